@@ -1,4 +1,4 @@
-"""The benchmarks' one command: `python -m benchmarks [CASE …]` from the root of the repository.
+"""The command of the benchmarks: `python -m benchmarks [CASE …]` from the root of the repository.
 
 Without a case it lists them. See `README.md` in this folder for what is measured and how.
 """
@@ -25,18 +25,18 @@ from benchmarks.harness.timing import say
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Options of the command."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Lists the cases, or runs some.")
-    parser.add_argument("cases", nargs="*", metavar="CASE", help="which to run")
+    parser.add_argument("cases", nargs="*", metavar="CASE", help="cases to run")
     parser.add_argument("--all", action="store_true", help="run every case")
-    parser.add_argument("--write", action="store_true", help="into RESULTS.md, the README's table and docs/")
+    parser.add_argument("--write", action="store_true", help="write to RESULTS.md, the README's table and docs/")
     parser.add_argument("--quick", action="store_true", help="smoke runs on small problems, figures not judged")
-    parser.add_argument("--output", type=Path, metavar="FOLDER", help="draw the cases' pictures there")
+    parser.add_argument("--output", type=Path, metavar="FOLDER", help="folder for the cases' figures")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write every result to this file")
     parser.add_argument("--without-pyeit", action="store_true", help="leave out pyEIT, which takes minutes")
     parser.add_argument("--data", type=Path, metavar="FOLDER", help="measured data (default ../shared/data)")
     parser.add_argument("--nodes", type=int, nargs="+", default=(), help="other sizes of meshes")
     parser.add_argument("--electrodes", type=int, nargs="+", default=(), help="other numbers of electrodes")
-    parser.add_argument("--rounds", type=int, help="turns each contestant has at each task")
-    parser.add_argument("--time-limit", type=float, metavar="S", help="for one call, then a contestant has given up")
+    parser.add_argument("--rounds", type=int, help="turns of each contestant at each task")
+    parser.add_argument("--time-limit", type=float, metavar="S", help="limit of one call of a contestant")
     options = parser.parse_args(arguments)
     unknown = [name for name in options.cases if name not in NAMES]
     if unknown:
@@ -73,10 +73,10 @@ def list_cases() -> None:
 
 
 def measure(name: str, options: argparse.Namespace) -> tuple[Result, list[str]]:
-    """One case's result, and what it was measured on. Raises `CaseFailedError`."""
+    """The result of one case, and the heading with the machine on which it was measured. Raises `CaseFailedError`."""
     case = find(name)
     pictures = machine.ROOT / "docs" / "images" if options.write and case.pictures else None
-    told = Options(
+    case_options = Options(
         quick=options.quick,
         without_pyeit=options.without_pyeit,
         output=options.output.resolve() if options.output else pictures,
@@ -86,18 +86,18 @@ def measure(name: str, options: argparse.Namespace) -> tuple[Result, list[str]]:
         rounds=options.rounds,
         time_limit=options.time_limit,
     )
-    if told.output is not None:
-        told.output.mkdir(parents=True, exist_ok=True)
+    if case_options.output is not None:
+        case_options.output.mkdir(parents=True, exist_ok=True)
     say(f"== {name}: {case.description}")
     heading = machine.heading()
-    return run_apart(name, told), heading
+    return run_apart(name, case_options), heading
 
 
 def measure_all(names: Iterable[str], options: argparse.Namespace) -> Iterator[tuple[str, Callable]]:
-    """Each case, as it is done, and a function that gives what `measure` does.
+    """Yield each case when it is done, with a function that returns what `measure` returns.
 
-    First those that measure times, one after the other; then the others, as many beside each other as there are cores.
-    A quick run judges no times, so all of its cases run beside each other.
+    Cases that measure times run first, one after the other. The others then run in parallel, as many as there are
+    cores. A quick run judges no times, so all of its cases run in parallel.
     """
     studies = []
     for name in names:
@@ -116,7 +116,7 @@ def measure_all(names: Iterable[str], options: argparse.Namespace) -> Iterator[t
 
 
 def keep(name: str, result: Result, heading: list[str], options: argparse.Namespace) -> None:
-    """Print a case's report, and write it where it is kept if asked; not what is wrong."""
+    """Print a case's report and, if requested, write it to its files. Returns messages about failures."""
     print(f"\n## {name}\n\n{report.text(result, heading)}\n", flush=True)
     if options.write and not result.wrong:
         for line in report.write(load(name), result, heading, NAMES):
@@ -124,7 +124,7 @@ def keep(name: str, result: Result, heading: list[str], options: argparse.Namesp
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run what is asked; 1 if a case fails, if results disagree or, in a full run, if a figure is missed."""
+    """Run the requested cases. Returns 1 if a case fails, results disagree or, in a full run, a figure is missed."""
     options = parse(arguments)
     if not (options.all or options.cases):
         list_cases()

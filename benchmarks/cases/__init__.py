@@ -1,4 +1,4 @@
-"""What is measured: one case to a file, each with its `CASE`. To add one, write a file and name it here."""
+"""The cases: one file each, with its `CASE`. To add a case, write a file and add its name here."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ NAMES = (
 
 
 def load(name: str) -> Case:
-    """The case of this name. Raises `ValueError` for a name that there is not."""
+    """The case of this name. Raises `ValueError` for an unknown name."""
     if name not in NAMES:
         raise ValueError(f"There is no case {name!r}; there are {', '.join(NAMES)}.")
     return import_module(f"benchmarks.cases.{name}").CASE

@@ -1,8 +1,9 @@
-"""Frames of pressed skins, from loads to voltages: jeit beside one factorisation of SciPy's per touch.
+"""Frames of pressed skins, from loads to voltages: jeit beside one SciPy factorisation per touch.
 
-A round skin of 5,000 nodes, pressed by balls, and by balls, discs and prisms, alone and in pairs: pressure balanced on
-the cells, the law of the material, exact changes of voltages. SciPy is given the changed conductivities; its time is
-that of a few touches, times their number. Then a stroke in time, and a contact on an elastic half-space.
+A round skin of 5,000 nodes is pressed by balls, and by balls, discs and prisms, alone and in pairs: pressure in
+equilibrium with the load on the cells, the material's law, exact changes of voltages. SciPy receives the changed
+conductivities, and its time is that of a few touches, multiplied by their number. Then a stroke in time, and a contact
+on an elastic half-space.
 """
 
 from __future__ import annotations
@@ -73,8 +74,9 @@ def run(options: Options) -> Result:
 
 
 def _plainly(skin: PressedSkin, touches: list, sample: int) -> tuple[float, float]:
-    """Seconds of a touch with one factorisation of its own, and the greatest difference of the changes of voltages,
-    relative to the greatest change."""
+    """Seconds for a touch with its own factorisation, and the largest difference of the changes of voltages, relative
+    to the largest change.
+    """
     plain = PlainTouches(skin.model, np.asarray(skin.conductivity))
     chosen = [touches[k] for k in np.linspace(0, len(touches) - 1, sample).astype(int)]
     touched = skin.touched(chosen)
@@ -89,7 +91,7 @@ def _plainly(skin: PressedSkin, touches: list, sample: int) -> tuple[float, floa
 
 
 def _stroke(skin: PressedSkin, number: int, rounds: int) -> list[str]:
-    """A row: a disc over the skin at 60 Hz, with creep and hysteresis of all that it leaves."""
+    """A table row for a disc that moves over the skin at 60 Hz, with creep and hysteresis everywhere on its path."""
     along = np.linspace(-0.03, 0.03, number)
     stroke = MovingPress(DiscIndenter(0.01), np.full(number, 3.0), np.stack([along, 0 * along], axis=-1))
     seconds = np.arange(number) / 60
@@ -99,7 +101,7 @@ def _stroke(skin: PressedSkin, number: int, rounds: int) -> list[str]:
 
 
 def _half_space(rounds: int) -> list[str]:
-    """A row: one contact, whose greatest pressure is Hertz's."""
+    """A table row for one contact, whose maximum pressure is compared with Hertz's."""
     support, indenter, load = HalfSpace(1e6, 0.5, 128), ball_indenter(0.02), 0.05
     spent = timed(lambda: support.pressure(indenter, load).values.max(), rounds)
     radius = (3 * load * 0.01 / (4 * support.plane_modulus)) ** (1 / 3)

@@ -1,7 +1,8 @@
-"""Contacts found in images of pressed skins: the published experiments, and ways to find contacts beside each other.
+"""Contacts found in images of pressed skins: the published experiments, and a comparison of contact finders.
 
-Chen et al. 2022 pressed a disk of 100 mm with weights, and looked for contacts in back-projected images. Their skin is
-simulated (`benchmarks/problems/contact_frames.py`); millimetres, profiles and ratios compare, values of pixels do not.
+Chen et al. 2022 pressed a disk of 100 mm with weights, and detected contacts in back-projected images. Their skin is
+simulated (`benchmarks/problems/contact_frames.py`). Millimetres, profiles and ratios are comparable with theirs, pixel
+values are not.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from jeit.touch.contacts import CellFinder, RasterFinder, find_contacts
 from jeit.touch.simulate import DiscIndenter, Press
 
 METHODS = ("one-step", "back-projection")
-# Beyond this a contact found is none of those that are there, metres.
+# Beyond this distance a detected contact matches none of the true ones, metres.
 CUT = 0.015
 AREAS, RATIOS = (415.5, 615.8, 1134.1), (1.0, 1.35, 2.68)
 GRAMS = (100, 200, 400, 700, 1000, 1500, 2000, 2500, 3000, 3500, 3900)
@@ -25,7 +26,7 @@ PLAIN = {"constant": 10.0, "opening": 5, "smoothing": 0.0}
 
 
 class Images:
-    """The frames of a skin as images of one method, and the contacts in them."""
+    """The frames of a skin as images by one method, and the contacts in them."""
 
     def __init__(self, frames: ContactFrames, method: str):
         self.frames, self.reconstruction = frames, frames.reconstruction(method)
@@ -37,7 +38,7 @@ class Images:
 
 
 def run(options: Options) -> Result:
-    """The published experiments, then the finders on touches that no default was chosen on."""
+    """The published experiments, then the finders on touches that were not used to choose defaults."""
     nodes = (1500, 600) if options.quick else (4000, 1000)
     quick = options.quick
     frames, single = ContactFrames(nodes=nodes), ContactFrames(nodes=nodes, saturation=SINGLE)
@@ -67,10 +68,10 @@ def _profile(frames, images, finder, quick):
         )
         along = 1e3 * off.reshape(len(radii), 3).mean(axis=1)
         inner, outer = along[: len(along) // 2].mean(), along[len(along) // 2 :].mean()
-        told = " ".join(f"{value:.1f}" for value in along)
-        figures.append(f"most {1e3 * off.max():.1f} mm; from the middle out {told}")
+        text = " ".join(f"{value:.1f}" for value in along)
+        figures.append(f"most {1e3 * off.max():.1f} mm; from the centre outwards {text}")
         met = met or bool(off.max() <= 0.011 and inner < outer)
-    return "error ≤ 11 mm, least in the middle", figures, met
+    return "error ≤ 11 mm, least at the centre", figures, met
 
 
 def _load_curve(frames, images, finder, quick):
@@ -81,8 +82,8 @@ def _load_curve(frames, images, finder, quick):
         slope = np.diff(peaks) / np.diff(GRAMS)
         rising, falling = bool((slope > 0).all()), bool(slope[-3:].mean() < 0.7 * slope[:3].mean())
         verdicts.append(rising and falling)
-        told = " ".join(f"{value:.1f}" for value in peaks / peaks[0])
-        figures.append(f"{told}; last slope over first {slope[-3:].mean() / slope[:3].mean():.2f}")
+        text = " ".join(f"{value:.1f}" for value in peaks / peaks[0])
+        figures.append(f"{text}; last slope over first {slope[-3:].mean() / slope[:3].mean():.2f}")
     return "100 to 3,900 g: rising, the slope falling", figures, verdicts[0]
 
 
@@ -95,7 +96,7 @@ def _round(frames, images, finder, quick):
         worst = np.abs(peaks / peaks.mean() - 1).max()
         figures.append(f"within {100 * worst:.1f} % of their mean")
         met.append(bool(worst <= 0.1))
-    return "16 points at 30 mm alike (10 %)", figures, met[0]
+    return "16 points at 30 mm equal within 10 %", figures, met[0]
 
 
 def _areas(frames, images, finder, quick):
@@ -130,7 +131,7 @@ def _two(frames, images, finder, quick):
         heavier = found[1][0].centroid[0] > 0
         figures.append(f"found {numbers[0]} and {numbers[1]}; peaks of 200 and 100 g 1 : {1 / ratio:.2f}")
         met.append(numbers == [2, 2] and bool(heavier))
-    return "two weights are two, the heavier the stronger", figures, met[0]
+    return "two weights are two contacts, the heavier the stronger", figures, met[0]
 
 
 def _nothing(frames, images, finder, quick):
@@ -150,19 +151,19 @@ EXPERIMENTS = {
 
 
 def _layers(frames, single, finder) -> list[str]:
-    """The least change that is found, in standard deviations of a cell: 0.5 N on two layers, 60 N on one."""
+    """The smallest change that is detected, in standard deviations of a cell: 0.5 N on two layers, 60 N on one."""
     radius = np.sqrt(226.98e-6 / np.pi)
     figures = []
     for method in METHODS:
-        told = []
+        text = []
         for own, load in ((frames, 0.5), (single, 60.0)):
             mine = Images(own, method)
             read = own.frames(600, [Press(DiscIndenter(2 * radius), load, (0.0, 0.0))])
             found = mine.found(finder, read)[0]
             strongest = (own.images(mine.reconstruction, read)[0] / mine.noise.deviation).max()
             off = f"{1e3 * _nearest(found, np.zeros(2)):.1f} mm off" if found else "not found"
-            told.append(f"{load:g} N: {strongest:.0f}σ, {off}")
-        figures.append("; ".join(told))
+            text.append(f"{load:g} N: {strongest:.0f}σ, {off}")
+        figures.append("; ".join(text))
     return [
         "two layers and one, 227 mm²",
         "two: 0.5 N is found; one: 60 N is misplaced",
@@ -171,7 +172,7 @@ def _layers(frames, single, finder) -> list[str]:
 
 
 def _finders(nodes, quick: bool) -> Table:
-    """Every way on touches of two materials, three levels of noise, discs and balls, one to three at once."""
+    """Each finder on touches of two materials, three levels of noise, discs and balls, one to three at once."""
     skins = [
         ContactFrames(name, noise, nodes=nodes, seed=7)
         for name in ("velostat", "conductive fabric")
@@ -203,13 +204,13 @@ def _finders(nodes, quick: bool) -> Table:
             say(" | ".join(row))
     header = ["images", "contacts", "OSPA distance, mm", "error, mm", "95th percentile, mm", "missed", "false"]
     caption = (
-        "OSPA: mean distance of contacts found from those there, 15 mm for each missed or false (Schuhmacher 2008)."
+        "OSPA: mean distance of detected from true contacts, 15 mm for each missed or false one (Schuhmacher 2008)."
     )
-    return Table(header, rows, "Touches that no default was chosen on", caption)
+    return Table(header, rows, "Touches that were not used to choose defaults", caption)
 
 
 def compared(true: list, found: list) -> tuple[float, list[float]]:
-    """OSPA distance, metres, and the distances of those that are matched."""
+    """OSPA distance, metres, and the distances of matched contacts."""
     if not found:
         return CUT, []
     distance = np.linalg.norm(np.array(true)[:, None] - np.array(found), axis=-1)
@@ -220,7 +221,7 @@ def compared(true: list, found: list) -> tuple[float, list[float]]:
 
 
 def _nearest(found: list, place: np.ndarray) -> float:
-    """Distance of the strongest contact, metres; that across the skin where there is none."""
+    """Distance of the strongest contact, metres. It is the diameter of the skin where there is none."""
     return float(np.linalg.norm(found[0].centroid - place)) if found else 2 * RADIUS
 
 

@@ -1,7 +1,8 @@
-"""kill -9 at random moments: whether what is left can be read, and whether the next run ends as one undisturbed does.
+"""kill -9 at random moments: whether the remaining files can be read, and whether the next run gives the undisturbed
+result.
 
-Half of the moments are drawn from all of a command's time, half from when it writes. Studies are resumed after every
-kill, on the same store, until they end; the others are run anew after every few.
+Half of the moments are drawn from all of a command's time, half from the time in which it writes. Studies are resumed
+after every kill, on the same store, until they end. The other commands are run anew after every few kills.
 """
 
 from __future__ import annotations
@@ -18,16 +19,17 @@ from benchmarks.harness.case import Case, Options, Result, Table, judged
 from benchmarks.harness.timing import say
 from benchmarks.problems.killed_commands import Command, study, tank, unreadable, watch
 
-# Of a study; of another command; of any in a quick run.
+# Kills of a study, of another command, and of any command in a quick run.
 KILLS, FEWER, QUICK = 30, 10, 1
-# A command that is not resumed is run to its end after so many kills.
+# A command that is not resumed runs to its end after this number of kills.
 ANEW = 5
 HEADER = ["command", "kills", "while it wrote", "readable after", "runs that ended after", "equal to undisturbed"]
 
 
 class Survived(NamedTuple):
-    """How many kills, how many of them after the command had begun to write, how many left what can be read; runs that
-    ended after them, how many of those left the same bytes as one undisturbed; and what was wrong."""
+    """Counts of kills, of kills after the command had begun to write, of readable remains, of completed runs, of runs
+    with the same bytes as an undisturbed one, and a list of faults.
+    """
 
     kills: int
     writing: int
@@ -61,7 +63,7 @@ def run(options: Options) -> Result:
 
 
 def _survive_all(folder: Path, kills: int, random: np.random.Generator, *, quick: bool):
-    """What each command survived, and the command."""
+    """The result of each command, and the command."""
     embedded = study(folder / "embedded", "study run")
     yield survive_resumed(embedded, kills, random), embedded
     if not quick:
@@ -80,7 +82,7 @@ def _survive_all(folder: Path, kills: int, random: np.random.Generator, *, quick
 
 
 def survive_resumed(command: Command, kills: int, random: np.random.Generator) -> Survived:
-    """Kill and resume until it ends, from the beginning again and again."""
+    """Kill and resume the command until it ends, repeatedly from the beginning."""
     from jeit.design.study import read_study, study_progress
 
     begun, span, whole = command.whole()
@@ -105,7 +107,7 @@ def survive_resumed(command: Command, kills: int, random: np.random.Generator) -
 
 
 def survive_anew(command: Command, kills: int, random: np.random.Generator) -> Survived:
-    """Kill it, and every few times let it end, in the same folder."""
+    """Kill the command, and every few times let it end, in the same folder."""
     command.clear(all=True)
     begun, span, whole = command.whole()
     killed = writing = readable = ends = equal = 0
@@ -123,7 +125,7 @@ def survive_anew(command: Command, kills: int, random: np.random.Generator) -> S
         wrong += [f"{command.name}: killed at {moment}: {one}" for one in broken]
         if killed % ANEW and killed < kills:
             continue
-        run_until(command, None)  # with what the killed ones left, caches included
+        run_until(command, None)  # with the remains of the killed runs, including caches
         ends += 1
         same = command.written() == whole
         equal += same
@@ -132,20 +134,20 @@ def survive_anew(command: Command, kills: int, random: np.random.Generator) -> S
 
 
 class Moment(NamedTuple):
-    """So many seconds after a command is started, or after it has begun to write."""
+    """Seconds after a command is started, or after it has begun to write."""
 
     seconds: float
     writing: bool
 
     @classmethod
     def draw(cls, random: np.random.Generator, begun: float, span: float) -> Moment:
-        """Any of all of a command's time, or any of that in which it writes."""
+        """A random moment in all of a command's time, or in the time in which it writes."""
         writing = bool(random.random() < 0.5)
         return cls(float(random.uniform(0.0, span - begun if writing else span)), writing)
 
 
 def run_until(command: Command, moment: Moment | None, *, again: bool = False) -> str:
-    """Run a command, and kill it at a moment: "ended" where it ended before, "killed", or "killed while it wrote"."""
+    """Run a command, and kill it at a moment: "ended" if it ended before, "killed", or "killed while it wrote"."""
     stamp, start = time.time(), time.perf_counter()
     process = command.start(again=again)
     wrote = False
@@ -165,10 +167,10 @@ def run_until(command: Command, moment: Moment | None, *, again: bool = False) -
 def _reads(read: Callable[[], object], wrong: list[str]) -> bool:
     try:
         read()
-    except Exception as error:  # whatever is said of what is broken
+    except Exception as error:  # any message about damaged files
         wrong.append(f"{type(error).__name__}: {error}")
         return False
     return True
 
 
-CASE = Case("crash", "commands killed at random moments: what is left, and whether the next run is right", run, 20)
+CASE = Case("crash", "commands killed at random moments: the remaining files, and the result of the next run", run, 20)

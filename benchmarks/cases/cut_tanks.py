@@ -1,6 +1,6 @@
-"""Tanks like the Kuopio challenge's with 0 to 12 electrodes gone: what the default segmentation scores.
+"""Tanks like the Kuopio challenge's with 0 to 12 missing electrodes: the score of the default segmentation.
 
-Tanks are those of `problems/cut_tanks.py`, solved without jeit; none of them was looked at when the defaults were set.
+Tanks are those of `problems/cut_tanks.py`, solved without jeit. None of them was used when the defaults were set.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ METHODS = ("auto", "total-variation")
 
 
 def run(options: Options) -> Result:
-    """One level of every tank, in turn; the challenge's score by level."""
+    """One level of every tank in turn. The challenge's score by level."""
     seeds = range(FIRST, FIRST + (1 if options.quick else TANKS))
     scores: dict[tuple[str, int], list[float]] = {}
     for seed in seeds:
@@ -45,4 +45,4 @@ def run(options: Options) -> Result:
     return Result([Table(["level", "tanks", *METHODS], rows)], [])
 
 
-CASE = Case("cut_tanks", "segmentations of simulated tanks some of whose electrodes are gone", run, 5, timed=False)
+CASE = Case("cut_tanks", "segmentations of simulated tanks with missing electrodes", run, 5, timed=False)

@@ -1,8 +1,8 @@
 """Maps of touched skins: jeit beside SciPy and scikit-learn.
 
 Exact maps of 48 × 48 touches on a sheet and on a layer, beside one SuperLU factorisation per touch (a few touches of
-each map, times their number); linear maps of many layouts in one batch and one by one; k-means of the same vectors. And
-what exact maps cost against the number of nodes.
+each map, multiplied by their number). Linear maps of many layouts in one batch and one by one. k-means of the same
+vectors. The cost of exact maps against the number of nodes.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from jeit_solvers import kmeans
 
 HEADER = ["task", "nodes", "jeit", "opponent", "times jeit's", "compile", "agreement"]
 FASTER, SAME = 30.0, 1e-8
-# Cell sizes in metres: of the map that SciPy makes too, and of those that show how cost grows.
+# Cell sizes in metres: of the map that SciPy computes too, and of maps that show the growth of cost.
 CASES = {"sheet": (3.07e-3, 4.3e-3, 6.3e-3), "layer": (4.34e-3, 6e-3, 8e-3)}
 
 
 class ExactMap(NamedTuple):
-    """Nodes, touches, jeit's time, SciPy's seconds and the greatest relative difference (or None)."""
+    """Nodes, touches, jeit's time, SciPy's seconds and the largest relative difference (or None)."""
 
     nodes: int
     touches: int
@@ -46,7 +46,7 @@ class ExactMap(NamedTuple):
     worst: float | None
 
     def row(self, kind: str) -> list[str]:
-        """Of the table."""
+        """Its row of the table."""
         row = [f"exact map, {kind}, {self.touches} touches", str(self.nodes), duration(self.spent.median)]
         if self.theirs is None:
             return [*row, "", "", duration(self.spent.compile), ""]
@@ -79,7 +79,7 @@ def run(options: Options) -> Result:
 
 
 def exact_map(kind: str, cell_size: float, places: int, sample: int, rounds: int) -> ExactMap:
-    """Touches all over one skin; SciPy's, as a few of them take, if `sample` is not 0."""
+    """Touches all over one skin. SciPy's time is that of `sample` touches, if `sample` is not 0."""
     model, conductivity, options = skin(kind, cell_size)
     grid = touch_grid(Rectangle(SIDE, SIDE), places, places)
     touched = touched_cells(model.mesh, Bell(), grid.places, **options)
@@ -98,7 +98,9 @@ def exact_map(kind: str, cell_size: float, places: int, sample: int, rounds: int
 
 
 def many_layouts(numbers: tuple[int, ...], rounds: int) -> tuple[list[list[str]], list[tuple[int, float]]]:
-    """Rows: linear maps of so many layouts in one batch, and one after the other; and seconds of each batch."""
+    """Rows of linear maps of several numbers of layouts, in one batch and one after the other, and seconds of each
+    batch.
+    """
     model, conductivity, options = skin("sheet", 6.3e-3)
     touched = touched_cells(model.mesh, Bell(), touch_grid(Rectangle(SIDE, SIDE), 24, 24).places, **options)
     sigma = jnp.asarray(conductivity)
@@ -113,7 +115,7 @@ def many_layouts(numbers: tuple[int, ...], rounds: int) -> tuple[list[list[str]]
     for number in numbers:
         moves = 1e-3 * jax.random.normal(jax.random.key(0), (number, 32, 2))
         together = timed(lambda moves=moves: batch(moves), rounds)
-        # One after the other costs so much each, however many: a few tell.
+        # One after the other each costs the same, however many there are: a few are timed.
         few = moves[:16]
         alone = timed(lambda few=few: [jax.block_until_ready(one(move)) for move in few], rounds).median / len(few)
         same = float(jnp.max(jnp.abs(together.answer[-1] / one(moves[-1]) - 1)))
@@ -129,7 +131,7 @@ def many_layouts(numbers: tuple[int, ...], rounds: int) -> tuple[list[list[str]]
 
 
 def clusters(rounds: int, quick: bool) -> list[str]:
-    """A row: 90 clusters of the changes of 2,304 touches by 94 voltages, beside scikit-learn on one thread."""
+    """A row for 90 clusters of the changes of 2,304 touches by 94 voltages, beside scikit-learn on one thread."""
     model, conductivity, options = skin("sheet", 7e-3 if quick else 5e-3)
     grid, number = touch_grid(Rectangle(SIDE, SIDE), *((12, 12) if quick else (48, 48))), 10 if quick else 90
     touched = touched_cells(model.mesh, Bell(), grid.places, **options)
@@ -154,7 +156,7 @@ def _asked_of_maps(kind: str, found: list[ExactMap]) -> list[Asked]:
 
 
 def _growth(asked: str, cost: list[tuple[int, float]]) -> Asked:
-    """The power with which seconds grow; nothing is asked of it."""
+    """The exponent with which seconds grow, reported but not judged."""
     return Asked(asked, f"{np.polyfit(*np.log(np.array(cost)).T, 1)[0]:.2f}")
 
 

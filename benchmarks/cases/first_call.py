@@ -1,4 +1,4 @@
-"""First calls: what a user waits for who types one command, or runs one script, in a fresh process."""
+"""First calls: the time that a user waits for one command or one script in a fresh process."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def image(length):
     reconstruct(model, model.voltages(1.1), 1.0, prior=Gaussian(length), hyperparameter=3.0)
 """
 )
-# A simulated skin, tapped and touched, as docs/hearing.md has it.
+# A simulated skin, tapped and touched, as in docs/hearing.md.
 _SKIN = """
 import jax
 from jeit.acoustic import Recording, Taps, write_recording, write_taps
@@ -59,9 +59,10 @@ calibrate_microphones(taps).calibration.save("skin.json")
 
 @dataclass(frozen=True)
 class Job:
-    """One thing to wait for: arguments of the command line, or a script; what it is allowed, seconds cold and warm.
+    """One command or script: command-line arguments or a script, its limits, and the seconds cold and warm.
 
-    `before`: what the script has done already when the clock starts; `files`: a script that writes what is read.
+    `before`: what the script has done already when the clock starts. `files`: a script that writes the files to be
+    read.
     """
 
     name: str
@@ -74,7 +75,7 @@ class Job:
 
 
 def jobs(options: Options) -> list[Job]:
-    """Those that can be run here: measured tanks need their data."""
+    """Those that can run here: measured tanks need their data."""
     few = [
         Job("import jeit", script="import jeit", cold=2.0),
         Job("jeit demo", ("demo",), cold=8.0, warm=4.0),
@@ -94,7 +95,7 @@ def jobs(options: Options) -> list[Job]:
         ]
     return [
         *few,
-        # Together they are allowed 8 s.
+        # Together they may take 8 s.
         Job("jeit calibrate-microphones", ("calibrate-microphones", "taps.npz"), files=_SKIN, warm=4.0),
         Job("jeit locate", ("locate", "recording.npz", "-c", "skin.json"), files=_CALIBRATED, warm=4.0),
         Job("jeit layout compare", ("layout", "compare", "park-inner", "park-boundary"), warm=15.0),
@@ -108,15 +109,15 @@ def jobs(options: Options) -> list[Job]:
 
 
 def run(options: Options) -> Result:
-    """Each cold, with no cache of compiled code, and again, median of three."""
+    """Each job cold, with no cache of compiled code, and warm, median of three."""
     rows, checks = [], []
     for job in jobs(options):
         with tempfile.TemporaryDirectory() as folder:
             subprocess.run([sys.executable, "-c", job.files], cwd=folder, check=True, timeout=LIMIT)
             cold, cpu = seconds(job, Path(folder))
             warm, again = (None, None) if job.before else _again(job, Path(folder))
-        said = [job.name, duration(cold), duration(cpu)]
-        rows.append([*said, *("" if one is None else duration(one) for one in (warm, again))])
+        cells = [job.name, duration(cold), duration(cpu)]
+        rows.append([*cells, *("" if one is None else duration(one) for one in (warm, again))])
         say(f"{job.name}: {duration(cold)}" + ("" if warm is None else f", then {duration(warm)}"))
         checks += [
             judged(f"{job.name}, {when} ≤ {most:g} s", duration(took), took <= most)
@@ -133,9 +134,9 @@ def _again(job: Job, folder: Path) -> tuple[float, float]:
 
 
 def seconds(job: Job, folder: Path) -> tuple[float, float]:
-    """Wall and CPU seconds of a job in a fresh process, its caches in `folder`; raises `RuntimeError` if it fails.
+    """Wall and CPU seconds of a job in a fresh process, with its caches in `folder`.
 
-    Of a job with something done `before`, the part after that.
+    Raises `RuntimeError` if it fails. Of a job with something done `before`, only the part after that counts.
     """
     environment = dict(os.environ, XDG_CACHE_HOME=str(folder / "cache"), MPLCONFIGDIR=str(folder / "matplotlib"))
     for name in ("JAX_COMPILATION_CACHE_DIR", "JEIT_COMPILATION_CACHE", "PYTHONDONTWRITEBYTECODE"):
@@ -162,7 +163,7 @@ def _children() -> float:
 
 
 def _fifteen_lines() -> str:
-    """README's example, up to where its image is known."""
+    """README's example, up to its image."""
     block = re.search(r"## Fifteen lines\n+```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     assert block is not None
     return block.group(1).split("plot_image(")[0]

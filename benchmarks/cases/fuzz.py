@@ -1,4 +1,4 @@
-"""Files made wrong at random, for every reader and some commands: taken, refused in one clear error, or a fault."""
+"""Randomly corrupted files for every reader and some commands: accepted, refused in one clear error, or a fault."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from benchmarks.harness.case import Case, Options, Result, Table, judged
 from benchmarks.harness.timing import say
 
 ROOT = Path(__file__).resolve().parents[2]
-# Inputs of files, 200 of each reader; and of commands, which take a second each.
+# Inputs of files, 200 for each reader, and of commands, which take a second each.
 FILES, COMMANDS, QUICK = 6200, 200, 310
 HEADER = ["reader or command", "tried", "one clear error", "accepted", "faults", "slowest"]
 
@@ -33,11 +33,13 @@ def run(options: Options) -> Result:
 
 
 def _fuzzed(which: str, number: int) -> tuple[list[list[str]], list[str]]:
-    """The rows that the fuzzer prints, and the faults that it names after them."""
+    """The rows that the fuzzer prints, and the faults that it lists after them."""
     command = [sys.executable, str(ROOT / "tests" / "fuzz" / "fuzz.py"), which, "--inputs", str(number)]
-    said = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=False)
+    completed = subprocess.run(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=False
+    )
     rows, faults = [], []
-    for line in said.stdout.splitlines():
+    for line in completed.stdout.splitlines():
         words = line.rsplit(maxsplit=6)
         if len(words) == 7 and words[-1] == "s" and words[1].isdigit():
             rows.append([*words[:5], f"{words[5]} s"])
@@ -45,8 +47,8 @@ def _fuzzed(which: str, number: int) -> tuple[list[list[str]], list[str]]:
         elif rows and line:
             faults.append(line)
     if not rows:
-        raise RuntimeError(f"the fuzzer ended with {said.returncode} and printed no row")
+        raise RuntimeError(f"the fuzzer ended with {completed.returncode} and printed no row")
     return rows, faults
 
 
-CASE = Case("fuzz", "files made wrong at random: refused in one clear error, accepted, or a fault", run, 5)
+CASE = Case("fuzz", "randomly corrupted files: refused in one clear error, accepted, or a fault", run, 5)

@@ -1,8 +1,8 @@
 """Five Gauss-Newton iterations: jeit beside pyEIT and SciPy.
 
 From the homogeneous background to noisy voltages of a disk with 16 electrodes. With complete electrodes, jeit and SciPy
-minimise the same function, so their images must be the same. pyEIT has point electrodes and a regularisation of its
-own; there, what counts is the misfit. See the folder's `README.md` for the contestants and how time is taken.
+minimise the same function, so their images must be equal. pyEIT has point electrodes and a different regularisation, so
+the misfit is compared. See the folder's `README.md` for the contestants and the timing.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from benchmarks.problems.accuracy import difference
 HEADER = ["nodes", "electrodes", "contestant", "one image", "times jeit's", "compile", "misfit", "error of image"]
 HEADER += ["peak memory"]
 NODES, ROUNDS, BUDGET, LIMIT = (1150, 5000), 15, 6.0, 600.0
-# Times faster than pyEIT asked for, up to so many nodes; and than SciPy.
+# Required ratios of time to pyEIT, up to a number of nodes, and to SciPy.
 AGAINST_PYEIT, AGAINST_SCIPY = ((2000, 100.0), (np.inf, 500.0)), 4.0
-# Images of one function's minimum, after five steps.
+# Images at the minimum of one function, after five steps.
 AGREEMENT = 1e-6
 
 
 def pose(num_points: int, model: str):
-    """The problem's arrays, and jeit's model, by which the voltages are simulated and every misfit is taken."""
+    """The problem's arrays, and jeit's model, which simulates the voltages and computes every misfit."""
     arrays = problem.make(num_points, 16, model)
     simulator = JeitContestant(arrays)
     voltages, rest = (np.asarray(simulator.tasks[task](0)) for task in ("64 conductivities", "homogeneous"))
@@ -66,7 +66,7 @@ def run(options: Options) -> Result:
 
 @dataclass
 class Match:
-    """One problem: who played, what each needed, and each one's image, misfit and distance from the truth."""
+    """One problem: the contestants, their times, and each one's image, misfit and distance from the truth."""
 
     nodes: int
     electrodes: str
@@ -78,7 +78,7 @@ class Match:
 
     @property
     def rows(self) -> list[list[str]]:
-        """Of the table."""
+        """Its rows of the table."""
         mine, rows = self.figures["jeit"], []
         for name, one in self.figures.items():
             row = [str(self.nodes), self.electrodes, name, cell(one), ratio(one, mine), duration(one.compile)]
@@ -89,7 +89,7 @@ class Match:
 
     @property
     def asked(self) -> list[Asked]:
-        """Beside what was measured; nothing of the tuned baseline."""
+        """The required figures beside the measured ones. Nothing is required against the tuned baseline."""
         return [_asked(self, name) for name in self.figures if name not in ("jeit", "scipy tuned")]
 
     @property
@@ -116,7 +116,7 @@ class Match:
 
 
 def play(num_points: int, model: str, opponents: dict[str, str], options: Options) -> Match:
-    """One problem. `opponents`: name: interpreter; one that does not run is left out, and a note says why."""
+    """One problem. `opponents`: name: interpreter. One that does not run is left out, and a note says why."""
     arrays, predict = pose(num_points, model)
     rounds, budget = options.rounds or (2 if options.quick else ROUNDS), 0.5 if options.quick else BUDGET
     nodes, contestants, notes = len(arrays["points"]), [], []
@@ -142,7 +142,7 @@ def play(num_points: int, model: str, opponents: dict[str, str], options: Option
 
 
 def _asked(match: Match, name: str) -> Asked:
-    """What is asked of jeit beside an opponent, what was measured, and whether it is met."""
+    """The requirement on jeit beside an opponent, the measured figure, and whether it is met."""
     most = AGAINST_SCIPY if name != "pyeit" else next(t for most, t in AGAINST_PYEIT if match.nodes < most)
     asked = f"{match.nodes} nodes: ≥ {most:g}× {name}, misfit no greater"
     if name not in match.images or "jeit" not in match.images:

@@ -1,8 +1,10 @@
-"""Six gestures on a sheet told apart, by LogitBoost and by others, beside Silvera Tawil et al. (2011); all simulated.
+"""Six gestures on a sheet, classified by LogitBoost and other methods, beside Silvera Tawil et al. (2011). All data are
+simulated.
 
-What is simulated, and how people differ, is in `problems/touching_people.py` and `jeit.touch.simulate.people`. To be
-compared: that one person's gestures are told better than many people's, and which are taken for each other; not per
-cent. The paper's folds are random, so that everybody is learnt from; with people held out nobody is.
+The simulation and the differences between people are in `problems/touching_people.py` and `jeit.touch.simulate.people`.
+Comparable with the paper: that one person's gestures are classified better than many people's, and which gestures are
+confused, but not percentages. The paper's folds are random, so that every person is in the training data. Held-out
+people are not.
 """
 
 from __future__ import annotations
@@ -32,20 +34,20 @@ from jeit.touch.reports.touch_watch import WrittenWatch, draw_watch
 from jeit.touch.simulate.people import GESTURES
 
 FOLDS = 15
-# The paper's: per cent right of each gesture, of one person and of 35.
+# The paper's percentages right of each gesture, of one person and of 35.
 PAPER = {"one person": (85, 83, 97, 93, 93, 97), "many people": (84, 61, 89, 58, 65, 87)}
 PAIRS = (("tap", "pat"), ("pat", "tap"), ("stroke", "scratch"), ("scratch", "stroke"))
 # Of those pairs, per cent.
 CONFUSED = {"one person": (14, 15, 7, 7), "many people": (15, 27, 37, 34)}
 THEIRS, HIS = "logit-boost", "seven"
-MINUTE = 60.0  # of the stream, drawn
+MINUTE = 60.0  # number of gestures in the stream
 # Where sets are kept from one run to the next.
 STORE = Path(tempfile.gettempdir()) / "jeit-gestures"
 
 
 @dataclass
 class Experiment:
-    """Touches (n,) by their numbers of gesture and person; how many recordings had none."""
+    """Touches (n,) with their numbers of gesture and person, and the number of recordings without a touch."""
 
     name: str
     touches: list[StreamTouch]
@@ -56,7 +58,7 @@ class Experiment:
 
     @classmethod
     def of(cls, name: str, sheet: Sheet, made: GestureSet) -> Experiment:
-        """What is found in a set."""
+        """The touches detected in a set."""
         found = sheet.touches(made)
         there = [number for number, one in enumerate(found) if one is not None]
         touches = [one for one in found if one is not None]
@@ -65,7 +67,7 @@ class Experiment:
         return cls(name, touches, right, made.person[there], len(found) - len(there), cut_off)
 
     def confusion(self, method: str, form: str, folds: np.ndarray) -> np.ndarray:
-        """Shares (6, 6), per cent, of each gesture that were told as each."""
+        """Shares (6, 6), per cent, of each gesture that were classified as each."""
         odds = held_out_odds(method, FEATURE_FORMS[form](self.touches).values, self.right, folds)
         counts = np.zeros((len(GESTURES), len(GESTURES)))
         np.add.at(counts, (self.right, odds.argmax(axis=1)), 1)
@@ -73,7 +75,7 @@ class Experiment:
 
 
 def run(options: Options) -> Result:
-    """One person and many, by every classifier, held out at random and by person; how quick an answer is."""
+    """One person and many, by every classifier, held out at random and by person, and the time of a classification."""
     quick = options.quick
     sheet = Sheet(fine=1300, nodes=900) if quick else Sheet()
     sizes = (
@@ -118,9 +120,9 @@ def run(options: Options) -> Result:
     tables = [
         Table(["experiment", "by", *GESTURES, "mean"], each, "Gestures", _caption(experiments, folds)),
         Table(
-            ["experiment", "told", "paper", "ours"],
+            ["experiment", "classified as", "paper", "ours"],
             pairs,
-            "Taken for each other",
+            "Confusions",
             "LogitBoost on the seven features, folds drawn at random; per cent of the gesture.",
         ),
         Table(
@@ -138,7 +140,7 @@ def run(options: Options) -> Result:
 
 
 def _gestures(name: str, confusion: np.ndarray, paper: tuple[int, ...] | None = None) -> list[str]:
-    """Right of each gesture and on average, the paper's in brackets."""
+    """The percentage right of each gesture and on average, the paper's in brackets."""
     own = [*confusion.diagonal(), confusion.diagonal().mean()]
     if paper is None:
         return [name, *(f"{value:.0f}" for value in own)]
@@ -146,23 +148,25 @@ def _gestures(name: str, confusion: np.ndarray, paper: tuple[int, ...] | None = 
 
 
 def _caption(experiments: dict[str, Experiment], folds: int) -> str:
-    said = "; ".join(
+    text = "; ".join(
         f"{name}: {len(one.touches) + one.missed} recordings, {one.missed} without a touch, {one.cut_off} cut off"
         for name, one in experiments.items()
     )
-    return f"Per cent right, the paper's in brackets. {folds} folds at random, and each person held out. {said}."
+    return f"Per cent right, the paper's in brackets. {folds} folds at random, and each person held out. {text}."
 
 
 @dataclass
 class Live:
-    """What was told of a stream of `frames` with so many `touches`: of these `told`, and told `right`; touches that
-    there were none of, `false`; seconds, in 99 of 100 cases at most, from any frame to what was told of it,
-    `followed`, from the frame after a touch to its name, `named`, and from the touch's last frame, `after_end`; and in
-    the middle of the latter computing alone, `usual`."""
+    """The classification of a stream of `frames` with a number of `touches`.
+
+    Of these `detected`, and classified `right`. Detections without a touch, `false`. The 99th percentile of seconds
+    from a frame to its events, `followed`, from the frame after a touch to its classification, `named`, and from the
+    touch's last frame, `after_end`. The median of `named`, `usual`.
+    """
 
     frames: int
     touches: int
-    told: int
+    detected: int
     right: int
     false: int
     followed: float
@@ -171,22 +175,22 @@ class Live:
     usual: float
 
     def table(self) -> Table:
-        """Of all of it."""
+        """The table of all of it."""
         rows = [
-            ["touches in the stream, by people who were not learnt from", f"{self.touches}"],
-            ["of these told", f"{self.told}"],
-            ["told right", f"{self.right}"],
-            ["told where there was none", f"{self.false}"],
-            ["a frame followed: imaged, cut (99 % within)", duration(self.followed)],
-            ["a touch named, computing (median)", duration(self.usual)],
-            ["a touch named, computing (99 % within)", duration(self.named)],
-            ["a touch named after its last frame, the next frame waited for (99 % within)", duration(self.after_end)],
+            ["touches in the stream, by people who are not in the training data", f"{self.touches}"],
+            ["of these detected", f"{self.detected}"],
+            ["classified correctly", f"{self.right}"],
+            ["detections without a touch", f"{self.false}"],
+            ["a frame processed: imaged, segmented (99 % within)", duration(self.followed)],
+            ["a touch classified, computing (median)", duration(self.usual)],
+            ["a touch classified, computing (99 % within)", duration(self.named)],
+            ["a touch classified after its last frame, wait included (99 % within)", duration(self.after_end)],
         ]
         return Table(["what", "measured"], rows, f"A live stream of {self.frames:,} frames at 60 Hz")
 
 
 def _live(sheet: Sheet, made: GestureSet, best: tuple[str, str], options: Options) -> Live:
-    """A stream by four people whom the model does not know, followed frame by frame."""
+    """A stream of four people who are not in the training data, processed frame by frame."""
     model = learn_gestures(sheet.description, made, method=best[0], form=best[1]).model
     stream = sheet.stream(4, 5 if options.quick else 60, 3, store=None if options.quick else STORE)
     still = stream.voltages[stream.seconds < 1.0]
@@ -197,15 +201,15 @@ def _live(sheet: Sheet, made: GestureSet, best: tuple[str, str], options: Option
         _draw_timeline(options.output / "timeline.png", watch, watched)
     onset = np.array([one.touch.onset for one in touches])
     own = [np.flatnonzero(np.abs(onset - begin) < 0.25) for begin in stream.onset]
-    told = [(one[0], name) for one, name in zip(own, stream.gesture, strict=True) if one.size]
+    detected = [(one[0], name) for one, name in zip(own, stream.gesture, strict=True) if one.size]
     named = np.array([one.named.latency for one in watched if one.named is not None] or [np.nan])
     waited = np.array([one.named.named - one.named.touch.offset for one in watched if one.named is not None] or [0.0])
     return Live(
         frames=len(stream.seconds),
         touches=len(stream.onset),
-        told=len(told),
-        right=sum(touches[number].gesture == name for number, name in told),
-        false=len(touches) - len({number for number, _ in told}),
+        detected=len(detected),
+        right=sum(touches[number].gesture == name for number, name in detected),
+        false=len(touches) - len({number for number, _ in detected}),
         followed=float(np.quantile([one.latency for one in watched], 0.99)),
         named=float(np.quantile(named, 0.99)),
         after_end=float(np.quantile(waited + named, 0.99)),
@@ -222,24 +226,24 @@ def _draw_timeline(path: Path, watch: TouchWatch, watched: list[WatchedFrame]) -
 
 
 def _draw(output: Path, many: Experiment, best: tuple[str, str]) -> None:
-    """Confusions of many people's gestures, each person held out."""
+    """Confusion matrices of many people's gestures, each person held out."""
     from jeit.touch.plots import plot_confusion
 
     labels = np.array(GESTURES)[many.right]
     model = GestureModel.fit(many.touches, labels, people=many.person, method=best[0], form=best[1])
     if model.standing is not None:
         right = 100 * np.mean(model.standing.held_out == model.standing.right)
-        title = f"Gestures of people who were held out: {right:.0f} % right"
+        title = f"Gestures of held-out people: {right:.0f} % right"
         plot_confusion(model.standing, title=title).figure.savefig(output / "gestures.png", dpi=110)
 
 
 def _asked(found: dict, best: tuple[str, str], live: Live) -> list[Asked]:
-    """What the paper finds, as far as it can be compared."""
+    """The paper's findings, as far as they are comparable."""
     one, many = (found[name, THEIRS, HIS] for name in PAPER)
     left_out = found["by person", *best].diagonal().mean()
     asked = [
         judged(
-            "one person's gestures are told better than many people's (91 and 74 %)",
+            "one person's gestures are classified better than many people's (91 and 74 %)",
             f"{one.diagonal().mean():.0f} and {many.diagonal().mean():.0f} %",
             one.diagonal().mean() > many.diagonal().mean(),
         )
@@ -247,19 +251,19 @@ def _asked(found: dict, best: tuple[str, str], live: Live) -> list[Asked]:
     for name, confusion in (("one person", one), ("many people", many)):
         rest = confusion + confusion.T
         order = sorted(((rest[a, b], a, b) for a in range(6) for b in range(a)), reverse=True)[:2]
-        told = {frozenset((GESTURES[a], GESTURES[b])) for _, a, b in order}
+        detected = {frozenset((GESTURES[a], GESTURES[b])) for _, a, b in order}
         asked.append(
             judged(
-                f"{name}: tap and pat, stroke and scratch are those most taken for each other",
+                f"{name}: tap and pat, stroke and scratch are confused most",
                 "; ".join(f"{GESTURES[b]} and {GESTURES[a]}" for _, a, b in order),
-                told == {frozenset(("tap", "pat")), frozenset(("stroke", "scratch"))},
+                detected == {frozenset(("tap", "pat")), frozenset(("stroke", "scratch"))},
             )
         )
     return [
         *asked,
-        Asked("of people who were not learnt from, by the best classifier", f"{left_out:.0f} % ({', '.join(best)})"),
+        Asked("of held-out people, by the best classifier", f"{left_out:.0f} % ({', '.join(best)})"),
         judged(
-            "on a live stream of 10,000 frames at 60 Hz a touch is named within 50 ms of its end (99 %)",
+            "on a live stream of 10,000 frames at 60 Hz a touch is classified within 50 ms of its end (99 %)",
             f"{duration(live.after_end)} after its last frame, {duration(live.named)} of it computing",
             live.after_end < 0.05,
         ),
@@ -268,7 +272,7 @@ def _asked(found: dict, best: tuple[str, str], live: Live) -> list[Asked]:
 
 CASE = Case(
     "gestures",
-    "six gestures told apart, by LogitBoost and others, beside the paper's",
+    "six gestures classified by LogitBoost and others, beside the paper's",
     run,
     25,
     page=("docs/gestures.md", "gestures"),

@@ -1,8 +1,8 @@
 """Localising touches by sound: jeit beside plain NumPy and SciPy.
 
 25 microphones, 200 × 200 pixels, frames with the noise of the simulated skin. Both minimise the paper's loss, so their
-maps and places must be the same. Without a map, SciPy starts from the loudest microphone. Then what only jeit does: the
-likelihood, and a recording of 25 channels at 40 kHz turned into a track.
+maps and places must agree. Without a map, SciPy starts from the loudest microphone. Then two tasks that only jeit has:
+the likelihood, and a recording of 25 channels at 40 kHz processed to a track.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ HEADER = ["task", "jeit, a frame", "frames a second", "NumPy and SciPy", "times 
 MAPS, PLACES, ALL = "maps, the paper's loss", "map and refined place", "all maps kept, and places"
 LIKELY = "place without a map, likelihood"
 FASTER, WITH_MAPS, WITHOUT_MAPS, RECORDING = 20.0, 500.0, 20_000.0, 0.2
-# Maps relative to their greatest value; places in metres.
+# Maps relative to their largest value. Places in metres.
 SAME_MAP, SAME_PLACE = 1e-10, 1e-6
 
 
 def frames(number: int):
-    """MicrophoneArray, and intensities (F, M) of as many touches with the noise that they expect; floor and ν."""
+    """MicrophoneArray, and intensities (F, M) of F touches with noise according to it, the floor and ν."""
 
     skin = SoundingSkin(jax.random.key(0))
     microphones = np.asarray(skin.microphones)
@@ -43,7 +43,7 @@ def frames(number: int):
     received = expected_power(skin, places) * np.exp(0.3 * random.standard_normal((number, 1))) * 3.0
     spread = np.sqrt(4 * received * floor / freedom + 2 * floor**2 / freedom)
     power = received + spread * random.standard_normal(received.shape)
-    # The decay models that fit the noise-free skin best, near enough.
+    # The decay models that approximately fit the noise-free skin best.
     squared = np.sum((microphone_grid(13)[:, None] - microphones) ** 2, axis=-1)
     response = expected_power(skin, microphone_grid(13))
     b = np.full(len(microphones), 1.3e-4)
@@ -54,7 +54,7 @@ def frames(number: int):
 
 
 def run(options: Options) -> Result:
-    """Every task, then the recording, and what is asked of them."""
+    """Every task, then the recording, and the required figures."""
     number, rounds = (8, 2) if options.quick else (32, options.rounds or 15)
     duel = Duel(number)
     rows, spent, theirs = [], {}, {}
@@ -74,15 +74,17 @@ def run(options: Options) -> Result:
         row[-1] = same.get(row[0], "")
     asked = _asked(spent, theirs)
     if not options.quick:
-        heard, samples = recording(rounds)
+        track_times, samples = recording(rounds)
         job = f"recording of 1 s, 25 × {samples:,} samples, to a track"
-        rows.append([job, duration(heard.median), "", "", "", duration(heard.compile), ""])
-        asked.append(judged("a recording of 1 s: < 0.2 s", duration(heard.median), heard.median < RECORDING))
+        rows.append([job, duration(track_times.median), "", "", "", duration(track_times.compile), ""])
+        asked.append(
+            judged("a recording of 1 s: < 0.2 s", duration(track_times.median), track_times.median < RECORDING)
+        )
     wrong = [] if map_error < SAME_MAP and place_error < SAME_PLACE else ["jeit and SciPy disagree"]
     ratio = times(theirs[PLACES] / spent[PLACES])
-    told = "a touch located by sound, map of 200 × 200 and refinement", duration(spent[PLACES])
+    job = "a touch located by sound, map of 200 × 200 and refinement", duration(spent[PLACES])
     other = f"SciPy: {duration(theirs[PLACES])}"
-    headline = Headline(*told, other, ratio, f"same place to {same[PLACES]}")
+    headline = Headline(*job, other, ratio, f"same place to {same[PLACES]}")
     return Result([Table(HEADER, rows)], asked, headline=headline, wrong=wrong)
 
 
@@ -97,7 +99,7 @@ class Duel:
         self.mapped = Localiser.create(self.array, method="consistency", map_shape=(200, 200))
 
     def agreement(self) -> tuple[float, float]:
-        """Greatest relative difference of maps, and median distance in metres of places inside the skin."""
+        """Largest relative difference of maps, and median distance in metres of places inside the skin."""
         maps, estimate = np.asarray(self.mapped.maps(self.few)), self.mapped(self.few)
         theirs = np.stack([self.plain.locate(frame) for frame in self.few])
         inside = np.abs(theirs).max(axis=1) < 0.1 - 1e-9
@@ -106,7 +108,7 @@ class Duel:
         return float(worst), float(np.median(apart))
 
     def tasks(self):
-        """Name: jeit's way, SciPy's for one frame (or None), and how many frames jeit's way takes."""
+        """Name: jeit's function, SciPy's for one frame (or None), and the number of frames that jeit's processes."""
         mapped, plain, few, many, power = self.mapped, self.plain, self.few, self.many, self.power
         coarse, likelihood = Localiser.create(self.array, method="consistency"), Localiser.create(self.array)
         likely_maps = Localiser.create(self.array, map_shape=(200, 200))
@@ -133,12 +135,12 @@ def recording(rounds: int) -> tuple[Timed, int]:
         Taps(array, corners, taps.positions, samples=taps.samples, rate=taps.rate)
     ).calibration
     sound = simulate_stroke(skin, jax.random.key(2), np.array([[-0.07, -0.06], [0.07, 0.05]]), strength=2.0)
-    heard = Recording(sound.samples, sound.rate)
-    return timed(lambda: track(locate(heard, calibration, compiled=True)), rounds), sound.samples.shape[1]
+    track_times = Recording(sound.samples, sound.rate)
+    return timed(lambda: track(locate(track_times, calibration, compiled=True)), rounds), sound.samples.shape[1]
 
 
 def _asked(spent: dict[str, float], theirs: dict[str, float]) -> list[Asked]:
-    """From the seconds of a frame, jeit's and SciPy's."""
+    """The required figures from the seconds of a frame, jeit's and SciPy's."""
 
     def at_least(asked: str, measured: float, least: float, unit: str) -> Asked:
         return judged(asked, f"{measured:,.0f}{unit}", measured >= least)

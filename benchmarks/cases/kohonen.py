@@ -1,8 +1,8 @@
 """Kohonen's map of a skin's frames: the published experiments, beside one-step images of the same frames.
 
-Pugach et al. 2015 taught a map 208 voltages of a disk of 200 mm under a weight of 100 g. Their skin is simulated
-(`benchmarks/problems/weighed_skins.py`); places, ratios and the order of time constants compare, seconds do not. Frames
-that maps are judged by are none of those that they learnt from.
+Pugach et al. 2015 trained a map on 208 voltages of a disk of 200 mm under a weight of 100 g. Their skin is simulated
+(`benchmarks/problems/weighed_skins.py`). Places, ratios and the order of time constants are comparable, seconds are
+not. No frame for evaluation is in the training data.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from jeit.touch.simulate import BarIndenter, DiscIndenter, Press, PrismIndenter,
 LEARNT, JUDGED, TRIALS = 10_000, 1000, 200
 RATES, THEIR_SECONDS = (0.01, 0.005, 0.001), (4.2, 7.7, 19.6)
 SHAPES = ((13, 16), (32, 32), (64, 64))
-# ε and ρ as published; how long, they do not say: frames of each phase for one round of ten thousand.
+# ε and ρ as published. Their durations are not published: frames of each phase for one round of ten thousand.
 PUBLISHED = MapSchedule(2000, 8000, (0.01, 0.001), (16.0, 1.0))
 GRAMS, WEIGHTS = (2.3, 6.3, 20.3, 52.3, 102.3), (100.0, 50.0, 20.0)
 APART, NEAR = 0.06, 0.02  # m: between weights, and of a touch from its weight
@@ -44,7 +44,7 @@ OBJECTS = {
     "ruler": BarIndenter(0.09, 0.02),
     "tube": RingIndenter(0.06, 0.05),
 }
-MIDDLE, MARKED = np.array([0.0, 0.02]), "#d1495b"  # of the objects, m; what is true, in pictures
+MIDDLE, MARKED = np.array([0.0, 0.02]), "#d1495b"  # sides of the objects, m, and their true values, in figures
 
 
 def _rectangle(length: float, width: float) -> np.ndarray:
@@ -56,7 +56,7 @@ def _circle(diameter: float) -> np.ndarray:
     return diameter / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-# What of them touches.
+# Their contact areas.
 OUTLINES = {
     "prism": [_rectangle(0.06, 0.0)],
     "cube": [_rectangle(0.03, 0.03)],
@@ -66,7 +66,7 @@ OUTLINES = {
 
 
 def run(options: Options) -> Result:
-    """All of them; pictures where an output folder is given."""
+    """All experiments, with figures where an output folder is given."""
     quick = options.quick
     learnt, judged_by, trials, nodes = (300, 60, 12, 800) if quick else (LEARNT, JUDGED, TRIALS, 4000)
     disk, square = WeighedSkin("disk", nodes), WeighedSkin("square", nodes)
@@ -93,7 +93,7 @@ def run(options: Options) -> Result:
     tables.append(Table(header, rows, "Learning curves", "The mean weight from a small start; the radius stays 16."))
     asked.append(
         judged(
-            "slower the smaller ε, no overshoot",
+            "slower for smaller ε, no overshoot",
             f"overshoot {100 * over:.2g} %",
             constants == sorted(constants) and over < 0.01,
         )
@@ -116,7 +116,7 @@ def run(options: Options) -> Result:
         "95 %",
         "most",
         "most, of 200 mm",
-        "median within 40 mm of the middle",
+        "median within 40 mm of the centre",
         "beyond 80 mm",
     ]
     tables.append(
@@ -128,8 +128,8 @@ def run(options: Options) -> Result:
         )
     )
     placed = maps[32, 32]
-    told, _ = placed.locate(fresh)
-    worst = float(np.linalg.norm(told - right, axis=1).max())
+    estimated, _ = placed.locate(fresh)
+    worst = float(np.linalg.norm(estimated - right, axis=1).max())
     asked.append(judged("error ≤ 1.5 % of the diameter everywhere", f"{100 * worst / 0.2:.1f} %", worst <= 3e-3))
     say("sensitivity")
     along, ohms = _sensitivity(disk, rest)
@@ -137,7 +137,7 @@ def run(options: Options) -> Result:
     tables.append(_ohms(along, ohms))
     asked.append(
         judged(
-            "102.3 g at the boundary about 7 × as in the middle",
+            "102.3 g at the boundary about 7 × as at the centre",
             f"{inner:.1f} × at 80 mm, {outer:.1f} × at 90 mm",
             5 <= outer <= 9,
         )
@@ -148,7 +148,7 @@ def run(options: Options) -> Result:
     for number, share in shares.items():
         asked.append(
             judged(
-                f"{number} of 100, 50, 20 g told in ≥ {100 * ASKED[number]:.0f} %",
+                f"{number} of 100, 50, 20 g detected in ≥ {100 * ASKED[number]:.0f} %",
                 f"{100 * share:.0f} %",
                 share >= ASKED[number],
             )
@@ -174,8 +174,8 @@ def run(options: Options) -> Result:
     return Result(tables, [] if quick else asked)
 
 
-def _row(name: str, told: np.ndarray, right: np.ndarray) -> list[str]:
-    off, radius = 1e3 * np.linalg.norm(told - right, axis=1), np.linalg.norm(right, axis=1)
+def _row(name: str, estimated: np.ndarray, right: np.ndarray) -> list[str]:
+    off, radius = 1e3 * np.linalg.norm(estimated - right, axis=1), np.linalg.norm(right, axis=1)
     figures = [np.median(off), off.mean(), np.quantile(off, 0.95), off.max()]
     middle, edge = np.median(off[radius < 0.04]), np.median(off[radius > 0.08])
     row = [name, *(f"{one:.2f}" for one in figures), f"{100 * off.max() / 200:.1f} %", f"{middle:.2f}", f"{edge:.2f}"]
@@ -206,7 +206,7 @@ def _ohms(along: np.ndarray, ohms: np.ndarray) -> Table:
         ["weight", *(f"{1e3 * x:.0f} mm" for x in along)],
         rows,
         "Mean change of 208 transfer resistances, Ω",
-        "The paper: at its boundary, 102.3 g change resistance about seven times as much as in the middle.",
+        "The paper: at its boundary, 102.3 g change resistance about seven times as much as at the centre.",
     )
 
 
@@ -228,7 +228,7 @@ def _several(disk: WeighedSkin, placed: PlacedMap, rest: np.ndarray, trials: int
                 strengths.append([found[one].strength for one in own[1]])
         near = [bool((one < NEAR).all()) for one in off]
         right = counts[0] / trials if not number else sum(near) / trials
-        told = (
+        estimated = (
             " : ".join(f"{one / np.median(strengths, axis=0)[0]:.2f}" for one in np.median(strengths, axis=0))
             if strengths
             else ""
@@ -239,7 +239,7 @@ def _several(disk: WeighedSkin, placed: PlacedMap, rest: np.ndarray, trials: int
                 *(str(one) for one in counts),
                 f"{100 * right:.0f} %",
                 f"{1e3 * np.median(np.concatenate(off)):.1f}" if off else "",
-                told,
+                estimated,
             ]
         )
         say(" | ".join(rows[-1]))
@@ -247,7 +247,7 @@ def _several(disk: WeighedSkin, placed: PlacedMap, rest: np.ndarray, trials: int
             shares[number] = right
     header = [
         "weights",
-        *(f"told {one}" for one in ("none", "1", "2", "3", "more")),
+        *(f"detected {one}" for one in ("none", "1", "2", "3", "more")),
         "right, within 20 mm",
         "error, mm",
         "strengths",
@@ -261,7 +261,7 @@ def _several(disk: WeighedSkin, placed: PlacedMap, rest: np.ndarray, trials: int
 
 
 def _topology(disk, square, placed, frames, learnt: int, schedule):
-    """Quality of the maps of both skins, and what is drawn of them."""
+    """Quality of the maps of both skins, and the arrays for their figures."""
     other, there = square.presses(30, learnt)
     again = PlacedMap.learn(SelfOrganisingMap.fit(other, jax.random.key(1), schedule=schedule), other, there)
     rows, trust, drawings = [], [], {}
@@ -283,7 +283,7 @@ def _topology(disk, square, placed, frames, learnt: int, schedule):
 
 
 def _shapes(placed: PlacedMap, pressed: dict[str, np.ndarray], rest: np.ndarray) -> Table:
-    """Length and width, root mean square times √12, of what of the map four objects of one load activate."""
+    """Length and width, root mean square times √12, of the part of the map that four objects of one load activate."""
     rows = []
     for name, frame in pressed.items():
         shares = neuron_shares(placed, frame, rest)
@@ -295,7 +295,7 @@ def _shapes(placed: PlacedMap, pressed: dict[str, np.ndarray], rest: np.ndarray)
         rows.append([name, f"{sides[1]:.0f} × {sides[0]:.0f} mm", f"{1e3 * np.hypot(*(middle - MIDDLE)):.1f} mm"])
         say(" | ".join(rows[-1]))
     return Table(
-        ["object", "extent told", "off"],
+        ["object", "estimated extent", "off"],
         rows,
         "Four shapes under 3 N",
         "Prism: a ridge of 60 mm; cube: 30 mm; ruler: 90 × 20 mm; tube: 60 mm outside, 50 mm inside.",
@@ -303,7 +303,7 @@ def _shapes(placed: PlacedMap, pressed: dict[str, np.ndarray], rest: np.ndarray)
 
 
 def _draw(folder: Path, curves, located, drawings, multi, pressed, sensed) -> None:
-    """One picture of everything that the paper draws."""
+    """One figure of everything that the paper shows."""
     import matplotlib.pyplot as plt
 
     from jeit.touch.plots import plot_map
@@ -347,9 +347,9 @@ def _draw(folder: Path, curves, located, drawings, multi, pressed, sensed) -> No
     axes[1, 3].legend([f"{one:g} g" for one in GRAMS], frameon=False, ncols=2, loc="upper center")
     axes[1, 3].set_ylim(top=60)
     for column, (name, own) in enumerate(drawings.items()):
-        plot_map(own.places, title=f"{name}: neurons where they lie", ax=axes[3, 2 * column])
+        plot_map(own.places, title=f"{name}: neurons at their places", ax=axes[3, 2 * column])
         drawn = drawn_map(own.learnt, jax.random.key(0))
-        plot_map(drawn, title=f"{name}: by springs alone", on_skin=False, ax=axes[3, 2 * column + 1])
+        plot_map(drawn, title=f"{name}: by a spring layout", on_skin=False, ax=axes[3, 2 * column + 1])
     figure.savefig(folder / "kohonen.png", dpi=72)
     plt.close(figure)
 

@@ -1,7 +1,7 @@
-"""How quick self-organising maps are, to learn and to be asked, beside MiniSom and beside one-step images.
+"""Speed of self-organising maps in training and evaluation, beside MiniSom and one-step images.
 
-A map of 32 by 32 neurons learns from 10,000 frames of 208 voltages of a simulated skin, each shown once, in an ordering
-and a tuning phase; MiniSom is shown the same in the same order, and ends with the same weights.
+A map of 32 by 32 neurons is trained on 10,000 frames of 208 voltages of a simulated skin, each presented once, in an
+ordering and a tuning phase. MiniSom is trained on the same frames in the same order, and ends with the same weights.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FRAMES, SHAPE, ASKED_S, TIMES, FRAME_S = 10_000, (32, 32), 5.0, 20.0, 0.2e-3
 
 
 def run(options: Options) -> Result:
-    """Learning by both, then one frame."""
+    """Training by both, then one frame."""
     number, nodes, turns = (300, 800, 2) if options.quick else (FRAMES, 4000, 5)
     skin = WeighedSkin("disk", nodes)
     frames, places = skin.presses(10, number)
@@ -48,7 +48,7 @@ def run(options: Options) -> Result:
         ["jeit", duration(first - ours.median), duration(ours.median), f"{1e6 * ours.median / number:.0f} µs", ""],
         ["MiniSom", "", duration(seconds), f"{1e6 * seconds / number:.0f} µs", f"{apart:.1e}"],
     ]
-    header = ["by", "compilation", f"{number:,} frames", "each", "weights apart, relative"]
+    header = ["by", "compilation", f"{number:,} frames", "each", "difference of weights, relative"]
     tables = [Table(header, rows, "A map of 32 × 32 neurons, 208 voltages")]
     placed = PlacedMap.learn(SelfOrganisingMap(learnt, 1.0), frames, places)
     model = skin.model(560)
@@ -84,7 +84,7 @@ def run(options: Options) -> Result:
 
 
 def _minisom(start, frames, order, rates, radii) -> np.ndarray:
-    """What MiniSom's weights become; in the tuning phase a radius next to nothing leaves the winner alone."""
+    """MiniSom's final weights. In the tuning phase a very small radius leaves the winner alone."""
     theirs = MiniSom(*start.shape)
     radii = np.append(radii, np.full(len(order) - len(radii), 0.01))
     theirs._weights = start.copy()

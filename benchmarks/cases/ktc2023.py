@@ -1,8 +1,8 @@
 """The Kuopio Tomography Challenge 2023 on its four training targets.
 
-Difficulty level l leaves out electrodes 1 to 2(l - 1), as injectors and as meters; the seven levels are made from the
-complete data by masking frame and reference. `jeit reconstruct --segment`, its defaults, which were set on simulated
-tanks (`problems/cut_tanks.py`), beside total variation.
+Difficulty level l leaves out electrodes 1 to 2(l - 1), as injectors and as meters. The seven levels are made from the
+complete data by masking frame and reference. `jeit reconstruct --segment` with its defaults, which were set on
+simulated tanks (`problems/cut_tanks.py`), beside total variation.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from jeit.imaging import ImagingSettings, image_difference
 
 LEVELS, TARGETS = range(1, 8), range(1, 5)
 METHOD, OTHER = "auto", "total-variation"
-# Mean scores: of all levels, and of those from the fourth on.
+# Mean scores of all levels, and of those from the fourth on.
 ALL, HARD = 0.8, 0.7
 
 
 def run(options: Options) -> Result:
-    """All levels of all targets; one of each in a quick run. Without the challenge's data, nothing."""
+    """All levels of all targets, or one of each in a quick run. Without the challenge's data, nothing."""
     asked = f"mean score of all levels ≥ {ALL}", f"mean score of levels 4 to 7 ≥ {HARD}"
     folder = _folder(options.data)
     if folder is None:
@@ -51,7 +51,7 @@ def run(options: Options) -> Result:
 
 
 def _folder(data: Path | None) -> Path | None:
-    """Where the challenge's data are: the folder given, or `ktc2023` in it, in JEIT_DATA or in ../shared/data."""
+    """The folder of the challenge's data: the given one, or `ktc2023` in it, in JEIT_DATA or in ../shared/data."""
     named = data or Path(os.environ.get("JEIT_DATA", ROOT.parent / "shared" / "data"))
     return next((path for path in (named, named / "ktc2023") if (path / "ref.mat").is_file()), None)
 

@@ -1,9 +1,9 @@
-"""How quick skins that learn are: to learn, to tell one frame, and many; beside scikit-learn's own estimators.
+"""Speed of learnt skins: training, prediction of one frame and of many, beside scikit-learn's own estimators.
 
-Presses of a simulated disk with 16 electrodes, 208 channels, on a mesh finer than that of the images. Each method
-learns places from 2,000 presses, and is asked of 10,000 frames together and of one alone: from voltages to places with
-their deviations, dead channels and strange frames looked for. scikit-learn's estimators are asked for places alone,
-from standardised changes.
+Presses on a simulated disk with 16 electrodes, 208 channels, on a mesh finer than that of the images. Each method
+learns places from 2,000 presses, and predicts 10,000 frames together and one alone: from voltages to places with their
+deviations, with a check for dead channels and unusual frames. scikit-learn's estimators predict places alone, from
+standardised changes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from jeit.touch.simulate import DiscIndenter, Press, PressedSkin, material
 
 RADIUS, FINGER, LOADS = 0.05, 0.016, (0.5, 8.0)  # m; a disc's diameter, m; N
 PRESSES, FRAMES, FRESH = 2000, 10_000, 500
-FIT, ONE, MANY = 60.0, 1e-3, 0.2  # seconds asked for
+FIT, ONE, MANY = 60.0, 1e-3, 0.2  # limits, seconds
 HEADER = ["method", "features", "learnt in", "one frame"]
 
 
@@ -48,11 +48,11 @@ def run(options: Options) -> Result:
         fits[name] = time.perf_counter() - start
         ones[name] = _one(lambda frame, skin=skin: skin.predict(frame, reference), frames)
         lots[name] = timed(lambda skin=skin: skin.predict(asked_of, reference).position, 5).median
-        told = skin.predict(frames, reference).position
-        error = float(np.nanmean(np.linalg.norm(told - right, axis=1)))
+        estimated = skin.predict(frames, reference).position
+        error = float(np.nanmean(np.linalg.norm(estimated - right, axis=1)))
         learnt, _, form = skin.standing["place"].method.partition(" on ")
-        said = form if method == learnt else skin.standing["place"].method
-        rows.append([name, said, *map(duration, (fits[name], ones[name], lots[name])), f"{1e3 * error:.2f} mm"])
+        label = form if method == learnt else skin.standing["place"].method
+        rows.append([name, label, *map(duration, (fits[name], ones[name], lots[name])), f"{1e3 * error:.2f} mm"])
         say(" | ".join(rows[-1]))
     rows += _rivals(presses, asked_of, frames, reference, right)
     tables = [Table([*HEADER, f"{many:,} frames", "error, mean"], rows)]
@@ -68,7 +68,7 @@ def run(options: Options) -> Result:
 
 
 def _skin(number: int, fresh: int):
-    """A model, presses on a finer one with their changes, fresh frames, the reference (M,), and places (n, 2), m."""
+    """A model, presses on a finer one with their changes, new frames, the reference (M,), and places (n, 2), m."""
     electrodes = BoundaryElectrodes(ring(RADIUS, 16), width=0.008, contact_impedance=300.0)
     model, fine = (ForwardModel(Disk(RADIUS).mesh(num_points=n), electrodes, adjacent(16)) for n in (400, 2500))
     skin, rng = PressedSkin(jax.random.key(0), fine, material("velostat")), np.random.default_rng(0)
@@ -85,12 +85,12 @@ def _skin(number: int, fresh: int):
     return model, presses, frames[number:], reference, places[number:]
 
 
-def _one(tell: Callable[[np.ndarray], Any], frames: np.ndarray) -> float:
+def _one(predict: Callable[[np.ndarray], Any], frames: np.ndarray) -> float:
     """Median seconds of a frame, one after the other."""
     spent = []
     for frame in frames[:300]:
         start = time.perf_counter()
-        tell(frame[None])
+        predict(frame[None])
         spent.append(time.perf_counter() - start)
     return statistics.median(spent)
 
@@ -122,4 +122,4 @@ def _rivals(presses: Presses, asked_of, frames, reference, right) -> list[list[s
     return rows
 
 
-CASE = Case("learnt", "skins that learn: seconds to learn, to tell one frame, and many", run, 5)
+CASE = Case("learnt", "skins that learn: seconds to learn, to predict one frame, and many", run, 5)

@@ -1,8 +1,8 @@
-"""A device on a pseudo-terminal, read, recorded and imaged live, with faults: what is lost, how late, how much memory.
+"""A device on a pseudo-terminal, read, recorded and imaged live, with faults: lost frames, latency and memory.
 
-A process of its own sends the frames of a simulated tank at 60 frames/s, and in turn garbage, half a line, another
-number of channels, no readings, twice the rate, and nothing, for it is unplugged and plugged in again. Latency is from
-the moment at which a frame was written to that at which its picture was made; a browser is not part of it.
+A separate process sends the frames of a simulated tank at 60 frames/s, with a series of faults: garbage, half a line,
+another number of channels, no readings, twice the rate, and nothing while it is unplugged and plugged in again. Latency
+is from the moment at which a frame was written to that at which its picture was made. A browser is not part of it.
 """
 
 from __future__ import annotations
@@ -36,17 +36,18 @@ from jeit.live.sources import open_source
 from jeit.live.views.conductivity import ConductivityView
 
 RATE = 60.0
-# Seconds of each stream, and between faults; of a quick run.
+# Seconds of each stream, and between faults, also of a quick run.
 LENGTHS = {False: (600.0, 7.0), True: (10.0, 1.2)}
-# The first minute fills the pictures that are kept. Memory may grow by this share from a quarter of the stream on; half
-# and 99 % of the pictures may be this late, seconds; and so many a second are made at least.
+# The first minute fills the store of pictures. Memory may grow by this fraction from a quarter of the stream on. Limits
+# of the median and 99th percentile of latency, seconds, and the least number of pictures per second.
 GROWTH, MEDIAN, HIGH, PICTURES = 0.05, 0.05, 0.1, 20.0
 _LINES = 997
 
 
 class Streamed(NamedTuple):
-    """Faults planted, by kind; frames sent whole, and of these recorded in their order; what the session counted;
-    seconds from a frame's being written to its picture; pictures a second; memory in MB at a quarter and at the end."""
+    """Planted faults, by kind, frames sent completely, and of these recorded in order, the session's counters, seconds
+    from writing a frame to its picture, pictures per second, and memory in MB at a quarter and at the end.
+    """
 
     planted: Counter[str]
     sent: int
@@ -117,20 +118,20 @@ def run(options: Options) -> Result:
 
 
 def stream(view: AbstractView, reference, frames: np.ndarray, folder: Path, seconds: float, period: float) -> Streamed:
-    """Play a device for so many seconds, and follow it."""
+    """Play a device for a number of seconds, and read it."""
     lines, link, log = (folder / name for name in ("lines.txt", "device", "log"))
     lines.write_text("".join(", ".join(map(repr, one)) + "\n" for one in frames.tolist()))
     recorder = Recorder(folder / "recordings", reference=reference)
     arguments = [sys.executable, played_device.__file__, lines, link, log, seconds, RATE, period]
-    made: list[tuple[float, float]] = []  # arrival and latency of each frame that was imaged
+    made: list[tuple[float, float]] = []  # arrival and latency of each imaged frame
     planted: Counter[str] = Counter()
     with subprocess.Popen(
         [str(one) for one in arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as device:
         assert device.stdin is not None
         assert device.stdout is not None
-        said = device.stdout
-        listening = threading.Thread(target=lambda: planted.update(line.strip() for line in said), daemon=True)
+        output = device.stdout
+        listening = threading.Thread(target=lambda: planted.update(line.strip() for line in output), daemon=True)
         listening.start()
         session = Session(
             open_source(f"serial:{link}@115200", reference=reference), _Noting(view, made), recorder=recorder
@@ -157,7 +158,7 @@ def stream(view: AbstractView, reference, frames: np.ndarray, folder: Path, seco
 
 
 class _Noting(AbstractView):
-    """A view that notes when the last byte of a frame arrived and when its picture was made."""
+    """A view that records when the last byte of a frame arrived and when its picture was made."""
 
     def __init__(self, view: AbstractView, made: list[tuple[float, float]]):
         self.view, self.made, self.scene = view, made, view.scene
@@ -176,12 +177,12 @@ def _latencies(written: list[float], made: list[tuple[float, float]]) -> np.ndar
     """Seconds from the last frame written before an arrival to the picture."""
     arrived, done = np.array(made).T
     before = np.searchsorted(written, arrived, side="right") - 1
-    # A frame may arrive before the writer has noted the time.
+    # A frame may arrive before the writer has recorded the time.
     return done - np.minimum(np.array(written)[np.maximum(before, 0)], arrived)
 
 
 def _in_order(recorded: np.ndarray, expected: np.ndarray) -> int:
-    """How many of the frames expected were recorded, in their order, with others between them."""
+    """How many of the expected frames were recorded, in their order, with others between them."""
     place = found = 0
     for one in expected:
         while place < len(recorded) and not np.array_equal(recorded[place], one):
@@ -193,7 +194,7 @@ def _in_order(recorded: np.ndarray, expected: np.ndarray) -> int:
 
 
 def _frames(tank: SimulatedSensor) -> np.ndarray:
-    """Different frames (997, M) of a turn, with noise."""
+    """Different frames (997, M) of one rotation, with noise."""
     states = tank.states[np.arange(_LINES) * len(tank.states) // _LINES]
     noise = 1e-4 * np.sqrt(np.mean(states**2))
     return states + noise * np.random.default_rng(0).standard_normal(states.shape)
@@ -205,4 +206,4 @@ def _recorded(folder: Path) -> np.ndarray:
     return np.concatenate([np.asarray(read(one).voltages) for one in parts if one.exists()])
 
 
-CASE = Case("live", "a device with faults, read, recorded and imaged live: what is lost, latency, memory", run, 21)
+CASE = Case("live", "a device with faults, read, recorded and imaged live: lost frames, latency, memory", run, 21)

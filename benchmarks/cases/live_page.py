@@ -1,8 +1,8 @@
 """Latency from a frame's last byte to the picture in a browser: a simulated tank, imaged and drawn by Chromium.
 
-The page reports each picture once it is painted, and the server takes the time of the report's arrival: the report's
-way back counts as well, so that no two clocks are compared. Simulating, imaging, serving and the browser share the
-machine's cores. The browser has no window, and paints without a graphics card.
+The page reports each picture once it is painted, and the server records when the report arrives. The report's transfer
+is included, so that only one clock is used. Simulation, imaging, server and browser share the machine's cores. The
+browser has no window, and paints without a graphics card.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jeit.live.views.conductivity import ConductivityView
 RATE, WINDOW = 60.0, 10.0
 """Frames a second, and seconds over which the page's latency is computed."""
 MEDIAN, HIGH, PICTURES = 0.05, 0.1, 20.0
-"""Half and 99 % of the pictures may be this late, seconds; and so many a second are drawn at least."""
+"""Limits of the median and 99th percentile of latency, seconds, and the least number of pictures drawn per second."""
 SIZES = ((1280, 800), (2000, 1100))
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
@@ -67,7 +67,7 @@ def run(options: Options) -> Result:
 
 
 def _sample(page) -> list[float]:
-    """Median latency, latency of 99 %, and pictures drawn a second, of the next ten seconds."""
+    """Median and 99th percentile of latency, and pictures drawn per second, of the next ten seconds."""
     time.sleep(WINDOW + 1.0)
     latency = page.locator("#latency")
     times = [float(latency.get_attribute(f"data-{name}")) for name in ("median", "worst")]

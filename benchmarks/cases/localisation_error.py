@@ -1,10 +1,10 @@
-"""How well touches are located by sound, beside the Cramér-Rao bound.
+"""Errors of touches located by sound, beside the Cramér-Rao bound.
 
-The simulated skin of 200 × 200 mm, which is not the model that is fitted (echoes from the edges, attenuation that grows
-with frequency, gains that differ, noise at which a source 55 mm away is just as loud), calibrated on a 13 × 13 grid of
-taps 15 mm apart (three at each place) and tested on another, 12.5 mm apart: the paper's experiment (ten bursts of a
-vibrator a place), single taps against the signal-to-noise ratio beside the Cramér-Rao bound, ten bursts against the
-number of microphones, and ten bursts with microphones that are not at their given positions and gains that changed
+The simulated skin of 200 × 200 mm is not the fitted model: it has echoes from the edges, attenuation that grows with
+frequency, different gains, and noise at which a source 55 mm away is just as loud. It is calibrated on a 13 × 13 grid
+of taps 15 mm apart (three at each place) and tested on another, 12.5 mm apart: the paper's experiment (ten bursts of a
+vibrator at each place), single taps against the signal-to-noise ratio beside the Cramér-Rao bound, ten bursts against
+the number of microphones, and ten bursts with microphones that are not at their given positions and gains that changed
 after the calibration.
 """
 
@@ -25,7 +25,8 @@ from jeit.acoustic.simulate.propagation import expected_power, noise_power
 from jeit.layout import grid
 
 RATIOS = (0, 5, 10, 15, 20, 25, 30, 35, 40)
-# What is asked: mean and standard deviation of the paper's loss, metres, and by how much likelihood must be better.
+# Limits: mean and standard deviation of the paper's loss, metres, and the fraction by which the likelihood must be
+# better.
 PAPER, BETTER = (6.6e-3, 3.8e-3), 0.25
 # Standard deviations of the coordinates of the microphones, metres, and of the gains, as fractions of the intensities.
 CHANGES = ((0.0, 0.0), (1e-3, 0.05), (2e-3, 0.1), (3e-3, 0.2))
@@ -34,8 +35,9 @@ METHODS = ("consistency", "likelihood")
 
 
 def calibrated(skin, given=None):
-    """The calibration of a skin from taps; `given`: positions (M, 2) in metres at which its microphones are said to be,
-    by default where they are."""
+    """The calibration of a skin from taps. `given`: stated positions (M, 2) of its microphones in metres, by default
+    the true ones.
+    """
 
     sound = simulate_calibration_taps(skin, jax.random.key(1), grid(0.18, 0.18, 13, 13))
     array = np.asarray(skin.microphones) if given is None else given
@@ -43,8 +45,8 @@ def calibrated(skin, given=None):
     return calibrate_microphones(taps).calibration
 
 
-def heard(skin, places, bursts: int):
-    """Intensities (P, M) at places (P, 2), averaged over some bursts; floor (M,), ν, and which can be used (P, M)."""
+def averaged_intensities(skin, places, bursts: int):
+    """Intensities (P, M) at places (P, 2), averaged over bursts, the floor (M,), ν, and which are usable (P, M)."""
 
     sound = simulate_calibration_taps(skin, jax.random.key(2), places, repeats=bursts)
     taps = Taps(np.asarray(skin.microphones), CORNERS, sound.positions, samples=sound.samples, rate=sound.rate)
@@ -55,10 +57,11 @@ def heard(skin, places, bursts: int):
 
 
 def errors(calibration, skin, places, bursts: int, pad: int):
-    """Distances (P,) in metres of what each method finds, the share of 95 % ellipses of the likelihood that hold the
-    truth, and the root mean square error that the Cramér-Rao bound allows."""
+    """Distances (P,) in metres of each method's places, the fraction of 95 % ellipses of the likelihood that contain
+    the truth, and the root mean square error of the Cramér-Rao bound.
+    """
 
-    power, floor, freedom, usable = heard(skin, places, bursts)
+    power, floor, freedom, usable = averaged_intensities(skin, places, bursts)
     order = np.arange(pad) % len(places)  # one shape for all: compiled once
     measured = Intensities(np.arange(pad), power[order], floor=floor, freedom=freedom, usable=usable[order])
     microphone_array, use, _ = microphones_in_use(measured, calibration)
@@ -82,9 +85,9 @@ def spread(values) -> str:
 
 
 def paper_table(skin, calibration, pad: int, sides=(0.15, 0.18)) -> tuple[Table, dict]:
-    """The paper's experiment, and the same nearer to the edge; and the distances of the first.
+    """The paper's experiment, the same nearer to the edge, and the distances of the first.
 
-    `sides`: of the square that is touched, metres.
+    `sides`: of the touched square, metres.
     """
     header = ["13 × 13 places, mm", "the paper's loss", "likelihood", "in the 95 % ellipse"]
     rows, first = [["paper, measured", "6.6 ± 3.8", "", ""]], None
@@ -97,7 +100,7 @@ def paper_table(skin, calibration, pad: int, sides=(0.15, 0.18)) -> tuple[Table,
 
 
 def ratio_table(skin, calibration, ratios, pad: int) -> tuple[Table, dict[str, list[float]], list[float]]:
-    """Single taps against the signal-to-noise ratio; root mean square errors, and their bounds, in metres."""
+    """Single taps against the signal-to-noise ratio: root mean square errors and their bounds, in metres."""
     places = grid(0.15, 0.15, 13, 13)
     loudest = 10 * np.log10((expected_power(skin, places) / noise_power(skin)).max(axis=1).mean())
     curve: dict[str, list[float]] = {"paper's loss": [], "likelihood": []}
@@ -118,7 +121,7 @@ def ratio_table(skin, calibration, ratios, pad: int) -> tuple[Table, dict[str, l
 
 
 def microphone_table(sides, pad: int) -> Table:
-    """Ten bursts against the number of microphones, in a square of so many a side."""
+    """Ten bursts against the number of microphones, in a square of `sides` places."""
     rows = []
     for side in sides:
         few = SoundingSkin(jax.random.key(0), microphone_grid(side))
@@ -135,7 +138,7 @@ def change_table(changes) -> Table:
     for place, gain in changes:
         rng = np.random.default_rng(0)
         skin = SoundingSkin(jax.random.key(0), given + place * rng.normal(size=given.shape))
-        power, floor, freedom, usable = heard(skin, places, 10)
+        power, floor, freedom, usable = averaged_intensities(skin, places, 10)
         factor = np.exp(gain * rng.normal(size=len(given)))
         recorded = Intensities(
             np.arange(len(places)), power * factor, floor=floor * factor, freedom=freedom, usable=usable
@@ -158,8 +161,8 @@ def draw(ratios, curve: dict[str, list[float]], bounds: list[float], path: Path)
     from jeit.acoustic.plots import plot_error_curve
 
     figure = Figure(figsize=(6.4, 4.4), layout="constrained")
-    told = {"quantity": "Signal-to-noise ratio of the loudest microphone (dB)", "statistic": "rms"}
-    plot_error_curve(ratios, curve, bound=bounds, title="A single tap", ax=figure.subplots(), **told)
+    labels = {"quantity": "Signal-to-noise ratio of the loudest microphone (dB)", "statistic": "rms"}
+    plot_error_curve(ratios, curve, bound=bounds, title="A single tap", ax=figure.subplots(), **labels)
     figure.savefig(path, dpi=110)
 
 
@@ -177,9 +180,9 @@ def run(options: Options) -> Result:
     asked = _asked(off)
     mine = f"{spread(off['likelihood'])} mm"
     job = "distance of touches located by sound, 13 × 13 places (simulated skin)"
-    told = f"paper, on its own skin: 6.6 ± 3.8 mm; its loss here: {spread(off['consistency'])} mm"
+    published = f"paper, on its own skin: 6.6 ± 3.8 mm; its loss here: {spread(off['consistency'])} mm"
     better = off["consistency"].mean() / off["likelihood"].mean()
-    headline = Headline(job, mine, told, f"{better:.1f}×", f"95 % ellipses hold {paper.rows[1][-1]}")
+    headline = Headline(job, mine, published, f"{better:.1f}×", f"95 % ellipses hold {paper.rows[1][-1]}")
     return Result(tables, [asked], headline=headline)
 
 
@@ -192,7 +195,7 @@ def _asked(off: dict) -> Asked:
 
 CASE = Case(
     "localisation_error",
-    "how well touches are located by sound, beside the Cramér-Rao bound",
+    "errors of touches located by sound, beside the Cramér-Rao bound",
     run,
     3,
     pictures=True,

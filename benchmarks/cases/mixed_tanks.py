@@ -1,7 +1,7 @@
-"""One to three strong bodies in a tank, metal, plastic or both: what the default image finds, and what one step finds.
+"""One to three strong bodies in a tank, metal, plastic or both: the default image beside one step.
 
-Tanks are those of `problems/mixed_tanks.py`, solved without jeit, 1 % noise on every voltage; none of them was looked
-at when the defaults were set.
+Tanks are those of `problems/mixed_tanks.py`, solved without jeit, with 1 % noise on every voltage. None of them was
+used when the defaults were set.
 """
 
 from __future__ import annotations
@@ -68,4 +68,4 @@ def _row(name: str, method: str, outcomes) -> list[str]:
     return [name, method, str(len(outcomes)), str(len(distances)), *figures]
 
 
-CASE = Case("mixed_tanks", "strong bodies in simulated tanks that no default was set on", run, 5, timed=False)
+CASE = Case("mixed_tanks", "strong bodies in simulated tanks that were not used to set defaults", run, 5, timed=False)

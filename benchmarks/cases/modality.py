@@ -1,9 +1,9 @@
-"""Pats, tickles, strokes, wind and nothing told apart by sound, beside Park et al. (2022); all simulated.
+"""Pats, tickles, strokes, wind and no touch classified by sound, beside Park et al. (2022). All data are simulated.
 
-What is simulated, and how people differ, is in `problems/sounding_people.py` and `jeit.acoustic.simulate.people`. The
-paper augments first and splits at random after, so that copies of one window, and windows of one recording, are on both
-sides; with recordings held out, and with people, they are not. To be compared: what each split makes of one and the
-same network; not per cent.
+The simulation and the differences between people are in `problems/sounding_people.py` and
+`jeit.acoustic.simulate.people`. The paper augments first and splits at random after, so that copies of one window, and
+windows of one recording, are on both sides. With held-out recordings or people they are not. Comparable: the effect of
+each split on the same network, but not percentages.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ import numpy as np
 from benchmarks.harness.case import Asked, Case, Options, Result, Table, judged
 from benchmarks.harness.tables import duration
 from benchmarks.harness.timing import say, timed
-from benchmarks.problems.sounding_people import FEWER, LOUDER, HeardPeople, heard_people
+from benchmarks.problems.sounding_people import FEWER, LOUDER, SoundSet, sound_set
 from jeit.acoustic import Recording
 from jeit.acoustic.simulate.people import MODALITIES
 from jeit.touch.listening import Levels, ModalityNetwork, SoundImages, sound_images
 from jeit.touch.listening.learners import LEARNERS, NetworkListener, TrainingSet
 from jeit.touch.listening.modality_network import COPIES
 
-# Where sets and trainings are kept from one run to the next.
+# Where sets and training states are kept from one run to the next.
 STORE = Path(tempfile.gettempdir()) / "jeit-modality"
 PEOPLE, CLIPS, SEED = 10, 8, 1
-# Folds by person, of two each.
+# Folds by person, of two people each.
 FOLDS = 5
-# Batches at most, of the paper's schedule, of our own, and of shuffled labels.
+# Maximum number of batches of the paper's schedule, of our own, and for shuffled labels.
 BATCHES, OWN_BATCHES, SHUFFLED_BATCHES = 1000, 400, 100
 # Decibels by which the copies of the paper's split differ from each window.
 _COPIED = 2.0
@@ -40,14 +40,14 @@ METHODS = tuple(LEARNERS)
 
 @dataclass
 class Experiment:
-    """A set, and what learns of it: `folder` for the trainings of networks, of a few batches if `quick`."""
+    """A set and training on it. `folder` is for the states of networks. Training has few batches if `quick`."""
 
-    heard: HeardPeople
+    sounds: SoundSet
     folder: Path | None
     quick: bool = False
 
     def learnt(self, method: str, name: str, images: SoundImages, right: np.ndarray, groups: np.ndarray):
-        """What learns these windows; `name` tells its training from others."""
+        """A model trained on these windows. `name` distinguishes its training state from others."""
         batches = OWN_BATCHES if method == "network" else BATCHES
         batches = 3 if self.quick else SHUFFLED_BATCHES if "shuffled" in name else batches
         kept = None if self.folder is None else self.folder / f"{name}-{batches}.training"
@@ -56,63 +56,66 @@ class Experiment:
         )
 
     def by_person(self, method: str, variants: list[tuple[float, int]], number: int = 25) -> np.ndarray:
-        """Confusions (V, C, C), counts, of the windows of each fold's people when they were held out, in each of the
-        `variants` of noise and microphones; what is learnt from is heard by `number` microphones without more noise."""
-        images, right, person = self.heard.images[0.0, number], self.heard.right, self.heard.person
+        """Confusion counts (V, C, C) of the windows of each fold's held-out people, in each of the `variants` of noise
+        and microphones.
+
+        Training uses `number` microphones without additional noise.
+        """
+        images, right, person = self.sounds.images[0.0, number], self.sounds.right, self.sounds.person
         fold = person // -(-(int(person.max()) + 1) // FOLDS)
         counts = np.zeros((len(variants), len(MODALITIES), len(MODALITIES)))
         for one in range(int(fold.max()) + 1):
             out = fold == one
             model = self.learnt(method, f"{method}-{number}-{one}", images[~out], right[~out], person[~out])
             for place, variant in enumerate(variants):
-                said = model.log_odds(self.heard.images[variant][out]).argmax(axis=1)
-                np.add.at(counts[place], (right[out], said), 1)
+                predicted = model.log_odds(self.sounds.images[variant][out]).argmax(axis=1)
+                np.add.at(counts[place], (right[out], predicted), 1)
             say(f"{method}, {number} microphones: fold {one + 1}; {_percent(counts[0])} so far")
         return counts
 
     def by_recording(self, method: str, *, shuffled: bool = False) -> float:
-        """Share that is right of a fifth of the clips, held out; learnt from labels that were `shuffled`, if so."""
-        heard = self.heard
-        out = heard.clip % 5 == 4
+        """Fraction right of a fifth of the clips, held out. Training labels are `shuffled` on request."""
+        sounds = self.sounds
+        out = sounds.clip % 5 == 4
         order = np.random.default_rng(0).permutation(int((~out).sum())) if shuffled else slice(None)
-        images, name = heard.images[0.0, 25], f"{method}-recording{'-shuffled' if shuffled else ''}"
-        model = self.learnt(method, name, images[~out], heard.right[~out][order], heard.clip[~out])
-        return float(np.mean(model.log_odds(images[out]).argmax(axis=1) == heard.right[out]))
+        images, name = sounds.images[0.0, 25], f"{method}-recording{'-shuffled' if shuffled else ''}"
+        model = self.learnt(method, name, images[~out], sounds.right[~out][order], sounds.clip[~out])
+        return float(np.mean(model.log_odds(images[out]).argmax(axis=1) == sounds.right[out]))
 
     def as_the_paper(self, method: str) -> float:
-        """Share that is right of a tenth of all copies, drawn at random: windows are copied with noise first."""
-        heard, rng = self.heard, np.random.default_rng(0)
-        copies = [_noisy(heard.images[0.0, 25], rng) for _ in range(COPIES)]
-        images, right = SoundImages.joined(copies), np.tile(heard.right, COPIES)
+        """Fraction right of a tenth of all copies, drawn at random: windows are copied with noise first."""
+        sounds, rng = self.sounds, np.random.default_rng(0)
+        copies = [_noisy(sounds.images[0.0, 25], rng) for _ in range(COPIES)]
+        images, right = SoundImages.joined(copies), np.tile(sounds.right, COPIES)
         deal = rng.permutation(len(right))
         part = np.empty(len(right), int)
         part[deal] = np.arange(len(right)) * 10 // len(right)
-        # Of the nine tenths one stops the training, drawn at random too.
+        # One of the nine tenths, drawn at random too, stops the training.
         train, test = part < 9, part == 9
         model = self.learnt(method, f"{method}-paper", images[train], right[train], part[train])
         return float(np.mean(model.log_odds(images[test]).argmax(axis=1) == right[test]))
 
     def untrained(self) -> float:
-        """Share that a network is right of before it is trained."""
-        images = self.heard.images[0.0, 25]
+        """Fraction right of an untrained network."""
+        images = self.sounds.images[0.0, 25]
         network = ModalityNetwork.draw(jax.random.key(0), images.intensity.shape[1] + 64, 41, len(MODALITIES))
-        said = NetworkListener.from_network(network, Levels.from_images(images)).log_odds(images).argmax(axis=1)
-        return float(np.mean(said == self.heard.right))
+        predicted = NetworkListener.from_network(network, Levels.from_images(images)).log_odds(images).argmax(axis=1)
+        return float(np.mean(predicted == self.sounds.right))
 
 
 def run(options: Options) -> Result:
-    """Three splits by every method; noise and microphones; how quick an answer is."""
+    """Three splits by every method, noise and microphones, and times."""
     if options.quick:
-        experiment = Experiment(heard_people(2, 2, SEED), None, quick=True)
+        experiment = Experiment(sound_set(2, 2, SEED), None, quick=True)
     else:
         say(f"{PEOPLE} people × {CLIPS} clips × {len(MODALITIES)} modalities are simulated, or read")
         (STORE / "trainings").mkdir(parents=True, exist_ok=True)
-        experiment = Experiment(heard_people(PEOPLE, CLIPS, SEED, store=STORE), STORE / "trainings")
+        experiment = Experiment(sound_set(PEOPLE, CLIPS, SEED, store=STORE), STORE / "trainings")
     noisier = [(louder, 25) for louder in LOUDER]
     splits, persons, rows = {}, {}, []
     nothing = experiment.untrained(), experiment.by_recording("paper-network", shuffled=True)
     for method in METHODS:
-        # By the two easier splits networks are told by the paper's schedule alone.
+        # On the two easier splits networks are trained by the paper's schedule alone.
         leaky, fair = (None, None)
         if method != "network":
             leaky, fair = experiment.as_the_paper(method), experiment.by_recording(method)
@@ -132,25 +135,32 @@ def run(options: Options) -> Result:
     ]
     confusion = persons[best][0]
     confusion /= np.maximum(confusion.sum(axis=1, keepdims=True), 1)
-    told = [[name, *(f"{100 * share:.0f}" for share in row)] for name, row in zip(MODALITIES, confusion, strict=True)]
+    confusion_rows = [
+        [name, *(f"{100 * share:.0f}" for share in row)] for name, row in zip(MODALITIES, confusion, strict=True)
+    ]
     seconds = _seconds(experiment)
     tables = [
         Table(
-            ["told by", "the paper's split", "by recording", "by person"],
+            ["classified by", "the paper's split", "by recording", "by person"],
             rows,
             "Three splits",
-            f"Right of windows of 0.5 s held out. {PEOPLE} people, {len(experiment.heard.right)} windows; two people "
+            f"Right of windows of 0.5 s held out. {PEOPLE} people, {len(experiment.sounds.right)} windows; two people "
             f"are held out at a time. The paper's: {PAPER} % of its own recordings. Batches at most: {BATCHES} by the "
             f"paper's schedule, {OWN_BATCHES} by our own, {SHUFFLED_BATCHES} of shuffled labels.",
         ),
-        Table(["modality", *MODALITIES], told, "Told as", f"Per cent, by {best}, two people held out at a time."),
         Table(
-            ["told by", *(f"+{louder:g} dB" for louder in LOUDER)],
+            ["modality", *MODALITIES],
+            confusion_rows,
+            "Classified as",
+            f"Per cent, by {best}, two people held out at a time.",
+        ),
+        Table(
+            ["classified by", *(f"+{louder:g} dB" for louder in LOUDER)],
             noise,
             "More noise",
-            "By person; learnt from without more noise.",
+            "By person; trained without additional noise.",
         ),
-        Table(["told by", *map(str, FEWER)], fewer, "Fewer microphones", "By person."),
+        Table(["classified by", *map(str, FEWER)], fewer, "Fewer microphones", "By person."),
         Table(["what", "a window"], [[name, duration(own)] for name, own in seconds.items()], "Times"),
     ]
     return Result(tables, [] if options.quick else _asked(splits, nothing, best, seconds))
@@ -174,15 +184,15 @@ def _noisy(images: SoundImages, rng: np.random.Generator) -> SoundImages:
 
 
 def _seconds(experiment: Experiment) -> dict[str, float]:
-    """Of one window of 25 microphones: its image, and what each method then needs."""
-    heard = experiment.heard
+    """Seconds for one window of 25 microphones: its image, and each method's evaluation."""
+    sounds = experiment.sounds
     sound = Recording(np.random.default_rng(0).standard_normal((25, 4928)), 10_000.0)
-    images = heard.images[0.0, 25]
+    images = sounds.images[0.0, 25]
     found = {"its image": timed(lambda: sound_images(sound), 20).median}
     every_other = np.arange(len(images)) % 2 == 0
-    small = Experiment(heard, None, quick=True)
+    small = Experiment(sounds, None, quick=True)
     for method in METHODS[1:]:
-        model = small.learnt(method, method, images[every_other], heard.right[every_other], heard.clip[every_other])
+        model = small.learnt(method, method, images[every_other], sounds.right[every_other], sounds.clip[every_other])
         found[method] = timed(lambda model=model: model.log_odds(images[:1]), 20).median
     return found
 
@@ -191,16 +201,14 @@ def _asked(splits: dict, nothing: tuple[float, float], best: str, seconds: dict[
     paper, recording, person = splits["paper-network"]
     slowest = seconds["its image"] + max(own for name, own in seconds.items() if name != "its image")
     return [
-        Asked(
-            "right of people who were not learnt from, by the best method", f"{100 * splits[best][2]:.1f} % ({best})"
-        ),
+        Asked("right of held-out people, by the best method", f"{100 * splits[best][2]:.1f} % ({best})"),
         judged(
             f"the paper's split is leaky: its figure ({PAPER} % in the paper) is above that by person",
             f"paper-network: {100 * paper:.1f} %, by recording {100 * recording:.1f} %, by person {100 * person:.1f} %",
             paper > person,
         ),
         judged(
-            "an untrained network and one that learnt shuffled labels know nothing (20 %)",
+            "an untrained network and one trained on shuffled labels are at chance (20 %)",
             f"{100 * nothing[0]:.1f} % and {100 * nothing[1]:.1f} %",
             max(nothing) < 0.35,
         ),
@@ -208,4 +216,6 @@ def _asked(splits: dict, nothing: tuple[float, float], best: str, seconds: dict[
     ]
 
 
-CASE = Case("modality", "touch told by its sound, by a network and others, beside the paper's", run, 25, timed=False)
+CASE = Case(
+    "modality", "touch classified by its sound, by networks and others, beside the paper's", run, 25, timed=False
+)

@@ -1,10 +1,10 @@
 """Networks that image a skin, beside linear and iterated images of the same frames.
 
-Park et al. 2022 image 200 × 200 × 10 mm of hydrogel, 32 inner electrodes and 94 pairs, by a network, and place a ball
-of 15 mm with 4.2 ± 2.9 mm. Their skin is simulated (`benchmarks/problems/imaged_touches.py`), as a sheet: networks
-learn on a coarse mesh, and are judged on a finer one with electrodes and contacts that are not where they were told.
-Rivals choose their hyperparameter by places of their own. Networks are trained here, unless `--data` names a folder
-with `unrolled` and `three-stages`, folders of `jeit learn image`.
+Park et al. 2022 image 200 × 200 × 10 mm of hydrogel, 32 inner electrodes and 94 pairs, by a network, and locate a ball
+of 15 mm with 4.2 ± 2.9 mm. Their skin is simulated (`benchmarks/problems/imaged_touches.py`), as a sheet. Networks are
+trained on a coarse mesh, and evaluated on a finer one whose electrodes and contacts deviate from their description.
+Rivals choose their hyperparameter by separate places. Networks are trained here, unless `--data` names a folder with
+`unrolled` and `three-stages`, folders of `jeit learn image`.
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ from jeit.touch.simulate import depth_maps
 from jeit.touch.simulate.contact.indent_sets import image_places
 
 SHAPE = (48, 48)
-# Times λ of the noise figure.
+# Factors of the λ of the noise figure.
 WEIGHTS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 ASKED_MEAN, ASKED_RATIO, ASKED_FRAME, ASKED_EACH = 4.2e-3, 0.8, 16.7e-3, 0.2e-3
 Maps = Callable[[np.ndarray], np.ndarray]
 
 
 def run(options: Options) -> Result:
-    """All of them; pictures where an output folder is given."""
+    """All experiments, with figures where an output folder is given."""
     quick = options.quick
-    told = problem.park_skin()
-    noise = detection_noise(told)
+    nominal_skin = problem.park_skin()
+    noise = detection_noise(nominal_skin)
     judged_by = problem.JudgedSkins(skins=2 if quick else problem.SKINS, cell=4.5e-3 if quick else problem.CELL)
     touches, right = problem.grid_touches()
     if quick:
         touches, right = touches[::15], right[::15]
-    places = image_places(told, SHAPE[1], SHAPE[0])
+    places = image_places(nominal_skin, SHAPE[1], SHAPE[0])
     random = np.random.default_rng(3)
     clean = judged_by.changes(touches)
     frames = clean + noise * random.normal(size=clean.shape)
-    networks = _networks(options, told, quick)
+    networks = _networks(options, nominal_skin, quick)
     tuned = problem.tuning_touches(8 if quick else 40)
     tuning = problem.JudgedSkins(seed=78, skins=2, cell=4.5e-3 if quick else problem.CELL).changes(tuned[0])
     tuning = tuning + noise * random.normal(size=tuning.shape)
-    ways: dict[str, Maps] = {"Tikhonov, Laplace": _linear(told, Laplace(), noise, places, tuning, tuned[1])}
-    ways["one-step, Gaussian"] = _linear(told, Gaussian(8e-3), noise, places, tuning, tuned[1])
-    ways["Gauss-Newton"] = _iterated(told, noise, places)
+    ways: dict[str, Maps] = {"Tikhonov, Laplace": _linear(nominal_skin, Laplace(), noise, places, tuning, tuned[1])}
+    ways["one-step, Gaussian"] = _linear(nominal_skin, Gaussian(8e-3), noise, places, tuning, tuned[1])
+    ways["Gauss-Newton"] = _iterated(nominal_skin, noise, places)
     ways |= {f"network, {name}": network.share for name, network in networks.items()}
     rows, mean = [], {}
     for name, way in ways.items():
@@ -73,7 +73,7 @@ def run(options: Options) -> Result:
     tables.append(wrong)
     pairs, together = _pairs(ways, judged_by, noise, places, 8 if quick else 60)
     tables.append(pairs)
-    shapes, share = _shapes(ways, judged_by, noise, places, 5 if quick else 60, told, options.output)
+    shapes, share = _shapes(ways, judged_by, noise, places, 5 if quick else 60, nominal_skin, options.output)
     tables.append(shapes)
     tables.append(_times(networks, frames))
     ours, paper, rival = (mean[one] for one in ("network, unrolled", "network, three-stages", "Tikhonov, Laplace"))
@@ -95,7 +95,7 @@ def run(options: Options) -> Result:
             share["network, unrolled"] < share["network, three-stages"],
         ),
         judged(
-            "two balls 41 mm apart are told as two",
+            "two balls 41 mm apart are distinguished",
             f"{100 * together['network, unrolled']:.0f} %",
             together["network, unrolled"] >= 0.9,
         ),
@@ -119,29 +119,29 @@ _SPREADS = (
 )
 
 
-def _networks(options: Options, told: Skin, quick: bool) -> dict[str, ImageNetwork]:
-    """One of each design, read where there are any, else learnt."""
+def _networks(options: Options, nominal_skin: Skin, quick: bool) -> dict[str, ImageNetwork]:
+    """One network of each design, read where it exists, otherwise trained."""
     found = {}
     for design in DESIGNS:
         own = None if options.data is None else options.data / design
         if own is not None and own.is_dir() and not quick:
-            found[design] = read_network(own, skin=told)
+            found[design] = read_network(own, skin=nominal_skin)
             continue
         with tempfile.TemporaryDirectory() as folder:
             preset = PRESETS["quick" if quick else "full"]
-            found[design] = learn_images(told, Path(folder), preset=preset, design=design, progress=say).network
+            found[design] = learn_images(nominal_skin, Path(folder), preset=preset, design=design, progress=say).network
     return found
 
 
-def _linear(told: Skin, prior, noise: float, places: np.ndarray, tuning: np.ndarray, right: np.ndarray) -> Maps:
-    """A one-step image of cells on the pixels, of the λ that places the tuning touches best."""
-    rest = np.asarray(told.model.voltages(told.model_conductivity))
-    nearest = _nearest(told, places)
-    background, own = float(told.model_conductivity), {}
+def _linear(nominal_skin: Skin, prior, noise: float, places: np.ndarray, tuning: np.ndarray, right: np.ndarray) -> Maps:
+    """A one-step image on the pixels, with the λ that locates the tuning touches best."""
+    rest = np.asarray(nominal_skin.model.voltages(nominal_skin.model_conductivity))
+    nearest = _nearest(nominal_skin, places)
+    background, own = float(nominal_skin.model_conductivity), {}
     known = {"prior": prior, "noise": noise * np.abs(rest)}
-    chosen = float(one_step(told.model, background, **known).hyperparameter)
+    chosen = float(one_step(nominal_skin.model, background, **known).hyperparameter)
     for times in WEIGHTS:
-        linear = one_step(told.model, background, hyperparameter=times * chosen, **known)
+        linear = one_step(nominal_skin.model, background, hyperparameter=times * chosen, **known)
         matrix = -np.asarray(linear.matrix)[nearest].T / background
 
         def maps(changes, matrix=matrix):
@@ -152,12 +152,12 @@ def _linear(told: Skin, prior, noise: float, places: np.ndarray, tuning: np.ndar
     return own[min(own)]
 
 
-def _iterated(told: Skin, noise: float, places: np.ndarray) -> Maps:
-    """Four Gauss-Newton steps a frame, as a stream takes them."""
-    rest = np.asarray(told.model.voltages(told.model_conductivity))
-    background = float(told.model_conductivity)
-    imager = Imager.create(told.model, background, reference=jnp.asarray(rest), noise=noise * np.abs(rest))
-    nearest, weighing = _nearest(told, places), imager.weighing(imager.mask)
+def _iterated(nominal_skin: Skin, noise: float, places: np.ndarray) -> Maps:
+    """Four Gauss-Newton steps per frame, as in a stream."""
+    rest = np.asarray(nominal_skin.model.voltages(nominal_skin.model_conductivity))
+    background = float(nominal_skin.model_conductivity)
+    imager = Imager.create(nominal_skin.model, background, reference=jnp.asarray(rest), noise=noise * np.abs(rest))
+    nearest, weighing = _nearest(nominal_skin, places), imager.weighing(imager.mask)
 
     def maps(changes):
         found = np.zeros((len(changes), *SHAPE))
@@ -171,17 +171,17 @@ def _iterated(told: Skin, noise: float, places: np.ndarray) -> Maps:
     return maps
 
 
-def _nearest(told: Skin, places: np.ndarray) -> np.ndarray:
-    return np.asarray(KDTree(np.asarray(centroids(told.model.mesh))).query(places.reshape(-1, 2))[1])
+def _nearest(nominal_skin: Skin, places: np.ndarray) -> np.ndarray:
+    return np.asarray(KDTree(np.asarray(centroids(nominal_skin.model.mesh))).query(places.reshape(-1, 2))[1])
 
 
 def _wrong(ways, touches, right, clean, noise: float, places, quick: bool) -> tuple[Table, dict[str, float]]:
-    """Mean errors against noise, against electrodes out of place, and against contacts; those of the last, metres."""
+    """Mean errors against noise, displaced electrodes, and contacts. Also returns those of the last, metres."""
     random = np.random.default_rng(4)
     cases = {f"noise × {times:g}": (clean, times * noise) for times in (0.0, 3.0, 10.0)}
     some = slice(None, None, 5)
     kinds = {
-        "all as told": problem.Wrong(0.0, 0.0),
+        "all as described": problem.Wrong(0.0, 0.0),
         "electrodes ±1 mm": problem.Wrong(0.1, 1e-3),
         "contacts ±30 %": problem.Wrong(0.3, 0.5e-3),
         "contacts drift by ±3 % after the reference": problem.Wrong(0.1, 0.5e-3, 0.03),
@@ -197,36 +197,41 @@ def _wrong(ways, touches, right, clean, noise: float, places, quick: bool) -> tu
         means = [error_statistics(depth_centroids(way(frames), places), known)["mean"] for way in ways.values()]
         rows.append([name, *(f"{1e3 * one:.2f}" for one in means)])
         say(" | ".join(rows[-1]))
-    caption = "A fifth of the places but for noise; on a mesh of 4.5 mm, three skins in turn, but for noise."
+    caption = "Except for noise: a fifth of the places, a mesh of 4.5 mm, three skins in turn."
     table = Table(["", *ways], rows, "The same ball, mean errors in millimetres", caption)
     return table, dict(zip(ways, means, strict=True))
 
 
 def _pairs(ways, judged_by, noise: float, places, number: int) -> tuple[Table, dict[str, float]]:
-    """How often two balls are two: a peak within 15 mm of each, and between them no more than 0.8 of the lower one,
-    which is more than half of the map's greatest depth."""
+    """How often two balls are distinguished.
+
+    There is a peak within 15 mm of each, and between them no more than 0.8 of the lower one, which is more than half of
+    the map's largest depth.
+    """
     touches, right = problem.pair_touches(number)
     changes = judged_by.changes(touches)
     frames = changes + noise * np.random.default_rng(6).normal(size=changes.shape)
     flat = places.reshape(-1, 2)
     found = {}
     for name, way in ways.items():
-        told = 0
+        distinguished = 0
         for one, pair in zip(way(frames), right, strict=True):
             values = one.ravel()
             near = [values[np.linalg.norm(flat - place, axis=1) < 0.015].max() for place in pair]
             middle = values[np.linalg.norm(flat - pair.mean(axis=0), axis=1) < 0.004].max()
-            told += min(near) > 0.5 * values.max() and middle < 0.8 * min(near)
-        found[name] = told / len(right)
+            distinguished += min(near) > 0.5 * values.max() and middle < 0.8 * min(near)
+        found[name] = distinguished / len(right)
     rows = [[name, f"{100 * share:.0f} %"] for name, share in found.items()]
     caption = "6 mm deep; the paper's virtual taxels are 41 mm wide."
-    return Table(["by", "told as two"], rows, "Two balls, 41 mm apart", caption), found
+    return Table(["by", "distinguished"], rows, "Two balls, 41 mm apart", caption), found
 
 
-def _shapes(ways, judged_by, noise, places, number, told: Skin, output: Path | None) -> tuple[Table, dict[str, float]]:
-    """Share of squared depth that maps of unseen bodies miss, each map scaled to miss least."""
+def _shapes(
+    ways, judged_by, noise, places, number, nominal_skin: Skin, output: Path | None
+) -> tuple[Table, dict[str, float]]:
+    """Fraction of squared depth that maps of unseen bodies miss, each map scaled to miss least."""
     touches, names = problem.shape_touches(number)
-    right = depth_maps(touches, places) / float(told.thickness)
+    right = depth_maps(touches, places) / float(nominal_skin.thickness)
     changes = judged_by.changes(touches)
     frames = changes + noise * np.random.default_rng(8).normal(size=changes.shape)
     kinds, rows, found, drawn = list(dict.fromkeys(names)), [], {}, {}
@@ -239,24 +244,24 @@ def _shapes(ways, judged_by, noise, places, number, told: Skin, output: Path | N
         rows.append([name, *(f"{one:.2f}" for one in each), f"{missed.mean():.2f}"])
         say(" | ".join(rows[-1]))
     if output is not None:
-        _draw(output, told, right, drawn, names)
+        _draw(output, nominal_skin, right, drawn, names)
     caption = "1 is an empty map; each map is scaled to miss least."
     return Table(["by", *kinds, "all"], rows, "Unseen bodies: share of squared depth missed", caption), found
 
 
-def _draw(output: Path, told: Skin, right, drawn, names) -> None:
+def _draw(output: Path, nominal_skin: Skin, right, drawn, names) -> None:
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_depth_map
 
     first = [names.index(kind) for kind in dict.fromkeys(names)]
-    low_x, high_x, low_y, high_y = map(float, told.outline.extent)
+    low_x, high_x, low_y, high_y = map(float, nominal_skin.outline.extent)
     figure = Figure(figsize=(2.5 * (len(drawn) + 1), 2.5 * len(first)), layout="constrained")
     panels = figure.subplots(len(first), len(drawn) + 1, squeeze=False)
     for row, number in zip(panels, first, strict=True):
         for ax, (name, maps) in zip(row, {"right": right, **drawn}.items(), strict=True):
             title = f"{names[number]}: right" if name == "right" else name
-            depth = float(told.thickness) * np.maximum(maps[number], 0)
+            depth = float(nominal_skin.thickness) * np.maximum(maps[number], 0)
             extent = low_x, high_x, low_y, high_y
             plot_depth_map(depth, extent, colour_bar=False, title=title, ax=ax)
     output.mkdir(parents=True, exist_ok=True)

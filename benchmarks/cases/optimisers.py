@@ -1,9 +1,9 @@
 """Nonlinear least-squares solvers on the same inverse problems: jeit's, optimistix's and jaxopt's.
 
-jeit's Gauss-Newton and Levenberg-Marquardt, which solve each step in the smaller of the spaces of data and of images,
-beside the same methods as optimistix and jaxopt have them, given the residuals of data and prior stacked on each other,
-and jaxopt's bounded solvers. All start from the background and run until their own tolerance of 1e-6 (or 200 steps, the
-bounded ones 2,000). What they reach is compared with jeit's minimum to rounding.
+jeit's Gauss-Newton and Levenberg-Marquardt solve each step in the smaller of the spaces of data and of images. They are
+compared with the same methods of optimistix and jaxopt, for the stacked residuals of data and prior, and with jaxopt's
+bounded solvers. All start from the background and run to their own tolerance of 1e-6 (or 200 steps, the bounded ones
+2,000). Their objectives are compared with jeit's minimum to rounding.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from jeit.inverse.nonlinear.solvers import minimise_between
 from jeit_solvers import Descent, lbfgsb, projected_gradient
 
 MOST_STEPS, MOST_BOUNDED_STEPS, TOLERANCE = 200, 2000, 1e-6
-# Above the least objective, in parts of it, within which a solver counts as having found it.
+# A solver has converged if its objective exceeds the least one by no more than this fraction.
 REACHED = 1e-3
 NODES, ROUNDS, BUDGET = 500, 5, 4.0
 QUICK = ("jeit Gauss-Newton", "optimistix Gauss-Newton")
@@ -45,7 +45,7 @@ def run(options: Options) -> Result:
 
 
 def _contest(name: str, inversion, minimum, options: Options) -> tuple[list[list[str]], list[Asked]]:
-    """The table's rows of one problem, and whether jeit's solvers find the least objective."""
+    """The table's rows of one problem, and whether jeit's solvers reach the least objective."""
     least, rows, asked, own = float(inversion.cost(minimum)), [], [], float("nan")
     for label, solve in solvers().items():
         if options.quick and label not in QUICK:
@@ -54,7 +54,7 @@ def _contest(name: str, inversion, minimum, options: Options) -> tuple[list[list
         try:
             spent, compiling, answer = timed(lambda f=compiled: f(inversion), options.rounds or ROUNDS, BUDGET)
         except Exception as error:
-            # Another library's failure is its row's, and does not lose the others.
+            # A failure of another library is reported in its row, and does not affect the others.
             rows.append([label, "", f"failed: {type(error).__name__}", "", "", "", ""])
             continue
         coefficients, iterations = answer
@@ -96,7 +96,7 @@ def problems(num_points: int, *, quick: bool = False):
 
 
 def solvers():
-    """Name: function of an inversion that gives coefficients and iterations, to be compiled."""
+    """Name: function of an inversion that returns coefficients and iterations, to be compiled."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         import jaxopt

@@ -1,10 +1,9 @@
-"""Skins that others have built and recorded, learnt from: where they are touched, and which keys are pressed.
+"""Skins that others have built and recorded: trained on their recordings, for places of touches and for pressed keys.
 
 Recordings are public, at github.com/lorcan2440/EIT_Touch_Sensor (one and two fingers on gelatine),
-github.com/DSHardman/WeightedActivationMaps (a probe on a hydrogel) and github.com/DSHardman/HandProbing (six keys;
-places on a hand); they are read from wherever they lie, under `--data FOLDER`. Learnt from the first 80 % in time,
-asked of the last 20 %; beside ridge regression on raw differences, and logistic regression on raw and standardised
-ones.
+github.com/DSHardman/WeightedActivationMaps (a probe on a hydrogel) and github.com/DSHardman/HandProbing (six keys, and
+places on a hand). They are searched under `--data FOLDER`. Trained on the first 80 % in time, tested on the last 20 %,
+beside ridge regression on raw differences, and logistic regression on raw and standardised ones.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from benchmarks.harness.timing import say
 from jeit.touch import LearntSkin, Presses, Touches
 
 LEARNT = 0.8
-# Of ridge's error, at most; and points of per cent above logistic regression, at least.
+# Limits: fraction of ridge's error, and percentage points above logistic regression.
 PLACES, KEYS = 0.75, 5.0
 WHERE = [
     "skin",
@@ -44,7 +43,7 @@ WHICH = ["skin", "presses", "channels", "learnt", "keys right", "patterns right"
 
 @dataclass(frozen=True)
 class Recording:
-    """Frames (N, M), their reference if they have one; places of K fingers (N, K, 2), metres, or keys (N, K)."""
+    """Frames (N, M), their reference if they have one, and places of K fingers (N, K, 2), metres, or keys (N, K)."""
 
     name: str
     frames: np.ndarray
@@ -58,7 +57,7 @@ class Recording:
 
 
 def run(options: Options) -> Result:
-    """Every recording that is there; without any, nothing."""
+    """Every available recording. Without any, nothing."""
     better, ahead = f"error ≤ {PLACES:g}× ridge's", f"≥ {KEYS:g} points above logistic regression on raw changes"
     asked = [f"places: {better}", f"keys: {ahead}"]
     folder = options.data or Path(os.environ.get("JEIT_DATA", ROOT.parent / "shared" / "data"))
@@ -75,14 +74,14 @@ def run(options: Options) -> Result:
         else:
             row, points = _keys(one)
             which.append(row)
-            said = f"{points[0]:+.1f}, whole {points[1]:+.1f}"
-            verdicts.append(judged(f"{one.name}: {ahead}", said, min(points) >= KEYS))
+            text = f"{points[0]:+.1f}, whole {points[1]:+.1f}"
+            verdicts.append(judged(f"{one.name}: {ahead}", text, min(points) >= KEYS))
         say(" | ".join(row))
     return Result([Table(WHERE, where), Table(WHICH, which)], verdicts)
 
 
 def recordings(folder: Path) -> Iterator[Recording]:
-    """All that lie somewhere under a folder."""
+    """All recordings under a folder."""
     for path in sorted(folder.rglob("EIT_Data_Gelatin_*_finger*_dof*.xlsx")):
         named = re.search(r"(\d)_finger.*- (\w+)", path.stem)
         if named:
@@ -100,7 +99,7 @@ def recordings(folder: Path) -> Iterator[Recording]:
 
 
 def _gelatine(path: Path, name: str) -> Recording:
-    """Sheets of voltages, as changes already, and of places: x of one or two fingers, then y, metres."""
+    """Sheets of voltages, already as changes, and of places: x of one or two fingers, then y, metres."""
     from openpyxl import load_workbook
 
     book = load_workbook(path, read_only=True)
@@ -110,7 +109,7 @@ def _gelatine(path: Path, name: str) -> Recording:
     )
     places = places.reshape(len(places), 2, 2).transpose(0, 2, 1)
     there = np.isfinite(places).all(axis=(0, 2))
-    # Each row has the frame of the press before: by places as they stand none is told better than by a guess.
+    # Each row has the frame of the preceding press: with its own place no prediction is better than chance.
     return Recording(name, frames[1:], None, places[:-1, there])
 
 
@@ -129,20 +128,20 @@ def _ask(skin: LearntSkin, one: Recording, rows: slice) -> Touches:
 
 
 def _places(one: Recording) -> tuple[list[str], float]:
-    """A row, and jeit's error beside ridge's: each finger by a skin of its own."""
+    """A row, and jeit's error beside ridge's. Each finger has its own model."""
     from sklearn.linear_model import RidgeCV
 
     learnt, asked = _cut(one)
     start, errors, theirs, ratios = time.perf_counter(), [], [], []
     for finger in np.moveaxis(one.places, 1, 0):
         skin = LearntSkin.fit(_presses(one, learnt, positions=finger[learnt]))
-        told, right = _ask(skin, one, asked), finger[asked]
-        errors.append(np.linalg.norm(told.position - right, axis=1))
-        ratios.append(np.abs(told.position - right) / told.position_std)
+        prediction, right = _ask(skin, one, asked), finger[asked]
+        errors.append(np.linalg.norm(prediction.position - right, axis=1))
+        ratios.append(np.abs(prediction.position - right) / prediction.position_std)
         ridge = RidgeCV(np.logspace(-8, 6, 29)).fit(one.changes[learnt], finger[learnt])
         theirs.append(np.linalg.norm(ridge.predict(one.changes[asked]) - right, axis=1))
     spent = time.perf_counter() - start
-    # A frame of which nothing is said is as far off as the middle of the skin would be.
+    # A frame without a prediction has the error of the skin's centre.
     error, plain, ratio = (np.concatenate(each) for each in (errors, theirs, ratios))
     guess = np.linalg.norm(one.places - one.places[learnt].mean(axis=0), axis=-1).mean()
     error = np.where(np.isfinite(error), error, guess)
@@ -153,8 +152,9 @@ def _places(one: Recording) -> tuple[list[str], float]:
 
 
 def _keys(one: Recording) -> tuple[list[str], tuple[float, float]]:
-    """A row, and by how many points of per cent jeit is ahead of logistic regression on raw differences, of each key
-    and of whole patterns."""
+    """A row, and the percentage points by which jeit is ahead of logistic regression on raw differences, for each key
+    and for whole patterns.
+    """
     learnt, asked = _cut(one)
     start = time.perf_counter()
     skin = LearntSkin.fit(_presses(one, learnt, touched=one.keys[learnt]))
@@ -177,9 +177,9 @@ def _logistic(values: np.ndarray, one: Recording, learnt: slice, asked: slice) -
     return np.column_stack([key(answers) for answers in one.keys[learnt].T])
 
 
-def _right(said: np.ndarray, keys: np.ndarray) -> tuple[float, float]:
-    """Per cent of the keys, and of whole patterns."""
-    return 100 * float(np.mean(said == keys)), 100 * float(np.mean((said == keys).all(axis=1)))
+def _right(predicted: np.ndarray, keys: np.ndarray) -> tuple[float, float]:
+    """Percentages right of the keys, and of whole patterns."""
+    return 100 * float(np.mean(predicted == keys)), 100 * float(np.mean((predicted == keys).all(axis=1)))
 
 
 CASE = Case("real_skins", "skins that others built, learnt from their recordings", run, 5, timed=False)

@@ -1,8 +1,8 @@
-"""Frames a second: a touch moves over two sensors, streamed frame by frame.
+"""Frame rates: a touch moves over two sensors, streamed frame by frame.
 
 Frames are simulated on finer meshes, with noise. For each sensor: the latency of every frame, linear and with four
-Gauss-Newton iterations; how far those images are from converged ones; and what the parts of an iteration cost, beside
-the time that their arithmetic takes at the speed of a large matrix product.
+Gauss-Newton iterations, the distance of those images from converged ones, and the time of the parts of an iteration,
+beside the time that their arithmetic takes at the speed of a large matrix product.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ HEADER = ["sensor", "image", "median", "99 %", "iterations", "greatest error"]
 
 
 class Streamed(NamedTuple):
-    """Images of all frames, and their latencies in milliseconds: median, and what 99 % stay below."""
+    """Images of all frames, and the median and 99th percentile of their latencies in milliseconds."""
 
     images: list
     median: float
@@ -77,7 +77,7 @@ def run(options: Options) -> Result:
 
 
 def stream_all(imager: Imager, frames: np.ndarray) -> Streamed:
-    """All frames, one after the other; the stream compiles before its first frame."""
+    """All frames, one after the other. The stream compiles before its first frame."""
     found = list(stream(imager, iter(frames)))
     assert all(one.imaged for one in found)
     latency = 1e3 * np.array([one.latency for one in found])
@@ -85,7 +85,7 @@ def stream_all(imager: Imager, frames: np.ndarray) -> Streamed:
 
 
 def _error(model, images: list, frames: np.ndarray, common: dict) -> float:
-    """Greatest distance of some images from converged ones, relative to what those differ from the background."""
+    """Largest distance of some images from converged ones, relative to the latter's difference from the background."""
     longer, every = GaussNewton(max_steps=30, rtol=1e-12), Parametrisation(informative=0.0)
     exact = Imager.create(model, 1.0, solver=longer, parametrisation=every, **common)
     weighing, errors = exact.weighing(exact.mask), []
@@ -142,4 +142,4 @@ def breakdown(imager) -> list[tuple[str, float, float]]:
     return [(name, 1e3 * seconds, 1e3 * operations / speed) for name, seconds, operations in parts]
 
 
-CASE = Case("realtime", "latency of streamed frames, and what a Gauss-Newton iteration is made of", run, 2)
+CASE = Case("realtime", "latency of streamed frames, and the parts of a Gauss-Newton iteration", run, 2)

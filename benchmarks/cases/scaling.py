@@ -1,8 +1,8 @@
 """The direct solver from a thousand nodes up, in the plane and in space, beside PARDISO.
 
-One matrix of a forward model, its values just assembled, for the loads of 32 electrodes: factorised and solved, which
-fields need, and factorised and multiplied (bᵀA⁻¹b), which is all that voltages need. What is made once for a pattern is
-apart. Every repeat takes another matrix. A second table has larger solids, solved by multigrid.
+One matrix of a forward model, with newly assembled values, for the loads of 32 electrodes: factorised and solved, as
+for fields, and factorised and multiplied (bᵀA⁻¹b), which suffices for voltages. The analysis of the pattern is timed
+separately. Every repeat has another matrix. A second table has larger solids, solved by multigrid.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from benchmarks.problems import matrices
 MINE, OTHER, ITERATIVE = "jeit's fronts", "PARDISO", "jeit's multigrid"
 SOLVED, MULTIPLIED = "factorise and solve", "factorise and multiply"
 SIZES = {"disk": (1_000, 5_000, 20_000, 100_000), "cylinder": (1_000, 10_000, 20_000, 50_000, 100_000, 280_000)}
-# How much longer than PARDISO voltages may take; what a solution may leave of its load.
+# Maximum ratio of time to PARDISO's for voltages, and maximum residual of a solution relative to its load.
 ASKED, ACCURATE = 1.2, 1e-12
-# Nodes of the cylinders that multigrid solves; seconds and bytes that voltages of the largest may take, from its
-# geometry on; what a solution may leave of its load.
+# Nodes of the cylinders that multigrid solves. Limits of seconds and bytes for voltages of the largest, including its
+# mesh, and of the residual of a solution.
 LARGE, SECONDS, MEGABYTES, CLOSE = (50_000, 280_000, 1_000_000), 300.0, 12_000, 1e-10
 LARGE_HEADER = ["nodes", "mesh and matrices", "32 solutions", "residual", "peak memory of the solutions"]
 HEADER = ["body", "nodes", "plan", "operations", "voltages: factor, multiply", "fields: factor, 32 solves"]
@@ -71,7 +71,7 @@ def run(options: Options) -> Result:
 
 
 def _problem(body: str, count: int) -> dict[str, np.ndarray]:
-    """Matrices of a forward model of about so many nodes, of random conductivities, and the loads of its electrodes."""
+    """Matrices of a forward model of about `count` nodes with random conductivities, and its electrodes' loads."""
     from jeit.electrodes import BoundaryElectrodes, FacePatches
     from jeit.electrodes.face_patches import body_mesh
     from jeit.forward.system import System
@@ -158,9 +158,9 @@ def _large(options: Options, asked: list, wrong: list[str]) -> Table:
 def _growth(points: list[tuple[int, float, float]]) -> str:
     """Exponents of the growth of time with the number of nodes, from the larger half of the sizes."""
     nodes, mine, other = np.array(points[len(points) // 2 - 1 :]).T
-    said = [f"{name} as nodes to the {np.polyfit(np.log(nodes), np.log(one), 1)[0]:.2f}"
+    terms = [f"{name} as nodes to the {np.polyfit(np.log(nodes), np.log(one), 1)[0]:.2f}"
             for name, one in (("jeit", mine), (OTHER, other)) if np.isfinite(one).all()]  # fmt: skip
-    return "time grows " + ", ".join(said)
+    return "time grows " + ", ".join(terms)
 
 
 def _draw(path: Path, seconds: dict[str, list[tuple[int, float, float]]]) -> None:

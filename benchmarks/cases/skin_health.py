@@ -1,8 +1,8 @@
-"""Damage told from frames: cuts, dead electrodes and torn wires found, false alarms, and places of touches beside cuts.
+"""Damage detected from frames: cuts, dead electrodes and torn wires, false alarms, and errors of touches beside cuts.
 
-Park et al. 2022 cut their skin and mended it, and saw no artefacts afterwards; they print no figures, so what is asked
-here is jeit's own: 95 % of cuts of the full depth, 1 % of false alarms, and errors of places, farther than 25 mm from
-the cut (12.5 on the skin of half the size), at most 1.2 times those of the whole skin.
+Park et al. 2022 cut and repaired their skin, and saw no artefacts afterwards. They publish no figures, so the limits
+are jeit's own: 95 % of cuts of the full depth, 1 % of false alarms, and errors of places, farther than 25 mm from the
+cut (12.5 on the skin of half the size), at most 1.2 times those of the undamaged skin.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from jeit.touch import watch
 from jeit.touch.health import EventKind
 
 SKINS = {"park": "hydrogel, 200 mm, 32 inner electrodes, 94 pairs", "round": "film, 100 mm, 16 electrodes, 208"}
-# Seconds of a sequence of touches, of a recording with damage, and when in it that begins.
+# Seconds of a sequence of touches, of a recording with damage, and the time at which it begins.
 SEQUENCE, RECORDING, BEGINS = 60.0, 90.0, 30.0
-# Nobody chose a limit on these.
+# These have no limit.
 SEED = 1
-HEADER = ["skin", "what", "recordings", "told", "named rightly", "told after, median", "error, median"]
+HEADER = ["skin", "what", "recordings", "detected", "named correctly", "detected after, median", "error, median"]
 
 
 def run(options: Options) -> Result:
@@ -37,8 +37,8 @@ def run(options: Options) -> Result:
             asked += verdicts
             for row in found:
                 say(" | ".join(row))
-    caption = "Error of a cut: mean distance of its path and that found, both ways. Half as deep: not asked for."
-    return Result([Table(HEADER, rows, "Damage told", caption)], asked)
+    caption = "Error of a cut: mean distance of its path and the detected one, both ways. Half as deep: no limit."
+    return Result([Table(HEADER, rows, "Damage detected", caption)], asked)
 
 
 def _touches(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]:
@@ -57,7 +57,7 @@ def _cuts(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]
     rows, asked = [], []
     seconds = np.arange(0, RECORDING, 1 / RATE)
     for depth, number, first in ((1.0, 3 if quick else 20, 10_000), (0.5, 1 if quick else 5, 20_000)):
-        told, named, after, error, beside = 0, 0, [], [], []
+        detected, named, after, error, beside = 0, 0, [], [], []
         for one in range(first, first + number):
             cut = skin.cut(one, depth)
             whole, torn, glued = skin.damaged(cut)
@@ -65,7 +65,7 @@ def _cuts(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]
             before, later = changes(whole, touches), changes(torn, touches)
             known = watch(skin.health, skin.read(whole, one, seconds, before, (BEGINS, torn, later)), seconds)
             events = [event for event in known.events if abs(event.time - BEGINS) < 3.0]
-            told += bool(events)
+            detected += bool(events)
             cuts = [event for event in events if event.kind == EventKind.CUT]
             named += bool(cuts)
             after += [event.noticed - BEGINS for event in events[:1]]
@@ -78,17 +78,23 @@ def _cuts(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]
                 states = ((skin.health, whole), (known, torn), (mended, glued))
                 beside.append([skin.off(health, state, away, one) for health, state in states])
         median = [f"{np.median(after):.1f} s" if after else "–", f"{1e3 * np.median(error):.1f} mm" if error else "–"]
-        rows.append([SKINS[skin.name], f"cuts, {depth:g} of the depth", str(number), str(told), str(named), *median])
+        rows.append(
+            [SKINS[skin.name], f"cuts, {depth:g} of the depth", str(number), str(detected), str(named), *median]
+        )
         if depth == 1:
             asked.append(
-                judged(f"{skin.name}: ≥ 95 % of cuts found", f"{100 * told / number:.0f} %", told >= 0.95 * number)
+                judged(
+                    f"{skin.name}: ≥ 95 % of cuts found", f"{100 * detected / number:.0f} %", detected >= 0.95 * number
+                )
             )
         if beside:
             off = np.concatenate(beside, axis=1)
             means = np.nanmean(off, axis=1)
-            for said, mean in zip(("beside the cut", "after repair"), means[1:], strict=True):
-                told_of = f"{1e3 * mean:.1f} against {1e3 * means[0]:.1f} mm, {mean / means[0]:.2f}×"
-                asked.append(judged(f"{skin.name}: touches {said} ≤ 1.2 × pristine", told_of, mean <= 1.2 * means[0]))
+            for condition, mean in zip(("beside the cut", "after repair"), means[1:], strict=True):
+                errors_beside = f"{1e3 * mean:.1f} against {1e3 * means[0]:.1f} mm, {mean / means[0]:.2f}×"
+                asked.append(
+                    judged(f"{skin.name}: touches {condition} ≤ 1.2 × pristine", errors_beside, mean <= 1.2 * means[0])
+                )
     return rows, asked
 
 
@@ -97,17 +103,17 @@ def _faults(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked
     seconds = np.arange(0, RECORDING, 1 / RATE)
     number = 2 if quick else 10
     for kind in ("dead", "torn", "loose"):
-        told, named, after = 0, 0, []
+        detected, named, after = 0, 0, []
         for one in range(30_000, 30_000 + number):
             electrode, more = skin.fault(one, kind, seconds, BEGINS)
             known = watch(skin.health, skin.read(skin.skin, one, seconds, skin.touches, more=more), seconds)
             events = [event for event in known.events if abs(event.time - BEGINS) < 3.0]
-            told += bool(events)
+            detected += bool(events)
             right = [event for event in events if event.electrode == electrode]
             named += bool(right)
             after += [event.noticed - BEGINS for event in events[:1]]
         median = f"{np.median(after):.1f} s" if after else "–"
-        rows.append([SKINS[skin.name], f"{kind} electrodes", str(number), str(told), str(named), median, ""])
+        rows.append([SKINS[skin.name], f"{kind} electrodes", str(number), str(detected), str(named), median, ""])
         if kind != "loose":
             asked.append(
                 judged(f"{skin.name}: {kind} electrodes found and named", f"{named} of {number}", named == number)
@@ -116,7 +122,7 @@ def _faults(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked
 
 
 def far(skin: DamagedSkin, number: int, cut) -> list:
-    """Touches of which none is nearer to the cut than is asked."""
+    """Touches with at least the required distance from the cut."""
     away = []
     for press in skin.presses(number + 50_000, 12):
         if np.linalg.norm(cut.along(1e-3) - press.position, axis=1).min() > APART * skin.scale:
@@ -125,10 +131,10 @@ def far(skin: DamagedSkin, number: int, cut) -> list:
 
 
 def apart(true: np.ndarray, path: np.ndarray) -> float:
-    """Mean distance, metres, of a path (n, 2) and one found (k, 2), both ways."""
+    """Mean distance, metres, between a path (n, 2) and a detected one (k, 2), in both directions."""
     parts = [np.linspace(a, b, 50) for a, b in itertools.pairwise(path)]
     distance = np.linalg.norm(true[:, None] - np.concatenate(parts), axis=-1)
     return 0.5 * float(distance.min(axis=0).mean() + distance.min(axis=1).mean())
 
 
-CASE = Case("skin_health", "damage told from frames, and touches placed beside it", run, 20, timed=False)
+CASE = Case("skin_health", "damage detected from frames, and touches located beside it", run, 20, timed=False)

@@ -1,7 +1,7 @@
-"""A stream that does not end: a million frames through linear images, and thousands through Gauss-Newton.
+"""An endless stream: a million frames through linear images, and thousands through Gauss-Newton.
 
-Every so often frames go wrong, each burst in a way that is known: memory must not grow, every bad frame must be named
-for what it is, and no good one refused.
+Frames are faulty in bursts, each of a known kind. Memory must not grow, every bad frame must be named for its fault,
+and no good one refused.
 """
 
 from __future__ import annotations
@@ -22,16 +22,17 @@ from jeit.inverse import Imager, stream
 from jeit.inverse.nonlinear import GaussNewton, OneStep
 
 SENSOR, NODES, BASE = "disk, 16 electrodes", 1193, 400
-# Frames, those from one burst to the next, and of a burst at most: linear, and by Gauss-Newton; then those of a quick
-# run.
+# Frames, frames from one burst to the next, and maximum frames of a burst: linear, and by Gauss-Newton. Then those of a
+# quick run.
 LENGTHS = {False: ((1_000_000, 2000, 400), (20_000, 400, 80)), True: ((20_000, 400, 80), (500, 50, 10))}
-# Megabytes by which memory may grow from a tenth of the stream to its end: an allocator's own to and fro.
+# Megabytes by which memory may grow from a tenth of the stream to its end: fluctuations of the allocator.
 GROWTH = 8.0
 
 
 class Soaked(NamedTuple):
-    """Memory in MB at a tenth, half and all of a stream; seconds of each good frame, and of each bad one; bad frames
-    that were named for what they are, by kind; good ones that were refused or said to be in part."""
+    """Memory in MB at a tenth, half and all of a stream, seconds of each good frame and of each bad one, bad frames
+    that were named for their fault, by kind, and good ones that were refused or reported as partial.
+    """
 
     memory: list[float]
     good: np.ndarray
@@ -72,8 +73,8 @@ def run(options: Options) -> Result:
         ]
     title = f"{SENSOR}, {model.mesh.num_points} nodes, {base.shape[1]} voltages"
     header = ["images", "frames", "memory at 10 %", "at 50 %", "at the end", "good frame: median", "99 %"]
-    header += ["bad frame: median", "99 %", "bad frames named", "good ones accused"]
-    bad_header = ["images", "bad frames", "become", "planted", "named for what they are"]
+    header += ["bad frame: median", "99 %", "bad frames named", "good ones reported"]
+    bad_header = ["images", "bad frames", "become", "planted", "named for their fault"]
     return Result([Table(header, streams, title), Table(bad_header, kinds)], asked)
 
 
@@ -87,9 +88,9 @@ def soak(imager: Imager, frames: DisturbedFrames) -> Soaked:
         bad[one.number] = bool(frames.kind)
         if frames.kind:
             kind = KINDS[frames.kind]
-            told = one.status == kind.status and kind.word.format(frames.electrode + 1) in one.reason
-            named[frames.kind] += told
-            if not told and named[frames.kind] == 0:
+            matches = one.status == kind.status and kind.word.format(frames.electrode + 1) in one.reason
+            named[frames.kind] += matches
+            if not matches and named[frames.kind] == 0:
                 say(f"  {frames.kind}: {one.status}. {one.reason}")
         else:
             accused += one.status in ("refused", "partial")
@@ -100,14 +101,14 @@ def soak(imager: Imager, frames: DisturbedFrames) -> Soaked:
 
 
 def resident_memory() -> float:
-    """Of this process, MB, after what is free has been given back."""
+    """Resident memory of this process, MB, after free memory has been returned."""
     gc.collect()
     try:
         ctypes.CDLL("libc.so.6").malloc_trim(0)
-        with open("/proc/self/statm", encoding="ascii") as told:
-            return int(told.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+        with open("/proc/self/statm", encoding="ascii") as statm:
+            return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
     except OSError:
         return float("nan")
 
 
-CASE = Case("soak", "a million streamed frames, some bad: memory, latency, each named for what it is", run, 12)
+CASE = Case("soak", "a million streamed frames, some bad: memory, latency, each named for its fault", run, 12)

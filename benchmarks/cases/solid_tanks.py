@@ -1,4 +1,6 @@
-"""One or two balls or columns in boxes and cylinders: what the default image tells; `problems/solid_tanks.py`."""
+"""One or two balls or columns in boxes and cylinders, with the default image. Tanks are those of
+`problems/solid_tanks.py`.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ TANKS, FIRST = 20, 700_000
 COLUMNS, FIRST_COLUMNS = 6, 720_000
 _CONTRAST = 0.15
 HEADER = ["tank", "electrodes", "channels", "method", "bodies"]
-HEADER += ["off / r", "volume", "contrast", "± 1 σ", "told as", "others", "seconds"]
+HEADER += ["off / r", "volume", "contrast", "± 1 σ", "reported as", "others", "seconds"]
 
 
 def run(options: Options) -> Result:
@@ -36,19 +38,19 @@ def run(options: Options) -> Result:
         seconds = time.perf_counter() - start
         bodies = () if found.shapes is None else found.shapes.bodies
         which, more = matched(tank, [body.centroid for body in bodies], [body.sign for body in bodies])
-        told = [(ball, bodies[one]) for ball, one in zip(tank.balls, which, strict=True) if one >= 0]
+        matches = [(ball, bodies[one]) for ball, one in zip(tank.balls, which, strict=True) if one >= 0]
         background = float(found.calibration.conductivity)
         ends = [1 + np.array(found.peak_ranges[one]) / background for one in which if one >= 0]
-        distance = [float(np.linalg.norm(body.centroid - ball.centre)) / ball.radius for ball, body in told]
-        volume = [body.volume / ball.volume for ball, body in told]
-        contrast = [float(np.exp(body.sign * body.contrast)) / ball.factor for ball, body in told]
+        distance = [float(np.linalg.norm(body.centroid - ball.centre)) / ball.radius for ball, body in matches]
+        volume = [body.volume / ball.volume for ball, body in matches]
+        contrast = [float(np.exp(body.sign * body.contrast)) / ball.factor for ball, body in matches]
         off, contrasts, spurious = off + distance, contrasts + contrast, spurious + more
-        held += sum(low <= ball.factor <= high for (ball, _), (low, high) in zip(told, ends, strict=True))
-        missed += len(tank.balls) - len(told)
+        held += sum(low <= ball.factor <= high for (ball, _), (low, high) in zip(matches, ends, strict=True))
+        missed += len(tank.balls) - len(matches)
         factors = ", ".join(f"{ball.factor:g}" for ball in tank.balls)
         figures = [" ".join(f"{one:.2f}" for one in many) for many in (distance, volume, contrast)]
-        told_as = ["column" if found.inclusions[one].is_column else "ellipsoid" for one in which if one >= 0]
-        figures += [", ".join(f"{low:.2g} to {high:.2g}" for low, high in ends), ", ".join(told_as)]
+        forms = ["column" if found.inclusions[one].is_column else "ellipsoid" for one in which if one >= 0]
+        figures += [", ".join(f"{low:.2g} to {high:.2g}" for low, high in ends), ", ".join(forms)]
         kind = tank.frame.protocol.name.split(",")[0]
         electrodes = f"{tank.kind}, columns" if columns else tank.kind
         rows.append(
@@ -61,7 +63,7 @@ def run(options: Options) -> Result:
         judged("contrasts ≤ 15 % off", f"{close} of {total}", close == total),
         judged("ranges that hold the truth ≥ 68 %", f"{held} of {len(off)}", held >= 0.68 * len(off)),
         judged("none missed", str(missed), missed == 0),
-        judged("nothing else told", str(spurious), spurious == 0),
+        judged("nothing else reported", str(spurious), spurious == 0),
     ]
     return Result([Table(HEADER, rows)], checks, [f"{len(refused)} tanks refused", *refused])
 

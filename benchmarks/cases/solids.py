@@ -10,10 +10,11 @@ from benchmarks.harness.tables import duration
 from benchmarks.harness.timing import say
 
 LIMIT = 1200.0
-# Nodes beyond which a body is to be imaged, in whatever time and memory, and the images that are made of one.
+# Nodes of a body to be imaged without limits of time and memory, and the images that are made of one.
 LARGE = 50_000
 AT_LARGE = ("one step, NOSER", "one step, Gaussian", "Gauss-Newton, Gaussian, with error bars")
-# A box of 0.17 × 0.255 × 0.17 m with plates of 8 × 8 cm, as published tanks have; a ball, noise of 0.1 % of the change.
+# A box of 0.17 × 0.255 × 0.17 m with plates of 8 × 8 cm, as published tanks have, a ball, and noise of 0.1 % of the
+# change.
 _SETUP = """
 import itertools, time
 import numpy as np
@@ -45,7 +46,7 @@ print(mesh.num_points, mesh.num_cells, time.perf_counter() - start, peak_memory(
 """
 _LINEAR = "one_step(model, 0.024, prior={}, hyperparameter={}).image(change)"
 _NEWTON = "reconstruct(model, rest + change, 0.024, prior={}, hyperparameter={}, noise=noise)"
-# What is made, how, and the seconds that it is allowed.
+# Name of the image, code, and limit in seconds.
 JOBS = {
     "one step, NOSER": (_LINEAR.format("Noser()", 3.0), 10.0),
     "one step, Gaussian": (_LINEAR.format("Gaussian(0.04)", 3.0), 10.0),
@@ -66,7 +67,9 @@ _MEMORY = 2048.0
 
 
 def run(options: Options) -> Result:
-    """Every image in a process of its own, mesh and model ready before the clock starts; of large bodies some."""
+    """Every image in a process of its own, with mesh and model ready before the clock starts. Large bodies have a
+    subset.
+    """
     rows, checks, wrong = [], [], []
     for nodes in options.nodes or (1500 if options.quick else 20_000,):
         for name in JOBS if nodes <= LARGE else AT_LARGE:

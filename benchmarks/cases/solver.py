@@ -1,8 +1,8 @@
 """The sparse direct solver alone beside SuperLU and CHOLMOD (sparsax).
 
-One task: factorise a finite-element matrix whose values have just been assembled, and solve for 16 right-hand sides, in
-double precision; and the same for a batch of matrices of one pattern. Every repeat takes another matrix. What is made
-once for a pattern (orderings, plans) is not timed; compilation is apart.
+One task: factorise a finite-element matrix with newly assembled values, and solve for 16 right-hand sides, in double
+precision, also for a batch of matrices of one pattern. Every repeat has another matrix. The analysis of a pattern
+(orderings, plans) is not timed, and compilation is separate.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MINE, BOTH = "jeit's solver", "factorise and solve"
 OPPONENTS = ("SuperLU", "sparsax")
 TASKS = (BOTH, "batch", "factorise", "solve")
 DISKS = (1150, 5000, 20_000)
-# A direct solver that leaves more of a right-hand side than this has failed.
+# A direct solver with a larger residual than this fraction of a right-hand side has failed.
 ACCURATE = 1e-10
 HEADER = ["mesh", "nodes", "task", "jeit", "SuperLU", "", "sparsax", "", "compile: jeit / sparsax"]
 HEADER += ["residual: jeit / SuperLU / sparsax", "peak memory: jeit / SuperLU / sparsax"]
@@ -78,7 +78,7 @@ def _enter(stack: ExitStack, interpreters: dict[str, str | None], path: Path, li
 
 
 def _play(problem, playing: list[Contestant], reasons: dict[str, str], rounds: int, budget: float, folder: Path):
-    """The table's rows, what is wrong, and the figures of a matrix alone."""
+    """The table's rows, the errors, and the figures of a single matrix."""
     rows, wrong, alone = [], [], {}
     for task in TASKS:
         share = len(problem["values"]) if task == "batch" else 1
@@ -100,7 +100,7 @@ def _play(problem, playing: list[Contestant], reasons: dict[str, str], rounds: i
 
 
 def _residual(problem, path: Path) -> float:
-    """The worst of the first and the last solution of what a contestant has left; of one alone, its own."""
+    """The larger residual of a contestant's first and last solution, or that of its only one."""
     solutions = results_in(path)[0]
     if solutions.ndim == 2:
         return matrices.residual(problem, 0, solutions)
@@ -108,7 +108,7 @@ def _residual(problem, path: Path) -> float:
 
 
 def _plan(details: dict[str, dict]) -> list[str]:
-    """What was made once for the pattern."""
+    """The analysis of the pattern, as text."""
     superlu, cholmod = details.get("SuperLU", {}), details.get("sparsax", {})
     sizes = [f"{one['factor MB']:.1f} MB" if one else "–" for one in (details[MINE], superlu)]
     made = [duration(details[MINE]["plan"]), " / ".join(sizes)]
@@ -116,16 +116,16 @@ def _plan(details: dict[str, dict]) -> list[str]:
 
 
 def _headline(mesh: str, nodes: int, figures: dict[str, Figures], row: list[str]) -> Headline:
-    """A matrix alone beside the fastest opponent."""
+    """A single matrix beside the fastest opponent."""
     others = {name: one for name, one in figures.items() if name in OPPONENTS and one.seconds and not one.remark}
     job = f"sparse factorisation and 16 solves, {mesh.split()[0]}, {nodes:,} nodes"
     if not others:
         return Headline(job, cell(figures[MINE]))
     name, best = min(others.items(), key=lambda pair: pair[1].median)
     residuals = dict(zip((MINE, *OPPONENTS), row[-2].split(" / "), strict=True))
-    told = f"residual {residuals[MINE]} against {residuals[name]}"
+    residual_text = f"residual {residuals[MINE]} against {residuals[name]}"
     label = "CHOLMOD (sparsax)" if name == "sparsax" else name
-    return Headline(job, cell(figures[MINE]), f"{label}: {cell(best)}", ratio(best, figures[MINE]), told)
+    return Headline(job, cell(figures[MINE]), f"{label}: {cell(best)}", ratio(best, figures[MINE]), residual_text)
 
 
 CASE = Case("solver", "sparse factorisation and 16 solves, alone and in batches: beside SuperLU and CHOLMOD", run, 5)

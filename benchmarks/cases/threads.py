@@ -1,4 +1,4 @@
-"""One model asked from eight threads at once: the same bits as from one, and how long it takes."""
+"""One model called from eight threads at once: the same bits as from one thread, and the time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _layer() -> ForwardModel:
 
 
 def run(options: Options) -> Result:
-    """A sheet and a layer, NumPy's engine: what has values is never compiled."""
+    """A sheet and a layer, with NumPy's engine: concrete values are never compiled."""
     calls = THREADS if options.quick else CALLS
     rows, right = [], []
     for name, make in (("disk", lambda: _disk(1000)), ("layer", _layer)):
@@ -46,9 +46,9 @@ def run(options: Options) -> Result:
                 seconds.append(time.perf_counter() - start)
             same = all(_equal(one, other) for one, other in zip(*found, strict=True))
             right.append(same)
-            model_said = f"{name}, {model.mesh.num_points:,} nodes"
-            said = ["yes" if same else "no"]
-            rows.append([model_said, f"{quantity} × {calls}", *(f"{one:.2f} s" for one in seconds), *said])
+            model_label = f"{name}, {model.mesh.num_points:,} nodes"
+            equal = ["yes" if same else "no"]
+            rows.append([model_label, f"{quantity} × {calls}", *(f"{one:.2f} s" for one in seconds), *equal])
     asked = [judged("the same bits as one thread", f"{sum(right)} of {len(right)}", all(right))]
     return Result([Table(HEADER, rows)], asked)
 
@@ -58,4 +58,4 @@ def _equal(one, other) -> bool:
     return all(np.array_equal(np.asarray(a), np.asarray(b)) for a, b in pairs)
 
 
-CASE = Case("threads", "one model asked from eight threads at once: the same bits, and seconds", run, 1)
+CASE = Case("threads", "one model called from eight threads at once: the same bits, and seconds", run, 1)

@@ -1,8 +1,8 @@
-"""Numbers of bodies in tanks that are not as described: places, and how often 68 % intervals hold the truth.
+"""Estimates of bodies in tanks that deviate from their description: places, and coverage of 68 % intervals.
 
 Sheets are those of `problems/unlike_tanks.py`, solids of `problems/unlike_solids.py`. jeit's defaults were set on some
-kinds of error; the others were kept back. Defaults were set on other tanks; what this case showed of tanks with a
-height was the reason to look at those.
+kinds of error. The others were kept back. Defaults were set on other tanks. Results of this case for tanks with a
+height were the reason to examine those.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ HEADER = [
 
 
 class Outcome(NamedTuple):
-    """**Fields**: `distance` of a body's inclusion, in units of R, infinite if it is missed; `holds` (3,): whether the
-    intervals of change, area and strength hold the truth, None without intervals; `width` of the interval of the
-    logarithm of conductivity, NaN where it is open; `error` of the logarithm of conductivity at the peak."""
+    """**Fields**: `distance` of a body's inclusion, in units of R, infinite if it is missed. `holds` (3,): whether the
+    intervals of change, area and strength contain the truth, None without intervals. `width` of the interval of the
+    logarithm of conductivity, NaN where it is open. `error` of the logarithm of conductivity at the peak.
+    """
 
     distance: float
     holds: tuple[bool, bool, bool] | None
@@ -79,7 +80,7 @@ def run(options: Options) -> Result:
 
 
 def outcome(tank: Tank, body: Body, one: Inclusion | None, background: float) -> Outcome:
-    """What a `body` of a tank was found as; `background`: conductivity of the reference."""
+    """The estimate of a `body` of a tank. `background`: conductivity of the reference."""
     if one is None:
         return Outcome(np.inf, None, np.nan, np.nan)
     distance = float(np.linalg.norm(np.array(one.centroid) - body.centre)) / tank.size
@@ -103,7 +104,7 @@ def _holds(value: float, interval: tuple[float | None, float | None]) -> bool:
 
 
 def _coverage(rows) -> np.ndarray:
-    """Shares of bodies with intervals whose change, area and strength they hold."""
+    """Fractions of bodies with intervals whose change, area and strength they contain."""
     held = [one.holds for outcomes, _ in rows for one in outcomes if one.holds is not None]
     return np.mean(held, axis=0) if held else np.full(3, np.nan)
 
@@ -122,11 +123,11 @@ def _row(name: str, rows) -> list[str]:
 
 
 def _line(tank: Tank, outcomes: list[Outcome]) -> str:
-    said = []
+    parts = []
     for body, one in zip(tank.bodies, outcomes, strict=True):
         held = "no interval" if one.holds is None else "".join("+" if yes else "-" for yes in one.holds)
-        said.append(f"{body.change:+.0%} {one.distance:.3f} R {held}")
-    return ", ".join(said)
+        parts.append(f"{body.change:+.0%} {one.distance:.3f} R {held}")
+    return ", ".join(parts)
 
 
-CASE = Case("unlike_tanks", "numbers of bodies in tanks that are not as they are described", run, 60, timed=False)
+CASE = Case("unlike_tanks", "estimates of bodies in tanks that deviate from their description", run, 60, timed=False)

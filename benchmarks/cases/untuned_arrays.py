@@ -1,10 +1,9 @@
-"""The defaults of hearing on arrays that nobody tuned them for: 200 drawn at random, beside each decay model and a fit
-as one writes it plainly.
+"""jeit's defaults for acoustic localisation on 200 random arrays, beside each decay model and a plain fit.
 
-How sound falls off, echoes of the edges, gains, noise, how many microphones there are and where, how well and where it
-is tapped: all drawn by a generator that knows none of jeit's decay models (`benchmarks/problems/heard_arrays.py`).
-Choices were made on arrays of other seeds and other ranges, `DEVELOPMENT` there. Then arrays on which sound falls off
-ever faster than a / (r² + b).
+The decay of sound, echoes of the edges, gains, noise, number and places of microphones, and accuracy and places of taps
+are all drawn by a generator that uses none of jeit's decay models (`benchmarks/problems/simulated_arrays.py`). Choices
+were made on arrays of other seeds and other ranges, `DEVELOPMENT` there. Then arrays on which sound decays ever faster
+than a / (r² + b).
 """
 
 from __future__ import annotations
@@ -13,32 +12,32 @@ import numpy as np
 
 from benchmarks.harness.case import Asked, Case, Options, Result, Table, judged
 from benchmarks.harness.timing import say
-from benchmarks.problems.heard_arrays import REPORTED, draw_array, steep_array
 from benchmarks.problems.located_arrays import Located, located_by_each, plainly_located
+from benchmarks.problems.simulated_arrays import REPORTED, draw_array, steep_array
 from jeit.acoustic.calibration.calibrate import AUTO
 from jeit.acoustic.decay import DECAYS
 
-# Of the first array; how many there are.
+# Seed of the first array, and number of arrays.
 SEED, ARRAYS = 70_000, 200
-# Which arrays a plain fit locates, metres; how much worse than the best fixed model's the median may be.
+# Limit of the arrays that a plain fit locates, metres, and of the median relative to the best fixed model's.
 WITHIN, WORSE = 0.01, 0.1
 LENGTHS = (0.035, 0.05, 0.065, 0.08)
 PLAIN = "plain fit"
 NAMES = (PLAIN, *DECAYS, AUTO)
 
 
-def told(array) -> dict[str, Located]:
-    """What each way makes of an array."""
+def locate_by_each(array) -> dict[str, Located]:
+    """The results of each method for an array."""
     return {PLAIN: plainly_located(array)} | located_by_each(array)
 
 
 def medians(found: list[dict[str, Located]], name: str) -> np.ndarray:
-    """Of the touches of each array, metres; infinite where it is refused."""
+    """Medians over the touches of each array, metres, infinite where it is refused."""
     return np.array([one[name].median for one in found])
 
 
 def arrays_table(found: list[dict[str, Located]]) -> Table:
-    """A row for each way: what is refused, how far off, and what ellipses hold of what is found."""
+    """A row for each method: refusals, errors, and coverage of ellipses among located touches."""
     header = ["decay model", "refused", "of those the plain fit locates", "median, mm", "9 of 10 arrays, mm", "best"]
     header += ["in the 68 % ellipse", "in the 95 % ellipse", "silence taken for touch"]
     least = np.min([medians(found, name) for name in DECAYS], axis=0)
@@ -46,7 +45,7 @@ def arrays_table(found: list[dict[str, Located]]) -> Table:
     rows = []
     for name in NAMES:
         mine = medians(found, name)
-        refused = np.array([bool(one[name].said) for one in found])
+        refused = np.array([bool(one[name].message) for one in found])
         row = [name, str(refused.sum()), str((refused & plain).sum())]
         row += [f"{1e3 * np.quantile(mine, part, method='inverted_cdf'):.1f}" for part in (0.5, 0.9)]
         row += [f"{100 * np.mean(mine <= least):.0f} %"]
@@ -63,7 +62,7 @@ def steep_table(lengths) -> Table:
     """Medians on 25 microphones under 200 × 200 mm, two arrays of each length."""
     rows = []
     for length in lengths:
-        found = [told(steep_array(length, seed)) for seed in (0, 1)]
+        found = [locate_by_each(steep_array(length, seed)) for seed in (0, 1)]
         chosen = ", ".join(dict.fromkeys(one[AUTO].decay for one in found))
         figures = [f"{1e3 * np.mean(medians(found, name)):.1f}" for name in NAMES]
         rows.append([f"{1e3 * length:.0f} mm", *figures, chosen])
@@ -72,19 +71,19 @@ def steep_table(lengths) -> Table:
 
 
 def run(options: Options) -> Result:
-    """Both tables, and what is asked."""
+    """Both tables, and the required figures."""
     number, lengths = (4, LENGTHS[1:2]) if options.quick else (ARRAYS, LENGTHS)
     found = []
     for k in range(number):
-        found.append(told(draw_array(REPORTED, SEED + k)))
+        found.append(locate_by_each(draw_array(REPORTED, SEED + k)))
         if (k + 1) % 20 == 0:
             say(f"{k + 1} arrays, median {1e3 * np.median(medians(found, AUTO)):.1f} mm")
     return Result([arrays_table(found), steep_table(lengths)], asked(found))
 
 
 def asked(found: list[dict[str, Located]]) -> list[Asked]:
-    """None refused that the plain fit locates; the median beside that of the best fixed model."""
-    lost = sum(bool(one[AUTO].said) and one[PLAIN].median < WITHIN for one in found)
+    """None refused that the plain fit locates, and the median beside that of the best fixed model."""
+    lost = sum(bool(one[AUTO].message) and one[PLAIN].median < WITHIN for one in found)
     mine = np.median(medians(found, AUTO))
     fixed = {name: float(np.median(medians(found, name))) for name in DECAYS}
     best = min(fixed, key=lambda name: fixed[name])

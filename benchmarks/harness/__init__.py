@@ -1,1 +1,1 @@
-"""How anything is measured: contestants in processes of their own, their turns, their memory, the machine, tables."""
+"""Measurement: contestants in processes of their own, their turns, their memory, the machine, and tables."""

@@ -1,4 +1,4 @@
-"""The one interface of every case: what it is told, and what it answers."""
+"""The interface of every case: its options and its result."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ MET, MISSED, NOT_MEASURED, NOT_JUDGED = "met", "missed", "not measured", "not ju
 
 @dataclass(frozen=True)
 class Options:
-    """What every case is told; `None` and empty mean the case's own choice.
+    """The options of a case. `None` and empty mean the case's own choice.
 
-    `quick`: a smoke run on small problems. `output`: where pictures go. `data`: folder of measured data. `nodes` and
+    `quick`: a smoke run on small problems. `output`: folder for figures. `data`: folder of measured data. `nodes` and
     `electrodes`: sizes, for the cases that have a choice. `rounds`: turns of each contestant. `time_limit`: seconds of
     one call, after which a contestant has given up.
     """
@@ -31,7 +31,7 @@ class Options:
 
 @dataclass
 class Table:
-    """Rows of text under a header; what was done, its time, its accuracy and what it took in the same row."""
+    """Rows of text under a header. Each row has a job, its time, its accuracy and its memory."""
 
     header: list[str]
     rows: list[list[str]]
@@ -41,7 +41,7 @@ class Table:
 
 @dataclass
 class Asked:
-    """One figure that is asked for: what, what was measured, and `met`, `missed` or `not measured` (or nothing)."""
+    """A required figure: the requirement, the measured figure, and `met`, `missed` or `not measured` (or empty)."""
 
     asked: str
     measured: str
@@ -49,7 +49,7 @@ class Asked:
 
 
 def judged(asked: str, measured: str, met: bool) -> Asked:
-    """A figure that was measured, and whether it is what is asked."""
+    """A measured figure, and whether it meets the requirement."""
     return Asked(asked, measured, MET if met else MISSED)
 
 
@@ -66,9 +66,9 @@ class Headline:
 
 @dataclass
 class Result:
-    """What a case answers.
+    """The result of a case.
 
-    `notes`: who competed, with which choices. `wrong`: results that disagree, for which the command fails.
+    `notes`: the contestants and their choices. `wrong`: results that disagree, for which the command fails.
     """
 
     tables: list[Table]
@@ -85,7 +85,7 @@ class Result:
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> Result:
-        """Undo `as_dict`."""
+        """The inverse of `as_dict`."""
         headline = plain["headline"]
         return cls(
             **plain
@@ -99,11 +99,11 @@ class Result:
 
 @dataclass(frozen=True)
 class Case:
-    """A name, a line about it, and the function that measures it.
+    """A name, a one-line description, and the function that measures the case.
 
-    `minutes`: about how long it takes on two quiet cores. `page`: a page of the documentation, and the name of the
-    markers in it between which its tables go too. `pictures`: whether it draws any. `timed`: whether its figures are
-    times; one whose figures are not may run beside another.
+    `minutes`: its approximate duration on two quiet cores. `page`: a page of the documentation, and the name of the
+    markers in it between which its tables are written. `pictures`: whether it draws any. `timed`: whether its figures
+    are times. A case whose figures are not may run in parallel with another.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Contestants in their processes, their turns interleaved, and what they needed: time, compile time, memory."""
+"""Contestants in their processes, with interleaved turns: time, compile time and memory."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ import numpy as np
 
 from benchmarks.harness.machine import ROOT, same_for_all
 
-# After its last task a pool of BLAS threads spins for a while: let it fall asleep before the next one's turn.
+# After its last task a pool of BLAS threads spins for a while: the pause lets it sleep before the next turn.
 REST = 0.06
 TURN = 0.1
-# A call this long, in seconds, is timed alone and not warmed up for.
+# A call of more than this, in seconds, is timed alone, without a warm-up call.
 SLOW = 1.0
-# A first call this long, in seconds, is not compilation, and is not repeated.
+# A first call of more than this, in seconds, is not counted as compilation, and is not repeated.
 LONG = 60.0
 
 
 class GaveUpError(Exception):
-    """A contestant took longer than its limit, ran out of memory or failed."""
+    """A contestant exceeded its limit, ran out of memory or failed."""
 
 
 @dataclass
 class Figures:
-    """What one contestant needed for one task: seconds of each call, of the first one, and peak memory in MB.
+    """The figures of one contestant for one task: seconds of each call, of the first one, and peak memory in MB.
 
     `remark`: why there are none.
     """
@@ -44,12 +44,12 @@ class Figures:
 
     @property
     def median(self) -> float:
-        """Median time of one repeat in seconds; NaN if it gave up."""
+        """Median time of one repeat in seconds. NaN if it gave up."""
         return statistics.median(self.seconds) if self.seconds else float("nan")
 
     @property
     def compile(self) -> float:
-        """What the first call took beyond a later one: compilation, in seconds."""
+        """The time of the first call beyond a later one: compilation, in seconds."""
         return max(self.first - self.median, 0.0) if self.seconds else float("nan")
 
 
@@ -101,7 +101,7 @@ class Contestant:
         return self._receive(self.limit)
 
     def save(self, task: str, path: Path) -> list[np.ndarray]:
-        """Results of a task for the first conductivity."""
+        """Save the results of a task for the first conductivity."""
         self.ask(do="save", task=task, path=str(path))
         results = results_in(path)
         path.unlink()
@@ -124,7 +124,7 @@ class Contestant:
 
 
 def results_in(path: Path) -> list[np.ndarray]:
-    """The arrays that a contestant has left."""
+    """The arrays that a contestant has saved."""
     with np.load(path) as arrays:
         return [arrays[name] for name in arrays.files]
 
@@ -132,11 +132,11 @@ def results_in(path: Path) -> list[np.ndarray]:
 def compete(
     contestants: list[Contestant], task: str, *, rounds: int, budget: float, folder: Path | None = None
 ) -> dict[str, Figures]:
-    """Median times of a task, the contestants taking turns so that a drifting machine is unfair to none.
+    """Median times of a task. Contestants take turns, so that a drift of the machine affects all of them.
 
-    Each turn makes as many calls as fit in `TURN` seconds (at most 25), after one that is not timed. `budget`:
-    seconds a contestant may use in all; a slow one gets fewer rounds, at least one (its first, if that is very long).
-    `folder`: where to leave the results of the first conductivity, NAME.npz.
+    Each turn makes as many calls as fit in `TURN` seconds (at most 25), after one that is not timed. `budget`: seconds
+    a contestant may use in all. A slow one has fewer rounds, at least one (its first, if that is very long). `folder`:
+    for the results of the first conductivity, NAME.npz.
     """
     playing = [one for one in contestants if task in one.tasks]
     figures = {one.name: _begin(one, task, folder) for one in playing}
@@ -159,7 +159,7 @@ def compete(
 
 
 def _begin(contestant: Contestant, task: str, folder: Path | None) -> Figures:
-    """Figures with the time of the first call, whose results are left in the folder."""
+    """Figures with the time of the first call, whose results are saved in the folder."""
     saved = {} if folder is None else {"path": str(folder / f"{contestant.name}.npz")}
     try:
         first = contestant.ask(do="first", task=task, **saved)["seconds"]
@@ -169,9 +169,9 @@ def _begin(contestant: Contestant, task: str, folder: Path | None) -> Figures:
 
 
 def _probe(contestant: Contestant, task: str, result: Figures) -> float:
-    """About how long a repeat takes, in seconds, once what is compiled is compiled; notes its peak memory.
+    """The approximate time of a repeat after compilation, in seconds. Records its peak memory.
 
-    A slow one counts as a repeat already.
+    A slow call counts as a repeat.
     """
     if result.remark or result.seconds:
         return result.first

@@ -1,4 +1,4 @@
-"""Virtual environments of opponents that must not meet jeit's libraries, made when first needed."""
+"""Virtual environments of opponents whose libraries conflict with jeit's, created when first needed."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ REQUIREMENTS = Path(__file__).parents[1] / "opponents" / "requirements"
 
 
 def python(opponent: str, *also: str, create: bool = True) -> str | None:
-    """Interpreter of an opponent's environment in `.cache/` of the repository; None if it is missing or can't be made.
+    """Interpreter of an opponent's environment in `.cache/` of the repository. None if it is missing or cannot be
+    created.
 
-    What goes into it is pinned in `opponents/requirements/OPPONENT.txt`, and in `also` (pip's requirements).
+    Its packages are pinned in `opponents/requirements/OPPONENT.txt`, and in `also` (pip's requirements).
     """
     requirements = REQUIREMENTS / f"{opponent}.txt"
     key = hashlib.sha256(requirements.read_bytes() + " ".join((sys.version, *also)).encode()).hexdigest()[:12]

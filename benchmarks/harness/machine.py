@@ -1,4 +1,4 @@
-"""What the figures were measured on, and with: the machine, the versions, the commit, the day."""
+"""The origin of figures: the machine, the versions, the commit, the day."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 CORES = 2
 PACKAGES = ("jeit", "jax", "jaxlib", "numpy", "scipy", "equinox", "lineax")
-# What makes a figure: the command itself writes RESULTS.md, README.md and pages of docs/.
+# Files that affect figures. RESULTS.md, README.md and pages of docs/ are written by the command itself.
 MEASURED = ("jeit", "solvers", "benchmarks", "pyproject.toml", ":!benchmarks/RESULTS.md")
 
 
 def use_cores(count: int = CORES) -> None:
-    """Bind this process, and those it starts, to `count` cores, where the system can."""
+    """Bind this process, and its child processes, to `count` cores, where the system allows it."""
     if hasattr(os, "sched_setaffinity"):
         allowed = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, allowed[:count])
 
 
 def same_for_all() -> dict[str, str]:
-    """The environment of every process that is measured: as many threads for each, nothing compiled before."""
+    """The environment of every measured process: the same number of threads, and no compiled code."""
     environment = dict(os.environ)
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         environment[variable] = str(CORES)
@@ -47,7 +47,7 @@ def heading() -> list[str]:
 
 
 def commit() -> str:
-    """The commit that is measured, with `-dirty` if anything that makes a figure differs from it."""
+    """The measured commit, with `-dirty` if any file that affects figures differs from it."""
     try:
         name = _git("rev-parse", "--short", "HEAD")
         changed = _git("status", "--porcelain", "--", *MEASURED)

@@ -1,4 +1,4 @@
-"""Peak memory of this process, where the system tells it."""
+"""Peak memory of this process, where the system reports it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def peak_memory() -> float | None:
 
 
 def reset_peak_memory() -> None:
-    """Start counting peak memory anew, where the system can."""
+    """Restart the measurement of peak memory, where the system allows it."""
     gc.collect()
     try:
         Path("/proc/self/clear_refs").write_text("5")
@@ -25,7 +25,7 @@ def reset_peak_memory() -> None:
 
 
 def available_memory() -> float:
-    """Memory in bytes that is free to use now (8 GiB if the system does not say)."""
+    """Free memory in bytes (8 GiB if the system does not report it)."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:

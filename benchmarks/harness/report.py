@@ -1,4 +1,4 @@
-"""A case's result as text, and where it is kept: `RESULTS.md`, the README's table, a page of the documentation."""
+"""A case's result as text, and its files: `RESULTS.md`, the README's table, a page of the documentation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def tables(result: Result) -> str:
 
 
 def text(result: Result, heading: list[str]) -> str:
-    """What was measured, on what, and what was asked."""
+    """The heading, tables, notes and required figures of a result."""
     spent = f"{duration(result.seconds)} in all"
     if result.peak_memory is not None:
         spent += f"; the case's own process took {result.peak_memory:.0f} MB at most"
@@ -42,7 +42,7 @@ def text(result: Result, heading: list[str]) -> str:
 
 
 def section(case: Case, result: Result, heading: list[str]) -> str:
-    """A case's part of `RESULTS.md`, with its row of the README in a comment."""
+    """A case's section of `RESULTS.md`, with its row of the README in a comment."""
     parts = [f"## {case.name}", f"{case.description[:1].upper()}{case.description[1:]}.", text(result, heading)]
     if result.headline is not None:
         parts.insert(1, f"<!-- headline {json.dumps(vars(result.headline), ensure_ascii=False)} -->")
@@ -50,7 +50,7 @@ def section(case: Case, result: Result, heading: list[str]) -> str:
 
 
 def sections(path: Path) -> dict[str, str]:
-    """Name of a case: its part of the file."""
+    """The sections of a file by the name of their case."""
     if not path.exists():
         return {}
     found = re.split(r"^(?=## )", path.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
@@ -58,15 +58,15 @@ def sections(path: Path) -> dict[str, str]:
 
 
 def headlines(known: dict[str, str]) -> dict[str, Headline]:
-    """The README's rows that the sections hold."""
+    """The README's rows that the sections contain."""
     found = {name: re.search(r"<!-- headline (.*) -->", one) for name, one in known.items()}
     return {name: Headline(**json.loads(row.group(1))) for name, row in found.items() if row is not None}
 
 
 def keep(path: Path, name: str, new: str, order: tuple[str, ...]) -> dict[str, str]:
-    """Put one case's section into the file, and leave the others as they are; all sections.
+    """Replace or add one case's section in the file, and return all sections.
 
-    The file is replaced at once, so that a run that is stopped leaves the old one or the new one.
+    The file is replaced atomically, so that a run that is stopped leaves the old one or the new one.
     """
     known = sections(path) | {name: new}
     known = {one: known[one] for one in order if one in known}
@@ -85,7 +85,7 @@ def readme_table(known: dict[str, str]) -> str:
 
 
 def write(case: Case, result: Result, heading: list[str], order: tuple[str, ...], root: Path = ROOT) -> list[str]:
-    """Write the case's section, the README's table, and the case's page if it has one; what could not be written."""
+    """Write the case's section, the README's table, and the case's page if any. Returns messages about failures."""
     known = keep(root / "benchmarks" / RESULTS.name, case.name, section(case, result, heading), order)
     pages = [("README.md", "benchmark", readme_table(known))]
     if case.page is not None:

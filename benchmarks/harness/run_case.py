@@ -1,6 +1,6 @@
 """One case in a process of its own: `python -m benchmarks.harness.run_case NAME OPTIONS.pickle RESULT.json`.
 
-So that memory is each case's own, nothing is compiled before, and a case that crashes does not take the others along.
+Each case thus has its own memory and no compiled code, and a case that crashes does not affect the others.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class CaseFailedError(Exception):
 def run_apart(name: str, options: Options) -> Result:
     """The case's result, from a process of its own. Raises `CaseFailedError` if it ends without one."""
     with tempfile.TemporaryDirectory() as folder:
-        told, answer = Path(folder, "options"), Path(folder, "result")
-        told.write_bytes(pickle.dumps(options))
-        command = [sys.executable, "-m", "benchmarks.harness.run_case", name, str(told), str(answer)]
+        option_file, answer = Path(folder, "options"), Path(folder, "result")
+        option_file.write_bytes(pickle.dumps(options))
+        command = [sys.executable, "-m", "benchmarks.harness.run_case", name, str(option_file), str(answer)]
         ended = subprocess.run(command, cwd=ROOT, env=same_for_all(), check=False)
         if ended.returncode != 0 or not answer.is_file():
             raise CaseFailedError(f"{name} ended with exit code {ended.returncode}; see the messages above.")
@@ -49,9 +49,9 @@ def run_here(name: str, options: Options) -> Result:
 
 
 def main() -> None:
-    """Run the case that the command line names, and leave its result."""
-    name, told, answer = sys.argv[1:]
-    result = run_here(name, pickle.loads(Path(told).read_bytes()))
+    """Run the case that the command line names, and save its result."""
+    name, option_file, answer = sys.argv[1:]
+    result = run_here(name, pickle.loads(Path(option_file).read_bytes()))
     Path(answer).write_text(json.dumps(result.as_dict()), encoding="utf-8")
 
 

@@ -9,7 +9,7 @@ from benchmarks.harness.contest import Figures
 
 
 def duration(seconds: float) -> str:
-    """A time with three figures and a fitting unit."""
+    """A time with three digits and a suitable unit."""
     if math.isnan(seconds):
         return "–"
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
@@ -20,31 +20,31 @@ def duration(seconds: float) -> str:
 
 
 def times(value: float) -> str:
-    """How many times longer."""
+    """A ratio as text, with "×"."""
     return f"{value:.0f}×" if value >= 20 else f"{value:.1f}×" if value >= 0.95 else f"{value:.2f}×"
 
 
 def cell(figures: Figures | None, share: int = 1) -> str:
-    """Median time of a contestant, of each of `share` alike, or why there is none."""
+    """Median time of a contestant, divided by `share`, or why there is none."""
     if figures is None:
         return "–"
     return figures.remark if figures.remark or not figures.seconds else duration(figures.median / share)
 
 
 def ratio(figures: Figures | None, reference: Figures) -> str:
-    """How many times longer than the reference."""
+    """Ratio to the reference."""
     if figures is None or figures.remark or not figures.seconds or not reference.seconds:
         return ""
     return times(figures.median / reference.median)
 
 
 def megabytes(*figures: Figures | None) -> str:
-    """Peak memory of each, parted by strokes."""
+    """Peak memory of each, separated by slashes."""
     return " / ".join("–" if one is None or one.peak is None else f"{one.peak:.0f} MB" for one in figures)
 
 
 def markdown(header: list[str], rows: list[list[str]], *, padded: bool = True) -> str:
-    """A Markdown table, `padded` so that it reads as plain text too."""
+    """A Markdown table. If `padded`, it is readable as plain text too."""
     shown = [header, *rows] if padded else [["---"] * len(header)]
     widths = [max(len(row[column]) for row in shown) for column in range(len(header))]
     lines = [header, ["-" * width for width in widths], *rows]
@@ -54,7 +54,7 @@ def markdown(header: list[str], rows: list[list[str]], *, padded: bool = True) -
 
 
 def write_between_markers(path: Path, text: str, name: str = "benchmark") -> None:
-    """Replace what stands between the markers of this name in a file. Raises `ValueError` if it has no markers."""
+    """Replace the text between the markers of this name in a file. Raises `ValueError` if it has no markers."""
     begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
     content = path.read_text(encoding="utf-8")
     if content.count(begin) != 1 or content.count(end) != 1:

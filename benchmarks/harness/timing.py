@@ -1,4 +1,4 @@
-"""Times of functions within one process: the first call apart from later ones, of which the median counts."""
+"""Times of functions within one process: the first call separate from later ones, of which the median counts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 
 class Timed(NamedTuple):
-    """Median seconds of a call, what the first call took beyond it (compilation), and the last call's answer."""
+    """Median seconds of a call, the additional time of the first call (compilation), and the last call's result."""
 
     median: float
     compile: float
@@ -20,7 +20,7 @@ class Timed(NamedTuple):
 def timed(function: Callable[[], Any], rounds: int, budget: float = float("inf")) -> Timed:
     """Call once, then `rounds` times, or fewer (at least once) if those take more than `budget` seconds.
 
-    What JAX computes is waited for.
+    The function waits for the results of JAX.
     """
     import jax
 
@@ -37,9 +37,9 @@ def timed(function: Callable[[], Any], rounds: int, budget: float = float("inf")
 
 
 def least_times(functions: dict[str, Callable[[], Any]], repeats: int = 15, budget: float = 4.0) -> dict[str, float]:
-    """Least time in seconds of each function, the repeats interleaved, no more of them than fit in `budget` seconds.
+    """Least time in seconds of each function, with interleaved repeats, as many as fit in `budget` seconds.
 
-    For choosing the fastest of several ways, not for figures.
+    For choosing the fastest of several alternatives, not for figures.
     """
     least, start = dict.fromkeys(functions, float("inf")), time.perf_counter()
     for _ in range(repeats):
@@ -53,5 +53,5 @@ def least_times(functions: dict[str, Callable[[], Any]], repeats: int = 15, budg
 
 
 def say(text: str) -> None:
-    """Progress, apart from the report."""
+    """Progress, separate from the report."""
     print(text, file=sys.stderr, flush=True)

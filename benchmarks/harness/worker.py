@@ -1,8 +1,9 @@
-"""One contestant in a process of its own: takes commands on standard input, answers on standard output, in JSON lines.
+"""One contestant in a process of its own: reads commands from standard input, writes answers to standard output, as
+JSON lines.
 
-Run as `python -m benchmarks.harness.worker CONTESTANT PROBLEM.npz`. Contestants live in processes so that pyEIT and
-sparsax can have their own environments, so that memory is each one's own, and so that turns can be interleaved
-whoever's turn it is.
+Run as `python -m benchmarks.harness.worker CONTESTANT PROBLEM.npz`. Contestants have processes of their own so that
+pyEIT and sparsax can have their own environments, so that memory is measured for each, and so that turns can be
+interleaved.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def store(contestant, task: str, results, path: str) -> None:
 
 
 def answer(contestant, command: dict) -> dict:
-    """Carry out one command: `describe`, `first`, `time`, `probe` (a call's time and peak memory) or `save`."""
+    """Execute one command: `describe`, `first`, `time`, `probe` (a call's time and peak memory) or `save`."""
     match command["do"]:
         case "describe":
             details = getattr(contestant, "details", {})
@@ -65,7 +66,7 @@ def answer(contestant, command: dict) -> dict:
 def main() -> None:
     """Serve until standard input closes."""
     name, path = sys.argv[1:]
-    # Whatever a library prints must not mix with the answers.
+    # Output printed by a library must not mix with the answers.
     channel = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     try:

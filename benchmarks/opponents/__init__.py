@@ -1,4 +1,4 @@
-"""Who competes: one file for each opponent at each kind of task, and jeit's own turn at the same.
+"""The contestants: one file for each opponent at each kind of task, and jeit at the same tasks.
 
 `CONTESTANTS` names those that run in processes of their own: the module, the class, and its arguments after the
 problem's arrays. A contestant has `tasks` (name: function of the number of the repeat), a `description`, and may have

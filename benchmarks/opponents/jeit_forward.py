@@ -1,4 +1,4 @@
-"""jeit's turn at every task, through its public interface."""
+"""jeit at every task, through its public interface."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _voltages_and_jacobians_of_many(model, conductivities):
 
 
 class JeitContestant:
-    """`tasks` maps a task's name to a function of the number of the repeat, which picks the conductivity or frame."""
+    """`tasks` maps a task's name to a function of the number of the repeat, which selects the conductivity or frame."""
 
     def __init__(self, problem: dict[str, np.ndarray]):
         mesh = Mesh.create(problem["points"], problem["cells"])
@@ -38,7 +38,7 @@ class JeitContestant:
         protocol = Protocol(
             problem["drive"], problem["measurement"], problem["drive_index"], problem["measurement_index"]
         )
-        model = ForwardModel(mesh, electrodes, protocol, solver="cholesky")  # asked again and again: compiled
+        model = ForwardModel(mesh, electrodes, protocol, solver="cholesky")  # called repeatedly: compiled
         conductivities = jnp.asarray(problem["conductivities"])
         each, count = list(conductivities), len(conductivities)
         frames = jnp.asarray(problem["frames"])
@@ -68,7 +68,7 @@ class JeitContestant:
         return np.asarray(self._model.voltages(jnp.asarray(conductivity)))
 
     def _imager(self, problem):
-        """NOSER on log σ, with every shape there is, so that opponents can minimise the same."""
+        """NOSER on log σ, with all basis functions, so that opponents can minimise the same function."""
         return Imager.create(
             self._model,
             self._background,
@@ -81,7 +81,7 @@ class JeitContestant:
 
     @property
     def reconstruction(self):
-        """The one-step reconstruction, made when first asked for."""
+        """The one-step reconstruction, computed on first use."""
         if self._reconstruction is None:
             self._reconstruction = one_step(self._model, self._background, prior=Noser(), hyperparameter=1e-2)
         return self._reconstruction

@@ -1,4 +1,4 @@
-"""The sparse direct solver of matrices at hand: factorisation in NumPy, with solutions or with products alone."""
+"""The sparse direct solver of concrete matrices: factorisation in NumPy, with solutions or with products alone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jeit_solvers import SparsityPattern, factorise_fronts, find_fronts
 
 
 class JeitFronts:
-    """`tasks` maps a task's name to a function of the number of the repeat, which picks the matrix."""
+    """`tasks` maps a task's name to a function of the number of the repeat, which selects the matrix."""
 
     def __init__(self, problem: dict[str, np.ndarray]):
         pattern = SparsityPattern.from_entries(problem["rows"], problem["columns"], len(problem["load"]))

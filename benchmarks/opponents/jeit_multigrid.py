@@ -1,4 +1,4 @@
-"""Conjugate gradients with multigrid, of matrices at hand: levels are made anew for each matrix."""
+"""Conjugate gradients with multigrid, for concrete matrices: levels are computed anew for each matrix."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jeit_solvers import Multigrid, SparseSymmetric, SparsityPattern
 
 
 class JeitMultigrid:
-    """`tasks` maps a task's name to a function of the number of the repeat, which picks the matrix."""
+    """`tasks` maps a task's name to a function of the number of the repeat, which selects the matrix."""
 
     def __init__(self, problem: dict[str, np.ndarray]):
         jax.config.update("jax_enable_x64", True)

@@ -1,4 +1,4 @@
-"""The sparse direct solver's turn: jitted factorisation, solution, and both, alone and for a batch of matrices."""
+"""The sparse direct solver under jit: factorisation, solution, and both, for one matrix and for a batch."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from jeit_solvers import SparsityPattern, analyse, factorise, in_turn, solve
 
 
 def factorise_and_solve(plan, values, load):
-    """The task: values (nnz,) of a matrix, just assembled, and load (n, k) to the solution (n, k)."""
+    """The task: from newly assembled values (nnz,) of a matrix and a load (n, k) to the solution (n, k)."""
     return solve(plan, factorise(plan, values), load)
 
 
 class JeitSolver:
-    """`tasks` maps a task's name to a function of the number of the repeat, which picks the matrix."""
+    """`tasks` maps a task's name to a function of the number of the repeat, which selects the matrix."""
 
     def __init__(self, problem: dict[str, np.ndarray]):
         start = time.perf_counter()

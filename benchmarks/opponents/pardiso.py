@@ -1,6 +1,6 @@
 """Intel's PARDISO (oneMKL, through pypardiso) at the sparse solver's task, in an environment of its own.
 
-The pattern is analysed once; every repeat factorises another matrix of it, with oneMKL's default settings.
+The pattern is analysed once. Every repeat factorises another matrix of it, with oneMKL's default settings.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from benchmarks.problems.matrices import symmetric
 
 
 class Pardiso:
-    """`tasks` maps a task's name to a function of the number of the repeat, which picks the matrix."""
+    """`tasks` maps a task's name to a function of the number of the repeat, which selects the matrix."""
 
     def __init__(self, problem: dict[str, np.ndarray]):
         load, count = np.asfortranarray(problem["load"]), len(problem["values"])

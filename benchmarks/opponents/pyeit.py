@@ -1,7 +1,7 @@
-"""pyEIT's turn, on the same mesh, protocol and conductivities; runs in pyEIT's own environment.
+"""pyEIT on the same mesh, protocol and conductivities, in pyEIT's own environment.
 
-pyEIT knows point electrodes only, one node each, so it meets jeit's point electrode model. It drives 1 A, and its
-Jacobian is -∂v/∂σ; `in_si` undoes both for the comparison, outside the timed part.
+pyEIT has point electrodes only, one node each, so it is compared with jeit's point electrode model. It drives 1 A, and
+its Jacobian is -∂v/∂σ. `in_si` converts both for the comparison, outside the timed part.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from pyeit.mesh import PyEITMesh
 
 from benchmarks.problems.disk import GAUSS_NEWTON, STEPS
 
-# Of fifteen settings tried (its three methods, weights from 1e-4 to 1e4, falling and constant, its example's among
-# them), the one whose images come nearest to the truth; its misfit is within 5 % of the lowest.
+# Of fifteen tested settings (its three methods, weights from 1e-4 to 1e4, decreasing and constant, with its example's
+# among them), the one whose images are closest to the truth. Its misfit is within 5 % of the lowest.
 SETTING = {"method": "kotre", "p": 0.5, "lamb": 0.1}
 
 
 class PyeitContestant:
-    """`tasks` maps a task's name to a function of the number of the repeat, which picks the conductivity."""
+    """`tasks` maps a task's name to a function of the number of the repeat, which selects the conductivity."""
 
     def __init__(self, problem: dict[str, np.ndarray]):
         drive, measurement = problem["drive"], problem["measurement"]
@@ -30,7 +30,7 @@ class PyeitContestant:
         num_drives = len(drive)
         drive_pairs = np.stack([drive.argmax(axis=1), drive.argmin(axis=1)], axis=1)
         pairs = np.stack([measurement.argmax(axis=1), measurement.argmin(axis=1)], axis=1)
-        # pyEIT wants as many channels for every drive, drive by drive: adjacent protocols have that.
+        # pyEIT requires equally many channels for every drive, drive by drive: adjacent protocols have that.
         if not np.array_equal(drive_index, np.repeat(np.arange(num_drives), len(drive_index) // num_drives)):
             raise ValueError("pyEIT needs channels drive by drive, equally many for each.")
         current = drive.max()
@@ -57,7 +57,7 @@ class PyeitContestant:
         }
         if "measured" in problem:
             measured, solver = problem["measured"] / current, JAC(mesh, protocol)
-            # `setup` inverts once for linear images, which `gn` does not use: only its parameters are wanted.
+            # `setup` inverts once for linear images, which `gn` does not use: only its parameters are needed.
             solver.params, solver.is_ready = SETTING, True
             self.description += f", {SETTING}"
             self.tasks[GAUSS_NEWTON] = lambda k: solver.gn(
@@ -65,7 +65,7 @@ class PyeitContestant:
             )
 
     def in_si(self, task, results):
-        """Volts, and volts per siemens, at the problem's current; images are in siemens already."""
+        """Volts, and volts per siemens, at the problem's current. Images are in siemens already."""
         if task == GAUSS_NEWTON:
             return results
         if isinstance(results, tuple):

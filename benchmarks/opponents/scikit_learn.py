@@ -1,4 +1,4 @@
-"""scikit-learn's k-means, on one thread, which suits it best at this size."""
+"""scikit-learn's k-means, on one thread, which is fastest at this size."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from benchmarks.harness.timing import Timed, timed
 
 
 def kmeans(vectors: np.ndarray, number: int, rounds: int, draws: int) -> tuple[Timed, float]:
-    """Clusters of vectors (n, d), 10 restarts; and the median inertia of some draws."""
+    """Clusters of vectors (n, d), 10 restarts, and the median inertia of several runs."""
     from sklearn.cluster import KMeans
     from threadpoolctl import threadpool_limits
 

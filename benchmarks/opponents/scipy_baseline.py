@@ -2,7 +2,7 @@
 
 Everything that does not depend on the conductivity is done once, in the constructor: element matrices, the sparse map
 from conductivity to matrix entries, gradients, the fill-reducing ordering (timed, the fastest kept) and the way the
-products are formed (timed, the fastest kept). What is left is the least a SciPy user can pay per conductivity.
+products are formed (timed, the fastest kept). The rest is the least cost per conductivity for a user of SciPy.
 
 Two strengths:
 
@@ -60,7 +60,7 @@ class ScipyBaseline:
 
     @property
     def reciprocal_pairs(self) -> list[tuple[int, int]]:
-        """Channels of equal reading, each pair once; -1 for one without a twin."""
+        """Channels of equal reading, each pair once. -1 for one without a duplicate."""
         return [(channel, twin) for channel, twin, _, _ in self._reciprocal]
 
     @property
@@ -71,10 +71,10 @@ class ScipyBaseline:
 
     @property
     def choices(self) -> str:
-        """Which ordering and which way of forming products won on this mesh."""
+        """The ordering and the way of forming products that were fastest on this mesh."""
         return f"{self.ordering}; {self.product.__name__.strip('_').replace('_', ' ')}"
 
-    # What depends on the conductivity: the timed part.
+    # The timed part, which depends on the conductivity.
 
     def voltages(self, conductivity: np.ndarray) -> np.ndarray:
         """Voltages (M,) in volts for a conductivity (m,) in siemens."""
@@ -111,7 +111,7 @@ class ScipyBaseline:
         stacked = self._gradient @ np.ascontiguousarray(fields)
         return np.ascontiguousarray(stacked.T).reshape(-1, 2, self.num_cells).transpose(1, 0, 2)
 
-    # Three ways of forming J[k, e] = -∫_e ∇u_drive(k) · ∇u_measurement(k); the fastest on this mesh is kept.
+    # Three ways of forming J[k, e] = -∫_e ∇u_drive(k) · ∇u_measurement(k). The fastest on this mesh is kept.
 
     def _by_drive(self, gradients):
         jacobian = np.empty((len(self.drive_index), self.num_cells))
@@ -135,7 +135,7 @@ class ScipyBaseline:
         per_cell = np.ascontiguousarray(gradients.transpose(2, 1, 0))
         products = np.matmul(-per_cell, per_cell.transpose(0, 2, 1)).reshape(self.num_cells, -1)
         chosen = np.take(products, self._drive_field * per_cell.shape[1] + self._measurement_field, axis=1)
-        return chosen.T  # column-major, as it comes: a row-major copy would only cost time
+        return chosen.T  # column-major, as computed: a row-major copy would only cost time
 
     def _by_reciprocal_pair(self, gradients):
         jacobian = np.empty((len(self.drive_index), self.num_cells))
@@ -150,7 +150,7 @@ class ScipyBaseline:
                 jacobian[twin] = row
         return jacobian
 
-    # What does not depend on the conductivity.
+    # The part that does not depend on the conductivity.
 
     def _set_up_electrodes(self, problem):
         count = self.num_points
@@ -159,7 +159,7 @@ class ScipyBaseline:
             self._nodes = problem["nodes"]
             self._load = np.zeros((count, len(self._nodes)), order="F")
             self._load[self._nodes, np.arange(len(self._nodes))] = 1.0
-            # Grounding one node through 1 S leaves currents that sum to zero as they are.
+            # Grounding one node through 1 S does not change currents that sum to zero.
             self._contact = scipy.sparse.coo_matrix(([1.0], ([0], [0])), (count, count))
             return
         mass, load, area = contact_integrals(
@@ -174,7 +174,7 @@ class ScipyBaseline:
         first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         self.area = 0.5 * (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
         stiffness = np.einsum("mid,mjd->mij", edge, edge) / (4 * self.area[:, None, None])
-        # The gradient of a corner's basis function is its opposite edge turned by 90°, over twice the area.
+        # The gradient of a corner's basis function is its opposite edge rotated by 90°, over twice the area.
         turned = np.stack([-edge[..., 1], edge[..., 0]], axis=-1) / (2 * self.area[:, None, None])
         weighted = turned * np.sqrt(self.area)[:, None, None]
         shape, rows = (self.num_cells, self.num_points), np.repeat(np.arange(self.num_cells), 3)
@@ -198,7 +198,7 @@ class ScipyBaseline:
         self._constant_values = np.bincount(place[entries:], contact.data, len(unique))
 
     def _set_up_fields(self):
-        """Drive and measurement patterns are solved for once where they are proportional."""
+        """Drive and measurement patterns that are proportional are solved for once."""
         patterns, drive_field, drive_scale = _distinct(self.drive, np.empty((0, self.drive.shape[1])))
         patterns, measurement_field, measurement_scale = _distinct(self.measurement, patterns)
         self._patterns = patterns
@@ -249,7 +249,7 @@ def _superlu(options):
 
 
 def _distinct(rows, known):
-    """Directions among `rows` not yet in `known`, which direction each row has, and its length along it."""
+    """Directions among `rows` not yet in `known`, the direction of each row, and its length along it."""
     directions, which, scale = list(known), [], []
     for row in rows:
         size = np.abs(row).max()

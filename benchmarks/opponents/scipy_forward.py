@@ -1,4 +1,4 @@
-"""The SciPy baseline's turn at every task."""
+"""The SciPy baseline at every task."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from benchmarks.problems.disk import GAUSS_NEWTON, STEPS
 
 
 class ScipyContestant:
-    """`tasks` maps a task's name to a function of the number of the repeat, which picks the conductivity or frame."""
+    """`tasks` maps a task's name to a function of the number of the repeat, which selects the conductivity or frame."""
 
     def __init__(self, problem: dict[str, np.ndarray], strength):
         baseline = ScipyBaseline(problem, strength)

@@ -1,7 +1,7 @@
-"""Localisation as one writes it plainly with NumPy and SciPy: frame by frame, each a map over pixels and a refinement.
+"""Localisation in a plain NumPy and SciPy implementation: frame by frame, each a map over pixels and a refinement.
 
-Text S2 of Park 2022: the loss on a raster, the least pixel, then a bounded solver from there. What does not change from
-frame to frame (distances, responses) is worked out once.
+Text S2 of Park 2022: the loss on a raster, its least pixel, then a bounded solver from there. Constants (distances,
+responses) are computed once.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class PlainLocaliser:
     def map(self, intensity: np.ndarray) -> np.ndarray:
         """The loss of one frame on the raster, relative to the square of the loudest intensity."""
         loudest = intensity.argmax()
-        told = (intensity / intensity[loudest])[:, None, None] * self.inverse
-        return np.sum((told[loudest] - told) ** 2, axis=0)
+        strength = (intensity / intensity[loudest])[:, None, None] * self.inverse
+        return np.sum((strength[loudest] - strength) ** 2, axis=0)
 
     def locate(self, intensity: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
         """The least pixel of the map, or `start`, refined within the skin by L-BFGS-B with the exact gradient."""
@@ -36,9 +36,9 @@ class PlainLocaliser:
 
         def loss(place):
             offset = place - self.microphones
-            told = relative * (np.sum(offset**2, axis=1) + self.b)
+            strength = relative * (np.sum(offset**2, axis=1) + self.b)
             slope = 2 * relative[:, None] * offset
-            off = told[loudest] - told
+            off = strength[loudest] - strength
             return np.sum(off**2), 2 * off @ (slope[loudest] - slope)
 
         bounds = [(-self.half, self.half)] * 2

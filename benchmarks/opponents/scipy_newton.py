@@ -9,7 +9,7 @@ next c is either of
 
 and the faster one on this mesh is kept, together with the way of forming J that suits it. The `tuned` strength also
 averages reciprocal channels, which halves the rows of J, and forms half of the symmetric product (`syrk`). All dense
-algebra goes through SciPy's BLAS: NumPy brings a second one, and the threads of the two get in each other's way.
+algebra goes through SciPy's BLAS: NumPy has another one, and the threads of the two disturb each other.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class ScipyNewton:
         return self._step(*self._weigh(voltages, jacobian, conductivity * self.deviation, frame), coefficients)
 
     def _combine(self, noise, pairs):
-        """Which channels stand for themselves and their twins, and what to divide them by."""
+        """The channels that represent themselves and their duplicates, and the deviations to divide them by."""
         if not self.baseline.tuned or any(twin < 0 for _, twin in pairs):
             return None, 1 / noise
         channel, twin = np.array(pairs).T
@@ -67,7 +67,7 @@ class ScipyNewton:
         return channel, np.sqrt(2) / noise[channel]
 
     def _weigh(self, voltages, jacobian, slope, frame):
-        """r (M,), and Jᵀ (m, M) in Fortran's order, which BLAS takes without a copy."""
+        """r (M,), and Jᵀ (m, M) in Fortran order, which BLAS accepts without a copy."""
         if self._rows is not None:
             frame = (frame[self._rows] + frame[self._twin]) / 2
             voltages, jacobian = voltages[self._rows], jacobian[self._rows]

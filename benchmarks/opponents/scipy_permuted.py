@@ -1,4 +1,4 @@
-"""Factorisations in an ordering that is known already, for the tuned SciPy baseline."""
+"""Factorisations in a known ordering, for the tuned SciPy baseline."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import scipy.sparse.linalg
 
 
 class Permuted:
-    """A matrix of fixed pattern in a given order, factorised with the order already known."""
+    """A matrix of fixed pattern in a given order, factorised with that order."""
 
     def __init__(self, matrix, permutation):
         self.permutation = permutation
-        # Carrying the places of the values through the permutation tells where each value goes.
+        # Applying the permutation to the places of the values gives the new place of each value.
         places = scipy.sparse.csc_matrix(
             (np.arange(1, matrix.nnz + 1, dtype=float), matrix.indices, matrix.indptr), matrix.shape
         )

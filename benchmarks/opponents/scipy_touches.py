@@ -1,7 +1,7 @@
-"""Voltages of a touched skin as one writes it plainly with SciPy: the touched cells change, and all is solved anew.
+"""Voltages of a touched skin in a plain SciPy implementation: the touched cells change, and the whole is solved anew.
 
-Per touch: the changed element matrices added to the sparse matrix, one SuperLU factorisation (minimum degree of Aᵀ + A,
-symmetric mode, no pivoting off the diagonal), one solve for all electrodes, the voltages of all pairs.
+Per touch: the changed element matrices are added to the sparse matrix, with one SuperLU factorisation (minimum degree
+of Aᵀ + A, symmetric mode, no pivoting off the diagonal), one solve for all electrodes, and the voltages of all pairs.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class PlainTouches:
         self.before = self.voltages(self.matrix)
 
     def voltages(self, matrix) -> np.ndarray:
-        """Of the protocol, from a matrix of stiffness and contacts."""
+        """Voltages of the protocol, from a matrix of stiffness and contacts."""
         factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         product = self.load.T @ factor.solve(self.load)
         impedance = np.linalg.inv((np.diag(self.load.sum(axis=0)) - product)[:-1, :-1])  # against the ground
@@ -40,7 +40,7 @@ class PlainTouches:
         return table[self.protocol.measurement_index, self.protocol.drive_index]
 
     def change(self, cells: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Of the voltages, where the conductivity of `cells` (c,) becomes (1 + change) times what it was."""
+        """Change of the voltages, where the conductivity of `cells` (c,) becomes (1 + change) times its value."""
         kept = change != 0
         cells, change = cells[kept], np.maximum(change[kept], 1e-9 - 1.0)
         nodes = self.cells[cells]

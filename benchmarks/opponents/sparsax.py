@@ -1,7 +1,7 @@
-"""sparsax, CHOLMOD through XLA's foreign functions, at the solver's task; runs in an environment of its own.
+"""sparsax, CHOLMOD through XLA's foreign functions, at the solver's task, in an environment of its own.
 
-It analyses a pattern once, remembers the last factor, and factorises anew when the values change: every repeat takes
-another matrix. Its three kinds of factorisation are tried, and the fastest on this matrix is kept.
+It analyses a pattern once, remembers the last factor, and factorises anew when the values change: every repeat has
+another matrix. Its three kinds of factorisation are timed, and the fastest on this matrix is kept.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ KINDS = ("auto", "simplicial", "supernodal")
 
 
 class Sparsax:
-    """`tasks` maps a task's name to a function of the number of the repeat, which picks the matrix."""
+    """`tasks` maps a task's name to a function of the number of the repeat, which selects the matrix."""
 
     def __init__(self, problem: dict[str, np.ndarray]):
-        # sparsax reads the upper triangle, problems hold the lower.
+        # sparsax reads the upper triangle, problems contain the lower.
         row, column = jnp.asarray(problem["columns"], jnp.int32), jnp.asarray(problem["rows"], jnp.int32)
         every, load = jnp.asarray(problem["values"]), jnp.asarray(problem["load"])
         each, count, size = list(every), len(every), len(problem["load"])
@@ -42,7 +42,7 @@ class Sparsax:
             spent |= least_times({kind: next_one}, budget=1.0)
         best = min(spent, key=spent.__getitem__)
         sparsax.set_options(supernodal=best)
-        jax.clear_caches()  # the first call is to compile
+        jax.clear_caches()  # the first call compiles
         self._factor = None
 
         def solve(_):

@@ -1,4 +1,4 @@
-"""SciPy's SuperLU at the solver's task: every ordering it offers is tried, and the fastest on this matrix is kept."""
+"""SciPy's SuperLU at the solver's task: all its orderings are timed, and the fastest on this matrix is kept."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ KEPT = "MMD_AT_PLUS_A found once, symmetric mode, panels of 1"
 
 
 class SuperLU:
-    """`tasks` maps a task's name to a function of the number of the repeat, which picks the matrix."""
+    """`tasks` maps a task's name to a function of the number of the repeat, which selects the matrix."""
 
     def __init__(self, problem: dict[str, np.ndarray]):
         load, count = problem["load"], len(problem["values"])
         self._matrices = [symmetric(problem, number) for number in range(count)]
         order = np.argsort(splu(self._matrices[0], **ORDERINGS["MMD_AT_PLUS_A, symmetric mode"]).perm_c)
-        # The values would arrive in this order, as they arrive in jeit's own.
+        # The values would arrive in this order, as they do for jeit's solver.
         permuted = [matrix[order][:, order].tocsc() for matrix in self._matrices]
 
         def kept(k: int) -> tuple[Any, Callable[[np.ndarray], np.ndarray]]:

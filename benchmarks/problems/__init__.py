@@ -1,1 +1,1 @@
-"""What is posed to contestants, as plain arrays, and what their answers are compared with."""
+"""The problems of the contestants, as plain arrays, and references for their results."""

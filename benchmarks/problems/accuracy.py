@@ -1,4 +1,4 @@
-"""What the results are compared with: each other, and the exact solutions for the homogeneous disk."""
+"""References for the results: each other, and the exact solutions for the homogeneous disk."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def difference(result: np.ndarray, reference: np.ndarray) -> float:
 
 
 def exact_voltages(problem: dict[str, np.ndarray]) -> np.ndarray:
-    """Voltages (M,) of the homogeneous disk: point electrodes where they are, or arcs equally spaced on the circle."""
+    """Voltages (M,) of the homogeneous disk: point electrodes at their places, or arcs equally spaced on the circle."""
     disk = ConductingDisk(radius=problems.RADIUS, conductivity=float(problem["background"]))
     if "nodes" in problem:
         x, y = problem["points"][problem["nodes"]].T

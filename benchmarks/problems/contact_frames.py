@@ -1,8 +1,8 @@
-"""Frames of a pressed skin of 100 mm, simulated on a finer mesh than its images use, after Chen et al. 2022.
+"""Frames of a pressed skin of 100 mm, simulated on a finer mesh than that of its images, after Chen et al. 2022.
 
-Spreads are those of the material, fixed before any accuracy was looked at: noise, gains, and drift over up to twenty
-seconds since the skin was as its model says; the noise that finders are told of is that of untouched frames over as
-long. One layer changes along the sheet by a hundredth of what two do (chosen: no figure is printed).
+Variation is that of the material, fixed before any accuracy was computed: noise, gains, and drift over up to twenty
+seconds since the skin equalled its model. The noise given to the finders is that of untouched frames over the same
+time. One layer changes along the sheet by a hundredth of the change of two layers (chosen: no figure is published).
 """
 
 from __future__ import annotations
@@ -27,14 +27,15 @@ from jeit.touch.simulate import DiscIndenter, Press, PressDraws, PressedSkin, ba
 RADIUS, GRAVITY, SECONDS = 0.05, 9.81, 20.0
 SINGLE = 0.01
 LOADS = {"velostat": (0.5, 10.0), "conductive fabric": (0.3, 2.5)}
-# Touches at once lie as far apart as two can be told apart at all, metres.
+# Least distance between simultaneous touches, at which two can be distinguished at all, metres.
 APART, MARGIN = 0.022, 0.008
 
 
 @dataclass
 class ContactFrames:
-    """A skin of `name`, with `noise` times the material's and `saturation` times its change, and the way to images:
-    "one-step" or "back-projection". `nodes` of the skin and of its images."""
+    """A skin of `name`, with `noise` times the material's and `saturation` times its change, and the imaging method:
+    "one-step" or "back-projection". `nodes` of the skin and of its images.
+    """
 
     name: str = "velostat"
     noise: float = 1.0
@@ -44,14 +45,14 @@ class ContactFrames:
 
     @cached_property
     def models(self) -> list[ForwardModel]:
-        """Of the skin, and of its images."""
+        """The models of the skin and of its images."""
         own = material(self.name)
         electrodes = BoundaryElectrodes(ring(RADIUS, 16), 0.008, 0.006 / (own.conductivity * own.thickness))
         return [ForwardModel(Disk(RADIUS).mesh(num_points=n), electrodes, adjacent(16)) for n in self.nodes]
 
     @cached_property
     def skin(self) -> PressedSkin:
-        """What is pressed."""
+        """The skin that is pressed."""
         own = material(self.name)
         changed = {"noise": self.noise * own.noise, "saturation": self.saturation * own.saturation}
         return PressedSkin(self._key(0), self.models[0], dataclasses.replace(own, **changed))
@@ -87,11 +88,13 @@ class ContactFrames:
         return np.asarray(reconstruction.image(frames - self.before.mean(axis=0)))
 
     def image_noise(self, reconstruction: LinearReconstruction) -> ImageNoise:
-        """Of untouched frames."""
+        """The noise of images of untouched frames."""
         return ImageNoise.of_frames(reconstruction, self.before)
 
     def touches(self, key: int, number: int) -> list[tuple[Press, ...]]:
-        """One to three discs and balls at once, of many sizes, loads and places, told apart at all."""
+        """One to three simultaneous discs and balls, of many sizes, loads and places, far enough apart to be
+        distinguished.
+        """
         shapes = [
             DiscIndenter(0.006),
             DiscIndenter(0.008),

@@ -1,8 +1,8 @@
-"""Tanks like the Kuopio challenge's, some of whose electrodes are gone, drawn at random and solved without jeit.
+"""Tanks like the Kuopio challenge's, with missing electrodes, drawn at random and solved without jeit.
 
-32 electrodes, 76 drives, every neighbour difference read; one to four strong bodies, metal or plastic: disks, triangles
-to hexagons, bars, crosses, L and T. What a real tank has besides: electrodes a little off their places and of uneven
-width and contact, gains and offsets of the electrodes' channels, now and then a loose one, and a bath that drifts
+32 electrodes, 76 drives, every adjacent difference read, and one to four strong bodies, metal or plastic: disks,
+triangles to hexagons, bars, crosses, L and T. As in a real tank, electrodes are slightly displaced and vary in width
+and contact, the electrodes' channels have gains and offsets, one contact is sometimes loose, and the bath drifts
 between the two frames. Mesh and solver are those of `mixed_tanks`.
 """
 
@@ -28,19 +28,19 @@ RADIUS, ELECTRODES, CURRENT = 0.115, 32, 1.47e-3
 CONDUCTIVITY, CONTACT = 7.5e-4, 0.01
 _WIDTH = np.radians(5.625) * RADIUS
 _SPACING, _APART, _FROM_WALL = 0.032, 0.1, 0.04
-# Standard deviations: place (m), width and contact (of themselves), gain, offset (V), drift of the bath, noise.
+# Standard deviations: place (m), width and contact (relative), gain, offset (V), drift of the bath, noise.
 _PLACE, _UNEVEN, _CONTACT, _GAIN, _OFFSET, _DRIFT, _NOISE = 3e-4, 0.05, 0.7, 0.005, 8e-3, 0.03, 2e-3
 
 
 class Tank(NamedTuple):
-    """**Fields**: `frame` and `reference` of all electrodes; `truth` (256, 256), labelled as the challenge does."""
+    """**Fields**: `frame` and `reference` of all electrodes. `truth` (256, 256), with the challenge's labels."""
 
     frame: Measurement
     reference: Measurement
     truth: np.ndarray
 
     def without(self, number: int) -> Tank:
-        """The same with the first so many electrodes gone."""
+        """The same with the first `number` electrodes missing."""
         frame, reference = (without(one, range(number)) for one in self[:2])
         return Tank(frame, reference, self.truth)
 
@@ -54,7 +54,7 @@ def without(measurement: Measurement, gone: Sequence[int]) -> Measurement:
 
 
 def protocol() -> Protocol:
-    """The challenge's: 16 drives between every other electrode, then 15 against each of four electrodes."""
+    """The challenge's protocol: 16 drives between every other electrode, then 15 against each of four electrodes."""
     pairs = [(k, (k + 2) % ELECTRODES) for k in range(0, ELECTRODES, 2)]
     pairs += [(k, one) for k in range(0, ELECTRODES, 8) for one in range(0, ELECTRODES, 2) if one != k]
     unit = np.eye(ELECTRODES)
@@ -63,7 +63,7 @@ def protocol() -> Protocol:
 
 
 def draw(seed: int) -> Tank:
-    """A tank, the same for the same seed."""
+    """A tank, reproducible from its seed."""
     rng = np.random.default_rng(seed)
     bodies = _bodies(rng)
     points, cells = _mesh([outline for outline, _ in bodies], rng)
@@ -76,7 +76,7 @@ def draw(seed: int) -> Tank:
         "position": RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=1),
         "width": _WIDTH * (1 + _UNEVEN * rng.normal(size=ELECTRODES)),
         "contact_impedance": CONTACT * np.exp(_CONTACT * rng.normal(size=ELECTRODES)),
-        # Unit currents into every electrode but the last, and out of it; all potentials.
+        # Unit currents into every electrode but the last, and out of the last, with all potentials.
         "drive": (np.eye(ELECTRODES) - np.eye(ELECTRODES)[-1])[:-1],
         "measurement": np.eye(ELECTRODES),
         "drive_index": np.repeat(np.arange(ELECTRODES - 1), ELECTRODES),
@@ -88,7 +88,7 @@ def draw(seed: int) -> Tank:
     for outline, factor in bodies:
         factors[Path(outline).contains_points(centres)] = factor
     spread = np.ones(ELECTRODES)
-    spread[rng.integers(ELECTRODES)] = rng.choice([1, 1, 10])  # a loose one in every third tank
+    spread[rng.integers(ELECTRODES)] = rng.choice([1, 1, 10])  # a loose contact in every third tank
     gain, offset = 1 + _GAIN * spread * rng.normal(size=ELECTRODES), _OFFSET * spread * rng.normal(size=ELECTRODES)
 
     def measured(factor, name):
@@ -131,7 +131,7 @@ def _bodies(rng) -> list[tuple[np.ndarray, float]]:
 
 
 def _outline(rng) -> np.ndarray:
-    """Corners (n, 2) round the origin, in units of the tank's radius."""
+    """Corners (n, 2) about the origin, in units of the tank's radius."""
     kind, size = rng.integers(6), rng.uniform(0.15, 0.33)
     if kind == 0:
         return _turned(np.array([[size, 0.0]]), 2 * np.pi * np.arange(48) / 48)
@@ -154,14 +154,14 @@ def _outline(rng) -> np.ndarray:
 
 
 def _turned(points: np.ndarray, angle) -> np.ndarray:
-    """Points turned by one angle, or one point by many."""
+    """Points rotated by one angle, or one point by many."""
     cosine, sine = np.cos(angle), np.sin(angle)
     x, y = points.T
     return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1)
 
 
 def _along(outline: np.ndarray, spacing: float) -> np.ndarray:
-    """Points along a polygon, about so far apart, none of them a corner."""
+    """Points along a polygon, about `spacing` apart, none of them a corner."""
     found = []
     for start, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         number = max(1, round(float(np.linalg.norm(end - start)) / spacing))

@@ -1,7 +1,8 @@
-"""Skins that get cut, lose electrodes and are mended: simulated on fine meshes of their own, watched on coarse ones.
+"""Skins that are cut, lose electrodes and are repaired: simulated on fine meshes of their own, monitored on coarse
+ones.
 
-Spreads are those of the materials, fixed before any figure was looked at; touches are trapezoids in time, of loads and
-durations as below, at 5 frames a second. Parameters and acceptance: Park et al. 2022, and what is asked of jeit.
+Variation is that of the materials, fixed before any figure was computed. Touches are trapezoids in time, with loads and
+durations as below, at 5 frames per second. Parameters and limits: Park et al. 2022, and jeit's requirements.
 """
 
 from __future__ import annotations
@@ -24,17 +25,18 @@ from jeit.touch.simulate import DiscIndenter, Press, PressDraws, PressedSkin, ba
 from jeit.touch.simulate.damage import Cut, ElectrodeFault, draw_cut, mend_cut
 
 RATE, PATIENCE = 5.0, 30.0
-# Shares of the load while a touch comes and goes; seconds that it lasts, median and spread of the logarithm; and those
-# between two.
+# Fractions of the load at onset and release of a touch, the median and spread of the logarithm of its duration in
+# seconds, and those of the pauses.
 RISE, LASTS, BETWEEN = (0.25, 0.6, 1.0), (1.5, 0.5), (1.0, 8.0)
-# Farther from a cut than this, touches are to be placed as before, metres.
+# Farther from a cut than this, touches must be located as before, metres.
 APART = 0.025
 
 
 @dataclass
 class DamagedSkin:
     """A skin by `name`, "park" (hydrogel, 32 inner electrodes, 94 pairs) or "round" (two films, 16 electrodes, 208
-    channels); `seed` of all that is drawn; `nodes` of the skin and of its images; `pool` of touches."""
+    channels), with the `seed` of all random draws, `nodes` of the skin and of its images, and a `pool` of touches.
+    """
 
     name: str
     seed: int = 0
@@ -51,16 +53,16 @@ class DamagedSkin:
 
     @property
     def sheet(self) -> float:
-        """Siemens."""
+        """Sheet conductance, siemens."""
         return self.material.conductivity * self.material.thickness
 
     @cached_property
     def scale(self) -> float:
-        """Of lengths beside the paper's skin."""
+        """Ratio of lengths to those of the paper's skin."""
         return 1.0 if self.name == "park" else 0.5
 
     def model(self, nodes: int, cut: Cut | None = None) -> ForwardModel:
-        """Of the skin, fine along a cut."""
+        """Model of the skin, refined along a cut."""
         mesh = self.outline.mesh(num_points=nodes, refine=None if cut is None else cut.refine(1e-3 * self.scale))
         if self.name == "park":
             layout = named_layout("park-inner")
@@ -73,7 +75,7 @@ class DamagedSkin:
         return self.model(self.nodes[1])
 
     def whole(self, cut: Cut | None = None) -> PressedSkin:
-        """The skin before it is cut; on the mesh that the cut needs."""
+        """The skin before it is cut, on the mesh that the cut needs."""
         return PressedSkin(self.key(0), self.model(self.nodes[0], cut), self.material)
 
     @cached_property
@@ -92,7 +94,7 @@ class DamagedSkin:
 
     @cached_property
     def touches(self) -> np.ndarray:
-        """Changes (pool, 3, M) by touches at the shares of their load."""
+        """Changes (pool, 3, M) by touches at the fractions of their load."""
         return changes(self.skin, self.presses(1, self.pool))
 
     @cached_property
@@ -107,8 +109,10 @@ class DamagedSkin:
     def read(
         self, skin: PressedSkin, number: int, seconds: np.ndarray, touches, later=None, more: float | np.ndarray = 0.0
     ) -> np.ndarray:
-        """Frames (T, M) of touches one after the other, of `touches`; from the time of `later` on, a (time, skin,
-        touches), of another skin; `more` (T, M), volts, is added."""
+        """Frames (T, M) of touches one after the other, of `touches`.
+
+        From the time of `later` on, a (time, skin, touches), they are of another skin. `more` (T, M), volts, is added.
+        """
         random = np.random.default_rng([self.seed, number])
         change = [np.zeros((len(seconds), self.skin.gain.size)) for _ in range(2)]
         parts = [touches, touches if later is None else later[2]]
@@ -122,7 +126,7 @@ class DamagedSkin:
             for out, some in zip(change, parts, strict=True):
                 out[rows] += some[which % len(some), profile[: len(rows)]]
             start += lasts + random.uniform(*BETWEEN)
-        # Voltages at rest are of the own mesh, and what damage changes is added: another mesh is no damage.
+        # Voltages at rest are of the skin's own mesh, and the change by damage is added: another mesh is not damage.
         at_rest = self.at_rest(self.skin)
         rest = [at_rest, at_rest if later is None else at_rest + self.at_rest(later[1]) - self.at_rest(skin)]
         found = [
@@ -134,7 +138,7 @@ class DamagedSkin:
 
     @staticmethod
     def at_rest(skin: PressedSkin) -> np.ndarray:
-        """Voltages (M,) of an untouched skin, undisturbed."""
+        """Voltages (M,) of an untouched skin without noise."""
         return np.asarray(skin.model.voltages(skin.conductivity))
 
     def cut(self, number: int, depth: float = 1.0) -> Cut:
@@ -142,7 +146,7 @@ class DamagedSkin:
         return draw_cut(self.key(number), self.outline, length=span, depth=depth, margin=4e-3 * self.scale)
 
     def damaged(self, cut: Cut) -> tuple[PressedSkin, PressedSkin, PressedSkin]:
-        """Whole, cut and mended, all on one mesh."""
+        """Undamaged, cut and repaired, all on one mesh."""
         whole = self.whole(cut)
         mesh = whole.model.mesh
         torn = cut.conductivity(mesh, whole.conductivity, self.material.thickness)
@@ -155,7 +159,7 @@ class DamagedSkin:
         )
 
     def fault(self, number: int, kind: str, seconds: np.ndarray, begins: float) -> tuple[int, np.ndarray]:
-        """An electrode, and changes (T, M) of voltages by its failing."""
+        """An electrode, and changes (T, M) of voltages by its fault."""
         electrode = int(np.random.default_rng([self.seed, number]).integers(self.skin.model.protocol.num_electrodes))
         there, more = seconds >= begins, np.zeros((len(seconds), self.skin.gain.size))
         fault = ElectrodeFault(electrode, kind)  # pyright: ignore[reportArgumentType]
@@ -163,7 +167,7 @@ class DamagedSkin:
         return electrode, more
 
     def off(self, health: SkinHealth, skin: PressedSkin, presses: list[Press], number: int) -> np.ndarray:
-        """How far presses are placed off, metres, in images about a fresh reference; NaN where nothing is found."""
+        """Errors of located presses, metres, in images about a new reference. NaN where nothing is detected."""
         rest = self.at_rest(skin)
         exact = rest + np.concatenate([np.zeros((10, 1, rest.size)), changes(skin, presses, (1.0,))])[:, 0]
         frames = self.skin.read(self.key(number), exact, np.array([20.0]))
@@ -179,7 +183,7 @@ class DamagedSkin:
 
 
 def changes(skin: PressedSkin, presses: list[Press], shares: tuple[float, ...] = RISE) -> np.ndarray:
-    """Changes (n, s, M) of voltages by presses at s shares of their load, each solved anew, volts."""
+    """Changes (n, s, M) of voltages by presses at s fractions of their load, each solved anew, volts."""
     model, rest = skin.model, np.broadcast_to(skin.conductivity, skin.model.mesh.num_cells)
     parts = [Press(one.indenter, share * one.load, one.position, one.angle) for one in presses for share in shares]
     touched = skin.touched(parts, held=1.0)

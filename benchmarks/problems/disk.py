@@ -1,4 +1,4 @@
-"""The problem every contestant solves: a disk, its electrodes, its protocol, as plain arrays."""
+"""The problem of every contestant: a disk, its electrodes, its protocol, as plain arrays."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 RADIUS = 0.05  # m
 CONDUCTIVITY = 0.02  # S: a conductive skin of a few mm
 CONTACT_IMPEDANCE = 0.05  # ohm·m
-COVERED = 0.5  # part of the boundary that electrodes cover
+COVERED = 0.5  # fraction of the boundary covered by electrodes
 FIRST = 0.25  # centre of the first electrode, in spacings from angle 0
 NUM_CONDUCTIVITIES = 64
 NUM_FRAMES = 1000
-GAUSS_NEWTON, STEPS = "Gauss-Newton", 5  # a task's name, and the iterations of each of its images
+GAUSS_NEWTON, STEPS = "Gauss-Newton", 5  # a task's name, and the number of iterations of each image
 NOISE = 1e-3  # standard deviation, of each voltage
-HYPERPARAMETER = 0.5  # the data are fitted a little closer than pyEIT does with its best setting
+HYPERPARAMETER = 0.5  # the data are fitted slightly closer than pyEIT does with its best setting
 
 
 def make(
@@ -66,7 +66,7 @@ def make(
 
 
 def measure(problem: dict[str, np.ndarray], voltages, rest) -> None:
-    """Add `measured` (c, M): the conductivities' voltages with `noise` (M,) in volts; and NOSER's λ."""
+    """Add `measured` (c, M), the conductivities' voltages with `noise` (M,) in volts, and NOSER's λ."""
     problem["noise"] = NOISE * np.abs(rest) + 1e-2 * NOISE * np.abs(rest).max()
     random = np.random.default_rng(3)
     problem["measured"] = voltages + problem["noise"] * random.normal(size=np.shape(voltages))

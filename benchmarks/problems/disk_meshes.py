@@ -1,4 +1,4 @@
-"""Meshes of a disk that are not jeit's: points that are given, a jittered grid between them, triangulated by SciPy."""
+"""Meshes of a disk that are not jeit's: given points with a jittered grid between them, triangulated by SciPy."""
 
 import numpy as np
 from scipy.spatial import Delaunay
@@ -7,7 +7,7 @@ from scipy.spatial import Delaunay
 def meshed_disk(fixed: np.ndarray, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 2) of the unit disk, the `fixed` ones (k, 2) first, and counter-clockwise cells (m, 3).
 
-    `fixed` has the boundary; the others lie about `spacing` apart.
+    `fixed` includes the boundary. The others are about `spacing` apart.
     """
     steps = np.arange(-1, 1, spacing)
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)

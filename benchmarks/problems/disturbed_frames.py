@@ -1,4 +1,4 @@
-"""An endless stream of a touched sensor whose frames go wrong in bursts, each of a known kind."""
+"""An endless stream of a touched sensor whose frames are faulty in bursts, each of a known kind."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jeit.inverse.streaming.stream import FrameStatus
 
 
 class Kind(NamedTuple):
-    """What becomes of such frames, and a word of the reason that is told."""
+    """The expected status of such frames, and a word of the reported reason."""
 
     status: FrameStatus
     word: str
@@ -33,11 +33,11 @@ KINDS = {
 
 @dataclass
 class DisturbedFrames:
-    """`number` frames (M,) volts, in turn those of `base` (F, M) with noise of their own, in bursts of up to `longest`
-    bad frames that begin every `period`; `rest` (M,) is one of the untouched sensor, `touching` (L, M) which channels
-    an electrode takes part in.
+    """`number` frames (M,) in volts, with bursts of up to `longest` faulty frames that begin every `period`.
 
-    While they are asked for, `kind` of the last (empty for a good one) and the `electrode` that is dead are told.
+    Frames are those of `base` (F, M) in turn, with noise of their own. `rest` (M,) is one of the untouched sensor, and
+    `touching` (L, M) states which channels an electrode takes part in. During iteration, `kind` of the last frame
+    (empty for a good one) and the dead `electrode` are available.
     """
 
     base: np.ndarray
@@ -65,10 +65,10 @@ class DisturbedFrames:
             if self.kind:
                 left -= 1
                 self.planted[self.kind] += 1
-                frame = self._spoilt(frame, random)
+                frame = self._disturbed(frame, random)
             yield frame
 
-    def _spoilt(self, frame: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    def _disturbed(self, frame: np.ndarray, random: np.random.Generator) -> np.ndarray:
         channels, largest = len(frame), np.abs(self.rest).max()
         if self.kind == "no readings":
             frame[random.permutation(channels)[: 2 * channels // 3]] = np.nan

@@ -1,17 +1,18 @@
-"""A fabric whose squares are pressed, one at a time, simulated after Russo et al. (2017).
+"""A fabric whose squares are pressed one at a time, simulated after Russo et al. (2017).
 
-A square with electrodes along its edge, opposite drive. A finger presses the squares of a chess board round its middle
-with 10 to 100 kPa, within 1 mm of their middles. Six repetitions of twenty presses of each square, ten minutes apart,
-read as medians of 160 samples, teach; twenty presses of each a day later test, four in each of five ways that a day
-may drift, as they are, or with a reference, one scan, taken anew up to ten minutes before. What drifts and what is
-noise is the material's.
+It is a square with electrodes along its edge and opposite drive. A finger presses the squares of a chess board about
+its centre with 10 to 100 kPa, within 1 mm of their centres. The training data are six repetitions of twenty presses of
+each square, ten minutes apart, read as medians of 160 samples. The test data are twenty presses of each square a day
+later, four for each of five random drifts of a day, either as they are or with a reference, one scan, renewed up to ten
+minutes before. Drift and noise are those of the material.
 
-**Bent** round a cylinder along y, the sheet conducts as before, but for two things. What conducts lies half of the
-sensor's 1.5 mm outside the layer that keeps its length: at a radius R it is stretched by 0.75 mm / R round the bend,
-and its resistance that way grows 5 times as much, a gauge factor (chosen). And a flat finger touches the ridge first:
+**Bent** round a cylinder along y, the sheet conducts as before, with two exceptions. The conductor lies half of the
+sensor's 1.5 mm outside the neutral layer: at a radius R it is stretched by 0.75 mm / R round the bend, and its
+resistance in that direction grows 5 times as much, a gauge factor (chosen). And a flat finger touches the ridge first:
 its gap is x² / 2R.
 
-All this was fixed before accuracies were looked at, but for the days, of which there was one: its draw decided.
+All this was fixed before accuracies were computed, except the number of days: with a single day its random drift
+determined the result.
 """
 
 from __future__ import annotations
@@ -45,22 +46,23 @@ class OnCylinder(AbstractIndenter):
     radius: float
 
     def gap(self, points):
-        """The indenter's, and x² / 2R."""
+        """The indenter's gap, and x² / 2R."""
         return self.indenter.gap(points) + np.asarray(points)[..., 0] ** 2 / (2 * self.radius)
 
     @property
     def reach(self) -> float:
-        """The indenter's."""
+        """The indenter's reach."""
         return self.indenter.reach
 
 
 class Fabric:
-    """What a fabric of `side` metres with so many `electrodes` reads of C squares as wide as a `target`, metres.
+    """Readings of C squares of width `target`, metres, on a fabric of `side` metres with a number of `electrodes`.
 
-    `squares`: their numbers along x and y; `bend`: radius of a cylinder that the fabric is bent round, metres. All is
-    changes of M voltages from those of the untouched fabric at first, without noise, whose deviation is `noise`, volts:
-    `features` (T, C + 1, P, M) of T repetitions of P presses, the last class untouched; `tests` (C + 1, P, M) a day
-    later, of one day after the other; `middles` (C, 2) of squares and `places` (L, 2) of electrodes, metres.
+    `squares`: their numbers along x and y. `bend`: radius of a cylinder round which the fabric is bent, metres. All
+    readings are changes of M voltages from the initial ones of the untouched fabric, without noise, whose deviation is
+    `noise`, volts: `features` (T, C + 1, P, M) of T repetitions of P presses, the last class untouched, and `tests` (C
+    + 1, P, M) a day later, one day after the other. Centres `middles` (C, 2) of squares and `places` (L, 2) of
+    electrodes, metres.
     """
 
     def __init__(
@@ -107,7 +109,7 @@ class Fabric:
     def observations(
         self, number: int, *, untouched: bool = False
     ) -> tuple[Float[np.ndarray, "N M"], Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
-        """About `number` observations a class, with noise, their classes and repetitions; `untouched` is class C."""
+        """About `number` observations per class, with noise, their classes and repetitions. `untouched` is class C."""
         features = self.features if untouched else self.features[:, :-1]
         repetitions, classes, presses, channels = features.shape
         own = min(presses, max(1, number // repetitions))
@@ -117,25 +119,28 @@ class Fabric:
         return self._noisy(exact, 1), label, np.repeat(np.arange(repetitions), classes * own * medians)
 
     def asked(self, *, anew: bool) -> Float[np.ndarray, "C P M"]:
-        """Presses a day later, with noise; with a reference taken `anew`, up to ten minutes before."""
+        """Presses a day later, with noise, and with a reference renewed up to ten minutes before, if `anew`."""
         if not anew:
             return self._noisy(self.tests[:-1], 2)
         return self._noisy(self.tests[:-1] - self.tests[-1] + self._later, 2) - self._reference()
 
     def untouched(self, number: int, each: int, *, anew: bool) -> Float[np.ndarray, "n M"]:
-        """The untouched fabric a day later, `each` so often after so many drifts, or after those of the tests in turn;
-        with noise, as of `asked`."""
+        """The untouched fabric a day later, `each` frames after each of `number` drifts, or after the drifts of the
+        tests in turn.
+
+        With noise, as for `asked`.
+        """
         if not anew:
             return self._noisy(np.repeat(np.resize(self.tests[-1], (number, self._rest.size)), each, axis=0), 3)
         return self._noisy(np.repeat(self._drifts(number), each, axis=0), 3) - self._reference()
 
     @property
     def distance(self) -> Float[np.ndarray, " C"]:
-        """Of the squares' middles from the nearest electrode's, metres."""
+        """Distance of the squares' centres from that of the nearest electrode, metres."""
         return np.linalg.norm(self.middles[:, None] - self.places, axis=-1).min(axis=1)
 
     def _drifts(self, number: int) -> Float[np.ndarray, "n M"]:
-        """By what the untouched fabric drifts within ten minutes of its reference, as when it was new, volts."""
+        """Drift of the untouched fabric within ten minutes of its reference, from the initial voltages, volts."""
         seconds = np.random.default_rng(4).uniform(0, 60 * MINUTES, number)
         return np.concatenate([self._changes(int(DAY) + one, [()], each) for one, each in enumerate(seconds, start=1)])
 

@@ -1,7 +1,8 @@
-"""Touches that image networks are judged by: on a finer mesh, with electrodes and contacts that no network was told of.
+"""Touches for the evaluation of image networks: on a finer mesh, with electrodes and contacts that deviate from the
+description.
 
-Spreads are those of the project's notes on fair simulations, fixed before any figure was looked at: contact impedances
-±10 %, electrodes ±0.5 mm (uniform), noise of a limit of detection of 0.7 N.
+Variation is that of the project's notes on fair simulations, fixed before any figure was computed: contact impedances
+±10 %, electrodes ±0.5 mm (uniform), noise for a limit of detection of 0.7 N.
 """
 
 from __future__ import annotations
@@ -32,8 +33,11 @@ APART = 0.041
 
 @dataclass(frozen=True)
 class Wrong:
-    """What the networks were not told: half widths of uniform spreads, of the logarithm of contact impedances, of the
-    electrodes' places, metres, and `drift`, of logarithms of contact impedances after the reference was taken."""
+    """Deviations from the description that networks have: half widths of uniform distributions.
+
+    Of the logarithm of contact impedances, of the electrodes' places, metres, and `drift`, of logarithms of contact
+    impedances after the reference.
+    """
 
     contact: float = 0.1
     place: float = 0.5e-3
@@ -41,12 +45,12 @@ class Wrong:
 
 
 def park_skin(cell: float | None = None) -> Skin:
-    """200 × 200 × 10 mm of hydrogel with 32 inner electrodes and 94 pairs; as a sheet."""
+    """200 × 200 × 10 mm of hydrogel with 32 inner electrodes and 94 pairs, as a sheet."""
     return Skin.create(named_layout("park-inner"), num_layers=0, cell_size=cell)
 
 
 class JudgedSkins:
-    """Skins that are wrong in their own ways; touches are read by one after the other."""
+    """Skins with different deviations. Touches are read by one after the other."""
 
     def __init__(self, wrong: Wrong | None = None, *, seed: int = 77, skins: int = SKINS, cell: float = CELL):
         wrong = Wrong() if wrong is None else wrong
@@ -81,19 +85,19 @@ class JudgedSkins:
 
 
 def grid_touches() -> tuple[list[list[Indent]], np.ndarray]:
-    """A ball of 15 mm, 7.5 mm deep, at 15 × 15 places; and these."""
+    """A ball of 15 mm, 7.5 mm deep, at 15 × 15 places, and the places."""
     places = touches_away_from_the_edge(park_skin().outline, TIP / 2, PLACES, PLACES).places
     return [[Indent(ball_indenter(TIP), TIP_DEPTH, place)] for place in places], places
 
 
 def tuning_touches(number: int = 60) -> tuple[list[list[Indent]], np.ndarray]:
-    """The same ball elsewhere: what rivals choose their hyperparameters by."""
+    """The same ball elsewhere, for the rivals' choice of hyperparameters."""
     places = np.random.default_rng(5).uniform(-0.09, 0.09, (number, 2))
     return [[Indent(ball_indenter(TIP), TIP_DEPTH, place)] for place in places], places
 
 
 def pair_touches(number: int, apart: float = APART, seed: int = 9) -> tuple[list[list[Indent]], np.ndarray]:
-    """Two balls so far apart, anywhere; and their places (n, 2, 2)."""
+    """Two balls at a given distance, anywhere, and their places (n, 2, 2)."""
     random, places = np.random.default_rng(seed), []
     while len(places) < number:
         one, angle = random.uniform(-0.085, 0.085, 2), random.uniform(0, 2 * np.pi)
@@ -105,7 +109,7 @@ def pair_touches(number: int, apart: float = APART, seed: int = 9) -> tuple[list
 
 
 def unseen_shapes() -> dict[str, object]:
-    """Five bodies that no network has seen the like of."""
+    """Five bodies unlike those in the training data."""
     along = np.linspace(-1, 1, 41)
     x, y = np.meshgrid(along, along)
     triangle = np.where((y > -0.5) & (y < 1 - 1.732 * np.abs(x)), 0.0, np.nan)
@@ -129,7 +133,7 @@ def unseen_shapes() -> dict[str, object]:
 
 
 def shape_touches(number: int, seed: int = 13) -> tuple[list[list[Indent]], list[str]]:
-    """Unseen bodies in turn, turned and placed at random, 2 to 7 mm deep; and their names."""
+    """Unseen bodies in turn, rotated and placed at random, 2 to 7 mm deep, and their names."""
     random, shapes = np.random.default_rng(seed), unseen_shapes()
     names = [list(shapes)[one % len(shapes)] for one in range(number)]
     touches = []

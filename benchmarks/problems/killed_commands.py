@@ -1,4 +1,4 @@
-"""Commands to be killed: what they are given, what they write, and whether that can be read and is right."""
+"""Commands to be killed: their input, their output, and whether that can be read and is correct."""
 
 from __future__ import annotations
 
@@ -40,9 +40,12 @@ _FRAMES, _NODES = 60, 400
 
 @dataclass(frozen=True)
 class Command:
-    """One of jeit's commands, run in `folder`: its `arguments`, what it is to `resume` with, where that is another;
-    what it writes, `output`; `begun`, a pattern of what is there once it writes; `same`, files that are of the same
-    bytes whenever it ends; `environment`, variables of its own; `afresh`, what is taken away before each run."""
+    """One of jeit's commands, run in `folder`.
+
+    Its `arguments`, those to `resume` with, where they differ, its `output`, `begun`, a pattern of files that exist
+    once it writes, `same`, files whose bytes do not depend on when it ends, `environment`, variables of its own, and
+    `afresh`, what is deleted before each run.
+    """
 
     name: str
     folder: Path
@@ -55,7 +58,7 @@ class Command:
     environment: dict[str, str] = field(default_factory=dict)
 
     def start(self, *, again: bool = False) -> subprocess.Popen:
-        """A process of it; `again` where it has begun before."""
+        """A process of it, with the arguments for resuming if `again`."""
         arguments = self.resume if again and self.resume else self.arguments
         command = [sys.executable, "-m", "jeit", *arguments]
         environment = os.environ | {"XDG_CACHE_HOME": str(self.folder / "cache")} | self.environment
@@ -64,7 +67,7 @@ class Command:
         )
 
     def whole(self) -> tuple[float, float, dict[str, bytes]]:
-        """Seconds until it writes, until it ends, and what it has written, undisturbed."""
+        """Seconds until it writes, until it ends, and its output, undisturbed."""
         start, stamp, begun = time.perf_counter(), time.time(), 0.0
         process = self.start()
         while process.poll() is None:
@@ -83,24 +86,24 @@ class Command:
         return False
 
     def ended(self, process: subprocess.Popen) -> None:
-        """Wait for its end. Raises `RuntimeError` where it fails or says anything."""
-        said = process.communicate()[1]
-        if process.returncode or said:
-            raise RuntimeError(f"{self.name}: status {process.returncode}: {said.strip()}")
+        """Wait for its end. Raises `RuntimeError` where it fails or prints anything."""
+        error_output = process.communicate()[1]
+        if process.returncode or error_output:
+            raise RuntimeError(f"{self.name}: status {process.returncode}: {error_output.strip()}")
 
     def written(self) -> dict[str, bytes]:
-        """The files that are to be the same, by their names: all of them unless some are named."""
+        """The files that must be the same, by their names: all of them unless some are named."""
         names = self.same or [str(one.relative_to(self.output)) for one in self.output.rglob("*") if one.is_file()]
         return {name: (self.output / name).read_bytes() for name in names if (self.output / name).exists()}
 
     def clear(self, *, all: bool = False) -> None:
-        """Take away what a run begins without, or all that it wrote."""
+        """Delete what must not exist before a run, or all output."""
         for path in (*self.afresh, *([self.output] if all else [])):
             shutil.rmtree(path, ignore_errors=True)
 
 
 def unreadable(folder: Path) -> list[str]:
-    """Files of a folder that are not whole, and why."""
+    """Files of a folder that are incomplete, and why."""
     wrong = []
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         look = _LOOKS.get(path.suffix)
@@ -108,7 +111,7 @@ def unreadable(folder: Path) -> list[str]:
             continue
         try:
             look(path)
-        except Exception as error:  # whatever a reader says of what is broken
+        except Exception as error:  # any message of a reader about damaged files
             wrong.append(f"{path.name}: {type(error).__name__}: {error}")
     return wrong
 
@@ -145,7 +148,7 @@ _LOOKS: dict[str, Callable[[Path], object]] = {
 
 
 def study(folder: Path, name: str, scheduler: str | None = None) -> Command:
-    """A study of twelve points in as many chunks, exact maps; by the workers of a scheduler where one is given."""
+    """A study of twelve points in as many chunks, exact maps, by the workers of a scheduler where one is given."""
     folder.mkdir(parents=True)
     (folder / "study.toml").write_text(STUDY, "utf-8")
     options = ("study.toml", "--quiet", *(() if scheduler is None else ("--scheduler", scheduler)))
@@ -154,7 +157,7 @@ def study(folder: Path, name: str, scheduler: str | None = None) -> Command:
 
 
 def tank(folder: Path) -> dict[str, Command]:
-    """A stream, an image, and the same image with nothing compiled, of a disk that a touch moves over."""
+    """A stream, an image, and the same image with nothing compiled, of a disk with a moving touch."""
     from benchmarks.problems.touched_sensors import bodies, simulate
     from jeit.data import Measurement, write_table
     from jeit.mesh import Disk
@@ -197,7 +200,7 @@ def tank(folder: Path) -> dict[str, Command]:
 
 
 def watch(folder: Path) -> Command:
-    """Gestures of a small sheet named as they end."""
+    """Gestures on a small sheet, classified as they end."""
     import jax
 
     from jeit.electrodes import PointElectrodes

@@ -1,4 +1,4 @@
-"""How well the touches of an array are located, with one decay model or another."""
+"""Errors of located touches of an array, with different decay models."""
 
 from __future__ import annotations
 
@@ -8,47 +8,50 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.opponents.plain_consistency import PlainConsistency
-from benchmarks.problems.heard_arrays import BURST, ONSET, RATE, SAMPLES, SILENT, HeardArray
+from benchmarks.problems.simulated_arrays import BURST, ONSET, RATE, SAMPLES, SILENT, SimulatedArray
 from jeit.acoustic import Intensities, Recording, Taps, locate
 from jeit.acoustic.calibration.calibrate import CalibrationFit, fit_each_decay, select_fit
 
-# χ² of two degrees of freedom that 68 and 95 % stay under.
+# 68 % and 95 % quantiles of χ² with two degrees of freedom.
 ELLIPSES = (-2 * np.log(1 - 0.68), -2 * np.log(1 - 0.95))
 
 
 @dataclass(frozen=True)
 class Located:
-    """Of N touches: `off` (N,) metres from where they are, infinite where none was found; `square` (N,) the same
-    squared, in units of the covariance; the `status` of each; `said`: the error of the calibration, "" where there is
-    none; the `decay` that was fitted; and how much of the `silence` was taken for a touch."""
+    """For N touches: `off` (N,), metres from their true places, infinite where none was located.
+
+    `square` (N,): the same squared, in units of the covariance. The `status` of each. `message`: the error message of
+    the calibration, empty where there is none. The `decay` that was fitted, and the fraction of the `silence` that was
+    reported as a touch.
+    """
 
     off: Float[np.ndarray, " N"]
     square: Float[np.ndarray, " N"]
     status: tuple[str, ...] = ()
-    said: str = ""
+    message: str = ""
     decay: str = ""
     silence: float = 0.0
 
     @property
     def median(self) -> float:
-        """Half the touches are located better, metres."""
+        """Median error, metres."""
         return float(np.median(self.off))
 
     def held(self, ellipse: int) -> float:
-        """Share of the touches that were found which the 68 (0) or 95 % (1) ellipse holds."""
+        """Fraction of the located touches that the 68 (0) or 95 % (1) ellipse contains."""
         found = np.isfinite(self.square)
         return float(np.mean(self.square[found] < ELLIPSES[ellipse])) if found.any() else np.nan
 
 
-def taps_of(array: HeardArray) -> Taps:
-    """As a user hands them over: samples, or intensities."""
+def taps_of(array: SimulatedArray) -> Taps:
+    """Taps as from a user: samples, or intensities."""
     if array.sampled:
         return Taps(array.microphones, array.outline, array.places, samples=array.taps, rate=RATE)
     return Taps(array.microphones, array.outline, array.places, power=array.intensity(array.taps)[0])
 
 
-def touches_of(array: HeardArray) -> tuple[Recording | Intensities, np.ndarray]:
-    """The recording of touches and silence, and when the middle of each is, (N + SILENT,) s."""
+def touches_of(array: SimulatedArray) -> tuple[Recording | Intensities, np.ndarray]:
+    """The recording of touches and silence, and the middle of each in time, (N + SILENT,) s."""
     middle = SAMPLES / RATE * np.arange(len(array.touches) + SILENT) + ONSET + BURST / 2
     if array.sampled:
         return Recording(array.sound, RATE), middle
@@ -56,21 +59,23 @@ def touches_of(array: HeardArray) -> tuple[Recording | Intensities, np.ndarray]:
     return Intensities(middle, power), middle
 
 
-def located_by_each(array: HeardArray) -> dict[str, Located]:
-    """By jeit, with every decay model, and with that which "auto" takes: a recording located with the defaults."""
+def located_by_each(array: SimulatedArray) -> dict[str, Located]:
+    """Results of jeit with every decay model, and with that which "auto" chooses: a recording located with the
+    defaults.
+    """
     fits, refused = fit_each_decay(taps_of(array))
     far = np.full(len(array.touches), np.inf)
     found = {name: located(array, fit) for name, fit in fits.items()}
-    found |= {name: Located(far, far, said=why) for name, why in refused.items()}
+    found |= {name: Located(far, far, message=why) for name, why in refused.items()}
     try:
         chosen = select_fit(fits, refused).left_out[0][0]
     except ValueError as error:
-        return found | {"auto": Located(far, far, said=str(error))}
+        return found | {"auto": Located(far, far, message=str(error))}
     return found | {"auto": found[chosen]}
 
 
-def located(array: HeardArray, fit: CalibrationFit) -> Located:
-    """By jeit's defaults, after this calibration."""
+def located(array: SimulatedArray, fit: CalibrationFit) -> Located:
+    """Results of jeit's defaults, after this calibration."""
     recording, middle = touches_of(array)
     found = locate(recording, fit.calibration)
     nearest = np.abs(found.times[:, None] - middle[:-SILENT]).argmin(axis=0)
@@ -81,14 +86,14 @@ def located(array: HeardArray, fit: CalibrationFit) -> Located:
     if known.any():
         covariance = found.covariance[nearest][known]
         square[known] = np.einsum("ni,nij,nj->n", offset[known], np.linalg.inv(covariance), offset[known])
-    # Not in the first of them, into which the last touch may sound.
+    # Without the first of them, which the last touch may reach.
     silence = float(np.mean(found.status[found.times >= middle[1 - SILENT]] != "no touch"))
-    told = fit.calibration.microphone_array.decay.name
-    return Located(np.where(known, off, np.inf), square, tuple(found.status[nearest]), "", told, silence)
+    law = fit.calibration.microphone_array.decay.name
+    return Located(np.where(known, off, np.inf), square, tuple(found.status[nearest]), "", law, silence)
 
 
-def plainly_located(array: HeardArray) -> Located:
-    """By the plain fit, from the same bursts."""
+def plainly_located(array: SimulatedArray) -> Located:
+    """Results of the plain fit, from the same bursts."""
     plain = PlainConsistency(array.microphones, array.outline, array.places, array.intensity(array.taps)[0])
     off = np.linalg.norm(plain(array.intensity(array.stretches[:-SILENT])[0]) - array.touches, axis=1)
     return Located(off, np.full(len(off), np.nan))

@@ -1,16 +1,16 @@
-"""Finite-element matrices whose values have just been assembled, for solvers alone: plain arrays."""
+"""Finite-element matrices with newly assembled values, for solvers alone: plain arrays."""
 
 from __future__ import annotations
 
 import numpy as np
 
 NUM_RIGHT_HAND_SIDES = 16
-# Matrices in a batch, below and above so many nodes.
+# Matrices in a batch, below and above this number of nodes.
 MANY, FEW, SMALL = 64, 16, 3000
 
 
 def meshes(disks: tuple[int, ...], solids: bool = True):
-    """Name: jeit's mesh: disks of about so many nodes, and a box (9,922 nodes) and a layer (14,885)."""
+    """Name: jeit's mesh: disks of about `disks` nodes, a box (9,922 nodes) and a layer (14,885)."""
     from jeit.mesh import box, disk, layer
 
     found = {f"disk {count}": disk(1.0, num_points=count) for count in disks}
@@ -55,7 +55,7 @@ def make(mesh) -> dict[str, np.ndarray]:
 
 
 def symmetric(problem: dict[str, np.ndarray], number: int):
-    """One of the matrices, whole, as SciPy's compressed columns (n, n)."""
+    """One of the matrices, with both triangles, as SciPy's compressed columns (n, n)."""
     from scipy.sparse import coo_array
 
     rows, columns, values = problem["rows"], problem["columns"], problem["values"][number]
@@ -66,6 +66,6 @@ def symmetric(problem: dict[str, np.ndarray], number: int):
 
 
 def residual(problem: dict[str, np.ndarray], number: int, solution: np.ndarray) -> float:
-    """What a solution (n, 16) leaves of the load, relative to it, in the Frobenius norm."""
+    """Residual of a solution (n, 16), relative to the load, in the Frobenius norm."""
     left = symmetric(problem, number) @ solution - problem["load"]
     return float(np.linalg.norm(left) / np.linalg.norm(problem["load"]))

@@ -1,8 +1,8 @@
 """Tanks with one to three strong bodies, drawn at random and solved without jeit: metal, plastic, or both.
 
 Mesh and solver are not jeit's: rings of points on the bodies' outlines and a jittered grid, triangulated by SciPy,
-solved by `scipy_baseline`. What differs from tank to tank: size, electrodes and how much of the boundary they cover,
-contact impedance, currents, channels, and the number, size, place, shape and conductivity of the bodies.
+solved by `scipy_baseline`. Tanks differ in size, electrodes and the fraction of the boundary that they cover, contact
+impedance, currents, channels, and in the number, size, place, shape and conductivity of the bodies.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from jeit.mesh import Disk
 from jeit.protocol import Protocol, adjacent, all_against_one, opposite, skip
 
 NOISE = 0.01
-"""Of each voltage."""
+"""Relative noise of each voltage."""
 REACH = 0.3
 """Distance, in units of the tank's radius, within which an inclusion may be a body's."""
 _APART, _FROM_WALL = 0.12, 0.06
@@ -31,8 +31,9 @@ _SPACING = 0.035
 
 
 class Body(NamedTuple):
-    """**Fields**: `centre` (2,) and `radius`, of a disk of the same area, in units of the tank's radius; `corners`, 0
-    of a disk, 4 of a square; `turned`, radians; `factor`, its conductivity over the background's."""
+    """**Fields**: `centre` (2,) and `radius`, of a disk of the same area, in units of the tank's radius. `corners`, 0
+    of a disk, 4 of a square. `turned`, radians. `factor`, its conductivity over the background's.
+    """
 
     centre: np.ndarray
     radius: float
@@ -46,12 +47,12 @@ class Body(NamedTuple):
         return 1 if self.factor > 1 else -1
 
     def outline(self, number: int, grown: float = 0.0) -> np.ndarray:
-        """Points (number, 2) of the outline, moved out by `grown`."""
+        """Points (number, 2) of the outline, moved outwards by `grown`."""
         angle = 2 * np.pi * (np.arange(number) + 0.5) / number
         return self.centre + (self._reach(angle) + grown)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """Which of points (n, 2) lie in it."""
+        """Which of points (n, 2) are inside it."""
         offset = points - self.centre
         return np.hypot(*offset.T) < self._reach(np.arctan2(offset[:, 1], offset[:, 0]))
 
@@ -64,7 +65,7 @@ class Body(NamedTuple):
 
 
 class Tank(NamedTuple):
-    """**Fields**: `frames`, the tank with its bodies, and `reference`, without; `bodies`; `radius`, metres."""
+    """**Fields**: `frame`, the tank with its bodies, and `reference`, without them. `bodies`. `radius`, metres."""
 
     frame: Measurement
     reference: Measurement
@@ -73,7 +74,7 @@ class Tank(NamedTuple):
 
 
 def draw(seed: int, noise: float = NOISE) -> Tank:
-    """A tank, the same for the same seed."""
+    """A tank, reproducible from its seed."""
     rng = np.random.default_rng(seed)
     radius = np.exp(rng.uniform(np.log(0.02), np.log(0.2)))
     count = int(rng.choice([16, 16, 32]))
@@ -114,8 +115,10 @@ def draw(seed: int, noise: float = NOISE) -> Tank:
 
 
 def matched(tank: Tank, inclusions: Sequence[Inclusion]) -> tuple[np.ndarray, int]:
-    """How far from each body, in units of the tank's radius, its own inclusion of the same sign is found, infinite
-    where there is none within `REACH`; and how many inclusions are no body's."""
+    """Distance of each body, in units of the tank's radius, from the nearest inclusion of the same sign.
+
+    It is infinite where there is none within `REACH`. Also the number of inclusions that match no body.
+    """
     if not inclusions:
         return np.full(len(tank.bodies), np.inf), 0
     places = np.array([one.centroid for one in inclusions]) / tank.radius

@@ -1,7 +1,7 @@
-"""A serial device played on a pseudo-terminal, in a process of its own, with faults that come in turn.
+"""A serial device simulated on a pseudo-terminal, in a process of its own, with a series of faults.
 
 The arguments are those of `play`. A link names the pseudo-terminal, as links of udev name devices: when the device is
-unplugged the link goes, and when it is plugged in again it names another one.
+unplugged the link disappears, and when it is plugged in again it names another one.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ import tty
 from pathlib import Path
 
 ENTRY = struct.Struct("<id")
-"""What is noted of each frame that was sent whole: the number of its line, and `time.monotonic()` after that."""
+"""Record of each frame sent completely: the number of its line, and `time.monotonic()` after that."""
 FAULTS = ("garbage", "half a line", "another number of channels", "no readings", "twice the rate", "unplugged")
-# Seconds for which the rate is doubled and the device unplugged, of rest before it is, and for which it then waits for
-# the reader.
+# Seconds for which the rate is doubled and the device unplugged, of rest before that, and of waiting for the reader.
 _DOUBLED, _UNPLUGGED, _REST, _PATIENCE = 2.0, 1.0, 0.1, 5.0
 
 
@@ -29,7 +28,7 @@ class _Terminal:
         self.link, self.leader = link, -1
 
     def plug(self) -> None:
-        """Make a pseudo-terminal, named by the link; a write to it that nobody reads fails rather than waits."""
+        """Create a pseudo-terminal, named by the link. A write to it that nobody reads fails instead of blocking."""
         self.leader, self.follower = os.openpty()
         tty.setraw(self.follower)
         os.set_blocking(self.leader, False)
@@ -38,7 +37,7 @@ class _Terminal:
         beside.replace(self.link)
 
     def unplug(self) -> None:
-        """Let it vanish, once all is read: what a device has not sent is not lost."""
+        """Remove it, once all is read: data that a device has not sent are not lost."""
         end = time.monotonic() + _PATIENCE
         while self._unread() and time.monotonic() < end:
             time.sleep(1e-3)
@@ -60,8 +59,11 @@ class _Terminal:
 
 
 def play(lines: Path, link: Path, log: Path, seconds: float, rate: float, period: float) -> None:
-    """Send `lines`, a frame each, over and over for so many `seconds`, at `rate` frames/s, with a fault every `period`
-    seconds; note each frame sent whole in `log`, and print each fault that was planted."""
+    """Send `lines`, a frame each, repeatedly for a number of `seconds`, at `rate` frames/s, with a fault every `period`
+    seconds.
+
+    Record each frame sent completely in `log`, and print each planted fault.
+    """
     frames = lines.read_bytes().splitlines(keepends=True)
     terminal, noise = _Terminal(link), random.Random(0)
     terminal.plug()

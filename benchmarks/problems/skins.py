@@ -1,4 +1,4 @@
-"""The skins of 200 × 200 mm with 32 electrodes inside them that are touched all over."""
+"""The skins of 200 × 200 mm with 32 inner electrodes that are touched all over."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ SIDE, THICKNESS = 0.2, 0.01
 
 
 def skin(kind: str, cell_size: float):
-    """A "sheet" or a "layer": model of the paper's inner layout, conductivity (m,), what `touched_cells` needs to know.
+    """A "sheet" or a "layer": model of the paper's inner layout, conductivity (m,), and the arguments for
+    `touched_cells`.
 
     `cell_size` in metres.
     """

@@ -1,8 +1,8 @@
-"""Boxes and cylinders with one or two balls or columns in them, drawn at random: solved on meshes cut along these.
+"""Boxes and cylinders with one or two balls or columns in them, drawn at random and solved on meshes cut along these.
 
-Those meshes are other and finer ones than images are made on. What differs from tank to tank: size, electrodes, contact
-impedances, currents and what is read, and number, size, place and conductivity of the balls. Columns stand in cylinders
-with a ring of tall strips, as they do in most tanks.
+Those meshes differ from, and are finer than, those of the images. Tanks differ in size, electrodes, contact impedances,
+currents and measurements, and in number, size, place and conductivity of the balls. Columns stand in cylinders with a
+ring of tall strips, as in most tanks.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ _REACH = 2.0
 
 
 class Ball(NamedTuple):
-    """**Fields**: `centre` (3,) and `radius`, metres; `factor`, its conductivity over the bath's; `height` of the tank,
-    metres, of what is no ball but a column through it."""
+    """**Fields**: `centre` (3,) and `radius`, metres. `factor`, its conductivity over the bath's. `height` of the tank,
+    metres, for a column through it instead of a ball.
+    """
 
     centre: np.ndarray
     radius: float
@@ -42,16 +43,16 @@ class Ball(NamedTuple):
 
     @property
     def volume(self) -> float:
-        """m³."""
+        """Volume, m³."""
         return np.pi * self.radius**2 * (4 / 3 * self.radius if self.height is None else self.height)
 
     def level(self, points: np.ndarray) -> np.ndarray:
-        """How far points (n, 3) lie outside, metres."""
+        """Distance of points (n, 3) outside it, metres."""
         along = 3 if self.height is None else 2
         return np.linalg.norm((points - self.centre)[..., :along], axis=-1) - self.radius
 
     def edge(self, corners: np.ndarray) -> np.ndarray:
-        """How long edges of cells (m, 4, 3) may be, metres: short on the surface."""
+        """Maximum length of edges of cells (m, 4, 3), metres: short on the surface."""
         outside, edge = self.level(corners), _EDGE if self.height is None else _COLUMNS_EDGE
         return np.where((outside.min(axis=1) < 0) & (outside.max(axis=1) > 0), edge * self.radius, np.inf)
 
@@ -66,7 +67,7 @@ class SolidTank(NamedTuple):
 
 
 def draw(seed: int, *, columns: bool = False) -> SolidTank:
-    """A tank, the same for the same seed; with `columns` in place of balls a cylinder with strips."""
+    """A tank, reproducible from its seed. With `columns` in place of balls it is a cylinder with strips."""
     rng = np.random.default_rng(seed)
     kind = "strips" if columns else KINDS[int(rng.integers(len(KINDS)))]
     domain, electrodes, protocol = empty_tank(rng, kind)
@@ -107,7 +108,7 @@ def mesh_along(domain: Solid, electrodes: FacePatches, balls: Sequence[Ball]) ->
 
 
 def empty_tank(rng, kind: str) -> tuple[Solid, FacePatches, Protocol]:
-    """A tank of a `kind` (see `KINDS`), its electrodes with contact impedances of 1, and what is driven and read."""
+    """A tank of a `kind` (see `KINDS`), its electrodes with contact impedances of 1, and its measurements."""
     current = np.exp(rng.uniform(np.log(1e-4), np.log(1e-2)))
     scale = np.exp(rng.uniform(np.log(0.3), np.log(2.0)))
     if kind == "plates":
@@ -136,14 +137,14 @@ def empty_tank(rng, kind: str) -> tuple[Solid, FacePatches, Protocol]:
 
 
 def _by_number(rng, own: Callable[..., Protocol], count: int, current: float, most: int) -> Protocol:
-    """By the electrodes' numbers: trigonometric, opposite, up to `most` skipped, or of the kind's `own`."""
+    """Patterns by the electrodes' numbers: trigonometric, opposite, up to `most` skipped, or the kind's `own`."""
     kind = (trigonometric, own, opposite, skip)[int(rng.integers(4))]
     skipped = (int(rng.integers(1, most + 1)),) if kind is skip else ()
     return kind(count, *skipped, current=current)
 
 
 def _pairs(rng, current: float) -> Protocol:
-    """Across within each of two rings and between them, read between neighbours of a ring and above each other."""
+    """Drives across each of two rings and between them, measured between neighbours of a ring and vertically."""
     one, ring = np.eye(32), np.arange(16)
     across = int(rng.integers(3, 9))
     ends = [(a + r, (a + across) % 16 + r) for r in (0, 16) for a in ring] + [(a, (a + across) % 16 + 16) for a in ring]
@@ -153,7 +154,7 @@ def _pairs(rng, current: float) -> Protocol:
 
 
 def balls_in(rng, domain: Solid, *, middle: bool) -> tuple[Ball, ...]:
-    """Anywhere, or at half the height: one ring of strips does not tell above from below."""
+    """Balls anywhere, or at half the height, since one ring of strips does not distinguish above from below."""
     number, balls = int(rng.integers(1, 3)), []
     height = domain.thickness
     disk = isinstance(domain.outline, Disk)
@@ -173,8 +174,10 @@ def balls_in(rng, domain: Solid, *, middle: bool) -> tuple[Ball, ...]:
 
 
 def matched(tank: SolidTank, places: Sequence[np.ndarray], signs: Sequence[int]) -> tuple[np.ndarray, int]:
-    """Which of what was found, at `places`, metres, is each ball: the nearest of the same sign within two radii, -1
-    where there is none; and how many are no ball's."""
+    """The index of the detected body, at `places`, metres, for each ball, and the number of bodies that match no ball.
+
+    It is the nearest of the same sign within two radii, -1 where there is none.
+    """
     if not len(places):
         return np.full(len(tank.balls), -1), 0
     distance = np.array([np.linalg.norm(np.array(places) - ball.centre, axis=1) / ball.radius for ball in tank.balls])

@@ -1,7 +1,7 @@
-"""People on the simulated skin of Park et al. (2022): windows of sound, heard in more noise, by fewer microphones.
+"""People on the simulated skin of Park et al. (2022): windows of sound, with more noise and with fewer microphones.
 
-25 microphones under 200 × 200 × 10 mm, sampled at 10 kHz. How people differ, and how loud they are beside the noise, is
-in `jeit.acoustic.simulate.people`, fixed before accuracies were looked at.
+25 microphones under 200 × 200 × 10 mm, sampled at 10 kHz. The differences between people, and their loudness relative
+to the noise, are in `jeit.acoustic.simulate.people`, fixed before accuracies were computed.
 """
 
 from __future__ import annotations
@@ -18,20 +18,22 @@ from jeit.acoustic.simulate import SoundingPerson, SoundingSkin, simulate_sound_
 from jeit.acoustic.simulate.people import MODALITIES, SOUND_MANNERS
 from jeit.touch.listening import SoundImages, sound_images
 
-# Decibels of noise more than the skin has; and of its 5 × 5 microphones those that are left: every other one of the
-# grid, its corners' square, and the one in the middle.
+# Decibels of additional noise, and the remaining ones of the skin's 5 × 5 microphones: every other one of the grid, the
+# square of its corners, and the one at the centre.
 LOUDER = (0.0, 5.0, 10.0, 15.0, 20.0)
 FEWER = {25: tuple(range(25)), 9: (0, 2, 4, 10, 12, 14, 20, 22, 24), 4: (6, 8, 16, 18), 1: (12,)}
-# Of the windows of a clip every other, 0.2 s apart: those between share most of their sound with them.
+# Every other window of a clip is used, 0.2 s apart: the windows between them share most of their sound.
 _EVERY = 2
-# Changes with what the same set is simulated to.
+# To be increased when the simulation of a set changes.
 _VERSION = 1
 
 
 @dataclass(frozen=True)
-class HeardPeople:
-    """W windows: `images`, by (decibels of noise more, microphones); of each the number of its class, `right` (W,), of
-    `MODALITIES`, of its `person` and its `clip`."""
+class SoundSet:
+    """W windows: `images`, by (decibels of additional noise, microphones).
+
+    For each window the number of its class of `MODALITIES`, `right` (W,), of its `person` and its `clip`.
+    """
 
     images: dict[tuple[float, int], SoundImages]
     right: np.ndarray
@@ -39,9 +41,11 @@ class HeardPeople:
     clip: np.ndarray
 
 
-def heard_people(people: int, each: int, seed: int, *, store: Path | None = None) -> HeardPeople:
-    """`each` clips of every modality by so many people drawn from `seed`, 2.9 s long; read from the folder `store`
-    where they were made before, and written there."""
+def sound_set(people: int, each: int, seed: int, *, store: Path | None = None) -> SoundSet:
+    """`each` clips of every modality by `people` persons drawn from `seed`, 2.9 s long.
+
+    Read from the folder `store` where they exist, otherwise simulated and written there.
+    """
     decides = people, each, seed, SOUND_MANNERS, LOUDER, FEWER, _EVERY, _VERSION
     path = None if store is None else store / f"sounds-{hashlib.sha256(repr(decides).encode()).hexdigest()[:12]}.npz"
     if path is None or not path.exists():
@@ -61,14 +65,14 @@ def heard_people(people: int, each: int, seed: int, *, store: Path | None = None
             )
             for louder, number in _variants()
         }
-        return HeardPeople(images, held["right"], held["person"], held["clip"])
+        return SoundSet(images, held["right"], held["person"], held["clip"])
 
 
 def _variants() -> list[tuple[float, int]]:
     return [(louder, 25) for louder in LOUDER] + [(0.0, number) for number in FEWER if number < 25]
 
 
-def _simulated(people: int, each: int, seed: int) -> HeardPeople:
+def _simulated(people: int, each: int, seed: int) -> SoundSet:
     skin = SoundingSkin(jax.random.key(0))
     for_people, for_clips = jax.random.split(jax.random.key(seed))
     drawn = [SoundingPerson.draw(key) for key in jax.random.split(for_people, people)]
@@ -76,12 +80,12 @@ def _simulated(people: int, each: int, seed: int) -> HeardPeople:
     right, person = [], []
     for clip in simulate_sound_clips(for_clips, skin, drawn, each):
         for louder, number in parts:
-            heard = clip.noisier(louder)[list(FEWER[number])]
-            parts[louder, number].append(sound_images(Recording(heard, skin.rate))[::_EVERY])
+            received = clip.noisier(louder)[list(FEWER[number])]
+            parts[louder, number].append(sound_images(Recording(received, skin.rate))[::_EVERY])
         right.append(MODALITIES.index(clip.modality))
         person.append(clip.person)
     count = len(parts[0.0, 25][0])
-    return HeardPeople(
+    return SoundSet(
         {one: SoundImages.joined(own) for one, own in parts.items()},
         np.repeat(right, count),
         np.repeat(person, count),

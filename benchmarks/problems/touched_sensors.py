@@ -1,4 +1,4 @@
-"""Sensors that a touch moves over, and the frames that they measure.
+"""Sensors with a moving touch, and the frames that they measure.
 
 The sheet of Silvera Tawil et al. 2011 (320 × 200 mm, 16 electrodes round it and one in its centre, 224 voltages) and a
 disk of 16 electrodes (208 voltages).
@@ -10,7 +10,7 @@ NOISE = 1e-3  # standard deviation, of each voltage
 
 
 def bodies():
-    """Name: function that makes the model for about so many nodes."""
+    """Name: function that creates the model for a number of nodes."""
     import numpy as np
 
     from jeit.electrodes import BoundaryElectrodes, CombinedElectrodes, SheetDiscs
@@ -34,7 +34,7 @@ def bodies():
 
 
 def simulate(model, reach, count: int):
-    """Frames (count, M) of a touch that travels round the body: half the conductivity within 15 mm; and one at rest."""
+    """Frames (count, M) of a touch moving round the body, half the conductivity within 15 mm, and one at rest."""
     import jax
     import jax.numpy as jnp
     import numpy as np

@@ -1,9 +1,9 @@
-"""The sheet of Silvera Tawil et al. (2011), and people who touch it, simulated: sets of gestures, imaged and cut.
+"""The sheet of Silvera Tawil et al. (2011), and people who touch it, simulated: sets of gestures, imaged and segmented.
 
-320 × 200 mm, 16 electrodes 10 mm from the edge and one in the middle, eyelets of 7 mm, 1.8 mA through neighbours, 224
-potentials against the middle, 60 frames/s. Simulated with complete electrodes on a mesh of some 2,000 nodes, imaged by
-one NOSER step on one of 1,193. How people differ is in `jeit.touch.simulate.people`, fixed before accuracies were
-looked at.
+320 × 200 mm, 16 electrodes 10 mm from the edge and one at the centre, eyelets of 7 mm, 1.8 mA through adjacent
+electrodes, 224 potentials against the centre, 60 frames/s. Simulated with complete electrodes on a mesh of some 2,000
+nodes, imaged by one NOSER step on a mesh of 1,193. The differences between people are in `jeit.touch.simulate.people`,
+fixed before accuracies were computed.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from jeit.touch.simulate.people import MANNERS, GestureStream, Person, simulate_
 
 SIDES, INSET, EYELET, CURRENT, CONTACT = (0.32, 0.2), 0.01, 0.007, 1.8e-3, 1e-3
 NODES, FINE_NODES = 1193, 2000
-# Changes with what the same set is simulated to.
+# To be increased when the simulation of a set changes.
 _VERSION = 1
 
 
 class Sheet:
-    """The sheet: `skin`, as it is, with `fine` nodes, and what images it: `linear`, and `outline`; `description`."""
+    """The sheet: the simulated `skin` with `fine` nodes, its imager `linear`, its `outline` and `description`."""
 
     def __init__(self, fine: int = FINE_NODES, nodes: int = NODES):
         self.outline = Rectangle(*SIDES)
@@ -60,11 +60,11 @@ class Sheet:
         )
 
     def level(self, made: GestureSet) -> TouchLevel:
-        """Of what the untouched sheet's images show."""
+        """The level of images of the untouched sheet."""
         return TouchLevel.of_untouched(self.linear.mesh, np.asarray(self.linear.image(made.untouched - made.reference)))
 
     def touches(self, made: GestureSet) -> list[StreamTouch | None]:
-        """Of each recording the touch that lasts longest; none where none was found."""
+        """The longest touch of each recording, or none where none was detected."""
         level, found = self.level(made), []
         for number in range(len(made)):
             seconds, changes = made.changes(number)
@@ -73,8 +73,10 @@ class Sheet:
         return found
 
     def gestures(self, people: int, each: int, seed: int, *, store: Path | None = None) -> GestureSet:
-        """`each` times each gesture by so many people, drawn from `seed`; read from the folder `store` where it was
-        made before, and written there."""
+        """`each` times each gesture by `people` persons drawn from `seed`.
+
+        Read from the folder `store` where they exist, otherwise simulated and written there.
+        """
         path = self._path("gestures", store, people, each, seed)
         if path is not None and path.exists():
             return GestureSet.read(path)
@@ -87,7 +89,7 @@ class Sheet:
         return made
 
     def stream(self, people: int, number: int, seed: int, *, store: Path | None = None) -> GestureStream:
-        """`number` gestures one after another by so many people, drawn from `seed`; kept as `gestures` are."""
+        """`number` gestures one after another by several people, drawn from `seed`, and stored as `gestures` are."""
         path = self._path("stream", store, people, number, seed)
         if path is not None and path.exists():
             with np.load(path, allow_pickle=False) as kept:
@@ -101,8 +103,9 @@ class Sheet:
         return made
 
     def _path(self, kind: str, store: Path | None, *sizes: int) -> Path | None:
-        """Where such a set is kept: its name holds all that decides what is made, but for the code, which the version
-        stands for."""
+        """Path of such a set: its name contains everything that determines the set, except the code, which the version
+        represents.
+        """
         if store is None:
             return None
         decides = *sizes, self.skin.model.mesh.num_cells, self.skin.material, MANNERS, _VERSION

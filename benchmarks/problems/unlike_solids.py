@@ -1,6 +1,6 @@
-"""Cylinders and boxes that are not as they are described, with one or two balls or columns in them.
+"""Cylinders and boxes that deviate from their description, with one or two balls or columns in them.
 
-Voltages are computed on a mesh along the balls, other and finer than that of an image. Errors are those of
+Voltages are computed on a mesh along the balls, different from and finer than that of an image. Errors are those of
 `problems/unlike_tanks.py`: of electrodes along both directions of their face, of contacts, size, gains and digits.
 """
 
@@ -21,12 +21,12 @@ from jeit.mesh import Disk, Solid
 from jeit_solvers.engines import as_array, on_host
 
 ERRORS = tuple(kind for kind in KINDS if kind != "in space")
-# Share of the room between an electrode and the rim of its face that a shift may use.
+# Fraction of the room between an electrode and the edge of its face that a shift may use.
 _ROOM = 0.9
 
 
 def draw(seed: int) -> Tank:
-    """A tank, the same for the same seed; its kind of error is `seed` modulo the number of kinds."""
+    """A tank, reproducible from its seed. Its kind of error is `seed` modulo the number of kinds."""
     rng = np.random.default_rng(seed)
     kind, form = ERRORS[seed % len(ERRORS)], FORMS[seed // len(ERRORS) % len(FORMS)]
     while True:

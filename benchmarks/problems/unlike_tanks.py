@@ -1,9 +1,9 @@
-"""Sheets that are not as they are described: disks, rectangles and polygons with one to three round bodies.
+"""Sheets that deviate from their description: disks, rectangles and polygons with one to three round bodies.
 
-Voltages are computed on another, finer mesh, for electrodes that are not where they are described, with contacts that
-differ; some tanks have one more kind of error. Tanks of the kind "in space" have a height, upright bodies, and strips
-that cover part of the height, and are described as sheets. The defaults of jeit were set on other tanks of the kinds
-`SET_ON`; those `KEPT_BACK` are never looked at for that.
+Voltages are computed on another, finer mesh, for electrodes that are displaced from their description, with contacts
+that differ. Some tanks have one more kind of error. Tanks of the kind "in space" have a height, upright bodies, and
+strips that cover part of the height, and are described as sheets. The defaults of jeit were set on other tanks of the
+kinds `SET_ON`. Those `KEPT_BACK` are never used for that.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _SIZE = 0.1
 REACH = 0.3
 """Distance, in units of half the width of a tank, within which an inclusion may be a body's."""
 _NODES = 7000
-# Least distance of the two ends of a strip, in units of its width.
+# Least distance between the two ends of a strip, in units of its width.
 _STRAIGHT = 0.98
 
 
@@ -67,7 +67,7 @@ class Tank(NamedTuple):
 
 
 def draw(seed: int) -> Tank:
-    """A tank, the same for the same seed; its kind of error is `seed` modulo the number of kinds."""
+    """A tank, reproducible from its seed. Its kind of error is `seed` modulo the number of kinds."""
     rng = np.random.default_rng(seed)
     kind, outline = KINDS[seed % len(KINDS)], ("disk", "rectangle", "polygon")[seed // len(KINDS) % 3]
     while True:
@@ -159,7 +159,7 @@ def recorded(rng, kind: str, voltages: np.ndarray, noise: float) -> np.ndarray:
 
 
 def matched(tank: Tank, inclusions: Sequence[Inclusion]) -> tuple[list[Inclusion | None], int]:
-    """For each body its own inclusion, the nearest of its sign within `REACH`; and how many are no body's."""
+    """For each body the nearest inclusion of its sign within `REACH`, and the number of spurious inclusions."""
     found: list[Inclusion | None] = [None] * len(tank.bodies)
     if not inclusions:
         return found, 0
@@ -174,8 +174,10 @@ def matched(tank: Tank, inclusions: Sequence[Inclusion]) -> tuple[list[Inclusion
 
 
 def _electrodes(place, width, contact, height: float | None, covered: float) -> BoundaryElectrodes | FacePatches:
-    """Arcs on the edge of a sheet; in a tank with a `height`, strips half way up that cover a part of it. `contact` is
-    that of the sheet, ohm·m."""
+    """Arcs on the edge of a sheet, or in a tank with a `height`, strips half way up that cover a part of it.
+
+    `contact` is that of the sheet, ohm·m.
+    """
     if height is None:
         return BoundaryElectrodes(place, width, contact)
     place = np.column_stack([place, np.full(len(place), height / 2)])
@@ -207,7 +209,7 @@ def drawn_change(rng) -> float:
 
 
 def _bodies(rng, domain: Domain) -> tuple[Body, ...]:
-    """One to three bodies that lie apart and off the edge."""
+    """One to three bodies that are separate and off the edge."""
     number, (x_min, x_max, y_min, y_max) = int(rng.integers(1, 4)), domain.extent
     while True:
         bodies: list[Body] = []

@@ -1,7 +1,7 @@
 """Skins of 200 mm under weights, after Pugach et al. 2015: a disk and a square of one film, 16 electrodes on the edge.
 
-Spreads are those of the material, fixed before any accuracy was looked at. A weight stands on a disc of 16.25 mm, as
-theirs do where they say so; places are told to be anywhere on the skin that the disc does not stick out.
+Variation is that of the material, fixed before any accuracy was computed. A weight stands on a disc of 16.25 mm, as
+theirs do where they specify it. Places are anywhere on the skin where the disc does not extend beyond it.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ OUTLINES: dict[str, Domain] = {"disk": Disk(RADIUS), "square": Rectangle(2 * RAD
 
 @dataclass
 class WeighedSkin:
-    """A skin of the outline of that name, simulated on so many `nodes`."""
+    """A skin of the outline of that name, simulated with `nodes` nodes."""
 
     name: str = "disk"
     nodes: int = 4000
 
     def model(self, nodes: int) -> ForwardModel:
-        """Of the skin, on a mesh of so many nodes."""
+        """Model of the skin, on a mesh with `nodes` nodes."""
         outline, own = OUTLINES[self.name], material("velostat")
         places = perimeter(outline, 16, start=outline.perimeter / 32)
         electrodes = BoundaryElectrodes(places, 0.01, 1e-3 / (own.conductivity * own.thickness))
@@ -40,7 +40,7 @@ class WeighedSkin:
 
     @cached_property
     def skin(self) -> PressedSkin:
-        """What is pressed."""
+        """The skin that is pressed."""
         return PressedSkin(jax.random.key(0), self.model(self.nodes), material("velostat"))
 
     def presses(self, seed: int, number: int, grams: float = GRAMS) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Calibration: from taps of unknown strength to the models they were made with, and what spoils them."""
+"""Calibration from taps of unknown strength: it recovers the true models, and copes with faulty data."""
 
 import numpy as np
 import pytest
@@ -21,8 +21,8 @@ def parameters(decay, seed=0):
     return {"inverse-square": (a, b), "exponential": (a, length), "attenuated": (a, b, length)}[decay]
 
 
-def heard(decay, values, squared=SQUARED):
-    """f (T, M), from the formulas."""
+def responses(decay, values, squared=SQUARED):
+    """Responses f (T, M), from the formulas."""
     r = np.sqrt(squared)
     if decay == "inverse-square":
         return values[0] / (squared + values[1])
@@ -32,12 +32,12 @@ def heard(decay, values, squared=SQUARED):
 
 
 def strengths(seed=1):
-    """Of taps by hand: over a factor of ten or so."""
+    """Strengths of taps by hand: spread over a factor of about ten."""
     return np.exp(0.7 * np.random.default_rng(seed).normal(size=NUMBER))
 
 
 def scaled(decay, values, usable=slice(None)):
-    """Logarithms (K, M), with the scale that a calibration has, and the logarithm of that scale."""
+    """Logarithms (K, M) of the parameters at the scale of a calibration, and the logarithm of that scale."""
     logarithms = np.log(values)
     gain = logarithms[0] - (logarithms[1] if decay != "exponential" else 0)
     shift = gain[usable].mean()
@@ -56,7 +56,7 @@ def logarithms_of(fit):
 @pytest.fixture(scope="module")
 def exact():
     values, loudness = parameters("inverse-square"), strengths()
-    return values, loudness, loudness[:, None] * heard("inverse-square", values)
+    return values, loudness, loudness[:, None] * responses("inverse-square", values)
 
 
 @pytest.mark.parametrize(
@@ -65,9 +65,9 @@ def exact():
     + [pytest.param(decay, seed, marks=pytest.mark.slow) for decay in DECAYS for seed in (1, 2)],
 )
 def test_exact_data_give_the_parameters(decay, seed):
-    """To 1e-6, with strengths unknown; all else that the fit tells of is in order too."""
+    """The parameters are exact to 1e-6 with unknown strengths, and the rest of the fit is consistent."""
     values, loudness = parameters(decay, seed), strengths()
-    fit = calibrated(loudness[:, None] * heard(decay, values), decay=decay)
+    fit = calibrated(loudness[:, None] * responses(decay, values), decay=decay)
     expected, shift = scaled(decay, values)
     np.testing.assert_allclose(logarithms_of(fit), expected, atol=1e-5)
     np.testing.assert_allclose(fit.strength, loudness * np.exp(shift), rtol=1e-6)
@@ -79,14 +79,14 @@ def test_exact_data_give_the_parameters(decay, seed):
     np.testing.assert_allclose(fit.distance, np.sqrt(SQUARED), atol=1e-8)
     assert float(np.log(fit.calibration.microphone_array.decay.gain).mean()) == pytest.approx(0, abs=1e-12)
     assert isinstance(fit.calibration.microphone_array.decay, DECAYS[decay])
-    # Nothing is known better than to a thousandth.
+    # No parameter is known better than to a thousandth.
     np.testing.assert_allclose(fit.calibration.microphone_array.noise.relative, 1e-3)
     np.testing.assert_array_equal(fit.calibration.microphone_array.noise.deviation, 0)
 
 
 @pytest.mark.parametrize("scale", [1e-12, pytest.param(1e12, marks=pytest.mark.slow)])
 def test_any_unit_of_intensity(scale, exact):
-    """By a class of decay models, too, in place of its name."""
+    """A class of decay models is accepted too, in place of its name."""
     values, loudness, power = exact
     fit = calibrated(scale * power, decay=InverseSquare)
     expected, shift = scaled("inverse-square", values)
@@ -95,13 +95,13 @@ def test_any_unit_of_intensity(scale, exact):
 
 
 @pytest.fixture(scope="module")
-def spoilt(exact):
-    """A tenth of the taps where they were not made, microphone 3 dead, 7 deaf: noise about one level."""
+def faulty(exact):
+    """A tenth of the taps at wrong places, microphone 3 dead, microphone 7 with noise about one level."""
     values, _, power = exact
     rng = np.random.default_rng(2)
     wrong = rng.choice(NUMBER, NUMBER // 10, replace=False)
     places, power = PLACES.copy(), power.copy()
-    # At least 4 cm from where it was: one that hits its own place by chance is not wrong.
+    # The wrong place is at least 4 cm from the true one, since a smaller displacement is not wrong.
     far = rng.uniform(-0.09, 0.09, (200, len(wrong), 2))
     apart = np.linalg.norm(far - PLACES[wrong], axis=-1)
     places[wrong] = far[(apart > 0.04).argmax(axis=0), np.arange(len(wrong))]
@@ -110,31 +110,31 @@ def spoilt(exact):
     return values, wrong, calibrated(power, places)
 
 
-def test_taps_at_wrong_places_are_found(spoilt):
-    """All of them, and no other."""
-    _, wrong, fit = spoilt
+def test_all_taps_at_wrong_places_are_detected(faulty):
+    """All of them, and no other tap, are reported as outliers."""
+    _, wrong, fit = faulty
     assert set(np.flatnonzero(fit.outlier)) == set(wrong)
     assert not fit.usable[wrong].any()
 
 
-def test_what_is_spoilt_does_no_harm(spoilt):
-    values, _, fit = spoilt
+def test_faulty_data_do_not_affect_the_other_microphones(faulty):
+    values, _, fit = faulty
     good = fit.calibration.usable
     assert set(np.flatnonzero(~good)) == {3, 7}
     expected = scaled("inverse-square", values, good)[0]
     np.testing.assert_allclose(logarithms_of(fit)[:, good], expected[:, good], atol=1e-6)
 
 
-def test_a_dead_and_a_deaf_microphone_are_named_with_reason(spoilt):
-    reasons = spoilt[2].calibration.reasons
+def test_dead_and_insensitive_microphones_are_reported_with_a_reason(faulty):
+    reasons = faulty[2].calibration.reasons
     assert reasons[3] == "dead: every intensity is 0"
     assert "explains" in reasons[7] or "does not fall with distance" in reasons[7]
     assert {reasons[k] for k in range(COUNT) if k not in (3, 7)} == {""}
-    assert spoilt[2].explained[7] < 0.3
+    assert faulty[2].explained[7] < 0.3
 
 
-def test_the_scale_is_that_of_the_usable_microphones(spoilt):
-    calibration = spoilt[2].calibration
+def test_the_scale_is_that_of_the_usable_microphones(faulty):
+    calibration = faulty[2].calibration
     gain = np.asarray(calibration.microphone_array.decay.gain)[calibration.usable]
     assert float(np.log(gain).mean()) == pytest.approx(0, abs=1e-12)
     assert np.isnan(calibration.standard_errors[:, 3]).all()
@@ -152,20 +152,22 @@ def drawn(power, number):
 
 @pytest.mark.slow
 def test_standard_errors_are_the_errors(exact):
-    """Root mean square of z-scores. The 25 of a draw are correlated through the scale: 6 draws are good to 12 %."""
+    """Root mean square of z-scores. The 25 scores of a draw are correlated through the scale: 6 draws determine it to
+    12 %.
+    """
     fits = drawn(exact[2], DRAWS)
     errors = np.array([logarithms_of(fit) - scaled("inverse-square", exact[0])[0] for fit in fits])
-    said = np.array([fit.calibration.standard_errors for fit in fits])
-    z = np.sqrt(np.mean((errors / said) ** 2, axis=(0, 2)))
+    estimated = np.array([fit.calibration.standard_errors for fit in fits])
+    z = np.sqrt(np.mean((errors / estimated) ** 2, axis=(0, 2)))
     assert ((z > 0.8) & (z < 1.25)).all(), z
 
 
-def test_relative_noise_is_found(exact):
-    """And hardly any additive noise where there is none: in few microphones, and little."""
+def test_relative_noise_is_estimated(exact):
+    """Hardly any additive noise is estimated where there is none: in few microphones, and little."""
     additive = []
     for fit in drawn(exact[2], 1):
         relative = np.asarray(fit.calibration.microphone_array.noise.relative)
-        # Of 169 taps: good to 5.5 % each.
+        # From 169 taps the deviation of each is determined to 5.5 %.
         assert np.mean(relative) == pytest.approx(0.05, rel=0.05)
         assert ((relative > 0.035) & (relative < 0.065)).all()
         additive.append(np.asarray(fit.calibration.microphone_array.noise.deviation))
@@ -176,8 +178,9 @@ def test_relative_noise_is_found(exact):
 
 @pytest.mark.slow
 def test_errors_shrink_with_the_noise(exact):
-    """In proportion, for microphones at exactly known places: the same draw, ten times smaller, so that what is not
-    linear is a hundredth of the error."""
+    """Errors fall in proportion to the noise, for microphones at exactly known places. The same draw is scaled by a
+    tenth, so that nonlinear terms are a hundredth of the error.
+    """
     values, _, power = exact
     draw = np.random.default_rng(4).normal(size=power.shape)
     expected = scaled("inverse-square", values)[0]
@@ -188,8 +191,8 @@ def test_errors_shrink_with_the_noise(exact):
     assert np.abs(large).max() < 0.1
 
 
-def test_additive_noise_is_found(exact):
-    """Of intensities whose floor nobody tells, some below zero."""
+def test_additive_noise_is_estimated(exact):
+    """Intensities of unknown floor, some of them below zero."""
     values, _, power = exact
     deviation = 0.1 * np.median(power)
     rng = np.random.default_rng(5)
@@ -198,7 +201,7 @@ def test_additive_noise_is_found(exact):
     assert np.median(noise.deviation) == pytest.approx(deviation, rel=0.25)
     assert np.mean(noise.relative) == pytest.approx(0.05, rel=0.25)
     z = (logarithms_of(fit) - scaled("inverse-square", values)[0]) / fit.calibration.standard_errors
-    # Far taps are lost in the noise, whose logarithm is not normal: errors are somewhat larger.
+    # Distant taps are lost in the noise, whose logarithm is not normal: errors are somewhat larger.
     assert 0.7 < np.sqrt(np.mean(z**2)) < 1.7
     assert fit.outlier.sum() <= 1
 
@@ -211,9 +214,10 @@ def with_one(exact, k, response):
     return power
 
 
-def test_a_microphone_whose_b_is_nothing_does_not_disturb_the_others(exact):
-    """a / r²: its b goes to zero, less than a millimetre squared, and stays within bounds; the others are as exact as
-    ever."""
+def test_a_microphone_whose_b_tends_to_zero_does_not_affect_the_others(exact):
+    """Its response is a / r²: b tends to zero, less than a square millimetre, and stays within bounds. The others
+    remain exact.
+    """
     values = exact[0]
     fit = calibrated(with_one(exact, 12, 1e-3 / (SQUARED[:, 12] + 1e-14)))
     lower = InverseSquare.bounds(np.sqrt(SQUARED.max()))[0][1]
@@ -223,13 +227,13 @@ def test_a_microphone_whose_b_is_nothing_does_not_disturb_the_others(exact):
     others = np.arange(COUNT) != 12
     assert fit.calibration.usable[others].all()
     relative = found - found[:, :1] - (np.log(values) - np.log(values)[:, :1])
-    # Its tap at r = 0 does not fit and may be called an outlier: the other taps are exact.
+    # Its tap at r = 0 does not fit and may be reported as an outlier. The other taps are exact.
     np.testing.assert_allclose(found[1, others], np.log(values[1])[others], atol=1e-4)
     np.testing.assert_allclose(relative[0, others], 0, atol=1e-4)
 
 
-def test_a_microphone_that_hears_all_alike_is_said_so(exact):
-    """b goes to infinity: held there, flagged, and of no use."""
+def test_a_microphone_whose_response_does_not_depend_on_distance_is_reported(exact):
+    """b tends to infinity: it is held at its bound, flagged, and not used."""
     values = exact[0]
     fit = calibrated(with_one(exact, 12, np.full(NUMBER, 0.7)))
     assert not fit.calibration.usable[12]
@@ -237,12 +241,13 @@ def test_a_microphone_that_hears_all_alike_is_said_so(exact):
     good = np.arange(COUNT) != 12
     assert fit.calibration.usable[good].all()
     expected = scaled("inverse-square", values, good)[0]
-    # At its bound, ten arrays away, its response still falls by a thousandth or so: that disturbs the others a little.
+    # At its bound, ten array sizes away, its response still falls by about a thousandth, which affects the others
+    # slightly.
     np.testing.assert_allclose(logarithms_of(fit)[:, good], expected[:, good], atol=2e-4)
 
 
-def test_readings_that_are_missing_are_left_out(exact):
-    """A fifth NaN, one tap nobody heard, one infinite: the rest is exact still."""
+def test_missing_readings_are_left_out(exact):
+    """A fifth of the readings are NaN, one tap was not detected, and one reading is infinite. The rest stays exact."""
     values, loudness, power = exact
     power = power.copy()
     rng = np.random.default_rng(6)
@@ -259,7 +264,7 @@ def test_readings_that_are_missing_are_left_out(exact):
     np.testing.assert_array_equal(fit.usable, np.isfinite(power))
 
 
-def test_a_microphone_that_heard_little_is_said_so(exact):
+def test_a_microphone_that_detected_few_taps_is_reported(exact):
     _, _, power = exact
     power = power.copy()
     power[3:, 4] = np.nan
@@ -271,7 +276,7 @@ def test_a_microphone_that_heard_little_is_said_so(exact):
 
 @pytest.mark.slow
 def test_order_does_not_matter():
-    """Of taps and microphones: the same models to rounding."""
+    """The order of taps and of microphones does not matter: the models agree to rounding."""
     place, places = MICROPHONES[9], PLACES[::2]
     power = listen(place, *(one[:9] for one in parameters("inverse-square")), places, strengths()[::2])
     power *= np.exp(0.05 * np.random.default_rng(7).normal(size=power.shape))
@@ -284,7 +289,7 @@ def test_order_does_not_matter():
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [3, 4, 9])
 def test_fewer_microphones(count):
-    """Three are the fewest: 169 taps give 507 readings for 175 unknowns."""
+    """Three microphones are the fewest: 169 taps give 507 readings for 175 unknowns."""
     place = MICROPHONES[count]
     a, b = parameters("inverse-square")
     power = listen(place, a[:count], b[:count], PLACES, strengths())
@@ -295,7 +300,7 @@ def test_fewer_microphones(count):
 
 @pytest.mark.slow
 def test_on_a_curved_skin():
-    """Distances are straight lines in space; microphones lie 10 mm beneath."""
+    """Distances are straight lines in space, and the microphones lie 10 mm beneath the surface."""
     radius = 0.15
 
     def on(chart, depth=0.0):
@@ -326,12 +331,12 @@ def coarse():
     places = grid(0.18, 0.18, 4, 4).repeat(3, axis=0)
     values = np.array(parameters("inverse-square")) / np.array([[1], [16]])
     squared = ((places[:, None] - MICROPHONE) ** 2).sum(axis=-1)
-    power = heard("inverse-square", values, squared)
+    power = responses("inverse-square", values, squared)
     return values, places, power * np.exp(0.2 * np.random.default_rng(3).normal(size=power.shape))
 
 
-def test_a_shape_that_no_tap_determines_is_that_of_the_others(coarse):
-    """Nearly: no microphone's is at its bound, where it would draw all places to itself."""
+def test_a_shape_that_no_tap_determines_is_estimated_from_the_others(coarse):
+    """It is nearly theirs: no microphone's is at its bound, where all places would be located at that microphone."""
     values, places, power = coarse
     fit = calibrated(power, places)
     b = logarithms_of(fit)[1]
@@ -347,8 +352,8 @@ def test_a_shape_that_no_tap_determines_is_that_of_the_others(coarse):
     assert (errors[1, ~fit.shared] < 1).all()
 
 
-def test_microphones_at_each_others_places_are_said_to_be_off(exact):
-    """Their models explain much of what they heard, but not as well as those of others."""
+def test_microphones_at_exchanged_places_are_reported_as_displaced(exact):
+    """Their models explain much of the power that they received, but less well than the other microphones' models."""
     microphones = MICROPHONE.copy()
     microphones[[11, 12]] = microphones[[12, 11]]
     power = exact[2] * np.exp(0.1 * np.random.default_rng(7).normal(size=exact[2].shape))
@@ -360,7 +365,7 @@ def test_microphones_at_each_others_places_are_said_to_be_off(exact):
 
 
 def test_few_microphones_share_the_noise():
-    """None of five is believed ever more for agreeing with strengths that it decides."""
+    """None of five microphones is weighted ever more for agreeing with strengths that it determines itself."""
     array, places = MICROPHONES[9][:5], grid(0.18, 0.18, 9, 9)
     squared = ((places[:, None] - array) ** 2).sum(axis=-1)
     rng = np.random.default_rng(8)
@@ -372,7 +377,7 @@ def test_few_microphones_share_the_noise():
 
 
 @pytest.mark.parametrize(
-    ("places", "said"),
+    ("places", "message"),
     [
         (np.repeat(PLACES[80:81], 20, axis=0), r"only 0 of \d+ microphones received taps from 4 distances"),
         (np.repeat(PLACES[[10, 80, 150]], 7, axis=0), r"tap all over the skin"),
@@ -380,15 +385,15 @@ def test_few_microphones_share_the_noise():
     ],
     ids=["one place", "three places", "another order"],
 )
-def test_taps_that_say_nothing_are_refused(places, said, exact):
+def test_uninformative_taps_are_refused(places, message, exact):
     power = exact[2][: len(places)] * np.exp(0.2 * np.random.default_rng(5).normal(size=(len(places), COUNT)))
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         calibrated(power, places)
 
 
 @pytest.mark.slow
-def test_microphones_are_judged_again_without_those_left_out(exact):
-    """What is left is fitted as if the others had never been there, until all that is left is of use."""
+def test_microphones_are_judged_again_after_others_are_left_out(exact):
+    """The remaining microphones are fitted as if the others had never been there, until all that remain are usable."""
     rng = np.random.default_rng(1)
     power = exact[2] * np.exp(0.2 * rng.normal(size=exact[2].shape))
     mixture = np.linspace(0.5, 0.95, 8)
@@ -404,8 +409,8 @@ def test_microphones_are_judged_again_without_those_left_out(exact):
 
 
 @pytest.mark.slow
-def test_too_few_that_make_sense(exact):
-    """All but two deaf: each with the reason it is of no use."""
+def test_too_few_usable_microphones(exact):
+    """All but two microphones are insensitive: each is listed with the reason why it is not used."""
     rng = np.random.default_rng(10)
     power = exact[2].copy()
     power[:, 2:] = np.exp(rng.normal(size=(NUMBER, COUNT - 2)))

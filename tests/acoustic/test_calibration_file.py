@@ -1,4 +1,4 @@
-"""The file of a calibration: what is written is read again to the bit, and what is no calibration is refused."""
+"""The file of a calibration: a saved calibration is read again bit by bit, and other files are refused."""
 
 import json
 
@@ -56,7 +56,7 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_there_and_back(name, tmp_path):
-    """Every array to the last bit."""
+    """Every array agrees to the last bit."""
     one = CASES[name]()
     one.save(tmp_path / "array.json")
     again = Calibration.load(tmp_path / "array.json")
@@ -72,8 +72,8 @@ def test_there_and_back(name, tmp_path):
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "array.json").read_bytes()
 
 
-def test_the_file_says_what_it_holds(tmp_path):
-    """Units, version, scale; and plain JSON, that others read: NaN is null."""
+def test_the_file_describes_its_content(tmp_path):
+    """Units, version and scale in plain JSON that other programs read: NaN is null."""
     CASES["with a band"]().save(tmp_path / "array.json")
     text = (tmp_path / "array.json").read_text("utf-8")
     content = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
@@ -86,7 +86,7 @@ def test_the_file_says_what_it_holds(tmp_path):
     assert content["strengths"] == [0.25, 8.0]
 
 
-def test_values_that_no_file_can_hold_are_not_written(tmp_path):
+def test_values_that_no_file_can_hold_are_refused(tmp_path):
     flat = array(9)
     noise = IntensityNoise(
         flat.noise.floor.at[0].set(jnp.nan), flat.noise.deviation, flat.noise.cross, flat.noise.relative
@@ -109,7 +109,7 @@ def load(tmp_path, written):
 
 
 def put(*where):
-    """A change of the content: the last argument goes to the place that the others say; `del` removes it."""
+    """Change of the content: the last argument is stored under the keys given before it, and `del` removes the key."""
     *keys, last, value = where
 
     def change(content):
@@ -124,7 +124,7 @@ def put(*where):
 
 
 def del_():
-    """Stands for removal."""
+    """Marker for removal."""
 
 
 EDITED = {
@@ -212,7 +212,7 @@ EDITED = {
         put("microphones", 3, "b", 10**400),
         r"microphones\[3\]\.b is 1000.*…, beyond double precision",
     ),
-    "band without a window": (put("intensity", {"low": 50.0}), None),  # the defaults stand in
+    "band without a window": (put("intensity", {"low": 50.0}), None),  # The defaults replace what is missing.
     "band upside down": (put("intensity", {"low": 500.0, "high": 50.0, "window": 0.05, "hop": 0.01}), "low= and high="),
     "band of another kind": (
         put("intensity", {"lowest": 500.0}),
@@ -230,8 +230,8 @@ EDITED = {
 
 
 @pytest.mark.parametrize("name", EDITED)
-def test_what_was_changed_by_hand_is_refused(name, content, tmp_path):
-    """With the file's name, and what is wrong in it."""
+def test_content_edited_by_hand_is_refused(name, content, tmp_path):
+    """The message has the file's name and the error in it."""
     change, message = EDITED[name]
     edited = json.loads(content)
     change(edited)
@@ -256,7 +256,7 @@ def test_what_was_changed_by_hand_is_refused(name, content, tmp_path):
         ("origin", [0.0, 0.0, float("inf")], r"surface\.curve\.origin must be 3 numbers; it has inf in it"),
     ],
 )
-def test_a_curve_changed_by_hand_is_refused(key, value, message, tmp_path):
+def test_a_curve_edited_by_hand_is_refused(key, value, message, tmp_path):
     CASES["curved"]().save(tmp_path / "array.json")
     edited = json.loads((tmp_path / "array.json").read_text("utf-8"))
     edited["surface"]["curve"][key] = value
@@ -285,8 +285,8 @@ def test_other_files_are_refused(name, tmp_path):
         load(tmp_path, OTHERS[name])
 
 
-def test_a_file_cut_off_is_refused(content, tmp_path):
-    """Wherever it is cut."""
+def test_a_truncated_file_is_refused(content, tmp_path):
+    """At any length."""
     for part in (0.01, 0.3, 0.9, 0.999):
         with pytest.raises(ValueError, match=r"array\.json is no calibration"):
             load(tmp_path, content[: int(part * len(content))])

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from microphone_arrays import array as device_array
-from microphone_arrays import hear, inside, localise, noisy
+from microphone_arrays import inside, localise, noisy, received_power
 from scipy.optimize import minimize
 
 from jeit.acoustic import MicrophoneArray
@@ -18,7 +18,7 @@ FRAMES = 12
 
 
 def array(*arguments, **noise):
-    """In NumPy, which need not compile."""
+    """Computed in NumPy, without compilation."""
     return on_host(device_array(*arguments, **noise))
 
 
@@ -29,13 +29,15 @@ def microphone_array():
 
 @pytest.fixture(scope="module")
 def frames(microphone_array):
-    """Power (F, M) with 10 % noise, strengths over a factor of 30, and which are used: two of them not, in some."""
+    """Power (F, M) with 10 % noise and strengths over a factor of 30, and a mask of the used readings: two are unused
+    in some frames.
+    """
     places = inside(FRAMES, reach=0.8)
     strength = np.exp(np.linspace(-2, 1.5, FRAMES))
-    power = noisy(microphone_array.noise, hear(microphone_array, places, strength), np.random.default_rng(0))
+    power = noisy(microphone_array.noise, received_power(microphone_array, places, strength), np.random.default_rng(0))
     use = np.ones(power.shape, bool)
     use[3, [1, 4]] = use[5, [7, 8]] = False
-    # What is not used may be anything, the loudest included.
+    # Readings that are not used may have any value, even the largest.
     power[3, 1], power[5, 7] = 1e9, np.nan
     return power, use
 
@@ -48,10 +50,10 @@ def loss(microphone_array, power, use, place):
     used = [i for i in range(len(power)) if use[i]]
     k = max(used, key=lambda i: power[i])
 
-    def told(i):
+    def source_strength(i):
         return power[i] * (((place - microphones[i]) ** 2).sum() + b[i]) / a[i]
 
-    return sum((told(k) - told(i)) ** 2 for i in used if i != k)
+    return sum((source_strength(k) - source_strength(i)) ** 2 for i in used if i != k)
 
 
 def objective(microphone_array, frames):
@@ -60,7 +62,7 @@ def objective(microphone_array, frames):
 
 
 def test_cost_is_the_papers(microphone_array, frames):
-    """Relative to the square of the loudest intensity."""
+    """Relative to the square of the largest intensity."""
     power, use = frames
     places = inside(FRAMES, seed=1)
     cost = objective(microphone_array, frames).cost(np.asarray(places.T))
@@ -85,7 +87,7 @@ def test_screen_is_the_same_at_many_places(microphone_array, frames):
 
 @pytest.mark.parametrize("decay", [Exponential, AttenuatedInverseSquare])
 def test_other_models_have_the_same_loss(decay, microphone_array, frames):
-    """Cost, screen and formula, with g = 1 / f of another model, in the plane."""
+    """Cost, screening and formula, with g = 1 / f of another model, in the plane."""
     rng = np.random.default_rng(6)
     values = [np.asarray(one) for one in 0.03 * np.exp(0.3 * rng.normal(size=(len(decay.parameters), 9)))]
     other = MicrophoneArray(
@@ -98,16 +100,16 @@ def test_other_models_have_the_same_loss(decay, microphone_array, frames):
     screened = np.asarray(one.screen(one.features(other, np.asarray(places.T))))
     for frame, place in enumerate(places):
         squared = ((place - np.asarray(other.microphones)) ** 2).sum(axis=1)
-        told = power[frame] / np.exp(np.asarray(other.decay.log_response(np.asarray(squared))))
+        source_strength = power[frame] / np.exp(np.asarray(other.decay.log_response(np.asarray(squared))))
         used = np.flatnonzero(use[frame])
         k = used[power[frame, used].argmax()]
-        expected = np.sum((told[k] - told[used]) ** 2) / power[frame, k] ** 2
+        expected = np.sum((source_strength[k] - source_strength[used]) ** 2) / power[frame, k] ** 2
         assert cost[frame] == pytest.approx(expected, rel=1e-10)
         assert screened[frame, frame] == pytest.approx(expected, rel=1e-10)
 
 
 def test_on_a_skin_in_space(microphone_array, frames):
-    """A plane in space, tilted: the loss of the plane."""
+    """In a tilted plane in space the loss is that of the plane."""
     turn = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))[0][:, :2]
     surface = on_host(make_surface(np.asarray(microphone_array.surface.outline.vertices) @ turn.T))
     tilted = MicrophoneArray(
@@ -123,7 +125,7 @@ def test_on_a_skin_in_space(microphone_array, frames):
 
 
 def test_expansion(microphone_array, frames):
-    """The gradient against JAX's own of the cost; the matrix against that of the differences, written out."""
+    """The gradient against JAX's gradient of the cost, and the matrix against that of the differences, written out."""
     one = objective(microphone_array, frames)
     chart = np.asarray(inside(FRAMES, seed=3).T)
     value, gradient, matrix = one.expand(chart)
@@ -142,10 +144,11 @@ def test_expansion(microphone_array, frames):
 
 @pytest.mark.slow
 def test_minimum_is_scipys(microphone_array, frames):
-    """From four starts each: the localiser's is as low as the lowest of them."""
+    """From four starting points each: the localiser's minimum is as low as the lowest of them."""
     power, use = frames
     found = localise(microphone_array, np.where(use, power, np.nan), "consistency")
-    # Gauss and Newton's steps are small where residuals curve the loss: a frame may need more, and is said to.
+    # Gauss-Newton steps are short where residuals curve the loss. A frame that needs more iterations is reported as
+    # such.
     assert found["converged"].mean() > 0.9
     starts = inside(4, seed=4)
     for frame in (0, 2, 3, 6, 11):
@@ -177,13 +180,13 @@ def test_scale_of_intensities_does_not_matter(microphone_array, frames):
 
 
 def test_covariance_is_that_of_draws(microphone_array):
-    """Of the minimum of noisy frames, at 1 % noise, where its formula is exact but for a few per cent."""
+    """Of the minimum for noisy frames at 1 % noise, where the formula is exact within a few per cent."""
     quiet = array(9, relative=0.01)
     rng = np.random.default_rng(5)
     for place in ([0.02, -0.03], [-0.06, 0.05]):
-        power = noisy(quiet.noise, np.repeat(hear(quiet, [place]), 1024, axis=0), rng)
+        power = noisy(quiet.noise, np.repeat(received_power(quiet, [place]), 1024, axis=0), rng)
         found = localise(quiet, power, "consistency")
         error = found["position"] - place
-        # Of 1,024 draws: good to 4.4 % in each variance, and twice that in three.
-        actual, said = error.T @ error / len(error), found["covariance"].mean(axis=0)
-        np.testing.assert_allclose(actual, said, atol=0.12 * np.trace(said) / 2)
+        # Each variance of 1,024 draws has a standard error of 4.4 %. The tolerance allows nearly three times that.
+        actual, predicted = error.T @ error / len(error), found["covariance"].mean(axis=0)
+        np.testing.assert_allclose(actual, predicted, atol=0.12 * np.trace(predicted) / 2)

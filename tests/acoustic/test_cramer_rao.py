@@ -1,9 +1,9 @@
-"""The Cramér-Rao bound against Fisher's matrix by differences of NumPy formulas, and what it must do."""
+"""The Cramér-Rao bound against Fisher's matrix by differences of NumPy formulas, and its properties."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from microphone_arrays import MICROPHONES, array, hear, inside, variance
+from microphone_arrays import MICROPHONES, array, inside, received_power, variance
 
 from jeit.acoustic import cramer_rao
 from jeit.acoustic.microphones import MicrophoneArray
@@ -16,7 +16,7 @@ def fisher(microphone_array, place, strength):
     """Σ ∇m ∇mᵀ / v + ½ ∇log v ∇log vᵀ in (x, y, log strength), by central differences."""
 
     def terms(x):
-        received = hear(microphone_array, [x[:2]], np.exp(x[2]))[0]
+        received = received_power(microphone_array, [x[:2]], np.exp(x[2]))[0]
         total = received + np.asarray(microphone_array.noise.floor)
         return np.stack([np.log(total), np.log(np.asarray(variance(microphone_array.noise, received)) / total**2)])
 
@@ -26,7 +26,7 @@ def fisher(microphone_array, place, strength):
     return np.einsum("m,mi,mj->ij", weight, slopes[0], slopes[0]) + 0.5 * slopes[1].T @ slopes[1]
 
 
-def test_it_is_the_inverse_of_fishers_matrix():
+def test_the_bound_is_the_inverse_of_fishers_matrix():
     microphone_array = array(9, relative=0.1, floor=0.05, freedom=30.0)
     bound = cramer_rao(microphone_array, jnp.asarray(PLACES), jnp.asarray(STRENGTH))
     for place, strength, mine in zip(PLACES, STRENGTH, bound, strict=True):
@@ -34,8 +34,8 @@ def test_it_is_the_inverse_of_fishers_matrix():
         np.testing.assert_allclose(mine, expected, rtol=1e-6, atol=1e-7 * np.trace(expected))
 
 
-def test_microphones_left_out_tell_nothing():
-    """The bound of those used is that of the array without the others, and larger than that of all."""
+def test_microphones_that_are_left_out_add_no_information():
+    """The bound for the used microphones is that of an array without the others, and larger than that of all."""
     whole = array(9, relative=0.1)
     use = np.ones(9, bool)
     use[[2, 3]] = False
@@ -51,15 +51,17 @@ def test_microphones_left_out_tell_nothing():
     assert (np.linalg.eigvalsh(more) > 0).all()
 
 
-def test_relative_noise_knows_no_scale():
-    """Without a floor: the same at any strength, and proportional to the noise's variance where that is small."""
+def test_relative_noise_has_no_scale():
+    """Without a floor the bound is the same at any strength, and proportional to the noise variance where that is
+    small.
+    """
     place = jnp.asarray(PLACES)
     plain = np.asarray(cramer_rao(array(9, relative=0.01), place, 1.0))
     np.testing.assert_allclose(cramer_rao(array(9, relative=0.01), place, 1e12), plain, rtol=1e-9)
     np.testing.assert_allclose(cramer_rao(array(9, relative=0.02), place, 1.0), 4 * plain, rtol=1e-9)
 
 
-def test_louder_is_better_until_the_relative_error_is_left():
+def test_louder_is_better_until_the_relative_error_dominates():
     microphone_array = array(9, relative=0.05, floor=0.1, freedom=20.0)
     place = jnp.asarray(np.repeat(PLACES[:1], 6, axis=0))
     spread = np.trace(cramer_rao(microphone_array, place, jnp.asarray(10.0 ** np.arange(-1, 5))), axis1=1, axis2=2)
@@ -68,7 +70,7 @@ def test_louder_is_better_until_the_relative_error_is_left():
 
 
 def test_on_a_skin_in_space():
-    """A plane in space, turned: the bound of the plane, turned along, and none across it."""
+    """In a rotated plane in space the bound is that of the plane, rotated, with zero variance across the plane."""
     flat = array(9, relative=0.1)
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0][:, :2]
     corners = flat.surface.outline.vertices @ turn.T

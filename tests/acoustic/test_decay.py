@@ -1,4 +1,4 @@
-"""Decay models: their formulas, their logarithms, and that they can be differentiated at the microphone itself."""
+"""Decay models: their formulas, their logarithms, and their derivatives at the microphone itself."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ def model(name):
 def test_formula(name):
     parameters, formula = FORMULAS[name]
     expected = formula(DISTANCE, *(values[:, None] for values in parameters))
-    # The tip of exp(-r / l) is rounded off by a hundredth of a micrometre: 5e-7 of the length.
+    # The tip of exp(-r / l) is rounded off within a hundredth of a micrometre: 5e-7 of the length.
     np.testing.assert_allclose(np.exp(model(name).log_response(np.asarray(DISTANCE**2))), expected, rtol=1e-5)
     away = DISTANCE[:, 1:]
     expected = formula(away, *(values[:, None] for values in parameters))
@@ -45,7 +45,7 @@ def test_gain_is_the_response_at_the_microphone(name):
 
 
 @every
-def test_logarithms_there_and_back(name):
+def test_logarithms_and_back(name):
     one = model(name)
     np.testing.assert_allclose(one.logarithms(), np.log(FORMULAS[name][0]), rtol=1e-14)
     again = DECAYS[name].from_logarithms(one.logarithms())
@@ -54,7 +54,7 @@ def test_logarithms_there_and_back(name):
 
 
 @every
-def test_the_first_parameter_scales(name):
+def test_the_first_parameter_is_a_factor(name):
     factor = np.eye(len(FORMULAS[name][0]))[:, :1] * np.log(3.0)
     shifted = DECAYS[name].from_logarithms(model(name).logarithms() + factor)
     squared = np.asarray(DISTANCE**2)
@@ -73,7 +73,7 @@ def test_any_axes_after_the_microphones(name):
 
 @every
 def test_slopes(name):
-    """In the parameters against differences, and in the place, which is finite on top of the microphone too."""
+    """Derivatives in the parameters against differences, and in the place, which are finite at the microphone too."""
     values, squared = model(name).logarithms(), np.asarray(DISTANCE**2)
     direction = np.asarray(np.random.default_rng(1).normal(size=values.shape))
 
@@ -100,8 +100,10 @@ def test_slopes(name):
 
 
 @every
-def test_start_reaches_a_spacing(name):
-    """Gain 1 at the microphone, for the exponential and inverse square; less, but not nothing, a spacing away."""
+def test_the_start_reaches_one_spacing(name):
+    """The gain is 1 at the microphone for the exponential and inverse square, and smaller but not zero one spacing
+    away.
+    """
     start = DECAYS[name].start(0.04, 5)
     response = np.exp(start.log_response(np.asarray(np.full((5, 2), [0.0, 0.04**2]))))
     np.testing.assert_allclose(response[:, 0], 1, rtol=1e-5)
@@ -109,12 +111,12 @@ def test_start_reaches_a_spacing(name):
 
 
 @every
-def test_bounds_hold_the_start(name):
+def test_bounds_contain_the_start(name):
     low, high = (np.array(bound) for bound in DECAYS[name].bounds(0.2))
     start = np.asarray(DECAYS[name].start(0.04, 1).logarithms())[:, 0]
     assert ((low < start) & (start < high)).all()
     assert len(low) == len(high) == len(DECAYS[name].parameters)
-    # The factor is free; all else is bounded on both sides.
+    # The factor is free. The other parameters are bounded on both sides.
     assert np.isinf(low[0])
     assert np.isinf(high[0])
     assert np.isfinite([*low[1:], *high[1:]]).all()

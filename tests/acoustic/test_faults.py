@@ -1,4 +1,4 @@
-"""Faults of microphones: each kind is found where it was put, and nothing else is taken for one."""
+"""Faults of microphones: each kind is detected where it is, and nothing else is taken for a fault."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def noise(deviation=0.01, seed=0):
 
 
 def touched(peak=0.5, frequency=200.0, seed=0):
-    """Noise, and in it a touch that dies away from `peak`, from 0.3 s on."""
+    """Noise and a decaying touch that starts from `peak` at 0.3 s."""
     after = np.maximum(TIME - 0.3, 0)
     rise = np.minimum(after / 0.005, 1)
     return noise(0.003, seed) + peak * rise * np.exp(-after / 0.03) * np.sin(2 * np.pi * frequency * after)
@@ -40,7 +40,7 @@ def changed(samples, where, value):
 
 
 @pytest.mark.parametrize(
-    ("samples", "said"),
+    ("samples", "message"),
     [
         (np.zeros(4000), "dead: every sample is 0"),
         (np.full(4000, 0.25), "dead: every sample is 0.25"),
@@ -48,27 +48,29 @@ def changed(samples, where, value):
         (changed(np.zeros(4000), slice(7), np.inf), "dead: every finite sample is 0"),
     ],
 )
-def test_dead(samples, said):
+def test_dead(samples, message):
     kind, dead = sample_faults(samples, RATE)
-    assert dead == said
+    assert dead == message
     usable, reason = window_faults(kind, dead, 2000, 500)
     assert usable.shape == (5,)
     assert not usable.any()
-    assert reason == said
+    assert reason == message
 
 
 @pytest.mark.parametrize("level", [0.0, 0.004, -1.0])
 @pytest.mark.parametrize("where", [slice(20_000, 21_500), slice(20_000, None), slice(0, 12_000)])
 @pytest.mark.parametrize("converter", [STEP, 1e-3, None])
 def test_stuck(level, where, converter):
-    """At zero, in range and at the end of it; for a while, for good, and from the start; a noise of 3 steps too."""
+    """Stuck at zero, in the range and at its end, for some time, until the end, and from the start, at noise of 3 steps
+    too.
+    """
     samples = changed(touched(), where, level)
     if converter:
         samples = quantised(samples, converter)
     kind, dead = sample_faults(samples, RATE)
     assert dead == ""
     assert (kind[where] == STUCK).all()
-    # A neighbour may happen to have the same value.
+    # An adjacent sample may have the same value by chance.
     assert (kind == STUCK).sum() <= kind[where].size + 2
     assert (kind != CLIPPING).all()
 
@@ -78,51 +80,52 @@ def test_stuck(level, where, converter):
 @pytest.mark.parametrize("hold", [1, 4])
 @pytest.mark.parametrize("ends", [(-0.25, 0.25), (-9, 0.25), (-0.25, 9)])
 def test_clipping(full_scale, frequency, hold, ends):
-    """Where a touch exceeds the range: exactly there, for tops of any length, at either end or both."""
+    """Clipped exactly where a touch exceeds the range, for peaks of any length, at either end or both."""
     samples = quantised(np.repeat(touched(0.8, frequency)[::hold], hold).clip(*ends))
     kind, dead = sample_faults(samples, RATE, full_scale)
     assert dead == ""
-    # The end is the last 3e-4 of the range and one step; with full scale known, the last thousandth of that too.
+    # The end is the last 3e-4 of the range and one step. If full scale is known, it is also the last thousandth of
+    # that.
     tolerance = max(3e-4 * np.ptp(samples), 1e-3 * (full_scale or 0)) + 1.001 * STEP
     over = ((samples >= 0.25 - tolerance) & (ends[1] == 0.25)) | ((samples <= tolerance - 0.25) & (ends[0] == -0.25))
     assert over.sum() > 20
     np.testing.assert_array_equal(kind == CLIPPING, over)
     usable, reason = window_faults(kind, dead, 2000, 500)
     assert reason == f"clipping in {(~usable).sum()} of {usable.size} windows"
-    # The touch begins at 0.3 s and is half as loud as the limit 0.08 s later; windows are 0.05 s long.
+    # The touch begins at 0.3 s and is half as loud as the limit 0.08 s later. Windows are 0.05 s long.
     middle = np.arange(usable.size) * 0.0125 + 0.025
     assert usable[(middle < 0.27) | (middle > 0.41)].all()
     assert not usable[(middle > 0.31) & (middle < 0.33)].any()
 
 
 def test_clipping_of_noise():
-    """No peak is slow, and few tops are long."""
+    """No peak is slow, and few peaks are long."""
     kind, _ = sample_faults(noise(1.0).clip(-1.3, 1.3), RATE)
     # 3e-4 of the range, 2.6, still counts as its end.
     np.testing.assert_array_equal(kind == CLIPPING, np.abs(noise(1.0)) >= 1.3 - 3e-4 * 2.6 - 1e-9)
 
 
-def test_rails_that_tremble():
-    """The ends of the range are not one value each but a few steps wide."""
+def test_limits_that_fluctuate():
+    """The ends of the range are not one value each but span a few steps."""
     samples = touched(0.8)
     samples = quantised(samples.clip(-0.25, 0.25) + 1.5 * STEP * noise(1.0, 3).clip(-1, 1))
     kind, _ = sample_faults(samples, RATE)
     assert (kind[np.abs(touched(0.8)) > 0.25] == CLIPPING).mean() > 0.95
 
 
-def test_one_bad_sample_spoils_only_its_windows():
+def test_one_bad_sample_affects_only_its_windows():
     for value in (np.nan, np.inf, -np.inf):
         kind, dead = sample_faults(changed(noise(), [20_499, 20_600], value), RATE)
         assert set(np.flatnonzero(kind)) == {20_499, 20_600}
         assert (kind[[20_499, 20_600]] == NOT_FINITE).all()
         usable, reason = window_faults(kind, dead, 2000, 500)
-        # From the window whose last sample is the first of them, to the last that begins before the second.
+        # From the window whose last sample is the first of them to the last window that begins before the second.
         assert set(np.flatnonzero(~usable)) == {37, 38, 39, 40, 41}
         assert reason == "NaN or infinite in 5 of 77 windows"
 
 
-def test_several_faults_are_all_named():
-    # Stuck far below the range that is left to it otherwise, at whose lower end it clips.
+def test_several_faults_are_all_reported():
+    # Stuck far below its remaining range, at whose lower end it clips.
     samples = changed(touched(0.8).clip(-0.25, 9), slice(30_000, 32_000), -1.0)
     kind, dead = sample_faults(changed(samples, 3, np.nan), RATE)
     usable, reason = window_faults(kind, dead, 2000, 500)
@@ -132,7 +135,7 @@ def test_several_faults_are_all_named():
     assert (~usable).sum() == sum(counts)
 
 
-def test_windows_of_a_batch_are_those_of_each():
+def test_windows_of_a_batch_are_those_of_each_recording():
     kind = (
         np.random.default_rng(1).choice([0, 1, 2, 3], p=[0.997, 0.001, 0.001, 0.001], size=(3, 4000)).astype(np.uint8)
     )
@@ -186,7 +189,7 @@ def test_no_false_alarm(which, full_scale):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_no_false_alarm_of_coloured_noise(seed):
-    """Noise of a random band and loudness, on a converter of random coarseness, held or not."""
+    """Noise of a random band and level, on a converter of random resolution, with or without held samples."""
     random = np.random.default_rng(seed)
     spectrum = np.fft.rfft(noise(1.0, seed))
     frequency = np.fft.rfftfreq(TIME.size, 1 / RATE)
@@ -221,7 +224,7 @@ def test_intensities_without_samples():
 
 
 @pytest.mark.parametrize(
-    ("reasons", "said"),
+    ("reasons", "message"),
     [
         ((), ""),
         (("", ""), ""),
@@ -233,5 +236,5 @@ def test_intensities_without_samples():
         ),
     ],
 )
-def test_one_reason_is_told_once(reasons, said):
-    assert describe_faults(reasons) == said
+def test_one_reason_is_reported_once(reasons, message):
+    assert describe_faults(reasons) == message

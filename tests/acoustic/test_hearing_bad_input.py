@@ -1,4 +1,4 @@
-"""What hearing says of things of another kind, before anything is computed."""
+"""Errors for arguments of another kind, raised before any computation."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from jeit.acoustic import (
 )
 from jeit.acoustic.surface import make_surface
 
-HEARD = Intensities([0.0], np.ones((1, 9)))
+INTENSITIES = Intensities([0.0], np.ones((1, 9)))
 SOUND = Recording(np.ones((9, 400)), 1e3)
 
 
@@ -43,8 +43,8 @@ def known():
         ({"method": "liklihood"}, r"^method must be one of .*; it is 'liklihood' \(did you mean 'likelihood'\?\)"),
     ],
 )
-def test_what_is_located(known, find, change, message):
-    sound = HEARD if "method" in change else SOUND
+def test_bad_arguments_of_locate(known, find, change, message):
+    sound = INTENSITIES if "method" in change else SOUND
     with pytest.raises(ValueError, match=message):
         find(**({"recording": sound, "calibration": known} | change))
 
@@ -57,12 +57,12 @@ def test_what_is_located(known, find, change, message):
         (lambda: intensities("a.wav"), r"^recording must be a Recording of samples, .*; it is 'a\.wav'"),
         (lambda: intensities(SOUND, 50.0), "^settings must be IntensitySettings"),
         (lambda: tap_intensities("taps.npz"), "^taps must be Taps"),
-        (lambda: track(HEARD), "^locations must be Locations, .*; it is an Intensities"),
+        (lambda: track(INTENSITIES), "^locations must be Locations, .*; it is an Intensities"),
         (lambda: Localiser.create("skin.json"), r"^microphone_array must be a MicrophoneArray, .*; it is 'skin\.json'"),
         (lambda: cramer_rao(np.ones((9, 2)), [[0.0, 0.0]]), "^microphone_array must be a MicrophoneArray"),
         (lambda: make_surface("square"), "^outline must be an outline, such as .*; it is 'square'"),
     ],
 )
-def test_what_is_given(make, message):
+def test_bad_arguments_of_other_functions(make, message):
     with pytest.raises(ValueError, match=message):
         make()

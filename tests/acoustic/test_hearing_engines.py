@@ -1,13 +1,13 @@
-"""Two engines, one formula: touches that NumPy locates at once are those that the compiled program locates.
+"""Two engines with one formula: the NumPy engine locates the same touches as the compiled program.
 
-Of one source they are compared in `test_localiser_gradients`, whose program is there anyway.
+For one source they are compared in `test_localiser_gradients`, which needs that program anyway.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from microphone_arrays import array, assert_same, both, hear, inside, noisy, quick_likelihood, same_shape
+from microphone_arrays import array, assert_same, both, inside, noisy, quick_likelihood, received_power, same_shape
 
 from jeit.acoustic import Localiser, cramer_rao, track, tracking
 from jeit.acoustic.decay import DECAYS
@@ -20,12 +20,14 @@ FRAMES = 160
 
 @pytest.fixture(scope="module")
 def touched():
-    """Noisy frames inside and beyond, some with readings missing."""
+    """Noisy frames inside and outside the outline, some with missing readings."""
     microphone_array = array(9, relative=0.1, floor=1e-4, freedom=100.0)
     rng = np.random.default_rng(11)
     places = inside(FRAMES)
     places[::8] += [0.15, 0.02]
-    power = noisy(microphone_array.noise, hear(microphone_array, places, np.exp(rng.normal(size=FRAMES))), rng)
+    power = noisy(
+        microphone_array.noise, received_power(microphone_array, places, np.exp(rng.normal(size=FRAMES))), rng
+    )
     power[rng.random(power.shape) < 0.05] = np.nan
     return microphone_array, power
 
@@ -49,10 +51,10 @@ def test_maps(method, touched):
     assert_same(at_once.maps(power), compiled.maps(power))
 
 
-def test_what_is_traced_is_compiled(touched):
-    """Though NumPy was asked for: it could not look at the intensities.
+def test_traced_intensities_are_compiled(touched):
+    """Although NumPy was requested: it could not read the traced intensities.
 
-    So are places of one source, which `test_localiser_gradients` compares.
+    `test_localiser_gradients` compares places of one source.
     """
     microphone_array, power = touched
     assert jax.eval_shape(lambda power: locate_two(microphone_array, power), power).position.shape == (FRAMES, 2, 2)
@@ -60,7 +62,7 @@ def test_what_is_traced_is_compiled(touched):
 
 @pytest.mark.slow
 def test_two_sources(touched):
-    """Where they are known: steps of Fisher's matrix creep where nothing fits."""
+    """Where the places are determined: steps with Fisher's matrix converge slowly where no place fits."""
     microphone_array, power = touched
     both = power[1:40] + power[41:80]
     at_once = locate_two(microphone_array, both)
@@ -114,7 +116,7 @@ def test_tracks(monkeypatch):
 
 @pytest.mark.parametrize("name", DECAYS)
 def test_slopes_of_decay_models(name):
-    """Complex steps are what JAX differentiates."""
+    """Complex steps agree with JAX's derivatives."""
     values = np.log(np.random.default_rng(13).uniform(0.5, 2.0, (len(DECAYS[name].parameters), 5)))
     squared = np.geomspace(1e-6, 1.0, 35).reshape(5, 7)
 

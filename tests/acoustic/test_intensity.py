@@ -1,4 +1,4 @@
-"""Intensity: calibrated on sines and noise, its scatter as the degrees of freedom say, above a floor that holds."""
+"""Intensity: calibrated on sines and noise, its scatter given by the degrees of freedom, above a stable noise floor."""
 
 import equinox as eqx
 import numpy as np
@@ -16,7 +16,7 @@ from jeit.acoustic.signal.recording import Intensities, Recording, Taps
 
 RATE = 20e3
 OUTLINE = [[0, 0], [0.2, 0], [0.2, 0.2], [0, 0.2]]
-# Odd lengths, edges between bins, the whole of the spectrum, a band from 0 and one at half the rate.
+# Odd lengths, edges between bins, the whole spectrum, a band from 0, and a band up to half the rate.
 SETTINGS = [
     IntensitySettings(),
     IntensitySettings(low=33.3, high=871.0, window=0.0301, hop=0.01),
@@ -33,7 +33,7 @@ def white(shape, seed=0, deviation=1.0):
 @pytest.mark.parametrize("settings", SETTINGS, ids=TITLES)
 @pytest.mark.parametrize("frequency", [520.0, 571.3])
 def test_sine(settings, frequency):
-    """A²/2, at any phase, on any offset. From more than 2 bins within the band a Hann window leaks less than 1e-3."""
+    """A²/2 at any phase and any offset. From more than 2 bins within the band a Hann window leaks less than 1e-3."""
     time = np.arange(8000) / RATE
     amplitude = np.array([1e-3, 1.0, 30.0])
     samples = amplitude[:, None] * np.sin(2 * np.pi * frequency * time + np.arange(3)[:, None]) + [[0.5], [-1], [1000]]
@@ -46,8 +46,8 @@ def test_sine(settings, frequency):
 
 
 @pytest.mark.parametrize("low", [0.0, 20.0])
-def test_constants_do_not_sound(low):
-    """Each window's own mean goes: a microphone that moves to another offset, and a band that begins at 0."""
+def test_constants_have_no_intensity(low):
+    """The mean of each window is subtracted: a microphone whose offset changes, and a band that begins at 0."""
     time = np.arange(8000) / RATE
     samples = np.sin(2 * np.pi * 520 * time) + np.where(time < 0.2, 50, -70)
     found = intensities(Recording(samples[None], RATE), IntensitySettings(low=low, hop=0.01), floor=np.zeros(1))
@@ -80,7 +80,7 @@ def test_freedom_of_white_noise(settings):
     power = intensities(Recording(windows.ravel()[None], RATE), eqx.tree_at(lambda s: s.hop, settings, settings.window))
     raw = power.power + power.floor
     measured = 2 * raw.mean() ** 2 / raw.var()
-    # A variance from n windows is good to √(2/n), 2.6 %.
+    # A variance from n windows is determined to √(2/n), 2.6 %.
     assert measured == pytest.approx(power.freedom, rel=0.1)
 
 
@@ -96,7 +96,7 @@ def test_freedom_is_the_trace(high, length):
     minus = intensity.band_power((one - other).reshape(-1, length), grid)
     form = ((plus - minus) / 4).reshape(length, length)
     assert np.trace(form) ** 2 / (form**2).sum() == pytest.approx(degrees_of_freedom(settings, rate), rel=1e-9)
-    # The same of windows that overlap: correlation is tr(A B) / tr(A²), with B the form moved on by the hop.
+    # The same for windows that overlap: their correlation is tr(A B) / tr(A²), with B the form shifted by the hop.
     moved = np.zeros((2, length + hop, length + hop))
     moved[0, :length, :length] = moved[1, hop:, hop:] = form
     correlation = (moved[0] * moved[1]).sum() / (form**2).sum()
@@ -106,8 +106,8 @@ def test_freedom_is_the_trace(high, length):
     assert shared[0, 4] == shared[4, 0] == 0
 
 
-def test_times_are_the_middle_of_windows():
-    """A click is loudest in the window whose middle it is."""
+def test_times_are_the_middles_of_windows():
+    """A click is loudest in the window at whose middle it is."""
     settings = IntensitySettings(window=0.05, hop=0.005)
     samples = white((1, 20_000), deviation=1e-3)
     samples[0, 7300] = 1.0
@@ -129,10 +129,10 @@ def test_chunks_do_not_matter(monkeypatch):
 
 
 def touches(seed, quiet):
-    """12 channels of noise, each as loud as its number; touches in all windows but a part `quiet` of them."""
+    """12 channels of noise, each as loud as its number, with touches in all windows but a fraction `quiet` of them."""
     random = np.random.default_rng(seed)
     samples = white((12, 60_000), seed) * np.arange(1, 13)[:, None]
-    # Three touches that fade; each second's end is quiet.
+    # Three decaying touches. The end of each second is quiet.
     length = int((1 - quiet) * RATE)
     time = np.arange(length) / RATE
     for k in range(3):
@@ -144,7 +144,7 @@ def touches(seed, quiet):
 
 @pytest.mark.parametrize(("quiet", "bias"), [(1.0, 0.02), (0.5, 0.03), (0.3, 0.06)])
 def test_floor_below_touches(quiet, bias):
-    """To a few per cent in the mean over seeds and channels, and of most channels to a tenth."""
+    """To a few per cent in the mean over seeds and channels, and for most channels to a tenth."""
     true = np.arange(1, 13) ** 2 * 950 / (RATE / 2)
     error = np.array([intensities(Recording(touches(seed, quiet), RATE)).floor / true - 1 for seed in range(6)])
     assert abs(error.mean()) < bias
@@ -162,7 +162,7 @@ def test_power_is_above_the_floor():
 
 
 def test_floor_of_distributions():
-    """χ² itself, to its scatter; and with half of the windows unusable, at any value they may have."""
+    """χ² itself, to its scatter, and with half of the windows unusable, at any value they may have."""
     random = np.random.default_rng(2)
     power = random.chisquare(30, size=(4000, 4)) / 30 * [1, 2, 0.1, 5]
     np.testing.assert_allclose(noise_floor(power, np.ones_like(power, bool), 30), [1, 2, 0.1, 5], rtol=0.02)
@@ -174,7 +174,7 @@ def test_floor_of_distributions():
     assert noise_floor(np.zeros((9, 1)), np.ones((9, 1), bool), 30.0) == 0.0
 
 
-def test_faults_reach_the_windows():
+def test_faults_are_assigned_to_windows():
     samples = white((4, 40_000))
     samples[1] = 0
     samples[2, 20_000] = np.nan
@@ -193,18 +193,20 @@ def test_faults_reach_the_windows():
 
 
 def taps(seed=0, noise=1.0):
-    """30 taps of 0.4 s, heard from 0.15 s on, of random loudness at 5 microphones."""
+    """30 taps of 0.4 s at 5 microphones, which receive them from 0.15 s on, of random loudness."""
     random = np.random.default_rng(seed)
     time = np.arange(8000) / RATE
-    heard = np.where(time > 0.15, np.exp(-(time - 0.15) / 0.03), 0) * np.sin(2 * np.pi * 300 * time)
+    tap = np.where(time > 0.15, np.exp(-(time - 0.15) / 0.03), 0) * np.sin(2 * np.pi * 300 * time)
     loudness = 10 ** random.uniform(0, 1.5, size=(30, 5))
-    samples = loudness[..., None] * heard + noise * random.normal(size=(30, 5, 8000))
+    samples = loudness[..., None] * tap + noise * random.normal(size=(30, 5, 8000))
     places = random.uniform(0.02, 0.18, size=(30, 2))
     return Taps(random.uniform(0, 0.2, (5, 2)), OUTLINE, places, samples=samples, rate=RATE), loudness
 
 
 def test_taps():
-    """Intensity is as the square of loudness, by one factor for all: the windows heard are the same for a tap."""
+    """Intensity is proportional to the square of loudness, by one factor for all: each tap has the same active
+    windows.
+    """
     measured, loudness = taps()
     found = tap_intensities(measured)
     assert found.power.shape == found.usable.shape == (30, 5)
@@ -221,8 +223,8 @@ def test_taps():
     np.testing.assert_allclose(ratio[clear], factor[0, 0], rtol=0.3)
 
 
-def test_loud_noise_does_not_choose():
-    """One microphone with a thousandfold gain, that hears nothing but itself: the others hear the taps as before."""
+def test_a_noisy_channel_does_not_choose_the_windows():
+    """One microphone with a thousandfold gain receives only its own noise. The others receive the taps as before."""
     measured, _ = taps()
     assert measured.samples is not None
     samples = np.insert(measured.samples, 5, white((30, 8000), 9, 1000.0), axis=1)
@@ -235,21 +237,21 @@ def test_loud_noise_does_not_choose():
 
 
 def test_freedom_of_taps():
-    """Against the scatter of silent microphones beside one that hears: noise of chosen windows that overlap."""
+    """Against the scatter of silent microphones beside one with a signal: noise of chosen windows that overlap."""
     random = np.random.default_rng(3)
     time = np.arange(6000) / RATE
-    heard = 100 * np.exp(-((time - 0.15) ** 2) / 2 / 0.03**2) * np.sin(2 * np.pi * 300 * time)
+    tap = 100 * np.exp(-((time - 0.15) ** 2) / 2 / 0.03**2) * np.sin(2 * np.pi * 300 * time)
     samples = random.normal(size=(40, 30, 6000))
-    samples[:, 0] += heard
+    samples[:, 0] += tap
     places = random.uniform(0.02, 0.18, size=(40, 2))
     found = tap_intensities(Taps(random.uniform(0, 0.2, (30, 2)), OUTLINE, places, samples=samples, rate=RATE))
     silent = found.power[:, 1:]
-    # 1,160 means of noise, above a floor that is good to a per cent.
+    # 1,160 means of noise, above a floor that is determined to one per cent.
     assert abs(silent.mean() / 0.095) < 0.02
     measured = 2 * (950 / (RATE / 2)) ** 2 / silent.var(axis=0).mean()
     assert measured == pytest.approx(found.freedom.mean(), rel=0.15)
     single = degrees_of_freedom(IntensitySettings(), RATE)
-    # Some 4 windows of 0.05 s, each a quarter further on.
+    # Some 4 windows of 0.05 s, at a hop of a quarter of their length.
     assert 1.2 * single < found.freedom.min() <= found.freedom.max() < 3 * single
 
 
@@ -258,8 +260,8 @@ def test_faults_of_taps():
     assert measured.samples is not None
     samples = measured.samples.copy()
     samples[:, 1] = 0
-    samples[4, 2, 200] = np.nan  # before the tap is heard
-    samples[5, 2, 3200] = np.nan  # while it is
+    samples[4, 2, 200] = np.nan  # before the tap arrives
+    samples[5, 2, 3200] = np.nan  # during the tap
     samples[6:, 3] = 0.125
     found = tap_intensities(eqx.tree_at(lambda t: t.samples, measured, samples))
     expected = np.ones((30, 5), bool)
@@ -277,7 +279,7 @@ def test_faults_of_taps():
     np.testing.assert_allclose(found.power[4, [0, 2, 4]], clean.power[4, [0, 2, 4]], rtol=0.3)
 
 
-def test_taps_of_intensities_pass():
+def test_intensities_are_returned_unchanged():
     power = np.abs(white((6, 3)))
     power[2, 1] = np.nan
     found = tap_intensities(Taps(0.02 + white((3, 2)) * 0.01, OUTLINE, 0.1 + white((6, 2)) * 0.01, power=power))

@@ -1,4 +1,4 @@
-"""Left-out taps: what they say of decay models, and of how wide covariances must be."""
+"""Left-out taps: they choose the decay model, and the factor by which covariances are widened."""
 
 import functools
 
@@ -30,22 +30,22 @@ def taps(power, error=0.05, seed=0):
 
 @functools.cache
 def fitted(law):
-    """Fits of every law to taps that one was made by; what cannot be fitted."""
+    """Fits of every law to taps simulated by one, and the laws that cannot be fitted."""
     return fit_each_decay(taps(LAWS[law]))
 
 
-# A steep array is said to be attenuated in `test_untuned_arrays`.
+# `test_untuned_arrays` has a steep array, whose law is reported as attenuated.
 @pytest.mark.parametrize(
     "law", [pytest.param(one, marks=pytest.mark.slow if one == "attenuated" else []) for one in LAWS]
 )
-def test_auto_takes_the_law_that_taps_were_made_by(law):
+def test_auto_chooses_the_law_that_simulated_the_taps(law):
     fit = select_fit(*fitted(law))
     assert fit.calibration.microphone_array.decay.name == law
     assert fit.left_out[0][1] < 2.1e-3
     assert {name for name, _ in fit.left_out} == set(DECAYS)
 
 
-def test_what_auto_takes_is_what_that_law_alone_gives():
+def test_the_chosen_fit_is_that_of_its_law_alone():
     auto = select_fit(*fitted("exponential"))
     alone = calibrate_microphones(taps(LAWS["exponential"]), decay="exponential")
     assert eqx.tree_equal(auto.calibration, alone.calibration)
@@ -59,17 +59,19 @@ def test_auto_fits_every_law_and_chooses():
     assert auto.left_out == expected.left_out
 
 
-def test_the_simpler_of_two_that_do_as_well():
+def test_the_simpler_of_two_equally_good_laws_is_chosen():
     fits, _ = fitted("inverse-square")
     off = {"inverse-square": 1.04e-3, "exponential": 5e-3, "attenuated": 1e-3}
-    told = {name: eqx.tree_at(lambda f: f.left_out, fit, ((name, off[name]),)) for name, fit in fits.items()}
-    assert select_fit(told, {}).calibration.microphone_array.decay.name == "inverse-square"
-    told["inverse-square"] = eqx.tree_at(lambda f: f.left_out, fits["inverse-square"], (("inverse-square", 1.06e-3),))
-    assert select_fit(told, {}).calibration.microphone_array.decay.name == "attenuated"
+    errors_of_fits = {name: eqx.tree_at(lambda f: f.left_out, fit, ((name, off[name]),)) for name, fit in fits.items()}
+    assert select_fit(errors_of_fits, {}).calibration.microphone_array.decay.name == "inverse-square"
+    errors_of_fits["inverse-square"] = eqx.tree_at(
+        lambda f: f.left_out, fits["inverse-square"], (("inverse-square", 1.06e-3),)
+    )
+    assert select_fit(errors_of_fits, {}).calibration.microphone_array.decay.name == "attenuated"
 
 
 def test_taps_in_another_order_are_refused():
-    """By a law, with its reason; and by auto, with the first."""
+    """By one law, with its reason, and by auto, with the first reason."""
     power = np.random.default_rng(1).permutation(LAWS["inverse-square"])
     with pytest.raises(ValueError, match="in the order of the taps"):
         calibrate_microphones(taps(power, 0.2), decay="inverse-square")
@@ -93,7 +95,7 @@ def test_taps_at_one_place_are_left_out_together():
     assert np.bincount(part[:, 0]).tolist() == [13, 12, 12, 12]
 
 
-def test_the_widening_is_what_holds_nine_in_ten():
+def test_the_widening_covers_nine_in_ten_taps():
     square = 3.0 * np.random.default_rng(2).chisquare(2, 4000)
     taken = LeftOutTaps(np.ones(4000), square, 1.0)
     assert taken.widening == pytest.approx(3.0, rel=0.06)
@@ -102,8 +104,8 @@ def test_the_widening_is_what_holds_nine_in_ten():
     assert LeftOutTaps(np.full(9, np.nan), np.full(9, np.nan), 1.0).median == np.inf
 
 
-def test_places_are_as_wide_as_the_calibration_says(tmp_path):
-    """By `widening`, which its file keeps; files without one are of calibrations that widened nothing."""
+def test_covariances_of_places_are_widened_by_the_calibration(tmp_path):
+    """By `widening`, which its file keeps. Files without the key are of calibrations that widen nothing."""
     a, b = models(9)
     calibration = calibrate_microphones(taps(listen(ARRAY, a, b, PLACES)), decay="inverse-square").calibration
     plain, wide = (eqx.tree_at(lambda c: c.widening, calibration, value) for value in (1.0, 2.5))
@@ -121,8 +123,10 @@ def test_places_are_as_wide_as_the_calibration_says(tmp_path):
         Calibration.load(tmp_path / "narrow.json")
 
 
-def test_a_microphone_is_not_believed_to_be_silent():
-    """Of eight that scatter about nothing alike, one by chance hardly: it is half as noisy as the others at least."""
+def test_no_microphone_is_estimated_to_be_noiseless():
+    """One of eight similar microphones is noiseless, by chance: its estimate is about half the others' noise at
+    least.
+    """
     rng = np.random.default_rng(4)
     power = LAWS["exponential"] + 0.02 * rng.normal(size=SQUARED.shape)
     power[:, 4] = LAWS["exponential"][:, 4]

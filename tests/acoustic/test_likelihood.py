@@ -1,11 +1,11 @@
-"""The likelihood against NumPy formulas, its gradient against JAX's, its matrix against the spread of scores."""
+"""The likelihood against NumPy formulas, its gradient against JAX's, its matrix against the covariance of scores."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from microphone_arrays import array as device_array
-from microphone_arrays import hear, inside, listen, noisy, variance
+from microphone_arrays import inside, listen, noisy, received_power, variance
 
 from jeit.acoustic.localisation.likelihood import Likelihood
 from jeit_solvers.engines import on_device, on_host
@@ -14,7 +14,7 @@ FRAMES = 12
 
 
 def array(*arguments, **noise):
-    """In NumPy, which need not compile."""
+    """Computed in NumPy, without compilation."""
     return on_host(device_array(*arguments, **noise))
 
 
@@ -27,7 +27,7 @@ def microphone_array():
 def frames(microphone_array):
     places = inside(FRAMES)
     strength = np.exp(np.linspace(-2, 3, FRAMES))
-    power = noisy(microphone_array.noise, hear(microphone_array, places, strength), np.random.default_rng(0))
+    power = noisy(microphone_array.noise, received_power(microphone_array, places, strength), np.random.default_rng(0))
     use = np.ones(power.shape, bool)
     use[3, [1, 4]] = use[5, 7] = False
     power[3, 1], power[5, 7] = np.inf, np.nan
@@ -58,7 +58,7 @@ def terms_of(microphone_array, power, use, x):
 
 @pytest.mark.parametrize("sources", [1, 2])
 def test_cost_is_the_formula(sources, microphone_array, frames):
-    """Σ ½ (y − m)² / v + ½ log v; the misfit is twice its first part."""
+    """Σ ½ (y − m)² / v + ½ log v. The misfit is twice its first part."""
     x = np.concatenate([unknowns(FRAMES, seed=k) for k in range(sources)])
     cost, misfit = (
         f(np.asarray(x))
@@ -71,7 +71,7 @@ def test_cost_is_the_formula(sources, microphone_array, frames):
 
 
 def test_a_level_far_below_the_floor_is_finite(microphone_array):
-    """Power that is minus the floor has no logarithm: the level stops at a twentieth of the floor."""
+    """Power that is minus the floor has no logarithm: the level is limited to a twentieth of the floor."""
     power = np.full((1, 9), -0.06)
     one = Likelihood.create(np.asarray(power.T), np.ones((9, 1), bool), microphone_array)
     np.testing.assert_allclose(one.level[:, 0], np.log(0.05 * np.asarray(microphone_array.noise.floor)), rtol=1e-12)
@@ -90,12 +90,14 @@ def test_gradient(sources, microphone_array, frames):
 
 
 def test_matrix_is_the_covariance_of_scores(microphone_array):
-    """Fisher's: E[∇cost ∇costᵀ] over draws at the truth, where the mean of ∇cost is nothing. 20,000 draws: 2 %."""
+    """Fisher's matrix: E[∇cost ∇costᵀ] over draws at the truth, where the mean of ∇cost is zero. 20,000 draws determine
+    it to 2 %.
+    """
     number = 20_000
     place, strength = np.array([0.02, -0.03]), 0.3
     power = noisy(
         microphone_array.noise,
-        np.repeat(hear(microphone_array, [place], strength), number, axis=0),
+        np.repeat(received_power(microphone_array, [place], strength), number, axis=0),
         np.random.default_rng(2),
     )
     truth = np.asarray(np.repeat([[*place, np.log(strength)]], number, axis=0).T)
@@ -105,7 +107,7 @@ def test_matrix_is_the_covariance_of_scores(microphone_array):
     scale = np.sqrt(np.diag(fisher))
     spread = score @ score.T / number
     np.testing.assert_allclose(spread / np.outer(scale, scale), fisher / np.outer(scale, scale), atol=0.05)
-    # The level stops where power goes below minus the floor: in few draws, which moves the mean a little.
+    # The level is limited where power is below minus the floor: in few draws, which shifts the mean slightly.
     assert (np.abs(score.mean(axis=1)) < 0.03 * scale).all()
 
 
@@ -116,7 +118,7 @@ def test_matrix_is_the_expected_hessian(microphone_array):
     place, strength = np.array([-0.05, 0.04]), 3.0
     power = noisy(
         microphone_array.noise,
-        np.repeat(hear(microphone_array, [place], strength), number, axis=0),
+        np.repeat(received_power(microphone_array, [place], strength), number, axis=0),
         np.random.default_rng(3),
     )
     one = Likelihood.create(np.asarray(power.T), np.ones((9, number), bool), microphone_array)
@@ -128,24 +130,24 @@ def test_matrix_is_the_expected_hessian(microphone_array):
 
 
 def test_strength_at_a_known_place(microphone_array):
-    """Exact data: the strength itself, whatever the unit; and then the cost cannot be lower at another."""
+    """From exact data the strength itself is found in any unit, and no other strength has a lower cost."""
     exact = array(9)
     places, strength = inside(5), np.array([1e-12, 0.1, 1.0, 10.0, 1e12])
-    one = Likelihood.create(np.asarray(hear(exact, places, strength).T), np.ones((9, 5), bool), exact)
+    one = Likelihood.create(np.asarray(received_power(exact, places, strength).T), np.ones((9, 5), bool), exact)
     start = one.start(np.asarray(places.T))
     np.testing.assert_allclose(start[2], np.log(strength), atol=1e-10)
     np.testing.assert_allclose(start[:2], places.T)
     np.testing.assert_allclose(one.misfit(start), 0, atol=1e-15)
 
 
-def test_screen_leaves_least_at_the_place(microphone_array):
-    """½ Σ w (p − s f)² at the best s, written out; and nothing at the place of exact data."""
+def test_screening_is_lowest_at_the_place(microphone_array):
+    """½ Σ w (p − s f)² at the best s, written out. It is zero at the place of exact data."""
     exact = array(9)
     places, candidates = inside(6), np.concatenate([inside(6), inside(20, seed=5)])
-    power = hear(exact, places, np.exp(np.linspace(-3, 3, 6)))
+    power = received_power(exact, places, np.exp(np.linspace(-3, 3, 6)))
     one = Likelihood.create(np.asarray(power.T), np.ones((9, 6), bool), exact)
     screened = np.asarray(one.screen(one.features(exact, np.asarray(candidates.T))))
-    response = hear(exact, candidates)
+    response = received_power(exact, candidates)
     for frame in range(6):
         weight = 1 / np.asarray(variance(exact.noise, power[frame]))
         for number, f in enumerate(response):

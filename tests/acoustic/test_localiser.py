@@ -1,4 +1,4 @@
-"""Places: found from exact data, best on the skin, on any outline and surface, by both losses."""
+"""Places: recovered from exact data, optimal on the skin, on any outline and surface, with both losses."""
 
 from itertools import product
 
@@ -12,10 +12,10 @@ from microphone_arrays import (
     array,
     both,
     distance,
-    hear,
     inside,
     localise,
     models,
+    received_power,
 )
 
 from jeit.acoustic.localisation.localiser import METHODS
@@ -26,14 +26,14 @@ from jeit.acoustic.localisation.localiser import METHODS
     "count", [pytest.param(4, marks=pytest.mark.slow), 9, pytest.param(25, marks=pytest.mark.slow)]
 )
 def test_exact_data_to_a_micrometre(count, method):
-    """All over the skin, of four microphones between them; whatever the strength and the unit of intensity."""
+    """At places all over the skin, between its microphones, for every strength and unit of intensity."""
     microphone_array, places = array(count), inside(600, reach=0.6 if count == 4 else 1.0)
     strength = np.exp(np.random.default_rng(1).normal(size=len(places)))
     for scale in (1.0, 1e-12, 1e12):
-        found = localise(microphone_array, hear(microphone_array, places, scale * strength), method)
+        found = localise(microphone_array, received_power(microphone_array, places, scale * strength), method)
         assert distance(found, places).max() < 1e-6
         np.testing.assert_allclose(found["strength"], scale * strength, rtol=1e-6)
-        # A few stop at rounding, a step before they are told converged.
+        # A few stop at rounding, one step before they are reported as converged.
         assert found["converged"].mean() > 0.99
         assert (found["freedom"] == count - 3).all()
         assert found["misfit"].max() < 1e-6
@@ -41,15 +41,17 @@ def test_exact_data_to_a_micrometre(count, method):
 
 
 def explained(microphone_array, power, places, method):
-    """Of one frame at many places in NumPy: the likelihood's misfit at the best strength, or the loss."""
-    told = np.log(power) - np.log(hear(microphone_array, places))  # log strength, as each microphone tells it
-    if method == "likelihood":  # all gains are known equally well: their mean is the best
+    """The misfit of one frame at many places in NumPy: the likelihood's misfit at the best strength, or the loss."""
+    log_strength = np.log(power) - np.log(
+        received_power(microphone_array, places)
+    )  # log strength, as estimated from each microphone
+    if method == "likelihood":  # all gains are known equally well, so that their mean is the best
         return (
-            np.sum((told - told.mean(axis=1, keepdims=True)) ** 2, axis=1)
+            np.sum((log_strength - log_strength.mean(axis=1, keepdims=True)) ** 2, axis=1)
             / float(microphone_array.noise.relative[0]) ** 2
         )
-    told = np.exp(told)
-    return np.sum((told - told[:, [power.argmax()]]) ** 2, axis=1)
+    log_strength = np.exp(log_strength)
+    return np.sum((log_strength - log_strength[:, [power.argmax()]]) ** 2, axis=1)
 
 
 RASTER = np.stack(np.meshgrid(*2 * [np.linspace(-0.1, 0.1, 101)]), axis=-1).reshape(-1, 2)
@@ -63,9 +65,9 @@ RASTER = np.stack(np.meshgrid(*2 * [np.linspace(-0.1, 0.1, 101)]), axis=-1).resh
     ],
 )
 def test_no_place_on_the_skin_is_better(count, noise, method):
-    """A search of the whole skin, its outline too, every 2 mm: nothing is lower than what is found."""
+    """In a search of the whole skin with its outline, every 2 mm, nothing is lower than the result."""
     microphone_array, places = array(count, relative=max(noise, 1e-3)), inside(150)
-    power = hear(microphone_array, places)
+    power = received_power(microphone_array, places)
     power = power * np.exp(noise * np.random.default_rng(11).normal(size=power.shape))
     found = localise(microphone_array, power, method)
     missed = []
@@ -73,14 +75,14 @@ def test_no_place_on_the_skin_is_better(count, noise, method):
         cost = explained(microphone_array, power[frame], np.concatenate([[mine], RASTER]), method)
         if not cost[0] <= cost[1:].min() * (1 + 1e-6) + 1e-9:
             missed.append((places[frame], mine, cost[0], RASTER[cost[1:].argmin()], cost[1:].min()))
-    # Noise makes valleys that are narrower than the coarse grid: a few frames may miss the deeper of two.
+    # Noise makes valleys that are narrower than the coarse grid: a few frames may end in the shallower of two.
     assert len(missed) <= ((0.02 if count == 9 else 0.05) * len(places) if noise else 0), (
         f"{len(missed)} of {len(places)}: {missed[:3]}"
     )
 
 
 def both_places(place, power, a, b, microphones):
-    """The two sources in the plane that three microphones cannot tell apart, one of them at `place`.
+    """The two sources in the plane that three microphones do not distinguish, one of them at `place`.
 
     |x − x_i|² = S c_i − b_i with c = a / I: differences are linear in x and S, which leaves a quadratic equation in S.
     """
@@ -102,9 +104,11 @@ def both_places(place, power, a, b, microphones):
 @pytest.mark.slow
 @both
 def test_three_microphones(method):
-    """Three are enough where the other place that they allow is off the skin; else that one is as good."""
+    """Three microphones suffice where the other possible place is off the skin. Otherwise that place fits equally
+    well.
+    """
     microphone_array, places = array(3), inside(300)
-    power = hear(microphone_array, places)
+    power = received_power(microphone_array, places)
     found = localise(microphone_array, power, method)
     a, b = models(3)
     pairs = [both_places(*args, a, b, MICROPHONES[3]) for args in zip(places, power, strict=True)]
@@ -114,7 +118,7 @@ def test_three_microphones(method):
     alone = (np.abs(other) > 0.11).any(axis=1)
     assert alone.sum() > 100
     assert distance(found, places)[alone].max() < 1e-6
-    # Two places that are nearer to each other are in one pixel of the coarse grid, which tells one from the other.
+    # Two places closer than one pixel are not distinguished by the coarse grid.
     nearest = np.minimum(distance(found, places), distance(found, other))
     assert nearest[apart > 0.03].max() < 1e-6
     assert (found["freedom"] == 0).all()
@@ -123,10 +127,10 @@ def test_three_microphones(method):
 @pytest.mark.slow
 @both
 def test_an_outline_that_is_no_rectangle(method):
-    """Inside an L to a micrometre; what sounds from its notch is held on its edge."""
+    """Inside an L-shaped outline to a micrometre. A source in its notch is located on the outline."""
     microphone_array, places = array(9, outline=L_SHAPE), inside(300, outline=L_SHAPE)
     notch = np.array([[0.05, 0.06], [0.03, 0.09], [0.08, 0.03]])
-    found = localise(microphone_array, hear(microphone_array, np.concatenate([places, notch])), method)
+    found = localise(microphone_array, received_power(microphone_array, np.concatenate([places, notch])), method)
     assert distance(found, np.concatenate([places, notch]))[:300].max() < 1e-6
     x, y = found["position"][300:].T
     on_edge = (np.abs(x) < 1e-9) & (y >= 0.01 - 1e-9) | (np.abs(y - 0.01) < 1e-9) & (x >= -1e-9)
@@ -137,7 +141,7 @@ def test_an_outline_that_is_no_rectangle(method):
 
 @pytest.fixture(scope="module")
 def cylinder():
-    """A cylinder of radius 0.15 m, 0.2 m by 0.2 m along it, with nine microphones 10 mm beneath."""
+    """A cylinder of radius 0.15 m, 0.2 m by 0.2 m, with nine microphones 10 mm beneath it."""
 
     def on(chart, depth=0.0):
         angle, radius = chart[:, 0] / 0.15, 0.15 - depth
@@ -152,24 +156,26 @@ def cylinder():
 @both
 def test_on_a_curved_skin(cylinder, method):
     places = np.asarray(cylinder.surface.place(jnp.asarray(inside(200, reach=0.9).T))).T
-    found = localise(cylinder, hear(cylinder, places), method)
+    found = localise(cylinder, received_power(cylinder, places), method)
     assert distance(found, places).max() < 1e-6
-    # The covariance is a sheet, tangent to the skin.
+    # The covariance is singular, tangent to the skin.
     values = np.linalg.eigvalsh(found["covariance"])
     assert (np.abs(values[:, 0]) < 1e-9 * values[:, 1]).all()
     assert (values[:, 1] > 0).all()
 
 
 @both
-def test_what_lies_beyond_is_held_on_the_skin(method):
-    """At the best place on the outline, or at one inside that is better: none of a thousand along it is lower."""
+def test_sources_outside_are_located_on_the_outline(method):
+    """At the best place on the outline, or at a better one inside: none of a thousand places along the outline is
+    lower.
+    """
     microphone_array = array(9, relative=0.05)
     beyond = np.array([[0.13, 0.02], [-0.12, 0.05], [0.03, -0.15], [0.115, 0.12]])
-    power = hear(microphone_array, beyond)
+    power = received_power(microphone_array, beyond)
     found = localise(microphone_array, power, method)
     assert np.abs(found["position"]).max() <= 0.1 + 1e-12
     on_outline = np.abs(np.abs(found["position"]).max(axis=1) - 0.1) < 1e-9
-    # The loss may have another valley inside.
+    # The loss may have another minimum inside.
     assert on_outline.all() if method == "likelihood" else on_outline.any()
     assert (found["excess"][on_outline] > (9 if method == "likelihood" else 0)).all()
     along = np.linspace(0, 1, 250, endpoint=False)[:, None]
@@ -177,6 +183,3 @@ def test_what_lies_beyond_is_held_on_the_skin(method):
     for frame in range(4):
         cost = explained(microphone_array, power[frame], np.concatenate([found["position"][[frame]], edge]), method)
         assert cost[0] <= cost[1:].min() * (1 + 1e-9)
-
-
-# Gradients. Frames with 10 % noise, so that residuals curve the cost: inside, on the outline, and in a corner.

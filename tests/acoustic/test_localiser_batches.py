@@ -1,9 +1,22 @@
-"""Batches of frames: independent, in chunks, compiled or not, with readings missing; maps; bad input."""
+"""Batches of frames: independent of each other, in chunks, compiled or not, with missing readings. Maps and bad
+input.
+"""
 
 import jax
 import numpy as np
 import pytest
-from microphone_arrays import L_SHAPE, array, both, distance, hear, inside, localise, noisy, padded, same_shape
+from microphone_arrays import (
+    L_SHAPE,
+    array,
+    both,
+    distance,
+    inside,
+    localise,
+    noisy,
+    padded,
+    received_power,
+    same_shape,
+)
 
 from jeit.acoustic import Localiser
 from jeit.acoustic.localisation.localiser import _CHUNK
@@ -11,11 +24,11 @@ from jeit.acoustic.localisation.localiser import _CHUNK
 
 @pytest.fixture(scope="module")
 def mixed():
-    """Noisy frames inside and beyond, some with readings missing."""
+    """Noisy frames inside and outside the outline, some with missing readings."""
     microphone_array = array(9, relative=0.1)
     rng = np.random.default_rng(7)
     places = np.concatenate([inside(40), inside(10, seed=1) + np.array([0.2, 0.0])])
-    power = noisy(microphone_array.noise, hear(microphone_array, places), rng)
+    power = noisy(microphone_array.noise, received_power(microphone_array, places), rng)
     power[rng.random(power.shape) < 0.1] = np.nan
     return microphone_array, power
 
@@ -23,7 +36,7 @@ def mixed():
 @pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.slow), False])
 @both
 def test_no_frames_give_nothing(method, compiled):
-    """As where a mask leaves none."""
+    """As where a mask selects none."""
     microphone_array = array(9, relative=0.1)
     found = Localiser.create(microphone_array, method=method, compiled=compiled)(np.zeros((0, 9)))
     assert found.position.shape == (0, 2)
@@ -33,8 +46,8 @@ def test_no_frames_give_nothing(method, compiled):
 
 @pytest.mark.slow
 @both
-def test_frames_do_not_see_each_other(method, mixed):
-    """One by one, in another order, or in another chunk: the same to rounding."""
+def test_frames_do_not_depend_on_each_other(method, mixed):
+    """One by one, in another order, or in another chunk, the results agree to rounding."""
     microphone_array, power = mixed
     localiser = Localiser.create(microphone_array, method=method)
     together = same_shape(localiser, power)
@@ -64,9 +77,11 @@ def test_compiled_or_not(method, mixed):
 
 @both
 def test_missing_readings(method):
-    """NaN, not used, or used and infinite are one; exact data stay exact with up to five of nine gone."""
+    """NaN, unused, and unused and infinite are equivalent. Exact data stay exact with up to five of nine readings
+    missing.
+    """
     exact, places = array(9), inside(200, reach=0.6)
-    power = hear(exact, places)
+    power = received_power(exact, places)
     rng = np.random.default_rng(9)
     use = np.ones(power.shape, bool)
     for frame in range(200):
@@ -74,7 +89,7 @@ def test_missing_readings(method):
     found = localise(exact, np.where(use, power, np.nan), method)
     several = use.sum(axis=1) >= 5
     assert distance(found, places)[several].max() < 1e-6
-    # Four leave one degree of freedom, and now and then a second place that is nearly as good.
+    # Four leave one degree of freedom, and sometimes a second place that fits nearly as well.
     assert np.mean(distance(found, places) < 1e-6) > 0.97
     np.testing.assert_array_equal(found["freedom"], use.sum(axis=1) - 3)
     localiser = Localiser.create(exact, method=method, compiled=False)
@@ -101,13 +116,13 @@ def test_too_few_readings_give_nan(method, mixed):
 @pytest.mark.slow
 @both
 def test_maps(method):
-    """Least where the source is found, to a pixel; blank beyond the outline; bottom row first.
+    """Maps are lowest at the source, to a pixel, and NaN outside the outline. The bottom row is first.
 
-    In NumPy; the compiled program's are those of the next test, and of `test_hearing_engines`.
+    In NumPy: the compiled program's maps are those of the next test, and of `test_hearing_engines`.
     """
     microphone_array, places = array(9, outline=L_SHAPE, relative=0.02), inside(20, outline=L_SHAPE, reach=0.9)
     localiser = Localiser.create(microphone_array, method=method, map_shape=(40, 30), compiled=False)
-    power = noisy(microphone_array.noise, hear(microphone_array, places), np.random.default_rng(10))
+    power = noisy(microphone_array.noise, received_power(microphone_array, places), np.random.default_rng(10))
     found, maps = localiser.with_maps(padded(power, 40))
     assert maps.shape == (40, 40, 30)
     x, y = -0.1 + 0.2 * (np.arange(30) + 0.5) / 30, -0.1 + 0.2 * (np.arange(40) + 0.5) / 40
@@ -122,9 +137,9 @@ def test_maps(method):
 @pytest.mark.slow
 @both
 def test_the_papers_raster(method):
-    """200 × 200 pixels of a millimetre: the map of the loss is the formula's, and its minimum the place."""
+    """200 × 200 pixels of a millimetre: the map of the loss is the formula's, and its minimum is at the place."""
     microphone_array, places = array(9, relative=0.02), inside(5, reach=0.9)
-    power = hear(microphone_array, places)
+    power = received_power(microphone_array, places)
     found, maps = Localiser.create(microphone_array, method=method, map_shape=(200, 200)).with_maps(power)
     np.testing.assert_allclose(found.position, places, atol=1e-6)
     for one, place in zip(np.asarray(maps), places, strict=True):

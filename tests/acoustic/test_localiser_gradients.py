@@ -1,11 +1,11 @@
-"""Derivatives of the place found, in all that it depends on, against finite differences."""
+"""Derivatives of the estimated place with respect to all inputs, against finite differences."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from microphone_arrays import array, assert_same, hear, inside, noisy, quick_likelihood
+from microphone_arrays import array, assert_same, inside, noisy, quick_likelihood, received_power
 
 from jeit.acoustic import Localiser
 from jeit.acoustic.localisation.localiser import METHODS
@@ -13,12 +13,14 @@ from jeit.acoustic.localisation.localiser import METHODS
 
 @pytest.fixture(scope="module")
 def moving():
-    """MicrophoneArray, power, a direction in which all of them are moved, and what is found as a function of them."""
+    """MicrophoneArray, power, a direction in which all inputs are varied, and the result as a function of them."""
     microphone_array = array(9, relative=0.1, floor=1e-4, freedom=100.0)
     beyond = [[0.14, 0.02], [0.15, -0.05], [-0.14, 0.03], [0.01, 0.15], [-0.04, -0.14], [0.05, 0.16]]
     places = np.concatenate([inside(20, reach=0.8), beyond, [[0.16, 0.16], [-0.17, 0.15]]])
     rng = np.random.default_rng(0)
-    power = noisy(microphone_array.noise, hear(microphone_array, places, np.exp(rng.normal(size=len(places)))), rng)
+    power = noisy(
+        microphone_array.noise, received_power(microphone_array, places, np.exp(rng.normal(size=len(places)))), rng
+    )
     point = (
         microphone_array.microphones,
         jnp.asarray(np.log(microphone_array.decay.a)),
@@ -77,14 +79,14 @@ def test_forward_mode_can_be_reversed(method, moving):
     [("likelihood", False)] + [pytest.param(one, True, marks=pytest.mark.slow) for one in METHODS],
 )
 def test_gradients(method, reversed_too, moving):
-    """What is compiled is what NumPy finds; its forward mode is what central differences are, in each of what
-    positions depend on.
+    """The compiled result is that of NumPy, and its forward mode agrees with central differences for each input.
 
-    So is reverse mode, for which more is compiled.
+    So does reverse mode, which takes longer to compile.
     """
     point, direction, located = moving
     _, found = located(method, *point)
-    # What needs more steps is said not to have converged, and its slopes are as far off as its place.
+    # A frame that needs more iterations is reported as not converged, and its derivatives are as inaccurate as its
+    # place.
     done = np.asarray(found.converged)
     assert done.mean() > 0.9
     weight = np.where(done[:, None], np.random.default_rng(2).normal(size=(28, 2)), 0.0)
@@ -94,7 +96,7 @@ def test_gradients(method, reversed_too, moving):
         _, push, compiled = jax.linearize(lambda *x: located(method, *x), *point, has_aux=True)
         return push(*tangent), jax.linear_transpose(push, *point)(weight) if reversed_too else None, compiled
 
-    # Frames on a side of the outline move along it, those in a corner stay in it.
+    # Frames on a side of the outline move along it. Those in a corner stay there.
     on = np.abs(np.abs(np.asarray(found.position)) - 0.1) < 1e-9
     inside, corner = ~on.any(axis=1), on.all(axis=1)
     assert inside.sum() >= 20
@@ -116,7 +118,7 @@ def test_gradients(method, reversed_too, moving):
         if reversed_too:
             product = sum(float(np.sum(by * part)) for by, part in zip(mine, map(np.asarray, reverse), strict=True))
             assert product == pytest.approx(float(np.sum(weight * slope)), rel=1e-9)
-    # With all microphones a source moves along.
+    # A source moves with all microphones.
     for axis in np.eye(2):
         shift = jnp.asarray(np.tile(axis, (9, 1)))
         slope = np.asarray(derivatives((shift, *map(jnp.zeros_like, point[1:])))[0])

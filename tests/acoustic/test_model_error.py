@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from microphone_arrays import OUTLINE, array, hear, inside, listen, localise, models
+from microphone_arrays import OUTLINE, array, inside, listen, localise, models, received_power
 
 from jeit.acoustic import Calibration, Intensities, Taps, calibrate_microphones, cramer_rao, locate
 from jeit.acoustic.localisation.gain_changes import GainChanges, covariance_with_gains
@@ -13,7 +13,7 @@ SIXTEEN, ERROR, DRIFT, CHI_SQUARE = grid(0.16, 0.16, 4, 4), 0.05, 0.1, 5.991
 
 
 def calibrated(off, *, error=ERROR, **options):
-    """A fit to taps at 81 places, by 16 microphones that are `off` (16, 2) metres from their given positions."""
+    """A fit to taps at 81 places by 16 microphones that are displaced by `off` (16, 2) metres."""
     places, (a, b) = grid(0.18, 0.18, 9, 9), models(16)
     power = listen(SIXTEEN + off, a, b, places)
     power = power * np.exp(error * np.random.default_rng(0).normal(size=power.shape))
@@ -22,7 +22,7 @@ def calibrated(off, *, error=ERROR, **options):
 
 def touches(microphone_array, places, gains, *, seed=1):
     """Intensities of touches at `places`, with the relative errors of the model, and changed gains (M,)."""
-    power = hear(microphone_array, places) * gains
+    power = received_power(microphone_array, places) * gains
     return Intensities(
         0.05 * np.arange(len(places)), power * np.exp(ERROR * np.random.default_rng(seed).normal(size=power.shape))
     )
@@ -39,13 +39,13 @@ def drawn_gains(seed, count=16, deviation=DRIFT):
 
 
 def held(found, places):
-    """Fraction of the 95 % ellipses that contain the places."""
+    """Fraction of the 95 % ellipses that contain the true places."""
     error = found.position - places
     return np.mean(np.einsum("fi,fij,fj->f", error, np.linalg.inv(found.covariance), error) < CHI_SQUARE)
 
 
-def test_misplaced_microphones_are_found_by_taps():
-    """2 mm off along each coordinate: to half a millimetre or so, which is what the noise leaves."""
+def test_displacements_of_microphones_are_estimated_from_taps():
+    """2 mm along each coordinate, estimated to about half a millimetre, which is the effect of the noise."""
     off = 2e-3 * np.random.default_rng(3).normal(size=(16, 2))
     fit, fixed = calibrated(off), calibrated(off, place_error=0)
     assert np.sqrt(np.mean((fit.displacement - off) ** 2)) < 0.7e-3
@@ -54,13 +54,13 @@ def test_misplaced_microphones_are_found_by_taps():
     assert (fixed.displacement == 0).all()
 
 
-def test_microphones_at_their_places_stay_there():
-    """Less than the noise alone would move them: the spread of the displacements is estimated too."""
+def test_microphones_at_their_places_are_not_displaced():
+    """By less than the noise alone would: the standard deviation of the displacements is estimated too."""
     assert np.sqrt(np.mean(calibrated(np.zeros((16, 2))).displacement ** 2)) < 0.25e-3
 
 
 def test_displacements_are_bounded():
-    """A microphone 30 mm away is not a matter of millimetres: it is left out, and the others are as good as before."""
+    """A microphone 30 mm away is left out, and the others are as accurate as before."""
     off = np.zeros((16, 2))
     off[5] = 0.02, 0.02
     fit = calibrated(off)
@@ -70,8 +70,8 @@ def test_displacements_are_bounded():
 
 
 @pytest.mark.parametrize("seed", [4, 5])
-def test_gains_that_changed_are_estimated(seed):
-    """Errors are as if gains were known, and 95 % ellipses hold the truth."""
+def test_changed_gains_are_estimated(seed):
+    """Errors are as if gains were known, and 95 % ellipses contain the truth."""
     microphone_array, places = array(16, microphones=SIXTEEN, relative=ERROR), inside(60, reach=0.95)
     frames = touches(microphone_array, places, drawn_gains(seed))
     found, fixed = locate(frames, known(microphone_array)), localise(microphone_array, frames.power)["position"]
@@ -84,7 +84,7 @@ def test_gains_that_changed_are_estimated(seed):
     assert [note.startswith("gains have changed") for note in found.notes] == [True]
 
 
-def test_gains_that_changed_much():
+def test_strongly_changed_gains():
     """By 25 %, so that one source explains few touches at first."""
     microphone_array, places = array(16, microphones=SIXTEEN, relative=ERROR), inside(60, reach=0.95)
     found = locate(touches(microphone_array, places, drawn_gains(6, deviation=0.25)), known(microphone_array))
@@ -92,8 +92,8 @@ def test_gains_that_changed_much():
     assert held(found, places) > 0.9
 
 
-def test_gains_that_did_not_change():
-    """Nothing is corrected, and places and ellipses are nearly those of exactly known gains."""
+def test_unchanged_gains():
+    """Nothing is corrected, and places and ellipses are nearly those for exactly known gains."""
     microphone_array, places = array(16, microphones=SIXTEEN, relative=ERROR), inside(60, reach=0.95)
     frames = touches(microphone_array, places, np.ones(16))
     found, exact = locate(frames, known(microphone_array)), locate(frames, known(microphone_array), gain_drift=0)
@@ -104,7 +104,7 @@ def test_gains_that_did_not_change():
 
 
 def test_ellipses_of_a_single_touch_include_the_gains():
-    """One touch says little of the gains: 24 recordings of one each, all with other gains."""
+    """One touch contains little information about the gains: 24 recordings of one touch each, with different gains."""
     microphone_array, places = array(16, microphones=SIXTEEN, relative=ERROR), inside(24, reach=0.9)
     inner = [
         held(locate(touches(microphone_array, [place], drawn_gains(k), seed=100 + k), known(microphone_array)), [place])
@@ -113,10 +113,10 @@ def test_ellipses_of_a_single_touch_include_the_gains():
     assert np.mean(inner) > 0.85
 
 
-def test_errors_of_gains_widen_along_what_they_move():
+def test_gain_errors_widen_ellipses_along_their_effect():
     """F⁻¹ + B C Bᵀ, with B by differences of the places that exact intensities give under other gains."""
     microphone_array, place = array(9, relative=0.05), np.array([[0.013, 0.021]])
-    localiser, power = Localiser.create(microphone_array, compiled=False), hear(microphone_array, place)
+    localiser, power = Localiser.create(microphone_array, compiled=False), received_power(microphone_array, place)
     step, use = 1e-4, np.ones((1, 9), bool)
     changed = power * np.exp(step * np.concatenate([np.eye(9), -np.eye(9)]))
     position = np.asarray(localiser(changed).position)

@@ -1,4 +1,4 @@
-"""Overlays: brightness of maps, and how the older fade."""
+"""Overlays: brightness of maps, and fading of older maps."""
 
 import numpy as np
 import pytest
@@ -22,8 +22,8 @@ def test_brightness_of_a_likelihood_is_relative_to_the_best_pixel():
     assert (shown[:, 0, 0] == 0).all()
 
 
-def test_brightness_of_the_papers_loss_falls_to_1_in_e_at_its_share():
-    """Whatever the unit of the loss: twenty pixels of a hundred are brighter than 1/e."""
+def test_brightness_of_the_papers_loss_falls_to_1_in_e_at_its_fraction():
+    """In any unit of the loss: twenty pixels of a hundred are brighter than 1/e."""
     values = np.random.default_rng(1).permutation(100.0 + np.arange(100)).reshape(1, 10, 10)
     for scale in (1e-20, 1.0, 1e20):
         shown = map_brightness(scale * values, method="consistency", share=0.2)
@@ -31,8 +31,8 @@ def test_brightness_of_the_papers_loss_falls_to_1_in_e_at_its_share():
         np.testing.assert_allclose(shown[0], np.exp(-(values[0] - 100) / 20), rtol=1e-9)
 
 
-def test_brightness_of_nothing():
-    """A frame that has no map is dark; one that is flat is bright all over."""
+def test_brightness_of_maps_without_contrast():
+    """A frame without a map is dark. A constant map is bright everywhere."""
     values = np.stack([np.full((4, 4), np.nan), np.full((4, 4), 3.0)])
     for method in ("likelihood", "consistency"):
         shown = map_brightness(values, method=method)
@@ -55,7 +55,7 @@ def test_bad_maps(values, options, message):
 
 
 def test_overlay_fades_with_age():
-    """One bright pixel after another: each is left as exp(-age / time constant)."""
+    """One bright pixel after another: each has the brightness exp(-age / time constant)."""
     times = np.array([0.0, 0.1, 0.15, 1.0])
     images = np.zeros((4, 2, 2))
     for number in range(4):
@@ -68,7 +68,7 @@ def test_overlay_fades_with_age():
             assert seen[number, other // 2, other % 2] == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_source_at_rest_does_not_burn_in():
+def test_a_stationary_source_does_not_accumulate():
     images = np.full((5, 2, 3), 0.6)
     np.testing.assert_allclose(overlay_images(images, np.arange(5.0)), images)
     brighter = images * np.array([1, 0.1, 0.1, 1.2, 0.1])[:, None, None]
@@ -78,7 +78,7 @@ def test_a_source_at_rest_does_not_burn_in():
     )
 
 
-def test_frames_without_a_map_are_dark_and_let_the_old_fade():
+def test_frames_without_a_map_are_dark_and_older_ones_fade():
     images = np.stack([np.full((2, 2), 0.8), np.full((2, 2), np.nan)])
     kept = images.copy()
     np.testing.assert_allclose(overlay_images(images, [1.0, 2.0], time_constant=0.5)[1], 0.8 * np.exp(-2), rtol=1e-12)
@@ -86,7 +86,7 @@ def test_frames_without_a_map_are_dark_and_let_the_old_fade():
 
 
 def test_irregular_times_do_not_matter():
-    """A frame in between that is dark changes nothing later."""
+    """An intermediate dark frame changes nothing later."""
     image = np.random.default_rng(2).random((1, 3, 3))
     direct = overlay_images(np.concatenate([image, 0 * image]), [0.0, 0.7])[-1]
     through = overlay_images(np.concatenate([image, 0 * image, 0 * image]), [0.0, 0.11, 0.7])[-1]

@@ -1,4 +1,4 @@
-"""The pictures of touches that were heard, judged by what was drawn: places, colours, names, units."""
+"""Figures of touches located by sound: the drawn places, colours, names and units."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +31,7 @@ DEAD = "dead: every sample is 0"
 
 
 def calibration(number=9, reasons=(), outline=OUTLINE, points=None, microphones=None):
-    """Of microphones on a square grid, all alike; some of them, {index: reason}, of no use."""
+    """Calibration of equal microphones on a square grid, some of them unusable, {index: reason}."""
     side = int(np.ceil(np.sqrt(number)))
     places = grid(0.15, 0.15, side, side)[:number] if microphones is None else microphones
     why = tuple(dict(reasons).get(k, "") for k in range(number))
@@ -44,12 +44,12 @@ def calibration(number=9, reasons=(), outline=OUTLINE, points=None, microphones=
 
 
 def dome(points):
-    """Points (n, 3) over points (n, 2)."""
+    """Points (n, 3) above points (n, 2)."""
     return np.column_stack([points, 0.3 - 1.5 * np.sum(np.asarray(points) ** 2, axis=1)])
 
 
 def fitted(number=9, reasons=(), outliers=()):
-    """A fit of 30 taps without errors, of strengths from 1 to 2; those left out are ten times as loud."""
+    """A fit to 30 taps without errors, of strengths from 1 to 2. The left-out taps are ten times as loud."""
     known = calibration(number, reasons)
     rng = np.random.default_rng(0)
     places = rng.uniform(-0.1, 0.1, (30, 2))
@@ -60,13 +60,13 @@ def fitted(number=9, reasons=(), outliers=()):
     for index, reason in dict(reasons).items():
         if reason == DEAD:
             power[:, index], usable[:, index] = np.nan, False
-    told = np.where(outlier, np.nan, strength)
+    strengths = np.where(outlier, np.nan, strength)
     still = np.zeros(known.microphone_array.microphones.shape)
-    return CalibrationFit(known, distance, power, usable, told, outlier, np.ones(number), ~known.usable, still)
+    return CalibrationFit(known, distance, power, usable, strengths, outlier, np.ones(number), ~known.usable, still)
 
 
 def recorded(position, statuses=None, *, spread=1e-6, rejected=(), touches=None, used=None, number=9, second=None):
-    """A track and the locations that it is of: frames 0.1 s apart; NaN is no touch."""
+    """A track and its locations: frames 0.1 s apart, NaN where there is no touch."""
     position = np.asarray(position, float)
     frames, d = position.shape
     located = np.isfinite(position).all(axis=1)
@@ -116,7 +116,7 @@ def texts(ax):
 
 
 def dots(ax, label):
-    """Places (n, 2) of the markers of this name."""
+    """Places (n, 2) of the markers of this label."""
     (line,) = [line for line in ax.lines if line.get_label() == label]
     return np.column_stack(line.get_data())
 
@@ -140,7 +140,7 @@ def test_a_receptive_field_is_intensity_over_strength_against_distance(ax):
     assert "left out" not in named(ax)
 
 
-def test_taps_left_out_are_red_and_useless_microphones_say_why(ax):
+def test_left_out_taps_are_red_and_unusable_microphones_have_a_reason(ax):
     fit = fitted(reasons={2: "what it hears does not fall with distance", 4: DEAD}, outliers=[3, 7])
     plot_receptive_fields(fit, ax=ax)
     panel = ax.child_axes[0]
@@ -157,7 +157,7 @@ def test_taps_left_out_are_red_and_useless_microphones_say_why(ax):
 
 
 @pytest.mark.parametrize(("number", "columns"), [(3, 3), (7, 3), (25, 5), pytest.param(64, 8, marks=pytest.mark.slow)])
-def test_axis_labels_stand_at_the_border_only(number, columns, ax):
+def test_axis_labels_are_at_the_border_only(number, columns, ax):
     plot_receptive_fields(fitted(number), ax=ax)
     ax.figure.canvas.draw()
     left = [panel.yaxis.get_tick_params()["labelleft"] for panel in ax.child_axes]
@@ -166,7 +166,7 @@ def test_axis_labels_stand_at_the_border_only(number, columns, ax):
     assert bottom == [k + columns >= number for k in range(number)]
 
 
-def test_some_microphones_only(ax):
+def test_a_selection_of_microphones(ax):
     plot_receptive_fields(fitted(), microphones=[5, 1], ax=ax)
     assert [panel.texts[0].get_text() for panel in ax.child_axes] == ["5", "1"]
     for wrong in ([9], [-1], [0.5], []):
@@ -174,7 +174,7 @@ def test_some_microphones_only(ax):
             plot_receptive_fields(fitted(), microphones=wrong, ax=ax)
 
 
-def test_a_loss_map_lies_bottom_row_first_and_is_least_at_the_source(ax):
+def test_a_loss_map_has_its_bottom_row_first_and_is_lowest_at_the_source(ax):
     known = calibration()
     values = np.full((20, 40), 50.0)
     values[0, 0], values[5, 30] = np.nan, 2.0
@@ -187,7 +187,7 @@ def test_a_loss_map_lies_bottom_row_first_and_is_least_at_the_source(ax):
     shown = np.asarray(drawn.get_array().filled(np.nan))
     assert shown[5, 30] == 0
     assert shown[10, 10] == pytest.approx(np.sqrt(2 * 48))
-    # Bright is where the source is.
+    # The source is in the bright region.
     assert sum(drawn.to_rgba(0.0)[:3]) > sum(drawn.to_rgba(shown[10, 10])[:3])
     (ellipse,) = [patch for patch in ax.patches if isinstance(patch, Ellipse)]
     # √χ²(0.95, 2) = 2.4477 standard deviations of 2 and 1 mm.
@@ -227,13 +227,13 @@ def test_the_papers_loss_is_in_decibels(ax):
         ("covariance has shape", {"marks": MapMarks(estimate=[0.0, 0.0], covariance=np.eye(3))}),
     ],
 )
-def test_loss_maps_refuse_what_makes_no_sense(match, change, ax):
+def test_loss_maps_refuse_bad_input(match, change, ax):
     arguments = {"values": np.ones((3, 3)), "surface": calibration().microphone_array, "ax": ax} | change
     with pytest.raises(ValueError, match=match):
         plot_loss_map(**arguments)
 
 
-def test_pairs_are_joined_and_their_error_is_the_title(ax):
+def test_pairs_are_connected_and_their_error_is_the_title(ax):
     true, found = grid(0.1, 0.1, 2, 2), grid(0.1, 0.1, 2, 2)
     found[0] += [3e-3, 4e-3]
     found[1] += [0.0, 1e-3]
@@ -248,7 +248,7 @@ def test_pairs_are_joined_and_their_error_is_the_title(ax):
     assert "50 mm" in texts(ax)
 
 
-def test_pairs_refuse_what_does_not_match(ax):
+def test_pairs_refuse_unequal_numbers(ax):
     place = np.zeros((4, 2))
     with pytest.raises(ValueError, match="found 3"):
         plot_position_errors(place, place[:3], place, OUTLINE, ax=ax)
@@ -289,7 +289,7 @@ def test_a_tap_is_a_dot_in_an_ellipse(ax):
     assert ellipse.width == pytest.approx(2 * 2.4477 * 3e-3, rel=1e-4)
     assert named(ax) == ["microphone", "touch, 95 %"]
     assert not ax.images
-    assert len(ax.figure.axes) == 1  # one moment needs no colour bar
+    assert len(ax.figure.axes) == 1  # a single time needs no colour bar
 
 
 def test_a_recording_without_a_touch_says_so(ax):
@@ -302,7 +302,7 @@ def test_a_recording_without_a_touch_says_so(ax):
     assert "no usable frame" in texts(other)
 
 
-def test_microphones_of_no_use_are_crossed(ax):
+def test_unusable_microphones_are_crossed_out(ax):
     used = np.ones((20, 9), bool)
     used[:, 5] = False
     used[3, 7] = False
@@ -313,7 +313,7 @@ def test_microphones_of_no_use_are_crossed(ax):
     assert named(ax)[:2] == ["microphone", "not usable"]
 
 
-def test_frames_that_are_no_plain_touch_are_named(ax):
+def test_frames_with_another_status_are_labelled(ax):
     statuses = np.full(20, "touch", dtype="<U12")
     statuses[[2, 3]], statuses[5], statuses[8] = "outside", "misfit", "two touches"
     second = np.full((20, 2), np.nan)
@@ -366,7 +366,7 @@ def test_the_ellipse_lies_in_the_plane_of_the_skin(ax):
         ("locations", {"locations": recorded(stroke(19))[1]}),
     ],
 )
-def test_tracks_refuse_what_does_not_match(match, change, ax):
+def test_tracks_refuse_bad_input(match, change, ax):
     track, locations = recorded(stroke())
     arguments = {"track": track, "locations": locations, "array": calibration(), "ax": ax} | change
     with pytest.raises(ValueError, match=match):
@@ -410,13 +410,13 @@ def test_error_curves_of_other_statistics(statistic, label, value, ax):
         ("statistic must be", {"statistic": "worst"}),
     ],
 )
-def test_error_curves_refuse_what_makes_no_sense(match, change, ax):
+def test_error_curves_refuse_bad_input(match, change, ax):
     arguments = {"values": [1.0, 2.0], "errors": {"a": np.ones((2, 4))}, "ax": ax} | change
     with pytest.raises(ValueError, match=match):
         plot_error_curve(**arguments)
 
 
-def test_figures_are_made_where_no_axes_are_given():
+def test_figures_are_created_where_no_axes_are_given():
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""Files of recordings and taps: what is written comes back, and what is wrong is refused in one line that says why."""
+"""Files of recordings and taps: written data are read again, and bad data are refused in one line that says why."""
 
 import wave
 import zipfile
@@ -24,13 +24,13 @@ TIMES = np.arange(6) * 0.01
 SQUARE = np.array([[0, 0], [0.2, 0], [0.2, 0.2], [0, 0.2]])
 GEOMETRY = {"microphones": SQUARE[:3] + 0.01, "outline": SQUARE, "positions": RANDOM.uniform(0, 0.2, size=(5, 2))}
 TAPS = {**GEOMETRY, "intensity": RANDOM.uniform(size=(5, 3))}
-HEARD = {**GEOMETRY, "samples": RANDOM.normal(size=(5, 3, 60)), "rate": 40e3}
+RECORDED_TAPS = {**GEOMETRY, "samples": RANDOM.normal(size=(5, 3, 60)), "rate": 40e3}
 
 
 @pytest.mark.parametrize("dtype", ["int16", "int32", "uint8", "float32", "float64"])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_wav(tmp_path, dtype, channels):
-    """Back to half a step of the format."""
+    """Equal to half a step of the format."""
     samples = SAMPLES[:channels].copy()
     samples[0, :2] = [-1, 0]
     bits = np.dtype(dtype).itemsize * 8
@@ -110,7 +110,7 @@ def test_intensities_alone(tmp_path):
     assert found.faults == ("", "", "")
 
 
-@pytest.mark.parametrize("arrays", [TAPS, HEARD, {**HEARD, "full_scale": 2.0}])
+@pytest.mark.parametrize("arrays", [TAPS, RECORDED_TAPS, {**RECORDED_TAPS, "full_scale": 2.0}])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_taps_round_trip(tmp_path, arrays, dimension):
     if dimension == 3:
@@ -130,7 +130,7 @@ def test_taps_round_trip(tmp_path, arrays, dimension):
 
 
 def test_numbers_keep_their_kind():
-    """Counts become floats; single precision, which halves the memory of a long recording, stays."""
+    """Counts become floats. Single precision is kept, since it halves the memory of a long recording."""
     assert Recording(SAMPLES.astype(np.float32), 8000).samples.dtype == np.float32
     assert Recording((100 * SAMPLES).astype(np.int16), np.array([8000])).samples.dtype == float
     clockwise = Taps(SQUARE[:2], SQUARE[::-1], SQUARE[:1], power=[[1, 2]])
@@ -139,8 +139,8 @@ def test_numbers_keep_their_kind():
     assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2 == pytest.approx(0.04)
 
 
-def test_microphones_and_taps_may_be_a_little_beside_the_outline():
-    """Under a rim, or pressed at the very edge: a skin's length off, and a twentieth of it."""
+def test_microphones_and_taps_may_be_slightly_outside_the_outline():
+    """Under a rim, or pressed at the edge: by a skin's length for microphones, and by a twentieth of it for taps."""
     beside = Taps(SQUARE[:2] - np.array([0.0, 0.199]), SQUARE, SQUARE + np.array([0.0099, 0.0]), power=np.ones((4, 2)))
     np.testing.assert_allclose(beside.positions[1], [0.2099, 0])
 
@@ -155,14 +155,14 @@ MISSING = np.where(np.arange(10).reshape(5, 2) == 3, np.nan, 0.1)
 
 
 @pytest.mark.parametrize(
-    ("arrays", "said"),
+    ("arrays", "message"),
     [
         ({"rate": 40e3, "sound": SAMPLES}, "neither 'samples' nor 'intensity'; the file holds rate, sound"),
         ({}, "neither"),
         ({"samples": SAMPLES, "Rate": 40e3}, "no array 'rate'; the file holds samples, Rate"),
         ({"intensity": POWER}, "no array 'times'"),
         ({**SOUND, **FRAMES}, "both 'intensity' and 'samples'"),
-        (HEARD, "read_taps"),
+        (RECORDED_TAPS, "read_taps"),
         ({"samples": SAMPLES.T, "rate": 40e3}, "transposed"),
         ({"samples": SAMPLES[0], "rate": 40e3}, r"shape \(400,\); give \(microphones, samples\)"),
         ({"samples": SAMPLES[:, :0], "rate": 40e3}, "empty"),
@@ -200,24 +200,24 @@ MISSING = np.where(np.arange(10).reshape(5, 2) == 3, np.nan, 0.1)
         ({**FRAMES, "overlap": [4.0, 4.0]}, "overlap must be one real number"),
     ],
 )
-def test_bad_recordings(tmp_path, arrays, said):
+def test_bad_recordings(tmp_path, arrays, message):
     np.savez(tmp_path / "bad.npz", **arrays)
-    with pytest.raises(ValueError, match=said) as caught:
+    with pytest.raises(ValueError, match=message) as caught:
         read_recording(tmp_path / "bad.npz")
     assert str(caught.value).startswith("bad.npz: ")
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("arrays", "said"),
+    ("arrays", "message"),
     [
         (SOUND, "no array 'microphones'"),
         (without(TAPS, "outline"), "no array 'outline'; the file holds microphones, positions, intensity"),
         (without(TAPS, "positions"), "no array 'positions'"),
         (without(TAPS, "intensity"), "neither 'samples' nor 'intensity'"),
-        ({**TAPS, **HEARD}, "both"),
-        (without(HEARD, "rate"), "no array 'rate'"),
-        ({**HEARD, "rate": 1.0}, "rate is 1"),
+        ({**TAPS, **RECORDED_TAPS}, "both"),
+        (without(RECORDED_TAPS, "rate"), "no array 'rate'"),
+        ({**RECORDED_TAPS, "rate": 1.0}, "rate is 1"),
         ({**TAPS, "positions": 1000 * TAPS["positions"]}, "positions .* metres"),
         ({**TAPS, "microphones": 1000 * TAPS["microphones"]}, "microphones .* metres"),
         ({**TAPS, **{key: 1000 * TAPS[key] for key in GEOMETRY}}, "outline .* metres"),
@@ -234,8 +234,8 @@ def test_bad_recordings(tmp_path, arrays, said):
         ({**TAPS, "positions": np.zeros((0, 2))}, "positions is empty"),
         ({**TAPS, "intensity": TAPS["intensity"].T}, "transposed"),
         ({**TAPS, "intensity": TAPS["intensity"][:4]}, "there are 5 positions and 3 microphones"),
-        ({**HEARD, "samples": HEARD["samples"].swapaxes(1, 2)}, "transposed"),
-        ({**HEARD, "samples": HEARD["samples"][0]}, r"\(taps, microphones, samples\)"),
+        ({**RECORDED_TAPS, "samples": RECORDED_TAPS["samples"].swapaxes(1, 2)}, "transposed"),
+        ({**RECORDED_TAPS, "samples": RECORDED_TAPS["samples"][0]}, r"\(taps, microphones, samples\)"),
         ({**TAPS, "microphones": np.array([["a", "b"]] * 3)}, "microphones is <U1"),
         ({**TAPS, **{k: np.insert(TAPS[k][:2], 2, 0, axis=1) for k in GEOMETRY}}, "at least three"),
         ({**TAPS, "microphones": SQUARE[[0, 1, 1]]}, r"numbers 1 and 2 are at the same place, \[0.2, 0.0\]"),
@@ -261,23 +261,23 @@ def test_bad_recordings(tmp_path, arrays, said):
         ),
     ],
 )
-def test_bad_taps(tmp_path, arrays, said):
+def test_bad_taps(tmp_path, arrays, message):
     np.savez(tmp_path / "bad.npz", **arrays)
-    with pytest.raises(ValueError, match=said) as caught:
+    with pytest.raises(ValueError, match=message) as caught:
         read_taps(tmp_path / "bad.npz")
     assert str(caught.value).startswith("bad.npz: ")
     assert "\n" not in str(caught.value)
 
 
 def files(folder):
-    """Files that are none of ours, each with a word of what is said of it."""
+    """Files of other kinds, each with a word of the expected message."""
     scipy.io.wavfile.write(folder / "good.wav", 8000, SAMPLES.T)
     np.savez(folder / "good.npz", **SOUND)
     for name, content, word in (
         ("empty.npz", b"", "neither an NPZ nor a sound"),
         ("text.npz", b"1,2,3\n4,5,6\n", "neither an NPZ nor a sound"),
         ("cut.npz", (folder / "good.npz").read_bytes()[:2000], "not a readable NPZ"),
-        ("spoilt.npz", (folder / "good.npz").read_bytes().replace(SAMPLES[1].tobytes(), SAMPLES[2].tobytes()), "CRC"),
+        ("corrupt.npz", (folder / "good.npz").read_bytes().replace(SAMPLES[1].tobytes(), SAMPLES[2].tobytes()), "CRC"),
         ("cut.wav", (folder / "good.wav").read_bytes()[:2000], "cut off"),
         ("cut_between.wav", (folder / "good.wav").read_bytes()[:-240], "cut off"),
         ("head.wav", (folder / "good.wav").read_bytes()[:20], "not a readable WAV"),
@@ -298,14 +298,14 @@ def files(folder):
 
 
 def test_bad_files(tmp_path):
-    said = {}
+    messages = {}
     for path, word in files(tmp_path):
         with pytest.raises(ValueError, match=word) as caught:
             read_recording(path)
         assert str(caught.value).startswith(f"{path.name}: ")
         assert "\n" not in str(caught.value)
-        said[path.name] = str(caught.value)
-    assert len(said) == 12
+        messages[path.name] = str(caught.value)
+    assert len(messages) == 12
     with pytest.raises(ValueError, match="neither an NPZ"):
         read_taps(tmp_path / "good.wav")
     for read in (read_recording, read_taps):
@@ -314,7 +314,7 @@ def test_bad_files(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda: Recording([[1, 2, 3], [1, 2]], 8000), "rows differ in length"),
         (lambda: Taps(SQUARE, SQUARE, SQUARE, samples=np.zeros((4, 4, 9))), "rate is missing"),
@@ -324,6 +324,6 @@ def test_bad_files(tmp_path):
         (lambda: Intensities(TIMES, POWER, faults=("", "")), "one string a microphone"),
     ],
 )
-def test_bad_arguments(call, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_arguments(call, message):
+    with pytest.raises(ValueError, match=message):
         call()

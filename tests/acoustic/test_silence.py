@@ -1,4 +1,4 @@
-"""Silence brought along to a recording that never pauses, on the simulated skin."""
+"""A separate recording of silence for a recording without pauses, on the simulated skin."""
 
 import equinox as eqx
 import jax
@@ -29,7 +29,7 @@ def skin():
 
 
 @pytest.fixture(scope="module")
-def heard_before(skin):
+def calibrated_before(skin):
     """A calibration of the simulated skin: 1 / f = (r² + b) / a by linear least squares, and the floor of silence."""
     places = grid(0.18, 0.18, 7, 7)
     power = expected_power(skin, places)
@@ -58,8 +58,8 @@ def vibration(skin):
     times, tones = np.arange(10_000) / skin.rate, np.arange(80.0, 800.0, 20.0)
     phases = np.exp(2j * np.pi * np.random.default_rng(1).random(len(tones)))
     waves = np.exp(2j * np.pi * tones[:, None] * times)
-    heard = np.real(np.asarray(transfer(skin, jnp.asarray(tones), jnp.asarray(PLACE))) * phases @ waves)
-    return recorded(skin, heard + simulate_silence(skin, jax.random.key(2)).samples)
+    calibrated_tones = np.real(np.asarray(transfer(skin, jnp.asarray(tones), jnp.asarray(PLACE))) * phases @ waves)
+    return recorded(skin, calibrated_tones + simulate_silence(skin, jax.random.key(2)).samples)
 
 
 @pytest.fixture(scope="module")
@@ -67,49 +67,51 @@ def silent(skin):
     return recorded(skin, simulate_silence(skin, jax.random.key(3)).samples, "hush")
 
 
-def test_a_touch_without_pauses(vibration, silent, heard_before):
-    """Taken for silence, which a note says together with what to do; with that, it is found all the time."""
-    lost = locate(vibration, heard_before)
+def test_a_touch_without_pauses(vibration, silent, calibrated_before):
+    """It is taken for silence, and a note says so and what to do. With the recording of silence it is located all the
+    time.
+    """
+    lost = locate(vibration, calibrated_before)
     assert lost.counts() == {"no touch": len(lost.times)}
     (note,) = lost.notes
     assert note.startswith("microphones ")
     assert "times the calibration's. If the recording never pauses" in note
     assert "silence=" in note
-    found = locate(vibration, heard_before, silence=silent)
+    found = locate(vibration, calibrated_before, silence=silent)
     assert found.notes == ()
     assert found.has_position.all()
     assert np.isin(found.status, ["touch", "ambiguous"]).all()
-    # Nine microphones 7 cm apart, and a model that knows nothing of echoes.
+    # Nine microphones 7 cm apart, and a model without echoes.
     assert np.median(np.linalg.norm(found.position - PLACE, axis=1)) < 0.012
     np.testing.assert_allclose(
-        calibrated_intensities(vibration, heard_before, silence=silent).floor, intensities(silent).floor
+        calibrated_intensities(vibration, calibrated_before, silence=silent).floor, intensities(silent).floor
     )
 
 
-def test_a_floor_is_compared_with_its_own_kind(skin, vibration, silent, heard_before):
-    """No note of silence as it was in the calibration, nor of taps as intensities; another band is said."""
-    assert locate(silent, heard_before).notes == ()
-    (note,) = locate(vibration, heard_before, intensity=IntensitySettings(high=900.0)).notes
+def test_a_floor_is_compared_with_a_floor_of_the_same_kind(skin, vibration, silent, calibrated_before):
+    """No note for silence as in the calibration, nor for taps as intensities. Another band is reported."""
+    assert locate(silent, calibrated_before).notes == ()
+    (note,) = locate(vibration, calibrated_before, intensity=IntensitySettings(high=900.0)).notes
     assert note.startswith("band or window are not the calibration's")
-    of_intensities = eqx.tree_at(lambda one: one.intensity, heard_before, None)
+    of_intensities = eqx.tree_at(lambda one: one.intensity, calibrated_before, None)
     assert locate(vibration, of_intensities).notes == ()
 
 
-def test_a_microphone_that_has_no_silence_is_not_used(skin, vibration, silent, heard_before):
+def test_a_microphone_without_silence_is_not_used(skin, vibration, silent, calibrated_before):
     samples = silent.samples.copy()
     samples[4] = 0
-    found = locate(vibration, heard_before, silence=recorded(skin, samples))
+    found = locate(vibration, calibrated_before, silence=recorded(skin, samples))
     assert found.faults[4] == "in the silence: dead: every sample is 0"
     assert not found.used[:, 4].any()
     assert found.used[:, :4].all()
     assert found.has_position.all()
 
 
-def test_silence_that_makes_no_sense(skin, vibration, silent, heard_before):
+def test_bad_silence(skin, vibration, silent, calibrated_before):
     with pytest.raises(ValueError, match=r"silence 'recording' is .* times as loud as the quietest windows of 'hush'"):
-        locate(silent, heard_before, silence=recorded(skin, 3 * silent.samples))
+        locate(silent, calibrated_before, silence=recorded(skin, 3 * silent.samples))
     with pytest.raises(ValueError, match="'hush' has 8 microphones"):
-        locate(vibration, heard_before, silence=recorded(skin, silent.samples[:8], "hush"))
+        locate(vibration, calibrated_before, silence=recorded(skin, silent.samples[:8], "hush"))
     for pair in ((intensities(vibration), silent), (vibration, intensities(silent))):
         with pytest.raises(ValueError, match="silence applies to a recording of samples"):
-            locate(pair[0], heard_before, silence=pair[1])
+            locate(pair[0], calibrated_before, silence=pair[1])

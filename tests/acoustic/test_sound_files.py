@@ -1,4 +1,4 @@
-"""Sound files of other formats than WAV, read through soundfile; and what is said of those that nobody reads."""
+"""Sound files of other formats than WAV, read through soundfile, and messages for formats that nothing reads."""
 
 import sys
 from importlib.util import find_spec
@@ -12,7 +12,7 @@ from jeit.acoustic import Recording, read_recording
 needs_soundfile = pytest.mark.skipif(
     find_spec("soundfile") is None, reason="soundfile is not installed: pip install 'jeit[sound]'"
 )
-# Of each: suffix, format and kind of samples in soundfile's words, and how far samples may be off.
+# For each: suffix, format and subtype as soundfile names them, and the tolerance of the samples.
 _KINDS = {
     "flac": ("flac", "FLAC", "PCM_16", 1e-4),
     "flac-24": ("flac", "FLAC", "PCM_24", 1e-6),
@@ -26,7 +26,7 @@ _KINDS = {
 
 
 def _tones(rate: int, channels: int) -> np.ndarray:
-    """0.3 s, another tone on each channel, nearly full scale at its loudest (S, channels)."""
+    """0.3 s of a different tone on each channel, nearly full scale at its loudest (S, channels)."""
     times = np.arange(round(0.3 * rate)) / rate
     return 0.9 * np.column_stack([np.sin(2 * np.pi * 200 * (1 + one) * times) for one in range(channels)])
 
@@ -35,7 +35,7 @@ def _tones(rate: int, channels: int) -> np.ndarray:
 @pytest.mark.parametrize("rate", [8000, 22_050, 44_100, 48_000, 96_000])
 @pytest.mark.parametrize("kind", _KINDS)
 def test_formats_of_soundfile_are_read(kind, rate, tmp_path):
-    """Every sample, of one channel, of two, and of five."""
+    """Every sample, of one, two and five channels."""
     import soundfile  # pyright: ignore[reportMissingImports]
 
     suffix, named, subtype, off = _KINDS[kind]
@@ -51,7 +51,7 @@ def test_formats_of_soundfile_are_read(kind, rate, tmp_path):
 
 @needs_soundfile
 def test_mp3_is_read_of_any_version(tmp_path):
-    """Its first bytes differ with its rate; its samples are nearly those."""
+    """Its first bytes depend on its rate. Its samples are nearly the original ones."""
     import soundfile  # pyright: ignore[reportMissingImports]
 
     if "MP3" not in soundfile.available_formats():
@@ -66,7 +66,7 @@ def test_mp3_is_read_of_any_version(tmp_path):
 
 @needs_soundfile
 @pytest.mark.parametrize("kind", ["flac", "ogg"])
-def test_what_is_cut_off_is_told(kind, tmp_path):
+def test_truncation_is_reported(kind, tmp_path):
     import soundfile  # pyright: ignore[reportMissingImports]
 
     suffix, named, subtype, _ = _KINDS[kind]
@@ -78,7 +78,7 @@ def test_what_is_cut_off_is_told(kind, tmp_path):
             read_recording(tmp_path / f"cut.{suffix}")
 
 
-def test_without_soundfile_it_is_asked_for(tmp_path, monkeypatch):
+def test_a_missing_soundfile_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "soundfile", None)
     (tmp_path / "one.flac").write_bytes(b"fLaC and more")
     with pytest.raises(ValueError, match=r"one\.flac: a format .* needs soundfile: pip install 'jeit\[sound\]'"):
@@ -94,7 +94,7 @@ def test_without_soundfile_it_is_asked_for(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "start", [b"\0\0\0\x20ftypM4A ", b"\x1aE\xdf\xa3webm", b"0&\xb2u\x8ef\xcf\x11", b"#!AMR\n and more"]
 )
-def test_what_nobody_reads_is_told_how_to_convert(start, tmp_path):
+def test_unreadable_formats_are_refused_with_how_to_convert_them(start, tmp_path):
     (tmp_path / "tap.m4a").write_bytes(start + bytes(100))
     with pytest.raises(ValueError, match=r"tap\.m4a: a format that is not read .*ffmpeg -i 'tap\.m4a' 'tap\.wav'"):
         read_recording(tmp_path / "tap.m4a")

@@ -26,7 +26,7 @@ def skin() -> SoundingSkin:
 
 
 def coherence(samples: np.ndarray) -> float:
-    """Greatest share of the power of two microphones that they have in common, whatever the delay between them."""
+    """Largest fraction of the power of two microphones that is common to both, at any delay between them."""
     spectrum = np.fft.rfft(samples[:, : samples.shape[1] // 200 * 200].reshape(len(samples), -1, 200))[..., 2:18]
     cross = np.einsum("mbf,nbf->mnf", spectrum, spectrum.conj())
     power = np.abs(np.diagonal(cross).T)
@@ -34,11 +34,11 @@ def coherence(samples: np.ndarray) -> float:
     return float((shared - np.eye(len(samples))).max())
 
 
-def test_wind_has_the_power_of_its_places(skin):
-    """All at one place, with the skin's own colour: what a steady source of that strength is received with."""
+def test_wind_has_the_power_of_its_sources(skin):
+    """All at one place, with the skin's own spectrum: the power received from a steady source of that strength."""
     blown = simulate_wind(skin, KEY, WHERE, strength=2.0, radius=1e-9, gusts=0.0, slope=1.0, duration=8.0, noise=False)
     expected = 4 * expected_power(skin, [WHERE])[0]
-    # 8 s of noise of 800 Hz: 1 % each, and edge echoes between frequencies that are worked out.
+    # 8 s of noise of 800 Hz: 1 % each, and edge echoes between the computed frequencies.
     np.testing.assert_allclose((blown.samples**2).mean(axis=1), expected, rtol=0.06)
 
 
@@ -50,8 +50,8 @@ def test_wind_is_incoherent_and_a_stroke_is_not(skin):
     assert blown.position.shape == (len(blown.position_times), 2)
 
 
-def test_wind_falls_with_frequency_as_it_is_told(skin):
-    """Twice the slope: the ratio of a low to a high band grows by that power of their distance."""
+def test_wind_falls_with_frequency_by_its_exponent(skin):
+    """At twice the exponent the ratio of a low to a high band grows by that power of their distance."""
     ratios = []
     for slope in (0.0, 2.0):
         spectrum = (
@@ -62,21 +62,21 @@ def test_wind_falls_with_frequency_as_it_is_told(skin):
     np.testing.assert_allclose(np.log(ratios[1] / ratios[0]), 2 * np.log(4), rtol=0.1)
 
 
-def test_gusts_waver_and_keep_the_power(skin):
+def test_gusts_vary_and_keep_the_power(skin):
     still, gusty = (simulate_wind(skin, KEY, WHERE, gusts=gusts, duration=60.0, noise=False) for gusts in (0.0, 0.3))
     assert np.std(np.log(gusty.active)) == pytest.approx(0.3, rel=0.15)
     assert (gusty.active**2).mean() == pytest.approx((still.active**2).mean(), rel=0.15)
 
 
-def test_a_room_is_heard_alike_by_all(skin):
-    heard = simulate_room_sound(skin, KEY, level_db=-3.0, duration=8.0).samples / np.asarray(skin.gain)[:, None]
-    np.testing.assert_allclose(heard, heard[:1].repeat(4, axis=0), atol=1e-12)
+def test_all_microphones_receive_the_same_room_sound(skin):
+    room = simulate_room_sound(skin, KEY, level_db=-3.0, duration=8.0).samples / np.asarray(skin.gain)[:, None]
+    np.testing.assert_allclose(room, room[:1].repeat(4, axis=0), atol=1e-12)
     nominal = np.median(noise_power(skin) / np.asarray(skin.noise_factor))
-    assert (heard[0] ** 2).mean() == pytest.approx(nominal * 10**-0.3, rel=0.1)
+    assert (room[0] ** 2).mean() == pytest.approx(nominal * 10**-0.3, rel=0.1)
 
 
-def test_people_differ_as_they_are_said_to():
-    """Logarithms of traits of many people: their median and spread; and two people are two."""
+def test_people_vary_as_documented():
+    """Median and spread of the logarithms of traits of many people. Two people have different traits."""
     people = [SoundingPerson.draw(key) for key in jax.random.split(KEY, 300)]
     for modality, traits in SOUND_MANNERS.items():
         for name, usual in traits.items():
@@ -86,7 +86,7 @@ def test_people_differ_as_they_are_said_to():
             assert logs.std() == pytest.approx(usual.spread, rel=0.2)
 
 
-def test_clips_are_told_by_their_key_alone(skin):
+def test_clips_are_determined_by_their_key_alone(skin):
     people = [SoundingPerson.draw(key) for key in jax.random.split(KEY, 2)]
     clips = list(simulate_sound_clips(KEY, skin, people, 1, duration=0.6))
     assert [(one.person, one.modality) for one in clips] == [(who, what) for who in range(2) for what in MODALITIES]
@@ -110,7 +110,7 @@ def test_a_stroke_stays_on_the_skin_and_turns(skin):
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda skin: simulate_wind(skin, KEY, (0.5, 0.0)), "off the skin"),
         (lambda skin: simulate_wind(skin, KEY, WHERE, strength=0.0), "strength must be a positive"),
@@ -123,6 +123,6 @@ def test_a_stroke_stays_on_the_skin_and_turns(skin):
         (lambda skin: SoundingPerson({"pat": {}}), r"medians\['pat'\] must have strength"),
     ],
 )
-def test_bad_input_is_explained(call, said, skin):
-    with pytest.raises(ValueError, match=said):
+def test_bad_input_is_explained(call, message, skin):
+    with pytest.raises(ValueError, match=message):
         call(skin)

@@ -1,4 +1,4 @@
-"""The simulated acoustic skin: its powers against closed forms and drawn touches, its clock and its truth."""
+"""The simulated acoustic skin: its powers against closed forms and drawn touches, its timing and its true places."""
 
 import jax
 import numpy as np
@@ -23,7 +23,7 @@ from jeit.acoustic.simulate.sounding_skin import Elastomer, ElastomerLayer
 from jeit.data import RoundSkin, simulate_press
 
 KEY = jax.random.key(0)
-# No spread from microphone to microphone, and no coupling: what is left has closed forms.
+# No variation between microphones and no coupling: the rest has closed forms.
 SPREADS = {"gain_spread_db": 0.0, "depth_spread": 0.0, "noise_spread_db": 0.0}
 ALIKE = {"microphone_model": MicrophoneModel(**SPREADS), "readout": Readout(coupling_db=-np.inf)}
 UNBOUNDED = ElastomerLayer(reflection=0.0)
@@ -46,7 +46,7 @@ def test_microphones_lie_on_a_grid_of_40_mm(skin):
     np.testing.assert_allclose(np.unique(place.round(12)), [-0.08, -0.04, 0, 0.04, 0.08])
     np.testing.assert_allclose(place[1] - place[0], [0.04, 0], atol=1e-15)
     assert skin.layer.material.wave_speed == pytest.approx(10)
-    # 2 dB of spread in power; the standard deviation of 25 draws scatters by 14 %.
+    # 2 dB of spread in power. The standard deviation of 25 draws scatters by 14 %.
     assert 20 * np.std(np.log10(np.asarray(skin.gain))) == pytest.approx(2, rel=0.45)
 
 
@@ -57,14 +57,14 @@ def test_without_loss_and_echoes_power_is_the_spreading():
     length, thickness = np.hypot(distance, 0.01), 0.01
     expected = (0.01 / length) ** 2 * (1 + length / thickness) / 2
     power = expected_power(lossless, np.stack([distance, 0 * distance], axis=-1))[:, 0]
-    # What is left is the quadrature of the source's density.
+    # The remaining error is of the quadrature over the source's density.
     np.testing.assert_allclose(power, expected, rtol=5e-5)
     np.testing.assert_allclose(nominal_power(lossless, distance), expected, rtol=5e-5)
 
 
-def test_edges_and_corners_answer_with_images_of_the_source():
+def test_edges_and_corners_reflect_as_images_of_the_source():
     # A microphone on an edge is as far from the image as from the source: amplitude 1 + reflection. In a corner there
-    # are three images, (1 + reflection)². The other edges are a metre and more away, where little is left.
+    # are three images, (1 + reflection)². The other edges are a metre and more away, where little power arrives.
     edges = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
     corners = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
     for reflection in (1.0, 0.5, -1.0):
@@ -76,8 +76,8 @@ def test_edges_and_corners_answer_with_images_of_the_source():
         np.testing.assert_allclose(power, expected, rtol=1e-3, atol=1e-9)
 
 
-def test_sound_is_delayed_as_its_loss_demands():
-    # For a loss ∝ f, α = α0 f / f0, Kramers and Kronig give the slowness 1 / speed - α0 ln(f / f0) / (π² f0).
+def test_sound_is_delayed_as_its_loss_requires():
+    # For a loss ∝ f, α = α0 f / f0, the Kramers-Kronig relations give the slowness 1 / speed - α0 ln(f / f0) / (π² f0).
     layer = ElastomerLayer(material=Elastomer(attenuation_exponent=1.0), reflection=0.0)
     readout = Readout(coupling_db=-np.inf, multiplexed=False)
     dispersive = SoundingSkin(KEY, CENTRE, layer=layer, microphone_model=ALIKE["microphone_model"], readout=readout)
@@ -87,10 +87,10 @@ def test_sound_is_delayed_as_its_loss_demands():
     np.testing.assert_allclose(-phase / length / (2 * np.pi * frequencies), slowness, rtol=1e-4)
 
 
-def test_a_microphone_hears_as_far_as_its_reach():
+def test_a_microphone_receives_up_to_its_reach():
     alike = SoundingSkin(KEY, CENTRE, **ALIKE)
     snr = expected_power(alike, [(0.055, 0.0), (0.0, -0.055)])[:, 0] / noise_power(alike)
-    # 0 dB, but for the edges' echoes, which are weak so far from them.
+    # 0 dB, but for the edges' echoes, which are weak at this distance.
     np.testing.assert_allclose(10 * np.log10(snr), 0, atol=0.4)
     louder = SoundingSkin(KEY, CENTRE, **ALIKE | {"microphone_model": MicrophoneModel(snr_db=10.0, **SPREADS)})
     np.testing.assert_allclose(noise_power(alike) / noise_power(louder), 10, rtol=1e-12)
@@ -106,7 +106,7 @@ def test_power_falls_with_distance():
 
 
 @pytest.mark.slow
-def test_the_library_s_decay_model_does_not_fit_exactly(skin):
+def test_the_librarys_decay_model_does_not_fit_exactly(skin):
     places = microphone_grid(13)
     power = expected_power(skin, places)
     scatter = []
@@ -128,33 +128,33 @@ def test_drawn_bursts_have_the_expected_power(small):
     taps = simulate_calibration_taps(small, KEY, places, repeats=200, strength_spread=0.0, **options)
     assert taps.samples.shape == (600, 4, 1400)
     np.testing.assert_array_equal(taps.positions[[0, 199, 200]], places[[0, 0, 1]])
-    # A strength of 1 over 60 ms is 600 samples' worth of energy at 10 kHz.
+    # A strength of 1 over 60 ms is the energy of 600 samples at 10 kHz.
     ratio = (taps.samples**2).sum(axis=-1).reshape(3, 200, 4) / 600 / expected_power(small, places)[:, None]
     error = ratio.std(axis=1) / np.sqrt(200)
-    # Two to ten independent values make a burst, fewer where only low tones arrive: 200 tell the mean to 2 to 5 %.
+    # A burst has two to ten independent values, fewer where only low tones arrive: 200 determine the mean to 2 to 5 %.
     assert error.max() < 0.06
     assert (np.abs(ratio.mean(axis=1) - 1) < 3.5 * error).all()
-    # The mean over places is good to 2.5 %.
+    # The mean over places is determined to 2.5 %.
     assert ratio.mean() == pytest.approx(1, abs=0.06)
     np.testing.assert_array_equal(taps.strengths, 1)
-    # Strengths scale the taps, no more; 600 draws tell their standard deviation to 3 %.
+    # Strengths only scale the taps. 600 draws determine their standard deviation to 3 %.
     spread = simulate_calibration_taps(small, KEY, places, repeats=200, strength_spread=0.5, **options)
     assert np.std(np.log(spread.strengths)) == pytest.approx(0.5, rel=0.12)
     np.testing.assert_allclose(spread.samples, taps.samples * spread.strengths[:, None, None], rtol=1e-9, atol=1e-12)
 
 
-def test_pieces_of_a_calibration_do_not_show(small, monkeypatch):
+def test_the_chunks_of_a_calibration_do_not_matter(small, monkeypatch):
     places = [(0.0, 0.01), (0.03, 0.02), (-0.08, 0.0)]
     whole = simulate_calibration_taps(small, KEY, places, repeats=2, duration=0.1)
     monkeypatch.setattr("jeit.acoustic.simulate.calibration_recording.PIECE", 12_000)
-    # Two pieces of two places, the last one twice.
+    # Two chunks of two places, the last one twice.
     parts = simulate_calibration_taps(small, KEY, places, repeats=2, duration=0.1)
     np.testing.assert_allclose(parts.samples, whole.samples, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("multiplexed", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_blocks_add_up_to_the_transfer_function(multiplexed):
-    # Whatever the source's spectrum was, two channels differ by the ratio of their transfer functions.
+    # For any spectrum of the source, two channels differ by the ratio of their transfer functions.
     made = SoundingSkin(KEY, microphone_grid(2), readout=Readout(multiplexed=multiplexed))
     place = (0.03, -0.06)
     recording = simulate_tap(made, KEY, place, repeats=2, duration=1.0, noise=False)
@@ -164,26 +164,26 @@ def test_blocks_add_up_to_the_transfer_function(multiplexed):
     ratio = np.asarray(transfer(made, frequencies[inside], np.asarray(place)))
     left, right = spectrum[0, inside] * ratio[1], spectrum[1, inside] * ratio[0]
     assert np.linalg.norm(left) > 0
-    # What rings before the recording begins, by the source's filter, is cut off: -50 dB.
+    # The filter's response before the recording begins is cut off: -50 dB.
     assert np.linalg.norm(left - right) < 3e-3 * np.linalg.norm(left)
 
 
-def test_a_row_of_taps_is_as_loud_and_as_late_as_it_should_be():
+def test_a_row_of_taps_has_the_expected_loudness_and_delay():
     near = SoundingSkin(KEY, CENTRE)
     recording = simulate_tap(near, KEY, (0.01, 0.0), repeats=100, frequency=10.0, noise=False)
-    heard, made = (
+    near_power, made = (
         (row[:100_000] ** 2).reshape(100, 1000).mean(axis=0) for row in (recording.samples[0], recording.active)
     )
-    # Each burst's energy scatters by a third, its middle by 10 ms: 100 tell them to 4 % and 1 ms.
-    assert heard.sum() / made.sum() == pytest.approx(expected_power(near, [(0.01, 0.0)])[0, 0], rel=0.12)
-    middles = [np.average(np.arange(1000) / recording.rate, weights=row) for row in (heard, made)]
-    # The way is 14 mm, 1.4 ms.
+    # The energy of each burst scatters by a third, its middle by 10 ms: 100 determine them to 4 % and 1 ms.
+    assert near_power.sum() / made.sum() == pytest.approx(expected_power(near, [(0.01, 0.0)])[0, 0], rel=0.12)
+    middles = [np.average(np.arange(1000) / recording.rate, weights=row) for row in (near_power, made)]
+    # The distance is 14 mm, 1.4 ms.
     assert middles[0] - middles[1] == pytest.approx(0.0014, abs=0.003)
 
 
 @pytest.mark.parametrize(("multiplexed", "step", "rate"), [(True, 25e-6, 10e3), (False, 0.0, 40e3)])
 def test_the_multiplexer_samples_one_after_another(multiplexed, step, rate):
-    # Six microphones in one place hear the same sound; later samples are earlier sound.
+    # Six microphones in one place receive the same sound. Later samples are earlier sound.
     readout = Readout(coupling_db=-np.inf, multiplexed=multiplexed)
     together = SoundingSkin(KEY, [(0.0, 0.02)] * 6, microphone_model=ALIKE["microphone_model"], readout=readout)
     recording = simulate_tap(together, KEY, (0.01, 0.0), noise=False)
@@ -200,21 +200,21 @@ def test_the_multiplexer_samples_one_after_another(multiplexed, step, rate):
     np.testing.assert_allclose(together.stagger, step * np.array([0, 1, 2, 3, 0, 1]), atol=1e-12)
 
 
-def test_coupling_leaks_from_the_slot_before():
+def test_coupling_comes_from_the_preceding_slot():
     frequencies, place = np.array([100.0, 700.0]), np.array([0.05, 0.03])
     grid = microphone_grid(3)[:6]
     alone, coupled = (
         np.asarray(transfer(SoundingSkin(KEY, grid, readout=Readout(coupling_db=db)), frequencies, place))
         for db in (-np.inf, -20.0)
     )
-    # The second multiplexer holds microphones 4 and 5 and two open slots, the last of which comes before 4.
+    # The second multiplexer has microphones 4 and 5 and two open slots, the last of which precedes 4.
     before = np.array([3, 0, 1, 2, 4, 4])
     expected = 0.1 * np.abs(alone[before])
     expected[4] = 0
     np.testing.assert_allclose(np.abs(coupled - alone), expected, rtol=1e-9, atol=1e-15)
 
 
-def test_noise_has_its_power_and_lies_in_the_band(small):
+def test_noise_has_its_power_in_its_band(small):
     recording = simulate_silence(small, KEY, duration=8.0)
     # 860 Hz for 8 s are some 14,000 independent values: 1.2 %.
     np.testing.assert_allclose((recording.samples**2).mean(axis=1), noise_power(small), rtol=0.05)
@@ -227,7 +227,7 @@ def test_noise_has_its_power_and_lies_in_the_band(small):
     assert not recording.active.any()
 
 
-def test_keys_decide_everything(small):
+def test_keys_determine_everything(small):
     line = [(-0.05, 0.0), (0.05, 0.0)]
     for made in (
         lambda key: simulate_pat(small, key, (0.01, 0.0)).samples,
@@ -238,12 +238,12 @@ def test_keys_decide_everything(small):
     ):
         np.testing.assert_array_equal(made(KEY), made(KEY))
         assert np.abs(made(KEY) - made(jax.random.key(1))).max() > 0
-    # A draw does not depend on what else the skin is.
+    # A draw does not depend on the rest of the skin.
     other = SoundingSkin(KEY, layer=UNBOUNDED, microphone_model=MicrophoneModel(snr_db=20.0))
     np.testing.assert_array_equal(SoundingSkin(KEY).gain, other.gain)
 
 
-def test_touches_add_and_noise_is_added_once(small):
+def test_touches_are_summed_and_noise_is_added_once(small):
     one, two = (
         simulate_pat(small, jax.random.key(k), at, noise=False) for k, at in ((1, (0.05, 0.05)), (2, (-0.06, 0.0)))
     )
@@ -270,25 +270,25 @@ def test_the_loudest_microphone_follows_a_stroke():
     starts = np.arange(500, 9000, 500)
     for start in starts:
         loudest = place[np.argmax((recording.samples[:, start : start + 500] ** 2).mean(axis=1))]
-        middle = (start + 250) / recording.rate - 0.003  # sound takes 3 ms to a microphone near by
+        middle = (start + 250) / recording.rate - 0.003  # sound takes 3 ms to a nearby microphone
         truth = [np.interp(middle, recording.position_times, axis) for axis in recording.position.T]
         nearest = place[np.argmin(((place - truth) ** 2).sum(axis=1))]
         right += np.allclose(loudest, nearest)
-    # Half way between two microphones chance decides.
+    # Half way between two microphones the loudest is random.
     assert right >= 0.8 * len(starts)
 
 
-def test_a_stroke_goes_where_the_path_says_and_faster_is_louder(small):
+def test_a_stroke_follows_its_path_and_is_louder_if_faster(small):
     line = simulate_stroke(small, KEY, [(-0.05, 0.0), (0.05, 0.0)], noise=False)
     np.testing.assert_allclose(line.position[:, 0], -0.05 + 0.1 * line.position_times, atol=2e-5)
-    # 0.1 m in a second: the nominal speed, but for the ends.
+    # 0.1 m in a second: the nominal speed, except at the ends.
     np.testing.assert_allclose(line.active[300:-300], 1, rtol=1e-9)
     faster = simulate_stroke(small, KEY, lambda t: np.stack([-0.05 + 0.1 * t**2, 0 * t], axis=-1), noise=False)
     np.testing.assert_allclose(faster.active[[2000, 8000]], np.sqrt([0.4, 1.6]), rtol=1e-3)
     np.testing.assert_allclose(faster.position[50], [-0.025, 0], atol=1e-9)
 
 
-def test_pats_and_tickles_are_where_and_when_they_say(small):
+def test_pats_and_tickles_have_their_places_and_times(small):
     patted = simulate_pat(small, KEY, (0.02, -0.01), taps=3, interval=0.3)
     rises = np.flatnonzero(np.diff((patted.active > 1).astype(int)) == 1) / patted.rate
     np.testing.assert_allclose(np.diff(rises), 0.3, atol=1e-9)

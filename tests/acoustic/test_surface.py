@@ -1,4 +1,4 @@
-"""Surfaces: charts of planes and of curved skins, against a cylinder that is known exactly."""
+"""Surfaces: charts of planes and of curved skins, against a cylinder, which has exact formulas."""
 
 import jax
 import numpy as np
@@ -22,18 +22,18 @@ RADIUS = 0.15
 
 
 def make_surface(outline, points=None):
-    """In NumPy, which need not compile."""
+    """Computed in NumPy, without compilation."""
     return on_host(surfaces.make_surface(outline, points))
 
 
 def on_cylinder(chart):
-    """Points (n, 3) of a cylinder about the y axis, arc length along x: (n, 2) of them."""
+    """Points (n, 3) of a cylinder about the y axis from its chart (n, 2), with arc length along x."""
     angle = np.asarray(chart)[:, 0] / RADIUS
     return np.stack([RADIUS * np.sin(angle), chart[:, 1], RADIUS * (np.cos(angle) - 1)], axis=1)
 
 
 def cylinder(number):
-    """A segment 0.2 m by 0.2 m, with number² taps on it."""
+    """A segment of 0.2 m by 0.2 m with number² taps on it."""
     along = np.linspace(-0.1, 0.1, 9)
     rim = [(x, -0.1) for x in along] + [(0.1, y) for y in along[1:]]
     rim += [(x, 0.1) for x in along[-2::-1]] + [(-0.1, y) for y in along[-2:0:-1]]
@@ -47,7 +47,7 @@ def off_cylinder(points):
 
 
 def turned(points):
-    """A rigid motion: three angles and a shift."""
+    """A rigid motion: three angles and a translation."""
     a, b, c = 0.4, -1.1, 2.3
     about_z = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
     about_x = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
@@ -61,12 +61,12 @@ def skin():
 
 
 def middle(number=200):
-    """Places in the chart, which for this cylinder is (x, y) in space, about the middle of the points."""
+    """Places in the chart, which for this cylinder is (x, y) in space, about the centre of the points."""
     return np.asarray(np.random.default_rng(0).uniform(-0.08, 0.08, (2, number)))
 
 
 @pytest.mark.parametrize("outline", [OUTLINE, Rectangle(0.2, 0.2), Polygon(OUTLINE)])
-def test_a_plane_is_its_own_chart(outline):
+def test_the_chart_of_a_plane_is_the_identity(outline):
     plane = make_surface(outline)
     assert isinstance(plane, Plane)
     assert plane.dimension == 2
@@ -99,7 +99,7 @@ def test_sides_are_those_of_the_outline_and_of_its_holes():
     assert start.shape == end.shape == (2, 7)
     legs = 0.07 + 0.1 + np.hypot(0.1, 0.07)
     assert float(np.linalg.norm(end - start, axis=0).sum()) == pytest.approx(0.8 + legs, rel=1e-12)
-    # Every corner is where one side ends and one begins.
+    # Every corner is the end of one side and the start of another.
     assert {tuple(p) for p in np.asarray(start).T} == {tuple(p) for p in np.asarray(end).T}
 
 
@@ -109,12 +109,14 @@ def test_a_curved_surface_passes_through_its_points():
     assert isinstance(skin, CurvedSurface)
     assert skin.dimension == 3
     again = np.asarray(skin.place(skin.project(np.asarray(known.T)))).T
-    # A little smoothing, 1e-9 of the size squared, is let in: less than a micrometre, of 0.2 m.
+    # Slight smoothing, 1e-9 of the size squared, is included: less than a micrometre for 0.2 m.
     assert np.linalg.norm(again - known, axis=1).max() < 1e-6
 
 
-def test_a_surface_that_leans():
-    """Steep on one side only, so that the best plane does not lie along it: through its points all the same."""
+def test_an_inclined_surface():
+    """It is steep on one side only, so that it deviates from the plane of best fit, and still passes through its
+    points.
+    """
     along = np.random.default_rng(3).uniform(0, 0.2, (60, 2))
     corners = np.array([[0.0, 0.0], [0.2, 0.0], [0.2, 0.2], [0.0, 0.2]])
     rim, taps = (np.column_stack([part, 4 * part[:, 0] ** 3 + part[:, 0] * part[:, 1]]) for part in (corners, along))
@@ -127,15 +129,17 @@ def test_chart_and_place_are_inverse(skin):
     np.testing.assert_allclose(skin.project(skin.place(middle())), middle(), atol=1e-15)
 
 
-def test_more_points_are_nearer_the_truth():
-    """Thin plates err by the pitch to the power 1.5 at least: halved, by less than 0.35 of it."""
+def test_more_points_are_closer_to_the_exact_surface():
+    """Thin-plate splines have errors of the pitch to the power 1.5 at least: at half the pitch, less than 0.35 of the
+    error.
+    """
     worst = [off_cylinder(np.asarray(make_surface(*cylinder(n)).place(middle())).T).max() for n in (5, 9)]
     assert worst[1] < 0.35 * worst[0]
     assert worst[1] < 5e-5  # of a sagitta of 32 mm
 
 
 def test_many_points_are_thinned_out():
-    """300 of 1,632, some 11 mm apart; those left out are nearly met."""
+    """300 of 1,632, some 11 mm apart. The surface nearly passes through those left out."""
     rim, taps = cylinder(40)
     dense, known = make_surface(rim, taps), np.vstack([rim, taps])
     assert len(dense.knots) == 300
@@ -145,7 +149,9 @@ def test_many_points_are_thinned_out():
 
 
 def test_the_surface_does_not_depend_on_axes():
-    """Turned and shifted with all its points: the same surface, as far from the points off it as before."""
+    """Rotated and translated with all its points, it is the same surface, at the same distance from the points off
+    it.
+    """
     rim, taps = cylinder(9)
     plain, moved = make_surface(rim, taps), make_surface(turned(rim), turned(taps))
     place = np.asarray(plain.place(middle())).T
@@ -167,7 +173,7 @@ def test_a_plane_in_space_is_a_plane():
 
 
 def test_slopes_of_a_curved_surface(skin):
-    """Second order of the Taylor remainder, on a knot too, and nothing undefined there."""
+    """Second order of the Taylor remainder, at a knot too, and finite everywhere."""
     at = np.concatenate([middle(5), skin.knots[:3].T], axis=1)
     direction = np.random.default_rng(1).normal(size=at.shape)
     covariance = np.broadcast_to(1e-6 * np.eye(2)[..., None], (2, 2, at.shape[1]))
@@ -191,7 +197,7 @@ def test_covariance_in_space(skin):
     root = np.random.default_rng(2).normal(size=(4, 2, 2)) * 1e-3
     covariance = root @ root.transpose(0, 2, 1)
     place, found = to_space(skin, chart, np.asarray(covariance.transpose(1, 2, 0)))
-    # In another order of sums.
+    # The order of summation differs.
     np.testing.assert_allclose(place, skin.place(chart).T, atol=1e-15)
     step = 1e-6
     columns = [

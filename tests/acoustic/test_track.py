@@ -11,7 +11,7 @@ NUMBER = 60
 
 
 def locations(times, position, deviation, located=None, overlap=1.0):
-    """With the same deviation for every place."""
+    """Locations with the same standard deviation at every place."""
     frames, d = position.shape
     there = np.ones(frames, bool) if located is None else located
     nothing = np.full(frames, np.nan)
@@ -34,7 +34,7 @@ def locations(times, position, deviation, located=None, overlap=1.0):
 
 
 def textbook(times, measured, covariance, located, density):
-    """Kalman's filter, and the smoother of Rauch, Tung and Striebel, for a random acceleration; step by step."""
+    """Kalman filter and Rauch-Tung-Striebel smoother for a random acceleration, step by step."""
     d = measured.shape[1]
     state = np.concatenate([measured[0], np.zeros(d)])
     error = np.diag([1e4 * np.trace(covariance[0])] * d + [0.5**2] * d)
@@ -81,7 +81,7 @@ def moving(d=2, seed=0, deviation=0.003, number=NUMBER, speed=0.2):
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("overlap", [1.0, 4.0])
 def test_the_textbooks_smoother(d, overlap):
-    """Irregular times, places that are missing, and covariances that are not round: to rounding."""
+    """Irregular times, missing places, and anisotropic covariances: equal to rounding."""
     rng = np.random.default_rng(1)
     times, _, measured = moving(d)
     times = times + 0.004 * rng.random(NUMBER)
@@ -101,8 +101,8 @@ def test_the_textbooks_smoother(d, overlap):
     assert len(result.touches) == 1
 
 
-def test_smoothing_takes_noise_out():
-    """Of strokes at even speed: to less than half the error, and the 95 % ellipses hold the truth."""
+def test_smoothing_reduces_noise():
+    """For strokes at constant speed the error is less than half, and the 95 % ellipses contain the truth."""
     raw, smooth, held, speeds = [], [], [], []
     for seed in range(25):
         times, truth, measured = moving(seed=seed)
@@ -114,7 +114,7 @@ def test_smoothing_takes_noise_out():
         held.append(np.mean(square < 5.991))
         speeds.append(np.linalg.norm(result.velocity, axis=1).mean())
     assert np.sqrt(np.mean(smooth)) < 0.5 * np.sqrt(np.mean(raw))
-    # Errors of neighbours are alike: 25 strokes are 100 or 200 independent places.
+    # Errors of adjacent frames are correlated: 25 strokes are 100 or 200 independent places.
     assert 0.9 < np.mean(held) <= 0.995
     assert np.mean(speeds) == pytest.approx(0.2, rel=0.1)
 
@@ -122,7 +122,7 @@ def test_smoothing_takes_noise_out():
 @pytest.mark.parametrize(
     "density", [pytest.param(1e-3, marks=pytest.mark.slow), 0.1, pytest.param(3.0, marks=pytest.mark.slow)]
 )
-def test_covariance_is_honest_for_random_walks(density):
+def test_covariance_is_calibrated_for_random_walks(density):
     """Truths drawn from the model itself, its density known or not."""
     rng = np.random.default_rng(2)
     held = {"known": [], "unknown": []}
@@ -144,8 +144,8 @@ def test_covariance_is_honest_for_random_walks(density):
     assert 0.88 < np.mean(held["unknown"]) < 0.99
 
 
-def test_a_touch_begins_and_ends_where_it_does():
-    """Within a frame, and gaps part touches: three of them, one a single frame."""
+def test_touches_have_their_onset_and_offset():
+    """To a frame, and gaps separate touches: three of them, one a single frame."""
     times, truth, measured = moving()
     located = np.zeros(NUMBER, bool)
     located[5:20] = located[35:50] = located[58] = True
@@ -161,12 +161,12 @@ def test_a_touch_begins_and_ends_where_it_does():
     for values in (result.position, result.velocity):
         np.testing.assert_array_equal(np.isfinite(values).all(axis=1), covered)
     np.testing.assert_array_equal(np.isfinite(result.covariance).all(axis=(1, 2)), covered)
-    # Within a pause the place goes on.
+    # During a pause the track continues.
     assert np.linalg.norm(result.position[[8, 9, 40]] - truth[[8, 9, 40]], axis=1).max() < 0.006
     assert result.touches[-1].length == 0
 
 
-def test_the_gap_is_a_time():
+def test_the_gap_is_a_duration():
     times, _, measured = moving()
     located = np.ones(NUMBER, bool)
     located[20:28] = False  # 0.1125 s from place to place
@@ -176,7 +176,7 @@ def test_the_gap_is_a_time():
 
 
 def test_the_length_of_a_stroke():
-    """0.2 m/s for 59 frames of 12.5 ms, where noise does not make it longer."""
+    """0.2 m/s for 59 frames of 12.5 ms, where noise does not lengthen it."""
     times, truth, _ = moving()
     result = track(locations(times, truth, 1e-4))
     assert result.touches[0].length == pytest.approx(0.2 * 0.0125 * 59, rel=1e-3)
@@ -192,8 +192,8 @@ def test_an_outlier_is_rejected(acceleration):
     assert np.linalg.norm(result.position - truth, axis=1).max() < 0.006
 
 
-def test_rest_and_haste_are_told_apart():
-    """The likeliest density: a finger at rest is smoothed far more than one that turns about."""
+def test_rest_and_fast_motion_are_distinguished():
+    """By the most likely density: a finger at rest is smoothed far more than one that changes direction."""
     rng = np.random.default_rng(3)
     times = 0.0125 * np.arange(NUMBER)
     noise = 0.003 * rng.normal(size=(NUMBER, 2))
@@ -206,7 +206,7 @@ def test_rest_and_haste_are_told_apart():
 
 
 def test_units_and_places_do_not_matter_to_a_given_density():
-    """Shifted by a metre: the same track, shifted."""
+    """Shifted by a metre, the track is the same, shifted."""
     times, _, measured = moving()
     here = track(locations(times, measured, 0.003), acceleration=0.1)
     there = track(locations(times + 100, measured + np.array([1.0, -2.0]), 0.003), acceleration=0.1)
@@ -215,8 +215,10 @@ def test_units_and_places_do_not_matter_to_a_given_density():
 
 
 @pytest.mark.parametrize("deviation", [3e-5, 1e-6])
-def test_places_may_be_known_very_well(deviation):
-    """Of strong, steady touches, and differently along and across: no density loses the covariance to rounding."""
+def test_places_of_high_precision(deviation):
+    """For strong, steady touches, with different precision along and across: no density loses the covariance to
+    rounding.
+    """
     times, truth, measured = moving(deviation=deviation, number=200)
     found = locations(times, measured, deviation)
     lean = np.random.default_rng(4).uniform(-0.9, 0.9, 200)
@@ -227,8 +229,8 @@ def test_places_may_be_known_very_well(deviation):
     assert np.isfinite(result.touches[0].length)
 
 
-def test_a_covariance_may_be_flat():
-    """On a curved skin it has no thickness."""
+def test_a_covariance_may_be_singular():
+    """On a curved skin it is zero along the normal."""
     times, truth, measured = moving(3)
     normal = np.array([0.0, 0.6, 0.8])
     flat = np.eye(3) - np.outer(normal, normal)
@@ -241,7 +243,7 @@ def test_a_covariance_may_be_flat():
     assert smooth < 0.6 * raw
 
 
-def test_no_touch_at_all():
+def test_no_touch():
     times, _, measured = moving()
     result = track(locations(times, measured, 0.003, np.zeros(NUMBER, bool)))
     assert result.touches == ()
@@ -251,7 +253,7 @@ def test_no_touch_at_all():
 
 
 def test_one_frame():
-    """A tap: the place itself, and nothing known of its velocity."""
+    """A tap: the place itself, and an undetermined velocity."""
     result = track(locations([2.0], np.array([[0.01, 0.02]]), 0.003))
     np.testing.assert_allclose(result.position, [[0.01, 0.02]], atol=1e-12)
     np.testing.assert_allclose(np.sqrt(result.covariance[0, 0, 0]), 0.003, rtol=1e-3)

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from microphone_arrays import array, hear, inside, noisy, variance
+from microphone_arrays import array, inside, noisy, received_power, variance
 
 from jeit.acoustic.localisation.two_sources import locate_two
 
@@ -12,7 +12,7 @@ FIELDS = ("position", "covariance", "strength", "misfit", "freedom", "converged"
 
 
 def pairs(number=40, apart=0.07, seed=0):
-    """Places (F, 2, 2) of two, some centimetres apart, and strengths (F, 2), the first the stronger."""
+    """Places (F, 2, 2) of two sources, some centimetres apart, and strengths (F, 2), the first the stronger."""
     rng = np.random.default_rng(seed)
     places = np.stack([inside(4 * number, seed=seed, reach=0.7), inside(4 * number, seed=seed + 1, reach=0.7)], axis=1)
     places = places[np.linalg.norm(places[:, 0] - places[:, 1], axis=1) > apart][:number]
@@ -21,23 +21,23 @@ def pairs(number=40, apart=0.07, seed=0):
 
 
 def both(microphone_array, places, strengths):
-    return sum(hear(microphone_array, places[:, k], strengths[:, k]) for k in range(2))
+    return sum(received_power(microphone_array, places[:, k], strengths[:, k]) for k in range(2))
 
 
 def find(microphone_array, power, use=None):
-    """By a program of 64 frames."""
+    """By a program for 64 frames."""
     index = np.arange(FRAMES) % len(power)
     found = locate_two(microphone_array, np.asarray(power)[index], None if use is None else use[index])
     return {key: np.asarray(getattr(found, key))[: len(power)] for key in FIELDS}
 
 
 def test_exact_data():
-    """Nine microphones, six unknowns; the stronger comes first, whatever the unit."""
+    """Nine microphones, six unknowns. The stronger source is first, in any unit."""
     microphone_array, (places, strengths) = array(9), pairs()
     for scale in (1.0, 1e-12, 1e12):
         found = find(microphone_array, both(microphone_array, places, scale * strengths))
         error = np.linalg.norm(found["position"] - places, axis=-1).max(axis=1)
-        # Of pairs beyond the outer microphones a few are missed: the coarse grid puts both into other valleys.
+        # A few pairs outside the outer microphones are missed: the coarse grid puts both into other minima.
         assert np.mean(error < 1e-6) >= 0.9
         good = error < 1e-6
         np.testing.assert_allclose(found["strength"][good], scale * strengths[good], rtol=1e-5)
@@ -59,7 +59,7 @@ def fisher(microphone_array, places, strengths):
     """In (x, y, log strength) of both, by differences of the formulas."""
 
     def terms(x):
-        received = sum(hear(microphone_array, [x[k : k + 2]], np.exp(x[k + 2]))[0] for k in (0, 3))
+        received = sum(received_power(microphone_array, [x[k : k + 2]], np.exp(x[k + 2]))[0] for k in (0, 3))
         total = received + np.asarray(microphone_array.noise.floor)
         return np.stack([np.log(total), np.log(np.asarray(variance(microphone_array.noise, received)) / total**2)])
 
@@ -70,7 +70,7 @@ def fisher(microphone_array, places, strengths):
 
 
 def test_covariance_is_the_inverse_of_fishers_matrix():
-    """At the places found, of noisy frames."""
+    """At the places found from noisy frames."""
     microphone_array, (places, strengths) = array(9, relative=0.02, floor=1e-3, freedom=50.0), pairs()
     power = noisy(microphone_array.noise, both(microphone_array, places, strengths), np.random.default_rng(2))
     found = find(microphone_array, power)
@@ -82,8 +82,8 @@ def test_covariance_is_the_inverse_of_fishers_matrix():
 
 
 @pytest.mark.slow
-def test_errors_are_as_said():
-    """95 % ellipses of either source, over 2,000 draws of one pair well apart."""
+def test_errors_match_the_covariance():
+    """95 % ellipses of either source, over 2,000 draws of one well separated pair."""
     microphone_array = array(9, relative=0.03)
     places, strengths = np.array([[[-0.05, -0.04], [0.05, 0.045]]]), np.array([[2.0, 1.0]])
     exact = np.repeat(both(microphone_array, places, strengths), 2048, axis=0)
@@ -94,10 +94,10 @@ def test_errors_are_as_said():
     assert float(np.mean(found.misfit)) == pytest.approx(3, rel=0.1)
 
 
-def test_one_touch_is_explained_too():
-    """Two where there is one: what is left unexplained is no more than one source leaves."""
+def test_a_single_touch():
+    """Two sources fitted to one touch leave no larger a misfit than one source."""
     microphone_array = array(9, relative=0.05)
-    power = noisy(microphone_array.noise, hear(microphone_array, inside(40)), np.random.default_rng(4))
+    power = noisy(microphone_array.noise, received_power(microphone_array, inside(40)), np.random.default_rng(4))
     found = find(microphone_array, power)
     assert np.median(found["misfit"]) < 6
     assert (found["strength"][:, 0] >= found["strength"][:, 1]).all()

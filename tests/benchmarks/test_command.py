@@ -1,4 +1,4 @@
-"""The benchmarks' one command: the list, what it refuses, and that a case that fails does not lose the others."""
+"""The benchmarks' command: its list, the arguments that it refuses, and the other cases after one fails."""
 
 import ast
 from pathlib import Path
@@ -34,7 +34,7 @@ def test_cases_are_listed_with_a_line_each(capsys):
         ["first_call", "--nodes", "9", "--write"],
     ],
 )
-def test_refuses_what_cannot_be_kept(arguments, capsys):
+def test_refuses_arguments_that_cannot_be_satisfied(arguments, capsys):
     with pytest.raises(SystemExit):
         command.main(arguments)
     assert "error" in capsys.readouterr().err
@@ -52,13 +52,13 @@ def test_a_case_that_fails_does_not_lose_the_others(monkeypatch, capsys):
     monkeypatch.setattr(command, "run_apart", apart)
     monkeypatch.setattr(command.machine, "use_cores", lambda: None)
     assert command.main(["ktc2023", "solver", "design_figures", "first_call"]) == 1
-    # Those that tell times come first and alone.
+    # Cases that measure times come first and alone.
     assert ran[:2] == ["solver", "first_call"]
     assert set(ran[2:]) == {"ktc2023", "design_figures"}
-    told = capsys.readouterr()
-    assert "| first_call |" in told.out
-    assert "solver ended" in told.err
-    assert "first_call: missed: as quick as that: slower" in told.err
+    printed = capsys.readouterr()
+    assert "| first_call |" in printed.out
+    assert "solver ended" in printed.err
+    assert "first_call: missed: as quick as that: slower" in printed.err
 
 
 def test_a_quick_case_is_measured_and_not_judged():
@@ -73,7 +73,7 @@ def test_a_case_in_a_process_of_its_own_may_fail():
         run_apart("nonsense", Options(quick=True))
 
 
-def test_nothing_reaches_into_the_tests():
+def test_nothing_imports_the_tests():
     for path in (ROOT / "benchmarks").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []

@@ -1,4 +1,4 @@
-"""Contestants in their processes: turns, what they leave, and one that does not run."""
+"""Contestants in their processes: taking turns, their results, and one that does not run."""
 
 import sys
 
@@ -12,7 +12,7 @@ from benchmarks.problems import matrices
 
 @pytest.fixture(scope="module")
 def problem():
-    """Three matrices of a chain of 40 springs, in the form that solvers get."""
+    """Three matrices of a chain of 40 springs, in the form that solvers receive."""
     size, random = 40, np.random.default_rng(0)
     below = np.arange(1, size)
     rows, columns = np.concatenate([np.arange(size), below]), np.concatenate([np.arange(size), below - 1])
@@ -24,13 +24,13 @@ def problem():
     return {"rows": rows, "columns": columns, "values": values, "load": random.normal(size=(size, 16))}
 
 
-def test_a_matrix_is_whole_and_symmetric(problem):
+def test_a_matrix_is_complete_and_symmetric(problem):
     matrix = matrices.symmetric(problem, 1)
     assert abs(matrix - matrix.T).max() == 0
     assert np.linalg.eigvalsh(matrix.toarray()).min() >= 1.0 - 1e-12
 
 
-def test_contestants_take_turns_and_leave_their_answers(problem, tmp_path):
+def test_contestants_take_turns_and_save_their_results(problem, tmp_path):
     np.savez(tmp_path / "problem.npz", **problem)
     with Contestant("SuperLU", tmp_path / "problem.npz", 60.0) as one:
         assert one.description.startswith("SciPy")
@@ -43,7 +43,7 @@ def test_contestants_take_turns_and_leave_their_answers(problem, tmp_path):
         assert matrices.residual(problem, 0, solution) < 1e-13
         (batch,) = one.save("batch", tmp_path / "batch.npz")
         assert [matrices.residual(problem, k, batch[k]) < 1e-13 for k in range(3)] == [True] * 3
-        # It fails at what it cannot, and is out.
+        # It fails at a problem that it cannot solve, and is excluded.
         with pytest.raises(GaveUpError, match="KeyError"):
             one.ask(do="first", task="juggle")
         again = compete([one], "solve", rounds=1, budget=1.0)["SuperLU"]
@@ -51,13 +51,13 @@ def test_contestants_take_turns_and_leave_their_answers(problem, tmp_path):
         assert np.isnan(again.median)
 
 
-def test_one_that_does_not_run_gives_up(tmp_path, problem):
+def test_one_that_does_not_run_is_excluded(tmp_path, problem):
     np.savez(tmp_path / "problem.npz", **problem)
     with pytest.raises(GaveUpError, match="KeyError"):
         Contestant("nobody", tmp_path / "problem.npz", 60.0, sys.executable)
 
 
-def test_compilation_is_apart_and_a_budget_ends_the_repeats():
+def test_compilation_is_measured_apart_and_a_budget_ends_the_repeats():
     calls = []
 
     def slow_at_first():

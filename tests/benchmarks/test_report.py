@@ -1,4 +1,4 @@
-"""RESULTS.md, one section for a case, and the README's table."""
+"""RESULTS.md, with one section for each case, and the README's table."""
 
 import subprocess
 
@@ -35,7 +35,7 @@ def write(root, name: str, figure: str, page=None) -> list[str]:
     return report.write(Case(name, "what it does", never, 1, page=page), result(figure), HEADING, ORDER, root)
 
 
-def test_a_section_holds_the_figures_asked_for_and_where_they_come_from(root):
+def test_a_section_contains_the_judged_figures_and_their_origin(root):
     write(root, "first", "1.00 s")
     text = (root / "benchmarks" / "RESULTS.md").read_text("utf-8")
     for part in ("## first", "What it does.", "commit 1234567, 2030-01-02", "jeit: a note", "**What it took**"):
@@ -56,7 +56,7 @@ def test_one_case_is_replaced_and_the_others_stay(root):
     assert "1.00 s" not in after["second"]
 
 
-def test_the_readme_has_a_row_of_every_case_in_order(root):
+def test_the_readme_has_a_row_for_every_case_in_order(root):
     write(root, "third", "1.00 s")
     write(root, "first", "5.00 s")
     text = (root / "README.md").read_text("utf-8")
@@ -69,7 +69,7 @@ def test_the_readme_has_a_row_of_every_case_in_order(root):
     assert len(report.readme_table(many).splitlines()) == 2 + 8
 
 
-def test_a_page_gets_the_tables_and_one_without_markers_stays(root):
+def test_a_page_gets_the_tables_and_one_without_markers_is_unchanged(root):
     assert write(root, "first", "1.00 s", ("docs/page.md", "figures")) == []
     assert "On one mesh." in (root / "docs" / "page.md").read_text("utf-8")
     (failed,) = write(root, "first", "1.00 s", ("docs/page.md", "elsewhere"))
@@ -77,11 +77,11 @@ def test_a_page_gets_the_tables_and_one_without_markers_stays(root):
     assert "## first" in (root / "benchmarks" / "RESULTS.md").read_text("utf-8")
 
 
-def test_what_disagrees_is_said():
+def test_disagreement_is_reported():
     assert "**Wrong:** images differ" in report.text(result("1 s", ("images differ",)), HEADING)
 
 
-def test_only_what_makes_figures_makes_a_commit_dirty(tmp_path, monkeypatch):
+def test_only_files_that_affect_figures_make_a_commit_dirty(tmp_path, monkeypatch):
     monkeypatch.setattr(machine, "ROOT", tmp_path)
     assert machine.commit() == "unknown"
     for name in ("jeit/a.py", "solvers/b.py", "benchmarks/RESULTS.md", "README.md", "pyproject.toml"):

@@ -1,4 +1,4 @@
-"""A study, its store after a run that nothing disturbed, and a watch on what is solved."""
+"""A study, its store after an undisturbed run, and a monitor of the chunks that are solved."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -26,20 +26,20 @@ def study(study_file) -> Study:
 
 @pytest.fixture(scope="session")
 def whole_store(study, study_file) -> Path:
-    """The store of a run of the sweep that nothing disturbed."""
+    """The store of an undisturbed run of the sweep."""
     run_study(study, study_file.parent / "whole.zarr")
     return study_file.parent / "whole.zarr"
 
 
 @pytest.fixture
 def store_path(tmp_path) -> Path:
-    """Where a store may be made."""
+    """A path for a store."""
     return tmp_path / "study.zarr"
 
 
 @pytest.fixture
 def watch_chunks(monkeypatch) -> Callable[[], list[int]]:
-    """Call it for the numbers of the chunks that are solved from then on."""
+    """Call it to get the numbers of the chunks that are solved from then on."""
 
     def watch() -> list[int]:
         solved, solve = [], run_module.solve_chunk

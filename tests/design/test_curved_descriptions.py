@@ -1,4 +1,6 @@
-"""Curved skins from TOML files, described and swept: as of Python, and what is refused before anything runs."""
+"""Curved skins from TOML files, described and swept: equal to those from Python, with errors raised before anything
+runs.
+"""
 
 import importlib.util
 import sys
@@ -53,7 +55,7 @@ def described(tmp_path):
     return call
 
 
-def test_a_described_tube_is_that_of_python(described):
+def test_a_described_tube_equals_that_from_python(described):
     skin = described(SKIN + '[skin]\nmodel = "layer"\nthickness_mm = 6\n')
     surface = tube(0.03, 0.08, cell_size=8e-3)
     layout = SurfaceLayout.spread(surface, 8, np.full(8, 0.01))
@@ -64,7 +66,7 @@ def test_a_described_tube_is_that_of_python(described):
 
 
 @pytest.mark.parametrize("name", SURFACES)
-def test_every_kind_of_surface_is_made(described, name):
+def test_every_kind_of_surface_is_constructed(described, name):
     skin = described(SKIN.replace(TUBE, SURFACES[name]))
     assert isinstance(skin.layout, SurfaceLayout)
     assert skin.layout.outward == (name != "inward")
@@ -94,13 +96,13 @@ def test_a_scan_is_read_in_its_unit_with_its_own_cells(described, tmp_path):
 
 @pytest.mark.parametrize("kind", ["layout", "layouts"])
 @pytest.mark.parametrize(("of_file", "given", "across"), [("mm", "m", "120 m"), ("m", "mm", "0.12 mm")])
-def test_a_scan_in_another_unit_is_told_by_its_key(described, tmp_path, kind, of_file, given, across):
+def test_a_scan_in_another_unit_is_read_by_its_key(described, tmp_path, kind, of_file, given, across):
     length = {"mm": 120.0, "m": 0.12}[of_file]
     with size_checked():
         write(forearm(length, (length / 4, length / 6), length / 3, num_points=400), tmp_path / "arm.stl")
     text = SKIN.replace(TUBE, f'file = "arm.stl"\nunit = "{given}"').replace("[mesh]\ncell_mm = 8\n", "")
-    said = rf'^skin\.toml: surface\.unit: in "{given}" the skin would be {across} across; give "{of_file}", in which'
-    with pytest.raises(ValueError, match=said):
+    message = rf'^skin\.toml: surface\.unit: in "{given}" the skin would be {across} across; give "{of_file}", in which'
+    with pytest.raises(ValueError, match=message):
         described(text.replace("layout =", f"{kind} ="), read_described_skin if kind == "layout" else read_study)
 
 
@@ -108,7 +110,7 @@ STEP = 'file = "part.STEP"\nunit = "mm"'
 
 
 @pytest.mark.skipif(importlib.util.find_spec("gmsh") is None, reason='needs the extra "mesh" (the gmsh package)')
-def test_a_cad_file_is_meshed_in_cells_of_the_table(described, tmp_path):
+def test_a_cad_file_is_meshed_with_the_cell_size_of_the_table(described, tmp_path):
     import gmsh
 
     gmsh.initialize(interruptible=False)
@@ -129,7 +131,7 @@ def test_a_cad_file_is_meshed_in_cells_of_the_table(described, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["layout", "layouts"])
-def test_a_cad_file_without_gmsh_says_what_to_install(described, tmp_path, monkeypatch, kind):
+def test_a_cad_file_without_gmsh_names_the_package_to_install(described, tmp_path, monkeypatch, kind):
     (tmp_path / "part.STEP").write_text("ISO-10303-21;")
     monkeypatch.setitem(sys.modules, "gmsh", None)
     read = read_described_skin if kind == "layout" else read_study
@@ -184,20 +186,20 @@ def test_electrodes_by_position(described, tmp_path):
     ],
 )
 @pytest.mark.parametrize("kind", ["layout", "layouts"])
-def test_what_is_wrong_is_said_by_its_key(described, tmp_path, kind, old, new, match):
+def test_errors_name_their_key(described, tmp_path, kind, old, new, match):
     (tmp_path / "flat.csv").write_text("x_mm,y_mm,diameter_mm\n0,0,6\n", "utf-8")
     text = SKIN.replace("layout =", f"{kind} =")
     assert old in text
     text = text.replace(old, new)
     if "no.stl" in text:
         text = text.replace("[mesh]\ncell_mm = 8\n", "")
-    with pytest.raises(ValueError, match=match) as said:
+    with pytest.raises(ValueError, match=match) as message:
         described(text, read_described_skin if kind == "layout" else read_study)
-    assert len(str(said.value)) <= 400
-    assert str(said.value).startswith("skin.toml: ")
+    assert len(str(message.value)) <= 400
+    assert str(message.value).startswith("skin.toml: ")
 
 
-def test_a_study_of_a_layer_says_where_it_is_too_thick(described):
+def test_a_study_of_a_layer_reports_where_it_is_too_thick(described):
     study = described(STUDY.replace("[skin]\nthickness_mm = [5, 8]", '[skin]\nmodel = "layer"\nthickness_mm = 45')
                       .replace(TUBE, f"{TUBE}\noutward = false"), read_study)  # fmt: skip
     with pytest.raises(ValueError, match=r"skin\.thickness_mm = 45.*radius of curvature"):
@@ -246,7 +248,7 @@ def test_places_on_a_layer_are_above_those_on_its_core(described):
     assert raised.areas.sum() == pytest.approx(1.2 * grid.areas.sum(), rel=0.02)
 
 
-def test_a_sphere_has_places_all_over(described):
+def test_a_sphere_has_places_everywhere(described):
     text = STUDY.replace(TUBE, SURFACES["sphere"])
     study = described(text, read_study)
     assert isinstance(study.outline, Triangles)

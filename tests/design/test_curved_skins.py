@@ -1,5 +1,6 @@
-"""Curved skins: the same calls as flat ones, the same answers where they are the same skin, and gradients against
-central differences."""
+"""Curved skins: the same functions as for flat skins, equal results where the skins are equivalent, and gradients
+against central differences.
+"""
 
 import equinox as eqx
 import jax
@@ -35,7 +36,7 @@ def raised(points) -> np.ndarray:
     return np.column_stack([points, np.zeros(len(points))])
 
 
-def test_places_are_spread_by_ways_along_the_surface():
+def test_places_are_spread_by_distance_along_the_surface():
     mesh = forearm(0.2, 0.025, 0.045, num_points=500)
     places = spread(mesh, 20, margin=0.01)
     ways = Geodesics.create(mesh)
@@ -65,8 +66,8 @@ def test_94_nearest_pairs_are_nearest_along_the_surface():
 
 
 @pytest.mark.parametrize("num_layers", [0, 3])
-def test_a_skin_in_a_plane_in_space_is_the_flat_skin(num_layers):
-    """And R → ∞ of a bent one."""
+def test_a_skin_in_a_tilted_plane_equals_the_flat_skin(num_layers):
+    """And a bent skin in the limit R → ∞."""
     flat = Layout(grid(0.08, 0.08, 3, 3), 12e-3, outline=SHEET, contact_impedance=1e-4)
     plane = Skin.create(flat, num_layers=num_layers, num_points=200)
     places = np.array([[0.01, 0.02], [-0.03, 0.0], [0.02, -0.03]])
@@ -83,7 +84,7 @@ def test_a_skin_in_a_plane_in_space_is_the_flat_skin(num_layers):
 
 
 @pytest.mark.slow
-def test_bends_towards_the_flat_skin():
+def test_a_bent_skin_tends_to_the_flat_skin():
     flat = Layout(grid(0.08, 0.08, 3, 3), 8e-3, outline=SHEET, contact_impedance=1e-4)
     fine = SHEET.mesh(num_points=300)
     places = np.array([[0.01, 0.02], [-0.03, 0.0]])
@@ -116,8 +117,8 @@ def unbent(surface: Mesh, radius: float) -> np.ndarray:
     return np.column_stack([radius * np.arctan2(points[:, 0], radius + points[:, 2]), points[:, 1]])
 
 
-def test_a_bent_sheet_without_thickness_is_the_flat_sheet():
-    """`bend` keeps all lengths on the sheet, and discs are measured along it."""
+def test_a_bent_sheet_without_thickness_equals_the_flat_sheet():
+    """`bend` preserves all lengths on the sheet, and discs are measured along it."""
     fine = SHEET.mesh(num_points=400)
     surface, flat = bend(fine, 0.03), bend(fine, np.inf)
     centres = grid(0.08, 0.08, 3, 3)
@@ -132,7 +133,7 @@ def test_a_bent_sheet_without_thickness_is_the_flat_sheet():
 
 @pytest.fixture(scope="module")
 def around() -> Skin:
-    """A sheet about a tube."""
+    """A sheet around a tube."""
     layout = SurfaceLayout.spread(tube(0.03, 0.1, num_points=200), 8, 12e-3, contact_impedance=1e-4)
     return Skin.create(layout, num_layers=0)
 
@@ -159,7 +160,7 @@ def test_the_same_calls_as_on_flat_skins(around):
     assert float(response.taxels.areas.sum()) > 0
 
 
-def test_touches_are_where_ways_along_the_surface_say_and_below_it():
+def test_touches_are_below_the_surface_at_their_distance_along_it():
     core = tube(0.03, 0.1, num_points=700)
     skin = Skin.create(SurfaceLayout.spread(core, 8, 8e-3), thickness=8e-3, num_layers=5)
     place = np.array([[0.038, 0.0, 0.05]])
@@ -184,7 +185,7 @@ def tangential(layout: SurfaceLayout, surface: Mesh) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("num_layers", [0, 1], ids=["sheet", "layer"])
 def test_positions_along_the_surface_have_gradients(num_layers):
-    """Of weighted sums of the voltages, those of central differences."""
+    """Gradients of weighted sums of the voltages, against central differences."""
     surface = tube(0.03, 0.08, num_points=100)
     layout = SurfaceLayout.spread(surface, 4, 20e-3, contact_impedance=1e-4)
     model, step = Skin.create(layout, num_layers=num_layers, thickness=6e-3).model, tangential(layout, surface)
@@ -204,7 +205,9 @@ def test_positions_along_the_surface_have_gradients(num_layers):
 
 @pytest.mark.parametrize("num_layers", [0, 1], ids=["sheet", "layer"])
 def test_loads_of_electrodes_along_the_surface_have_gradients(num_layers):
-    """Of the electrodes' loads, through which alone the voltages know of them, those of central differences."""
+    """Gradients with respect to the electrodes' load vectors, through which alone voltages depend on them, against
+    central differences.
+    """
     surface = tube(0.03, 0.08, num_points=100)
     layout = SurfaceLayout.spread(surface, 4, 20e-3, contact_impedance=1e-4)
     model, step = Skin.create(layout, num_layers=num_layers, thickness=6e-3).model, tangential(layout, surface)
@@ -245,8 +248,8 @@ def mean_error(fine: Skin, coarse: Skin, places, far) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.03, 0.04])
-def test_touches_are_found_as_well_as_on_the_flat_skin(radius):
-    """`TOUCH` H: geodesic error no more than 1.5 times that of the flat skin of the same sides."""
+def test_touches_are_located_as_accurately_as_on_the_flat_skin(radius):
+    """`TOUCH` H: the geodesic error is at most 1.5 times that of the flat skin with the same sides."""
     height = 0.14
     sides = Rectangle(2 * np.pi * radius, height)
     even = Layout(grid(0.75 * 2 * np.pi * radius, 0.75 * height, 4, 4), 6e-3, outline=sides)
@@ -265,7 +268,7 @@ def test_touches_are_found_as_well_as_on_the_flat_skin(radius):
     assert error < 0.008
 
 
-def test_a_touch_across_the_seam_is_one():
+def test_a_touch_across_the_seam_is_one_touch():
     surface = tube(0.03, 0.1, cell_size=8e-3)
     skin = Skin.create(SurfaceLayout.spread(surface, 12, 9e-3), num_layers=0)
     touched = skin.touched_cells([[-0.03, 0.0, 0.05]], Bell(4e-3, 7e-3))
@@ -284,12 +287,12 @@ def test_a_touch_across_the_seam_is_one():
         ("larger than the surface's radius of curvature", [[0.03, 0, 0.05]], 8e-2),
     ],
 )
-def test_refuses_electrodes_that_cannot_be(match, centres, diameter):
+def test_refuses_bad_electrodes(match, centres, diameter):
     with pytest.raises(ValueError, match=match):
         SurfaceLayout(centres, diameter, tube(0.03, 0.1, num_points=1500))
 
 
-def test_refuses_skins_that_cannot_be():
+def test_refuses_bad_skins():
     layout = SurfaceLayout.spread(tube(0.03, 0.1, num_points=300), 8, 9e-3, outward=False)
     with pytest.raises(ValueError, match="cell_size and num_points are of flat skins"):
         Skin.create(layout, cell_size=0.005)

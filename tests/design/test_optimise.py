@@ -1,4 +1,4 @@
-"""Layout optimisation: better, within all constraints, from several starts, the same every time."""
+"""Layout optimisation: improved layouts within all constraints, from several starting points, and reproducible."""
 
 import equinox as eqx
 import jax
@@ -32,7 +32,7 @@ SKIN = Rectangle(0.1, 0.1)
 SPACING, NUMBER = 0.02, 8
 MESH = rectangle(0.1, 0.1, num_points=200)
 PLACES = touch_grid(SKIN, 5, 5).places
-# A poor one: all along one side and a half.
+# A poor layout: all electrodes along one side and a half.
 START = Layout(
     np.array([[x, y] for y in (-0.04, -0.015) for x in (-0.036, -0.012, 0.012, 0.036)]), 8e-3, outline=SKIN, name="low"
 )
@@ -64,7 +64,7 @@ def distances(centres):
     return np.linalg.norm(centres[:, None] - centres, axis=-1)[np.triu_indices(len(centres), 1)]
 
 
-def test_optimised_layout_is_better_by_far(found):
+def test_the_optimised_layout_is_much_better(found):
     assert found.value > found.start_value + 2
     before = layout_scores(MODEL, 2e-3, TOUCHES, **SETTING)
     np.testing.assert_allclose(found.start_value, balanced_score(before), rtol=1e-9)
@@ -75,12 +75,12 @@ def test_optimised_layout_is_better_by_far(found):
     assert "satisfied by 3" in found.reason
 
 
-def test_the_costs_that_are_descended_have_their_gradients(monkeypatch):
-    """Of all starts, along a direction, central differences of score and penalty."""
+def test_the_minimised_costs_have_their_gradients(monkeypatch):
+    """For all starting points, in one direction, central differences of score and penalty."""
     asked = []
 
     def stay(cost, variables, steps, record, **options):
-        if options:  # to where the constraints are satisfied
+        if options:  # up to where the constraints are satisfied
             return descend(cost, variables, steps, record, **options)
         asked.append((cost, np.asarray(variables)))
         return variables, "step limit"
@@ -95,7 +95,7 @@ def test_the_costs_that_are_descended_have_their_gradients(monkeypatch):
     np.testing.assert_allclose(slope, (above - below) / (2 * step), rtol=1e-4)
 
 
-def test_all_starts_satisfy_all_constraints(found):
+def test_all_starting_points_end_within_all_constraints(found):
     np.testing.assert_array_equal(found.shortfall, 0)
     for centres in found.centres:
         assert distances(centres).min() >= SPACING
@@ -105,7 +105,7 @@ def test_all_starts_satisfy_all_constraints(found):
     assert found.layout.outline == SKIN
 
 
-def test_history_and_snapshots_tell_the_way(found):
+def test_history_and_snapshots_contain_the_iterations(found):
     steps = found.history.shape[1]
     assert found.snapshots.shape == (3, steps, NUMBER, 2)
     np.testing.assert_allclose(found.snapshots[0, 0], START.centres, atol=1e-12)
@@ -114,7 +114,7 @@ def test_history_and_snapshots_tell_the_way(found):
 
 
 def test_same_arguments_same_layout(found):
-    """To the last bit on a processor; a graphics processor adds in another order each time."""
+    """Bit by bit on a CPU. A GPU sums in another order each time."""
     tolerance = 0.0 if jax.default_backend() == "cpu" else 1e-6
     reported = []
     again = optimise_from_three(callback=lambda step, scores: reported.append((step, scores)))
@@ -123,8 +123,8 @@ def test_same_arguments_same_layout(found):
     assert [step for step, _ in reported] == list(range(len(reported)))
 
 
-def test_symmetric_layouts_of_sizes_within_limits_are_what_is_searched():
-    """Whatever the variables are, quarters of the skin are alike; and those of a layout that is so, give it back."""
+def test_the_search_is_over_symmetric_layouts_with_sizes_within_limits():
+    """For any variables the quarters of the skin are equal, and the variables of a symmetric layout reproduce it."""
     ring = Layout(perimeter(Rectangle(0.08, 0.08), NUMBER, start=0.005), 8e-3, outline=SKIN)
     skin = Skin(ring, MODEL, thickness=0.01, conductivity=0.2)
     space = DesignSpace(symmetry="rotate-4", sizes=(6e-3, 12e-3))
@@ -142,13 +142,13 @@ def test_symmetric_layouts_of_sizes_within_limits_are_what_is_searched():
 
 
 def nearest(places, others):
-    """From each place to the nearest of others."""
+    """Distance from each place to the nearest of the others."""
     return np.linalg.norm(np.asarray(places)[:, None] - np.asarray(others), axis=-1).min(axis=1)
 
 
 @pytest.mark.slow
 def test_symmetry_and_sizes():
-    # A shift along the edge keeps electrodes off the axes and the symmetry of the quarters.
+    # A shift along the edge keeps electrodes off the axes, about which the quarters are symmetric.
     track = Rectangle(0.08, 0.08)
     ring = Layout(perimeter(track, NUMBER, start=0.005), 8e-3, outline=SKIN)
     found = optimise(ring, symmetry="rotate-4", sizes=(6e-3, 12e-3), steps=8, minimum_spacing=0.015)
@@ -163,14 +163,16 @@ def test_symmetry_and_sizes():
 
 
 @pytest.mark.slow
-def test_contact_impedance_and_thickness_are_varied():
-    """Within their ranges, for the better; and the scores told are those of such a skin, built anew."""
+def test_contact_impedance_and_thickness_are_variables():
+    """They stay within their ranges and improve the score, and the reported scores are those of such a skin, built
+    anew.
+    """
     found = optimise(contact_impedance=(2e-5, 5e-4), thickness=(6e-3, 2e-2), steps=5)
     assert found.best == 0
     impedance, thickness = np.asarray(found.layout.contact_impedance), float(found.thickness[0])
     assert impedance.shape == (NUMBER,)
     assert 2e-5 <= impedance.min() < impedance.max() <= 5e-4
-    assert 6e-3 <= thickness < 0.01  # the thinner, the more a touch takes of the current's way
+    assert 6e-3 <= thickness < 0.01  # the thinner, the larger the fraction of the current's path that a touch takes
     model = MODEL.with_electrodes(found.layout.sheet_discs())
     touches = sheet_touches(MESH, Bell(deviation=12e-3), PLACES, thickness=thickness)
     scores = layout_scores(model, 2e-3 * thickness / 0.01, touches, **SETTING)
@@ -182,7 +184,7 @@ def test_contact_impedance_and_thickness_are_varied():
     assert fixed.layout.contact_impedance is None
 
 
-def test_shortfall_is_what_lacks():
+def test_shortfall_is_the_missing_distance():
     angle = np.arange(6)
     corners = 0.05 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     hexagon = Polygon(corners, [[[0, 0], [0, 0.01], [0.01, 0]]])
@@ -204,8 +206,8 @@ L_SHAPE = Polygon(((0.0, 0.0), (0.1, 0.0), (0.1, 0.04), (0.04, 0.04), (0.04, 0.1
 
 @pytest.mark.slow
 @pytest.mark.parametrize("outline", [L_SHAPE, Disk(0.05)], ids=["L", "disk"])
-def test_skins_that_leave_room_in_their_box(outline):
-    """A step may put an electrode beside the skin, where it has no score."""
+def test_skins_that_do_not_fill_their_bounding_box(outline):
+    """A step may move an electrode off the skin, where it has no score."""
     mesh = outline.mesh(num_points=250)
     middle = np.mean(outline.extent[:2]), np.mean(outline.extent[2:])
     inside = touches_away_from_the_edge(outline, 4e-3, 9, 9).places
@@ -222,7 +224,7 @@ def test_skins_that_leave_room_in_their_box(outline):
     assert found.shortfall.max() == 0
 
 
-def test_points_beside_a_skin_are_pulled_to_its_edge():
+def test_points_off_a_skin_are_projected_to_its_edge():
     points = np.array([[0.02, 0.05], [0.07, 0.05], [0.05, 0.09], [0.045, 0.05], [-0.01, -0.02]])
     expected = np.array([[0.02, 0.05], [0.07, 0.04], [0.04, 0.09], [0.04, 0.05], [0.0, 0.0]])
     np.testing.assert_allclose(L_SHAPE.nearest(points), expected, atol=1e-15)
@@ -231,8 +233,10 @@ def test_points_beside_a_skin_are_pulled_to_its_edge():
 
 
 @pytest.mark.slow
-def test_optimised_skin_beats_the_paper_s_and_a_regular_grid():
-    """From the boundary layout, on a coarse sheet; judged on a finer one, at other places, by exact touches."""
+def test_the_optimised_skin_is_better_than_the_papers_and_a_regular_grid():
+    """Starting from the boundary layout, on a coarse sheet. Evaluated on a finer one, at other places, with exact
+    touches.
+    """
     skin, protocol, conductance = Rectangle(0.2, 0.2), two_terminal(32), 2e-3
     start = named_layout("park-boundary")
 
@@ -257,7 +261,7 @@ def test_optimised_skin_beats_the_paper_s_and_a_regular_grid():
     assert least_variance < 0.5 * min(variance.values())
 
 
-def test_errors_teach():
+def test_error_messages():
     with pytest.raises(ValueError, match="do not fit the outline"):
         optimise(minimum_spacing=0.06)
     with pytest.raises(ValueError, match="key, which random starts need, must be one random key"):
@@ -303,14 +307,14 @@ def test_errors_teach():
         optimise_layout(Skin.create(START, cell_size=0.012), Objective(TOUCHES, **SETTING))
 
 
-def test_starts_that_end_outside_the_constraints_are_reported(monkeypatch):
-    """As where descent of the penalty leads all to a layout that is too close: the layout given is kept."""
+def test_starting_points_that_end_outside_the_constraints_are_reported(monkeypatch):
+    """As where minimising the penalty makes all layouts too dense: the given layout is kept."""
 
     def descent(variables, constraints, values):
         return jnp.broadcast_to(variables.start, values.shape)
 
     monkeypatch.setattr("jeit.design.optimisation.optimise._make_feasible", descent)
-    crowded = Layout(0.4 * START.centres, 8e-3, outline=SKIN, name="low")  # for the program of the others
+    crowded = Layout(0.4 * START.centres, 8e-3, outline=SKIN, name="low")  # for the compiled program of the others
     found = optimise_from_three(layout=crowded, steps=1)
     assert (found.status, found.best) == ("infeasible", None)
     assert (found.shortfall > 1e-3).all()
@@ -320,9 +324,9 @@ def test_starts_that_end_outside_the_constraints_are_reported(monkeypatch):
 
 
 @pytest.mark.slow
-def test_constraints_that_cannot_be_met_are_reported():
+def test_infeasible_constraints_are_reported():
     found = optimise(keep_out=(Rectangle(0.096, 0.096),), steps=1)
     assert found.status == "infeasible"
     assert found.shortfall[0] > 1e-3
-    assert "minimum_spacing= lacks" in found.reason  # all are pressed into a corner
+    assert "minimum_spacing= lacks" in found.reason  # all are confined to a corner
     assert found.layout is START

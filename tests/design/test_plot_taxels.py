@@ -1,4 +1,4 @@
-"""The pictures of virtual taxels, judged by what was drawn: cells, colours, outlines, areas, units."""
+"""Figures of virtual taxels, tested on what was drawn: cells, colours, outlines, areas, units."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ ELECTRODES = grid(0.08, 0.08, 2, 2)
 
 
 def four(columns=8, rows=8, places=None):
-    """Four taxels about the quarters of a square of 100 mm, of 9 to 36 cm² and the last, which is nowhere, of none."""
+    """Four taxels in the quarters of a square of 100 mm, of 9 to 36 cm². The last has no cell and no area."""
     if places is None:
         places = grid(0.1 * (1 - 1 / columns), 0.1 * (1 - 1 / rows), columns, rows)
     count = len(places)
@@ -89,7 +89,7 @@ def test_coverage_is_counted(ax):
     assert ax.figure.axes[-1].get_ylabel() == "Taxels over a point"
 
 
-def test_neighbours_have_unlike_colours(ax):
+def test_adjacent_taxels_have_different_colours(ax):
     taxels = four()
     plot_taxels(taxels, colour="label", outlines=True, ax=ax)
     colour, labels = np.asarray(cells_of(ax).get_array()), np.asarray(taxels.labels)
@@ -97,7 +97,7 @@ def test_neighbours_have_unlike_colours(ax):
     assert all(len(one) == 1 for one in of_cluster)
     assert of_cluster[0] != of_cluster[1] != of_cluster[3] != of_cluster[2] != of_cluster[0]
     assert len(ax.figure.axes) == 1  # labels need no colour bar
-    # The taxel that is nowhere has no outline.
+    # The taxel without cells has no outline.
     assert len(outlines(ax)) == 3
 
 
@@ -125,7 +125,7 @@ def test_a_similarity_surface_has_the_outline_of_its_taxel(ax):
     np.testing.assert_allclose(cells.get_array(), taxels.similarity[1])
     assert cells.get_clim() == (0, 1)
     (outline,) = outlines(ax)
-    # 0.3 · 120 mm to all sides of the middle, as far as there is skin.
+    # 0.3 · 120 mm to all sides of the centre, as far as the skin extends.
     x, y = outline.get_paths()[0].vertices.T
     assert (x.min(), y.max()) == pytest.approx((0.025 - 0.036, -0.025 + 0.036), abs=1e-3)
     assert ax.get_title() == f"{1e4 * float(taxels.areas[1]):.1f} cm²"
@@ -133,15 +133,15 @@ def test_a_similarity_surface_has_the_outline_of_its_taxel(ax):
     assert "20 mm" in texts(ax)
 
 
-def test_a_taxel_that_is_nowhere_can_be_drawn(ax):
+def test_a_taxel_without_cells_can_be_drawn(ax):
     plot_similarity(four(), 3, colour_bar=False, ax=ax)
     assert not outlines(ax)
     assert ax.get_title() == "0.0 cm²"
     assert len(ax.figure.axes) == 1
 
 
-def test_legends_of_histograms_stand_above_them(ax):
-    """Even of the tallest bar, wherever it is."""
+def test_legends_of_histograms_are_above_them(ax):
+    """Above the tallest bar too, wherever it is."""
     one = four()
     plot_taxel_areas({"inside": one, "a layout of a long name that reaches far to the left": one}, bins=4, ax=ax)
     ax.figure.draw_without_rendering()
@@ -149,7 +149,7 @@ def test_legends_of_histograms_stand_above_them(ax):
     assert box.y0 > max(patch.get_path().vertices[:, 1].max() for patch in ax.patches)
 
 
-def test_the_line_in_histograms_of_sensitivity_is_named(ax):
+def test_the_line_in_histograms_of_sensitivity_has_a_label(ax):
     places = touch_grid(Rectangle(0.1, 0.1), 4, 4)
     maps = {
         name: SensitivityMap(places, scale * jnp.arange(1.0, 17.0)[:, None])
@@ -189,7 +189,7 @@ def test_histograms_share_their_bins(ax):
         ("7 layouts", lambda one: plot_taxel_areas(dict.fromkeys("abcdefg", one))),
     ],
 )
-def test_refuses_what_makes_no_sense(match, draw, monkeypatch, ax):
+def test_refuses_bad_input(match, draw, monkeypatch, ax):
     monkeypatch.setattr("jeit.design.plots.taxels.axes_or_new", lambda *_: ax)
     with pytest.raises(ValueError, match=match):
         draw(four())
@@ -202,7 +202,7 @@ def test_a_batch_is_drawn_one_by_one(ax):
             draw(batch, ax=ax)
 
 
-def test_figures_are_made_where_no_axes_are_given():
+def test_figures_are_created_where_no_axes_are_given():
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""The picture of electrodes travelling, judged by what was drawn: ways, discs, regions, title."""
+"""The figure of electrode displacements during optimisation, tested on what was drawn: paths, discs, regions, title."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -44,7 +44,7 @@ def ax():
     return Figure(layout="constrained").subplots()
 
 
-def test_ways_lead_from_start_to_end(ax):
+def test_paths_lead_from_start_to_end(ax):
     assert plot_travel(optimisation(), ax=ax) is ax
     (ways,) = (one for one in ax.collections if isinstance(one, LineCollection))
     segments = np.array(ways.get_segments())
@@ -62,7 +62,7 @@ def test_ways_lead_from_start_to_end(ax):
     assert ax.get_ylim()[0] < min(scale.get_position()[1], bar.get_ydata()[0])
 
 
-def test_a_legend_says_what_is_what(ax):
+def test_a_legend_names_the_symbols(ax):
     plot_travel(optimisation(), ax=ax)
     assert [text.get_text() for text in ax.get_legend().get_texts()] == [
         "where it began", "way, step by step", "where it ended",
@@ -76,7 +76,7 @@ def test_a_legend_says_what_is_what(ax):
     assert box.x0 > max(line.get_xdata()[1] for line in ax.lines)
 
 
-def test_regions_are_hatched_and_starts_chosen(ax):
+def test_regions_are_hatched_and_a_start_can_be_selected(ax):
     plot_travel(optimisation(), 1, keep_out=(Disk(0.01, (0.02, 0.02)),), title="second", ax=ax)
     assert [bool(patch.get_hatch()) for patch in ax.patches] == [False, True]
     box = ax.patches[1].get_path().get_extents()

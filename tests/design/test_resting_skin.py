@@ -1,4 +1,4 @@
-"""A skin at rest whose touches are worked out in many calls, against changes of each call's own, and the model anew."""
+"""A skin at rest with touches computed in many calls, against the changes of each call alone, and a new solution."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from jeit.touch.simulate import BarIndenter, DiscIndenter, Indent, indented_cell
 from jeit.touch.simulate.contact.indents import resting_skin
 from jeit_solvers.engines import as_array
 
-# One to three contacts, of few cells and many, in a group that one program works on and beyond.
+# One to three contacts of few and many cells, in a group for one program and beyond its size.
 TOUCHES = [
     [Indent(DiscIndenter(0.004), 3e-3, (0.01, 0.0))],
     [
@@ -34,7 +34,7 @@ def skin(request):
     return made(request.param)
 
 
-def test_changes_are_those_of_each_call(skin):
+def test_changes_equal_those_of_each_call(skin):
     touched = indented_cells(skin, TOUCHES)
     right = np.asarray(touch_changes(skin.model, skin.model_conductivity, touched))
     resting = resting_skin(skin, 8e-3)
@@ -45,7 +45,7 @@ def test_changes_are_those_of_each_call(skin):
 
 
 @pytest.mark.slow
-def test_changes_are_those_of_another_call(skin):
+def test_changes_equal_those_of_another_call(skin):
     resting = resting_skin(skin, 8e-3)
     assert resting is not None
     found = resting.changes(indented_cells(skin, TOUCHES))
@@ -53,8 +53,8 @@ def test_changes_are_those_of_another_call(skin):
     assert np.abs(again[0] - found[1]).max() < 1e-12 * np.abs(found).max()
 
 
-def test_a_layer_is_to_know_the_nodes_that_are_reached(monkeypatch):
-    """Of four layers of cells in 10 mm, those of the upper one, or of all."""
+def test_a_layer_selects_the_nodes_that_touches_can_reach(monkeypatch):
+    """For four layers of cells in 10 mm: those of the upper one, or of all."""
     monkeypatch.setattr(RestingSkin, "create", lambda model, conductivity, touchable: touchable)
     layer = made(4)
     shallow, deep = (np.asarray(resting_skin(layer, depth)) for depth in (2e-3, 8e-3))
@@ -64,8 +64,8 @@ def test_a_layer_is_to_know_the_nodes_that_are_reached(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_layer_knows_the_nodes_that_are_reached():
-    """Those of the upper cells, where less is touched; 0 where nothing is."""
+def test_a_layer_stores_the_nodes_that_are_reached():
+    """Those of the upper cells, where a smaller depth is touched, and 0 where nothing is."""
     layer = made(4)
     shallow, deep = (resting_skin(layer, depth) for depth in (2e-3, 8e-3))
     assert shallow is not None
@@ -82,14 +82,14 @@ def test_a_layer_knows_the_nodes_that_are_reached():
     assert np.abs(found[0] - anew).max() < 1e-7 * np.abs(anew).max()
 
 
-def test_no_more_than_fits():
+def test_no_more_than_fits_in_memory():
     sheet = made(0)
     everywhere = np.ones(sheet.model.mesh.num_points, bool)
     assert RestingSkin.create(sheet.model, sheet.model_conductivity, everywhere, max_bytes=1e4) is None
 
 
-def test_what_is_not_found():
-    """By conductors of any contrast, as of `touch_changes`."""
+def test_touches_that_do_not_converge():
+    """By conductors of any contrast, as for `touch_changes`."""
     sheet = made(0)
     resting = resting_skin(sheet, 8e-3)
     assert resting is not None

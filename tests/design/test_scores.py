@@ -59,7 +59,7 @@ def changes():
     return linear_changes(MODEL, CONDUCTANCE, TOUCHES.touched)
 
 
-def test_sensitivity_is_that_of_linear_touches(scores, changes):
+def test_sensitivity_equals_that_of_linear_touches(scores, changes):
     np.testing.assert_allclose(scores.sensitivity, np.linalg.norm(changes, axis=1), rtol=1e-9)
     np.testing.assert_allclose(scores.worst, np.linalg.norm(changes, axis=1).min(), rtol=1e-9)
     assert scores.worst < scores.soft_worst < scores.mean
@@ -67,10 +67,10 @@ def test_sensitivity_is_that_of_linear_touches(scores, changes):
     assert 0 < scores.uniformity < 1
 
 
-def test_optimality_is_that_of_dense_matrices(scores, changes):
+def test_optimality_equals_that_of_dense_matrices(scores, changes):
     squared = np.sum((PLACES[:, None] - PLACES) ** 2, axis=-1)
     prior = np.exp(-squared / (2 * 0.02**2))
-    # In data space: another way to the same covariance. What the prior's factor leaves out is below a millionth.
+    # In data space: another derivation of the same covariance. What the prior's factor leaves out is below a millionth.
     data = changes.T @ prior @ changes + NOISE**2 * np.eye(changes.shape[1])
     covariance = prior - prior @ changes @ np.linalg.solve(data, changes.T @ prior)
     np.testing.assert_allclose(scores.variance, np.diag(covariance), atol=1e-4)
@@ -89,23 +89,23 @@ def test_slopes_are_those_of_shifted_touches():
             np.add.at(one, (np.arange(len(PLACES))[:, None], np.asarray(moved.cells)), np.asarray(moved.change))
         wanted = (blank[0] - blank[1]) / (2 * step)
         slope = np.asarray(TOUCHES.weights(np.ones(MESH.num_cells))[1][axis])
-        # Cells that enter or leave the reach in the step jump by a hundredth of the depth.
+        # Cells that enter or leave the reach during the step change by a hundredth of the depth.
         same = (blank[0] != 0) == (blank[1] != 0)
         np.testing.assert_allclose(slope[same], wanted[same], atol=1e-6 * np.abs(slope).max())
 
 
-def test_localisation_error_is_that_of_the_inverse_information(scores, changes):
+def test_localisation_error_equals_that_of_the_inverse_information(scores, changes):
     slopes = TOUCHES.weights(np.full(MESH.num_cells, CONDUCTANCE))[1]
     jacobian = np.asarray(MODEL.jacobian(CONDUCTANCE)).T
     x, y = np.asarray(slopes) @ jacobian
     for k in range(len(PLACES)):
-        directions = np.stack([1e-2 * x[k], 1e-2 * y[k], changes[k]]) / NOISE  # centimetres, for the condition
+        directions = np.stack([1e-2 * x[k], 1e-2 * y[k], changes[k]]) / NOISE  # centimetres, for the condition number
         variance = np.diag(np.linalg.inv(directions @ directions.T))
         np.testing.assert_allclose(scores.localisation_error[k], 1e-2 * np.sqrt(variance[:2].sum()), rtol=1e-6)
 
 
-def test_estimates_of_a_place_scatter_as_the_bound_says(scores):
-    """The Gauss-Newton estimate of (x, y, a) from noisy voltages has the bound's error: noise is small."""
+def test_estimates_of_a_place_attain_the_bound(scores):
+    """The Gauss-Newton estimate of (x, y, a) from noisy voltages has the bound's error at low noise."""
     k = int(np.argmin(np.linalg.norm(PLACES, axis=1)))
     weights, slopes = TOUCHES.weights(np.full(MESH.num_cells, CONDUCTANCE))
     jacobian = np.asarray(MODEL.jacobian(CONDUCTANCE)).T
@@ -117,7 +117,7 @@ def test_estimates_of_a_place_scatter_as_the_bound_says(scores):
 
 
 @pytest.mark.slow
-def test_gradients_are_those_of_central_differences():
+def test_gradients_equal_central_differences():
     random, unit = np.random.default_rng(0), np.eye(len(NAMES))
     slopes = [jax.tree.map(np.asarray, figures_and_gradient(DISCS, one)[1]) for one in unit]
     for field, step in (("position", 1e-6), ("radius", 1e-6), ("contact_impedance", 1e-7)):
@@ -132,15 +132,15 @@ def test_gradients_are_those_of_central_differences():
         np.testing.assert_allclose(found, wanted, rtol=1e-4, err_msg=f"{field}: {NAMES}")
 
 
-def test_figures_of_a_batch_are_those_of_each_layout(scores):
-    """Of scores with a leading axis of layouts, as of `jax.vmap`; that it computes the same, studies prove."""
+def test_figures_of_a_batch_equal_those_of_each_layout(scores):
+    """For scores with a leading axis of layouts, as from `jax.vmap`. Tests of studies show that the results agree."""
     other = scores_of(SheetDiscs(CENTRES + 1e-3, 5e-3, 1e-4))
     batch = jax.tree.map(lambda *one: np.stack(one), scores, other)
     for name in ("worst", "mean", "uniformity", "mean_variance"):
         np.testing.assert_allclose(getattr(batch, name), [getattr(one, name) for one in (scores, other)], rtol=1e-12)
 
 
-def test_errors_teach():
+def test_error_messages():
     keywords = {"prior": PRIOR, "noise": NOISE}
     with pytest.raises(ValueError, match="noise must be positive"):
         layout_scores(MODEL, CONDUCTANCE, TOUCHES, prior=PRIOR, noise=0.0)

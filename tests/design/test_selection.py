@@ -20,7 +20,7 @@ NUMBER = 4
 
 
 class Case:
-    """Random measurements with noise of their own under a random prior, and their figures from dense matrices."""
+    """Random measurements with different noise under a random prior, and their figures from dense matrices."""
 
     def __init__(self, seed: int, shapes: int = 10):
         random = np.random.default_rng(seed)
@@ -49,7 +49,7 @@ each_criterion = pytest.mark.parametrize("criterion", ["D", "A"])
 @pytest.mark.parametrize(
     ("shapes", "criterion"), [(3, "D"), *(pytest.param(20, each, marks=pytest.mark.slow) for each in "AD")]
 )
-def test_information_is_that_of_dense_matrices(shapes, criterion):
+def test_information_equals_that_of_dense_matrices(shapes, criterion):
     case = Case(11, shapes)
     wanted = [case.information(chosen, criterion) for chosen in SETS]
     np.testing.assert_allclose(information(case.candidates, np.array(SETS), criterion=criterion), wanted, rtol=1e-9)
@@ -72,7 +72,7 @@ def test_weak_measurements_beside_strong_ones_count():
 
 @each_case
 @each_criterion
-def test_greedy_adds_the_best_each_time(case, criterion):
+def test_greedy_adds_the_best_measurement_each_time(case, criterion):
     selection = select_measurements(case.candidates, NUMBER, criterion=criterion, exchange=False)
     chosen: list[int] = []
     for pick, gain in zip(selection.chosen.tolist(), selection.gains.tolist(), strict=True):
@@ -104,7 +104,7 @@ def test_exchange_ends_where_no_swap_helps(case, criterion):
     assert 0.99 * best <= value <= best * (1 + 1e-9)
 
 
-@pytest.mark.filterwarnings("ignore:Values in x were outside bounds:RuntimeWarning")  # SciPy 1.15, of its own steps
+@pytest.mark.filterwarnings("ignore:Values in x were outside bounds:RuntimeWarning")  # SciPy 1.15, from its own steps
 @each_criterion
 def test_bound_is_the_best_of_all_fractional_designs(criterion):
     case = CASES[1]
@@ -117,15 +117,15 @@ def test_bound_is_the_best_of_all_fractional_designs(criterion):
     whole = {"type": "eq", "fun": lambda parts: parts.sum() - NUMBER}
     best = -minimize(lost, start, method="SLSQP", bounds=[(1e-9, 1)] * MEASUREMENTS, constraints=whole).fun
     bound = float(information_bound(case.candidates, NUMBER, criterion=criterion))
-    # Frank and Wolfe's gap falls as one over the number of iterations.
+    # The gap of the Frank-Wolfe method falls as one over the number of iterations.
     assert best * (1 - 1e-6) <= bound <= 1.005 * best
     assert max(case.information(each, criterion) for each in SETS) < bound
     every = information_bound(case.candidates, MEASUREMENTS, criterion=criterion)
     np.testing.assert_allclose(every, case.information(range(MEASUREMENTS), criterion), rtol=1e-9)
 
 
-def test_exchange_repairs_a_greedy_choice_and_heeds_its_cap():
-    # Greedy takes the sum of two directions first; the two alone are better together.
+def test_exchange_repairs_a_greedy_choice_and_respects_its_cap():
+    # Greedy takes the sum of two directions first. The two alone are better together.
     rows = np.array([[1.0, 1.0], [1.35, 0.0], [0.0, 1.35]])
     candidates = Candidates.from_factor(rows, np.eye(2), 1.0)
     greedy = select_measurements(candidates, 2, exchange=False)
@@ -138,8 +138,8 @@ def test_exchange_repairs_a_greedy_choice_and_heeds_its_cap():
     np.testing.assert_allclose(better.information, 2 * np.log(1 + 1.35**2), rtol=1e-12)
 
 
-def test_precise_measurements_do_not_spoil_the_swaps():
-    # With a signal of 1e7 deviations 1 - f_iᵀC f_i is 1e-14, and a difference of large numbers would be noise.
+def test_precise_measurements_do_not_spoil_the_exchanges():
+    # With a signal of 1e7 deviations 1 - f_iᵀC f_i is 1e-14, and a difference of large numbers would be rounding noise.
     case = CASES[0]
     product = case.covariance @ case.jacobian.T
     precise = select_measurements(Candidates.create(case.jacobian, product, 1e-7 * case.noise), NUMBER)
@@ -161,7 +161,7 @@ def test_layouts_in_a_batch(criterion):
         np.testing.assert_allclose(selections.information[index], alone.information, rtol=1e-9)
 
 
-def test_random_selections_are_sets_drawn_evenly():
+def test_random_selections_are_uniform():
     sets = np.asarray(random_selections(jax.random.key(3), 10, 4, 500))
     assert sets.shape == (500, 4)
     assert all(len(set(each)) == 4 for each in sets.tolist())
@@ -170,7 +170,7 @@ def test_random_selections_are_sets_drawn_evenly():
     np.testing.assert_array_equal(sets, random_selections(jax.random.key(3), 10, 4, 500))
 
 
-def test_patterns_by_length_are_channels_of_two_terminal():
+def test_patterns_by_length_equal_two_terminal_channels():
     centres = np.array([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [7.0, 0.0]])
     protocol = two_terminal(4)
 
@@ -216,8 +216,9 @@ def test_bad_arguments_are_refused(call, complaint):
 def test_the_paper_measures_94_of_496_pairs():
     """Park et al. 2022: 32 electrodes inside 200 × 200 mm.
 
-    Conductance varies by 25 % (2.5 of 10 mm pressed in) over 38 mm, the electrodes' pitch; noise is 1e-4 of a voltage.
-    With finer detail or more noise the 94 keep less, and so does any other 94: see `information_bound`.
+    Conductance varies by 25 % (2.5 of 10 mm pressed in) over 38 mm, the electrodes' pitch, and noise is 1e-4 of a
+    voltage. With finer detail or more noise the 94 keep less, and so does any other selection of 94: see
+    `information_bound`.
     """
     layout = named_layout("park-inner")
     mesh = rectangle(0.2, 0.2, cell_size=0.012, refine=Refine(layout.centres, cell_size=2.5e-3, distance=3e-3))
@@ -229,15 +230,15 @@ def test_the_paper_measures_94_of_496_pairs():
     selection = select_measurements(candidates, 94)
     kernel = np.asarray(candidates.rows @ candidates.rows.T)
 
-    def told(sets):
+    def total_information(sets):
         return np.linalg.slogdet(np.eye(sets.shape[-1]) + kernel[sets[..., :, None], sets[..., None, :]])[1]
 
-    random = told(np.asarray(random_selections(jax.random.key(0), 496, 94, 1000)))
-    share = told(np.asarray(selection.chosen)) / told(np.arange(496))
+    random = total_information(np.asarray(random_selections(jax.random.key(0), 496, 94, 1000)))
+    share = total_information(np.asarray(selection.chosen)) / total_information(np.arange(496))
     np.testing.assert_allclose(selection.share, share, rtol=1e-9)
     # On a mesh of 4,216 nodes: 0.912 the chosen, 0.745 the median and 0.782 the best of the random, 0.902 the nearest.
     assert share >= 0.9
-    assert share >= np.median(random) / told(np.arange(496)) + 0.15
-    assert selection.information > max(random.max(), told(nearest_pairs(layout.centres, 94)))
+    assert share >= np.median(random) / total_information(np.arange(496)) + 0.15
+    assert selection.information > max(random.max(), total_information(nearest_pairs(layout.centres, 94)))
     assert information_bound(candidates, 94, iterations=5) < 1.02 * selection.information
     assert model.protocol.subset(selection.chosen).num_measurements == 94

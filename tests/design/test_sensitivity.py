@@ -1,4 +1,4 @@
-"""Sensitivity maps: what they are made of, and the symmetry of the skin."""
+"""Sensitivity maps: their definition, and the symmetry of the skin."""
 
 import numpy as np
 import pytest
@@ -34,14 +34,14 @@ def test_values_are_norms_of_the_changes(theta):
 
 
 def test_a_symmetric_skin_has_a_symmetric_map(theta):
-    """The mesh is not quite: rows of cells are staggered."""
+    """The mesh is not exactly symmetric: rows of cells are staggered."""
     image = theta.image()
     assert image.shape == (6, 8)
     np.testing.assert_allclose(image, image[::-1], rtol=0.1)
     np.testing.assert_allclose(image, image[:, ::-1], rtol=0.1)
 
 
-def test_the_blind_spot_is_the_share_below_a_level(theta):
+def test_the_blind_spot_is_the_fraction_below_a_level(theta):
     level = np.median(np.asarray(theta.values))
     assert float(theta.blind_spot(level)) == pytest.approx(0.5, abs=0.02)
     assert float(theta.blind_spot(theta.minimum)) == 0

@@ -1,4 +1,6 @@
-"""What a skin of one layout feels: insulating and conductive touches, and everything checked before any is made."""
+"""The response of a skin with one layout: insulating and conductive touches, with all arguments checked before any is
+simulated.
+"""
 
 import jax
 import numpy as np
@@ -58,7 +60,7 @@ def test_a_comparison_with_itself_has_no_blind_spot():
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"contrast": 1.0}, "contrast must be a factor"),
         ({"cell_size": 1e-5}, r"cell_size is 0\.01 mm, which makes about 1\.8e\+08 nodes; give 0\.14 mm or more"),
@@ -78,9 +80,9 @@ def test_a_comparison_with_itself_has_no_blind_spot():
         ({"num_taxels": 200}, "num_taxels is 200"),
     ],
 )
-def test_what_cannot_be_felt_is_refused_before_it_is_touched(options, said, monkeypatch):
+def test_touches_that_cannot_be_detected_are_refused_before_they_are_simulated(options, message, monkeypatch):
     monkeypatch.setattr(Skin, "voltage_changes", None)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         respond(**options)
 
 
@@ -89,7 +91,7 @@ def test_a_skin_is_a_sheet_or_a_layer_with_one_set_of_defaults():
     assert [skin.model.mesh.dimension for skin in (sheet, layer)] == [2, 3]
     for skin in (sheet, layer):
         np.testing.assert_array_equal(skin.model.electrodes.contact_impedance, defaults.CONTACT_IMPEDANCE)
-        assert skin.model.protocol.num_measurements == 15  # all pairs, as there are no 94
+        assert skin.model.protocol.num_measurements == 15  # all pairs, since there are fewer than 94
         assert (skin.thickness, float(skin.conductivity)) == (defaults.THICKNESS, defaults.CONDUCTIVITY)
     assert float(sheet.model_conductivity) == pytest.approx(0.01)
     assert float(layer.model_conductivity) == 1.0
@@ -104,7 +106,7 @@ def test_the_same_mesh_with_other_electrodes():
         skin.with_layout(Layout(LAYOUT.centres, 2e-3, outline=OUTLINE))
 
 
-def test_a_drawing_of_a_rectangle_is_meshed_as_one():
+def test_a_drawing_of_a_rectangle_is_meshed_as_a_rectangle():
     drawn = Layout(LAYOUT.centres, 8e-3, outline=Polygon(OUTLINE.vertices))
     assert isinstance(Skin.create(drawn, num_layers=0, cell_size=6e-3).outline, Rectangle)
 
@@ -142,6 +144,6 @@ def test_a_drawing_of_a_rectangle_is_meshed_as_one():
         (lambda skin: Objective(None, None, score="minimum"), "score must be a function"),
     ],
 )
-def test_things_of_another_kind_are_refused(call, complaint):
+def test_bad_arguments_are_refused(call, complaint):
     with pytest.raises(ValueError, match=complaint):
         call(Skin.create(LAYOUT, num_layers=0, cell_size=8e-3))

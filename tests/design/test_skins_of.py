@@ -1,4 +1,4 @@
-"""Skins of several layouts: one mesh serves those that it can, and what is measured is what each skin alone gives."""
+"""Skins of several layouts share a mesh where they can, and each gives the results that it gives alone."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def skins(*layouts):
     return skins_of(layouts, [skin_protocol(one) for one in layouts], **OPTIONS)
 
 
-def test_layouts_of_as_many_electrodes_on_one_outline_share_a_mesh():
+def test_layouts_of_equal_size_on_one_outline_share_a_mesh():
     first, second = (named_layout(name, FIELD) for name in ("grid-3x2", "perimeter-6"))
     made, alone = skins(first, second), Skin.create(second, **OPTIONS)
     assert made[1].model.mesh.points is made[0].model.mesh.points
@@ -32,7 +32,7 @@ def test_layouts_of_as_many_electrodes_on_one_outline_share_a_mesh():
     [named_layout("grid-3x2", Rectangle(0.1, 0.1)), named_layout("grid-3x3", FIELD)],
     ids=["another outline", "more electrodes"],
 )
-def test_others_have_their_own(other):
+def test_other_layouts_have_their_own_mesh(other):
     made = skins(named_layout("grid-3x2", FIELD), other)
     assert made[1].model.mesh.points is not made[0].model.mesh.points
     assert made[1].outline.area == pytest.approx(other.known_outline.area)

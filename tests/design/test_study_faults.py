@@ -1,4 +1,4 @@
-"""Studies against kill -9, full disks, damaged files and lost workers: nothing is lost, nothing solved twice."""
+"""Studies against kill -9, full disks, damaged files and lost workers: nothing is lost, and nothing is solved twice."""
 
 import errno
 import os
@@ -18,7 +18,7 @@ pytest.importorskip("xarray")
 pytest.importorskip("zarr")
 
 
-# What Zarr has written when the second chunk's sensitivities are there and its last arrays are not.
+# The files that Zarr has written when the second chunk's sensitivities exist and its last arrays do not.
 FILES = 4 * ARRAYS + 5
 KILLED_BY_ZARR = """
 import os, signal, sys
@@ -48,10 +48,10 @@ run_study(study, sys.argv[2])
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 @pytest.mark.slow
-def test_killed_in_the_middle_of_a_chunk_and_resumed_the_store_is_the_same(
+def test_after_a_kill_inside_a_chunk_the_resumed_store_is_the_same(
     study, study_file, whole_store, store_path, watch_chunks
 ):
-    """Half of the second chunk's last array, and of the next file what Zarr was writing, under another name."""
+    """Half of the second chunk's last array, and part of the next file, which Zarr was writing under another name."""
     ended = in_another_process(KILLED_BY_ZARR.format(calls=FILES), study_file, store_path, whole_store)
     assert ended.returncode == -signal.SIGKILL, ended.stderr
     assert study_progress(study, store_path).chunks == 1
@@ -60,7 +60,7 @@ def test_killed_in_the_middle_of_a_chunk_and_resumed_the_store_is_the_same(
     assert [name for name in torn if name.endswith(".partial")]
     data = open_results(study, store_path)
     assert data.finished.values.sum() == 2
-    assert np.isnan(data.sensitivity.values[~data.finished.values]).all()  # what is torn is not read
+    assert np.isnan(data.sensitivity.values[~data.finished.values]).all()  # an incomplete array is not read
     solved = watch_chunks()
     run_study(study, store_path)
     assert solved == [1, 2]
@@ -71,7 +71,7 @@ def test_killed_in_the_middle_of_a_chunk_and_resumed_the_store_is_the_same(
 @pytest.mark.slow
 @pytest.mark.parametrize("calls", [3, 2 * ARRAYS + 20])
 def test_killed_while_zarr_writes_a_file(study, study_file, whole_store, store_path, calls):
-    """As the store is made, and in the first chunk: what Zarr was writing lies under another name."""
+    """During creation of the store, and in the first chunk: the file that Zarr was writing has another name."""
     ended = in_another_process(KILLED_BY_ZARR.format(calls=calls), study_file, store_path, whole_store)
     assert ended.returncode == -signal.SIGKILL, ended.stderr
     assert [name for name in contents(store_path.parent) if name.endswith(".partial")]
@@ -81,8 +81,8 @@ def test_killed_while_zarr_writes_a_file(study, study_file, whole_store, store_p
 
 
 @pytest.mark.parametrize("where", ["before the mark", "in the mark"])
-def test_stopped_about_the_mark(study, whole_store, store_path, monkeypatch, where):
-    """Interrupted between a chunk's arrays and its mark, or before the mark takes the place of the old one."""
+def test_stopped_before_or_during_the_completion_mark(study, whole_store, store_path, monkeypatch, where):
+    """Interrupted between a chunk's arrays and its completion mark, or before the mark replaces the old one."""
 
     def stop(*arguments):
         raise KeyboardInterrupt
@@ -122,7 +122,7 @@ def test_a_full_disk_keeps_finished_chunks(study, whole_store, store_path, monke
 
 
 def test_a_file_size_limit_keeps_finished_chunks(study, whole_store, store_path, watch_chunks):
-    """What the system does, not what it is made to: the last mark is too long by a little."""
+    """By a limit of the system: the last mark is slightly too long."""
     resource = pytest.importorskip("resource")
     earlier = resource.getrlimit(resource.RLIMIT_FSIZE)
     Store(study, store_path)
@@ -140,10 +140,10 @@ def test_a_file_size_limit_keeps_finished_chunks(study, whole_store, store_path,
     assert contents(store_path) == contents(whole_store)
 
 
-def test_no_room_for_a_store(study, store_path):
+def test_no_space_for_a_store(study, store_path):
     resource = pytest.importorskip("resource")
     earlier = resource.getrlimit(resource.RLIMIT_FSIZE)
-    for limit in (20, 400):  # not for the lock, not for all of the store
+    for limit in (20, 400):  # neither for the lock nor for the complete store
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, earlier[1]))
         try:
             with pytest.raises(OSError, match=r"the study's store cannot be made \(File too large\)"):
@@ -153,7 +153,7 @@ def test_no_room_for_a_store(study, store_path):
         assert os.listdir(store_path.parent) == []
 
 
-def test_a_store_that_can_only_be_read(study, whole_store, monkeypatch):
+def test_a_read_only_store(study, whole_store, monkeypatch):
     def refusing(path, flags, *rest, **options):
         if flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
             raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
@@ -199,7 +199,7 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("damage", DAMAGED.values(), ids=DAMAGED)
-def test_a_damaged_store_is_not_called_another_study(study, whole_store, store_path, damage):
+def test_a_damaged_store_is_not_reported_as_another_study(study, whole_store, store_path, damage):
     shutil.copytree(whole_store, store_path)
     file = store_path / "zarr.json"
     file.write_bytes(damage(file.read_bytes()))
@@ -213,20 +213,20 @@ def test_a_damaged_store_is_not_called_another_study(study, whole_store, store_p
 @pytest.mark.slow
 def test_a_lost_worker_loses_nothing(study, whole_store, store_path):
     distributed = pytest.importorskip("distributed")
-    told = []
+    chunks = []
     with (
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
 
         def kill_one(now):
-            told.append(now.chunks)
+            chunks.append(now.chunks)
             if now.chunks == 1:
                 busy = max(client.processing().items(), key=lambda item: len(item[1]))[0]
                 pids = client.run(os.getpid, workers=[busy])
                 os.kill(pids[busy], signal.SIGKILL)
 
         data = run_study(study, store_path, client=client, progress=kill_one)
-    assert told == [0, 1, 2, 3]
+    assert chunks == [0, 1, 2, 3]
     assert data.finished.all()
     assert contents(store_path) == contents(whole_store)

@@ -1,4 +1,4 @@
-"""One process at a time writes a store: owners are named, dead ones seen through, what they left is cleared."""
+"""Only one process at a time writes a store: lock owners are named, dead ones detected, and leftovers removed."""
 
 import json
 import os
@@ -30,7 +30,7 @@ with locked(Path(sys.argv[1]), "study"):
 
 @pytest.fixture
 def lock_file(store_path):
-    """Where the lock of the store is."""
+    """Path of the store's lock."""
     return store_path.with_name(".study.zarr.lock")
 
 
@@ -46,15 +46,15 @@ def other_process(store_path):
 
 
 def signed(lock_file, **owner):
-    """A lock that says this of its owner, as if left behind."""
-    said = {"pid": 4242, "host": "elsewhere", "boot": "another", "since": "2026-01-02 03:04:05+00:00"} | owner
-    lock_file.write_text(json.dumps(said))
+    """A lock with this text about its owner, as if left behind."""
+    owner_record = {"pid": 4242, "host": "elsewhere", "boot": "another", "since": "2026-01-02 03:04:05+00:00"} | owner
+    lock_file.write_text(json.dumps(owner_record))
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
-def test_another_process_is_named_and_a_dead_one_seen_through(study, store_path, lock_file, other_process):
-    told = rf"^{re.escape(str(store_path))} is being written by process {other_process.pid} since \d{{4}}-\d\d-\d\d "
-    with pytest.raises(ValueError, match=told):
+def test_a_running_owner_is_named_and_a_dead_one_detected(study, store_path, lock_file, other_process):
+    message = rf"^{re.escape(str(store_path))} is being written by process {other_process.pid} since \d{{4}}-\d\d-\d\d "
+    with pytest.raises(ValueError, match=message):
         run_study(study, store_path)
     assert not store_path.exists()
     other_process.send_signal(signal.SIGKILL)
@@ -65,7 +65,7 @@ def test_another_process_is_named_and_a_dead_one_seen_through(study, store_path,
     assert not lock_file.exists()
 
 
-def test_reading_needs_no_lock_and_writing_twice_is_refused(study, whole_store, lock_file):
+def test_reading_needs_no_lock_and_a_second_writer_is_refused(study, whole_store, lock_file):
     with locked(whole_store, "study"):
         assert study_progress(study, whole_store).chunks == 3
         assert open_results(study, whole_store).finished.all()
@@ -84,7 +84,7 @@ def test_a_link_to_a_store_has_its_lock(store_path, whole_store):
         pass
 
 
-def test_another_machines_lock_says_how_to_be_rid_of_it(study, whole_store):
+def test_a_lock_of_another_machine_explains_how_to_remove_it(study, whole_store):
     lock_file = whole_store.with_name(f".{whole_store.name}.lock")
     signed(lock_file)
     with pytest.raises(
@@ -99,12 +99,12 @@ def test_another_machines_lock_says_how_to_be_rid_of_it(study, whole_store):
 @pytest.mark.parametrize(
     "left", ["nothing", "no JSON", "a list", "before this machine started", "another name of this machine"]
 )
-def test_locks_left_behind_are_taken_over(store_path, lock_file, left):
+def test_abandoned_locks_are_taken_over(store_path, lock_file, left):
     if left == "before this machine started":
         signed(lock_file, host=lock_module.platform.node())
     elif left == "another name of this machine":
         if not lock_module.boot():
-            pytest.skip("this system does not tell its runs apart")
+            pytest.skip("this system does not distinguish its boots")
         signed(lock_file, boot=lock_module.boot())
     else:
         lock_file.write_text({"nothing": "", "no JSON": "{" * 5000, "a list": "[1]"}[left])
@@ -112,7 +112,7 @@ def test_locks_left_behind_are_taken_over(store_path, lock_file, left):
         assert json.loads(lock_file.read_text())["pid"] == os.getpid()
 
 
-def test_where_the_system_locks_no_files(store_path, lock_file, monkeypatch):
+def test_on_file_systems_without_locks(store_path, lock_file, monkeypatch):
     monkeypatch.setattr(lock_module, "fcntl", None)
     signed(lock_file, host=lock_module.platform.node(), pid=os.getpid())
     with (
@@ -127,7 +127,7 @@ def test_where_the_system_locks_no_files(store_path, lock_file, monkeypatch):
         assert json.loads(lock_file.read_text())["pid"] == os.getpid()
 
 
-def test_a_link_is_not_written_through(store_path, lock_file, tmp_path):
+def test_a_link_is_not_followed_for_writing(store_path, lock_file, tmp_path):
     (tmp_path / "letter.txt").write_text("dear")
     lock_file.symlink_to(tmp_path / "letter.txt")
     with pytest.raises(OSError, match="the study's store cannot be made"), locked(store_path, "study"):
@@ -135,7 +135,7 @@ def test_a_link_is_not_written_through(store_path, lock_file, tmp_path):
     assert (tmp_path / "letter.txt").read_text() == "dear"
 
 
-def test_what_killed_runs_have_left_is_cleared(study, whole_store, store_path):
+def test_leftovers_of_killed_runs_are_removed(study, whole_store, store_path):
     run_study(study, store_path)
     beside, inside = store_path.parent, store_path / "sensitivity" / "c" / "0"
     (beside / ".study.zarr.4242.tmp").write_text("{")
@@ -154,7 +154,7 @@ def test_what_killed_runs_have_left_is_cleared(study, whole_store, store_path):
     ]
 
 
-def test_nothing_is_cleared_of_what_is_no_store(study, store_path):
+def test_nothing_is_removed_from_a_folder_that_is_no_store(study, store_path):
     store_path.mkdir()
     (store_path / "film.partial").write_text("mine")
     with pytest.raises(ValueError, match="holds no study"):
@@ -163,7 +163,7 @@ def test_nothing_is_cleared_of_what_is_no_store(study, store_path):
     assert os.listdir(store_path.parent) == ["study.zarr"]
 
 
-def test_a_clock_set_back_does_no_harm(study, whole_store, store_path, monkeypatch):
+def test_a_clock_that_was_set_back_does_no_harm(study, whole_store, store_path, monkeypatch):
     now = [2e9]
 
     def backwards():

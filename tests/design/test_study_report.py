@@ -1,4 +1,4 @@
-"""The report: one page that needs nothing else, and holds what was asked for and found."""
+"""The report: one self-contained page with the configuration and the results."""
 
 import base64
 import re
@@ -33,7 +33,7 @@ def folder(tmp_path_factory):
 
 
 class Page(HTMLParser):
-    """Tags, their sources, and the text in them."""
+    """Tags, their sources, and their text."""
 
     def __init__(self, text):
         super().__init__()
@@ -52,7 +52,7 @@ class Page(HTMLParser):
             self.heads.append(data)
 
 
-def test_the_page_needs_nothing_else_and_escapes_all(folder):
+def test_the_page_is_self_contained_and_escapes_all_text(folder):
     text = (folder / "study.html").read_text("utf-8")
     page = Page(text)
     assert not {"script", "link", "iframe", "b"} & set(page.tags)
@@ -68,7 +68,7 @@ def test_the_page_needs_nothing_else_and_escapes_all(folder):
     assert "inside <b>or</b> around" in page.text
 
 
-def test_the_table_holds_what_was_found(folder):
+def test_the_table_contains_the_results(folder):
     study = read_study(folder / "study.toml")
     page, data = Page((folder / "study.html").read_text("utf-8")), open_results(study, folder / "study.zarr")
     assert page.tags.count("tr") == 3
@@ -80,7 +80,7 @@ def test_the_table_holds_what_was_found(folder):
     assert "2 of 2 points finished" in page.text
 
 
-def test_the_panels_of_scores_are_in_the_unit_of_the_maps(folder):
+def test_the_panels_of_scores_have_the_unit_of_the_maps(folder):
     data = open_results(read_study(folder / "study.toml"), folder / "study.zarr")
     panels = {axes.get_title(): axes for axes in pictures.draw_scores(data).axes}
     assert set(panels) == {"least sensitivity (mV)", "mean sensitivity (mV)", "uniformity"}
@@ -88,7 +88,7 @@ def test_the_panels_of_scores_are_in_the_unit_of_the_maps(folder):
     np.testing.assert_allclose(drawn, 1e3 * data.minimum.values)
 
 
-def test_a_half_finished_study_is_reported_without_what_is_missing(folder, tmp_path):
+def test_the_report_of_an_unfinished_study_omits_what_is_missing(folder, tmp_path):
     study = read_study(folder / "study.toml")
     store = Store(study, tmp_path / "half.zarr")
     with pytest.raises(ValueError, match=r"no chunk of the study is finished.*resume"):
@@ -103,7 +103,7 @@ def test_a_half_finished_study_is_reported_without_what_is_missing(folder, tmp_p
     assert [file.name for file in tmp_path.iterdir() if file.name.startswith(".")] == []
 
 
-def test_what_is_infinite_stands_in_table_and_picture(folder, tmp_path):
+def test_infinite_values_are_in_table_and_figure(folder, tmp_path):
     study = read_study(folder / "study.toml")
     store, data = Store(study, tmp_path / "study.zarr"), open_results(study, folder / "study.zarr")
     store.write(0, {name: np.asarray(data[name])[:1] for name in data.data_vars} | {"uniformity": np.array([np.inf])})
@@ -116,7 +116,7 @@ def test_what_is_infinite_stands_in_table_and_picture(folder, tmp_path):
     assert marked == {"^": [0]}
 
 
-def test_titles_tell_what_differs(tmp_path):
+def test_titles_contain_the_differences(tmp_path):
     varied = (
         TEXT.replace("diameter_mm = 10", "diameter_mm = [8, 10]")
         .replace('protocol = "adjacent"', 'protocol = "two-terminal"\npairs = [0, 9]\nnoise_V = [1e-6, 2e-6]')

@@ -1,4 +1,4 @@
-"""What a study finds is what maps and scores find one at a time, in batches, on layers, and on two devices."""
+"""A study's results equal maps and scores computed one at a time, in batches, on layers, and on two devices."""
 
 import os
 
@@ -38,8 +38,8 @@ MESH, GRID = rectangle(0.1, 0.08, cell_size=8e-3), touch_grid(Rectangle(0.1, 0.0
 
 
 @pytest.mark.slow
-def test_results_are_those_of_one_map_at_a_time(study, whole_store):
-    """Of the nearest pairs of each layout."""
+def test_results_equal_those_of_one_map_at_a_time(study, whole_store):
+    """For the nearest pairs of each layout."""
     data = open_results(study, whole_store)
     prior = TouchPrior.create(GRID.places, correlation=20e-3)
     for number, point in enumerate(study.points):
@@ -83,7 +83,7 @@ def results(tmp_path):
 
 
 def model_of(point) -> ForwardModel:
-    """Of a skin as a sheet, or a layer, and its ten nearest pairs."""
+    """Model of a skin as a sheet or a layer, and its ten nearest pairs."""
     centres = point.layout.centres
     protocol = two_terminal(8).subset(np.sort(nearest_pairs(centres, 10)))
     if not point.layers:
@@ -93,7 +93,7 @@ def model_of(point) -> ForwardModel:
 
 
 @pytest.mark.slow
-def test_a_layer_is_touched_on_its_top(results):
+def test_a_layer_is_touched_at_its_top(results):
     found = results(skin='model = "layer"', mesh="layers = 2")
     for point, values in found:
         theta = sensitivity_map(model_of(point), 0.5, GRID, linear=True)
@@ -101,7 +101,7 @@ def test_a_layer_is_touched_on_its_top(results):
 
 
 @pytest.mark.slow
-def test_exact_maps_of_layers_are_those_of_a_comparison(results):
+def test_exact_maps_of_layers_equal_those_of_a_comparison(results):
     lines = {"skin": 'model = "layer"', "mesh": "layers = 3", "touch": "exact = true"}
     for point, values in results(**lines):
         skin = Skin.create(
@@ -126,8 +126,8 @@ def test_conducting_touches_of_a_sheet(results, exact):
         np.testing.assert_allclose(values, np.linalg.norm(found, axis=1), rtol=1e-8)
 
 
-def test_a_place_that_cannot_be_told_is_infinite_and_counted(study, store_path, monkeypatch):
-    """Two voltages, measured again and again, for a place and an amplitude."""
+def test_the_error_at_a_place_that_is_not_determined_is_infinite_and_counted(study, store_path, monkeypatch):
+    """Two voltages, measured repeatedly, for a place and an amplitude."""
     measured = Point.measured
 
     def two(point, current):
@@ -144,7 +144,7 @@ def test_a_place_that_cannot_be_told_is_infinite_and_counted(study, store_path, 
 
 
 def compiled(study, *scores) -> str:
-    """The program of two points of a study, for its own scores or others."""
+    """The program for two points of a study, with its own scores or others."""
     shared, skin = batch._shared_data(study, study.points[0].shape), batch._point_data(study.points[0], study.current)
     options = {"num_taxels": study.num_taxels, "threshold": study.threshold, "num_devices": 1}
     lowered = batch._solve_batch.lower(shared, batch._stack_trees([skin] * 2), scores=scores or study.scores, **options)
@@ -170,7 +170,7 @@ run_study(read_study(sys.argv[1]), sys.argv[2])
 
 
 @pytest.mark.slow
-def test_two_devices_give_the_same(study, study_file, whole_store, store_path):
+def test_two_devices_give_the_same_results(study, study_file, whole_store, store_path):
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
     ended = in_another_process(TWO_DEVICES, study_file, store_path, XLA_FLAGS=flags, JAX_PLATFORMS="cpu")
     assert ended.returncode == 0, ended.stderr

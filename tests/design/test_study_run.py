@@ -1,4 +1,4 @@
-"""How studies run: into a store that xarray opens, with progress, and refused before anything runs."""
+"""Running studies: into a store that xarray opens, with progress, and with errors before anything runs."""
 
 import sys
 
@@ -32,38 +32,38 @@ def test_xarray_opens_the_store(study, whole_store):
 
 def test_a_finished_study_is_not_run_again(study, whole_store, watch_chunks):
     before, solved = contents(whole_store), watch_chunks()
-    told = []
-    run_study(study, whole_store, progress=told.append)
+    reports = []
+    run_study(study, whole_store, progress=reports.append)
     assert solved == []
     assert contents(whole_store) == before
-    assert [(now.points, now.chunks) for now in told] == [(6, CHUNKS)]
+    assert [(now.points, now.chunks) for now in reports] == [(6, CHUNKS)]
 
 
-def test_progress_counts_up_and_says_the_time_left(study, store_path):
-    told = []
-    run_study(study, store_path, progress=told.append)
-    assert [now.points for now in told] == [0, 2, 4, 6]
-    assert [now.chunks for now in told] == [0, 1, 2, 3]
-    assert {(now.all_points, now.all_chunks) for now in told} == {(6, CHUNKS)}
-    assert told[0].seconds_left is None
-    assert told[1].seconds_left > 0
-    assert told[-1].seconds_left == 0
-    assert study_progress(study, store_path)[:4] == told[-1][:4]
+def test_progress_counts_up_and_estimates_the_remaining_time(study, store_path):
+    reports = []
+    run_study(study, store_path, progress=reports.append)
+    assert [now.points for now in reports] == [0, 2, 4, 6]
+    assert [now.chunks for now in reports] == [0, 1, 2, 3]
+    assert {(now.all_points, now.all_chunks) for now in reports} == {(6, CHUNKS)}
+    assert reports[0].seconds_left is None
+    assert reports[1].seconds_left > 0
+    assert reports[-1].seconds_left == 0
+    assert study_progress(study, store_path)[:4] == reports[-1][:4]
 
 
-def test_exact_maps_are_told_one_by_one_and_resumed_to_the_same_store(tmp_path, store_path, watch_chunks):
-    """Of touches that conduct; one map against a model of its own."""
+def test_exact_maps_are_reported_one_by_one_and_resumed_to_the_same_store(tmp_path, store_path, watch_chunks):
+    """Of conducting touches. One map against a model of its own."""
     text = changed(touch="exact = true\ncontrast = 5") + '[scores]\nwanted = "mean"'
     (tmp_path / "exact.toml").write_text(text, "utf-8")
-    study, told = read_study(tmp_path / "exact.toml"), []
-    found = run_study(study, store_path, progress=told.append)
+    study, reports = read_study(tmp_path / "exact.toml"), []
+    found = run_study(study, store_path, progress=reports.append)
     point, plane = study.points[1], rectangle(0.1, 0.08, cell_size=8e-3)
     model = ForwardModel(plane, SheetDiscs(point.layout.centres, 5e-3, 1e-3), point.measured(study.current))
     places = touch_grid(Rectangle(0.1, 0.08), 6, 5).places
     touched = touched_cells(plane, Bell(), places, thickness=point.thickness, contrast=5.0)
     exact = touch_changes(model, 0.5 * point.thickness, touched)
     np.testing.assert_allclose(found.sensitivity[1], np.linalg.norm(exact, axis=1), rtol=1e-8)
-    assert [(now.points, now.chunks) for now in told] == [(0, 0), (1, 0), (2, 1), (3, 1), (4, 2)]
+    assert [(now.points, now.chunks) for now in reports] == [(0, 0), (1, 0), (2, 1), (3, 1), (4, 2)]
 
     def stop(now):
         if now.points == 3:
@@ -78,7 +78,7 @@ def test_exact_maps_are_told_one_by_one_and_resumed_to_the_same_store(tmp_path, 
     assert contents(tmp_path / "stopped.zarr") == contents(store_path)
 
 
-def test_other_stores_are_refused_and_left_alone(study, whole_store, store_path, study_file):
+def test_other_stores_are_refused_and_unchanged(study, whole_store, store_path, study_file):
     (study_file.parent / "other.toml").write_text(SWEEP.replace("[5, 8]", "[5, 9]"), "utf-8")
     before = contents(whole_store)
     with pytest.raises(ValueError, match="holds the results of another study"):
@@ -93,7 +93,7 @@ def test_other_stores_are_refused_and_left_alone(study, whole_store, store_path,
         open_results(study, store_path / "none")
 
 
-def test_an_unwritable_store_is_said_before_anything_runs(study, tmp_path, watch_chunks):
+def test_an_unwritable_store_is_reported_before_anything_runs(study, tmp_path, watch_chunks):
     (tmp_path / "file").write_text("in the way")
     solved = watch_chunks()
     with pytest.raises(OSError, match="the study's store cannot be made"):
@@ -101,8 +101,8 @@ def test_an_unwritable_store_is_said_before_anything_runs(study, tmp_path, watch
     assert solved == []
 
 
-def test_electrodes_too_small_for_their_mesh_are_refused_when_read(study_file):
-    """By the limit that skins have: what is read can be run."""
+def test_electrodes_too_small_for_their_mesh_are_refused_on_reading(study_file):
+    """With the limit that skins have: a study that can be read can be run."""
     text = SWEEP.replace("diameter_mm = 10", "diameter_mm = 2.1")
     (study_file.parent / "small.toml").write_text(text, "utf-8")
     with pytest.raises(

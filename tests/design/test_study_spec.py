@@ -1,4 +1,4 @@
-"""Study files: what a sweep is, and everything that is refused before anything runs."""
+"""Study files: the definition of a sweep, and errors raised before anything runs."""
 
 import pickle
 import re
@@ -55,7 +55,7 @@ def test_a_sweep_is_the_product_of_its_lists(read):
     assert study.points[-1].thickness == pytest.approx(10e-3)
 
 
-def test_chunks_hold_every_point_once_and_one_shape(read):
+def test_chunks_contain_every_point_once_and_one_shape(read):
     text = 'chunk_points = 4\n[electrodes]\nlayouts = ["grid-4x4", "inner-12", "perimeter-16"]\ndiameter_mm = [6, 7, 8]'
     study = read(text)
     assert sorted(index for chunk in study.chunks for index in chunk) == list(range(9))
@@ -77,7 +77,7 @@ def test_generated_layouts_fill_the_skin_of_the_study(read):
     assert [len(edge), len(inner)] == [16, 9]
 
 
-def test_files_lie_beside_the_study_and_keep_their_own_sizes(read, tmp_path):
+def test_files_are_relative_to_the_study_and_keep_their_own_sizes(read, tmp_path):
     centres = grid(0.1, 0.1, 3, 3)
     write_layout(Layout(centres, 9e-3, contact_impedance=0.02, outline=Rectangle(0.2, 0.2)), tmp_path / "mine.csv")
     write_layout(Layout(centres, 9e-3, outline=Rectangle(0.2, 0.2)), tmp_path / "mine.svg")
@@ -92,7 +92,7 @@ def test_files_lie_beside_the_study_and_keep_their_own_sizes(read, tmp_path):
         read(text + "[skin]\nwidth_mm = 300\nheight_mm = 200")
 
 
-def test_touches_are_those_of_the_library(read):
+def test_touches_equal_those_of_the_library(read):
     assert read(one()).indentation == Bell()
     study = read(one(rest='[touch]\nindentation = "hemisphere"\ndepth_mm = 2'))
     assert study.indentation == Hemisphere(2e-3, 15e-3)
@@ -110,7 +110,7 @@ def test_a_study_s_defaults_are_those_of_a_skin(read):
         np.testing.assert_array_equal(point.measured(defaults.CURRENT).drive, protocol.drive)
 
 
-def test_a_fingerprint_tells_what_decides_the_results(read, tmp_path):
+def test_a_fingerprint_depends_on_everything_that_determines_the_results(read, tmp_path):
     base = read(one())
     assert base == read("# a remark\nname = 'other'\n" + one())
     assert pickle.loads(pickle.dumps(base)) == base
@@ -291,7 +291,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("text", "message"), REFUSED.values(), ids=REFUSED)
-def test_refused_naming_the_key_and_what_to_do(read, text, message):
+def test_errors_name_the_key_and_the_remedy(read, text, message):
     with pytest.raises(ValueError, match=message):
         read(text)
 

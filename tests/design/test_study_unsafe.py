@@ -1,4 +1,4 @@
-"""Stores from somebody else: nothing that they hold runs, and the error is kind."""
+"""Untrusted stores: nothing that they contain is executed, and the error explains why."""
 
 import json
 import os
@@ -36,7 +36,7 @@ FORMAT_2 = {
 
 
 class Touch:
-    """Makes a file when it is unpickled."""
+    """Creates a file when it is unpickled."""
 
     def __init__(self, path):
         self.path = path
@@ -46,7 +46,7 @@ class Touch:
 
 
 class PlantedCodec(zarr.codecs.BytesCodec):
-    """A codec of format 3 that is registered on this machine, and makes a file when a store asks for it."""
+    """A codec of format 3 that is registered here, and creates a file when a store requests it."""
 
     made = pathlib.Path()
 
@@ -58,8 +58,8 @@ class PlantedCodec(zarr.codecs.BytesCodec):
 
 @pytest.fixture
 def ran(tmp_path, monkeypatch) -> pathlib.Path:
-    """The file that is there once something ran."""
-    # numcodecs below 0.16.6 unpickles without being asked.
+    """The file that exists once something was executed."""
+    # numcodecs below 0.16.6 unpickles by default.
     monkeypatch.setattr(numcodecs.pickles, "ALLOW_UNSAFE_PICKLE_DECODE", True, raising=False)
     monkeypatch.setattr(PlantedCodec, "made", tmp_path / "ran")
     for name in ("numcodecs.pickle", "planted"):
@@ -69,7 +69,7 @@ def ran(tmp_path, monkeypatch) -> pathlib.Path:
 
 @pytest.fixture
 def planted(whole_store, store_path, ran) -> pathlib.Path:
-    """A good store, and pickles beside what it holds."""
+    """A valid store with pickles beside its content."""
     shutil.copytree(whole_store, store_path)
     touches = np.array([Touch(ran)] * 6, dtype=object)
     for name in ("layout", "minimum"):
@@ -172,7 +172,7 @@ PLANTS = (
 
 
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.__name__)
-def test_what_might_run_or_lead_elsewhere_is_not_opened(study, planted, ran, plant):
+def test_content_that_might_execute_or_lead_elsewhere_is_not_opened(study, planted, ran, plant):
     plant(planted)
     for use in USES.values():
         with pytest.raises(
@@ -182,7 +182,7 @@ def test_what_might_run_or_lead_elsewhere_is_not_opened(study, planted, ran, pla
     assert not ran.exists()
 
 
-def test_a_store_of_format_2_alone_is_no_study(study, planted, ran):
+def test_a_store_of_format_2_alone_is_not_a_study(study, planted, ran):
     a_whole_store_of_format_2(planted)
     (planted / "zarr.json").unlink()
     for use in USES.values():
@@ -214,7 +214,7 @@ def test_arrays_other_than_those_of_the_study_are_damage(study, planted, change,
         open_results(study, planted)
 
 
-def test_arrays_that_are_too_many_or_lack_are_damage(study, planted):
+def test_missing_or_additional_arrays_are_damage(study, planted):
     shutil.copytree(planted / "minimum", planted / "more")
     with pytest.raises(ValueError, match=r"not those of its contents: 'more'.*the store is damaged"):
         open_results(study, planted)
@@ -225,12 +225,12 @@ def test_arrays_that_are_too_many_or_lack_are_damage(study, planted):
 
 
 @pytest.mark.parametrize("file", ["zarr.json", "minimum/zarr.json"])
-def test_metadata_nested_too_deep_are_damage(study, planted, file):
+def test_deeply_nested_metadata_are_damage(study, planted, file):
     (planted / file).write_text('{"a":' * 10**5 + "1" + "}" * 10**5)
     with pytest.raises(ValueError, match=r"nested too deep.*the store is damaged"):
         open_results(study, planted)
 
 
-def test_a_good_store_is_opened(study, planted, ran):
+def test_a_valid_store_is_opened(study, planted, ran):
     assert open_results(study, planted).finished.values.all()
     assert not ran.exists()

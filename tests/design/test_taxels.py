@@ -1,4 +1,4 @@
-"""Virtual taxels: against angles worked out by hand, sums in NumPy, and what inner electrodes must do for a skin."""
+"""Virtual taxels: against angles computed by hand, sums in NumPy, and the effect that interior electrodes must have."""
 
 from functools import partial
 
@@ -16,8 +16,11 @@ CELL = (SIDE / 16) ** 2
 
 
 def two_terminal_changes(electrodes, pairs=40):
-    """Changes (256, pairs) on an infinite sheet: at each place the squared field of the nearest pairs of electrodes,
-    each a source and a sink, softened within 10 mm of them."""
+    """Changes (256, pairs) on an infinite sheet.
+
+    At each place: the squared field of the nearest pairs of electrodes, each a source and a sink, softened within 10 mm
+    of them.
+    """
     first, second = np.triu_indices(len(electrodes), 1)
     nearest = np.argsort(np.linalg.norm(electrodes[first] - electrodes[second], axis=1), kind="stable")[:pairs]
     away = PLACES[:, None] - electrodes
@@ -47,7 +50,7 @@ def found(layouts):
 
 
 def test_areas_are_those_of_an_angle():
-    """Changes that turn by 20 rad/m along a strip, whatever their length: a taxel is ± arccos 0.7 wide."""
+    """Changes that rotate by 20 rad/m along a strip, at any length: a taxel is ± arccos 0.7 wide."""
     x = (np.arange(128) + 0.5) * SIDE / 128
     places = np.column_stack([np.repeat(x, 2), np.tile([0.0, 0.01], 128)])
     angle = 20 * places[:, 0]
@@ -65,7 +68,7 @@ def test_areas_are_those_of_an_angle():
 
 
 def test_figures_are_sums_over_places(layouts, found):
-    """All of them worked out again, in loops, from the labels alone."""
+    """All of them recomputed, in loops, from the labels alone."""
     changes, taxels = layouts[1], found[1]
     labels = np.asarray(taxels.labels)
     assert set(labels) == set(range(20))
@@ -88,7 +91,7 @@ def test_figures_are_sums_over_places(layouts, found):
     assert float(taxels.two_point_discrimination) == pytest.approx(np.mean(np.sqrt(4 * np.array(areas) / np.pi)))
 
 
-def test_cells_of_unlike_areas_are_weighed(layouts, found):
+def test_cells_of_unequal_areas_are_weighted(layouts, found):
     area = np.random.default_rng(0).uniform(0.5, 1.5, 256) * CELL
     taxels = find_taxels(layouts[0], PLACES, area, num_taxels=20, key=jax.random.key(0))
     np.testing.assert_array_equal(taxels.members, found[0].members)
@@ -98,8 +101,8 @@ def test_cells_of_unlike_areas_are_weighed(layouts, found):
     np.testing.assert_allclose(taxels.positions[3], area[inside] @ PLACES[inside] / area[inside].sum())
 
 
-def test_electrodes_inside_make_smaller_taxels(found):
-    """As in the paper: by a clear margin, of more even sizes, and with less overlap."""
+def test_interior_electrodes_make_smaller_taxels(found):
+    """As in the paper: by a clear margin, with more uniform sizes and less overlap."""
     inner, outer = found
     assert float(inner.mean_area) < 0.7 * float(outer.mean_area)
     assert float(inner.std_area) < 0.7 * float(outer.std_area)
@@ -120,8 +123,8 @@ def test_units_of_voltage_do_not_matter(layouts, found):
     np.testing.assert_allclose(taxels.similarity, found[0].similarity, rtol=1e-10)
 
 
-def test_directions_do_not_know_how_sensitive_places_are(layouts):
-    """A skin pressed harder in some places: as they are, the changes fall into other clusters; scaled, they do not."""
+def test_directions_do_not_depend_on_the_sensitivity_of_places(layouts):
+    """A skin pressed harder in some places: unscaled changes form other clusters, scaled ones do not."""
     harder = np.random.default_rng(1).uniform(0.3, 3, (256, 1)) * layouts[0]
     options = {"num_taxels": 20, "key": jax.random.key(0)}
 
@@ -139,7 +142,7 @@ def test_directions_do_not_know_how_sensitive_places_are(layouts):
     assert not np.array_equal(even.labels, uneven.labels)
 
 
-def test_silent_places_are_in_no_taxel(layouts):
+def test_insensitive_places_are_in_no_taxel(layouts):
     changes = layouts[0].copy()
     changes[[5, 200]] = 0
     taxels = find_taxels(changes, PLACES, CELL, num_taxels=20, key=jax.random.key(0))
@@ -148,7 +151,7 @@ def test_silent_places_are_in_no_taxel(layouts):
 
 
 @pytest.mark.slow
-def test_a_batch_of_layouts_gives_what_a_loop_gives(layouts, found):
+def test_a_batch_of_layouts_equals_a_loop(layouts, found):
     keys = jnp.stack([jax.random.key(0)] * 2)
 
     def find(changes, key):
@@ -165,7 +168,7 @@ def test_a_batch_of_layouts_gives_what_a_loop_gives(layouts, found):
 
 
 def test_similarity_has_a_derivative(layouts):
-    """Along the gradient against a central difference, clusters held; a silent place, which has no direction, too."""
+    """The gradient against a central difference, with fixed clusters and an insensitive place, without a direction."""
     changes = 1e6 * layouts[0]
     changes[5] = 0
 
@@ -176,7 +179,7 @@ def test_similarity_has_a_derivative(layouts):
         return jnp.mean(taxels.similarity**2), taxels.labels
 
     (_, labels), slope = mean_square(changes)
-    # The direction of a silent place is not continuous.
+    # The direction of an insensitive place is not continuous.
     steepest = np.array(slope) / np.linalg.norm(slope)
     steepest[5] = 0
     step = 1e-3
@@ -205,7 +208,7 @@ def test_similarity_has_a_derivative(layouts):
         ("places in metres and cell_area in m²", {"cell_area": 1e4 * CELL}),
     ],
 )
-def test_refuses_what_makes_no_sense(match, change):
+def test_refuses_bad_input(match, change):
     arguments = {"changes": np.ones((256, 4)), "places": PLACES, "cell_area": CELL, "num_taxels": 9}
     with pytest.raises(ValueError, match=match):
         find_taxels(**(arguments | {"key": jax.random.key(0)} | change))

@@ -1,4 +1,4 @@
-"""Changes of voltages by touches: equal to solving the model anew, and to first order to the Jacobian's."""
+"""Changes of voltages by touches: equal to a new solution of the model, and to first order to the Jacobian's."""
 
 import equinox as eqx
 import jax
@@ -39,7 +39,7 @@ def models():
 
 
 def anew(model, conductivity, touched):
-    """The straightforward way: the model solved for every touch; what is cut off keeps a billionth."""
+    """The direct way: the model solved for every touch. Removed material keeps a billionth of its conductivity."""
     before = np.asarray(model.voltages(conductivity))
     found = []
     for cells, change in zip(np.asarray(touched.cells), np.asarray(touched.change), strict=True):
@@ -68,7 +68,7 @@ BALL = Hemisphere(depth=3e-3, diameter=20e-3)
     ],
     ids=["sheet", "a ball", "points", "layer", "bell on a layer", "smooth layer", "conductor", "conjugate gradients"],
 )
-def test_exact_changes_are_those_of_solving_anew(kind, indentation, options, models):
+def test_exact_changes_equal_a_new_solution(kind, indentation, options, models):
     model = models[kind]
     conductivity = 0.5 + 0.4 * np.random.default_rng(0).random(model.mesh.num_cells)
     touched = touched_cells(model.mesh, indentation, PLACES, **options)
@@ -86,8 +86,8 @@ def test_touches_scale_the_tensors_of_a_stretched_sheet(models):
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
-def test_a_touch_that_is_found_at_once_waits_for_a_slow_one(models):
-    """Some change or cut off few cells; the others' conductivities are seven orders of magnitude apart."""
+def test_a_touch_that_converges_at_once_waits_for_a_slow_one(models):
+    """Some change or remove few cells. The others' conductivities are seven orders of magnitude apart."""
     model, draw = models["sheet"], np.random.default_rng(0)
     touched = touched_cells(model.mesh, Bell(), PLACES, **SHEET)  # of the sizes of others, for their program
     reached = np.asarray(touched.change) != 0
@@ -103,8 +103,8 @@ def test_a_touch_that_is_found_at_once_waits_for_a_slow_one(models):
 
 
 @pytest.mark.slow
-def test_nearly_cut_off_layers_are_exact(models):
-    """A smooth edge leaves cells any fraction of their conductivity, down to millionths."""
+def test_nearly_removed_layers_are_exact(models):
+    """A smooth edge leaves cells with any fraction of their conductivity, down to millionths."""
     model = models["layer"]
     conductivity = np.full(model.mesh.num_cells, 0.5)
     for indentation in (Bell(), Bell(depth=5e-3), BALL):
@@ -115,7 +115,7 @@ def test_nearly_cut_off_layers_are_exact(models):
 
 
 @pytest.mark.slow
-def test_touches_that_are_not_found_are_an_error(models, monkeypatch):
+def test_touches_that_do_not_converge_are_an_error(models, monkeypatch):
     monkeypatch.setattr("jeit.design.skin.voltage_changes._MAX_STEPS", 1)
     model = models["sheet"]
     touched = touched_cells(model.mesh, Bell(), np.array([[0.01, 0.02], [0.0, 0.0], [0.02, 0.0]]), **SHEET)
@@ -123,7 +123,7 @@ def test_touches_that_are_not_found_are_an_error(models, monkeypatch):
         touch_changes(model, 0.5, touched)
 
 
-def test_conductors_that_drown_the_voltages_in_rounding_are_an_error(models):
+def test_conductors_that_leave_only_rounding_errors_are_an_error(models):
     model = models["sheet"]
     changes = [
         touch_changes(model, 0.5, touched_cells(model.mesh, Bell(), PLACES, contrast=c, **SHEET)) for c in (1e5, 1e6)
@@ -135,7 +135,7 @@ def test_conductors_that_drown_the_voltages_in_rounding_are_an_error(models):
         touch_changes(model, 0.5, harder)
 
 
-def test_exact_changes_are_not_traced(models):
+def test_exact_changes_cannot_be_traced(models):
     model = models["sheet"]
     touched = touched_cells(model.mesh, Bell(), PLACES, **SHEET)
     with pytest.raises(ValueError, match="cannot be traced"):
@@ -160,7 +160,7 @@ def test_touches_of_another_mesh_are_refused(models):
 
 
 def test_small_touches_are_linear(models):
-    """What is left beyond the Jacobian falls with the square of the touch."""
+    """The remainder beyond the Jacobian falls with the square of the touch."""
     model = models["sheet"]
     left = []
     for depth in (1e-4, 2e-4):
@@ -193,8 +193,8 @@ def test_linear_changes_have_derivatives_in_electrode_positions_and_batch(models
     np.testing.assert_allclose(slopes[0], difference, atol=1e-6 * np.abs(difference).max())
 
 
-def test_touches_weaken_and_do_not_depend_on_their_order(models):
-    """An insulating touch raises every self-impedance; touches do not see each other."""
+def test_touches_reduce_conduction_and_do_not_depend_on_their_order(models):
+    """An insulating touch raises every self-impedance. Touches do not affect each other."""
     model = models["layer"]
     touched = touched_cells(model.mesh, BALL, PLACES)
     turned = touched_cells(model.mesh, BALL, PLACES[::-1])
@@ -203,7 +203,7 @@ def test_touches_weaken_and_do_not_depend_on_their_order(models):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"places": [[0.3, 0.0]]}, "1 of 1 touches change no cell"),
         ({"places": [0.0, 0.0]}, r"places must be \(n, 2\)"),
@@ -215,9 +215,9 @@ def test_touches_weaken_and_do_not_depend_on_their_order(models):
         ({"edge": -1e-3}, "edge"),
     ],
 )
-def test_bad_touches(change, said, models):
+def test_bad_touches(change, message, models):
     arguments = {"places": PLACES, **SHEET, **change}
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         touched_cells(models["sheet"].mesh, Bell(), arguments.pop("places"), **arguments)
 
 

@@ -1,4 +1,4 @@
-"""Meshes of the room, each made once: the same disk is imaged in most tests."""
+"""Meshes for these tests, each generated once: most tests image the same disk."""
 
 import pickle
 
@@ -11,7 +11,7 @@ MADE = {}
 
 @pytest.fixture(scope="module", autouse=True)
 def meshes_made_once():
-    """No test changes one: meshes are values."""
+    """No test changes a mesh: they are immutable."""
     make = preparation.body_mesh
 
     def made_once(*described, **named):

@@ -1,4 +1,4 @@
-"""The default method: linear where that is sound, solved for conductivity itself where it is not; and what it finds."""
+"""The default method: a linear image where that is sound, otherwise a nonlinear reconstruction, and what it detects."""
 
 import functools
 from contextlib import nullcontext
@@ -31,7 +31,7 @@ FEW = {"num_points": 450, "raster_shape": (128, 128)}
 
 @functools.cache
 def frame(factor: float = 1.0, *, noise: float = 1e-4, seed: int = 0) -> Measurement:
-    """A disk of a third of the tank's radius, so many times as conductive as the rest."""
+    """A disk of a third of the tank's radius, whose conductivity is `factor` times that of the rest."""
     inside = np.linalg.norm(CENTRES - [0.02, 0.01], axis=1) < RADIUS / 3
     voltages = np.asarray(TRUTH.voltages(np.where(inside, 0.02 * factor, 0.02)))
     voltages = voltages * (1 + noise * np.random.default_rng(seed).normal(size=voltages.shape))
@@ -47,7 +47,7 @@ def frame(factor: float = 1.0, *, noise: float = 1e-4, seed: int = 0) -> Measure
 
 @functools.cache
 def image(factor: float, **settings):
-    """The same settings are imaged once; no test changes what it gets."""
+    """The same settings are imaged once. No test changes the result."""
     return image_difference(frame(factor, seed=1), frame(), ImagingSettings(**{**FEW, **settings}))
 
 
@@ -58,8 +58,8 @@ def test_a_small_change_is_imaged_in_one_step():
     assert report_image(result)["reconstruction"]["why"] == result.why
 
 
-def test_sheets_are_imaged_with_one_thread_of_blas(monkeypatch):
-    """Whatever comes of it; solids, whose matrices are large, with all threads."""
+def test_sheets_are_imaged_with_one_blas_thread(monkeypatch):
+    """Even if imaging fails. Solids, whose matrices are large, use all threads."""
     entered = []
 
     def context():
@@ -68,7 +68,7 @@ def test_sheets_are_imaged_with_one_thread_of_blas(monkeypatch):
 
     monkeypatch.setattr(calibration, "one_thread_of_blas", context)
     image(20.0, method="one-step", raster_shape=(16, 16))
-    assert len(entered) == 2  # while it is calibrated, and while it is imaged
+    assert len(entered) == 2  # during calibration and during imaging
     with calibration.threads_for(cylinder(0.1, 0.1, cell_size=0.05)):
         assert len(entered) == 2
 
@@ -79,7 +79,7 @@ def test_a_sheet_has_no_columns():
 
 
 @pytest.mark.parametrize(("factor", "why"), [(20.0, "no longer linear"), (1e-3, "below -100 %")])
-def test_a_strong_change_is_solved_for(factor, why):
+def test_a_strong_change_is_reconstructed_nonlinearly(factor, why):
     result = image(factor)
     assert result.settings.method == "gauss-newton"
     assert why in result.why
@@ -88,7 +88,7 @@ def test_a_strong_change_is_solved_for(factor, why):
     assert np.linalg.norm(np.array(result.inclusions[0].centroid) - [0.02, 0.01]) < 0.04 * RADIUS
 
 
-def test_strong_bodies_are_outlined():
+def test_strong_bodies_have_outlines():
     result = image(20.0)
     assert result.shapes is not None
     (star,) = result.shapes.bodies
@@ -105,7 +105,7 @@ def test_strong_bodies_are_outlined():
     np.testing.assert_allclose(share, star.area / (np.pi * RADIUS**2), rtol=0.02)
 
 
-def test_weak_bodies_are_cut_out_of_an_image_of_few_pieces():
+def test_weak_bodies_are_segmented_from_an_image_of_few_components():
     result = image(1.05, segment=True)
     assert (result.settings.method, result.shapes) == ("total-variation", None)
     assert "bodies are weak" in result.why
@@ -113,7 +113,7 @@ def test_weak_bodies_are_cut_out_of_an_image_of_few_pieces():
 
 
 def test_every_inclusion_of_a_segmented_image_is_labelled():
-    """A body that shows a quarter as much as another of its sign is one nevertheless."""
+    """A body that shows a quarter of the contrast of another of its sign is also labelled."""
     near = [np.linalg.norm(CENTRES - place, axis=1) < 0.013 for place in ([0.028, 0], [-0.028, 0])]
     voltages = np.asarray(TRUTH.voltages(0.02 * np.where(near[0], 1.2, np.where(near[1], 1.09, 1.0))))
     one = frame()
@@ -129,8 +129,8 @@ def test_every_inclusion_of_a_segmented_image_is_labelled():
     np.testing.assert_allclose(labelled, [one.area for one in cut.inclusions[::-1]], rtol=0.05)
 
 
-def test_noise_damps_images_that_are_then_not_sound():
-    """A body that a sound image shows by a fifth: kept linear, unless noise is why it shows so little."""
+def test_noise_damps_images_which_then_are_not_sound():
+    """A body that a sound image shows at a fifth of its contrast: kept linear, unless noise is the reason."""
     pairs = (frame(1.15, seed=1), frame()), (frame(1.15, noise=1.5e-2, seed=2), frame())
     sound, noisy = (image_difference(*pair, ImagingSettings(**FEW, method="one-step")) for pair in pairs)
     shown = [float(np.abs(one.change).max() / one.calibration.conductivity) for one in (sound, noisy)]
@@ -145,7 +145,7 @@ def test_noise_damps_images_that_are_then_not_sound():
     assert "no longer linear" in faults[1]
 
 
-def test_sharp_outlines_are_asked_less_of_where_the_model_is_at_fault():
+def test_sharp_outlines_are_fitted_less_closely_where_the_model_is_wrong():
     exact = prepare_difference(frame(20.0, seed=1), frame(), num_points=450)
     noisy = prepare_difference(frame(20.0, noise=0.1, seed=1), frame(), num_points=450)
     for one in (exact, noisy):
@@ -155,7 +155,7 @@ def test_sharp_outlines_are_asked_less_of_where_the_model_is_at_fault():
     assert noisy.modelled_share < 0.5 < 0.95 < exact.modelled_share < 1
 
 
-def test_shapes_may_be_asked_for():
+def test_shapes_can_be_requested():
     result = image(20.0, method="shapes")
     assert (result.settings.method, result.chosen_by) == ("shapes", "none")
     assert [one.sign for one in result.inclusions] == [1]
@@ -179,7 +179,7 @@ def test_shapes_that_explain_less_than_the_image_are_not_shown(monkeypatch):
 
 @pytest.mark.slow
 def test_shapes_that_do_not_explain_the_voltages_are_not_shown():
-    """Conductivity that rises evenly across the tank is no body."""
+    """Conductivity that rises evenly across the tank is not a body."""
 
     def sloped(amount, seed):
         rising = 0.02 * np.exp(amount * CENTRES[:, 0] / RADIUS)
@@ -193,15 +193,15 @@ def test_shapes_that_do_not_explain_the_voltages_are_not_shown():
     assert result.shapes is None
 
 
-def test_a_hyperparameter_or_a_method_asked_for_is_taken():
+def test_a_requested_hyperparameter_or_method_is_used():
     assert ImagingSettings(hyperparameter="gcv").method == "one-step"
     assert ImagingSettings(method="gauss-newton", hyperparameter=3.0).method == "gauss-newton"
     result = image(20.0, method="one-step")
     assert (result.settings.method, result.why) == ("one-step", "")
 
 
-def test_what_speaks_against_an_image_is_said():
-    """A λ so small that noise is imaged, and one so large that little of the data is."""
+def test_reasons_to_doubt_an_image_are_reported():
+    """A λ so small that noise is imaged, and one so large that few of the data are."""
     assert image(20.0, method="gauss-newton").doubts == image(1.05).doubts == ()
     unfinished = image(20.0, method="gauss-newton", hyperparameter=1e-4).doubts
     assert "did not converge" in unfinished[0]
@@ -210,7 +210,7 @@ def test_what_speaks_against_an_image_is_said():
     assert report_image(stiff)["doubts"] == list(stiff.doubts)
 
 
-def test_one_step_is_kept_where_gauss_newton_finds_nothing(monkeypatch):
+def test_one_step_is_kept_where_gauss_newton_fails(monkeypatch):
     def fails(*_):
         raise ValueError("it fails.")
 
@@ -220,8 +220,8 @@ def test_one_step_is_kept_where_gauss_newton_finds_nothing(monkeypatch):
     assert "Gauss-Newton found no image. it fails." in result.why
 
 
-def test_the_noise_of_an_image_is_what_noise_makes_of_images():
-    """Repeated frames of a small change: images scatter by what is foretold of one of them."""
+def test_the_noise_of_an_image_is_the_scatter_of_images():
+    """Repeated frames of a small change: images scatter as predicted from one of them."""
     electrodes = BoundaryElectrodes(ring(RADIUS, 8), 0.01, 0.05)
     model = ForwardModel(Disk(RADIUS).mesh(num_points=120), electrodes, adjacent(8))
     clean, rng = np.asarray(model.voltages(0.02)), np.random.default_rng(0)
@@ -238,11 +238,11 @@ def test_the_noise_of_an_image_is_what_noise_makes_of_images():
         for _ in range(60)
     ]
     scatter = np.std([np.log(np.asarray(one.conductivity)) for one in found], axis=0)
-    # Of 60 the deviation is uncertain by 9 %; misfits lie between 0.8 and 1.2.
+    # For 60 frames the deviation is uncertain by 9 %, and misfits are between 0.8 and 1.2.
     np.testing.assert_allclose(np.median(scatter / image_noise(found[0])), 1.0, atol=0.15)
 
 
-def test_ghosts_that_noise_makes_are_not_listed():
+def test_artefacts_of_noise_are_not_listed():
     mesh = Disk(RADIUS).mesh(num_points=400)
     away = [np.linalg.norm(np.asarray(centroids(mesh)) - place, axis=1) for place in ([0.02, 0], [-0.02, 0])]
     shown = np.exp(-((away[0] / 0.01) ** 2)) + 0.5 * np.exp(-((away[1] / 0.01) ** 2))
@@ -253,8 +253,8 @@ def test_ghosts_that_noise_makes_are_not_listed():
         find_inclusions(mesh, shown, noise=np.ones(3))
 
 
-def test_what_a_model_misses_is_noise_to_those_who_solve_with_it():
-    """Channels of uneven gain: the model misses the reference, and the difference alike."""
+def test_model_errors_are_noise_to_nonlinear_solvers():
+    """Channels with different gains: the model misfits the reference and the difference by the same ratio."""
     gain = 1 + 0.05 * np.random.default_rng(0).normal(size=frame().num_channels)
 
     def uneven(one: Measurement) -> Measurement:
@@ -270,13 +270,13 @@ def test_what_a_model_misses_is_noise_to_those_who_solve_with_it():
         missed = max(0.03, min(shares))
         size = np.sqrt(np.mean((one.difference / one.relative_noise) ** 2))
         np.testing.assert_allclose(one.modelled_noise, one.relative_noise * np.hypot(one.noise, missed * size))
-    # Noise of 1e-4 of each voltage, in both frames; channels are trusted to 1e-2.
+    # Noise of 1e-4 of each voltage, in both frames. Channels have an assumed error of 1e-2.
     assert 0.008 < exact.noise < 0.02
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 6, 31])
-def test_metal_and_plastic_in_one_tank_are_all_found_and_nothing_else(seed):
+def test_metal_and_plastic_in_one_tank_are_all_detected_and_nothing_else(seed):
     tank = draw(seed)
     result = image_difference(tank.frame, tank.reference, ImagingSettings(num_points=900))
     distances, spurious = matched(tank, result.inclusions)
@@ -285,8 +285,8 @@ def test_metal_and_plastic_in_one_tank_are_all_found_and_nothing_else(seed):
 
 
 @pytest.mark.slow
-def test_neighbours_of_one_kind_are_told_apart():
-    """Two resistive neighbours merge in the image; split as disks, and then bent, they come apart."""
+def test_adjacent_bodies_of_one_kind_are_distinguished():
+    """Two adjacent resistive bodies merge in the image. Split as disks, and then deformed, they separate."""
     tank = draw(500082)
     distances, spurious = matched(tank, image_difference(tank.frame, tank.reference).inclusions)
     assert distances.max() < 0.05
@@ -294,8 +294,8 @@ def test_neighbours_of_one_kind_are_told_apart():
 
 
 @pytest.mark.slow
-def test_frames_of_mixed_tanks_are_those_of_a_model_on_a_fine_mesh():
-    """The problem itself: SciPy's voltages of the empty tank are those of a model on a fine mesh."""
+def test_frames_of_mixed_tanks_equal_those_of_a_model_on_a_fine_mesh():
+    """The problem itself: SciPy's voltages of the empty tank equal those of a model on a fine mesh."""
     tank = draw(0, noise=0.0)
     model = ForwardModel(
         Disk(tank.radius).mesh(num_points=8000, refine=tank.reference.electrodes.refinement(Disk(tank.radius))),

@@ -1,4 +1,4 @@
-"""A strong ball in a tank of plates: fitted beside a smooth field, its conductivity told with its range."""
+"""A strong ball in a tank with plate electrodes, fitted beside a smooth field, with its conductivity and interval."""
 
 import re
 from types import SimpleNamespace
@@ -43,7 +43,7 @@ def measured(model, conductivity, seed, domain=BOX):
     return Measurement(voltages, np.ones(voltages.shape, bool), model.protocol, **known)
 
 
-def test_labels_of_a_solid_are_those_half_way_up():
+def test_labels_of_a_solid_are_those_at_half_height():
     mesh = BOX.mesh(num_points=300)
     raster = Raster.create(mesh, shape=(40, 30), height=0.05)
 
@@ -83,7 +83,7 @@ def test_a_ball_is_fitted_beside_a_smooth_field(monkeypatch):
     assert np.asarray(result.change)[in_ball].mean() > 0.8 * result.inclusions[0].peak  # the image is of the body
     background = float(result.calibration.conductivity)
     deviation = np.diff(np.log1p(np.array([low, high]) / background)) / 2
-    assert deviation > 0.1  # what the mesh adds, and noise more
+    assert deviation > 0.1  # the mesh's error, with more from noise
     known, (one,) = body.quantities, result.inclusions
     np.testing.assert_allclose([low, high], background * np.array(known.change_interval))
     assert (one.area, one.area_interval) == (body.volume, known.measure_interval)
@@ -92,7 +92,7 @@ def test_a_ball_is_fitted_beside_a_smooth_field(monkeypatch):
 
 
 def test_strengths_in_a_solid_count_its_cells():
-    """A reference that the model explains exactly leaves the discretisation."""
+    """A reference that the model explains exactly leaves the discretisation error."""
     tank = Solid(Disk(0.1), 0.08)
     angle = 2 * np.pi * np.arange(8) / 8
     places = np.column_stack([0.1 * np.cos(angle), 0.1 * np.sin(angle), np.full(8, 0.04)])
@@ -104,9 +104,9 @@ def test_strengths_in_a_solid_count_its_cells():
 
 
 def prepared(dimension, strongest, noise):
-    told = None if noise is None else SimpleNamespace(relative=noise)
+    difference_noise = None if noise is None else SimpleNamespace(relative=noise)
     return SimpleNamespace(
-        quality=SimpleNamespace(difference_noise=told),
+        quality=SimpleNamespace(difference_noise=difference_noise),
         calibration=SimpleNamespace(conductivity=BATH),
         mesh=SimpleNamespace(dimension=dimension),
     ), np.array([0.0, -strongest * BATH])
@@ -116,7 +116,7 @@ def prepared(dimension, strongest, noise):
     ("dimension", "strongest", "noise", "looks"),
     [(3, 0.1, 0.1, True), (3, 0.1, None, True), (3, 0.1, 0.5, False), (3, 0.02, 0.1, False), (2, 0.1, 0.1, False)],
 )
-def test_bodies_are_looked_for_in_solids_where_data_can_tell_of_them(monkeypatch, dimension, strongest, noise, looks):
+def test_bodies_are_searched_in_solids_where_data_can_determine_them(monkeypatch, dimension, strongest, noise, looks):
     asked = []
 
     def image(*_):
@@ -145,11 +145,11 @@ def test_bodies_are_looked_for_in_solids_where_data_can_tell_of_them(monkeypatch
         (2e-8, 3, 0.9, 5.5, [r'unit = "uV" \(a background of 0.02 S/m\)\?$']),
         (2e-8, 2, 0.9, 400.0, [r'no sheet\'s.*"mV" \(a background of 2e-05 S\) or "uV" .* They are whole numbers']),
         (2e-5, 2, 0.9, 90.5, [r'voltages of up to 90.5 V are beyond what instruments read: .* "mV" .* or "uV"']),
-        (2e-5, 2, 0.9, 5.5, []),  # a skin of 50 kilohm a square
-        (220.0, 2, 0.9, 0.1, []),  # sheets have any
+        (2e-5, 2, 0.9, 5.5, []),  # a skin of 50 kilohm per square
+        (220.0, 2, 0.9, 0.1, []),  # sheets may have any
     ],
 )
-def test_thin_data_and_units_that_cannot_be_are_doubted(background, dimension, left, volts, expected):
+def test_thin_data_and_impossible_units_are_doubted(background, dimension, left, volts, expected):
     used = np.arange(10) < 10 * left
     frame = SimpleNamespace(mask=used[None], voltages=np.full((1, 10), volts), notes=())
     image: Any = SimpleNamespace(
@@ -167,7 +167,7 @@ def test_thin_data_and_units_that_cannot_be_are_doubted(background, dimension, l
 
 @pytest.mark.parametrize("fault", ["", "it is strong"])
 @pytest.mark.parametrize("prior", ["gaussian", "noser", Laplace()])
-def test_a_prior_that_is_asked_for_is_that_of_the_image(monkeypatch, prior, fault):
+def test_a_requested_prior_is_that_of_the_image(monkeypatch, prior, fault):
     data, change = prepared(3, 0.1, 0.1)
     data.difference = change
     monkeypatch.setattr(automatic, "unsound", lambda *_: fault)
@@ -183,8 +183,8 @@ def test_a_prior_that_is_asked_for_is_that_of_the_image(monkeypatch, prior, faul
 
 @pytest.mark.parametrize("strongest", [0.1, 1.0])
 @pytest.mark.parametrize(("dimension", "edges"), [(2, "outlines"), (3, "surfaces")])
-def test_what_is_fitted_is_named_for_the_body(monkeypatch, dimension, edges, strongest):
-    """An outline in a sheet, a surface in a solid: beside a sound linear image, and where it is none."""
+def test_the_fit_is_named_for_the_kind_of_body(monkeypatch, dimension, edges, strongest):
+    """An outline in a sheet, a surface in a solid, beside a sound linear image and without one."""
     data, change = prepared(dimension, strongest, 0.1)
     data.difference, data.calibration.conductivity = change, BATH
     data.mask = np.ones(2, bool)
@@ -203,7 +203,7 @@ def test_what_is_fitted_is_named_for_the_body(monkeypatch, dimension, edges, str
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_what_is_asked_of_bodies_reaches_their_search(monkeypatch, dimension):
+def test_settings_of_bodies_reach_their_search(monkeypatch, dimension):
     data, _ = prepared(dimension, 0.1, 0.1)
     data.model, data.difference = SimpleNamespace(voltages=lambda background: np.zeros(2)), np.zeros(2)
     data.sharp_noise = data.mask = None
@@ -217,7 +217,7 @@ def test_what_is_asked_of_bodies_reaches_their_search(monkeypatch, dimension):
 
 
 @pytest.mark.parametrize("given", [{"method": "one-step"}, {"prior": "noser"}, {"hyperparameter": 3.0}])
-def test_kinds_of_bodies_are_asked_for_where_bodies_are_looked_for(given):
+def test_kinds_of_bodies_are_settings_where_bodies_are_searched(given):
     assert ImagingSettings(method="shapes", bodies="columns").bodies == "columns"
     with pytest.raises(ValueError, match="bodies: only methods 'auto' and 'shapes' with the default prior"):
         ImagingSettings(bodies="ellipsoids", **given)
@@ -226,8 +226,10 @@ def test_kinds_of_bodies_are_asked_for_where_bodies_are_looked_for(given):
 
 
 @pytest.mark.slow
-def test_bodies_of_a_sound_linear_image_are_told_in_a_cylinder():
-    """A ball a fifth as conductive, that one step shows at a tenth of its contrast, by currents between two rings."""
+def test_bodies_of_a_sound_linear_image_are_distinguished_in_a_cylinder():
+    """A ball with a fifth of the conductivity, which one step shows at a tenth of its contrast, from currents between
+    two rings.
+    """
     angle = 2 * np.pi * np.arange(12) / 12
     around = np.stack([0.05 * np.cos(angle), 0.05 * np.sin(angle)], axis=1)
     places = np.concatenate([np.column_stack([around, np.full(12, z)]) for z in (0.025, 0.055)])
@@ -243,7 +245,7 @@ def test_bodies_of_a_sound_linear_image_are_told_in_a_cylinder():
     assert body.sign == -1
 
 
-def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_and_intervals_are_of_both():
+def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_and_intervals_cover_both():
     def body(column, contrast):
         return Ellipsoid(1, BALL, 0.02 * np.eye(3), 3e-5, BALL, contrast, column, column, 2.0)
 
@@ -271,17 +273,17 @@ def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_an
     assert include_deviation(own, None, np.nan) == own
     (doubt,) = ImagedDifference.doubts.fget(image)  # pyright: ignore
     assert "x 12 mm, y -25 mm may as well be no column but an ellipsoid, of 6 times the background and 30 cm³" in doubt
-    told = image_report._shapes_report(image)["bodies"]  # pyright: ignore
-    assert told[0]["form"] == "column"
-    assert told[0]["or"]["form"] == "ellipsoid"
-    np.testing.assert_allclose(told[0]["or"]["conductivity_over_background"], 6)
-    assert told[0]["or"]["deviation_of_logarithm"] == 0.5
-    assert "or" not in told[1]
-    assert told[0]["conductivity_is"] == "estimated from the data, as of one material with all others of its sign"
-    assert told[1]["conductivity_is"] == "estimated from the data"
+    bodies = image_report._shapes_report(image)["bodies"]  # pyright: ignore
+    assert bodies[0]["form"] == "column"
+    assert bodies[0]["or"]["form"] == "ellipsoid"
+    np.testing.assert_allclose(bodies[0]["or"]["conductivity_over_background"], 6)
+    assert bodies[0]["or"]["deviation_of_logarithm"] == 0.5
+    assert "or" not in bodies[1]
+    assert bodies[0]["conductivity_is"] == "estimated from the data, as of one material with all others of its sign"
+    assert bodies[1]["conductivity_is"] == "estimated from the data"
 
 
-def test_a_column_of_another_volume_keeps_its_height_and_a_ball_grows_all_round():
+def test_a_column_of_another_volume_keeps_its_height_and_a_ball_grows_in_all_directions():
     known = Quantities(2.0, (1.5, 2.5), 8e-5, (7e-5, 9e-5), 4e-5, (3e-5, 5e-5))
     axes = np.array([[0.0, 0.0, 0.05], [0.03, 0.0, 0.0], [0.0, 0.01, 0.0]])
     for column, scale in ((True, [1.0, 2.0, 2.0]), (False, [4 ** (1 / 3)] * 3)):
@@ -291,7 +293,7 @@ def test_a_column_of_another_volume_keeps_its_height_and_a_ball_grows_all_round(
         assert found.bounded_axes == 3 - column
 
 
-def test_the_last_axis_of_a_column_that_is_drawn_stands():
+def test_the_last_axis_of_a_drawn_column_is_vertical():
     axes = np.array([[0.0, 0.0, 0.05], [0.03, 0.0, 0.0], [0.0, 0.01, 0.0]])
     form = difference._form(Ellipsoid(1, BALL, axes, 3e-5, BALL, 1.0, True, False, 2.0))  # pyright: ignore
     assert form is not None

@@ -1,4 +1,4 @@
-"""A file of several frames: which one was imaged is said, and errors name it."""
+"""A file with several frames: the imaged frame is reported, and errors name it."""
 
 import json
 
@@ -40,14 +40,14 @@ IMAGED = {
 
 
 @pytest.mark.parametrize("name", IMAGED)
-def test_the_frame_is_told_and_written(name, tmp_path, capsys):
-    frame, measured, number, said = IMAGED[name]
+def test_the_frame_is_reported_and_written(name, tmp_path, capsys):
+    frame, measured, number, label = IMAGED[name]
     base = None if measured.frame_names else tank(EMPTY)
     result = image_difference(measured, base, SETTINGS, frame=frame)
     np.testing.assert_array_equal(np.asarray(result.measurement.voltages)[0], FULL)
     assert (result.frame, result.num_frames) == (number, measured.num_frames)
     show(plain_console(), result, asked=frame is not None)
-    assert f"frame {said} background " in " ".join(capsys.readouterr().out.split())
+    assert f"frame {label} background " in " ".join(capsys.readouterr().out.split())
     write_image(result, tmp_path)
     data = json.loads((tmp_path / "report.json").read_text())["data"]
     assert data["frame"] == (measured.frame_names[number] if measured.frame_names else number)
@@ -77,7 +77,7 @@ def test_a_frame_that_cannot_be_imaged_is_named_and_its_reference_is_not():
         prepare_difference(tank(EMPTY), tank(EMPTY), num_points=300)
 
 
-def test_a_difference_that_is_rounding_is_named():
+def test_a_difference_within_rounding_is_named():
     drifted = EMPTY * (1 + 5e-5 * np.random.default_rng(0).normal(size=EMPTY.size))
     empty, almost = (np.array([float(f"{one:.4g}") for one in frame]) for frame in (EMPTY, drifted))
     assert (empty != almost).any()

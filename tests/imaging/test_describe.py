@@ -1,4 +1,4 @@
-"""Files that nobody has described: explained, or a question; never a description of something else."""
+"""Files without a description: explained, or a question asked, but never described as something else."""
 
 import functools
 import io
@@ -29,7 +29,7 @@ def empty_disk():
 
 
 def simulated(table):
-    """Voltages (2, M) of a disk, empty and with a rod at (50, 0) mm, and the protocol of a table."""
+    """Voltages (2, M) of a disk, empty and with a rod at (50, 0) mm, with the protocol of a table."""
     table = {"number": 8, "current": 1e-3, **table}
     model = empty_disk().with_protocol(parse_description({"protocol": table}, "a.toml").protocol(Path("a.csv")))
     away = np.asarray(centroids(model.mesh)) - [0.05, 0]
@@ -64,7 +64,7 @@ def test_the_protocol_is_found(kind, tmp_path):
     best = found.candidates[0]
     assert best.measurement.protocol.same_patterns(protocol)
     assert best.misfit < 0.05
-    # An order that a uniform body explains once it is changed is not explained as it is.
+    # An order that a uniform body explains after a permutation is not explained without it.
     turned = [one for one in found.candidates if one.wiring is not None and one.wiring.order]
     assert all(one.misfit > 0.2 for one in turned)
     assert turned or kind["kind"] == "two_terminal"
@@ -73,7 +73,7 @@ def test_the_protocol_is_found(kind, tmp_path):
 
 
 def test_magnitudes_with_gains(tmp_path):
-    """As an instrument with a converter for each pair of electrodes records them."""
+    """As recorded by an instrument with one converter for each pair of electrodes."""
     voltages, protocol = simulated(KINDS[2])
     gains = np.exp(0.1 * np.random.default_rng(1).normal(size=8))
     driven = (np.asarray(protocol.channel_drive) != 0) & (np.asarray(protocol.channel_measurement) != 0)
@@ -97,7 +97,9 @@ def test_magnitudes_with_gains(tmp_path):
 
 
 def test_half_of_the_channels_leaves_the_order_open(tmp_path):
-    """Without reciprocal channels, and in a round body, both orders explain a frame nearly as well: a question."""
+    """Without reciprocal channels, and in a round body, both orders explain a frame nearly as well: a question is
+    asked.
+    """
     voltages, protocol = simulated({"kind": "adjacent", "reciprocal": "half", "order": "fixed"})
     empty, rod = saved(tmp_path, voltages)
     found = find_description(rod, DISK, RING, reference=empty)
@@ -105,7 +107,7 @@ def test_half_of_the_channels_leaves_the_order_open(tmp_path):
     assert same[0] in (found.candidates[0], *found.undecided)
 
 
-def test_what_is_not_good_enough_is_named(tmp_path):
+def test_an_insufficient_explanation_is_reported(tmp_path):
     random = np.random.default_rng(0).normal(size=(2, 40))
     empty, rod = saved(tmp_path, random)
     found = find_description(rod, DISK, RING, reference=empty)
@@ -115,28 +117,28 @@ def test_what_is_not_good_enough_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "deviation", "said"),
+    ("kind", "deviation", "fault"),
     [
         ({"kind": "adjacent", "reciprocal": "half"}, 0.2, ""),
         ({"kind": "two_terminal"}, 0.3, "not good enough to go on"),
     ],
     ids=str,
 )
-def test_the_order_of_unlike_channels_speaks_for_an_explanation(kind, deviation, said, tmp_path):
-    """A tank that is far from its description is explained; voltages that are all alike are explained by anything."""
+def test_the_order_of_different_channels_supports_an_explanation(kind, deviation, fault, tmp_path):
+    """A tank that deviates from its description is explained. Any description explains voltages that are all alike."""
     voltages, _ = simulated(kind)
     factors = np.exp(deviation * np.random.default_rng(3).normal(size=voltages.shape[1]))
     empty, rod = saved(tmp_path, voltages * factors)
     found = find_description(rod, DISK, RING, reference=empty)
     assert 0.25 < found.candidates[0].misfit < 0.4
-    assert said in found.fault
-    assert bool(said) == bool(found.fault)
-    if said:
+    assert fault in found.fault
+    assert bool(fault) == bool(found.fault)
+    if fault:
         assert not find_description(rod, DISK, RING, reference=empty, known=kind).fault
 
 
-def test_a_column_of_something_else_is_not_explained_away(tmp_path):
-    """Frames of the empty body are alike; and a few channels are explained by anything."""
+def test_a_column_of_other_data_is_not_explained_away(tmp_path):
+    """Frames of the empty body are similar, and any description explains a few channels."""
     voltages, _ = simulated(KINDS[0])
     for path, values in zip((tmp_path / "empty.csv", tmp_path / "rod.csv"), voltages, strict=True):
         np.savetxt(path, np.tile(np.append(values, 0.01), (6, 1)), delimiter=",")
@@ -156,7 +158,7 @@ def test_a_column_of_something_else_is_not_explained_away(tmp_path):
         find_description(tmp_path / "wide.csv", DISK, RING, keys=("a", None))
 
 
-def test_a_square_table_is_turned_where_its_columns_are_alike(tmp_path):
+def test_a_square_table_is_transposed_where_its_columns_are_similar(tmp_path):
     voltages, protocol = simulated(KINDS[0])
     noise = 1 + 1e-4 * np.random.default_rng(2).normal(size=(2, 40, 40))
     for name, values, own in zip(("empty", "rod"), voltages, noise, strict=True):
@@ -169,8 +171,8 @@ def test_a_square_table_is_turned_where_its_columns_are_alike(tmp_path):
     np.testing.assert_allclose(data.read(tmp_path / "rod.csv").mean_frame().voltages[0], voltages[1], rtol=1e-3)
 
 
-def test_a_frame_of_16_lines_that_are_alike(tmp_path):
-    """A line for each drive of a ring: the same from every electrode."""
+def test_a_frame_of_16_similar_lines(tmp_path):
+    """One line for each drive of a ring: the same from every electrode."""
     voltages, protocol = simulated(KINDS[0])
     paths = tmp_path / "empty.txt", tmp_path / "rod.txt"
     for path, values in zip(paths, voltages, strict=True):
@@ -180,7 +182,7 @@ def test_a_frame_of_16_lines_that_are_alike(tmp_path):
     assert found.candidates[0].measurement.protocol.same_patterns(protocol)
 
 
-def test_what_is_known_narrows_the_search(tmp_path):
+def test_known_settings_restrict_the_search(tmp_path):
     voltages, _ = simulated(KINDS[0])
     empty, rod = saved(tmp_path, voltages, " ")
     found = find_description(rod, DISK, RING, reference=empty, known={"kind": "adjacent", "number": 8})
@@ -188,8 +190,8 @@ def test_what_is_known_narrows_the_search(tmp_path):
     assert {replace(one.measurement).num_frames for one in found.candidates} == {1}
 
 
-def test_of_a_file_that_states_its_protocol_the_body_is_described(tmp_path):
-    """Electrodes are where the file places them, if it does; instruments say nothing of it."""
+def test_for_a_file_with_its_protocol_the_body_is_described(tmp_path):
+    """Electrodes are where the file places them, if it does. Files of instruments do not."""
     voltages, made = simulated(KINDS[1])
     values, position = voltages[0] / 1e-3, ring(0.1, 8)
     places = "\n".join(f"{x:.7f} {y:.7f}" for x, y in position)
@@ -224,9 +226,9 @@ def test_command(tmp_path, capsys, monkeypatch):
     assert main([*given, "--shape", "disk:0.1", "--width", "0", "--electrodes", "8"]) == 1
     assert capsys.readouterr().err.startswith("jeit: --width is 0, and must be from")
     assert main([*given, "--shape", "disk:0.1", "--width", "0.012", "--electrodes", "8", "--protocol", "adjacent"]) == 0
-    said = capsys.readouterr().out
-    assert "adjacent, 8 electrodes, order fixed" in said
-    assert "resistive" in said
+    printed = capsys.readouterr().out
+    assert "adjacent, 8 electrodes, order fixed" in printed
+    assert "resistive" in printed
     assert {"description.toml", "image.png", "report.json"} <= {path.name for path in (tmp_path / "out").iterdir()}
     assert 'polarity = "reversed"' in (tmp_path / "out" / "description.toml").read_text("utf-8")
     assert main([*given, "--shape", "disk:0.1", "--width", "0.012"]) == 1

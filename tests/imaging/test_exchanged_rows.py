@@ -1,4 +1,4 @@
-"""Drives or measurements exchanged in a frame alone: told, where noise is not."""
+"""Drives or measurements exchanged in one frame alone: reported, but not for noise."""
 
 import numpy as np
 import pytest
@@ -41,27 +41,27 @@ def exchanged(*pairs, axis=0):
 
 
 @pytest.mark.parametrize(
-    ("pairs", "axis", "said"),
+    ("pairs", "axis", "beginning"),
     [
         ([(2, 6)], 0, "drives 3 and 7 look exchanged in it"),
         ([(4, 12)], 1, "measurements of every drive 5 and 13 look exchanged in it"),
         ([(1, 2), (8, 13)], 0, "drives "),
     ],
 )
-def test_what_is_exchanged_in_a_frame_is_told(pairs, axis, said):
-    told = exchanges_message(measured(OBJECT, exchanged(*pairs, axis=axis)), EMPTY)
-    assert told.startswith(said)
-    assert all(f"{one + 1} and {other + 1}" in told for one, other in pairs)
+def test_exchanged_rows_of_a_frame_are_reported(pairs, axis, beginning):
+    message = exchanges_message(measured(OBJECT, exchanged(*pairs, axis=axis)), EMPTY)
+    assert message.startswith(beginning)
+    assert all(f"{one + 1} and {other + 1}" in message for one, other in pairs)
 
 
-def test_it_is_refused_with_that():
+def test_the_frame_is_refused_with_that_message():
     with pytest.raises(
         ValueError, match=r"'frame' does not fit its reference: measurements of every drive 5 and 13 look exchang"
     ):
         prepare_difference(measured(OBJECT, exchanged((4, 12), axis=1)), EMPTY, num_points=500)
 
 
-def test_objects_and_noise_are_no_exchange():
+def test_objects_and_noise_are_not_reported_as_exchange():
     for change in (OBJECT, np.where(NEAR, 2.0, 0.02), np.where(NEAR, 2e-4, 0.02)):
         assert exchanges_message(measured(change), EMPTY) == ""
     noisy = measured(OBJECT, noise=0.5)
@@ -70,7 +70,7 @@ def test_objects_and_noise_are_no_exchange():
         prepare_difference(noisy, EMPTY, num_points=500)
 
 
-def test_protocols_whose_drives_have_readings_of_their_own_are_left_alone():
+def test_protocols_with_different_readings_for_each_drive_are_not_checked():
     model = MODEL.with_protocol(adjacent(16))
     frame = Measurement(np.array(model.voltages(0.02))[::-1], np.ones(208, bool), model.protocol)
     assert exchanges_message(frame, frame) == ""

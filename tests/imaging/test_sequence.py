@@ -1,4 +1,6 @@
-"""Breathing lungs in a chest, and a sphere that oscillates ten times a second, and what images tell of them."""
+"""Breathing lungs in a chest, and a sphere that oscillates ten times a second: frequency, amplitude and phase in
+images.
+"""
 
 from dataclasses import replace
 
@@ -25,13 +27,13 @@ def measured(model, conductivity, domain, times, seed):
 
 
 def degrees(phase, expected):
-    """How far a phase is off."""
+    """Error of a phase, degrees."""
     return np.degrees(np.abs(np.angle(np.exp(1j * (phase - expected)))))
 
 
 @pytest.fixture(scope="module")
 def chest():
-    """Two lungs at 0.3 Hz, the right one an eighth of a period late, and a heart at 1.25 Hz; 20 frames a second."""
+    """Two lungs at 0.3 Hz, the right one an eighth of a period late, and a heart at 1.25 Hz: 20 frames a second."""
     domain, times = Disk(0.15), np.arange(300) / 20.0
     model = ForwardModel(
         domain.mesh(num_points=700), BoundaryElectrodes(ring(0.15, 16), 0.02, 0.01), protocol.adjacent(16)
@@ -46,7 +48,7 @@ def chest():
 
 
 @pytest.mark.slow
-def test_breathing_is_told_by_frequency_amplitude_and_phase(chest):
+def test_breathing_is_measured_by_frequency_amplitude_and_phase(chest):
     found = image_sequence(chest, settings=ImagingSettings(num_points=500))
     series, mesh = found.series, found.series.mesh
     left, right, heart = (
@@ -56,7 +58,7 @@ def test_breathing_is_told_by_frequency_amplitude_and_phase(chest):
     assert slow.frequency == pytest.approx(0.3, abs=0.005)
     curves = np.stack([series.mean_change(one) for one in (left, right, heart)], axis=1)
     breath = oscillation(curves, series.times, slow.frequency)
-    # cos(turn - π/4) with a minus: π - π/4. The other lung's image reaches over by a few per cent.
+    # cos(turn - π/4) with a minus: π - π/4. The other lung's image contributes a few per cent.
     assert degrees(breath.phase[:2], [np.pi, np.pi - np.pi / 4]).max() < 5
     # A smooth image of a change of 0.045 S is lower, in both lungs alike.
     assert breath.amplitude[0] == pytest.approx(breath.amplitude[1], rel=0.1)
@@ -72,7 +74,7 @@ def test_breathing_is_told_by_frequency_amplitude_and_phase(chest):
     assert np.median(degrees(slow.phase[right], 0.75 * np.pi)) < 5
 
 
-def test_images_are_those_of_one_frame_after_the_other(chest):
+def test_images_equal_those_of_one_frame_at_a_time(chest):
     few = chest.frames(slice(0, 40))
     found = image_sequence(few, chest.mean_frame(), ImagingSettings(num_points=500, hyperparameter=0.1))
     change = np.asarray(few.voltages) - np.asarray(chest.mean_frame().voltages)
@@ -82,7 +84,7 @@ def test_images_are_those_of_one_frame_after_the_other(chest):
         )
 
 
-def test_frames_that_lack_channels_are_refused_and_channels_that_most_lack_left_out(chest):
+def test_frames_with_missing_channels_are_refused_and_channels_missing_in_most_are_left_out(chest):
     few = chest.frames(slice(0, 30))
     mask = np.ones(few.mask.shape, bool)
     mask[5, 17], mask[:20, 40] = False, False
@@ -92,7 +94,7 @@ def test_frames_that_lack_channels_are_refused_and_channels_that_most_lack_left_
     assert not np.asarray(found.reconstruction.matrix)[:, 40].any()
 
 
-def test_what_makes_no_series(chest):
+def test_invalid_series(chest):
     with pytest.raises(ValueError, match="1 frame; a series takes two at least"):
         image_sequence(chest.frame(0))
     with pytest.raises(ValueError, match="take a linear one"):
@@ -115,29 +117,31 @@ def test_a_sphere_that_oscillates_ten_times_a_second():
     found = image_sequence(made, settings=ImagingSettings(num_points=2000, contact="common"))
     series = found.series
     ball = ball_region(series.mesh, centre, 0.025)
-    told = oscillation(series.changes, series.times, (5, 20))
-    assert told.frequency == pytest.approx(10, abs=0.05)
-    curve = oscillation(series.mean_change(ball), series.times, told.frequency)
+    fitted = oscillation(series.changes, series.times, (5, 20))
+    assert fitted.frequency == pytest.approx(10, abs=0.05)
+    curve = oscillation(series.mean_change(ball), series.times, fitted.frequency)
     assert degrees(curve.phase, -0.6) < 5
-    # A smooth image of it is weak: the oscillation has half of what lies between images of both ends, at rest.
+    # A smooth image of it is weak: the oscillation has half of the contrast between images of both ends, at rest.
     ends = model.voltages(0.2 * (1 + 0.5 * inside)) - model.voltages(0.2 * (1 - 0.5 * inside))
     still = np.asarray(found.reconstruction.image(ends)) / 2
     size = np.asarray(measures(series.mesh))[ball]
     assert curve.amplitude == pytest.approx(still[ball] @ size / size.sum(), rel=0.05)
-    peak = np.asarray(centroids(series.mesh))[np.argmax(told.amplitude)]
+    peak = np.asarray(centroids(series.mesh))[np.argmax(fitted.amplitude)]
     assert np.linalg.norm(peak - centre) < 0.025
     assert series.unit == "S/m"
     upper = half_region(series.mesh, (0, 0, 1))
-    assert told.amplitude[upper].mean() == pytest.approx(told.amplitude[~upper].mean(), rel=0.3)  # it is half way up
+    assert fitted.amplitude[upper].mean() == pytest.approx(
+        fitted.amplitude[~upper].mean(), rel=0.3
+    )  # it is at half height
 
 
 def test_a_spike_in_one_channel_changes_no_image(chest):
-    """It is replaced, and said so; the frame is not refused."""
+    """It is replaced, with a note. The frame is not refused."""
     few = chest.frames(slice(0, 6))
-    spoilt = np.array(few.voltages)
-    spoilt[2, 40] *= 2
+    faulty = np.array(few.voltages)
+    faulty[2, 40] *= 2
     settings = ImagingSettings(num_points=500, hyperparameter=0.1)
-    sound, found = (image_sequence(one, few.frames([5]), settings) for one in (few, replace(few, voltages=spoilt)))
+    sound, found = (image_sequence(one, few.frames([5]), settings) for one in (few, replace(few, voltages=faulty)))
     assert not found.refused.any()
     size = np.abs(sound.series.changes).max()
     assert np.abs(found.series.changes - sound.series.changes).max() < 0.05 * size

@@ -1,4 +1,4 @@
-"""Error bars of a solid imaged by total variation from two measurements."""
+"""Error bars of a solid imaged with total variation from two measurements."""
 
 import numpy as np
 import pytest
@@ -37,6 +37,6 @@ def test_a_solid_imaged_by_total_variation_has_error_bars():
     relative = deviation / np.asarray(result.reconstruction.conductivity)  # pyright: ignore[reportAttributeAccessIssue]
     assert deviation.shape == (result.mesh.num_cells,)
     assert (np.isfinite(deviation) & (relative > 0) & (relative < 0.5 * np.sqrt(free))).all()
-    # The data tell of the bath as a whole far better than of a cell.
+    # The data determine the bath as a whole much better than a single cell.
     mean, spread = around.region(np.ones(result.mesh.num_cells, bool))
     assert spread / mean < 0.2 * np.median(relative)

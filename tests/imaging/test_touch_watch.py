@@ -1,6 +1,6 @@
-"""Gestures of a small simulated skin, learnt and named on a live stream; and what goes wrong in streams.
+"""Gestures of a small simulated skin, learnt and classified on a live stream, and errors in streams.
 
-The skin is a linear one: streams are judged, not methods. That of which a pressed skin is made is in the slow suite.
+The skin is linear, since the tests are of streams, not of methods. A test with a pressed skin is in the slow suite.
 """
 
 import tomllib
@@ -44,12 +44,12 @@ def watch(made, learnt):
 
 
 def followed(watch, seconds, frames):
-    """What is told of a stream: all, and the touches that ended."""
+    """The events of a stream: all of them, and the touches that ended."""
     watched = list(watch.follow(zip(np.asarray(seconds).tolist(), frames, strict=True)))
     return watched, [touch for one in watched for touch in one.ended]
 
 
-def test_a_set_is_learnt(made, learnt):
+def test_a_model_is_learnt_from_a_set(made, learnt):
     model = learnt.model
     assert model.reading.sign == 1
     assert model.reading.rate == pytest.approx(RATE)
@@ -60,7 +60,7 @@ def test_a_set_is_learnt(made, learnt):
 
 
 @pytest.mark.slow
-def test_a_set_of_a_pressed_skin_is_learnt():
+def test_a_model_is_learnt_from_a_pressed_skin():
     made, stream = gestures_and_stream()
     learnt = learn_gestures(DESCRIPTION, made, method="linear-discriminant", form="course")
     right = learnt.model.standing.held_out == learnt.model.standing.right
@@ -72,7 +72,7 @@ def test_a_set_of_a_pressed_skin_is_learnt():
         assert np.count_nonzero(np.abs(onset - start) < 0.2) == 1
 
 
-def test_every_touch_is_told_once_and_soon(made, watch):
+def test_every_touch_is_reported_once_and_soon(made, watch):
     stream = made[1]
     watched, touches = followed(watch, stream.seconds, stream.voltages)
     assert len([one for one in watched if one.image is not None]) == len(stream.seconds)
@@ -84,12 +84,12 @@ def test_every_touch_is_told_once_and_soon(made, watch):
         assert one.named - one.touch.offset == pytest.approx(1 / RATE)  # with the first frame below the level
         assert one.probability == one.probabilities.max()
         assert one.latency > 0
-    said = [watch.model.predict([one.touch]).gesture[0] for one in touches]
-    assert said == [one.gesture for one in touches]
+    predicted = [watch.model.predict([one.touch]).gesture[0] for one in touches]
+    assert predicted == [one.gesture for one in touches]
 
 
-def test_what_touches_lower_is_told_too(made):
-    """A skin that conducts worse where touched: the voltages mirrored about those at rest."""
+def test_touches_that_reduce_voltages_are_reported_too(made):
+    """A skin that conducts less where touched: the voltages mirrored about those at rest."""
     gestures, stream = made
     mirrored = replace(
         gestures,
@@ -104,8 +104,8 @@ def test_what_touches_lower_is_told_too(made):
     assert len(followed(other, stream.seconds, frames)[1]) >= 6
 
 
-def test_drift_is_followed(made, watch):
-    """The whole skin conducts one per cent better every hundred seconds; nobody touches it."""
+def test_the_reference_follows_drift(made, watch):
+    """The whole skin conducts one per cent better every hundred seconds. Nobody touches it."""
     seconds = np.arange(1800) / RATE
     still = made[1].voltages[:60].mean(axis=0)
     noise = made[1].voltages[:60].std(axis=0) * np.random.default_rng(0).normal(size=(1800, len(still)))
@@ -113,19 +113,19 @@ def test_drift_is_followed(made, watch):
     watched, touches = followed(watch, seconds, frames)
     assert not touches
     kept = watch.images.changes(frames[-60:])
-    assert np.nanmax(kept) > watch.level.level  # without following there were one
+    assert np.nanmax(kept) > watch.level.level  # without following the drift there was one
     assert not watched[-1].touched
 
 
 def push(made):
-    """The longest touch of the stream, with some of the untouched skin before it."""
+    """The longest touch of the stream, with some frames of the untouched skin before it."""
     stream = made[1]
     one = int(np.argmax(stream.offset - stream.onset))
     first, last = (round(RATE * second) for second in (stream.onset[one], stream.offset[one]))
     return stream.voltages[:60], stream.voltages[first : last + 1]
 
 
-def test_a_touch_that_is_there_at_the_end_is_cut_off(made, watch):
+def test_a_touch_during_the_last_frame_is_cut_off(made, watch):
     still, frames = push(made)
     run = np.vstack([still, frames[: len(frames) // 2]])
     _, (touch,) = followed(watch, np.arange(len(run)) / RATE, run)
@@ -133,7 +133,7 @@ def test_a_touch_that_is_there_at_the_end_is_cut_off(made, watch):
     assert touch.touch.offset == (len(run) - 1) / RATE
 
 
-def test_a_gap_in_time_parts_a_touch(made, watch):
+def test_a_gap_in_time_separates_touches(made, watch):
     still, frames = push(made)
     run = np.vstack([still, frames, still])
     seconds = np.arange(len(run)) / RATE
@@ -143,7 +143,7 @@ def test_a_gap_in_time_parts_a_touch(made, watch):
     assert touches[1].touch.begun_before
 
 
-def test_doubled_and_broken_frames_are_lost_not_told(made, watch):
+def test_repeated_and_faulty_frames_are_lost_and_not_reported(made, watch):
     still, frames = push(made)
     run = np.vstack([still, frames, still])
     seconds = np.arange(len(run)) / RATE
@@ -162,8 +162,8 @@ def test_doubled_and_broken_frames_are_lost_not_told(made, watch):
     assert twice.gesture == whole.gesture
 
 
-def test_an_electrode_that_dies_in_a_touch_is_left_out(made, watch):
-    """Its channels are left out from then on, the touch ends, and the next is told."""
+def test_an_electrode_that_fails_in_a_touch_is_left_out(made, watch):
+    """Its channels are left out from then on, the touch ends, and the next is reported."""
     still, frames = push(made)
     run = np.vstack([still, frames, still, still, frames, still])
     protocol = watch.images.calibration.model.protocol
@@ -175,7 +175,7 @@ def test_an_electrode_that_dies_in_a_touch_is_left_out(made, watch):
     assert touches[-1].touch.onset == pytest.approx((180 + len(frames)) / RATE, abs=0.2)
 
 
-def test_what_is_held_is_told_and_then_is_how_the_skin_is(made, watch):
+def test_a_lasting_load_is_reported_and_becomes_the_reference(made, watch):
     still, frames = push(made)
     strongest = frames[np.argmax(np.abs(frames - still.mean(axis=0)).sum(axis=1))]
     noise = still - still.mean(axis=0)
@@ -188,8 +188,8 @@ def test_what_is_held_is_told_and_then_is_how_the_skin_is(made, watch):
     assert not watched[-1].touched
 
 
-def test_a_skin_held_from_the_first_frame_is_noticed_when_it_is_let_go(made, learnt):
-    """Rest is read in the midst of a push; the push is lifted, and then comes again."""
+def test_a_skin_loaded_from_the_first_frame_is_recognised_when_released(made, learnt):
+    """The reference is taken during a push. The push is released, and applied again."""
     still, frames = push(made)
     strongest = frames[np.argmax(np.abs(frames - still.mean(axis=0)).sum(axis=1))]
     held = strongest + np.vstack([still - still.mean(axis=0)] * 2)
@@ -202,11 +202,11 @@ def test_a_skin_held_from_the_first_frame_is_noticed_when_it_is_let_go(made, lea
     assert not watched[-1].touched or watched[-1].second - touches[-1].touch.onset > 1
 
 
-def test_of_nothing_nothing_is_told(watch):
+def test_without_frames_nothing_is_reported(watch):
     assert list(watch.follow([])) == []
 
 
-def test_a_stream_noisier_than_what_was_learnt_says_so(made, learnt):
+def test_a_stream_noisier_than_the_training_data_is_reported(made, learnt):
     still = made[1].voltages[:60]
     rng = np.random.default_rng(0)
     rough = still + 50 * still.std(axis=0) * rng.normal(size=still.shape)
@@ -215,7 +215,7 @@ def test_a_stream_noisier_than_what_was_learnt_says_so(made, learnt):
     assert "weak touches are missed" in watch.notes[0]
 
 
-def test_what_cannot_be_is_said(made, learnt, watch):
+def test_bad_arguments(made, learnt, watch):
     still = made[1].voltages[:60]
     images = watch.images
     with pytest.raises(ValueError, match="seconds must not fall"):
@@ -241,7 +241,9 @@ def test_what_cannot_be_is_said(made, learnt, watch):
 
 
 def test_a_dead_electrode_of_many_leaves_an_image():
-    """What only the channels left out tell has no inverse; with sixteen electrodes and a common one it was NaN."""
+    """The part that only excluded channels determine has no inverse. With sixteen electrodes and a common one it was
+    NaN.
+    """
     places = np.vstack([perimeter(Rectangle(0.3, 0.18), 16, start=0.03), [[0.0, 0.0]]])
     table = tomllib.loads(TOML)
     table["electrodes"]["positions"] = places.tolist()
@@ -256,6 +258,6 @@ def test_a_dead_electrode_of_many_leaves_an_image():
     assert np.isfinite(found[1]).all()
 
 
-def test_a_file_keeps_how_the_skin_was_read(learnt, tmp_path):
+def test_a_file_keeps_the_reading_settings_of_the_skin(learnt, tmp_path):
     learnt.model.write(tmp_path / "gestures.skops")
     assert GestureModel.read(tmp_path).reading == learnt.model.reading

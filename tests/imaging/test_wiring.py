@@ -1,4 +1,6 @@
-"""Wires exchanged, channels in another order, signs turned: found on simulated and measured tanks, and nowhere else."""
+"""Exchanged wires, channels in another order, reversed signs: detected on simulated and measured tanks, and nowhere
+else.
+"""
 
 from dataclasses import replace
 from itertools import combinations, islice
@@ -25,7 +27,7 @@ PLACES = tuple(range(COUNT))
 
 
 def measured(model=MODEL, domain=DISK, places=PLACES, order="", sign=1, conductivity=0.02, name="empty") -> Measurement:
-    """A frame with 1 % noise, electrode k standing where `places[k]` should, its channels in another order."""
+    """A frame with 1 % noise, with electrode k at the place of `places[k]` and its channels in another order."""
     electrodes = model.electrodes
     there = np.asarray(electrodes.position)[list(places)]
     turned = model.with_electrodes(
@@ -58,14 +60,14 @@ def test_a_sound_tank_raises_no_alarm(protocol):
 
 
 @pytest.mark.parametrize("pair", [(0, 1), (2, 6), (4, 12), (0, 15), (7, 9)])
-def test_two_exchanged_electrodes_are_found(pair):
+def test_two_exchanged_electrodes_are_detected(pair):
     wiring = find_wiring(MODEL, measured(places=exchanged(pair)))
     assert wiring.places == exchanged(pair)
     assert f"electrodes {pair[0] + 1} and {pair[1] + 1} look exchanged" in wiring.explanation
     assert wiring.misfit < 0.02 < 0.15 < wiring.described
 
 
-def test_two_exchanges_and_a_ring_of_three_are_found():
+def test_two_exchanges_and_a_cycle_of_three_are_detected():
     assert find_wiring(MODEL, measured(places=exchanged((1, 5), (8, 11)))).places == exchanged((1, 5), (8, 11))
     turned = exchanged((3, 4), (4, 5))
     wiring = find_wiring(MODEL, measured(places=turned))
@@ -74,28 +76,28 @@ def test_two_exchanges_and_a_ring_of_three_are_found():
 
 
 @pytest.mark.parametrize("order", list(channel_orders(adjacent(COUNT)))[1:])
-def test_another_order_of_channels_is_found(order):
-    """By reciprocity they hold the same voltages, measurement by measurement and drive by drive: the first is named."""
+def test_another_order_of_channels_is_detected(order):
+    """By reciprocity measurement by measurement and drive by drive have the same voltages: the first order is named."""
     wiring = find_wiring(MODEL, measured(order=order))
     first = list(channel_orders(MODEL.protocol))[1]
     assert (wiring.order, wiring.reversed_signs, wiring.places) == (first, False, PLACES)
     assert f"the channels look ordered {first}" in wiring.explanation
 
 
-def test_a_fixed_order_described_as_rotating_is_the_protocols_own_fixed_order():
+def test_a_fixed_order_described_as_rotating_is_recognised_as_the_protocols_fixed_order():
     fixed = ForwardModel(MODEL.mesh, ELECTRODES, adjacent(COUNT, order="fixed")).voltages(1.0)
     name = next(name for name in channel_orders(MODEL.protocol) if "fixed" in name)
     np.testing.assert_allclose(np.asarray(fixed)[channel_orders(MODEL.protocol)[name]], MODEL.voltages(1.0))
 
 
-def test_the_opposite_sign_is_found_also_beside_an_exchange():
+def test_the_opposite_sign_is_detected_also_beside_an_exchange():
     wiring = find_wiring(MODEL, measured(sign=-1, places=exchanged((2, 6))))
     assert (wiring.reversed_signs, wiring.places) == (True, exchanged((2, 6)))
     assert "opposite sign" in wiring.explanation
 
 
-def test_a_sign_that_explains_a_frame_alone_is_told_alone_and_with_no_way_out_that_is_shut():
-    """One of many turns may explain a little more."""
+def test_a_sign_that_explains_a_frame_alone_is_reported_alone_and_without_unavailable_remedies():
+    """One of many permutations may explain slightly more."""
     angle = 2 * np.pi * np.arange(64) / 64
     oval = Polygon(np.stack([0.102 * np.cos(angle), 0.1 * np.sin(angle)], axis=1))
     electrodes = BoundaryElectrodes(perimeter(oval, COUNT), 0.01, 0.05)
@@ -109,7 +111,7 @@ def test_a_sign_that_explains_a_frame_alone_is_told_alone_and_with_no_way_out_th
         prepare_difference(measured(model, oval, turned, sign=-1, conductivity=0.03), empty)
 
 
-def test_electrodes_counted_from_another_one_are_found_where_the_body_shows_it():
+def test_a_shifted_first_electrode_is_detected_where_the_body_shows_it():
     domain = Polygon(np.array([[0, 0], [0.1, 0], [0.08, 0.06], [0, 0.05]]))
     electrodes = BoundaryElectrodes(perimeter(domain, COUNT, start=0.013), 0.008, 0.05)
     model = ForwardModel(imaging_mesh(domain, electrodes, 400), electrodes, adjacent(COUNT))
@@ -120,14 +122,14 @@ def test_electrodes_counted_from_another_one_are_found_where_the_body_shows_it()
         way = "from another one" if places == shifted else "the other way round"
         assert f"look counted {way}, electrode 1 standing where 4 should" in wiring.explanation
     round_again = tuple(-k % COUNT for k in range(COUNT))
-    told = find_wiring(model, measured(model, domain, round_again)).explanation
-    assert "look counted the other way round" in told
-    assert "electrode 1" not in told
-    # A round, even tank looks alike from all electrodes.
+    explanation = find_wiring(model, measured(model, domain, round_again)).explanation
+    assert "look counted the other way round" in explanation
+    assert "electrode 1" not in explanation
+    # A round, uniform tank looks the same from all electrodes.
     assert find_wiring(MODEL, measured(places=shifted)).as_described
 
 
-def test_what_nothing_explains_is_refused_too():
+def test_a_frame_that_nothing_explains_is_refused_too():
     frame = measured()
     voltages = np.random.default_rng(1).permutation(np.asarray(frame.voltages)[0])
     wiring = find_wiring(
@@ -137,7 +139,7 @@ def test_what_nothing_explains_is_refused_too():
     assert "no order of channels, sign, or exchange" in wiring.fault
 
 
-def test_an_image_is_refused_with_what_was_found_and_made_as_it_is_if_asked():
+def test_an_image_is_refused_with_the_explanation_and_computed_unchanged_on_request():
     places = exchanged((2, 6))
     near = np.linalg.norm(np.asarray(centroids(MODEL.mesh)) - [0.02, 0.01], axis=1) < 0.012
     object_ = measured(places=places, conductivity=np.where(near, 0.04, 0.02), name="object")
@@ -150,7 +152,7 @@ def test_an_image_is_refused_with_what_was_found_and_made_as_it_is_if_asked():
     assert report_image(image_difference(*sound, replace(plain, as_is=False)))["wiring"]["fault"] is None
 
 
-def test_a_frame_without_signal_is_left_to_others():
+def test_a_frame_without_signal_is_left_to_other_checks():
     nothing = Measurement(np.zeros(208), np.ones(208, bool), MODEL.protocol, electrodes=ELECTRODES, domain=DISK)
     assert find_wiring(MODEL, nothing).fault == ""
     with pytest.raises(ValueError, match="inf times those of the reference"):
@@ -182,7 +184,7 @@ def test_measured_tanks_raise_no_alarm(data_folder):
 
 
 @pytest.mark.slow
-def test_all_exchanges_of_two_electrodes_are_found_on_measured_tanks(data_folder):
+def test_all_exchanges_of_two_electrodes_are_detected_on_measured_tanks(data_folder):
     """Each pair on one of two tanks, and every distance along the ring on both."""
     frames = list(islice(measured_tanks(data_folder), 2))
     models = [model_of(frame) for frame in frames]
@@ -200,8 +202,8 @@ def test_all_exchanges_of_two_electrodes_are_found_on_measured_tanks(data_folder
 
 
 @pytest.mark.parametrize("signed", [False, True])
-def test_the_order_of_magnitudes_is_found(signed):
-    """Magnitudes, or these with the signs that the described order gives them, as on reading."""
+def test_the_order_of_magnitudes_is_detected(signed):
+    """Magnitudes, or the same with the signs that the described order gives them on reading."""
     model = MODEL.with_protocol(opposite(COUNT))
     order = 'from electrode 1 on in every drive (order = "fixed")'
     frame = measured(model, order=order)

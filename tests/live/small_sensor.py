@@ -1,4 +1,4 @@
-"""A sensor of eight electrodes for tests that need frames and no image, and a view that draws nothing."""
+"""A sensor of eight electrodes for tests that need frames but no image, and a view that draws nothing."""
 
 import numpy as np
 
@@ -47,7 +47,7 @@ def description(path, data=""):
 
 
 class Blank(AbstractView):
-    """A view without images, which keeps the frames it was shown and the references it was given."""
+    """A view without images, which stores the frames and references that it received."""
 
     def __init__(self, make=None):
         self.scene = Scene("blank", "nothing", "", True, (-0.1, 0.1, -0.1, 0.1), ())

@@ -1,4 +1,4 @@
-"""A session without a device, for tests of the page: a Gaussian that goes round, and notes of what was asked for."""
+"""A session without a device, for tests of the page: a moving Gaussian, and a record of the commands received."""
 
 import math
 import threading
@@ -45,7 +45,7 @@ def round_scene() -> Scene:
 
 
 class StandIn:
-    """What a page needs of a session: pictures at a rate, or those that a test publishes (`rate` None)."""
+    """A session's interface for a page: pictures at a rate, or those that a test publishes (`rate` None)."""
 
     def __init__(self, rate: float | None = 60.0, period: float = 8.0) -> None:
         self.scene, self.rate, self.period = round_scene(), rate, period
@@ -79,7 +79,7 @@ class StandIn:
         return ORBIT * math.cos(angle), ORBIT * math.sin(angle)
 
     def publish(self, number: int, second: float, refused: str = "", values=None) -> None:
-        """Make the picture of a time, with its largest value, 0.004, at `place(second)`."""
+        """Create the picture for a time, with its largest value, 0.004, at `place(second)`."""
         arrived = time.monotonic()
         x, y = self.place(second)
         pixels = -0.004 * np.exp(-((self._x - x) ** 2 + (self._y - y) ** 2) / (2 * WIDTH**2))

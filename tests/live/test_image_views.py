@@ -1,7 +1,7 @@
 """Views of images and contacts against `stream`, `find_contacts` and `track_contacts` on the same frames.
 
-A sheet of sixteen electrodes on 120 nodes, in which a body of half the conductivity moves: views are judged here, not
-images.
+A sheet of sixteen electrodes on 120 nodes, in which a body of half the conductivity moves. The tests are of views, not
+of the accuracy of images.
 """
 
 import numpy as np
@@ -77,8 +77,8 @@ def live(frames, first=0):
 
 
 @pytest.mark.parametrize("memory", [0.0, 3.0])
-def test_pixels_are_those_of_the_stream(model, calibration, still, frames, memory):
-    """With a memory too, and of faulty frames among them the same are refused for the same reasons."""
+def test_pixels_equal_those_of_the_stream(model, calibration, still, frames, memory):
+    """Also with a memory. Of faulty frames among them the same ones are refused, for the same reasons."""
     imager = imager_of(model, still.mean(axis=0), memory=memory)
     partly = np.where(np.arange(208) < 20, np.nan, frames[2])
     given = [frames[0], still[0], frames[1, :-1], partly, np.full(208, np.nan), "half a li", 0 * frames[0], frames[2]]
@@ -108,12 +108,12 @@ def test_the_first_row_is_the_uppermost(model, calibration, imager):
     assert 0.4 < column / width < 0.6
 
 
-def test_a_new_reference_is_that_of_an_imager_made_with_it(model, calibration, imager, still, frames):
+def test_a_new_reference_equals_a_new_imager_with_it(model, calibration, imager, still, frames):
     other = 1.02 * still
     view = ConductivityView(imager, calibration)
     view.picture(live(frames)[0])
     view.set_reference(other)
-    # Noise stays that of the first reference.
+    # The noise remains that of the first reference.
     deviation = np.asarray(imager.noise)
     made = Imager.create(
         *(model, 1.0),
@@ -129,7 +129,7 @@ def test_a_new_reference_is_that_of_an_imager_made_with_it(model, calibration, i
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         (lambda still: still[:, :-1], "shape"),
         (lambda still: still[:0], "give frames"),
@@ -141,23 +141,23 @@ def test_a_new_reference_is_that_of_an_imager_made_with_it(model, calibration, i
         (lambda still: 1000 * still, "1e+03 times"),
     ],
 )
-def test_a_wrong_reference_leaves_the_old_one(calibration, imager, still, frames, wrong, said):
+def test_a_bad_reference_leaves_the_old_one(calibration, imager, still, frames, wrong, message):
     view = ConductivityView(imager, calibration)
     before = view.picture(live(frames)[0]).pixels
     with pytest.raises(ValueError, match="reference") as error:
         view.set_reference(wrong(still))
-    assert said in str(error.value)
+    assert message in str(error.value)
     np.testing.assert_array_equal(view.picture(live(frames)[0]).pixels, before)
 
 
-def test_contacts_and_paths_are_those_of_the_batch(model, calibration, imager, still, frames):
+def test_contacts_and_paths_equal_those_of_the_batch(model, calibration, imager, still, frames):
     """Markers of each frame against contacts found in images of the stream, with the noise of images of `still`; the
     number of the touch is that of the tracker over all frames."""
     view = ContactsView(ConductivityView(imager, calibration), still)
     quiet = np.array([one.conductivity for one in stream(imager, still)])
     factor = (quiet - quiet.mean(axis=0)) / np.sqrt(len(quiet) - 1)
     noise = ImageNoise(np.sqrt((factor**2).sum(axis=0)), factor)
-    given = [*frames, *still[:15], *frames]  # a quarter of a second of nothing: a second touch
+    given = [*frames, *still[:15], *frames]  # no contact for a quarter of a second: a second touch
     pictures = [view.picture(frame) for frame in live(given)]
     finder = CellFinder(model.mesh, sign=-1)
     found = [find_contacts(finder, one.conductivity - 1.0, noise) for one in stream(imager, given)]
@@ -179,14 +179,14 @@ def test_a_long_session_of_contacts_keeps_little(calibration, imager, still, fra
     assert view._tracker.closed == ()
 
 
-def test_frames_of_one_moment_are_followed(calibration, imager, still, frames):
+def test_frames_of_one_moment_are_tracked(calibration, imager, still, frames):
     view = ContactsView(ConductivityView(imager, calibration), still)
     pictures = [view.picture(LiveFrame(number, 1.0, 0.0, frames[0])) for number in range(3)]
     assert [one.status for one in pictures] == 3 * ["imaged"]
     assert {one.markers[0].track for one in pictures} == {0}
 
 
-def test_a_scene_has_what_a_page_draws(model, calibration, imager):
+def test_a_scene_contains_what_a_page_draws(model, calibration, imager):
     scene = ConductivityView(imager, calibration).scene
     assert (scene.unit, scene.diverging, len(scene.outline)) == ("S", True, 1)
     np.testing.assert_allclose(np.linalg.norm(scene.outline[0], axis=1), RADIUS)
@@ -205,7 +205,7 @@ def test_channels_against_a_reference_electrode_are_named():
 
 
 def test_a_solid_is_shown_as_a_slice():
-    """The outline of the slice is the circle, within a pixel; discs on top are circles, as seen from above."""
+    """The outline of the slice is the circle, within a pixel. Discs on top are circles, as seen from above."""
     mesh = cylinder(0.05, 0.04, num_points=300)
     place = np.column_stack([0.03 * ring(1.0, 4), np.full(4, 0.04)])
     electrodes = FaceDiscs(place, 0.008, 1e-3)

@@ -1,5 +1,6 @@
 """Views of learnt skins, depth and gestures against `LearntSkin.predict`, `stream_depths` and `TouchWatch` on the same
-frames."""
+frames.
+"""
 
 import tomllib
 
@@ -29,7 +30,7 @@ DESCRIPTION = parse_description(tomllib.loads(TOML), "skin.toml")
 
 @pytest.fixture(scope="module", autouse=True)
 def _quick():
-    """Images of gestures are coarse: learning has no option for their mesh."""
+    """Images for gestures are coarse: learning has no option for their mesh."""
     with libraries_found_once(), pytest.MonkeyPatch.context() as patch:
         patch.setattr("jeit.imaging.stream_preparation.STREAM_POINTS", 250)
         yield
@@ -51,8 +52,10 @@ def presses():
     return record(12, seed=5, untouched=3)
 
 
-def test_places_and_forces_are_those_predicted(skin, presses):
-    """A frame at a time against all at once; a ring holds 68 % of a round normal distribution of that deviation."""
+def test_places_and_forces_equal_the_predictions(skin, presses):
+    """One frame at a time against all at once. A ring contains 68 % of an isotropic normal distribution of that
+    deviation.
+    """
     still = presses["reference"][:1]
     found = skin.predict(presses["frames"], still[0])
     made = pictures(LearntSkinView(skin, still), presses["frames"])
@@ -71,16 +74,18 @@ def test_places_and_forces_are_those_predicted(skin, presses):
     assert made[-1].status == "unchanged"
 
 
-@pytest.mark.parametrize(("values", "said"), [("half a li", "text"), (np.ones(39), "39 channels"), (np.ones(0), "0")])
-def test_what_is_no_frame_of_the_skin_is_refused(skin, presses, values, said):
+@pytest.mark.parametrize(
+    ("values", "message"), [("half a li", "text"), (np.ones(39), "39 channels"), (np.ones(0), "0")]
+)
+def test_invalid_frames_are_refused(skin, presses, values, message):
     view = LearntSkinView(skin, presses["reference"][:1])
     picture = view.picture(LiveFrame(0, 0.0, 0.0, values))
     assert picture.status == "refused"
-    assert said in picture.reason
+    assert message in picture.reason
     assert view.picture(LiveFrame(1, 0.1, 0.0, presses["frames"][0])).markers
 
 
-def test_a_learnt_skin_takes_a_new_reference_of_its_own_kind(skin, presses):
+def test_a_learnt_skin_accepts_a_new_reference_of_its_own_kind(skin, presses):
     view = LearntSkinView(skin, presses["reference"][:1])
     view.set_reference(1.05 * presses["reference"])
     found = skin.predict(presses["frames"][:1], 1.05 * presses["reference"][0])
@@ -92,7 +97,7 @@ def test_a_learnt_skin_takes_a_new_reference_of_its_own_kind(skin, presses):
 
 
 def test_labels_and_keys_are_events_once_they_last():
-    """A label of one frame alone is none; the first that lasts is said once."""
+    """A label of a single frame is no event. The first that lasts is reported once."""
     rng = np.random.default_rng(0)
     centres = {"none": 0.0, "palm": 1.0, "finger": -1.0}
     label = np.array(list(centres))[np.arange(90) % 3]
@@ -102,8 +107,8 @@ def test_labels_and_keys_are_events_once_they_last():
     view = LearntSkinView(learnt)
     which = [0, 0, 1, 0, 1, 1, 1, 2, 2, 0, 0]
     events = [one.events for one in pictures(view, frames[which])]
-    said = [(number, *(word.split()[0] for word in one)) for number, one in enumerate(events) if one]
-    assert said == [(5, "palm"), (8, "finger"), (10, "none")]
+    reported = [(number, *(word.split()[0] for word in one)) for number, one in enumerate(events) if one]
+    assert reported == [(5, "palm"), (8, "finger"), (10, "none")]
     with pytest.raises(ValueError, match="without a reference"):
         view.set_reference(frames[:3])
 
@@ -115,7 +120,7 @@ def test_a_skin_learnt_by_sessions_is_refused():
         LearntSkinView(learnt, given["reference"])
 
 
-def test_the_box_of_a_skin_without_a_description_holds_its_places(skin, presses):
+def test_the_box_of_a_skin_without_a_description_contains_its_places(skin, presses):
     scene = LearntSkinView(skin, presses["reference"]).scene
     x_min, x_max, y_min, y_max = scene.extent
     assert -0.05 <= x_min < -0.04 < 0.04 < x_max <= 0.05
@@ -128,7 +133,7 @@ def test_the_box_of_a_skin_without_a_description_holds_its_places(skin, presses)
 
 @pytest.fixture(scope="module")
 def network():
-    """A network that is not trained, whose maps are linear images; and frames of its skin."""
+    """An untrained network, whose maps are linear images, and frames of its skin."""
     skin = Skin.create(named_layout("grid-4x4", Rectangle(0.1, 0.1)), num_layers=0, cell_size=8e-3)
     plain = Unrolled(skin.model.protocol.num_measurements, SHAPE, key=jax.random.key(0))
     places, sensed = image_places(skin, SHAPE[1], SHAPE[0]), LinearChannels.from_skin(skin, SHAPE)
@@ -138,7 +143,7 @@ def network():
     return ImageNetwork.from_skin(linear, skin, 1.5e-3, SHAPE), 1.0 + change
 
 
-def test_depths_are_those_of_the_stream(network):
+def test_depths_equal_those_of_the_stream(network):
     imaging, frames = network
     rest = frames[0]
     given = [*frames, frames[1][:-1], np.where(np.arange(len(rest)) == 3, np.nan, frames[2]), 200 * frames[1]]
@@ -167,8 +172,8 @@ def gestures():
     return learn_gestures(DESCRIPTION, made, method="linear-discriminant", form="course").model, stream
 
 
-def test_gestures_are_those_of_the_watch(gestures):
-    """Every sentence at the frame at which `TouchWatch` classifies a touch, with its gesture and probability."""
+def test_gestures_equal_those_of_the_watch(gestures):
+    """Every event is at the frame at which `TouchWatch` classifies a touch, with its gesture and probability."""
     model, stream = gestures
     still = stream.voltages[:60]
     watch = TouchWatch.create(TouchImages.prepare(DESCRIPTION, still), model, still, rate=RATE)
@@ -193,7 +198,7 @@ def test_gestures_are_those_of_the_watch(gestures):
     assert made[named].markers[0].label == made[named].events[0].split(" at ")[0]
 
 
-def test_gestures_go_on_after_faulty_frames_and_a_new_reference(gestures):
+def test_gestures_continue_after_faulty_frames_and_a_new_reference(gestures):
     model, stream = gestures
     view = GestureView(DESCRIPTION, model, stream.voltages[:60])
     wrong = [stream.voltages[0], "text", stream.voltages[0][:-1], np.full(48, np.nan)]

@@ -1,4 +1,4 @@
-"""Lines cut from bytes, against Python's own splitting; numbers turned into volts, against the readers of files."""
+"""Lines split from bytes, against Python's own splitting, and numbers as volts, against the readers of files."""
 
 import tracemalloc
 
@@ -11,7 +11,7 @@ from jeit.live.lines import LineBuffer, LineReading
 
 
 def pieces(content, longest):
-    """Content in pieces of random length."""
+    """Content in chunks of random length."""
     random = np.random.default_rng(0)
     while content:
         size = int(random.integers(1, longest + 1))
@@ -20,7 +20,7 @@ def pieces(content, longest):
 
 
 @pytest.mark.parametrize("longest", [1, 3, 7, 1000])
-def test_lines_do_not_depend_on_how_bytes_are_cut(longest):
+def test_lines_do_not_depend_on_chunk_boundaries(longest):
     content = b"1, 2, 3\r\n\n  \n4;5;6\rmagnitudes : 1,2\nx\xff\x00y\nlast"
     buffer = LineBuffer()
     lines = [line for piece in pieces(content, longest) for line in buffer.feed(piece)]
@@ -30,7 +30,7 @@ def test_lines_do_not_depend_on_how_bytes_are_cut(longest):
 
 
 @pytest.mark.parametrize("longest", [1, 5, 1000])
-def test_frames_of_openeit_are_cut_without_line_ends(longest):
+def test_frames_of_openeit_are_separated_without_line_ends(longest):
     buffer = LineBuffer()
     content = b"boot magnitudes : 1, 2,magnitudes : 3, 4\nMagnitudes: 5, 6magnitudes : 7"
     lines = [line for piece in pieces(content, longest) for line in buffer.feed(piece)]
@@ -38,7 +38,7 @@ def test_frames_of_openeit_are_cut_without_line_ends(longest):
     assert buffer.rest() == b"magnitudes : 7"
 
 
-def test_a_line_without_end_takes_bounded_memory_and_the_next_one_is_whole():
+def test_a_line_without_end_uses_bounded_memory_and_the_next_one_is_complete():
     buffer, piece = LineBuffer(10_000), b"7" * 4096
     tracemalloc.start()
     for _ in range(500):
@@ -52,7 +52,7 @@ def test_a_line_without_end_takes_bounded_memory_and_the_next_one_is_whole():
 
 
 def frame_in(reading, line):
-    """The frame in a line, which must be one."""
+    """The frame in a line, which must contain one."""
     found = reading(line)
     assert isinstance(found, np.ndarray)
     return found
@@ -108,8 +108,8 @@ def test_a_disturbed_first_frame_does_not_fix_signs():
     np.testing.assert_allclose(frame_in(reading, ", ".join(map(repr, frame.tolist())).encode()), frame, rtol=1e-12)
 
 
-def test_a_channel_that_one_frame_shows_wrong_is_known_from_the_next():
-    """Of the first frame the reader masks a channel, and another is zero."""
+def test_a_channel_that_one_frame_has_wrong_is_known_from_the_next():
+    """In the first frame the reader masks one channel, and another is zero."""
     reading, frames = LineReading(None, measured()), noisy(3)
     first = frames[0].copy()
     first[[2, 9]] = 0.0, 1e3
@@ -128,8 +128,8 @@ def test_garbage_is_text_or_numbers_of_another_number(line):
     assert len(found) <= 400 if isinstance(found, str) else len(found) != CHANNELS
 
 
-def spoilt(content, random):
-    """Content with some bytes changed, left out, repeated, or numbers made huge."""
+def corrupted(content, random):
+    """Content with some bytes changed, removed or repeated, or with numbers made huge."""
     content = bytearray(content)
     for _ in range(int(random.integers(1, 6))):
         place = int(random.integers(len(content)))
@@ -151,14 +151,14 @@ def spoilt(content, random):
 
 
 @pytest.mark.parametrize("word", ["", "magnitudes : "])
-def test_spoilt_lines_are_frames_or_text_and_leave_whole_ones_right(word):
-    """Half of the lines are spoilt at random, from the first on."""
+def test_corrupted_lines_are_frames_or_text_and_leave_the_others_correct(word):
+    """Half of the lines are corrupted at random, from the first on."""
     reading, buffer, random = LineReading(None, measured()), LineBuffer(5000), np.random.default_rng(0)
     frames, right = noisy(400), 0
     for number, values in enumerate(frames):
         line = (word + ", ".join(map(repr, (abs(values) if word else values).tolist()))).encode()
         whole = number % 2 == 1
-        for one in buffer.feed((line if whole else spoilt(line, random)) + b"\n"):
+        for one in buffer.feed((line if whole else corrupted(line, random)) + b"\n"):
             found = reading(one)
             assert found is None or (len(found) <= 400 if isinstance(found, str) else found.ndim == 1)
             if whole and number > 50:
@@ -168,7 +168,7 @@ def test_spoilt_lines_are_frames_or_text_and_leave_whole_ones_right(word):
     assert right == 175
 
 
-def test_gaps_and_words_of_no_number_become_nan_and_comments_notes():
+def test_gaps_and_non_numeric_words_become_nan_and_comments_notes():
     reading = LineReading()
     np.testing.assert_array_equal(reading(b"1,,nan,4"), [1, np.nan, np.nan, 4])
     assert reading(b"# ready, 16 electrodes") is None
@@ -180,7 +180,7 @@ def test_frames_of_two_lines_are_refused_with_advice(tmp_path):
         LineReading(description(tmp_path / "d.toml", "complex_pairs = true\n"))
 
 
-def test_numbers_that_no_reader_takes_are_volts_with_a_note():
+def test_numbers_without_a_reader_are_volts_with_a_note():
     frame = noisy(1)[0]
     sensor = measured()
     reading = LineReading(None, sensor)

@@ -1,5 +1,8 @@
-"""`jeit live` and `jeit.live.prepare`: which source and view become of what is given, and what is said where something
-does not fit. The page itself is not served here."""
+"""`jeit live` and `jeit.live.prepare`: the source and view that arguments select, and messages where something does not
+fit.
+
+The page itself is not served here.
+"""
 
 import json
 import re
@@ -34,7 +37,7 @@ def _coarse(monkeypatch):
 
 @pytest.fixture
 def served(monkeypatch):
-    """What the command would serve: the session with its first results, in place of a server."""
+    """The session that the command would serve, with its first results, in place of a server."""
     seen = SimpleNamespace(results=[], wanted=3)
 
     def serve(session, *, host, port, stay, opened):
@@ -70,7 +73,7 @@ def files(tmp_path):
 
 @pytest.mark.slow
 def test_the_demonstration_shows_the_rod(served, run):
-    """Within 10 mm of where it is, in linear images."""
+    """Within 10 mm of its true place, in linear images."""
     status, output, error = run("live", "demo", "--method", "one-step", "--num-points", 800, "--no-browser")
     assert (status, error) == (0, "")
     assert "http://127.0.0.1:1/  (open it in a browser)" in output
@@ -96,7 +99,7 @@ def test_a_file_is_played_against_its_reference(served, run, files):
     assert len(served.session.scene.channels) == CHANNELS
 
 
-def test_where_nothing_is_imaged_the_status_says_so(served, run, files):
+def test_without_an_image_the_status_says_so(served, run, files):
     np.savetxt(files / "short.csv", np.ones((3, 7)), delimiter=",")
     lines = (files / "short.csv").open()
     given = ("live", "-", "--reference", files / "rest.npz", "--rate", 500, "--until-end", "--method", "one-step")
@@ -107,7 +110,7 @@ def test_where_nothing_is_imaged_the_status_says_so(served, run, files):
     assert (status, "3 frames, and none could be imaged: The frame is" in error) == (1, True)
 
 
-def test_what_stands_in_the_way_is_found_before_anything_is_prepared(run, files, monkeypatch):
+def test_obstacles_are_found_before_anything_is_prepared(run, files, monkeypatch):
     monkeypatch.setattr("jeit.live.preparation.prepare", None)
     (files / "taken").write_text("")
     given = ("live", files / "frames.csv", "--reference", files / "rest.npz")
@@ -121,7 +124,7 @@ def test_what_stands_in_the_way_is_found_before_anything_is_prepared(run, files,
 
 
 def test_the_first_frames_are_the_reference(served, run, files, monkeypatch):
-    """Of lines on standard input that a description says the meaning of; what is no frame among them is left out."""
+    """From lines on standard input with a description. Lines that are no frames are left out."""
     lines = "\n".join(" ".join(map(repr, row)) for row in noisy(60).tolist())
     changed = " ".join(map(repr, (1.02 * rest()).tolist()))
     (files / "lines.txt").write_text(f"starting\n{lines}\n{changed}\n", "utf-8")
@@ -152,7 +155,7 @@ def _kept(frames):
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         (("-",), "--reference is missing"),
         (("nowhere.csv", "--description", "sensor.toml"), "SOURCE: there is no file or folder 'nowhere.csv'"),
@@ -169,17 +172,17 @@ def _kept(frames):
         (("frames.csv", "--reference", "none.npz"), "none.npz"),
     ],
 )
-def test_what_does_not_fit_is_said(served, run, files, monkeypatch, given, said):
+def test_messages_about_arguments_that_do_not_fit(served, run, files, monkeypatch, given, message):
     monkeypatch.chdir(files)
     status, _, error = run("live", *given, "--quiet", "--no-browser")
     assert status == 1
     assert error.count("\n") == 1
-    assert said in error
+    assert message in error
     assert not served.results
 
 
 def test_a_recording_is_played_from_its_beginning(files):
-    """The frames of its first tenth of a second are the reference besides."""
+    """The frames of its first tenth of a second are the reference as well."""
     settings = StreamSettings(solver="one-step")
     given = {"description": files / "sensor.toml", "rate": 200.0, "untouched": 0.1, "settings": settings}
     ready = jeit.live.prepare(str(files / "frames.csv"), **given)
@@ -188,13 +191,13 @@ def test_a_recording_is_played_from_its_beginning(files):
     np.testing.assert_array_equal(frames, noisy(40, seed=3))
 
 
-def test_contacts_are_shown_where_asked_for(served, run):
+def test_contacts_are_shown_on_request(served, run):
     assert run("live", "demo", "--contacts", "--method", "one-step", "-q")[0] == 0
     assert served.session.scene.title == "Contacts, Conductivity change, simulated tank"
     assert {one.picture.markers[0].track for one in served.results} == {0}
 
 
-def test_a_learnt_skin_is_told_by_its_file(tmp_path):
+def test_a_learnt_skin_is_recognised_by_its_file(tmp_path):
     with libraries_found_once():
         given = record(120)
         skin = LearntSkin.fit(Presses.create(**given), method="neighbours")
@@ -229,9 +232,9 @@ def test_gestures_need_a_description(tmp_path):
         jeit.live.prepare(str(tmp_path / "stream.npz"), **given)
     ready = jeit.live.prepare(str(tmp_path / "stream.npz"), description=tmp_path / "skin.toml", **given, untouched=0.5)
     assert isinstance(ready.view, jeit.live.GestureView)
-    said = [text for one in jeit.live.frames(ready.source, ready.view) for text in one.picture.events]
-    assert len(said) == 1
-    assert json.dumps(said)
+    reported = [text for one in jeit.live.frames(ready.source, ready.view) for text in one.picture.events]
+    assert len(reported) == 1
+    assert json.dumps(reported)
 
 
 @pytest.mark.parametrize(
@@ -250,7 +253,7 @@ def test_a_browser_opens_where_there_is_a_display(monkeypatch, served, run, file
     assert opened == ["http://127.0.0.1:1/"] * shown
 
 
-def test_a_port_that_is_taken_is_named(run, files):
+def test_a_port_in_use_is_named(run, files):
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         given = ("live", files / "frames.csv", "--reference", files / "rest.npz", "--method", "one-step", "--rate", 500)
@@ -263,7 +266,7 @@ def test_a_port_that_is_taken_is_named(run, files):
 @pytest.mark.slow
 @pytest.mark.parametrize(("sent", "exits"), [(signal.SIGINT, 0), (signal.SIGTERM, 128 + signal.SIGTERM)])
 def test_a_process_serves_the_page_until_it_is_stopped(tmp_path, sent, exits):
-    """By Ctrl-C or SIGTERM; it prints its counters, and the recording has every frame read."""
+    """By Ctrl-C or SIGTERM. It prints its counters, and the recording contains every frame read."""
     command = [sys.executable, "-m", "jeit", "live", "demo", "--record", "--output", str(tmp_path / "out")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as process:
         assert process.stdout is not None

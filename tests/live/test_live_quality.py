@@ -1,4 +1,4 @@
-"""Quality of a live stream, against frames whose noise, dead and drifting electrodes are known."""
+"""Quality of a live stream, against frames with known noise, dead and drifting electrodes."""
 
 import numpy as np
 import pytest
@@ -24,17 +24,17 @@ def reciprocity_of(frames):
     return found
 
 
-def test_noise_is_that_of_the_frames_also_while_something_moves():
+def test_noise_equals_that_of_the_frames_also_during_motion():
     random = np.random.default_rng(0)
     moving = 0.2 * np.sin(0.05 * np.arange(32))[:, None] * random.uniform(size=CHANNELS) * rest()
     for frames in (noisy(32), noisy(32) + moving):
         assert looked(frames).noise == pytest.approx(NOISE, rel=0.25)
 
 
-def test_reciprocity_is_that_of_the_mean_frame():
+def test_reciprocity_equals_that_of_the_mean_frame():
     assert 0 < reciprocity_of(noisy(32)) < 1e-4
-    spoilt = noisy(32) * np.where(np.arange(CHANNELS) < CHANNELS // 2, 1.1, 1.0)
-    assert reciprocity_of(spoilt) > 0.02
+    scaled = noisy(32) * np.where(np.arange(CHANNELS) < CHANNELS // 2, 1.1, 1.0)
+    assert reciprocity_of(scaled) > 0.02
 
 
 @pytest.mark.parametrize("lost", [np.nan, 0.0, 5.0])
@@ -45,13 +45,13 @@ def test_dead_electrodes_are_named_and_their_neighbours_are_not(lost, dead):
     assert list(looked(frames).dead) == dead
 
 
-def test_a_strong_touch_is_no_dead_electrode():
+def test_a_strong_touch_is_not_a_dead_electrode():
     frames = noisy(32)
     frames[:, np.random.default_rng(1).permutation(CHANNELS) < 0.45 * CHANNELS] *= 1.8
     assert list(looked(frames).dead) == []
 
 
-def test_an_electrode_drifts_if_its_channels_stay_off():
+def test_an_electrode_drifts_if_its_channels_stay_changed():
     frames = noisy(32)
     frames[:, PROTOCOL.channels_touching([4])] *= 1.12
     watch = QualityWatch(measured())
@@ -62,7 +62,7 @@ def test_an_electrode_drifts_if_its_channels_stay_off():
     assert list(looked(frames, watch, times=30).drifting) == []
 
 
-def test_a_touch_that_passes_is_no_drift():
+def test_a_touch_that_ends_is_not_drift():
     touched, still = noisy(32), noisy(32)
     touched[:, PROTOCOL.channels_touching([4])] *= 1.3
     watch, quality = QualityWatch(measured()), Quality()
@@ -72,7 +72,7 @@ def test_a_touch_that_passes_is_no_drift():
     assert list(quality.drifting) == []
 
 
-def test_few_frames_text_and_other_sensors_give_nothing():
+def test_few_frames_text_and_other_sensors_give_no_result():
     watch = QualityWatch(measured())
     for values in (*["text"] * 20, *np.zeros((20, 3)), *noisy(3)):
         watch.add(LiveFrame(0, 0.0, 0.0, values))
@@ -87,13 +87,15 @@ def test_few_frames_text_and_other_sensors_give_nothing():
 
 def test_a_rate_that_doubles_is_reported_once():
     watch = RateWatch()
-    said = [watch(rate) for rate in (0, 59, 61, 60, 60, 90, 60, 119, 120, 121, 120, 118, 0)]
-    assert [one for one in said if one] == ["The frame rate has changed from 60 to 121 frames a second."]
+    reported = [watch(rate) for rate in (0, 59, 61, 60, 60, 90, 60, 119, 120, 121, 120, 118, 0)]
+    assert [one for one in reported if one] == ["The frame rate has changed from 60 to 121 frames a second."]
 
 
 @pytest.mark.parametrize("number", [8, 30, 300])
-def test_noise_is_no_change(number):
-    """Of a hundred references, none; a motion of ten times the noise is found, and its size is that of its parts."""
+def test_noise_is_not_reported_as_change(number):
+    """None of a hundred references. A motion of ten times the noise is detected, and its size is that of its
+    components.
+    """
     random = np.random.default_rng(number)
     usual = 1 + random.random(CHANNELS)
     for _ in range(100):

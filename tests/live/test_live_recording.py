@@ -1,4 +1,4 @@
-"""Recordings are complete to the last whole frame, whatever ends them, and other commands' readers read them."""
+"""Recordings are complete to the last whole frame, however they end, and the readers of other commands accept them."""
 
 import csv
 import errno
@@ -72,7 +72,7 @@ def test_a_recording_is_read_with_its_times_description_and_reference(tmp_path):
     assert rows[2][1].split() == ["0.0"] * (CHANNELS + 1)
 
 
-def test_the_readers_of_skins_read_it_too(tmp_path):
+def test_the_readers_of_skins_accept_it_too(tmp_path):
     recorder, frames = Recorder(tmp_path, reference=measured()), noisy(12, seed=3)
     folder = recorder.start()
     for number, values in enumerate(frames):
@@ -84,7 +84,7 @@ def test_the_readers_of_skins_read_it_too(tmp_path):
 
 
 def test_a_recording_that_was_cut_off_anywhere_in_a_line_is_read_to_the_frame_before(tmp_path):
-    """As a process is that is killed while the system copies a line that lies on two pages."""
+    """As by a process that is killed while the system copies a line that is on two pages."""
     recorder, frames = Recorder(tmp_path, reference=measured()), noisy(4)
     frames[3, -1] = np.nan
     folder = recorder.start()
@@ -109,7 +109,7 @@ def test_a_recording_that_was_cut_off_anywhere_in_a_line_is_read_to_the_frame_be
         np.testing.assert_array_equal(read_frame_recording(folder / "frames.csv", described).frames[:3], frames[:3])
 
 
-def test_frames_of_one_moment_have_times_that_rise(tmp_path):
+def test_frames_of_one_moment_have_increasing_times(tmp_path):
     recorder = Recorder(tmp_path, reference=measured())
     folder = recorder.start()
     seconds = 1.0 + np.array([0, 0, 4e-7, 5e-7, 1.4e-6, 1.5e-6, 1.5e-6, 3e-6])
@@ -135,7 +135,7 @@ def test_two_recordings_are_in_two_folders_and_each_has_its_own_frames(tmp_path)
 
 
 class FullDisk:
-    """`os.write` of a disk with `room` bytes: what does not fit is written in part, then refused."""
+    """`os.write` of a disk with `room` bytes: content that does not fit is written in part, then refused."""
 
     def __init__(self, room):
         self.room, self.write = room, os.write
@@ -149,7 +149,7 @@ class FullDisk:
 
 
 @pytest.mark.parametrize("room", [0, 3, 1000, 2048])
-def test_a_full_disk_leaves_whole_frames_and_the_rest_follows_when_there_is_room(room, tmp_path, monkeypatch):
+def test_a_full_disk_leaves_whole_frames_and_the_rest_follows_when_there_is_space(room, tmp_path, monkeypatch):
     recorder, frames = Recorder(tmp_path), noisy(20)
     folder = recorder.start()
     disk = FullDisk(room)
@@ -170,8 +170,8 @@ def test_a_full_disk_leaves_whole_frames_and_the_rest_follows_when_there_is_room
     np.testing.assert_array_equal(rows[:, 1:], frames)
 
 
-def test_a_recording_that_is_given_up_writes_nothing_into_the_next(tmp_path, monkeypatch):
-    """The disk hangs while the first recording ends; the second begins before the disk goes on."""
+def test_an_abandoned_recording_writes_nothing_into_the_next(tmp_path, monkeypatch):
+    """The disk blocks while the first recording ends. The second begins before the disk responds."""
     recorder, frames, goes_on, written = Recorder(tmp_path), noisy(3), threading.Event(), os.write
 
     def hangs(descriptor, content):
@@ -197,7 +197,7 @@ def test_a_recording_that_is_given_up_writes_nothing_into_the_next(tmp_path, mon
     assert len((first / "frames.csv").read_text().splitlines()) <= 2
 
 
-def test_what_finds_no_room_is_counted(tmp_path, monkeypatch):
+def test_frames_without_space_are_counted(tmp_path, monkeypatch):
     recorder = Recorder(tmp_path)
     recorder.start()
     monkeypatch.setattr(recording.os, "write", FullDisk(0))
@@ -206,12 +206,12 @@ def test_what_finds_no_room_is_counted(tmp_path, monkeypatch):
         recorder.add(frame(number, values))
     wait_for(lambda: recorder._lost)
     assert "could not be recorded" in state_of(recorder)["problem"]
-    said = recorder.stop()
-    assert "0 frames" in said
-    assert "Not recorded, for there was no room: 30 lines" in said
+    report = recorder.stop()
+    assert "0 frames" in report
+    assert "Not recorded, for there was no room: 30 lines" in report
 
 
-def test_long_recordings_are_in_parts_that_are_read_alone(tmp_path, monkeypatch):
+def test_long_recordings_are_in_parts_that_can_be_read_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(recording, "_PART", 5000)
     recorder, frames = Recorder(tmp_path, reference=measured()), noisy(30)
     folder = recorder.start()
@@ -239,7 +239,7 @@ def test_an_unknown_sensor_may_begin_with_half_a_line_and_change_its_channels(tm
     assert len(refused) == 1 + 5
 
 
-def test_a_new_reference_is_kept_beside_the_first(tmp_path):
+def test_a_new_reference_is_saved_beside_the_first(tmp_path):
     recorder, frames = Recorder(tmp_path, reference=measured()), noisy(5)
     folder = recorder.start()
     recorder.renew(2.5, frames)
@@ -271,7 +271,7 @@ while True:
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills a process by a signal")
 def test_a_killed_process_leaves_all_whole_frames(tmp_path):
-    """The process reports how many frames are written; at least as many are read, all of them right."""
+    """The process reports how many frames are written. At least as many are read, all of them correct."""
     with subprocess.Popen(
         [sys.executable, "-c", KILLED, str(tmp_path), str(HERE)], stdout=subprocess.PIPE, text=True
     ) as process:

@@ -1,7 +1,8 @@
 """The page of a live session in a real browser, Debian's Chromium, driven by Playwright.
 
-What is drawn is read from the canvas: the place of a Gaussian and of a rod, which are known, against the place of the
-strongest colour; each button, key and field by what it changes. Skipped where there is no browser or no Playwright.
+Drawn pictures are read from the canvas: the known place of a Gaussian or of a rod is compared with the place of the
+strongest colour. Each button, key and field is tested by its effect. Skipped where there is no browser or no
+Playwright.
 """
 
 import os
@@ -57,7 +58,7 @@ LOOK = """() => {
 
 @pytest.fixture
 def serving():
-    """Start a session and serve it; gives the address. It ends after the pages are closed."""
+    """Start a session and serve it. Returns the address. It ends after the pages are closed."""
     running = []
 
     def start(session, **options):
@@ -87,7 +88,7 @@ def browser():
 
 @pytest.fixture
 def open_page(browser, serving):
-    """Open an address in a window of its own; whatever the console reports as an error fails the test."""
+    """Open an address in a window of its own. Any error on the console fails the test."""
     contexts, faults = [], []
 
     def opened(address, width=1280, height=800, theme="light"):
@@ -108,7 +109,7 @@ def open_page(browser, serving):
 
 
 def until(condition, seconds=5.0):
-    """Wait for a condition, and say whether it came."""
+    """Wait for a condition, and return whether it was met."""
     end = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > end:
@@ -123,7 +124,7 @@ def resident_memory():
 
 
 def drawn(page):
-    """Number of the frame whose picture is drawn; -1 before the first."""
+    """Number of the frame whose picture is drawn, or -1 before the first."""
     return int(page.get_attribute("#image", "data-number") or -1)
 
 
@@ -146,7 +147,7 @@ def text(page, name):
 
 @pytest.mark.parametrize("width", [400, 1280, 2000])
 def test_gaussian_appears_where_it_is(serving, open_page, width):
-    """The strongest colour is within 4 mm of the Gaussian, whose label hides a part of it, at each width and time."""
+    """The strongest colour is within 4 mm of the Gaussian, part of which its label hides, at each width and time."""
     session = StandIn(None)
     address = serving(session)
     page = open_page(address, width, 1000)
@@ -180,7 +181,7 @@ def test_rod_of_the_demonstration_appears_where_it_is(serving, open_page):
 
 
 def test_measurement_buttons(serving, open_page):
-    """Reference, event and recording reach the session, with what is typed, and the page shows what came of them."""
+    """Reference, event and recording reach the session, with the typed text, and the page shows the results."""
     session = StandIn()
     address = serving(session)
     page = open_page(address)
@@ -216,7 +217,7 @@ def test_measurement_buttons(serving, open_page):
 
 
 def test_pause_and_steps(serving, open_page):
-    """Pause stops the picture, steps show neighbours, the slider goes back in time, and going on shows the newest."""
+    """Pause stops the picture, steps show adjacent frames, the slider goes back, and resuming shows the newest."""
     session = StandIn(30.0)
     address = serving(session)
     page = open_page(address)
@@ -244,7 +245,7 @@ def test_pause_and_steps(serving, open_page):
 
 
 def test_colours(serving, open_page):
-    """Scale fitted and kept, its limit typed, values hidden, pixels smoothed, light and dark: each as it says."""
+    """Scale fitted and kept, its limit typed, values hidden, pixels smoothed, light and dark: each has its effect."""
     session = StandIn(None)
     address = serving(session)
     page = open_page(address)
@@ -289,7 +290,7 @@ def test_colours(serving, open_page):
 
 
 def test_pictures_and_films_are_saved(serving, open_page):
-    """The picture is a PNG of the canvas' size, the film a video; both are downloads with names of their own."""
+    """The picture is a PNG of the canvas' size, the film a video. Both are downloads with names of their own."""
     session = StandIn()
     address = serving(session)
     page = open_page(address)
@@ -359,7 +360,7 @@ def test_regions_and_channels_are_followed(serving, open_page):
 
 @pytest.mark.parametrize("width", [400, 1280])
 def test_picture_is_saved_after_the_cross_was_moved(serving, open_page, width):
-    """The words under the image change as the cross goes, but no button moves from under the mouse."""
+    """The text under the image changes as the cross moves, but no button moves from under the mouse."""
     session = StandIn()
     page = open_page(serving(session), width)
     page.wait_for_selector("#image[data-number]")
@@ -373,7 +374,7 @@ def test_picture_is_saved_after_the_cross_was_moved(serving, open_page, width):
 
 
 def test_straight_drags_and_clicks(serving, open_page):
-    """A straight drag follows a rectangle, a click beside the body nothing; after Escape the arrows step again."""
+    """A straight drag adds a rectangle, a click beside the body nothing. After Escape the arrows step again."""
     session = StandIn()
     page = open_page(serving(session))
     page.wait_for_selector("#image[data-number]")
@@ -395,7 +396,7 @@ def test_straight_drags_and_clicks(serving, open_page):
     assert text(page, "pause") == "Go on"
 
 
-def test_failed_recording_is_said_over_the_image(serving, open_page):
+def test_a_failed_recording_is_reported_over_the_image(serving, open_page):
     """A recording that cannot begin is named in the banner when it fails, and not again when the page is opened."""
     session = StandIn()
     address = serving(session)
@@ -423,8 +424,8 @@ def test_numbers_have_no_caret(serving, open_page):
     ]  # fmt: skip
 
 
-def test_what_is_wrong_is_shown(serving, open_page):
-    """Refused frames with reasons, dead electrodes in colour, a disk that is full, a device that is gone."""
+def test_faults_are_shown(serving, open_page):
+    """Refused frames with reasons, dead electrodes in colour, a full disk, a disconnected device."""
     session = StandIn(None)
     warned = """() => {
       const canvas = document.getElementById("image");
@@ -463,8 +464,8 @@ def test_what_is_wrong_is_shown(serving, open_page):
     assert until(lambda: page.locator("#banner").is_hidden())
 
 
-def test_two_browsers_and_a_sleeper(serving, open_page):
-    """Two pages each draw; one that is busy for seconds is sent nothing meanwhile, and wakes with the newest."""
+def test_two_browsers_and_a_sleeping_one(serving, open_page):
+    """Two pages each draw. One that is busy for seconds is sent nothing meanwhile, and continues with the newest."""
     session = StandIn()
     address = serving(session)
     one, two = open_page(address), open_page(address, 400, 800)
@@ -477,8 +478,8 @@ def test_two_browsers_and_a_sleeper(serving, open_page):
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads memory as Linux has it")
-def test_a_browser_asleep_for_a_minute(browser, serving):
-    """A browser that is stopped for a minute costs the session nothing, and shows the newest 3 s after it wakes."""
+def test_a_browser_suspended_for_a_minute(browser, serving):
+    """A browser suspended for a minute costs the session nothing, and shows the newest 3 s after it resumes."""
     session, processes = StandIn(30.0), browser.new_browser_cdp_session()
     page = browser.new_context().new_page()
     page.goto(serving(session))
@@ -503,7 +504,7 @@ def test_a_browser_asleep_for_a_minute(browser, serving):
 
 
 def test_a_lost_server_is_found_again(browser, serving):
-    """When the server goes the page says so, and it draws again when the server is back."""
+    """When the server stops, the page says so, and it draws again when the server is back."""
     session, context = StandIn(), browser.new_context()
     page = context.new_page()
     address = serving(session)
@@ -544,7 +545,9 @@ def lightness(colours):
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_colour_maps_are_even_and_readable(serving, open_page, theme):
-    """Lightness runs one way from end to end, or from the middle; ends stay apart for those without green cones."""
+    """Lightness is monotone from end to end, or from the middle. The ends remain distinct for viewers without green
+    cones.
+    """
     address = serving(StandIn())
     page = open_page(address)
     read = """async ([diverging, theme]) =>

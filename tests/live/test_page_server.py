@@ -1,6 +1,6 @@
-"""The server of a live session's page, spoken to over real sockets: what it sends, whom it lets in, what it refuses.
+"""The server of a live session's page, over real sockets: what it sends, whom it admits, what it refuses.
 
-Pictures are decoded here as the page does it, and compared with the arrays they were made from.
+Pictures are decoded here as by the page, and compared with the arrays that they were made from.
 """
 
 import http.client
@@ -66,7 +66,7 @@ def decoded(message: bytes) -> Any:
 
 @pytest.fixture
 def served():
-    """Start to serve a session on a free port; returns (host, port) and the address; all of it ends with the test."""
+    """Start to serve a session on a free port. Returns (host, port) and the address, and ends with the test."""
     running = []
 
     def start(session, **options):
@@ -121,7 +121,7 @@ def until(connection, kind, seconds=5.0) -> Any:
 
 
 def test_picture_keeps_values_pixels_and_marks():
-    """Pixels come back within half of a 32,767th of the largest, those outside as NaN; a NaN radius as null."""
+    """Pixels are equal within half of a 32,767th of the largest, with NaN outside. A NaN radius is null."""
     pixels = np.array([[np.nan, 1e-3, -2e-3], [0.0, 5e-4, np.inf]], np.float32)
     frame = LiveFrame(7, 1.5, 0.0, np.array([1.0, np.nan, 3.0]))
     message = picture_message(frame, Picture(pixels, (Marker(0.01, -0.02, "1 N"),)), latency=0.004)
@@ -133,14 +133,14 @@ def test_picture_keeps_values_pixels_and_marks():
 
 
 @pytest.mark.parametrize("pixels", [None, np.zeros((2, 3), np.float32), np.full((2, 3), np.nan, np.float32)])
-def test_picture_without_anything_to_see(pixels):
-    """No image, an image of zeros and one of NaN come back as they are, without a warning."""
+def test_picture_without_content(pixels):
+    """No image, an image of zeros and one of NaN are decoded unchanged, without a warning."""
     _, values, back = decoded(picture_message(LiveFrame(0, 0.0, 0.0, "no frame"), Picture(pixels), latency=0.0))
     assert values.size == 0
     np.testing.assert_array_equal(back, pixels)
 
 
-def test_json_holds_what_python_cannot_write():
+def test_json_of_values_that_python_cannot_write():
     """NaN, infinity, NumPy's numbers and unknown objects become JSON that a browser reads."""
     content = {"a": np.float64("nan"), "b": np.int64(3), "c": (1.0, float("inf")), 4: np.bool_(True), "p": b"x"}
     assert json.loads(to_json("state", content)) == {
@@ -156,14 +156,14 @@ def test_json_holds_what_python_cannot_write():
 
 @pytest.mark.parametrize("message", HOSTILE)
 def test_messages_that_are_no_commands_are_refused(message):
-    """Whatever else a page sends raises `ValueError`, in a sentence of one line."""
+    """Anything else that a page sends raises `ValueError`, with a message of one line."""
     with pytest.raises(ValueError, match=r"\w") as error:
         read_command(message)
     assert "\n" not in str(error.value)
 
 
 def test_label_becomes_one_line():
-    """Control characters and repeated spaces of a label are dropped; other scripts stay."""
+    """Control characters and repeated spaces of a label are removed. Other scripts stay."""
     command = read_command('{"do": "mark", "label": "  a\\u0007\\tß  声\\n"}')
     assert command == Mark(do="mark", label="a ß 声")
 
@@ -189,12 +189,12 @@ def test_label_becomes_one_line():
     ],
 )
 def test_hosts(header, listening, allowed):
-    """This machine's names and addresses are let in, and names that another site can point here are not."""
+    """This machine's names and addresses are admitted. Names that another site can direct here are not."""
     assert host_allowed(header, listening) == allowed
 
 
 def test_strangers_get_nothing(served):
-    """Other hosts, other origins, other methods and other paths are refused; pages carry headers that keep out more."""
+    """Other hosts, other origins, other methods and other paths are refused. Pages carry headers that restrict more."""
     address = served(StandIn(None))
     status, headers, text = answer(address)
     assert (status, "<title>jeit live</title>" in text) == (200, True)
@@ -214,7 +214,7 @@ def test_strangers_get_nothing(served):
 
 
 def test_token(served):
-    """A server that other machines reach asks for the token of its address; the wrong one opens nothing."""
+    """A server that other machines can reach requires the token of its address. A wrong one opens nothing."""
     address = served(StandIn(None), host="0.0.0.0")
     assert len(address.query) > len("token=") + 30
     here = {"host": f"127.0.0.1:{address.port}"}
@@ -228,7 +228,7 @@ def test_token(served):
 
 
 def test_commands_reach_the_session(served):
-    """Each command does what it says, and a refused one changes nothing and is answered."""
+    """Each command has its effect. A refused one changes nothing and is answered."""
     session = StandIn(None)
     address = served(session)
     with page(address) as connection:
@@ -259,7 +259,7 @@ def _ask_often(connection, message, most):
 
 
 def test_a_flood_is_cut_off(served):
-    """A page that sends rubbish, or a message that is too long, is disconnected; another goes on."""
+    """A page that sends invalid or overlong messages is disconnected. Another continues."""
     address = served(StandIn(None))
     with page(address) as good:
         for rubbish, most in (("rubbish", 30), ("x" * (LONGEST_COMMAND + 1), 1)):
@@ -269,8 +269,8 @@ def test_a_flood_is_cut_off(served):
         assert until(good, "answer")["problem"] is None
 
 
-def test_slow_page_gets_two_pictures_and_then_the_newest(served):
-    """Pictures that a page has not drawn are not piled up: it is sent two, and after it reports, the newest."""
+def test_a_slow_page_gets_two_pictures_and_then_the_newest(served):
+    """Pictures that a page has not drawn do not accumulate: it is sent two, and after its report, the newest."""
     session = StandIn(None)
     address = served(session)
     with page(address) as connection:
@@ -289,7 +289,7 @@ def test_slow_page_gets_two_pictures_and_then_the_newest(served):
 
 
 def test_pause_and_steps_through_the_past(served):
-    """A paused page is sent nothing; a picture asked for comes, or its neighbour, or the reason why there is none."""
+    """A paused page is sent nothing. A requested picture is sent, or its neighbour, or the reason why there is none."""
     session = StandIn(None)
     address = served(session)
     for number in (0, 1, 2, 5):
@@ -310,8 +310,8 @@ def test_pause_and_steps_through_the_past(served):
         assert until(connection, "picture")[0]["number"] == 6
 
 
-def test_latency_counts_what_was_seen():
-    """Latency is from a frame's last byte to the report; passed-over and hidden pictures do not count."""
+def test_latency_is_of_displayed_pictures():
+    """Latency is from a frame's last byte to the report. Skipped and hidden pictures do not count."""
     import asyncio
 
     async def judged():
@@ -330,7 +330,7 @@ def test_latency_counts_what_was_seen():
 
 
 def test_the_end(served):
-    """The server ends with the session, unless it is to stay; the state says that the session has ended."""
+    """The server ends with the session, unless it is configured to stay. The state says that the session has ended."""
     session = StandIn(None)
     address = served(session)
     session.stop()
@@ -346,7 +346,7 @@ def test_the_end(served):
 
 
 def test_taken_port_and_unknown_host():
-    """A port that is taken, and a host that is not this machine's, are errors that say so."""
+    """A port in use, and a host that is not this machine's, are errors that say so."""
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(OSError, match=rf"port {port}.*choose another"):

@@ -1,4 +1,4 @@
-"""A live session: nothing lost from the recording, late frames left out of the view, and everything reported."""
+"""A live session: the recording is complete, late frames are not displayed, and everything is reported."""
 
 import json
 import threading
@@ -19,7 +19,7 @@ from jeit.live.sources import ENDED, AbstractSource
 
 
 class Given(AbstractSource):
-    """A source of given values, each after a pause of `pause` seconds, which waits at the numbers in `gates`."""
+    """A source of given values, each after a delay of `pause` seconds, which waits at the numbers in `gates`."""
 
     def __init__(self, values, pause=0.0, gates=()):
         super().__init__("given")
@@ -39,7 +39,7 @@ class Given(AbstractSource):
 
 @pytest.fixture(autouse=True)
 def _patience(monkeypatch):
-    """No frame is late because the machine is busy with something else."""
+    """No frame is late because the machine is busy otherwise."""
     monkeypatch.setattr(session_module, "_PATIENCE", 5.0)
 
 
@@ -95,7 +95,7 @@ def test_a_slow_view_misses_frames_and_the_recording_none(tmp_path, monkeypatch)
     np.testing.assert_array_equal(read(f"{folder}/frames.csv").voltages, values)
 
 
-def test_a_hiccup_shorter_than_the_patience_misses_nothing():
+def test_a_delay_shorter_than_the_patience_misses_nothing():
     def hiccup(frame):
         time.sleep(0.03 if frame.number == 5 else 0)
         return Picture(None)
@@ -106,7 +106,7 @@ def test_a_hiccup_shorter_than_the_patience_misses_nothing():
     assert view.seen == list(range(40))
 
 
-def test_reasons_that_differ_in_numbers_are_one_and_kinds_are_bounded():
+def test_reasons_that_differ_in_numbers_are_one_and_the_number_of_kinds_is_bounded():
     def refuse(frame):
         word = "a" * (frame.number // 2 + 1)
         return Picture(None, status=FrameStatus.REFUSED, reason=f"It differs by {frame.number * 1.5} %: {word}.")
@@ -120,7 +120,7 @@ def test_reasons_that_differ_in_numbers_are_one_and_kinds_are_bounded():
     assert state["reasons"]["other reasons"] > 100
 
 
-def test_a_view_that_fails_refuses_the_frame_and_goes_on():
+def test_a_view_that_fails_refuses_the_frame_and_continues():
     def fail(frame):
         if frame.number == 2:
             raise ZeroDivisionError("by zero")
@@ -145,7 +145,7 @@ def test_a_source_that_fails_ends_the_session_with_the_reason():
         assert session.newest(10, 0.1) is None
 
 
-def test_newest_waits_for_a_result_and_gives_up():
+def test_newest_waits_for_a_result_and_times_out():
     source = Given(noisy(3), gates=(2,))
     with Session(source, Blank()) as session:
         wait_for(lambda: session.state()["imaged"] == 2)
@@ -160,7 +160,7 @@ def test_newest_waits_for_a_result_and_gives_up():
         assert number_of(session.result(7)) == 2
 
 
-def test_results_are_kept_for_their_time_and_in_their_memory(monkeypatch):
+def test_results_are_kept_for_a_time_within_their_memory(monkeypatch):
     pixels = np.zeros((10, 10), np.float32)
     with Session(Given(noisy(60), pause=5e-3), Blank(lambda frame: Picture(pixels)), history=0.1) as session:
         session.wait()
@@ -178,7 +178,7 @@ def test_results_are_kept_for_their_time_and_in_their_memory(monkeypatch):
         assert [one.frame.number for one in session._results] == [4]
 
 
-def test_a_new_reference_is_the_next_frames_and_goes_into_the_recording(tmp_path):
+def test_a_new_reference_is_of_the_next_frames_and_is_recorded(tmp_path):
     values = [*noisy(10), "garbage", np.zeros(CHANNELS - 1), *noisy(30, seed=5)]
     source, view = Given(values, gates=(10, 25)), Blank()
     recorder = Recorder(tmp_path, reference=measured())
@@ -210,7 +210,7 @@ def test_a_reference_that_a_view_refuses_is_reported():
             session.take_reference(0)
 
 
-def test_a_reference_that_is_taken_while_the_sensor_changes_is_refused():
+def test_a_reference_taken_while_the_sensor_changes_is_refused():
     moved = noisy(30) * (1 + 0.02 * np.linspace(0, 1, 30)[:, None])
     view = Blank()
     with Session(Given(list(moved), pause=1e-3), view) as session:
@@ -224,8 +224,8 @@ def test_frames_of_another_number_of_channels_are_reported_once():
     values = [*noisy(5), *(np.zeros(CHANNELS + 3) for _ in range(9)), np.zeros(3), *noisy(5)]
     with Session(Given(values), Blank(), reference=measured()) as session:
         session.wait()
-        said = [one for one in texts(session) if "channels" in one]
-    assert said == [
+        messages = [one for one in texts(session) if "channels" in one]
+    assert messages == [
         f"Frames now have {CHANNELS + 3} channels; they had {CHANNELS}.",
         "Frames now have 40 channels; they had 43.",
     ]

@@ -1,5 +1,6 @@
-"""Simulated sources: their places are where images of their frames have the change, and recordings of them are imaged
-by other commands."""
+"""Simulated sources: their places are where images of their frames show the change, and other commands image their
+recordings.
+"""
 
 import csv
 import itertools
@@ -25,7 +26,7 @@ def source(request):
 
 
 @pytest.mark.slow
-def test_the_change_in_an_image_is_where_the_source_says(source):
+def test_the_change_in_an_image_is_at_the_place_of_the_source(source):
     imager, calibration = prepare_imager(source.reference, StreamSettings(solver="one-step", num_points=500))
     cells, sign = np.asarray(centroids(calibration.model.mesh)), -1.0 if "tank" in source.name else 1.0
     seconds = np.arange(0.01, source.period, source.period / 97)
@@ -43,7 +44,7 @@ def test_the_change_in_an_image_is_where_the_source_says(source):
     assert touched > 40
 
 
-def test_no_electrode_of_it_is_dead_or_drifts(source):
+def test_none_of_its_electrodes_is_dead_or_drifts(source):
     watch = QualityWatch(source.reference)
     for second in np.arange(0, 30, 0.5):
         for number in range(32):
@@ -52,7 +53,7 @@ def test_no_electrode_of_it_is_dead_or_drifts(source):
         assert not [*quality.dead, *quality.drifting]
 
 
-def test_it_repeats_itself(source):
+def test_it_is_periodic(source):
     assert source.truth(0.3) == source.truth(0.3 + source.period)
     assert source.reference.num_frames == 50
 
@@ -84,7 +85,7 @@ def test_frames_come_at_their_rate_and_end_at_the_limit():
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Folder of a recording of the simulated skin: 150 frames in which it is stroked twice, at 60 frames/s."""
+    """Folder with a recording of the simulated skin: 150 frames with two strokes, at 60 frames/s."""
     source = simulated_skin(rate=60, limit=150)
     recorder = Recorder(tmp_path_factory.mktemp("live"), reference=source.reference)
     session = Session(source, Blank(), recorder=recorder)

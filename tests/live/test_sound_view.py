@@ -33,11 +33,11 @@ def power():
 
 
 @pytest.mark.parametrize("method", ["likelihood", "consistency"])
-def test_places_are_those_of_locate(calibration, power, method):
-    """A frame at a time against all at once; pixels against the maps, and the least of them near the place."""
+def test_places_equal_those_of_locate(calibration, power, method):
+    """One frame at a time against all at once. Pixels against the maps, which are lowest near the place."""
     view = SoundView(calibration, method=method, floor=FLOOR, freedom=FREEDOM)
-    heard = Intensities(0.05 * np.arange(5), power, floor=FLOOR, freedom=FREEDOM)
-    found = locate(heard, calibration, method=method, gain_drift=0.0, compiled=False)
+    intensities = Intensities(0.05 * np.arange(5), power, floor=FLOOR, freedom=FREEDOM)
+    found = locate(intensities, calibration, method=method, gain_drift=0.0, compiled=False)
     shape = view.scene.extent[3] / view.scene.extent[1]
     for number, values in enumerate(power):
         picture = view.picture(LiveFrame(number, 0.05 * number, 0.0, values))
@@ -62,12 +62,12 @@ def test_places_are_those_of_locate(calibration, power, method):
     assert sorted(set(found.status)) == ["no touch", "touch", "two touches"]
 
 
-def test_faulty_frames_are_refused_and_lost_microphones_are_left_out(calibration, power):
+def test_faulty_frames_are_refused_and_missing_microphones_are_left_out(calibration, power):
     view = SoundView(calibration, floor=FLOOR, freedom=FREEDOM)
     lost = np.where(np.arange(9) < 2, np.nan, power[0])
-    for values, said in (("text", "text"), (power[0, :8], "8 numbers"), (np.full(9, np.nan), "three")):
+    for values, reason in (("text", "text"), (power[0, :8], "8 numbers"), (np.full(9, np.nan), "three")):
         picture = view.picture(LiveFrame(0, 0.0, 0.0, values))
-        assert (picture.status, said in picture.reason) == ("refused", True)
+        assert (picture.status, reason in picture.reason) == ("refused", True)
     (marker,) = view.picture(LiveFrame(1, 0.1, 0.0, lost)).markers
     assert np.hypot(marker.x - 0.03, marker.y - 0.05) < 0.01
 

@@ -1,4 +1,4 @@
-"""Sources against devices that are played here: a pseudo-terminal, a server, a pipe, a folder; lost and found again."""
+"""Sources against simulated devices: a pseudo-terminal, a server, a pipe, a folder, also when reconnected."""
 
 import contextlib
 import os
@@ -27,7 +27,7 @@ def line(values):
 
 
 class Reading:
-    """A source that is read by a thread, which keeps the frames."""
+    """A source read by a thread, which keeps the frames."""
 
     def __init__(self, source):
         self.source, self.frames = source, []
@@ -52,7 +52,7 @@ class Reading:
             assert time.monotonic() < end, (len(self.frames), self.source.connection, list(self.source.messages))
             time.sleep(0.005)
 
-    def said(self, word):
+    def reported(self, word):
         return any(word in text for _, text in self.source.messages)
 
     @property
@@ -65,7 +65,7 @@ class Reading:
 
 
 def are_due(seconds, expected):
-    """Whether frames come when they should: none early, and most of them soon, whatever else the machine does."""
+    """Whether frames come when they should: none early, and most of them soon, despite other load of the machine."""
     late = np.asarray(seconds) - expected
     return late.min() > -1e-3 and np.median(late) < 0.05
 
@@ -92,12 +92,12 @@ def test_lines_of_a_pipe_with_garbage_between_them():
     assert len(reading.numbers[1]) < CHANNELS
     assert reading.texts == ["\ufffd\ufffd garbage"]
     assert [one.number for one in reading.frames] == list(range(5))
-    assert reading.said("The device sends: # ready")
+    assert reading.reported("The device sends: # ready")
     os.close(read)
 
 
 @posix
-def test_lines_that_have_arrived_are_played_at_a_rate():
+def test_available_lines_are_replayed_at_a_rate():
     read, write = os.pipe()
     os.write(write, b"".join(map(line, FRAMES)))
     os.close(write)
@@ -109,7 +109,7 @@ def test_lines_that_have_arrived_are_played_at_a_rate():
 
 @posix
 def test_a_serial_device_unplugged_and_plugged_in_again(tmp_path):
-    """A link names the device, as those of udev do: it vanishes, and then names another pseudo-terminal."""
+    """A link names the device, as those of udev do: it disappears, and then names another pseudo-terminal."""
     pytest.importorskip("serial")
     name = tmp_path / "device"
 
@@ -125,7 +125,7 @@ def test_a_serial_device_unplugged_and_plugged_in_again(tmp_path):
     source = open_source(f"serial:{name}@115200", reference=measured())
     with Reading(source) as reading:
         reading.wait(lambda: source.connection.startswith("waiting"))
-        assert reading.said(f"Not connected: could not open port {name} (serial devices here: ")
+        assert reading.reported(f"Not connected: could not open port {name} (serial devices here: ")
         leader, follower = plug()
         reading.wait(lambda: source.connection == "connected")
         os.write(leader, line(FRAMES[4])[4:] + line(FRAMES[0]) + line(FRAMES[1]) + line(FRAMES[2])[:40])
@@ -138,8 +138,8 @@ def test_a_serial_device_unplugged_and_plugged_in_again(tmp_path):
         reading.wait(lambda: source.connection == "connected")
         os.write(leader, line(FRAMES[3]))
         reading.wait(lambda: len(reading.numbers) == 3)
-        assert reading.said("Connection lost")
-        assert reading.said("Connected")
+        assert reading.reported("Connection lost")
+        assert reading.reported("Connected")
     np.testing.assert_array_equal(reading.numbers, FRAMES[[0, 1, 3]])
     begun, cut = reading.texts
     assert begun.startswith("begun before connecting: ")
@@ -148,7 +148,7 @@ def test_a_serial_device_unplugged_and_plugged_in_again(tmp_path):
     os.close(follower)
 
 
-def test_a_server_that_goes_and_comes_back():
+def test_a_server_that_disconnects_and_returns():
     listening = socket.create_server(("127.0.0.1", 0))
     port = listening.getsockname()[1]
     source = open_source(f"tcp:127.0.0.1:{port}", reference=measured())
@@ -159,12 +159,12 @@ def test_a_server_that_goes_and_comes_back():
                 for one in sent:
                     peer.sendall(line(one))
                 reading.wait(lambda sent=sent: len(reading.frames) >= (5 if len(sent) == 5 else 12))
-        assert reading.said("the other side has closed the connection")
+        assert reading.reported("the other side has closed the connection")
     listening.close()
     np.testing.assert_array_equal(reading.numbers, FRAMES)
 
 
-def test_a_server_that_is_not_there_is_waited_for_and_can_be_given_up():
+def test_a_missing_server_is_awaited_and_can_be_cancelled():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     with Reading(LineSource("tcp", Server("127.0.0.1", port), LineReading())) as reading:
@@ -207,12 +207,12 @@ def test_files_that_appear_in_a_folder_are_frames(tmp_path, monkeypatch):
         reading.wait(lambda: len(reading.frames) == 4)
         write_table(reference.frames(slice(0, 2)), tmp_path / "many.npz")
         reading.wait(lambda: len(reading.frames) == 6)
-    assert reading.said("Left out: 1 file")
+    assert reading.reported("Left out: 1 file")
     np.testing.assert_array_equal(reading.numbers, [*FRAMES[1:4], *np.asarray(reference.voltages)[:2]])
     assert "broken.csv" in reading.texts[0]
 
 
-def test_files_that_are_there_are_played_at_a_rate(tmp_path):
+def test_existing_files_are_replayed_at_a_rate(tmp_path):
     for number in range(3):
         (tmp_path / f"frame{number}.csv").write_bytes(line(FRAMES[number]))
     with Reading(open_source(str(tmp_path), reference=measured(), rate=1000)) as reading:
@@ -220,7 +220,7 @@ def test_files_that_are_there_are_played_at_a_rate(tmp_path):
     np.testing.assert_array_equal(reading.numbers, FRAMES[:3])
 
 
-def test_a_file_is_read_once_it_keeps_its_size(tmp_path):
+def test_a_file_is_read_once_its_size_is_constant(tmp_path):
     source = open_source(str(tmp_path), reference=measured())
     assert isinstance(source, WatchedFolder)
     path = tmp_path / "frame.csv"
@@ -231,7 +231,7 @@ def test_a_file_is_read_once_it_keeps_its_size(tmp_path):
     assert len(list(source._file(path.name, path.stat().st_size))) == 2
 
 
-def test_a_recording_is_played_at_its_own_rate_or_another():
+def test_a_recording_is_replayed_at_its_own_rate_or_another():
     frames, times = noisy(10), 7.0 + np.arange(10) / 50
     for rate, expected in ((None, 50), (200, 200)):
         seconds = [one.second for one in PlayedRecording("made", frames, times, rate)]
@@ -256,7 +256,7 @@ def test_a_text_that_names_no_source_is_refused_with_advice(text):
         open_source(text)
 
 
-def test_addresses_are_taken_apart():
+def test_addresses_are_parsed():
     server = connection_to("tcp:[::1]:5000")
     assert isinstance(server, Server)
     assert (server.host, server.port) == ("::1", 5000)

@@ -1,7 +1,7 @@
 """Every figure of docs/design.md's "The paper's comparison".
 
-The paper's two layouts touched all over, for several margins, thicknesses and kinds of touch; optimised layouts; and
-measurements chosen from all that could be made. Of accuracy, not of time.
+The paper's two layouts touched all over, for several margins, thicknesses and kinds of touch, optimised layouts, and
+measurements selected from all possible ones. The figures are of accuracy, not of time.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ PICTURE = "design-thickness.png"
 
 
 def run(options: Options) -> Result:
-    """Five tables and, where an output folder is given, the picture of thickness."""
+    """Five tables and, where an output folder is given, the figure of thickness."""
     setting = touches.QUICK if options.quick else touches.Setting()
     say("both layouts touched")
     changed = {name: touches.changes(name, setting.places, setting.mesh) for name in touches.LAYOUTS}
@@ -27,7 +27,7 @@ def run(options: Options) -> Result:
 
 
 def _improved(quick: bool) -> list[Table]:
-    """What can be done better than the paper's layouts and measurements."""
+    """Improvements over the paper's layouts and measurements."""
     say("layouts optimised")
     sizes = ((300, 600), (6, 8), 2, 2) if quick else ((1300, 6000), (16, 24), 4, 60)
     optimised = layouts.optimised(*sizes)

@@ -1,4 +1,4 @@
-"""Optimised layouts and chosen measurements: what the case tells of them."""
+"""Optimised layouts and selected measurements, for the case `design_figures`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ CONDUCTANCE = 2e-3
 
 
 def optimised(nodes: tuple[int, int], columns: tuple[int, int], starts: int, steps: int) -> Table:
-    """Layouts before and after, on a sheet of 2 mS, judged on a finer mesh (nodes and touches along a side of each)."""
+    """Layouts before and after optimisation, on a sheet of 2 mS, evaluated on a finer mesh (nodes and touches along a
+    side of each).
+    """
     import jax
 
     from jeit.design import (
@@ -48,16 +50,18 @@ def optimised(nodes: tuple[int, int], columns: tuple[int, int], starts: int, ste
         begun = f"random layout {number}" if number else "park-boundary"
         layouts[f"optimised from {begun}"] = Layout(centres, 2 * radii, outline=skin)
     model, grid, touches, options = setting(nodes[1], columns[1])
-    told = {}
+    figures_of = {}
     for name, layout in layouts.items():
         moved = model.with_electrodes(layout.sheet_discs(1e-4))
         least = float(sensitivity_map(moved, CONDUCTANCE, grid, thickness=10e-3).minimum)
         variance = float(layout_scores(moved, CONDUCTANCE, touches, **options).mean_variance)
-        told[name] = least, variance
-    best = list(told.values())[3 + int(np.argmax(found.values))]
+        figures_of[name] = least, variance
+    best = list(figures_of.values())[3 + int(np.argmax(found.values))]
     rows = []
-    for name, (least, variance) in told.items():
-        margins = [f"×{best[0] / least:.1f}", f"×{variance / best[1]:.2f}"] if name in list(told)[:3] else ["", ""]
+    for name, (least, variance) in figures_of.items():
+        margins = (
+            [f"×{best[0] / least:.1f}", f"×{variance / best[1]:.2f}"] if name in list(figures_of)[:3] else ["", ""]
+        )
         rows.append([name, f"{1e3 * least:.1f}", f"{variance:.4f}", *margins])
     header = ["layout", "least Θ, mV", "A, mean variance", "best start's Θ, times", "best start's A, lower by"]
     caption = (
@@ -69,8 +73,11 @@ def optimised(nodes: tuple[int, int], columns: tuple[int, int], starts: int, ste
 
 
 def selected(name: str, number: int, cell_sizes: tuple[float, float], correlations, noises, count: int) -> Table:
-    """So many of a layout's pairs: what is kept, for priors' correlation lengths in metres and noises relative to each
-    voltage; cell sizes of the sheet and under electrodes, metres; of `count` random choices the median."""
+    """A table of `number` selected pairs of a layout: the fraction of information kept.
+
+    For correlation lengths of the prior, metres, and noise relative to each voltage. Cell sizes are of the sheet and
+    under electrodes, metres. The median is of `count` random selections.
+    """
     import jax
 
     from jeit.design import Candidates, information_bound, select_measurements

@@ -1,4 +1,4 @@
-"""The paper's two layouts on a layer, touched all over: what the case tells of them.
+"""The paper's two layouts on a layer, touched all over, for the case `design_figures`.
 
 Text S4 and Figs. S11 and S12 of Park et al., Science Robotics 7, eabm7187 (2022).
 """
@@ -24,15 +24,16 @@ MARGIN, PAIRS, THICKNESS = 10e-3, 94, 10e-3
 
 class Setting(NamedTuple):
     """Places along a side, clusters, margins to the edge in metres, the mesh of the comparison (cell size in metres,
-    layers of cells), that of the study of thickness (cell size, and layers for each thickness, metres) and where it is
-    tried with finer layers; shapes of touches."""
+    layers of cells), that of the study of thickness (cell size, and layers for each thickness, metres) and of its check
+    with finer layers, and shapes of touches.
+    """
 
     places: int = 48
     taxels: int = 90
     margins: tuple[float, ...] = (0.0, 5e-3, 10e-3, 15e-3)
     mesh: tuple[float, int] = (4.5e-3, 5)
     study_cell: float = 7e-3
-    # Cells 1.25 mm tall throughout.
+    # Cells 1.25 mm high throughout.
     study: tuple[tuple[float, int], ...] = ((5e-3, 4), (7.5e-3, 6), (10e-3, 8), (15e-3, 12), (20e-3, 16))
     check: tuple[tuple[float, int], ...] = ((10e-3, 16),)
     shapes: tuple[str, ...] = ("bell", "hemisphere")
@@ -49,7 +50,7 @@ def changes(
     indentation: AbstractIndentation | None = None,
     contrast: float = 0.0,
 ) -> Array:
-    """Changes (n, 496) of the voltages of all pairs at 1 mA, by touches of the whole skin of 1 S/m."""
+    """Changes (n, 496) of the voltages of all pairs at 1 mA, by touches all over the skin of 1 S/m."""
     from jeit.design import sensitivity_map, touch_grid
     from jeit.electrodes import FaceDiscs
     from jeit.forward import ForwardModel
@@ -68,7 +69,7 @@ def changes(
 def response_of(
     name: str, setting: Setting, changed: Array, margin: float = MARGIN, pairs: int = PAIRS
 ) -> SkinResponse:
-    """What the layout feels farther than `margin` from the edge with the nearest `pairs`, given all changes."""
+    """The layout's response farther than `margin` from the edge with the nearest `pairs`, from all changes."""
     import jax
 
     from jeit.design import find_taxels, touches_away_from_the_edge
@@ -88,19 +89,19 @@ def response_of(
     return SkinResponse(layout, theta, taxels)
 
 
-def area(told: dict) -> str:
+def area(figures: dict) -> str:
     """Mean ± standard deviation of the taxels' areas."""
-    return f"{told['taxel_area_cm2']['mean']:.1f} ± {told['taxel_area_cm2']['std']:.1f}"
+    return f"{figures['taxel_area_cm2']['mean']:.1f} ± {figures['taxel_area_cm2']['std']:.1f}"
 
 
-def largest(told: dict) -> str:
+def largest(figures: dict) -> str:
     """Area of the largest taxel."""
-    return f"{told['taxel_area_cm2']['max']:.0f}"
+    return f"{figures['taxel_area_cm2']['max']:.0f}"
 
 
-def blind(told: dict) -> str:
+def blind(figures: dict) -> str:
     """The blind spot."""
-    return f"{100 * told['blind_spot_fraction']:.1f} %"
+    return f"{100 * figures['blind_spot_fraction']:.1f} %"
 
 
 def comparison_table(setting: Setting, changed: dict[str, Array]) -> Table:
@@ -121,7 +122,7 @@ def comparison_table(setting: Setting, changed: dict[str, Array]) -> Table:
 
 
 def thickness_table(setting: Setting) -> tuple[Table, dict[float, list[SkinResponse]]]:
-    """Both layouts on layers of several thicknesses, and what they feel."""
+    """Both layouts on layers of several thicknesses, and their responses."""
     from jeit.design.comparison import comparison_figures
 
     rows, studied = [], {}
@@ -130,11 +131,11 @@ def thickness_table(setting: Setting) -> tuple[Table, dict[float, list[SkinRespo
         mesh = setting.study_cell, num_layers
         both = [response_of(name, setting, changes(name, setting.places, mesh, thickness)) for name in LAYOUTS]
         studied.setdefault(thickness, both)
-        for name, told in zip(LAYOUTS, comparison_figures(*both), strict=True):
+        for name, figures in zip(LAYOUTS, comparison_figures(*both), strict=True):
             row = [f"{1e3 * thickness:g}", str(num_layers), name]
-            row += [f"{1e3 * told['sensitivity_min_V']:.3g}", f"{1e3 * told['sensitivity_mean_V']:.3g}"]
-            row += [f"{told['sensitivity_uniformity']:.2f}", blind(told), area(told), largest(told)]
-            rows.append([*row, f"{told['two_point_mm']:.0f}"])
+            row += [f"{1e3 * figures['sensitivity_min_V']:.3g}", f"{1e3 * figures['sensitivity_mean_V']:.3g}"]
+            row += [f"{figures['sensitivity_uniformity']:.2f}", blind(figures), area(figures), largest(figures)]
+            rows.append([*row, f"{figures['two_point_mm']:.0f}"])
     header = ["thickness, mm", "layers of cells", "layout", "least Θ, mV", "mean Θ, mV", "uniformity", "blind spot"]
     return Table([*header, "taxels, cm²", "largest, cm²", "two-point, mm"], rows, "Thickness"), studied
 
@@ -157,7 +158,7 @@ def kinds_table(setting: Setting, changed: dict[str, Array]) -> Table:
                     known = changes(name, setting.places, setting.mesh, **options)
                 both.append(response_of(name, setting, known))
             one, other = comparison_figures(*both)
-            least = [f"{1e3 * told['sensitivity_min_V']:.3g}" for told in (one, other)]
+            least = [f"{1e3 * figures['sensitivity_min_V']:.3g}" for figures in (one, other)]
             row = [f"{kind} {shape}", *least, blind(other), blind(one), area(one), f"{one['two_point_mm']:.0f}"]
             rows.append([*row, area(other), largest(other)])
     header = ["touch", "least Θ, inner, mV", "least Θ, boundary, mV", "blind spot, boundary", "blind spot, inner"]
@@ -175,7 +176,7 @@ def draw_thickness(studied: dict[float, list[SkinResponse]], path) -> None:
     theta, taxels = figure.subplots(1, 2)
     for shift, colour in enumerate(colours):
         at = np.arange(len(studied)) + 0.4 * (shift - 0.5)
-        both = [felt[shift] for felt in studied.values()]
+        both = [responses[shift] for responses in studied.values()]
         for ax, values in (
             (theta, [1e3 * np.asarray(one.sensitivity.values) for one in both]),
             (taxels, [1e4 * np.asarray(one.taxels.areas) for one in both]),

@@ -1,7 +1,7 @@
 """Voltages, Jacobians, linear images and batches of them: jeit beside SciPy and pyEIT on the same disks.
 
-Same meshes, protocols and conductivities for all; every contestant in a process of its own, turns interleaved. Arcs
-with contact impedance against SciPy, point electrodes against pyEIT, which has no others.
+Meshes, protocols and conductivities are the same for all. Every contestant has its own process, and turns are
+interleaved. Arcs with contact impedance are compared with SciPy, point electrodes with pyEIT, which has no others.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from benchmarks.harness.case import Case, Headline, Options, Result
 from benchmarks.harness.tables import cell, markdown, ratio
 from benchmarks.harness.timing import say
 
-# Sizes of the meshes for each number of electrodes. Figures are asked for 16 electrodes only; with 32, the voltages and
-# the Jacobian show how cost grows.
+# Sizes of the meshes for each number of electrodes. Figures are judged for 16 electrodes only. With 32, the voltages
+# and the Jacobian show the growth of cost.
 NODES = {16: (1150, 5000, 20_000), 32: (5000,)}
 
 
@@ -31,7 +31,7 @@ def run(options: Options) -> Result:
             for model in ("complete", "point"):
                 say(f"{num_points} nodes, {num_electrodes} electrodes, {model} electrode model …")
                 matches.append(play(num_points, num_electrodes, model, settings, matches, Path(folder)))
-                # A run that is stopped has said what it knew.
+                # A run that is stopped has reported its results so far.
                 shown = table(matches[-1:])
                 say(markdown(shown.header, shown.rows))
     wrong = [

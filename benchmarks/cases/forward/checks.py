@@ -1,4 +1,4 @@
-"""The figures that are asked for, beside those measured."""
+"""The required figures, beside those measured."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ JACOBIAN = "voltages and Jacobian"
 
 
 def checks(matches: list[Match]) -> list[Asked]:
-    """All checks that can be made with what was measured."""
+    """All checks that the measured figures allow."""
     return [*_against_pyeit(matches), *_against_scipy(matches), *_images(matches), *_batches(matches)]
 
 
@@ -75,7 +75,7 @@ def _batches(matches: list[Match]) -> Iterator[Asked]:
             if match.num_electrodes != 16 or many is None or one is None:
                 continue
             each = many.median / 64
-            # 5 % is what the medians of two such series differ by on a quiet machine.
+            # The medians of two such series differ by 5 % on a quiet machine.
             yield judged(
                 f"{batch}, {match.num_points} nodes: per item no more than one alone ({alone})",
                 f"{duration(each)} against {duration(one.median)}",

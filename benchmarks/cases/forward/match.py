@@ -1,4 +1,4 @@
-"""One match: a mesh, a number of electrodes, an electrode model, and the contestants that can play it."""
+"""One match: a mesh, a number of electrodes, an electrode model, and the contestants that can take part."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from benchmarks.problems.accuracy import difference, exact_voltages
 TASKS = ("voltages", "voltages and Jacobian", "linear image", "1000 linear images", "64 conductivities", "64 Jacobians")
 # Above this size 64 Jacobians, or pyEIT's dense inverse with its copies, do not fit in this part of free memory.
 MEMORY_SHARE = 0.5
-# Results of direct solvers on the same discretisation may differ by the condition of the problem times rounding.
+# Results of direct solvers on the same discretisation may differ by the condition number times rounding.
 AGREEMENT = 1e-9
 
 
 @dataclass
 class Settings:
-    """How long everything may take, and the interpreter that has pyEIT (None: without it)."""
+    """Limits of time, and the interpreter that has pyEIT (None: without it)."""
 
     rounds: int
     budget: float
@@ -48,14 +48,14 @@ class Match:
 
     @property
     def agreed(self) -> bool:
-        """Whether every result is the same as the opponent's, to rounding."""
+        """Whether every result equals the opponent's, to rounding."""
         return all(value < AGREEMENT for value in self.accuracy.values())
 
 
 def play(
     num_points: int, num_electrodes: int, model: str, settings: Settings, before: list[Match], folder: Path
 ) -> Match:
-    """Time all tasks on one problem. `before`: earlier matches, from which pyEIT's time is foreseen."""
+    """Time all tasks on one problem. `before`: earlier matches, from which pyEIT's time is predicted."""
     problem = problems.make(num_points, num_electrodes, model)
     path = folder / "problem.npz"
     problems.save(problem, path)
@@ -95,7 +95,7 @@ def play(
 def _play_tasks(
     match: Match, contestants: list[Contestant], settings: Settings, before: list[Match], folder: Path
 ) -> None:
-    """Figures of every task that fits, and how far jeit's results are from the first opponent's."""
+    """Figures of every task that fits, and the differences of jeit's results from the first opponent's."""
     for task in settings.tasks:
         if (match.model == "point" and task not in TASKS[:2]) or not _fits(match, task):
             continue
@@ -116,13 +116,15 @@ def _fits(match: Match, task: str) -> bool:
 
 
 def _foresee(match: Match, task: str, settings: Settings, before: list[Match]) -> dict[str, Figures]:
-    """pyEIT inverts the dense matrix for its Jacobian: n³ operations, three copies of n². Spare the hopeless."""
+    """The predicted reason why pyEIT cannot finish, or "". For its Jacobian it inverts the dense matrix: n³ operations,
+    three copies of n².
+    """
     if match.model != "point" or task != "voltages and Jacobian" or settings.pyeit_python is None:
         return {}
     for earlier in reversed(before):
         known = earlier.figures.get(task, {}).get("pyeit")
         if earlier.num_electrodes == match.num_electrodes and known is not None and known.seconds:
-            # Between the loop over cells (n) and the inverse (n³), n² is a forecast in pyEIT's favour.
+            # Between the loop over cells (n) and the inverse (n³), n² is a prediction in pyEIT's favour.
             expected = known.median * (match.num_points / earlier.num_points) ** 2
             if expected > settings.limit:
                 return {"pyeit": Figures(remark=f"> {expected:.0f} s expected, not run")}

@@ -1,4 +1,4 @@
-"""Attributes of touch, of recordings whose attributes are known."""
+"""Attributes of touch from recordings with known attributes."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def test_weber_ratio_of_a_linear_skin_falls_with_the_load(sign):
     np.testing.assert_allclose(ratio, 0.1 / levels, rtol=0.05)
 
 
-def test_a_response_that_saturates_tells_nothing_more():
+def test_a_saturated_response_adds_no_information():
     loads = np.repeat([1.0, 2.0, 3.0, 4.0], 5)
     response = np.minimum(loads, 2.0) + np.tile([-0.1, 0.0, 0.1, 0.0, 0.0], 4)
     assert np.isinf(weber_ratio(loads, response)[1][-1])
@@ -26,31 +26,31 @@ def test_a_response_that_saturates_tells_nothing_more():
 def test_localisation():
     place = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1], [0.1, 0.1]])
     found = place + np.array([[0.003, 0.004], [0.0, 0.001], [np.nan, np.nan], [0.0, 0.0]])
-    told = point_localisation(place, found)
-    assert told.mean == pytest.approx(2e-3)
-    assert told.most == pytest.approx(5e-3)
-    assert told.missed == 0.25
+    result = point_localisation(place, found)
+    assert result.mean == pytest.approx(2e-3)
+    assert result.most == pytest.approx(5e-3)
+    assert result.missed == 0.25
 
 
-def test_least_told_is_where_half_of_the_trials_tell():
+def test_least_detected_amount_is_where_half_of_the_trials_detect():
     amount = np.repeat([0.01, 0.02, 0.03, 0.04], 10)
-    told = np.concatenate([np.arange(10) < number for number in (0, 2, 8, 10)])
-    assert least_detected(amount, told) == pytest.approx(0.025)
+    result = np.concatenate([np.arange(10) < number for number in (0, 2, 8, 10)])
+    assert least_detected(amount, result) == pytest.approx(0.025)
     assert least_detected(amount, np.ones(40, bool)) == 0.01
     assert least_detected(amount, np.zeros(40, bool)) == np.inf
-    # Shares rise with the amount, as one trial that went wrong cannot undo.
+    # The fraction rises with the amount. One failed trial does not change that.
     odd = np.concatenate([np.arange(10) < number for number in (0, 2, 10, 9)])
     assert 0.02 < least_detected(amount, odd) < 0.03
 
 
 def test_areas_and_blur():
     area = np.linspace(1e-4, 1e-3, 7)
-    told = contact_area(area, 3e-4 + 0.5 * area)
-    assert told == pytest.approx((0.5, 3e-4, 1.0))
+    result = contact_area(area, 3e-4 + 0.5 * area)
+    assert result == pytest.approx((0.5, 3e-4, 1.0))
     assert contact_area(area, np.full(7, 3e-4)).correlation == 0.0
 
 
-def test_times_of_a_response():
+def test_response_times():
     seconds = np.arange(0.0, 3.0, 0.01)
     rising = np.where(seconds < 1, 1 - np.exp(-seconds / 0.1), 0.0)
     falling = np.where(seconds >= 1, np.exp(-(seconds - 1) / 0.2), 0.0)
@@ -69,7 +69,7 @@ BAD = {
     "text": (lambda: weber_ratio("a", "b"), "load"),
     "places": (lambda: point_localisation(np.ones((3, 2)), np.ones((2, 2))), "shapes"),
     "nothing found": (lambda: point_localisation(np.ones((3, 2)), np.full((3, 2), np.nan)), "no touch was found"),
-    "numbers told": (lambda: least_detected([1.0, 2.0], [0, 2]), "true or false"),
+    "numbers as detections": (lambda: least_detected([1.0, 2.0], [0, 2]), "true or false"),
     "one area": (lambda: contact_area(np.ones(4), np.ones(4)), "two different areas"),
     "times": (lambda: response_times([0.0, 0.0, 1.0], np.ones(3)), "must increase"),
     "nothing touches": (lambda: response_times([0.0, 1.0, 2.0], np.zeros(3)), "nowhere positive"),

@@ -1,4 +1,4 @@
-"""All attributes of a simulated film, and that they are worse where the skin is."""
+"""All attributes of a simulated film, which are worse where the skin is worse."""
 
 import dataclasses
 
@@ -14,8 +14,7 @@ KEY = jax.random.key(1)
 
 
 def film(noise):
-    """What presses a skin of 100 mm with so many times the film's noise, images of it, what finds contacts; and the
-    skin."""
+    """Presses on a skin of 100 mm at a multiple of the film's noise, its imager, its contact finder, and the skin."""
     electrodes = BoundaryElectrodes(ring(0.05, 16), width=0.008, contact_impedance=300.0)
     fine, model = (ForwardModel(Disk(0.05).mesh(num_points=n), electrodes, adjacent(16)) for n in (1200, 500))
     own = material("velostat")

@@ -1,4 +1,4 @@
-"""A simulated skin, finer than the mesh of its images, and what it reads."""
+"""A simulated skin, on a finer mesh than its images, and its readings."""
 
 from types import SimpleNamespace
 
@@ -18,7 +18,7 @@ from jeit.touch.simulate import DiscIndenter, Press, PressedSkin, material
 
 @pytest.fixture(scope="session")
 def skin():
-    """Frames of two contacts, of one in the middle, and of none: readings, images, and what is known of the noise."""
+    """Frames of two contacts, of one at the centre, and of none: readings, images, and the known noise."""
     electrodes = BoundaryElectrodes(ring(0.05, 16), 0.008, 300.0)
     fine, coarse = (ForwardModel(Disk(0.05).mesh(num_points=n), electrodes, adjacent(16)) for n in (1200, 700))
     pressed = PressedSkin(jax.random.key(0), fine, material("velostat"))

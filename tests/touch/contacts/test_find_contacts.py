@@ -1,4 +1,4 @@
-"""Contacts found: places, areas, noise; none where nothing touches."""
+"""Contacts found in images: places, areas and noise, and none where nothing touches."""
 
 import sys
 
@@ -33,15 +33,16 @@ def test_bumps_are_where_they_are(finder):
     np.testing.assert_allclose(found[0].centroid, [0.02, 0.01], atol=5e-4)
     np.testing.assert_allclose(found[1].centroid, [-0.02, -0.005], atol=5e-4)
     assert found[1].peak / found[0].peak == pytest.approx(0.6, rel=0.02)
-    for one in found:  # the outline lies round the centroid, and encloses about the region
+    for one in found:  # the outline surrounds the centroid and encloses about the region
         x, y = (one.contour - one.centroid).T
         enclosed = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
         assert enclosed == pytest.approx(one.area, rel=0.15)
 
 
 def test_area_and_integral_of_a_smoothed_gaussian():
-    """A Gaussian of variance w² smoothed by one of ℓ² is one of w² + ℓ², whose cut at a level has area 2π(w² + ℓ²)
-    ln(1 / level), and peak w² / (w² + ℓ²)."""
+    """A Gaussian of variance w² smoothed by one of ℓ² is one of w² + ℓ², whose cut at a level has area 2π(w² + ℓ²) ln(1
+    / level), and peak w² / (w² + ℓ²).
+    """
     (found,) = find_contacts(CellFinder(MESH, smoothing=0.003, level=0.5), bump(0.0, 0.0), QUIET)
     wide = 0.007**2 + 0.003**2
     assert found.peak == pytest.approx(0.007**2 / wide, rel=0.03)
@@ -49,13 +50,13 @@ def test_area_and_integral_of_a_smoothed_gaussian():
     assert found.integral == pytest.approx(2 * np.pi * 0.007**2 * 0.5, rel=0.05)
 
 
-def test_near_contacts_part_and_a_shoulder_does_not():
+def test_close_contacts_are_separated_and_a_shoulder_is_not():
     assert len(find_contacts(CellFinder(MESH), bump(0.011, 0) + bump(-0.011, 0), QUIET)) == 2
     assert len(find_contacts(CellFinder(MESH), bump(0.006, 0) + bump(-0.006, 0), QUIET)) == 1
 
 
 @pytest.mark.parametrize("finder", FINDERS)
-def test_negative_changes_are_contacts_only_where_asked(finder):
+def test_negative_changes_are_contacts_only_on_request(finder):
     image = -bump(0.02, 0.01)
     assert find_contacts(finder(MESH), image, QUIET) == []
     (found,) = find_contacts(finder(MESH, sign=-1), image, QUIET)
@@ -65,7 +66,7 @@ def test_negative_changes_are_contacts_only_where_asked(finder):
 
 
 @pytest.mark.parametrize("finder", FINDERS)
-def test_two_presses_are_two(skin, finder):
+def test_two_presses_are_two_contacts(skin, finder):
     found = find_contacts(finder(skin.mesh), skin.two, skin.noise)
     assert len(found) == 2
     truth = np.array([[0.025, 0.0], [-0.02, 0.01]])
@@ -77,16 +78,17 @@ def test_two_presses_are_two(skin, finder):
 def test_no_contact_in_a_thousand_empty_frames(skin, finder):
     ready = finder(skin.mesh)
     assert sum(len(find_contacts(ready, image, skin.noise)) for image in skin.empty) == 0
-    eager = finder(skin.mesh, floor=1.0)  # and it is the floor that keeps them out
+    eager = finder(skin.mesh, floor=1.0)  # the noise floor excludes them
     assert sum(bool(find_contacts(eager, image, skin.noise)) for image in skin.empty[:12]) > 6
 
 
 @pytest.mark.parametrize(
     ("finder", "times", "draws", "within"), [(CellFinder, 50, 50, 0.2), (RasterFinder, 10, 20, 0.5)]
 )
-def test_deviation_is_how_far_the_centroid_strays(skin, finder, times, draws, within):
-    """Against draws of noise many times that of the readings, whose own error is 7 % of 50, 11 % of 20; a contour
-    steps by cells."""
+def test_deviation_is_the_scatter_of_the_centroid(skin, finder, times, draws, within):
+    """Against draws of noise many times that of the readings. The standard error is 7 % for 50 draws, 11 % for 20, and
+    a contour moves by whole cells.
+    """
     random = np.random.default_rng(0)
     volts = times * random.choice([-1, 1], 208) * skin.before.std(axis=0)
     noise = ImageNoise.of_channels(skin.reconstruction, np.abs(volts))
@@ -98,15 +100,15 @@ def test_deviation_is_how_far_the_centroid_strays(skin, finder, times, draws, wi
         found = find_contacts(ready, image, noise)
         nearest = min(found, key=lambda one: np.linalg.norm(one.centroid - exact.centroid))
         places.append(nearest.centroid)
-    strayed = np.sqrt(np.var(places, axis=0).sum())
-    told = find_contacts(ready, skin.one, noise)[0].deviation
-    assert told == pytest.approx(strayed, rel=within)
+    observed = np.sqrt(np.var(places, axis=0).sum())
+    predicted = find_contacts(ready, skin.one, noise)[0].deviation
+    assert predicted == pytest.approx(observed, rel=within)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", [Rectangle(0.2, 0.05), Rectangle(0.1, 0.1)])
-def test_deviation_on_a_raster_counts_cells_that_join_and_leave(shape):
-    """Their edge's slope alone told 0.04 mm of 0.22, and 0.08 of 0.2."""
+def test_deviation_on_a_raster_includes_cells_that_join_and_leave(shape):
+    """The slope at the edge alone gave 0.04 mm of 0.22, and 0.08 of 0.2."""
     electrodes = BoundaryElectrodes(perimeter(shape, 16), 0.008, 300.0)
     fine, coarse = (ForwardModel(shape.mesh(num_points=n), electrodes, adjacent(16)) for n in (1500, 900))
     skin = PressedSkin(jax.random.key(0), fine, material("velostat"))
@@ -116,17 +118,17 @@ def test_deviation_on_a_raster_counts_cells_that_join_and_leave(shape):
     noise, finder = ImageNoise.of_channels(linear, deviation), RasterFinder(coarse.mesh)
     points = np.asarray(coarse.mesh.points)
     low, wide = points.min(axis=0), np.ptp(points, axis=0)
-    random, told, strayed = np.random.default_rng(0), [], []
+    random, predicted, observed = np.random.default_rng(0), [], []
     for share in ((0.63, 0.63), (0.28, 0.6), (0.45, 0.4), (0.7, 0.35), (0.37, 0.52), (0.55, 0.7)):
         (frame,) = skin.frames(jax.random.key(2), [Press(DiscIndenter(0.01), 2.0, low + np.array(share) * wide)])
         frames = frame - empty.mean(axis=0) + deviation * random.normal(size=(12, len(deviation)))
         found = [find_contacts(finder, image, noise)[0] for image in np.asarray(linear.image(frames))]
-        strayed.append(np.var([one.centroid for one in found], axis=0).sum())
-        told.append(np.mean([one.deviation**2 for one in found]))
-    assert 0.7 < np.sqrt(np.sum(told) / np.sum(strayed)) < 1.5
+        observed.append(np.var([one.centroid for one in found], axis=0).sum())
+        predicted.append(np.mean([one.deviation**2 for one in found]))
+    assert 0.7 < np.sqrt(np.sum(predicted) / np.sum(observed)) < 1.5
 
 
-def test_outline_of_cells_is_their_outer_edge_alone():
+def test_outline_of_cells_is_their_outer_boundary_alone():
     points = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     loop = outline_of_cells(points, np.array([[0, 1, 2], [0, 2, 3]]))
     assert sorted(loop.tolist()) == sorted(points.tolist())
@@ -136,14 +138,14 @@ def test_outline_of_cells_is_their_outer_edge_alone():
 
 
 def test_noise_of_frames_is_that_of_channels(skin):
-    told = ImageNoise.of_channels(skin.reconstruction, skin.before.std(axis=0))
-    np.testing.assert_allclose(skin.noise.deviation, told.deviation, rtol=0.3)  # a hundred frames tell it to 7 %
+    predicted = ImageNoise.of_channels(skin.reconstruction, skin.before.std(axis=0))
+    np.testing.assert_allclose(skin.noise.deviation, predicted.deviation, rtol=0.3)  # 100 frames give 7 %
     matrix = np.asarray(skin.reconstruction.matrix)
     covariance = (matrix * skin.before.std(axis=0) ** 2) @ matrix.T
-    np.testing.assert_allclose(told.factor.T @ told.factor, covariance, atol=1e-9 * np.abs(covariance).max())
+    np.testing.assert_allclose(predicted.factor.T @ predicted.factor, covariance, atol=1e-9 * np.abs(covariance).max())
 
 
-def test_noise_unknown_is_taken_from_the_image(skin):
+def test_unknown_noise_is_estimated_from_the_image(skin):
     random = np.random.default_rng(0)
     own = ImageNoise.of_image(0.01 * random.normal(size=MESH.num_cells) + bump(0.0, 0.0, 0.003))
     assert own.deviation[0] == pytest.approx(0.01, rel=0.1)  # a narrow contact, of 2 % of the cells
@@ -155,8 +157,10 @@ def test_noise_unknown_is_taken_from_the_image(skin):
 
 
 @pytest.mark.slow
-def test_large_artefacts_are_no_noise():
-    """Two touches on eight electrodes leave artefacts all over; the median distance from the median hid both."""
+def test_large_artefacts_are_not_reported_as_noise():
+    """Two touches on eight electrodes leave artefacts everywhere. The median distance from the median concealed both
+    touches.
+    """
     electrodes = BoundaryElectrodes(ring(0.05, 8), 0.008, 300.0)
     fine, coarse = (ForwardModel(Disk(0.05).mesh(num_points=n), electrodes, adjacent(8)) for n in (1500, 600))
     skin = PressedSkin(jax.random.key(0), fine, material("velostat"))
@@ -168,7 +172,7 @@ def test_large_artefacts_are_no_noise():
     pairs = [two for two in drawn if np.linalg.norm(two[0] - two[1]) > 0.03]
     presses = [tuple(Press(DiscIndenter(0.01), 5.0, place) for place in two) for two in pairs]
     images = np.asarray(linear.image(skin.frames(jax.random.key(2), presses) - reference))
-    assert sum(len(find_contacts(finder, image)) == 2 for image in images) >= 8  # of 17; 5 were
+    assert sum(len(find_contacts(finder, image)) == 2 for image in images) >= 8  # of 17, where 5 were left before
     untouched = np.asarray(linear.image(empty[100:] - reference))
     assert sum(bool(find_contacts(finder, image)) for image in untouched) <= 9  # of 300
 
@@ -189,7 +193,7 @@ def test_smoothing_is_a_mean(skin):
         (np.zeros(MESH.num_cells, complex), "real"),
     ],
 )
-def test_images_that_are_none(finder, image, wrong):
+def test_bad_images(finder, image, wrong):
     with pytest.raises(ValueError, match=wrong):
         find_contacts(finder(MESH), image, QUIET)
 
@@ -208,7 +212,7 @@ def test_stages_lead_from_image_to_contacts(skin):
     assert sum(one.area for one in found) == pytest.approx(finder.raster.pixel_area * stages.opened.sum(), rel=0.01)
 
 
-def test_stages_where_touched_skin_conducts_worse():
+def test_stages_where_touched_skin_conducts_less():
     image = -bump(0.02, 0.01)
     stages = RasterFinder(MESH, sign=-1).stages(image, QUIET)
     (found,) = find_contacts(RasterFinder(MESH, sign=-1), image, QUIET)
@@ -228,12 +232,12 @@ def test_stages_where_touched_skin_conducts_worse():
         (np.ones(3), np.ones((5, 2)), r"give \(r, 3\)"),
     ],
 )
-def test_noise_that_is_none(deviation, factor, wrong):
+def test_bad_noise(deviation, factor, wrong):
     with pytest.raises(ValueError, match=wrong):
         ImageNoise(deviation, factor)
 
 
-def test_an_image_of_nothing_has_no_contact():
+def test_a_zero_image_has_no_contact():
     assert find_contacts(CellFinder(MESH), np.zeros(MESH.num_cells)) == []
     assert find_contacts(RasterFinder(MESH), np.zeros(MESH.num_cells)) == []
 
@@ -257,7 +261,7 @@ def test_noise_of_another_mesh(skin):
         ({"sign": np.ones(2)}, "sign"),
     ],
 )
-def test_cell_finders_that_are_none(options, wrong):
+def test_bad_cell_finders(options, wrong):
     with pytest.raises(ValueError, match=wrong):
         CellFinder(MESH, **options)
 
@@ -272,17 +276,17 @@ def test_cell_finders_that_are_none(options, wrong):
         ({"constant": 300}, "constant"),
     ],
 )
-def test_raster_finders_that_are_none(options, wrong):
+def test_bad_raster_finders(options, wrong):
     with pytest.raises(ValueError, match=wrong):
         RasterFinder(MESH, **options)
 
 
-def test_a_body_is_no_sheet():
+def test_a_solid_is_refused():
     with pytest.raises(ValueError, match="three dimensions"):
         CellFinder(layer(disk(0.05, num_points=60), 0.01, num_layers=1))
 
 
-def test_frames_that_tell_no_noise(skin):
+def test_frames_that_do_not_determine_noise(skin):
     with pytest.raises(ValueError, match="10 frames or more"):
         ImageNoise.of_frames(skin.reconstruction, skin.before[:3])
     with pytest.raises(ValueError, match="all the same"):
@@ -301,7 +305,7 @@ def test_frames_that_tell_no_noise(skin):
         ImageNoise.of_image(np.array([1.0, np.nan]))
 
 
-def test_without_opencv_it_says_what_to_install(monkeypatch):
+def test_without_opencv_the_message_names_the_package_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(ImportError, match=r"jeit\[vision\]"):
         RasterFinder(MESH)

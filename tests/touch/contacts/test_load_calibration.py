@@ -1,4 +1,4 @@
-"""Loads from peaks: the curve found again, error bars that hold, and what was not calibrated refused."""
+"""Loads from peaks: the curve is recovered, error bars are calibrated, and loads beyond the calibration are refused."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ def drawn(random, number, scatter, sign=1):
     return [contact(*one, sign) for one in zip(loads, places, noise, strict=True)], loads
 
 
-def test_an_exact_curve_is_found_again():
+def test_an_exact_curve_is_recovered():
     calibration = LoadCalibration.fit(*drawn(np.random.default_rng(0), 60, 1e-6), radius=RADIUS)
     np.testing.assert_allclose(calibration.parameters, [np.log(2e-6), 0.8, 0.5, np.log(8.0)], atol=0.02)
     for load, place in ((1.0, 0.0), (5.0, 0.03), (15.0, 0.035)):
@@ -37,13 +37,13 @@ def test_an_exact_curve_is_found_again():
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_error_bars_hold_what_they_say(sign):
+def test_error_bars_are_calibrated(sign):
     random, off = np.random.default_rng(1), []
-    for _ in range(20):  # each calibration has one error for all the loads that it tells
+    for _ in range(20):  # each calibration has one error for all the loads that it estimates
         calibration = LoadCalibration.fit(*drawn(random, 40, 0.05, sign), radius=RADIUS)
         for load, place in zip(random.uniform(1, 8, 40), random.uniform(0, 0.035, 40), strict=True):
-            told = calibration.load(contact(load, place, 0.05 * random.normal(), sign))
-            off.append((told.force - load) / told.deviation)
+            estimated = calibration.load(contact(load, place, 0.05 * random.normal(), sign))
+            off.append((estimated.force - load) / estimated.deviation)
     assert np.std(off) == pytest.approx(1.0, abs=0.2)
     assert np.mean(np.abs(off) < 2) > 0.9
 
@@ -54,7 +54,7 @@ def test_loads_rise_with_peaks():
     assert (np.diff(forces) > 0).all()
 
 
-def test_what_was_not_calibrated_is_refused():
+def test_loads_beyond_the_calibration_are_refused():
     calibration = LoadCalibration.fit(*drawn(np.random.default_rng(3), 40, 0.01), radius=RADIUS)
     with pytest.raises(ValueError, match="greater loads"):
         calibration.load(contact(60.0, 0.02))
@@ -64,7 +64,7 @@ def test_what_was_not_calibrated_is_refused():
 
 @pytest.mark.slow
 def test_a_skin_is_calibrated_over_its_radius(skin):
-    """Loads at places and of sizes that were not calibrated, to 15 %, near the edge as in the middle."""
+    """Loads at places and of sizes outside the calibration, to 15 %, near the edge and at the centre."""
     electrodes = BoundaryElectrodes(ring(RADIUS, 16), 0.008, 300.0)
     model = ForwardModel(Disk(RADIUS).mesh(num_points=2500), electrodes, adjacent(16))
     pressed = PressedSkin(jax.random.key(0), model, dataclasses.replace(material("velostat"), gain_spread=0.0))
@@ -89,7 +89,7 @@ def test_a_skin_is_calibrated_over_its_radius(skin):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_peak_of_the_other_sign_is_no_load(sign):
+def test_a_peak_of_the_other_sign_is_not_a_load(sign):
     contacts, loads = drawn(np.random.default_rng(0), 20, 0.01, sign)
     calibration = LoadCalibration.fit(contacts, loads, radius=RADIUS)
     assert calibration.load(contact(2.0, 0.0, sign=sign)).force == pytest.approx(2.0, rel=0.1)

@@ -1,4 +1,4 @@
-"""Pictures of contacts: what is drawn, where."""
+"""Figures of contacts: the drawn content and its position."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def image():
     return 1e-6 * sum(height * np.exp(-((one / 0.01) ** 2)) for height, one in zip((1.0, 2.0), near, strict=True))
 
 
-def test_contacts_are_drawn_where_they_are(image):
+def test_contacts_are_drawn_at_their_places(image):
     found = find_contacts(CellFinder(MESH), image, QUIET)
     ax = plot_contacts(MESH, image, found, ax=Figure().subplots())
     outlines = [one.get_xy()[:-1] for one in ax.patches if isinstance(one, Polygon)]
@@ -47,7 +47,7 @@ def test_every_stage_has_its_axes(image):
     assert "µS)" in bar.get_ylabel() or "nS)" in bar.get_ylabel()
 
 
-def test_things_of_another_kind(image):
+def test_bad_arguments(image):
     with pytest.raises(ValueError, match="contacts must be"):
         plot_contacts(MESH, image, 3)
     with pytest.raises(ValueError, match=r"contacts\[0\] must be"):

@@ -1,4 +1,4 @@
-"""Touches followed: identities where paths cross, gaps, onsets and offsets."""
+"""Tracked touches: identities where paths cross, gaps, onsets and offsets."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,9 @@ def contact(place, peak=1.0):
 
 
 def crossing(hide):
-    """Two fingers at right angles, one contact between them while they are nearer than `hide`; the peak tells them."""
+    """Two fingers at right angles, one contact between them while they are closer than `hide`. Their peaks distinguish
+    them.
+    """
     along = np.linspace(-0.03, 0.03, 60)
     frames = []
     for x in along:
@@ -24,7 +26,7 @@ def crossing(hide):
 
 
 @pytest.mark.parametrize("hide", [0.0, 0.008, 0.02])
-def test_fingers_that_cross_keep_who_they_are(hide):
+def test_fingers_that_cross_keep_their_identities(hide):
     touches = track_contacts(TIMES, crossing(hide))
     assert len(touches) == 2
     for path in touches:
@@ -34,15 +36,15 @@ def test_fingers_that_cross_keep_who_they_are(hide):
         assert path.length == pytest.approx(0.06, rel=0.3)
 
 
-def test_without_velocity_they_would_be_swapped():
-    """Fingers that meet head on and pass: nearest places alone would take each for the other."""
+def test_without_velocity_they_would_be_exchanged():
+    """Fingers that meet head on and pass: the nearest places alone would exchange them."""
     along = np.linspace(-0.03, 0.03, 61)
     frames = [[contact((x, 0.001), 1.0), contact((-x, -0.001), 2.0)] for x in along]
     touches = track_contacts(np.arange(61) / 60, frames)
     assert [len(set(path.peak)) for path in touches] == [1, 1]
 
 
-def test_short_gaps_are_bridged_and_long_ones_part_touches():
+def test_short_gaps_are_bridged_and_long_ones_separate_touches():
     place = np.stack([0.1 * TIMES, 0 * TIMES], axis=-1)
     seen = [[contact(one)] for one in place]
     short = [[] if 20 <= k < 26 else one for k, one in enumerate(seen)]
@@ -54,20 +56,20 @@ def test_short_gaps_are_bridged_and_long_ones_part_touches():
     assert second.onset == TIMES[40]
 
 
-def test_a_touch_of_one_frame_is_not_told_of():
+def test_a_touch_of_one_frame_is_not_reported():
     frames = [[contact((0.0, 0.0))] if k == 5 else [] for k in range(20)]
     assert track_contacts(TIMES[:20], frames) == []
     assert len(track_contacts(TIMES[:20], frames, ContactTracker(least=1))) == 1
 
 
-def test_far_contacts_are_another_touch():
+def test_distant_contacts_are_another_touch():
     frames = [[contact((0.0, 0.0))]] * 10 + [[contact((0.04, 0.0))]] * 10
     assert len(track_contacts(TIMES[:20], frames)) == 2
 
 
 @pytest.mark.parametrize(("rate", "speed", "side"), [(30, 0.4, 0.07), (30, 0.6, 0.8), (10, 0.1, 0.1), (200, 1.0, 0.05)])
 def test_a_stroke_is_one_touch_of_its_length(rate, speed, side):
-    """With a reach of 12 mm at any rate, the first came back as 17 mm of it and the second not at all."""
+    """With a reach of 12 mm at any rate, the first was reported with 17 mm of its length and the second not at all."""
     along = np.arange(0, side, speed / rate)
     stray = np.random.default_rng(0).normal(0, 5e-4, (len(along), 2))
     frames = [[contact(place)] for place in stray + np.stack([along, 0 * along], axis=-1)]
@@ -77,8 +79,10 @@ def test_a_stroke_is_one_touch_of_its_length(rate, speed, side):
 
 
 @pytest.mark.parametrize("rate", [10, 30, 200])
-def test_two_fingers_side_by_side_stay_two(rate):
-    """Three centimetres apart at 0.3 m/s, one behind the other: farther in a frame, at 10 frames/s, than apart."""
+def test_two_adjacent_fingers_stay_two_touches(rate):
+    """Three centimetres apart at 0.3 m/s, one behind the other: at 10 frames/s each moves farther in a frame than their
+    distance.
+    """
     along = np.arange(0, 0.3, 0.3 / rate)
     frames = [[contact((x, 0.0), 1.0), contact((x + 0.03, 0.0), 2.0)] for x in along]
     touches = track_contacts(np.arange(len(along)) / rate, frames)
@@ -90,7 +94,7 @@ def test_missed_frames_of_a_slow_stream_are_bridged():
     assert len(track_contacts(np.arange(10) / 10, frames)) == 1
 
 
-def test_a_tracker_stays_as_it_was():
+def test_a_tracker_is_immutable():
     empty = ContactTracker()
     after = empty.follow(0.0, [contact((0, 0))]).follow(0.1, [contact((0, 0))])
     assert empty.touches == []

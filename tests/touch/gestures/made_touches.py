@@ -1,4 +1,4 @@
-"""Touches made up for learning: courses of four kinds by people who differ, on no mesh."""
+"""Synthetic touches for learning, without a mesh: four kinds of time courses, from people who differ."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ KINDS = ("tap", "push", "stroke", "slap")
 
 
 def touch(kind, rng, person=0, scale=1.0):
-    """One touch: short or long, weak or strong, still or moving, all spread log-normally, people's means too."""
+    """One touch: short or long, weak or strong, still or moving, with log-normal spreads, also between people."""
     own = np.exp(0.25 * np.random.default_rng(1000 + person).normal(size=3) + 0.15 * rng.normal(size=3))
     force, duration, path = (
         own
@@ -28,7 +28,7 @@ def touch(kind, rng, person=0, scale=1.0):
 
 
 def touches(people=4, each=5, seed=0, kinds=KINDS):
-    """Touches, their kinds, and by whom."""
+    """Touches, their kinds, and the person of each."""
     rng = np.random.default_rng(seed)
     rows = [(person, kind) for person in range(people) for kind in kinds for _ in range(each)]
     made = [touch(kind, rng, person) for person, kind in rows]

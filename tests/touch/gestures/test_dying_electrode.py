@@ -1,4 +1,4 @@
-"""An electrode that dies in the midst of a touch, on a simulated skin: the touch does not end, and is cut off."""
+"""An electrode that fails during a touch on a simulated skin: the touch does not end and is marked as cut off."""
 
 import jax
 import numpy as np
@@ -18,7 +18,7 @@ KEY, FRAMES = jax.random.key(0), 64
 
 @pytest.fixture(scope="module")
 def recorded():
-    """Images of change of a push of 0.2 s; and the same with the third electrode's channels dead from its midst on."""
+    """Images of change of a push of 0.2 s, and the same with the third electrode's channels dead from the middle on."""
     outline = Rectangle(0.32, 0.2)
     places = np.vstack([perimeter(Rectangle(0.3, 0.18), 8, start=0.06), [[0.0, 0.0]]])
     model = ForwardModel(outline.mesh(num_points=250), PointElectrodes(places), reference_electrode(8))
@@ -47,7 +47,7 @@ def test_a_push_is_one_touch_that_ends(recorded):
 
 
 @pytest.mark.slow
-def test_with_an_electrode_dying_it_does_not_end(recorded):
+def test_if_an_electrode_fails_it_does_not_end(recorded):
     level, seconds, images, dead = recorded
     whole, broken = (find_touches(level, seconds, one)[-1] for one in (images, dead))
     assert broken.cut_off

@@ -1,4 +1,6 @@
-"""The seven features of a touch, each by its definition on a mesh of four elements; and more of its course."""
+"""The seven features of a touch, by their definitions on a mesh of four elements, and further features of its time
+course.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ MESH = Mesh.create(
     np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]),
 )
 LEVEL = TouchLevel(MESH, 1.0)
-# At 0.5 s intervals; a touch of three frames.
+# A touch of three frames at 0.5 s intervals.
 IMAGES = np.array([[0, 0, 0, 0], [2, 0, -1, 0], [6, 4, -2, 2], [0, 0, -3, 3], [0, 0, -9, 0]], float)
 
 
@@ -21,7 +23,7 @@ def touch():
     return one
 
 
-def test_the_seven():
+def test_the_seven_features():
     found = touch_features([touch()])
     values = dict(zip(found.names, found.values[0], strict=True))
     centres = np.asarray(centroids(MESH))
@@ -35,21 +37,21 @@ def test_the_seven():
     assert found.units == tuple(FEATURES.values()) == ("image", "image", "1", "image", "s", "image/s", "m")
 
 
-def test_a_centroid_is_weighted_by_what_exceeds_the_level():
+def test_a_centroid_is_weighted_by_the_excess_over_the_level():
     centres = np.asarray(centroids(MESH))
     right = (5 * centres[0] + 3 * centres[1] + 1 * centres[3]) / 9
     np.testing.assert_allclose(touch().course.centroid[1], right)
     assert touch().course.area == pytest.approx([1e-4, 3e-4, 1e-4])
 
 
-def test_of_one_frame_nothing_is_not_a_number():
+def test_features_of_one_frame_are_finite():
     touches = find_touches(LEVEL, np.arange(5) / 50, IMAGES[[0, 2, 0, 0, 0]], least=1)
     found = course_features(touches)
     assert np.isfinite(found.values).all()
     assert found.values[0, list(FEATURES).index("rate of change")] == 0
 
 
-def test_more_of_the_course():
+def test_further_features_of_the_time_course():
     found = course_features([touch()])
     values = dict(zip(found.names, found.values[0], strict=True))
     assert found.names == COURSE_FEATURES

@@ -1,4 +1,4 @@
-"""Models of gestures: chosen on people held out, asked, kept in files; and what is no gesture."""
+"""Gesture models: selected on held-out people, applied, saved in files, and tested on touches that are no gesture."""
 
 import zipfile
 
@@ -24,19 +24,19 @@ def model():
     return GestureModel.fit(made, labels, people=people, method="quadratic-svm")
 
 
-def test_unseen_people_are_told_right(model):
+def test_unseen_people_are_classified_correctly(model):
     made, labels, _ = touches(people=3, each=6, seed=7)
-    said = model.predict(made)
-    assert np.mean(said.gesture == labels) > 0.9
-    assert said.names == tuple(sorted(KINDS))
-    np.testing.assert_allclose(said.probabilities.sum(axis=1), 1)
-    np.testing.assert_array_equal(said.probability, said.probabilities.max(axis=1))
-    assert np.mean(said.unlike) < 0.1
+    predicted = model.predict(made)
+    assert np.mean(predicted.gesture == labels) > 0.9
+    assert predicted.names == tuple(sorted(KINDS))
+    np.testing.assert_allclose(predicted.probabilities.sum(axis=1), 1)
+    np.testing.assert_array_equal(predicted.probability, predicted.probabilities.max(axis=1))
+    assert np.mean(predicted.unlike) < 0.1
     assert len(model.predict([])) == 0
 
 
-def test_what_is_no_gesture_is_unlike_any(model):
-    """An electrode that dies throws the image for good: a change a thousand times as strong that does not end."""
+def test_a_touch_that_is_no_gesture_is_unlike_any(model):
+    """A failing electrode changes the image for good: a change a thousand times as strong that does not end."""
     rng = np.random.default_rng(3)
     assert model.predict([touch("push", rng, scale=1000.0)]).unlike.tolist() == [True]
     assert model.predict([touch("push", rng)]).unlike.tolist() == [False]
@@ -44,12 +44,12 @@ def test_what_is_no_gesture_is_unlike_any(model):
 
 @pytest.fixture
 def quick_network(monkeypatch):
-    """A linear discriminant of whole courses in place of the network, which `test_temporal_network` has."""
+    """A linear discriminant of whole time courses in place of the network, which `test_temporal_network` covers."""
     monkeypatch.setitem(GESTURE_CLASSIFIERS, "temporal-network", GESTURE_CLASSIFIERS["linear-discriminant"])
 
 
 @pytest.mark.usefixtures("quick_network")
-def test_the_best_on_people_held_out_is_taken():
+def test_the_best_method_on_held_out_people_is_selected():
     made, labels, people = touches(people=2, each=3)
     model = GestureModel.fit(made, labels, people=people)
     assert model.standing is not None
@@ -61,15 +61,15 @@ def test_the_best_on_people_held_out_is_taken():
     assert model.notes == ()
 
 
-def test_of_one_person_it_says_so():
+def test_data_of_one_person_are_reported_as_such():
     made, labels, _ = touches(people=1, each=6)
     (note,) = GestureModel.fit(made, labels, people=["a"] * len(made), method="nearest", form="seven").notes
     assert "not on people" in note
 
 
 @pytest.mark.usefixtures("quick_network")
-def test_a_class_that_somebody_never_made():
-    """Folds that lack it do not fail, and a class that never occurs is never told."""
+def test_a_class_that_one_person_never_made():
+    """Folds without it do not fail, and a class that never occurs is never predicted."""
     made, labels, people = touches(people=3, each=2)
     kept = (labels != "slap") | (people == 0)
     some = [one for one, there in zip(made, kept, strict=True) if there]
@@ -99,8 +99,10 @@ def test_folds():
     assert person_folds(people, 2).max() == 1
 
 
-def test_touches_held_out_are_not_learnt_from():
-    """Of labels that mean nothing a fair guess is right by chance; one that had seen them would always be."""
+def test_held_out_touches_are_not_used_for_training():
+    """With random labels a valid accuracy is that of chance. A model that had seen the held-out touches would always be
+    right.
+    """
     rng = np.random.default_rng(0)
     values, right = rng.normal(size=(200, 3)), rng.integers(0, 2, 200)
     odds = held_out_odds("nearest", values, right, random_folds(right, 10))
@@ -108,7 +110,7 @@ def test_touches_held_out_are_not_learnt_from():
 
 
 @pytest.mark.parametrize("method", ["logit-boost", "linear-discriminant", "quadratic-svm"])
-def test_a_file_keeps_it(method, tmp_path):
+def test_a_model_is_saved_and_read(method, tmp_path):
     made, labels, people = touches(people=2)
     model = GestureModel.fit(made, labels, people=people, method=method)
     model.write(tmp_path / "gestures.skops")
@@ -143,7 +145,7 @@ def test_other_files_are_refused(model, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"labels": ["tap"]}, "names of 16 gestures"),
         ({"labels": range(16)}, "names of 16 gestures"),
@@ -156,15 +158,17 @@ def test_other_files_are_refused(model, tmp_path):
         ({"touches": "tap"}, "touches must be a list"),
     ],
 )
-def test_what_cannot_be_learnt_is_said(change, said):
+def test_bad_training_data_are_refused(change, message):
     made, labels, _ = touches(people=2, each=2)
     given = {"touches": made, "labels": labels, "method": "nearest"} | change
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         GestureModel.fit(**given)
 
 
-def test_how_sure_a_support_vector_machine_is_differs():
-    """Votes of pairs are the same for nearly all touches; distances from borders are not, and err less."""
+def test_probabilities_of_a_support_vector_machine_differ_between_touches():
+    """Votes of pairs are nearly the same for all touches. Distances from decision boundaries differ, and are wrong less
+    often.
+    """
     from sklearn.svm import SVC
 
     from jeit.touch.learnt.array_models import SupportVectorMachine
@@ -177,10 +181,10 @@ def test_how_sure_a_support_vector_machine_is_differs():
         SVC(kernel="poly", degree=2, coef0=1.0).fit(values[:300], right[:300])
     )
     odds = log_odds(machine, values[300:])
-    said = np.exp(odds - np.logaddexp.reduce(odds, axis=1, keepdims=True))
-    sure = said.max(axis=1)
+    predicted = np.exp(odds - np.logaddexp.reduce(odds, axis=1, keepdims=True))
+    sure = predicted.max(axis=1)
     assert np.quantile(sure, 0.9) - np.quantile(sure, 0.1) > 0.2
-    correct = said.argmax(axis=1) == right[300:]
+    correct = predicted.argmax(axis=1) == right[300:]
     assert correct[sure > np.median(sure)].mean() > correct[sure <= np.median(sure)].mean() + 0.1
     voted = machine.decision_function(values[300:]).argmax(axis=1)
     assert np.mean(voted == odds.argmax(axis=1)) > 0.9

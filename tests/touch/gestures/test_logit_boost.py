@@ -1,4 +1,4 @@
-"""LogitBoost: an estimator as scikit-learn's are, the same as worked by hand, and never less likely than before."""
+"""LogitBoost: a scikit-learn estimator, equal to a computation by hand, whose likelihood never falls."""
 
 import subprocess
 import sys
@@ -19,7 +19,7 @@ def made(number=60, features=3, classes=3, seed=0, noise=0.5):
 
 
 def by_hand(x, label, rounds):
-    """LogitBoost in plain NumPy, all thresholds tried; probabilities after each round."""
+    """LogitBoost in plain NumPy with all thresholds: the probabilities after each round."""
     classes = np.unique(label)
     right = (label[:, None] == classes).astype(float)
     score, stages = np.zeros(right.shape), []
@@ -34,33 +34,33 @@ def by_hand(x, label, rounds):
             for feature in x.T:
                 for low, high in zip(np.unique(feature)[:-1], np.unique(feature)[1:], strict=True):
                     below = feature <= (low + high) / 2
-                    said = np.where(below, *(np.sum((w * z)[one]) / np.sum(w[one]) for one in (below, ~below)))
-                    error = np.sum(w * (z - said) ** 2)
+                    leaf_means = np.where(below, *(np.sum((w * z)[one]) / np.sum(w[one]) for one in (below, ~below)))
+                    error = np.sum(w * (z - leaf_means) ** 2)
                     if error < best - 1e-12:
-                        best, fitted[:, j] = error, said
+                        best, fitted[:, j] = error, leaf_means
         score = score + share * (fitted - fitted.mean(axis=1, keepdims=True))
         stages.append(np.exp(score) / np.exp(score).sum(axis=1, keepdims=True))
     return stages
 
 
-def test_it_is_an_estimator_of_scikit_learn():
+def test_it_is_a_scikit_learn_estimator():
     check_estimator(LogitBoostClassifier(), on_skip=None)
 
 
-def test_two_samples_worked_by_hand():
+def test_two_samples_computed_by_hand():
     """p = ½, z = ±2, so f = ±2, and F grows by ½ · 2 = 1: p = e / (e + 1/e), then the same once more."""
     model = LogitBoostClassifier(2).fit([[0.0], [1.0]], ["a", "b"])
     first, second = model.staged_predict_proba([[0.0], [1.0]])
     assert first[0, 0] == pytest.approx(np.e / (np.e + 1 / np.e), rel=1e-12)
     p = first[0, 0]
-    odds = 2 * (1 + 1 / (2 * p))  # z = 1 / p for the one, and as much the other way for the other
+    odds = 2 * (1 + 1 / (2 * p))  # z = 1 / p for one sample, and minus that for the other
     assert second[0, 0] == pytest.approx(1 / (1 + np.exp(-odds)), rel=1e-12)
     assert model.decision_function([[1.0]]) == pytest.approx(odds)
     assert model.step_.tolist() == [1.0, 1.0]
 
 
 @pytest.mark.parametrize("classes", [2, 3, 5])
-def test_as_in_plain_numpy(classes):
+def test_result_equals_plain_numpy(classes):
     x, label = made(classes=classes, features=5, seed=classes)
     x = x.astype(np.float32).astype(float)
     model = LogitBoostClassifier(6).fit(x, label)
@@ -73,7 +73,9 @@ def test_as_in_plain_numpy(classes):
 
 
 def test_responses_are_clipped():
-    """Of a class with a sixth of the samples the first response would be 6; at 3, it is no leaf's mean above that."""
+    """For a class with a sixth of the samples the first response would be 6. It is clipped to 3, and no leaf's mean
+    exceeds that.
+    """
     x, label = np.eye(6).repeat(4, axis=0), np.arange(6).repeat(4)
     model = LogitBoostClassifier(1).fit(x, label)
     assert np.maximum(model.above_, model.below_).max() == pytest.approx(3 * 5 / 6)
@@ -95,8 +97,8 @@ def test_the_likelihood_never_falls(seed, number, classes, rate, noise):
     assert np.mean(np.log(chosen)) == pytest.approx(model.log_likelihood_[-1], abs=1e-6)
 
 
-def test_a_step_too_far_is_halved(monkeypatch):
-    """Without clipped responses samples that were told wrongly throw their leaf too far."""
+def test_an_overlong_step_is_halved(monkeypatch):
+    """Without clipped responses misclassified samples shift their leaf too far."""
     from jeit.touch.gestures import logit_boost
 
     monkeypatch.setattr(logit_boost, "_MOST_RESPONSE", 1e9)
@@ -116,13 +118,13 @@ def test_importing_jeit_does_not_import_scikit_learn():
     assert done.returncode == 0, done.stderr
 
 
-def test_a_feature_that_is_constant_tells_nothing():
+def test_a_constant_feature_adds_no_information():
     model = LogitBoostClassifier().fit(np.zeros((6, 2)), [0, 0, 0, 1, 1, 1])
     np.testing.assert_allclose(model.predict_proba([[5.0, -1.0]]), [[0.5, 0.5]])
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"y": ["a"] * 4}, "one class only, 'a'"),
         ({"X": [[np.nan], [1.0], [2.0], [3.0]]}, "NaN"),
@@ -131,9 +133,9 @@ def test_a_feature_that_is_constant_tells_nothing():
         ({"learning_rate": 1.5}, "learning_rate must be above 0"),
     ],
 )
-def test_what_cannot_be_learnt_is_said(change, said):
+def test_bad_training_data_are_refused(change, message):
     given = {"X": [[0.0], [1.0], [2.0], [3.0]], "y": ["a", "a", "b", "b"]}
     settings = {name: value for name, value in change.items() if name not in given}
     given |= {name: value for name, value in change.items() if name in given}
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         LogitBoostClassifier(**settings).fit(**given)

@@ -1,4 +1,6 @@
-"""Touches in time and on the skin, judged by what was drawn: lanes, bars, gaps, colours; a skin's change in time."""
+"""Figures of touches in time and on the skin, tested on the drawn lanes, bars, gaps and colours, and of a skin's change
+in time.
+"""
 
 import numpy as np
 import pytest
@@ -61,26 +63,26 @@ def test_a_curve_is_thinned_with_its_extremes_and_gaps(ax):
         plot_changes(seconds, peaks[:-1], 1e-3, ax=ax)
 
 
-def test_paths_leave_out_what_has_no_place(ax):
+def test_paths_leave_out_touches_without_a_place(ax):
     plot_touch_paths(Rectangle(0.1, 0.05).mesh(num_points=60), [named(1, "pat", 0.0, 1.0)], NAMES, ax=ax)
     path = next(one for one in ax.lines if len(one.get_xdata()) == 4)
     assert path.get_xdata()[-1] == pytest.approx(0.02)
 
 
-def test_what_are_no_touches_is_said(ax):
+def test_a_figure_without_touches_says_so(ax):
     for draw in (lambda: plot_timeline([1], NAMES, ax=ax), lambda: plot_timeline(None, NAMES, ax=ax)):
         with pytest.raises(ValueError, match="touches"):
             draw()
 
 
-def test_what_was_tried_stands_in_order(ax):
+def test_methods_are_shown_in_order(ax):
     standing = Standing("b on seven", [("b on seven", 0.1), ("a on seven", 0.3)], np.array(["x"]), np.array(["x"]))
     plot_tried(standing, ax=ax)
     assert [round(one.get_width()) for one in ax.patches] == [90, 70]
     assert ax.patches[0].get_facecolor() != ax.patches[1].get_facecolor()
 
 
-def test_a_skin_in_time(ax):
+def test_a_skin_over_time(ax):
     rng = np.random.default_rng(0)
     health = SkinHealth.fit(1 + 1e-3 * rng.normal(size=(200, 6)))
     frames = 1 + 1e-3 * rng.normal(size=(50, 6))

@@ -1,4 +1,6 @@
-"""Streams cut into touches: levels, gaps, frames of no use, ends; frame by frame and at once to the same."""
+"""Segmentation of streams into touches: levels, gaps, unusable frames and ends, with equal results frame by frame and
+at once.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ LEVEL = TouchLevel(MESH, 1.0)
 
 
 def images(peaks, place=(0.0, 0.0)):
-    """A bump at one place, or one for each frame, of these heights (F,)."""
+    """A bump at one place, or at one for each frame, of these heights (F,)."""
     place = np.broadcast_to(place, (len(peaks), 2))
     apart = np.linalg.norm(CENTRES - place[:, None], axis=2)
     bump = np.exp(-((apart / 0.05) ** 2))
@@ -39,7 +41,7 @@ def same(one, other):
 
 
 def found(peaks, seconds=None, **options):
-    """Touches at once, having seen that they are those frame by frame; 100 frames/s unless told."""
+    """Touches found at once, which equal those found frame by frame. 100 frames/s by default."""
     seconds = np.arange(len(peaks)) / 100 if seconds is None else np.asarray(seconds)
     frames = images(peaks)
     frames[np.isnan(peaks)] = np.nan
@@ -48,14 +50,14 @@ def found(peaks, seconds=None, **options):
     return touches
 
 
-def test_a_touch_is_what_exceeds_the_level():
+def test_a_touch_is_where_the_level_is_exceeded():
     (touch,) = found([0, 0, 2, 3, 2, 0, 0])
     assert (touch.onset, touch.offset, touch.whole) == (0.02, 0.04, True)
     assert touch.course.peak.max() == pytest.approx(2.9)
 
 
-def test_short_gaps_are_bridged_and_longer_ones_part():
-    short = [0, 2, 2, *[0] * 9, 2, 2, *[0] * 20]  # 100 ms between frames above: not less than 100
+def test_short_gaps_are_bridged_and_longer_ones_separate():
+    short = [0, 2, 2, *[0] * 9, 2, 2, *[0] * 20]  # 100 ms between frames above the level: not less than 100
     assert len(found([0, 2, 2, *[0] * 8, 2, 2, *[0] * 20])) == 1
     assert [len(one.course) for one in found(short)] == [2, 2]
     assert [len(one.course) for one in found(short, gap=0.15)] == [13]
@@ -69,7 +71,7 @@ def test_no_frames_and_no_touches():
     assert course_features([]).values.shape[0] == 0
 
 
-def test_single_frames_are_not_told_of():
+def test_single_frames_are_not_reported():
     peaks = [0, 3, *[0] * 20]
     assert found(peaks) == []
     assert len(found(peaks, least=1)) == 1
@@ -84,21 +86,21 @@ def test_touches_cut_off_by_the_streams_ends_are_flagged(peaks, begun_before, cu
     assert (touch.begun_before, touch.cut_off, touch.whole) == (begun_before, cut_off, not (begun_before or cut_off))
 
 
-def test_missing_frames_part_a_touch_that_may_have_ended():
+def test_missing_frames_separate_a_touch_that_may_have_ended():
     seconds = np.concatenate([np.arange(10), np.arange(40, 50)]) / 100
     first, second = found([0, *[2] * 18, 0], seconds)
     assert (first.begun_before, first.cut_off) == (False, True)
     assert (second.begun_before, second.cut_off) == (True, False)
 
 
-def test_few_missing_frames_are_bridged_and_told():
+def test_few_missing_frames_are_bridged_and_reported():
     seconds = np.concatenate([np.arange(10), np.arange(15, 25)]) / 100
     (touch,) = found([0, *[2] * 18, 0], seconds)
     assert touch.whole
     assert touch.longest_gap == pytest.approx(0.06)
 
 
-def test_frames_of_no_use_are_left_out_and_counted():
+def test_unusable_frames_are_left_out_and_counted():
     peaks = [0, 2, np.nan, 2, 2, np.nan, 0, np.nan, 0]
     (touch,) = found(peaks)
     assert (touch.lost, len(touch.course)) == (1, 3)
@@ -109,7 +111,7 @@ def test_frames_of_no_use_are_left_out_and_counted():
 
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
-def test_frame_by_frame_is_at_once(data):
+def test_frame_by_frame_equals_at_once(data):
     number = data.draw(st.integers(1, 40))
     value = st.sampled_from([0.0, 0.5, 1.6, 3.0, np.nan])
     peaks = np.array(data.draw(st.lists(value, min_size=number, max_size=number)))
@@ -120,7 +122,7 @@ def test_frame_by_frame_is_at_once(data):
     found(np.concatenate([np.full(50, before), peaks]), seconds, least=data.draw(st.integers(1, 3)))
 
 
-def test_a_stream_stays_as_it_was():
+def test_a_stream_is_immutable():
     start = TouchStream(LEVEL)
     start.follow(0.0, images([2.0])[0])
     assert start.open == ()
@@ -137,7 +139,7 @@ def test_the_level_is_five_deviations_above_untouched_peaks():
 
 
 @pytest.mark.parametrize(
-    ("action", "said"),
+    ("action", "message"),
     [
         (lambda: TouchLevel(MESH, 0.0), "level must be positive"),
         (lambda: TouchLevel(None, 1.0), "mesh must be a Mesh"),
@@ -157,6 +159,6 @@ def test_the_level_is_five_deviations_above_untouched_peaks():
         (lambda: course_features(None), "touches must be a list"),
     ],
 )
-def test_what_cannot_be_is_said(action, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_arguments(action, message):
+    with pytest.raises(ValueError, match=message):
         action()

@@ -1,4 +1,6 @@
-"""The network on a touch's course: learns what features of the whole do not tell, and is the same in NumPy."""
+"""The network on the time course of a touch: it learns what features of the whole touch do not contain, and has the
+same outputs in NumPy.
+"""
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from jeit.touch.learnt import temporal_network
 from jeit.touch.learnt.temporal_network import TemporalNetwork
 
 
-def test_the_sequence_is_the_course_place_by_place():
+def test_the_sequence_is_the_time_course():
     made = [touch(kind, np.random.default_rng(3)) for kind in KINDS]
     found = sequence_features(made)
     assert found.names == SEQUENCE_FEATURES
@@ -39,7 +41,7 @@ def test_the_sequence_is_the_course_place_by_place():
 
 
 def test_an_order_in_time_is_learnt(monkeypatch):
-    """Classes whose values are the same ones, in rising or in falling order: no mean or greatest value parts them."""
+    """Classes with the same values in rising or falling order: no mean or maximum distinguishes them."""
     rng = np.random.default_rng(0)
     monkeypatch.setattr(temporal_network, "_EPOCHS", 20)
     label = rng.integers(0, 2, 400)
@@ -47,14 +49,14 @@ def test_an_order_in_time_is_learnt(monkeypatch):
     course[label == 1] = course[label == 1, ::-1]
     features = np.hstack([rng.normal(size=(400, 3)), course.reshape(400, -1)])
     network = TemporalNetwork.fit(features[:300], label[:300], whole=3, values=2)
-    said = network.predict_proba(features[300:])
-    np.testing.assert_allclose(said.sum(axis=1), 1)
-    assert np.mean(said.argmax(axis=1) == label[300:]) > 0.95
+    predicted = network.predict_proba(features[300:])
+    np.testing.assert_allclose(predicted.sum(axis=1), 1)
+    assert np.mean(predicted.argmax(axis=1) == label[300:]) > 0.95
     again = TemporalNetwork.fit(features[:300], label[:300], whole=3, values=2)
     np.testing.assert_array_equal(network.last, again.last)
 
 
-def test_what_numpy_asks_is_convolved_as_by_jax():
+def test_convolution_in_numpy_equals_that_of_jax():
     import jax
     import jax.numpy as jnp
 
@@ -81,7 +83,7 @@ def test_what_numpy_asks_is_convolved_as_by_jax():
 
 
 def untrained(features, label, *, whole, values):
-    """In place of `TemporalNetwork.fit`: what it is drawn as, of the sizes that it would be of."""
+    """In place of `TemporalNetwork.fit`: the network as initialised, of the size that training would have."""
     rng, classes = np.random.default_rng(0), np.unique(label)
     sizes = {"first": (4, 5 * values), "second": (4, 20), "dense": (6, whole + 8), "last": (len(classes), 6)}
     weights = {name: 0.1 * rng.normal(size=(2, *size)) for name, size in sizes.items()}
@@ -89,21 +91,21 @@ def untrained(features, label, *, whole, values):
     return TemporalNetwork(**weights, whole=whole, classes_=classes)
 
 
-def test_a_model_of_it_is_kept(tmp_path, monkeypatch):
-    """Its training aside, which `test_an_order_in_time_is_learnt` has."""
+def test_a_model_with_a_network_is_saved(tmp_path, monkeypatch):
+    """Without its training, which `test_an_order_in_time_is_learnt` covers."""
     monkeypatch.setattr(TemporalNetwork, "fit", untrained)
     made, labels, people = touches(people=2)
     model = GestureModel.fit(made, labels, people=people, method="temporal-network")
     assert (model.method, model.form) == ("temporal-network", "sequence")
     model.write(tmp_path / "gestures.skops")
     asked = touches(people=2, seed=5)
-    said, right = (one.predict(asked[0]) for one in (GestureModel.read(tmp_path / "gestures.skops"), model))
-    np.testing.assert_array_equal(said.probabilities, right.probabilities)
-    assert np.ptp(said.probabilities, axis=0).min() > 0
+    predicted, right = (one.predict(asked[0]) for one in (GestureModel.read(tmp_path / "gestures.skops"), model))
+    np.testing.assert_array_equal(predicted.probabilities, right.probabilities)
+    assert np.ptp(predicted.probabilities, axis=0).min() > 0
 
 
 @pytest.mark.slow
-def test_gestures_of_people_are_told():
+def test_gestures_of_people_are_classified():
     made, labels, people = touches(people=2)
     model = GestureModel.fit(made, labels, people=people, method="temporal-network")
     asked = touches(people=3, seed=5)

@@ -1,4 +1,6 @@
-"""Cuts fitted on a mesh made finer: that mesh, the update of one solve, its derivatives, and paths found in noise."""
+"""Cuts fitted on a refined mesh: the mesh, the update of one solve, its derivatives, and paths recovered from noisy
+data.
+"""
 
 from functools import cache
 
@@ -23,7 +25,7 @@ def model() -> ForwardModel:
     return ForwardModel(mesh, BoundaryElectrodes(ring(0.05, 16), 0.008, 0.003), adjacent(16))
 
 
-def test_a_mesh_is_made_finer_without_a_node_that_hangs(model):
+def test_refinement_leaves_no_hanging_node(model):
     finer, parent = finer_mesh(model.mesh, CENTRE, RADIUS, 1e-6)
     size, centres = np.asarray(measures(finer)), np.asarray(centroids(finer))
     assert size[np.linalg.norm(centres - CENTRE, axis=1) < RADIUS].max() <= 1e-6
@@ -31,7 +33,7 @@ def test_a_mesh_is_made_finer_without_a_node_that_hangs(model):
     edges = np.sort(np.asarray(finer.cells)[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
     number = np.unique(edges, axis=0, return_counts=True)[1]
     assert set(number) == {1, 2}
-    # A node that hangs would leave edges with one cell inside the skin.
+    # A hanging node would leave edges with only one cell inside the skin.
     before = np.sort(np.asarray(model.mesh.cells)[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
     outer = np.unique(before, axis=0, return_counts=True)[1] == 1
     ends = np.asarray(model.mesh.points)[np.unique(before, axis=0)[outer]]
@@ -40,7 +42,7 @@ def test_a_mesh_is_made_finer_without_a_node_that_hangs(model):
     assert np.linalg.norm(own[:, 0] - own[:, 1], axis=1).sum() == pytest.approx(around)
 
 
-def test_a_skin_whose_electrodes_are_of_its_mesh_keeps_it(model):
+def test_a_skin_whose_electrodes_belong_to_its_mesh_keeps_it(model):
     groups = [[8 * one, 8 * one + 1] for one in range(4)]
     electrodes = FacetElectrodes(model.mesh, groups, 1e-3)
     plates = ForwardModel(model.mesh, electrodes, adjacent(4))
@@ -51,7 +53,7 @@ def test_a_skin_whose_electrodes_are_of_its_mesh_keeps_it(model):
 
 
 def test_each_end_of_a_path_is_uncertain_by_half_an_edge():
-    """Where the fit is exact, the mesh's edge is all that is left."""
+    """Where the fit is exact, the length of the mesh's edges is the only uncertainty."""
     fit = object.__new__(LossFit)
     fit.energy, fit.edge, fit.change = 1.0, 1e-3, np.ones(50)
     fit._misfit = lambda unknowns: 1e6 * float(np.sum((unknowns - path) ** 2))  # pyright: ignore
@@ -101,7 +103,7 @@ _HALF = "half of the sheet reads as a shorter cut through all of it: a third of 
 
 @cache
 def line_of_a_cut(depth):
-    """A cut, the line and the spot that are fitted to what another mesh says of it."""
+    """A cut, and the line and the spot that are fitted to data simulated on another mesh."""
     cut = Cut([(0.0, 0.008), (0.016, 0.02)], depth)
     electrodes = BoundaryElectrodes(ring(0.05, 16), 0.008, 3.0)
     fine = ForwardModel(Disk(0.05).mesh(num_points=1500, refine=cut.refine(7e-4)), electrodes, adjacent(16))
@@ -116,7 +118,7 @@ def line_of_a_cut(depth):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("depth", [1.0, 0.5])
-def test_a_path_is_found_in_a_change_that_another_mesh_made(depth):
+def test_a_path_is_recovered_from_data_of_another_mesh(depth):
     cut, line, spot = line_of_a_cut(depth)
     assert line.misfit < 0.25 * spot.misfit
     found = Cut(line.path).along(1e-3)
@@ -132,7 +134,7 @@ def test_a_path_is_found_in_a_change_that_another_mesh_made(depth):
     "depth",
     [1.0, pytest.param(0.5, marks=pytest.mark.xfail(raises=AssertionError, reason=_HALF))],
 )
-def test_its_length_is_told_within_its_deviation(depth):
+def test_its_length_is_estimated_within_its_deviation(depth):
     cut, line, _ = line_of_a_cut(depth)
     length = np.linalg.norm(np.diff(line.path, axis=0), axis=1).sum()
     assert abs(length - cut.length) < max(0.25 * cut.length, 2 * line.deviation)

@@ -1,4 +1,4 @@
-"""Cuts found on a model of the skin: where they are, what images say beside them, and what is refused."""
+"""Cuts located on a model of the skin: their places, contacts in images beside them, and refused input."""
 
 import equinox as eqx
 import jax
@@ -40,7 +40,7 @@ def damaged(skin) -> PressedSkin:
 
 
 def press(places, starts, load=2.0, last=1.0) -> MovingPress:
-    """One press after the other, each for a second."""
+    """One press after the other, each of one second."""
     loads, position = np.zeros(len(SECONDS)), np.zeros((len(SECONDS), 2))
     for place, start in zip(places, starts, strict=True):
         there = (start <= SECONDS) & (start + last > SECONDS)
@@ -57,13 +57,13 @@ def health(skin) -> SkinHealth:
 
 @pytest.fixture(scope="module")
 def after(skin, damaged, health) -> SkinHealth:
-    """The cut comes in the midst of a touch."""
+    """The cut occurs during a touch."""
     touch = press([(-0.02, -0.02)], PRESSED[:1], last=PRESSED[1] - PRESSED[0])
     frames = record_mishaps(jax.random.key(2), skin, touch, SECONDS, [Mishap(DAMAGED, damaged)])
     return watch(health, frames, SECONDS)
 
 
-def test_a_cut_is_found_where_it_is(after):
+def test_a_cut_is_located(after):
     (event,) = after.open_events
     assert (event.kind, event.status) == (EventKind.CUT, EventStatus.LASTING)
     assert abs(event.time - DAMAGED) <= 0.5
@@ -75,7 +75,7 @@ def test_a_cut_is_found_where_it_is(after):
     assert 0 < event.deviation < 0.3 * CUT.length
 
 
-def test_touches_are_placed_beside_the_cut(after, damaged):
+def test_touches_beside_the_cut_are_located(after, damaged):
     place = np.array([-0.02, -0.012])
     read = damaged.read(jax.random.key(5), pressed(damaged, place), np.array([20.0]))
     contact = find_contacts(CellFinder(after.skin.model.mesh), after.images(read)[0])[0]
@@ -89,7 +89,7 @@ def pressed(skin: PressedSkin, place) -> np.ndarray:
     return np.asarray(skin.model.voltages(skin.conductivity * (1 + change)))[None]
 
 
-def test_images_do_without_what_is_not_read(after):
+def test_images_do_not_use_channels_that_are_not_read(after):
     frames = np.tile(after.reference, (3, 1))
     frames[0, :13] = np.nan
     frames[2] = np.nan
@@ -98,18 +98,18 @@ def test_images_do_without_what_is_not_read(after):
     assert np.abs(images[:2]).max() < 1e-6 * SHEET
 
 
-def test_a_cut_that_the_user_denies_is_out_of_the_model(after):
+def test_a_cut_that_the_user_denies_is_removed_from_the_model(after):
     assert np.ptp(after.skin.conductivity) > 0
     denied = after.deny(after.open_events[0])
     assert np.ptp(denied.skin.conductivity) == 0
 
 
-def test_a_picture_has_the_cut_and_its_length(after):
+def test_a_figure_has_the_cut_and_its_length(after):
     ax = plot_health(after, title="a skin", ax=Figure().subplots())
-    said = [text.get_text() for text in ax.texts]
+    labels = [text.get_text() for text in ax.texts]
     event = after.open_events[0]
-    assert any(f"cut, {1e3 * event.length:.0f} ± {1e3 * event.deviation:.0f} mm" in text for text in said)
-    assert any(text.endswith("0 mm") and text[0].isdigit() for text in said)  # the scale bar
+    assert any(f"cut, {1e3 * event.length:.0f} ± {1e3 * event.deviation:.0f} mm" in text for text in labels)
+    assert any(text.endswith("0 mm") and text[0].isdigit() for text in labels)  # the scale bar
     lines = [np.column_stack(line.get_data()) for line in ax.lines]
     assert any(line.shape == (2, 2) and np.allclose(line, after.open_events[0].path) for line in lines)
     image = after.images(after.reference[None])[0]
@@ -126,7 +126,7 @@ def test_after_repair_the_skin_is_healthy(after, skin):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"model": "disk"}, "model"),
         ({"sign": 0, "conductivity": SHEET}, "sign"),
@@ -134,10 +134,10 @@ def test_after_repair_the_skin_is_healthy(after, skin):
         ({"conductivity": 1e-4 * SHEET}, "times what the model predicts"),
     ],
 )
-def test_a_reference_that_is_none_is_refused(options, said):
+def test_bad_references_are_refused(options, message):
     model = disk_model(300)
     frames = np.asarray(model.voltages(SHEET)) * (1 + 1e-3 * np.random.default_rng(0).normal(size=(60, 208)))
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         SkinHealth.fit(frames, **({"model": model} | options))
     with pytest.raises(ValueError, match="channels"):
         SkinHealth.fit(frames[:, :90], model=model, conductivity=SHEET)

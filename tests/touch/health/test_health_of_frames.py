@@ -1,4 +1,4 @@
-"""The health of a skin told from frames alone: steps that last, electrodes, repair, and what is refused."""
+"""The health of a skin estimated from frames alone: lasting steps, electrodes, repair, and refused input."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ REST = np.linspace(0.8, 1.6, NUMBER)
 
 
 def recording(seed: int, number: int = 600, noise: float = 1e-3, drift: float = 2e-5) -> np.ndarray:
-    """Frames (F, M) with touches of about ten frames somewhere on a line of channels, noise and drift."""
+    """Frames (F, M) with touches of about ten frames along a line of channels, noise and drift."""
     random = np.random.default_rng(seed)
     frames, at = np.tile(REST, (number, 1)), 5
     while at < number - 12:
@@ -31,17 +31,17 @@ def health() -> SkinHealth:
 
 
 def damage() -> np.ndarray:
-    """Here and there, of both signs: no touch does that."""
+    """Scattered and of both signs, as from no touch."""
     random = np.random.default_rng(9)
     return 0.05 * np.where(random.random(NUMBER) < 0.3, random.choice([-1, 1], NUMBER), 0.0)
 
 
 def test_healthy_touches_are_no_events(health):
-    told = [len(watch(health, recording(seed, 300)).events) for seed in range(1, 41)]
-    assert sum(map(bool, told)) == 0
+    reported = [len(watch(health, recording(seed, 300)).events) for seed in range(1, 41)]
+    assert sum(map(bool, reported)) == 0
 
 
-def test_a_lasting_change_is_told_with_when_and_where(health):
+def test_a_lasting_change_is_reported_with_its_time_and_place(health):
     frames = recording(50)
     frames[301:] += damage()
     (event,) = watch(health, frames).events
@@ -54,7 +54,7 @@ def test_a_lasting_change_is_told_with_when_and_where(health):
     np.testing.assert_allclose(event.change, damage(), atol=0.01)
 
 
-def test_the_whole_is_the_same_as_frame_by_frame(health):
+def test_the_whole_recording_gives_the_same_as_frame_by_frame(health):
     frames = recording(51)
     frames[250:] += damage()
     followed = health
@@ -80,7 +80,7 @@ def held_press(start: int = 200, end: int = 600) -> np.ndarray:
     return frames
 
 
-def test_a_press_that_is_held_is_told_by_time_or_by_the_user():
+def test_a_lasting_press_is_recognised_by_time_or_by_the_user():
     health = SkinHealth.fit(recording(0), patience=250.0)
     waiting = watch(health, held_press()[:400])
     assert waiting.events == ()
@@ -96,12 +96,12 @@ def test_a_press_that_is_held_is_told_by_time_or_by_the_user():
     assert watch(health, held_press(end=300)).events == ()
 
 
-def test_what_the_user_denies_is_taken_back():
+def test_an_event_that_the_user_denies_is_withdrawn():
     health = SkinHealth.fit(recording(0), patience=250.0)
-    told = watch(health, held_press())
-    denied = told.deny(told.events[0])
+    reported = watch(health, held_press())
+    denied = reported.deny(reported.events[0])
     assert denied.open_events == []
-    np.testing.assert_allclose(denied.reference, told.reference - told.events[0].change)
+    np.testing.assert_allclose(denied.reference, reported.reference - reported.events[0].change)
 
 
 @pytest.mark.parametrize(("kind", "reading"), [(EventKind.TORN, 0.0), (EventKind.TORN, 5.0), (EventKind.DEAD, None)])
@@ -109,7 +109,7 @@ def test_an_electrode_that_fails_is_named_and_left_out(health, kind, reading):
     frames, own = recording(54), PROTOCOL.channels_touching(5)
     random = np.random.default_rng(2)
     shape = frames[300:, own].shape
-    # In the midst of a touch.
+    # During a touch.
     frames[280:320] += 0.08 * np.exp(-((np.arange(NUMBER) - 12) ** 2) / 8)
     frames[300:, own] = (7.0 + REST[own] if reading is None else reading) + 1e-3 * random.normal(size=shape)
     after = watch(health, frames)
@@ -133,7 +133,7 @@ def test_a_loose_electrode_is_named(health):
     assert [(one.electrode, one.kind) for one in watch(health, frames).events] == [(3, EventKind.LOOSE)]
 
 
-def spoilt(kind: str, channel: int = 9) -> np.ndarray:
+def faulty(kind: str, channel: int = 9) -> np.ndarray:
     frames, random = recording(60), np.random.default_rng(4)
     if kind == "noisy":
         frames[300:, channel] += 8e-3 * random.normal(size=300)
@@ -144,32 +144,32 @@ def spoilt(kind: str, channel: int = 9) -> np.ndarray:
     return frames
 
 
-@pytest.mark.parametrize(("kind", "said"), [("noisy", "noisy"), ("jumps", "noisy"), ("stuck", "stuck")])
-def test_a_single_channel_that_goes_wrong_is_named_and_left_out(health, kind, said):
-    after = watch(health, spoilt(kind))
+@pytest.mark.parametrize(("kind", "message"), [("noisy", "noisy"), ("jumps", "noisy"), ("stuck", "stuck")])
+def test_a_single_faulty_channel_is_named_and_left_out(health, kind, message):
+    after = watch(health, faulty(kind))
     (event,) = [one for one in after.events if one.kind in (EventKind.NOISY, EventKind.STUCK)]
-    assert event.kind == f"{said} channel"
+    assert event.kind == f"{message} channel"
     assert np.flatnonzero(event.channels).tolist() == [9]
-    assert f"Channel 9 {'is several' if said == 'noisy' else 'does not move'}" in event.reason
+    assert f"Channel 9 {'is several' if message == 'noisy' else 'does not move'}" in event.reason
     assert np.flatnonzero(~after.trusted).tolist() == [9]
     assert event.noticed - 300 <= 2.5 * health.healthy.window * health.healthy.stride
     denied = after.deny(event)
     assert denied.trusted.all()
-    again = watch(denied, spoilt(kind)[400:], 1000 + np.arange(200.0))
+    again = watch(denied, faulty(kind)[400:], 1000 + np.arange(200.0))
     assert [one.number for one in again.events if one.kind == event.kind] == [event.number]
 
 
 def test_counts_of_a_coarse_converter_are_healthy():
     counts = 2e-3
     health = SkinHealth.fit(np.round(recording(0) / counts))
-    told = [watch(health, np.round(recording(seed, 300) / counts)).events for seed in range(61, 76)]
-    assert sum(map(bool, told)) == 0
+    reported = [watch(health, np.round(recording(seed, 300) / counts)).events for seed in range(61, 76)]
+    assert sum(map(bool, reported)) == 0
     frames = recording(76)
     frames[301:] += damage()
     assert [abs(one.frame - 301) <= 2 for one in watch(health, np.round(frames / counts)).events] == [True]
 
 
-def test_rows_that_are_doubled_and_channels_that_are_constant():
+def test_repeated_rows_and_constant_channels():
     healthy = np.repeat(recording(0, 300), 2, axis=0)
     healthy[:, 3] = 1.0
     health = SkinHealth.fit(healthy)
@@ -181,7 +181,7 @@ def test_rows_that_are_doubled_and_channels_that_are_constant():
     assert abs(event.frame - 602) <= 4
 
 
-def test_repair_is_told_and_the_reference_is_new(health):
+def test_repair_is_reported_and_the_reference_is_renewed(health):
     frames = recording(57, 900)
     frames[300:600] += damage()
     after = watch(health, frames)
@@ -195,8 +195,8 @@ def test_repair_is_told_and_the_reference_is_new(health):
     assert watch(mended, frames[620:], 1000 + np.arange(280.0)).events == mended.events
 
 
-def test_a_fresh_reference_before_the_first_frame_is_what_frames_are_compared_with(health):
-    """A day later gains differ, and the skin is whole; damage after that is reported."""
+def test_frames_are_compared_with_a_reference_taken_before_the_first(health):
+    """A day later gains differ and the skin is undamaged. Later damage is reported."""
     gains = 1 + 0.05 * np.random.default_rng(2).normal(size=NUMBER)
     later = recording(57) * gains
     (event,) = watch(health, later).events
@@ -209,12 +209,12 @@ def test_a_fresh_reference_before_the_first_frame_is_what_frames_are_compared_wi
     assert abs(event.frame - 301) <= 2
 
 
-def test_a_recording_that_begins_damaged_says_so(health):
+def test_a_recording_that_begins_damaged_is_reported(health):
     (event,) = watch(health, recording(58) + 4 * damage()).events
     assert event.frame == 0
 
 
-def test_frames_that_lack_something(health):
+def test_frames_with_missing_readings(health):
     frames, times = recording(59), np.arange(600.0)
     frames[300:] += damage()
     frames[::7, 4] = np.nan
@@ -231,7 +231,7 @@ def test_frames_that_lack_something(health):
 
 
 @pytest.mark.parametrize(
-    ("ask", "said"),
+    ("ask", "message"),
     [
         (lambda _: SkinHealth.fit(recording(0)[:10]), "too few"),
         (lambda _: SkinHealth.fit(np.zeros((100, 4))), "every channel"),
@@ -250,6 +250,6 @@ def test_frames_that_lack_something(health):
         (lambda health: health.confirm("it"), "event"),
     ],
 )
-def test_what_cannot_be_is_refused(health, ask, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_input_is_refused(health, ask, message):
+    with pytest.raises(ValueError, match=message):
         ask(health)

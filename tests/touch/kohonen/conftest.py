@@ -1,4 +1,4 @@
-"""A map of touches all over a disk, and what it says of places."""
+"""A map of touches all over a disk, and its estimates of places."""
 
 import jax
 import numpy as np

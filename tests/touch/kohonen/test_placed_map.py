@@ -1,4 +1,4 @@
-"""What a map says of places: one touch, several, and what is saved."""
+"""Estimates of places by a map: for one touch and for several, and its files."""
 
 import io
 import pickle
@@ -14,19 +14,19 @@ from jeit.touch import PlacedMap, SelfOrganisingMap
 from jeit.touch.kohonen import read_map, touches_reported, write_map
 
 
-def test_places_lie_between_neurons(placed):
-    """16 neurons across 170 mm are 11 mm apart; what is told is a tenth of that off."""
+def test_places_are_interpolated_between_neurons(placed):
+    """16 neurons across 170 mm are 11 mm apart. The errors of estimated places are a tenth of that."""
     places = drawn_places(5, 300)
-    said, spread = placed.locate(frames_at(places))
-    off = np.linalg.norm(said - places, axis=1)
+    estimated, spread = placed.locate(frames_at(places))
+    off = np.linalg.norm(estimated - places, axis=1)
     assert np.median(off) < 1.2e-3
     assert np.quantile(off, 0.95) < 5e-3
     ratio = np.sqrt(np.mean(off**2) / np.mean(np.sum(spread**2, axis=1)))
     assert 0.5 < ratio < 2.0
 
 
-def test_many_presses_are_told_by_the_grid_about_the_winner(placed):
-    """Six presses for each neuron: told better than by the nearest, in the worst case too."""
+def test_many_presses_are_located_by_the_grid_around_the_winner(placed):
+    """Six presses for each neuron: the errors are smaller than those of the nearest neuron, in the worst case too."""
     assert placed.fitted is not None
     places = drawn_places(5, 300)
     ways = placed, replace(placed, fitted=None)
@@ -35,27 +35,27 @@ def test_many_presses_are_told_by_the_grid_about_the_winner(placed):
     assert off.max() < other.max()
 
 
-def test_a_grid_without_order_tells_nothing(learnt, pressed, places):
+def test_a_grid_without_order_does_not_locate(learnt, pressed, places):
     shuffled = np.random.default_rng(0).permutation(learnt.weights.reshape(256, CHANNELS)).reshape(16, 16, CHANNELS)
     assert PlacedMap.learn(SelfOrganisingMap(shuffled, learnt.scale), pressed, places).fitted is None
 
 
-def test_places_stay_on_the_skin_whatever_is_read(placed):
+def test_places_stay_on_the_skin_for_any_reading(placed):
     random = np.random.default_rng(0)
-    said, _ = placed.locate(REST + random.normal(0, 1e-3, (200, CHANNELS)))
-    assert np.linalg.norm(said, axis=1).max() < 0.2
+    estimated, _ = placed.locate(REST + random.normal(0, 1e-3, (200, CHANNELS)))
+    assert np.linalg.norm(estimated, axis=1).max() < 0.2
 
 
-def test_neurons_that_won_nothing_have_no_place(learnt, places):
+def test_neurons_that_never_win_have_no_place(learnt, places):
     few = PlacedMap.learn(learnt, frames_at(places[:30]), places[:30])
     assert few.placed.sum() <= 30
     assert np.isnan(few.places[~few.placed]).all()
-    said, _ = few.locate(frames_at(places[:30]))
-    assert np.median(np.linalg.norm(said - places[:30], axis=1)) < 0.01
+    estimated, _ = few.locate(frames_at(places[:30]))
+    assert np.median(np.linalg.norm(estimated - places[:30], axis=1)) < 0.01
 
 
 @pytest.mark.parametrize("strengths", [(1.0,), (1.0, 0.5), (1.0, 0.5, 0.2)])
-def test_touches_at_once_are_told_apart(placed, strengths):
+def test_simultaneous_touches_are_distinguished(placed, strengths):
     random, right = np.random.default_rng(1), 0
     for _ in range(20):
         where = _apart(random, len(strengths))
@@ -65,8 +65,8 @@ def test_touches_at_once_are_told_apart(placed, strengths):
             continue
         distance = np.linalg.norm(where[:, None] - np.array([one.place for one in found]), axis=-1)
         rows, columns = linear_sum_assignment(distance)
-        told = np.array([found[one].strength for one in columns])
-        right += bool((distance[rows, columns] < 0.02).all() and (np.abs(told / strengths - 1) < 0.5).all())
+        estimated = np.array([found[one].strength for one in columns])
+        right += bool((distance[rows, columns] < 0.02).all() and (np.abs(estimated / strengths - 1) < 0.5).all())
     assert right >= (19, 18, 15)[len(strengths) - 1]
 
 
@@ -77,14 +77,14 @@ def _apart(random, number):
             return where
 
 
-def test_nothing_is_told_of_an_untouched_skin(placed):
+def test_no_touch_is_reported_on_an_untouched_skin(placed):
     random = np.random.default_rng(2)
     assert touches_reported(placed, REST, REST) == []
     noisy = [touches_reported(placed, REST + random.normal(0, NOISE, CHANNELS), REST) for _ in range(50)]
     assert sum(map(bool, noisy)) == 0
 
 
-def test_files_hold_all(learnt, placed, tmp_path):
+def test_files_are_complete(learnt, placed, tmp_path):
     write_map(placed, tmp_path / "placed.npz")
     write_map(learnt, tmp_path / "learnt")
     again, plain = read_map(tmp_path / "placed.npz"), read_map(tmp_path / "learnt")
@@ -104,7 +104,7 @@ class _Payload:
         return (exec, ("raise SystemError('it ran')",))
 
 
-def test_files_run_nothing(tmp_path):
+def test_files_execute_nothing(tmp_path):
     """An array of objects in a map's place is refused before it is opened."""
     held = io.BytesIO()
     np.save(held, np.array([_Payload()], dtype=object), allow_pickle=True)

@@ -1,4 +1,4 @@
-"""A learnt map: activity, winners, quality, and what it refuses."""
+"""A trained map: activity, winners, quality, and refused input."""
 
 import jax
 import numpy as np
@@ -30,7 +30,7 @@ def test_distances_are_euclidean(learnt):
     np.testing.assert_allclose(learnt.distances(frames), plain, atol=1e-8)
 
 
-def test_quality_is_minisoms_and_the_order_is_kept(learnt, places):
+def test_quality_is_that_of_minisom_and_the_order_is_kept(learnt, places):
     frames = frames_at(places)
     quality = map_quality(learnt, frames)
     oracle = MiniSom(16, 16, CHANNELS)
@@ -41,7 +41,7 @@ def test_quality_is_minisoms_and_the_order_is_kept(learnt, places):
     assert quality.trustworthiness > 0.97
 
 
-def test_an_unordered_map_is_told(learnt, places):
+def test_an_unordered_map_is_reported(learnt, places):
     random = np.random.default_rng(0)
     shuffled = random.permutation(learnt.weights.reshape(256, CHANNELS)).reshape(16, 16, CHANNELS)
     quality = map_quality(SelfOrganisingMap(shuffled, learnt.scale), frames_at(places))

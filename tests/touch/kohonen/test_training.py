@@ -1,4 +1,4 @@
-"""The learning rule: MiniSom's, to rounding; phases, batches, and curves that settle."""
+"""The learning rule: equal to MiniSom's, to rounding. Phases, batches, and learning curves that settle."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,9 @@ from jeit.touch.kohonen.training import train
 
 
 def minisoms(weights, frames, order, rates, radii):
-    """What MiniSom makes of the same frames in the same order: with a radius next to nothing the winner moves alone."""
+    """Weights that MiniSom learns from the same frames in the same order. With a very small radius only the winner
+    moves.
+    """
     oracle = MiniSom(*weights.shape)
     radii = np.append(radii, np.full(len(order) - len(radii), 0.01))
     oracle._weights = weights.copy()
@@ -35,7 +37,7 @@ def test_weights_are_minisoms(ordering, tuning):
     assert curve[-1] == pytest.approx(oracle._weights.mean(), abs=1e-12)
 
 
-def test_tuning_moves_the_winner_alone():
+def test_tuning_moves_only_the_winner():
     random = np.random.default_rng(2)
     frames, weights = random.normal(size=(1, 6)), random.normal(size=(4, 4, 6))
     learnt, _ = train(jnp.asarray(weights), jnp.asarray(frames), np.zeros(1, int), *_one_step())
@@ -49,7 +51,7 @@ def _one_step():
     return schedule.rates(), schedule.radii((4, 4))
 
 
-def test_maps_at_once_are_those_one_by_one():
+def test_maps_trained_together_equal_those_trained_alone():
     frames = np.random.default_rng(3).normal(size=(60, 5))
     keys, schedules = [jax.random.key(0), jax.random.key(1)], [MapSchedule(100, 50), MapSchedule(50, 100, (0.1, 0.1))]
     together = fit_maps(frames, keys, shape=(5, 4), schedules=schedules)
@@ -62,20 +64,20 @@ def test_maps_at_once_are_those_one_by_one():
     assert not np.allclose(together[0].weights, together[1].weights)
 
 
-def test_curves_settle_without_overshoot_the_slower_the_smaller_the_rate():
+def test_curves_settle_without_overshoot_and_more_slowly_at_smaller_rates():
     frames = np.random.default_rng(4).normal(2.0, 0.01, (200, 8))
     curves = learning_curves(frames, jax.random.key(0), (0.01, 0.005, 0.001), steps=8000, shape=(8, 8))
     constants = [time_constant(one) for one in curves]
     assert constants == sorted(constants)
-    # Every neuron moves by a share of ε of between 1 and exp(−(7² + 7²) / 2·4²) of the way.
+    # Every neuron moves by a fraction of ε between 1 and exp(−(7² + 7²) / 2·4²) of the distance.
     assert all(1 <= constant * rate <= 10 for constant, rate in zip(constants, (0.01, 0.005, 0.001), strict=True))
     assert (curves.max(axis=1) < 2.0 + 0.005).all()
     np.testing.assert_allclose(curves[:2, -1], 2.0, atol=0.01)
 
 
 @pytest.mark.slow
-def test_a_phase_may_end_anywhere_in_what_is_shown_at_once():
-    """Frames are shown some at once, and the last of them are filled up: of those nothing is seen."""
+def test_a_phase_may_end_inside_a_batch():
+    """Frames are presented in batches, and the last batch is padded. The padding has no effect."""
     random = np.random.default_rng(5)
     frames, weights = random.normal(size=(30, 6)), random.normal(size=(4, 3, 6))
     schedule = MapSchedule(37, 101)

@@ -1,4 +1,4 @@
-"""A skin that has learnt, and a quick one."""
+"""A trained skin, and one trained by a quick method."""
 
 from contextlib import contextmanager
 
@@ -19,12 +19,12 @@ def _libraries_found_once():
 
 @pytest.fixture(scope="session")
 def recorded():
-    """Presses on the made-up skin."""
+    """Presses on the simulated skin."""
     return record(200)
 
 
 class Mean:
-    """What errs most: the mean of what was learnt from, whatever is asked."""
+    """A poor method: it predicts the mean of the training data for every frame."""
 
     def __init__(self, features, targets):
         self.mean = targets.mean(axis=0)
@@ -35,7 +35,7 @@ class Mean:
 
 @contextmanager
 def few_seconds():
-    """Methods that take seconds say the mean, and trees are few; `test_methods` has those methods themselves."""
+    """Methods that take seconds predict the mean, and trees are few. `test_methods` covers those methods themselves."""
     with libraries_found_once(), pytest.MonkeyPatch.context() as patch:
         for slow in ("trees", "network", "som"):
             patch.setitem(methods.REGRESSORS, slow, Mean)
@@ -51,13 +51,13 @@ def few_seconds_for_all_methods():
 
 @pytest.fixture(scope="session")
 def skin(recorded):
-    """What was learnt from them with all defaults."""
+    """A skin trained on the recorded presses with all defaults."""
     with few_seconds():
         return LearntSkin.fit(Presses.create(**recorded))
 
 
 @pytest.fixture(scope="session")
 def quick(recorded):
-    """The same by the quickest method."""
+    """The same, trained by the quickest method."""
     with libraries_found_once():
         return LearntSkin.fit(Presses.create(**recorded), method="neighbours")

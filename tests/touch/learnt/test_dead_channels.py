@@ -1,4 +1,4 @@
-"""What channels do together: dead ones are found and replaced, frames unlike any are told."""
+"""Correlations between channels: dead channels are detected and replaced, and unusual frames are reported."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from jeit.touch.learnt.channels import _DIAGONALS, Channels, _leave_one_out_erro
 
 
 def changes(number, seed, *, noise=0.01):
-    """Of 20 channels with three patterns."""
+    """Changes of 20 channels with three patterns."""
     rng = np.random.default_rng(seed)
     patterns = np.random.default_rng(5).normal(size=(3, 20))
     return rng.normal(size=(number, 3)) @ patterns + noise * rng.normal(size=(number, 20))
@@ -25,8 +25,8 @@ def test_dead_channels_are_found_and_replaced():
     assert novelty.max() < 2
 
 
-def test_healthy_channels_that_were_left_out_beside_a_dead_one_are_taken_back():
-    """A dead channel bends what is foretold of those beside it, until it is left out."""
+def test_healthy_channels_excluded_beside_a_dead_one_are_restored():
+    """A dead channel distorts the predictions of other channels until it is excluded."""
     rng, mixed = np.random.default_rng(1), np.random.default_rng(7).normal(size=(5, 12))
     given, fresh = (rng.normal(size=(number, 5)) @ mixed for number in (400, 200))
     channels = Channels.learn(given + 0.01 * rng.normal(size=given.shape))
@@ -37,7 +37,7 @@ def test_healthy_channels_that_were_left_out_beside_a_dead_one_are_taken_back():
     assert np.count_nonzero(~alive) < 1.05 * len(fresh)
 
 
-def test_readings_that_are_missing_are_foretold():
+def test_missing_readings_are_predicted():
     channels, fresh = Channels.learn(changes(200, 0)), changes(50, 1)
     holed = np.where(np.random.default_rng(0).random(fresh.shape) < 0.1, np.nan, fresh)
     whole, alive, *_ = channels.complete(holed)
@@ -46,15 +46,19 @@ def test_readings_that_are_missing_are_foretold():
 
 
 def twins(number, seed):
-    """Of ten channels that follow six numbers, not by lines, and ten that read the same, as reciprocal ones do."""
+    """Changes of ten channels that depend nonlinearly on six numbers, and of ten duplicates, as reciprocal channels
+    are.
+    """
     rng = np.random.default_rng(seed)
     mixed = np.tanh(rng.normal(size=(number, 6)) @ np.random.default_rng(6).normal(size=(6, 10)))
     return np.hstack([mixed, mixed]) + 1e-3 * rng.normal(size=(number, 20))
 
 
 @pytest.mark.parametrize("reading", [np.nan, 9.0, -9.0])
-def test_a_channel_is_foretold_by_the_one_that_reads_the_same(reading):
-    """Whatever else the patterns know; and its twin is not held for dead for reading what nothing else bears out."""
+def test_a_channel_is_predicted_by_its_duplicate(reading):
+    """Whatever the other patterns predict. The duplicate is not reported as dead, although no other channel confirms
+    its reading.
+    """
     channels, fresh = Channels.learn(twins(300, 0)), twins(60, 1)
     for channel in range(20):
         broken = fresh.copy()
@@ -65,7 +69,7 @@ def test_a_channel_is_foretold_by_the_one_that_reads_the_same(reading):
         assert np.abs(whole - fresh)[:, channel].max() < 0.02
 
 
-def test_channels_that_are_alive_are_not_held_for_dead_beside_four_that_are():
+def test_healthy_channels_are_not_reported_as_dead_beside_four_dead_ones():
     channels, fresh = Channels.learn(changes(200, 0)), changes(200, 1)
     broken = fresh.copy()
     broken[:, [4, 11, 7, 15]] = [8.0, -8.0, 8.0, 8.0]
@@ -74,24 +78,24 @@ def test_channels_that_are_alive_are_not_held_for_dead_beside_four_that_are():
     assert np.delete(alive, [4, 11, 7, 15], axis=1).mean() > 0.99
 
 
-def test_what_is_missed_is_what_the_other_channels_leave():
+def test_residuals_are_those_of_prediction_by_the_other_channels():
     learnt, other = changes(60, 0, noise=0.3)[:, :6], changes(40, 1, noise=0.3)[:, :6]
     variance, directions = _variances(learnt)
     covariance = (directions * variance) @ directions.T + _DIAGONALS[8] * np.eye(6)
     left = []
     for one in range(6):
         rest = np.arange(6) != one
-        told = other[:, rest] @ np.linalg.solve(covariance[np.ix_(rest, rest)], covariance[rest, one])
-        left.append(other[:, one] - told)
+        predicted = other[:, rest] @ np.linalg.solve(covariance[np.ix_(rest, rest)], covariance[rest, one])
+        left.append(other[:, one] - predicted)
     missed, unpredicted = _leave_one_out_errors(other, variance, directions)[:, 8]
     np.testing.assert_allclose(missed, np.mean(np.square(left), axis=1), rtol=1e-9)
-    # The second, over the share of a channel's diagonal in what foretells it, is the first.
+    # The second, divided by the channel's diagonal entry of the precision matrix, is the first.
     np.testing.assert_allclose(
         unpredicted * np.diag(np.linalg.inv(covariance)) ** -1 / _DIAGONALS[8], missed, rtol=1e-9
     )
 
 
-def test_frames_that_lack_different_channels_are_mended_as_each_alone():
+def test_frames_with_different_missing_channels_are_completed_as_each_alone():
     channels, fresh = Channels.learn(changes(200, 0)), changes(60, 1)
     fresh[:30, 4], fresh[20:40, 7], fresh[45, 1], fresh[50:, 12] = np.nan, 3.0, np.nan, -4.0
     together = channels.complete(fresh)
@@ -100,7 +104,7 @@ def test_frames_that_lack_different_channels_are_mended_as_each_alone():
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
-def test_frames_of_another_kind_are_told():
+def test_unusual_frames_are_reported():
     channels = Channels.learn(changes(200, 0))
     frames = changes(300, 2), np.random.default_rng(3).normal(size=(30, 20)) * 3, 100 * changes(30, 2)
     usual, strange, great = (channels.complete(one)[2] for one in frames)
@@ -109,7 +113,7 @@ def test_frames_of_another_kind_are_told():
     assert (strange > 2).mean() > 0.9
 
 
-def test_channels_that_say_nothing_are_not_used():
+def test_uninformative_channels_are_not_used():
     given = np.column_stack([changes(60, 0), np.full(60, 3.0), np.full(60, np.nan)])
     channels = Channels.learn(given)
     np.testing.assert_array_equal(np.flatnonzero(~channels.used), [20, 21])
@@ -118,12 +122,12 @@ def test_channels_that_say_nothing_are_not_used():
         Channels.learn(np.ones((20, 4)))
 
 
-def test_the_channels_that_tell_most_are_chosen():
+def test_the_most_informative_channels_are_chosen():
     rng = np.random.default_rng(0)
     answers = rng.normal(size=(100, 2))
     scaled = rng.normal(size=(100, 12))
     scaled[:, 7] = answers[:, 0] + 0.1 * scaled[:, 7]
     scaled[:, 2] = answers[:, 1] + 0.2 * scaled[:, 2]
-    scaled[:, 3] = scaled[:, 7] + 1e-6 * scaled[:, 3]  # says again what 7 says
+    scaled[:, 3] = scaled[:, 7] + 1e-6 * scaled[:, 3]  # repeats the information of 7
     chosen = choose_channels(scaled, answers, 2)
     assert set(chosen) in ({7, 2}, {3, 2})

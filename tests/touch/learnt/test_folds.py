@@ -1,4 +1,4 @@
-"""Folds of cross-validation: stretches of time, nothing that belongs together split."""
+"""Folds of cross-validation: intervals of time that split no group."""
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -9,7 +9,7 @@ RNG = np.random.default_rng(0)
 FRAMES = RNG.normal(size=(60, 4))
 
 
-def test_they_are_stretches_of_time():
+def test_folds_are_intervals_of_time():
     folds, notes = time_folds(FRAMES, positions=RNG.normal(size=(60, 2)))
     np.testing.assert_array_equal(folds, np.repeat(np.arange(5), 12))
     assert notes == ()
@@ -33,30 +33,30 @@ def test_copies_are_not_split():
     assert "2 frames are copies" in notes[0]
 
 
-def test_places_pressed_one_after_the_other_are_in_all_folds():
-    """A raster pressed line by line: held out by stretches, whole parts of the skin would be."""
+def test_places_pressed_in_sequence_are_in_all_folds():
+    """A raster pressed line by line: folds of intervals would hold out whole parts of the skin."""
     places = np.stack(np.meshgrid(np.arange(20.0), np.arange(15.0), indexing="ij"), axis=-1).reshape(-1, 2)
     folds, notes = time_folds(RNG.normal(size=(300, 4)), positions=places)
     apart = [KDTree(places[folds != one]).query(places[folds == one])[0].mean() for one in range(5)]
-    assert max(apart) < 1.6  # where stretches of four lines would be 2.5 lines away on average
+    assert max(apart) < 1.6  # with intervals of four lines the average would be 2.5 lines
     assert "short intervals" in notes[0]
 
 
-def test_kinds_pressed_one_after_the_other_are_in_all_folds():
+def test_kinds_pressed_in_sequence_are_in_all_folds():
     kinds = np.repeat(np.arange(4), 15)
     folds, _ = time_folds(FRAMES, kinds=kinds)
     assert all(set(kinds[folds != one]) == {0, 1, 2, 3} for one in range(5))
 
 
-def test_keys_pressed_one_after_the_other_are_in_all_folds():
+def test_keys_pressed_in_sequence_are_in_all_folds():
     keys = np.repeat(np.eye(5, dtype=bool), 12, axis=0)
     folds, notes = time_folds(FRAMES, kinds=keys)
     assert all(keys[folds != one].any(axis=0).all() for one in range(5))
     assert "keys were given one after the other" in notes[0]
 
 
-def test_places_repeated_in_any_order_are_not_said_to_be_in_turn():
-    """Of a place held out no press is left, in whatever order they were pressed."""
+def test_places_repeated_in_any_order_are_not_taken_for_a_sequence():
+    """No press at a held-out place is in the training data, in whatever order they were pressed."""
     places = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), axis=-1).reshape(-1, 2)
     places = places[np.random.default_rng(2).integers(0, 25, 300)]
     folds, notes = time_folds(RNG.normal(size=(300, 4)), positions=places)

@@ -1,4 +1,4 @@
-"""Skins of which a model is known: images of their changes tell places before much is learnt."""
+"""Skins with a known model: images of their changes locate touches after little training."""
 
 import numpy as np
 import pytest
@@ -10,12 +10,12 @@ from jeit.touch.learnt.imaged import ContactFeatures, ImageFeatures, ImageRecons
 RADIUS = 0.05
 ELECTRODES = BoundaryElectrodes(ring(RADIUS, 12), width=0.008, contact_impedance=0.01)
 MODEL = ForwardModel(Disk(RADIUS).mesh(num_points=300), ELECTRODES, adjacent(12))
-# Twice as conductive as the model says, and on another mesh.
+# Twice as conductive as the model assumes, and on another mesh.
 SKIN, CONDUCTIVITY = ForwardModel(Disk(RADIUS).mesh(num_points=700), ELECTRODES, adjacent(12)), 2.0
 
 
 def record(number, seed, *, sign=1.0):
-    """Presses that change the conductivity of a round spot, by up to half."""
+    """Presses that change the conductivity of a round spot by up to a half."""
     rng = np.random.default_rng(seed)
     radius, angle = 0.04 * np.sqrt(rng.uniform(size=number)), rng.uniform(0, 2 * np.pi, number)
     places = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
@@ -33,8 +33,8 @@ LEARNT, FRESH = record(24, 0), record(60, 1)
 
 
 def off(skin):
-    told = skin.predict(FRESH["frames"], FRESH["reference"])
-    return np.nanmean(np.linalg.norm(told.position - FRESH["positions"], axis=1))
+    prediction = skin.predict(FRESH["frames"], FRESH["reference"])
+    return np.nanmean(np.linalg.norm(prediction.position - FRESH["positions"], axis=1))
 
 
 @pytest.fixture(scope="module")
@@ -43,13 +43,13 @@ def skin():
 
 
 def test_few_presses_are_enough_with_a_model(skin):
-    """Where they are not without one."""
+    """Without a model they are not."""
     assert off(skin) < 3.5e-3
     assert off(LearntSkin.fit(Presses.create(**LEARNT), method="ridge")) > 3 * off(skin)
     assert skin.standing["place"].method == "ridge on contacts"
 
 
-def test_skins_with_a_model_are_kept(skin, tmp_path):
+def test_skins_with_a_model_are_saved(skin, tmp_path):
     write_skin(skin, tmp_path / "skin.skops")
     again = read_skin(tmp_path / "skin.skops").predict(FRESH["frames"], FRESH["reference"])
     np.testing.assert_array_equal(again.position, skin.predict(FRESH["frames"], FRESH["reference"]).position)
@@ -57,8 +57,8 @@ def test_skins_with_a_model_are_kept(skin, tmp_path):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("unit", [1.0, 1e-3, -250.0])
-def test_the_contact_is_the_touch_whatever_its_sign_and_the_unit(sign, unit):
-    """Millivolts, counts of a converter, voltages told with the other sign."""
+def test_the_contact_is_the_touch_for_any_sign_and_unit(sign, unit):
+    """Millivolts, counts of a converter, and voltages with the opposite sign."""
     pressed = record(24, 0, sign=sign)
     changes = unit * (pressed["frames"] - pressed["reference"])
     imaged, _ = ImageReconstruction.create(MODEL, changes, np.ones(len(changes.T), bool), unit * pressed["reference"])
@@ -66,8 +66,8 @@ def test_the_contact_is_the_touch_whatever_its_sign_and_the_unit(sign, unit):
     assert np.linalg.norm(place - pressed["positions"], axis=1).mean() < 3e-3
 
 
-def test_contacts_of_an_image_in_hand():
-    """Of a square of 3 × 3 cells, the middle one the peak, its right neighbour above the level."""
+def test_contacts_of_a_given_image():
+    """Of a square of 3 × 3 cells, with its peak at the centre and the right neighbour above the level."""
     grid = np.stack(np.meshgrid(np.arange(3.0), np.arange(3.0)), axis=-1).reshape(-1, 2)
     imaged = ImageReconstruction(np.eye(9), grid, np.full(9, 2.0), np.tile(np.arange(9), (9, 1)))
     image = np.zeros((1, 9))
@@ -78,7 +78,7 @@ def test_contacts_of_an_image_in_hand():
     assert np.isfinite(imaged.contacts(-np.ones((1, 9)))).all()
 
 
-def test_what_is_far_from_the_peak_is_another_contact():
+def test_distant_cells_are_another_contact():
     changes = LEARNT["frames"] - LEARNT["reference"]
     imaged, _ = ImageReconstruction.create(MODEL, changes, np.ones(108, bool), LEARNT["reference"])
     image = sum(
@@ -98,7 +98,7 @@ def test_images_are_relative_to_their_size():
     np.testing.assert_allclose(three[:, 5] - one[:, 5], np.log(3))
 
 
-def test_a_model_that_does_not_fit_is_told_of(skin):
+def test_a_model_that_does_not_fit_is_reported(skin):
     assert not [note for note in skin.notes if "misses" in note]
     turned = np.random.default_rng(0).permutation(108)
     mixed = {key: value if key == "positions" else value[..., turned] for key, value in LEARNT.items()}
@@ -106,7 +106,7 @@ def test_a_model_that_does_not_fit_is_told_of(skin):
     assert any("model misses" in note for note in found.notes)
 
 
-def test_models_that_cannot_be_are_refused():
+def test_bad_models_are_refused():
     presses = Presses.create(**LEARNT)
     more = BoundaryElectrodes(ring(RADIUS, 16), width=0.008, contact_impedance=0.01)
     other = ForwardModel(MODEL.mesh, more, adjacent(16))

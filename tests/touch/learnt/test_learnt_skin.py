@@ -1,6 +1,6 @@
-"""A skin that has learnt: how far off it is, how sure it says it is, and what it does where it cannot know.
+"""A trained skin: its errors, its estimated uncertainty, and its behaviour where it has no information.
 
-Against places, forces, labels and keys of fresh presses on a made-up skin, that it never saw.
+Against places, forces, labels and keys of new presses on a simulated skin, which were not in the training data.
 """
 
 import numpy as np
@@ -16,15 +16,15 @@ ASK = {key: FRESH[key] for key in ("frames", "reference")}
 
 
 def test_places_and_forces_of_fresh_presses(skin):
-    told = skin.predict(**ASK)
-    assert off(told, FRESH["positions"]).mean() < 4e-3
-    assert np.abs(told.force - FRESH["force"]).mean() < 0.25
-    assert not told.unlike.any()
-    assert told.alive.mean() > 0.999
+    prediction = skin.predict(**ASK)
+    assert off(prediction, FRESH["positions"]).mean() < 4e-3
+    assert np.abs(prediction.force - FRESH["force"]).mean() < 0.25
+    assert not prediction.unlike.any()
+    assert prediction.alive.mean() > 0.999
 
 
 @pytest.mark.usefixtures("few_seconds_for_all_methods")
-def test_a_blend_says_the_mean_of_what_errs_least():
+def test_a_blend_predicts_the_mean_of_the_best_methods():
     recorded = {**record(80), "force": None}
     skin = LearntSkin.fit(Presses.create(**recorded), method="blend")
     standing, place = skin.standing["place"], skin.place
@@ -33,14 +33,14 @@ def test_a_blend_says_the_mean_of_what_errs_least():
     assert len(place.members) == standing.method.count(" on ") >= 2
     changes = FRESH["frames"] - FRESH["reference"]
     each = [model.predict(features(changes, FRESH["reference"])) for features, model in place.members]
-    said = place.mean + place.scale * np.mean(each, axis=0)
-    np.testing.assert_allclose(skin.predict(**ASK).position, said, atol=1e-9)
+    expected = place.mean + place.scale * np.mean(each, axis=0)
+    np.testing.assert_allclose(skin.predict(**ASK).position, expected, atol=1e-9)
     assert off(skin.predict(**ASK), FRESH["positions"]).mean() < 4e-3
 
 
 @pytest.mark.slow
-def test_places_by_every_method_as_it_is():
-    """None of which says the mean."""
+def test_places_by_the_actual_methods():
+    """None of them is replaced by the mean."""
     skin = LearntSkin.fit(Presses.create(**{**record(100), "force": None}))
     assert off(skin.predict(**ASK), FRESH["positions"]).mean() < 4e-3
     place = skin.standing["place"]
@@ -48,8 +48,8 @@ def test_places_by_every_method_as_it_is():
     assert all(error < 0.7 * spread for _, error in place.tried)
 
 
-def test_the_best_method_is_taken(skin):
-    """Of all that there are; better than lines by far, where nothing is linear."""
+def test_the_best_method_is_selected(skin):
+    """Among all methods, and much better than linear ones, since nothing is linear."""
     place = skin.standing["place"]
     errors = dict(place.tried)
     assert {name.partition(" on ")[0] for name in errors} >= set(REGRESSORS)
@@ -58,15 +58,15 @@ def test_the_best_method_is_taken(skin):
     assert place.held_out.shape == (200, 2)
 
 
-def test_deviations_hold_as_often_as_they_say(skin):
+def test_deviations_are_calibrated(skin):
     many = record(600, seed=2)
-    told = skin.predict(many["frames"], many["reference"])
-    ratio = np.abs(told.position - many["positions"]) / told.position_std
-    assert 0.6 < np.mean(ratio < 1) < 0.82  # a few frames by chance look as if their readings were worse
+    prediction = skin.predict(many["frames"], many["reference"])
+    ratio = np.abs(prediction.position - many["positions"]) / prediction.position_std
+    assert 0.6 < np.mean(ratio < 1) < 0.82  # by chance a few frames look as if their readings were noisier
     assert abs(np.mean(ratio < 1.96) - 0.95) < 0.05
 
 
-def test_frames_one_by_one_are_as_together(skin):
+def test_frames_one_by_one_equal_frames_together(skin):
     together = skin.predict(**ASK)
     alone = skin.predict(FRESH["frames"][7], FRESH["reference"][7])
     np.testing.assert_allclose(alone.position[0], together.position[7], rtol=1e-9)
@@ -74,19 +74,19 @@ def test_frames_one_by_one_are_as_together(skin):
 
 
 @pytest.mark.parametrize("reading", [0.0, np.nan, 5.0])
-def test_a_channel_that_dies_costs_little(quick, reading):
+def test_a_dead_channel_costs_little_accuracy(quick, reading):
     sound = off(quick.predict(**ASK), FRESH["positions"]).mean()
     for channel in (3, 17, 30):
         frames = FRESH["frames"].copy()
         frames[:, channel] = reading
-        told = quick.predict(frames, FRESH["reference"])
-        assert off(told, FRESH["positions"]).mean() < 2 * sound
-        assert not told.alive[:, channel].any() or np.isfinite(reading)
-        assert any(f" {channel}" in note for note in told.notes)
+        prediction = quick.predict(frames, FRESH["reference"])
+        assert off(prediction, FRESH["positions"]).mean() < 2 * sound
+        assert not prediction.alive[:, channel].any() or np.isfinite(reading)
+        assert any(f" {channel}" in note for note in prediction.notes)
 
 
 def few_channels(number, seed):
-    """Changes of eight channels, each of which says what no other does, and places."""
+    """Changes of eight channels, each with information that no other has, and places."""
     rng, centres = np.random.default_rng(seed), np.random.default_rng(3).uniform(-0.06, 0.06, (8, 2))
     place, force = rng.uniform(-0.05, 0.05, (number, 2)), rng.uniform(0.5, 4.0, number)
     near = np.exp(-((np.linalg.norm(place[:, None] - centres, axis=2) / 0.035) ** 2))
@@ -100,26 +100,28 @@ def skin_of_few_channels():
 
 
 @pytest.mark.parametrize("dead", [[2], [1, 6]])
-def test_deviations_hold_where_channels_are_dead(skin_of_few_channels, dead):
+def test_deviations_are_calibrated_where_channels_are_dead(skin_of_few_channels, dead):
     skin = skin_of_few_channels
     fresh, right = few_channels(300, 1)
     sound = skin.predict(fresh)
     fresh[:, dead] = np.nan
-    told = skin.predict(fresh)
-    assert np.nanmean(off(told, right)) > 2 * np.nanmean(off(sound, right))
-    ratio = (np.abs(told.position - right) / told.position_std)[np.isfinite(told.position).all(axis=1)]
+    prediction = skin.predict(fresh)
+    assert np.nanmean(off(prediction, right)) > 2 * np.nanmean(off(sound, right))
+    ratio = (np.abs(prediction.position - right) / prediction.position_std)[
+        np.isfinite(prediction.position).all(axis=1)
+    ]
     assert len(ratio) > 250
     assert 0.55 < np.mean(ratio < 1) < 0.9
     assert np.mean(ratio < 1.96) > 0.88
 
 
-def test_a_channel_that_is_stuck_is_done_without(quick):
-    """At a value that it might have read: nothing but its constancy tells."""
+def test_a_stuck_channel_is_left_out(quick):
+    """At a plausible value: only its constancy reveals it."""
     frames = FRESH["frames"].copy()
     frames[:, 9] = np.median(frames[:, 9])
-    told = quick.predict(frames, FRESH["reference"])
-    assert not told.alive[:, 9].any()
-    assert told.alive.mean() > 0.97
+    prediction = quick.predict(frames, FRESH["reference"])
+    assert not prediction.alive[:, 9].any()
+    assert prediction.alive.mean() > 0.97
     still = quick.predict(np.repeat(frames[:1], 30, axis=0), FRESH["reference"][0])
     assert still.alive.all()
     coarse = np.round(FRESH["reference"][:40], 2)  # untouched: nearly all channels read the same
@@ -129,54 +131,54 @@ def test_a_channel_that_is_stuck_is_done_without(quick):
     assert quick.predict(frames, FRESH["reference"]).unlike.all()
 
 
-def test_frames_unlike_any_are_said_to_be(quick):
+def test_unusual_frames_are_reported(quick):
     frames = FRESH["frames"].copy()
     frames[:5] = np.random.default_rng(0).normal(size=(5, CHANNELS))
-    told = quick.predict(frames, FRESH["reference"])
-    np.testing.assert_array_equal(np.flatnonzero(told.unlike), range(5))
-    assert np.isnan(told.position[:5]).all()
-    assert np.isnan(told.force[:5]).all()
-    assert "5 of 120 frames are unlike" in told.notes[-1]
+    prediction = quick.predict(frames, FRESH["reference"])
+    np.testing.assert_array_equal(np.flatnonzero(prediction.unlike), range(5))
+    assert np.isnan(prediction.position[:5]).all()
+    assert np.isnan(prediction.force[:5]).all()
+    assert "5 of 120 frames are unlike" in prediction.notes[-1]
 
 
-def test_untouched_frames_are_at_no_place():
+def test_untouched_frames_have_no_place():
     recorded = record(200, untouched=40, noise=0.002)
     skin = LearntSkin.fit(Presses.create(**recorded), method="neighbours")
     fresh = record(100, seed=3, untouched=30, noise=0.002)
-    told = skin.predict(fresh["frames"], fresh["reference"])
-    still = np.isnan(told.position).any(axis=1)
+    prediction = skin.predict(fresh["frames"], fresh["reference"])
+    still = np.isnan(prediction.position).any(axis=1)
     assert still[70:].mean() > 0.9
     assert still[:70].mean() < 0.1
-    assert (told.force[still] == 0).all()
+    assert (prediction.force[still] == 0).all()
 
 
-def test_a_touch_that_nothing_told_of_is_unlike(quick):
-    """Of the other sign, it is made of patterns that were learnt, but like no press that was."""
-    told = quick.predict(2 * FRESH["reference"] - FRESH["frames"], FRESH["reference"])
-    assert told.unlike.all()
+def test_a_touch_unlike_the_training_data_is_reported(quick):
+    """With the opposite sign it consists of learnt patterns, but resembles no press."""
+    prediction = quick.predict(2 * FRESH["reference"] - FRESH["frames"], FRESH["reference"])
+    assert prediction.unlike.all()
     assert quick.predict(**ASK).unlike.mean() < 0.02
 
 
 @pytest.mark.parametrize("readings", [0, 10])
-def test_frames_without_most_readings_are_not_taken_for_untouched(quick, readings):
+def test_frames_without_most_readings_are_not_reported_as_untouched(quick, readings):
     frames = FRESH["frames"].copy()
     frames[:, readings:] = np.nan
-    told = quick.predict(frames, FRESH["reference"])
-    assert told.unlike.all()
-    assert np.isnan(told.force).all()
+    prediction = quick.predict(frames, FRESH["reference"])
+    assert prediction.unlike.all()
+    assert np.isnan(prediction.force).all()
 
 
-def test_an_untouched_skin_is_at_no_place(quick):
-    """Though no untouched frame was recorded."""
+def test_an_untouched_skin_has_no_place(quick):
+    """Although no untouched frame was recorded."""
     noise = 1e-3 * np.random.default_rng(0).normal(size=FRESH["frames"].shape)
-    told = quick.predict(FRESH["reference"] + noise, FRESH["reference"])
-    assert np.isnan(told.position).all()
-    assert not told.unlike.any()
-    assert (told.force == 0).all()
+    prediction = quick.predict(FRESH["reference"] + noise, FRESH["reference"])
+    assert np.isnan(prediction.position).all()
+    assert not prediction.unlike.any()
+    assert (prediction.force == 0).all()
 
 
-def test_places_pressed_again_and_again_are_held_out_together():
-    """What is forecast is the error between them, not that at them."""
+def test_places_pressed_repeatedly_are_held_out_together():
+    """The predicted error is that between them, not at them."""
     grid = np.stack(np.meshgrid(*2 * [np.linspace(-0.045, 0.045, 7)]), axis=-1).reshape(-1, 2)
     recorded = record(245, places=np.tile(grid, (5, 1)), noise=0.002)
     skin = LearntSkin.fit(Presses.create(**{**recorded, "force": None}), method="neighbours")
@@ -208,23 +210,23 @@ def test_labels_and_no_touch():
     label = np.where(np.isnan(x), "none", np.where(x > 0, "right", "left"))
     skin = LearntSkin.fit(Presses.create(recorded["frames"], reference=recorded["reference"], label=label))
     fresh = record(200, seed=4, untouched=50, noise=0.003)
-    told = skin.predict(fresh["frames"], fresh["reference"])
+    prediction = skin.predict(fresh["frames"], fresh["reference"])
     x = fresh["positions"][:, 0]
     right = np.where(np.isnan(x), "none", np.where(x > 0, "right", "left"))
-    assert np.mean(told.label == right) > 0.93
-    assert abs(told.probability.mean() - np.mean(told.label == right)) < 0.06
+    assert np.mean(prediction.label == right) > 0.93
+    assert abs(prediction.probability.mean() - np.mean(prediction.label == right)) < 0.06
     assert len(skin.standing["label"].tried) >= 9
 
 
 @pytest.fixture
 def few_trees(monkeypatch):
-    """Fifteen a key, where a hundred and fifty take ten times as long."""
+    """Fifteen for each key, where a hundred and fifty take ten times as long."""
     monkeypatch.setattr(labels, "_TREES", 15)
 
 
 @pytest.mark.usefixtures("few_trees")
 def test_keys_pressed_together():
-    """Six keys, each with a pattern of its own, that saturate together."""
+    """Six keys, each with its own pattern, which saturate together."""
     rng = np.random.default_rng(0)
     patterns = rng.normal(size=(6, CHANNELS))
 
@@ -236,16 +238,16 @@ def test_keys_pressed_together():
     frames, touched = press(150, 1)
     skin = LearntSkin.fit(Presses.create(frames, touched=touched))
     fresh, right = press(200, 2)
-    told = skin.predict(fresh)
-    assert np.mean(told.touched == right) > 0.97
-    assert np.mean((told.touched == right).all(axis=1)) > 0.85
-    assert np.mean((told.key_probability > 0.5) == told.touched) == 1
+    prediction = skin.predict(fresh)
+    assert np.mean(prediction.touched == right) > 0.97
+    assert np.mean((prediction.touched == right).all(axis=1)) > 0.85
+    assert np.mean((prediction.key_probability > 0.5) == prediction.touched) == 1
 
 
 @pytest.mark.usefixtures("few_trees")
 @pytest.mark.parametrize("group", [None, np.repeat(np.arange(4), 20)])
-def test_keys_pressed_in_turn(group):
-    """Where each person pressed one only, what is held out has a key that nothing else tells of."""
+def test_keys_pressed_in_sequence(group):
+    """Where each person pressed one key only, the held-out data have a key without training data."""
     rng = np.random.default_rng(0)
     touched = np.repeat(np.eye(4, dtype=bool), 20, axis=0)
     frames = touched @ rng.normal(size=(4, 12)) + 0.1 * rng.normal(size=(80, 12))
@@ -271,11 +273,11 @@ def test_sessions_that_drift_are_standardised():
     )
     assert np.nanmean(with_it) < 6e-3
     assert np.isnan(with_it).mean() < 0.1
-    assert np.isnan(without).mean() > 0.9  # like nothing that was learnt from, and said to be
+    assert np.isnan(without).mean() > 0.9  # unlike all training data, and reported as such
 
 
-def test_a_reference_that_lacks_readings():
-    """They are taken for the mean, in learning and in telling: no form of the features is lost to one of them."""
+def test_a_reference_with_missing_readings():
+    """They are replaced by the mean, in training and in prediction: no form of the features is lost."""
     recorded = record(80)
     reference = recorded["reference"].copy()
     reference[::7, 4] = np.nan
@@ -286,8 +288,8 @@ def test_a_reference_that_lacks_readings():
     assert off(skin.predict(FRESH["frames"], lacking), FRESH["positions"]).mean() < 0.03
 
 
-def test_a_reference_of_zeros_can_be_given_again():
-    """As by devices that take it off themselves."""
+def test_a_reference_of_zeros_is_accepted_again():
+    """As from devices that subtract it themselves."""
     changes = FRESH["frames"] - FRESH["reference"]
     skin = LearntSkin.fit(
         Presses.create(changes, reference=np.zeros(CHANNELS), force=FRESH["force"]), method="neighbours"
@@ -296,8 +298,8 @@ def test_a_reference_of_zeros_can_be_given_again():
     assert np.nanmean(np.abs(again.force - FRESH["force"])) < 1.0
 
 
-def test_frames_recorded_late_take_their_own_reference_along():
-    """And it is their own press that says whether they were touched."""
+def test_frames_recorded_late_carry_their_own_reference():
+    """Their own press determines whether they were touched."""
     recorded = record(240, untouched=40, noise=0.002)
     order = np.random.default_rng(3).permutation(240)
     recorded = {key: values[order] for key, values in recorded.items()}
@@ -319,14 +321,14 @@ def test_forces_of_a_few_weights_are_held_out_by_time():
     assert not any("repeated" in note for note in skin.notes)
 
 
-def test_frames_that_never_change_teach_nothing():
+def test_constant_frames_are_refused():
     frames, reference = np.full((20, 6), 0.1), np.linspace(0.3, 1, 6)
     with pytest.raises(ValueError, match="no channel changes"):
         LearntSkin.fit(Presses.create(frames, reference=reference, force=np.arange(20.0)))
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda skin: skin.predict(FRESH["frames"][:, :30], FRESH["reference"][:, :30]), "frames have 30 channels"),
         (lambda skin: skin.predict(FRESH["frames"]), "reference is missing"),
@@ -344,8 +346,8 @@ def test_frames_that_never_change_teach_nothing():
         (lambda skin: LearntSkin.fit(Presses.create(0 * FRESH["frames"], force=FRESH["force"])), "no channel changes"),
     ],
 )
-def test_what_cannot_be_is_refused(quick, call, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_arguments_are_refused(quick, call, message):
+    with pytest.raises(ValueError, match=message):
         call(quick)
 
 

@@ -1,4 +1,4 @@
-"""Methods: those told for one frame in microseconds are scikit-learn's, to rounding; and all learn."""
+"""Methods: those that predict one frame in microseconds equal scikit-learn's, to rounding, and all of them learn."""
 
 import numpy as np
 import pytest
@@ -23,11 +23,11 @@ ASKED = RNG.normal(size=(50, 6)) * np.linspace(2, 0.5, 6)
 
 @pytest.mark.parametrize("name", sorted(REGRESSORS))
 def test_numbers_are_learnt(name, monkeypatch):
-    monkeypatch.setattr("jeit.touch.learnt.methods._SHOWN", 20)  # a map of few presses, each shown so often
-    said = np.asarray(REGRESSORS[name](FEATURES, TARGETS).predict(ASKED))
+    monkeypatch.setattr("jeit.touch.learnt.methods._SHOWN", 20)  # a map with few presses, each presented this often
+    predicted = np.asarray(REGRESSORS[name](FEATURES, TARGETS).predict(ASKED))
     right = np.stack([np.tanh(ASKED[:, 0]), np.sin(ASKED[:, 1])], axis=1)
     guess = np.abs(right - right.mean(axis=0)).mean()
-    assert np.abs(said - right).mean() < {"ridge": 0.75, "forest": 0.85}.get(name, 0.55) * guess
+    assert np.abs(predicted - right).mean() < {"ridge": 0.75, "forest": 0.85}.get(name, 0.55) * guess
 
 
 @pytest.mark.parametrize("name", sorted(CLASSIFIERS))
@@ -41,7 +41,7 @@ def test_labels_are_learnt(name):
 
 
 @pytest.mark.parametrize("name", sorted(CLASSIFIERS))
-def test_two_kinds_are_learnt(name):
+def test_two_classes_are_learnt(name):
     label = (FEATURES[:, 0] > 0).astype(int)
     odds = log_odds(CLASSIFIERS[name](FEATURES, label), FEATURES)
     assert odds.shape == (220, 2)
@@ -63,12 +63,12 @@ def test_trees_are_scikit_learns():
     forest = ExtraTreesRegressor(100, max_features=0.3, min_samples_leaf=2, random_state=0).fit(FEATURES, TARGETS)
     np.testing.assert_allclose(REGRESSORS["forest"](FEATURES, TARGETS).predict(ASKED), forest.predict(ASKED))
     bagged = BaggingClassifier(DecisionTreeClassifier(random_state=0), 30, random_state=0).fit(FEATURES, LABEL)
-    told = CLASSIFIERS["bagged-trees"](FEATURES, LABEL).decision_function(ASKED)
-    np.testing.assert_allclose(told, bagged.predict_proba(ASKED))
+    output = CLASSIFIERS["bagged-trees"](FEATURES, LABEL).decision_function(ASKED)
+    np.testing.assert_allclose(output, bagged.predict_proba(ASKED))
     one = DecisionTreeClassifier(max_leaf_nodes=21, random_state=0)
     ada = AdaBoostClassifier(one, n_estimators=30, random_state=0).fit(FEATURES, LABEL)
-    told = CLASSIFIERS["boosted-trees"](FEATURES, LABEL).decision_function(ASKED)
-    np.testing.assert_array_equal(told.argmax(axis=1), ada.predict(ASKED))
+    output = CLASSIFIERS["boosted-trees"](FEATURES, LABEL).decision_function(ASKED)
+    np.testing.assert_array_equal(output.argmax(axis=1), ada.predict(ASKED))
 
 
 @pytest.mark.parametrize("number", [2, 4])
@@ -79,8 +79,8 @@ def test_subspace_discriminants_are_scikit_learns(number):
     one = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
     bagged = BaggingClassifier(one, 30, bootstrap=False, max_features=0.5, random_state=0)
     label = LABEL % number
-    told = CLASSIFIERS["subspace-discriminant"](FEATURES, label).predict_proba(ASKED)
-    np.testing.assert_allclose(told, bagged.fit(FEATURES, label).predict_proba(ASKED), atol=1e-12)
+    output = CLASSIFIERS["subspace-discriminant"](FEATURES, label).predict_proba(ASKED)
+    np.testing.assert_allclose(output, bagged.fit(FEATURES, label).predict_proba(ASKED), atol=1e-12)
 
 
 @pytest.mark.parametrize("number", [2, 4])
@@ -90,13 +90,13 @@ def test_machines_are_scikit_learns(name, kernel, number):
 
     label = LABEL % number
     theirs = SVC(kernel=kernel, degree=2, coef0=1.0).fit(FEATURES, label)
-    told = CLASSIFIERS[name](FEATURES, label).decision_function(ASKED)
-    np.testing.assert_array_equal(told.argmax(axis=1), theirs.predict(ASKED))
+    output = CLASSIFIERS[name](FEATURES, label).decision_function(ASKED)
+    np.testing.assert_array_equal(output.argmax(axis=1), theirs.predict(ASKED))
     if number > 2:
-        np.testing.assert_allclose(told, theirs.decision_function(ASKED), rtol=1e-9)
+        np.testing.assert_allclose(output, theirs.decision_function(ASKED), rtol=1e-9)
 
 
-def test_the_nearest_are_scikit_learns():
+def test_nearest_neighbours_are_scikit_learns():
     from sklearn.neighbors import KNeighborsRegressor
 
     ours = NearestNeighbours.fit_regressor(FEATURES, TARGETS)
@@ -114,7 +114,7 @@ def test_the_gaussian_process_is_scikit_learns():
     np.testing.assert_allclose(GaussianProcess.fit(FEATURES, TARGETS).predict(ASKED), theirs.predict(ASKED), atol=1e-7)
 
 
-def test_few_centres_tell_nearly_what_all_do(monkeypatch):
+def test_few_inducing_points_predict_nearly_the_same(monkeypatch):
     whole = GaussianProcess.fit(FEATURES, TARGETS).predict(ASKED)
     monkeypatch.setattr("jeit.touch.learnt.methods._CENTRES", 150)
     few = GaussianProcess.fit(FEATURES, TARGETS)
@@ -122,7 +122,7 @@ def test_few_centres_tell_nearly_what_all_do(monkeypatch):
     assert np.abs(few.predict(ASKED) - whole).mean() < 0.05
 
 
-def test_the_likeliest_sharpness_is_found():
+def test_the_most_likely_sharpness_is_found():
     right = RNG.integers(0, 3, 4000)
     odds = RNG.normal(size=(4000, 3))
     odds = np.log(probabilities(odds, 1.0))

@@ -1,4 +1,4 @@
-"""Recorded presses: what is read, and that nothing which cannot be is taken."""
+"""Recorded presses: files that are read, and bad ones that are refused."""
 
 import pickle
 
@@ -27,7 +27,7 @@ def test_a_file_is_read(tmp_path):
     assert presses.rows(slice(3, 9)).positions.shape == (6, 2)
 
 
-def test_one_reference_is_for_all_frames():
+def test_one_reference_serves_all_frames():
     presses = Presses.create(GOOD["frames"], reference=GOOD["reference"][0], positions=GOOD["positions"])
     np.testing.assert_array_equal(presses.reference, np.broadcast_to(GOOD["reference"][0], GOOD["frames"].shape))
 
@@ -38,14 +38,14 @@ def test_labels_are_text_and_no_touch_has_one_name():
     assert Presses.create(GOOD["frames"], label=np.repeat([3, 4], 12)).label[0] == "3"
 
 
-def test_infinite_readings_are_none():
+def test_infinite_readings_are_missing():
     frames = GOOD["frames"].copy()
     frames[3, 4] = np.inf
     assert np.isnan(Presses.create(frames, positions=GOOD["positions"]).frames[3, 4])
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"positions": 1e3 * GOOD["positions"]}, "are these metres"),
         ({"positions": GOOD["positions"][:20]}, "positions has 20 rows and frames 24"),
@@ -76,9 +76,9 @@ def test_infinite_readings_are_none():
         ({"group": np.ones((24, 3))}, "one plain value for each press"),
     ],
 )
-def test_what_cannot_be_is_refused(change, said):
+def test_bad_presses_are_refused(change, message):
     given = {**GOOD, **change}
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         Presses.create(given.pop("frames"), **given)
 
 
@@ -97,7 +97,7 @@ def test_files_of_other_kinds_are_refused(tmp_path):
 
 
 class Payload:
-    """What a pickle would run."""
+    """A pickle that would be executed."""
 
     def __reduce__(self):
         return (open, ("ran", "w"))

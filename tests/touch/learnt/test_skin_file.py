@@ -1,4 +1,4 @@
-"""Learnt skins as files: as they were, and nothing else than skins."""
+"""Learnt skins as files: they are read unchanged, and other files are refused."""
 
 import zipfile
 from dataclasses import replace
@@ -23,30 +23,30 @@ def same(one, other):
     np.testing.assert_array_equal(one.label, other.label)
 
 
-def test_what_is_read_says_the_same(skin, tmp_path):
+def test_a_skin_that_is_read_predicts_the_same(skin, tmp_path):
     write_skin(skin, tmp_path / "skin.skops")
-    again = read_skin(tmp_path)  # the folder of it
+    again = read_skin(tmp_path)  # its folder
     same(again, skin)
     assert again.notes == skin.notes
 
 
 def drawn_network(features, targets):
-    """Of the kind that `Network.train` makes, its weights drawn."""
+    """A network of the kind that `Network.train` makes, with random weights."""
     rng, sizes = np.random.default_rng(0), (features.shape[1], 5, targets.shape[1])
     weights = [rng.normal(size=(after, before)) for before, after in pairwise(sizes)]
     return Network(weights, [rng.normal(size=len(one)) for one in weights], features.std(axis=0))
 
 
 def coarse_map(features, targets):
-    """A placed map, of which each press is a neuron."""
+    """A placed map in which each press is a neuron."""
     return PlacedMap.learn(SelfOrganisingMap(features[None], 1.0), features, targets)
 
 
 MODELS = [*(REGRESSORS[name] for name in ("ridge", "neighbours", "gaussian-process", "forest", "trees"))]
 
 
-def test_models_of_every_kind_tell_the_same_places(quick, tmp_path, recorded):
-    """One file of a skin that takes the mean of seven models, as blends are kept."""
+def test_models_of_every_kind_predict_the_same_places(quick, tmp_path, recorded):
+    """One file of a skin that averages seven models, as blends are saved."""
     changes = recorded["frames"] - recorded["reference"]
     place = quick.place
     (features, _), *_ = place.members
@@ -77,19 +77,19 @@ def test_classifiers(method, tmp_path, recorded):
     skin = LearntSkin.fit(presses.rows(slice(60)), method=method)
     write_skin(skin, tmp_path / "one.skops")
     asked = FRESH["frames"], FRESH["reference"]
-    said = skin.predict(*asked)
-    assert np.isfinite(said.probability).any()
-    np.testing.assert_array_equal(read_skin(tmp_path / "one.skops").predict(*asked).probability, said.probability)
+    predicted = skin.predict(*asked)
+    assert np.isfinite(predicted.probability).any()
+    np.testing.assert_array_equal(read_skin(tmp_path / "one.skops").predict(*asked).probability, predicted.probability)
 
 
 class Payload:
-    """What reading might run."""
+    """A pickle that would be executed on reading."""
 
     def __reduce__(self):
         return (open, ("ran", "w"))
 
 
-def test_other_files_are_refused_and_nothing_runs(tmp_path, monkeypatch):
+def test_other_files_are_refused_and_nothing_is_executed(tmp_path, monkeypatch):
     from skops.io import dump
 
     monkeypatch.chdir(tmp_path)
@@ -113,8 +113,8 @@ def test_other_files_are_refused_and_nothing_runs(tmp_path, monkeypatch):
     assert not (tmp_path / "ran").exists()
 
 
-def test_a_changed_file_is_told(quick, tmp_path):
-    """Numbers that do not belong together would end in errors of NumPy, or in wrong places."""
+def test_an_inconsistent_file_is_reported(quick, tmp_path):
+    """Inconsistent numbers would cause errors in NumPy, or wrong places."""
     write_skin(quick, tmp_path / "skin.skops")
     with zipfile.ZipFile(tmp_path / "skin.skops") as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
@@ -135,8 +135,8 @@ def test_the_same_skin_is_the_same_bytes(quick, tmp_path):
     assert (tmp_path / "one.skops").read_bytes() == (tmp_path / "two.skops").read_bytes()
 
 
-def test_a_forest_is_no_deeper_than_it_has_nodes():
-    """Else it would be walked down without end."""
+def test_a_forest_is_no_deeper_than_its_number_of_nodes():
+    """Otherwise it could be traversed without end."""
     nodes = np.zeros((1, 3), int)
     with pytest.raises(ValueError, match="depth is 1000000000000, of trees of 3 nodes"):
         Forest(nodes, np.zeros((1, 3)), nodes, nodes, np.zeros((1, 3, 1)), 10**12, np.zeros(1), np.zeros(0))

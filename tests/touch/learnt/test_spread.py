@@ -1,4 +1,4 @@
-"""Standard deviations of what is learnt hold as often as they say."""
+"""Predicted standard deviations are calibrated."""
 
 import numpy as np
 import pytest
@@ -10,34 +10,36 @@ from jeit.touch.learnt.numbers import DeviationModel
 
 @pytest.fixture(scope="module")
 def fine():
-    """A skin whose places depend on all channels: it errs little, and more with the noise."""
+    """A skin whose places depend on all channels: its errors are small and grow with the noise."""
     return LearntSkin.fit(Presses.create(**record(200)), method="gaussian-process")
 
 
-def test_deviations_hold_for_errors_of_which_few_are_large():
-    """Their root mean square would hold for nearly all of them."""
+def test_deviations_are_calibrated_for_errors_of_which_few_are_large():
+    """Their root mean square would exceed nearly all of them."""
     rng = np.random.default_rng(0)
-    said, changes, errors = rng.normal(size=(3, 1500, 2))
+    predictions, changes, errors = rng.normal(size=(3, 1500, 2))
     errors = errors * np.where(rng.random((1500, 1)) < 0.1, 10.0, 1.0)
-    spread = DeviationModel.learn(said[:500], changes[:500], errors[:500], np.ones(500, bool))
+    spread = DeviationModel.learn(predictions[:500], changes[:500], errors[:500], np.ones(500, bool))
     for some, deviations in ((slice(500, None), spread), (slice(500), spread.held_out)):
-        within = np.mean(np.abs(errors[some]) <= deviations(said[some], changes[some]))
+        within = np.mean(np.abs(errors[some]) <= deviations(predictions[some], changes[some]))
         assert 0.6 < within < 0.86
 
 
-def test_deviations_are_in_the_units_of_what_is_told():
+def test_deviations_are_in_the_units_of_the_targets():
     rng = np.random.default_rng(0)
-    said, changes, errors = rng.normal(size=(3, 300, 2))
+    predictions, changes, errors = rng.normal(size=(3, 300, 2))
     one, thousand = (
-        DeviationModel.learn(unit * said, changes, unit * errors, np.ones(300, bool))(unit * said, changes)
+        DeviationModel.learn(unit * predictions, changes, unit * errors, np.ones(300, bool))(
+            unit * predictions, changes
+        )
         for unit in (1.0, 1000.0)
     )
     np.testing.assert_allclose(thousand, 1000 * one, rtol=1e-6)
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.03, 0.06], ids=["as learnt from", "three times", "six times"])
-def test_deviations_hold_where_readings_are_noisier_than_those_learnt_from(fine, noise):
-    """Only the residuals of the frames show the noise: their predictions look like any others."""
+def test_deviations_are_calibrated_where_readings_are_noisier_than_in_training(fine, noise):
+    """Only the residuals of the frames show the noise: their predictions are not unusual."""
     fresh = record(200, seed=7, noise=noise)
     touches = fine.predict(fresh["frames"], fresh["reference"])
     within = np.abs(touches.position - fresh["positions"]) <= touches.position_std

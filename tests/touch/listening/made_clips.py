@@ -1,4 +1,4 @@
-"""Clips of taps on three materials that there are not: rings of their own pitch and decay."""
+"""Clips of taps on three synthetic materials: decaying tones with a pitch and decay of their own."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ MATERIALS = {"wood": (300.0, 0.02), "metal": (900.0, 0.2), "glass": (1800.0, 0.0
 
 
 def struck(random: np.random.Generator, material: str, rate: float = 44_100.0, seconds: float = 0.25) -> Recording:
-    """One tap, louder or softer, on a thing that is larger or smaller, in a little noise."""
+    """One tap, louder or softer, on a larger or smaller object, with a little noise."""
     pitch, decay = MATERIALS[material]
     times = np.arange(round(seconds * rate)) / rate
     sound = np.zeros(len(times))

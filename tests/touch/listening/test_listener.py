@@ -1,4 +1,4 @@
-"""Listeners: what is learnt from clips, kept in a file, and told of recordings; who is held out; what is refused."""
+"""Listeners: trained on clips, saved in a file, and applied to recordings. Held-out groups, and refused input."""
 
 from itertools import pairwise
 
@@ -26,14 +26,14 @@ def clips(each: int, seed: int = 0, **options) -> LabelledClips:
 
 @pytest.fixture(scope="module")
 def learnt() -> dict[str, Listener]:
-    """A listener by each quick method, of five clips a class."""
+    """A listener by each quick method, trained on five clips of each class."""
     few = clips(5)
     return {method: Listener.fit(few, method=method) for method in QUICK}
 
 
 @pytest.mark.parametrize("method", QUICK)
-def test_materials_are_told_and_kept(method, learnt, tmp_path):
-    """Of clips of other seeds most are right; a file says the same; its probabilities add up."""
+def test_materials_are_classified_and_listeners_are_saved(method, learnt, tmp_path):
+    """For clips of other seeds most are right, a saved listener gives the same result, and probabilities sum to one."""
     listener = learnt[method]
     assert listener.standing is not None
     assert (listener.standing.held_out == listener.standing.right).mean() > 0.7
@@ -41,26 +41,27 @@ def test_materials_are_told_and_kept(method, learnt, tmp_path):
     again = Listener.read(tmp_path)
     others, right = clips(6, seed=1), 0
     for number in range(len(others)):
-        heard = listener.hear(others.clip(number))
+        sound_labels = listener.hear(others.clip(number))
         same = again.hear(others.clip(number))
-        np.testing.assert_allclose(same.probabilities, heard.probabilities, rtol=1e-4, atol=1e-7)
-        np.testing.assert_allclose(heard.probabilities.sum(axis=1), 1)
-        right += heard.whole[0] == others.labels[number]
+        np.testing.assert_allclose(same.probabilities, sound_labels.probabilities, rtol=1e-4, atol=1e-7)
+        np.testing.assert_allclose(sound_labels.probabilities.sum(axis=1), 1)
+        right += sound_labels.whole[0] == others.labels[number]
     assert right >= 0.75 * len(others)
 
 
 @pytest.mark.slow
-def test_the_best_of_clips_held_out_is_taken(learnt, tmp_path, monkeypatch):
-    """All are tried, a network where windows are enough for one; killed before its last fold, the same call goes on to
-    the same bits."""
+def test_the_best_method_on_held_out_clips_is_selected(learnt, tmp_path, monkeypatch):
+    """All methods are tried, with a network where there are enough windows. After a kill before its last fold, the same
+    call continues to the same bits.
+    """
     few = clips(5)
     monkeypatch.setattr("jeit.touch.listening.listener._FOR_NETWORKS", 0)
 
     class Killed(Exception):
         pass
 
-    def kill(said: str) -> None:
-        if said.startswith("network, fold 3"):
+    def kill(message: str) -> None:
+        if message.startswith("network, fold 3"):
             raise Killed
 
     with pytest.raises(Killed):
@@ -77,23 +78,23 @@ def test_the_best_of_clips_held_out_is_taken(learnt, tmp_path, monkeypatch):
     for method, listener in learnt.items():
         assert listener.standing is not None
         assert listener.standing.tried == [(method, tried[method])]
-    heard, same = (one.hear(few.clip(0)) for one in (on, through))
-    np.testing.assert_array_equal(heard.probabilities, same.probabilities)
+    sound_labels, same = (one.hear(few.clip(0)) for one in (on, through))
+    np.testing.assert_array_equal(sound_labels.probabilities, same.probabilities)
 
 
-def test_windows_of_silence_are_quiet(learnt):
-    """A tap a second: named where it is heard, and silence between."""
+def test_silent_windows_are_quiet(learnt):
+    """One tap a second: it is classified where it sounds, with silence between."""
     random = np.random.default_rng(3)
     tap = struck(random, "metal")
     long = np.zeros((1, 4 * 44_100))
     for second in (0, 2):
         long[:, second * 44_100 + 22_050 :][:, : tap.samples.shape[1]] += tap.samples
-    heard = learnt["linear"].hear(Recording(long, 44_100.0, name="long"))
-    assert heard.whole[0] == "metal"
-    # At its edges a window holds little of a tap, and may take that for another.
-    assert np.mean(heard.named[heard.loud] == "metal") > 0.6
-    assert heard.quiet.sum() > 10
-    assert [event.name for event in heard.events].count("") >= 2
+    sound_labels = learnt["linear"].hear(Recording(long, 44_100.0, name="long"))
+    assert sound_labels.whole[0] == "metal"
+    # At its edges a window contains little of a tap, and may be assigned to another class.
+    assert np.mean(sound_labels.named[sound_labels.loud] == "metal") > 0.6
+    assert sound_labels.quiet.sum() > 10
+    assert [event.name for event in sound_labels.events].count("") >= 2
     nothing = learnt["linear"].hear(Recording(np.zeros((1, 44_100)), 44_100.0))
     assert set(nothing.named) == {""}
     assert nothing.whole == ("", 0.0)
@@ -102,7 +103,7 @@ def test_windows_of_silence_are_quiet(learnt):
     assert faint.whole == ("", 0.0)
 
 
-def test_what_does_not_fit_is_refused_with_the_difference(learnt):
+def test_unlike_recordings_are_refused_with_the_difference(learnt):
     tap = struck(np.random.default_rng(4), "glass")
     mono = learnt["linear"]
     both = mono.hear(Recording(tap.samples.repeat(2, axis=0), tap.rate))
@@ -122,7 +123,7 @@ def test_what_does_not_fit_is_refused_with_the_difference(learnt):
     assert "10 samples not finite" in mono.hear(Recording(holes, tap.rate)).notes[0]
 
 
-def test_few_clips_are_enough_to_learn_and_what_is_not_known_is_said():
+def test_few_clips_are_enough_and_the_unknown_error_is_reported():
     one = clips(1)
     listener = Listener.fit(one, method="linear")
     assert listener.standing is None
@@ -141,14 +142,14 @@ def _at(gain: float, one: Recording) -> Recording:
 
 
 @pytest.mark.parametrize("method", ["linear", "spectrum", "trees"])
-def test_gain_does_not_matter_unless_loudness_tells(method):
-    """Clips of one gain, asked at another: probabilities are the same, and what sounds is not quiet."""
+def test_gain_does_not_matter_unless_loudness_is_a_feature(method):
+    """Clips of one gain, classified at another: probabilities are the same, and a sound is not quiet."""
     listener = Listener.fit(clips(4), method=method)
     assert not listener.loudness
     others = clips(2, seed=1)
     for number in range(len(others)):
-        heard, softer = (listener.hear(_at(gain, others.clip(number))) for gain in (1.0, 0.2))
-        np.testing.assert_allclose(softer.probabilities, heard.probabilities, atol=1e-3)
+        sound_labels, softer = (listener.hear(_at(gain, others.clip(number))) for gain in (1.0, 0.2))
+        np.testing.assert_allclose(softer.probabilities, sound_labels.probabilities, atol=1e-3)
         assert not softer.quiet[softer.loud].any()
     soft = [_at(gain, one) for gain in (0.05, 1.0) for one in clips(4).recordings]
     listener = Listener.fit(LabelledClips.from_recordings(soft, ["soft"] * 12 + ["hard"] * 12), method=method)
@@ -157,8 +158,8 @@ def test_gain_does_not_matter_unless_loudness_tells(method):
     assert listener.hear(others.clip(0)).whole[0] == "hard"
 
 
-def test_one_recording_of_many_taps_is_many_clips():
-    """A file a class, 15 taps in each: they are held out in turn, and no tap is on both sides."""
+def test_one_recording_of_many_taps_is_split_into_clips():
+    """One file for each class, with 15 taps in each: they are held out in turn, and no tap is on both sides."""
     random = np.random.default_rng(6)
     labels, long = list(MATERIALS), []
     for name in labels:
@@ -173,7 +174,7 @@ def test_one_recording_of_many_taps_is_many_clips():
     assert not any("one recording" in note for note in Listener.fit(several, method="linear").notes)
 
 
-def test_a_sound_that_does_not_end_is_cut_where_no_sample_is_on_both_sides():
+def test_a_continuous_sound_is_split_without_samples_on_both_sides():
     times = np.arange(0.25, 20, 0.1)
     pieces = _split_pieces(times)
     assert len(pieces) == 8
@@ -183,7 +184,7 @@ def test_a_sound_that_does_not_end_is_cut_where_no_sample_is_on_both_sides():
     assert [len(piece) for piece in _split_pieces(two)] == [5, 10]
 
 
-def test_a_class_of_few_clips_is_told_as_often():
+def test_a_class_of_few_clips_is_predicted_as_often():
     """Three clips of one class beside thirty of another."""
     random = np.random.default_rng(7)
     labels = ["wood"] * 30 + ["glass"] * 3
@@ -193,7 +194,7 @@ def test_a_class_of_few_clips_is_told_as_often():
     assert all(listener.hear(struck(random, "glass")).whole[0] == "glass" for _ in range(10))
 
 
-def test_no_group_is_on_both_sides_and_every_class_is_learnt_from():
+def test_no_group_is_on_both_sides_and_every_class_is_in_training():
     random = np.random.default_rng(0)
     for _ in range(50):
         groups = random.integers(0, random.integers(2, 12), 40)
@@ -208,21 +209,21 @@ def test_no_group_is_on_both_sides_and_every_class_is_learnt_from():
         assert set(right[~held]) == set(right)
 
 
-def test_rates_and_channels_that_differ_are_told():
+def test_different_rates_and_channels_are_reported():
     random = np.random.default_rng(5)
     mixed = [struck(random, "wood"), struck(random, "metal", rate=16_000.0)]
     mixed += [Recording(struck(random, name).samples.repeat(2, axis=0), 44_100.0) for name in ("wood", "metal")]
-    told = LabelledClips.from_recordings(mixed, ["wood", "metal", "wood", "metal"])
-    assert told.highest == 8000
-    assert told.channels == 1
-    assert "1 or 2 channels" in told.notes[0]
-    assert "1 of 4 clips have fewer than 44100" in told.notes[1]
-    listener = Listener.fit(told, method="linear")
+    labelled = LabelledClips.from_recordings(mixed, ["wood", "metal", "wood", "metal"])
+    assert labelled.highest == 8000
+    assert labelled.channels == 1
+    assert "1 or 2 channels" in labelled.notes[0]
+    assert "1 of 4 clips have fewer than 44100" in labelled.notes[1]
+    listener = Listener.fit(labelled, method="linear")
     assert listener.hear(mixed[1]).names == ("metal", "wood")
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda: LabelledClips.from_recordings([], []), "there are no clips"),
         (
@@ -242,8 +243,8 @@ def test_rates_and_channels_that_differ_are_told():
         (lambda: Listener.fit(clips(2), key=3), "key"),
     ],
 )
-def test_bad_input_is_explained(call, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_input_is_explained(call, message):
+    with pytest.raises(ValueError, match=message):
         call()
 
 
@@ -267,23 +268,23 @@ def test_files_of_another_kind_are_refused(learnt, tmp_path):
         Listener.read(path)
 
 
-def test_features_that_never_change_count_for_nothing():
-    """They leave a covariance that is singular, on which least squares may fail."""
+def test_constant_features_have_no_effect():
+    """Their covariance is singular, for which least squares may fail."""
     random = np.random.default_rng(0)
-    told = random.normal(size=(30, 3)) + np.repeat(np.eye(3), 10, axis=0)
-    given = np.concatenate([told, np.full((30, 2), 7.0)], axis=1)
+    informative = random.normal(size=(30, 3)) + np.repeat(np.eye(3), 10, axis=0)
+    given = np.concatenate([informative, np.full((30, 2), 7.0)], axis=1)
     nothing = SoundImages(
         np.zeros(30), np.zeros((30, 1, 41)), np.zeros((30, 64, 41)), np.zeros(30, int), np.ones(30, bool)
     )
     right = np.repeat(np.arange(3), 10)
     lesson = TrainingSet(nothing, right, np.arange(30), 3, jax.random.key(0))
-    found, plain = (LinearLearner(lambda _, own=own: own).learn(lesson) for own in (given, told))
+    found, plain = (LinearLearner(lambda _, own=own: own).learn(lesson) for own in (given, informative))
     assert not found.weights[3:].any()
     np.testing.assert_allclose(found.weights[:3], plain.weights, atol=1e-9)
 
 
-def test_a_covariance_that_least_squares_fail_on(monkeypatch):
-    """Is solved with by its eigenvectors: the same odds."""
+def test_a_covariance_for_which_least_squares_fails(monkeypatch):
+    """It is inverted by its eigenvectors: the odds are the same."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis as Discriminant
 
     random = np.random.default_rng(0)

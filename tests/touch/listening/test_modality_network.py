@@ -1,4 +1,4 @@
-"""The network: its layers, its answers in NumPy, and people told apart from nobody by a small training."""
+"""The network: its layers, its outputs in NumPy, and people distinguished from no touch after a small training."""
 
 import jax
 import numpy as np
@@ -15,17 +15,17 @@ from jeit.touch.listening.modality_network import NetworkAnswers, library_plan, 
 KEY = jax.random.key(1)
 
 
-def test_answers_in_numpy_are_the_networks():
-    """With running means and variances that are not those it was drawn with; and in training a batch's own are used."""
+def test_outputs_in_numpy_equal_those_of_the_network():
+    """With other running means and variances than initially. In training those of the batch are used."""
     random = np.random.default_rng(0)
     network = ModalityNetwork.draw(KEY, 89, 41, 5)
     images = (3 + 2 * random.standard_normal((4, 89, 41))).astype(np.float32)
-    said, moved = network.log_odds_in_training(images)
-    np.testing.assert_array_equal(said, network.log_odds_in_training(images)[0])
+    answers, moved = network.log_odds_in_training(images)
+    np.testing.assert_array_equal(answers, network.log_odds_in_training(images)[0])
     learn = jax.jit(lambda one: one.log_odds_in_training(images)[1])
     for _ in range(200):
         moved = learn(moved)
-    np.testing.assert_allclose(moved.log_odds(images), said, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(moved.log_odds(images), answers, rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(NetworkAnswers(moved).log_odds(images), moved.log_odds(images), rtol=1e-3, atol=1e-4)
     assert network.dense.shape[0] == 13 * 5 * 64
     assert NetworkAnswers(network).log_odds(images[:0]).shape == (0, 5)
@@ -41,19 +41,20 @@ def test_the_plan_is_the_papers():
     assert (own.rate, own.patience, own.decay_epochs) == (1e-3, 20, round(2 * own.epochs / 3))
 
 
-def test_a_network_is_kept_with_its_levels(tmp_path):
-    heard = sound_images(Recording(np.random.default_rng(0).standard_normal((4, 9000)), 10_000.0))
-    own = NetworkListener.from_network(ModalityNetwork.draw(KEY, 68, 41, 3), Levels.from_images(heard))
+def test_a_network_is_saved_with_its_levels(tmp_path):
+    images = sound_images(Recording(np.random.default_rng(0).standard_normal((4, 9000)), 10_000.0))
+    own = NetworkListener.from_network(ModalityNetwork.draw(KEY, 68, 41, 3), Levels.from_images(images))
     listener = Listener(("a", "b", "c"), "network", own, 4, 5000.0, True, 0.0, (1.0, 2.0), 1.0, 0.0)
     listener.write(tmp_path / "listener.jeit")
     again = Listener.read(tmp_path)
-    np.testing.assert_array_equal(again.model.log_odds(heard), own.log_odds(heard))
+    np.testing.assert_array_equal(again.model.log_odds(images), own.log_odds(images))
 
 
 @pytest.mark.slow
-def test_a_small_training_tells_people_it_never_met():
-    """The small preset: four people are learnt from, a fifth is asked, on a skin that hears well. One in five is right
-    by chance; a network that is not trained, or that learnt shuffled labels, comes nowhere near the bar."""
+def test_a_small_training_generalises_to_a_new_person():
+    """The small preset: trained on four people and tested on a fifth, on a skin with sensitive microphones. One in five
+    is right by chance. A network that is not trained, or was trained on shuffled labels, is far below the bound.
+    """
     skin = SoundingSkin(jax.random.key(0), microphone_grid(3), microphone_model=MicrophoneModel(snr_db=12.0))
     people = [SoundingPerson.draw(key) for key in jax.random.split(KEY, 5)]
     parts, right, person = [], [], []

@@ -1,4 +1,4 @@
-"""A small skin, and a network that learnt it."""
+"""A small skin, and a network trained on it."""
 
 import jax
 import pytest
@@ -32,7 +32,7 @@ def layer():
 
 @pytest.fixture(scope="session")
 def imaging(small_skin, tmp_path_factory):
-    """A folder with a network that is not trained, whose maps are linear images; and the network."""
+    """A folder with an untrained network, whose maps are linear images, and the network."""
     folder, noise = tmp_path_factory.mktemp("imaging"), 1.5e-3
     network = Unrolled(small_skin.model.protocol.num_measurements, SHAPE, key=jax.random.key(0))
     places = image_places(small_skin, SHAPE[1], SHAPE[0])

@@ -1,4 +1,4 @@
-"""Frames with channels missing, and frames that no touch makes."""
+"""Frames with missing channels, and frames that no touch produces."""
 
 import numpy as np
 import pytest
@@ -14,8 +14,10 @@ def change(small_skin):
     return relative_changes(small_skin, [[Indent(DiscIndenter(0.02), 5e-3, PLACE)]])
 
 
-def test_missing_channels_are_what_is_expected_of_them():
-    """The mean of a normal distribution, given some of it, as by the inverse of its covariance."""
+def test_missing_channels_are_replaced_by_their_expectation():
+    """The mean of a normal distribution, conditional on some of its components, computed from the inverse of its
+    covariance.
+    """
     rng = np.random.default_rng(0)
     factor = rng.normal(size=(6, 6))
     covariance, noise = factor @ factor.T, 0.3
@@ -30,8 +32,8 @@ def test_missing_channels_are_what_is_expected_of_them():
         np.testing.assert_allclose(whole[lost] @ row, 0, atol=1e-9)
 
 
-def test_an_electrode_that_says_nothing(small_skin, imaging, change):
-    """All channels of one electrode lost: the touch stays where it is, where zeros move it."""
+def test_a_missing_electrode(small_skin, imaging, change):
+    """All channels of one electrode are missing: the touch stays at its place, whereas zeros shift it."""
     network, protocol = imaging[1], small_skin.model.protocol
     drive, measured = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
     for electrode in (5, 10):
@@ -43,8 +45,8 @@ def test_an_electrode_that_says_nothing(small_skin, imaging, change):
         assert np.linalg.norm(without - whole) < 0.7 * np.linalg.norm(zeros - whole)
 
 
-def test_what_no_touch_makes(imaging, change):
-    """Signs turned round, and other units, are told; a touch is not doubted, nor what is not touched."""
+def test_frames_that_no_touch_produces(imaging, change):
+    """Reversed signs and other units are reported. A touch is not doubted, nor is an untouched frame."""
     network = imaging[1]
 
     def doubted(frames):

@@ -1,6 +1,6 @@
-"""Networks that image a skin: what they learn, that they go on, and their files.
+"""Networks that image a skin: their training, its continuation after interruption, and their files.
 
-Against depth maps of touches that nothing was learnt from, and bits of trainings that nothing stopped.
+Against depth maps of new touches, and bit by bit against uninterrupted training.
 """
 
 import copy
@@ -40,8 +40,8 @@ def voltages(skin, touches):
 
 
 @pytest.mark.parametrize("change", [lambda one: pickle.loads(pickle.dumps(one)), cloudpickle_copy, copy.deepcopy])
-def test_a_network_that_has_imaged_is_pickled_and_copied(learnt, change):
-    """With all that it has compiled, which is left behind."""
+def test_a_used_network_is_pickled_and_copied(learnt, change):
+    """Its compiled programs are left out."""
     network = learnt[1].network
     frames = 0.01 * np.random.default_rng(0).normal(size=(3, network.made_for["channels"]))
     expected = network.share(frames)
@@ -51,8 +51,8 @@ def test_a_network_that_has_imaged_is_pickled_and_copied(learnt, change):
     assert other.doubts(frames, expected) == network.doubts(frames, expected)
 
 
-def test_it_learns(learnt):
-    """Of two hundred touches, in three rounds, something; an untrained network explains nothing."""
+def test_training_explains_depth(learnt):
+    """Two hundred touches in three epochs explain part of the depth. An untrained network explains nothing."""
     _, found = learnt
     assert found.standing.explained > 0.3
     assert found.standing.place["mean"] < 0.02
@@ -61,13 +61,13 @@ def test_it_learns(learnt):
 
 
 class Silent(eqx.Module):
-    """Says that nothing touches."""
+    """A network that predicts no touch."""
 
     def __call__(self, changes):
         return jnp.zeros((len(changes), *SHAPE), changes.dtype)
 
 
-def test_a_network_that_says_nothing_explains_nothing(small_skin, learnt):
+def test_a_network_that_predicts_no_touch_explains_nothing(small_skin, learnt):
     _, found = learnt
     right = found.standing.right
     examples = TouchExamples(np.zeros((len(right), found.network.made_for["channels"])), right)
@@ -89,7 +89,7 @@ def test_frames(small_skin, learnt):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda frame, rest: (frame[:-1], rest), "voltages has shape"),
         (lambda frame, rest: (frame, rest[:-1]), "reference has shape"),
@@ -97,13 +97,13 @@ def test_frames(small_skin, learnt):
         (lambda frame, rest: (frame, np.stack([rest, rest])), "reference has shape"),
     ],
 )
-def test_frames_of_another_kind(small_skin, learnt, change, said):
+def test_frames_of_other_shapes(small_skin, learnt, change, message):
     given, rest = voltages(small_skin, [[Indent(DiscIndenter(0.02), 5e-3)]])
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         learnt[1].network.depth(*change(given[0], rest))
 
 
-def test_what_is_done_is_not_done_again(small_skin, learnt):
+def test_finished_work_is_not_repeated(small_skin, learnt):
     folder, found = learnt
     again = learn_images(small_skin, folder, preset=PRESET)
     assert again.seconds["training"] < found.seconds["training"]
@@ -120,14 +120,14 @@ from small_networks import PRESET, small_maps
 
 skin = Skin.create(named_layout("grid-4x4", Rectangle(0.1, 0.1)), num_layers=0, cell_size=8e-3)
 with small_maps():
-    learn_images(skin, sys.argv[1], preset=PRESET, progress=lambda said: print(said, flush=True))
+    learn_images(skin, sys.argv[1], preset=PRESET, progress=lambda report: print(report, flush=True))
 """
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("last_word", ["touches learnt: 100 of 100", "unrolled, epoch 3 "])
 def test_killed_at_any_moment(small_skin, learnt, tmp_path, last_word):
-    """By kill -9, amid touches or training; it ends as one that was never killed."""
+    """By kill -9, during the simulation of touches or training. The result is that of an uninterrupted run."""
     path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
     process = subprocess.Popen(
         [sys.executable, "-c", SCRIPT, str(tmp_path)],
@@ -144,7 +144,7 @@ def test_killed_at_any_moment(small_skin, learnt, tmp_path, last_word):
     assert bits(again.network.network) == bits(learnt[1].network.network)
 
 
-def test_a_network_comes_back(small_skin, learnt, tmp_path):
+def test_a_network_is_saved_and_read(small_skin, learnt, tmp_path):
     folder, found = learnt
     again = read_network(folder, skin=small_skin)
     assert eqx.tree_equal(again.network, found.network.network)
@@ -167,15 +167,15 @@ def test_another_skin_is_refused(small_skin, learnt):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"preset": "fast"}, "preset must be"),
         ({"design": "u"}, "design must"),
         ({"touches": 0}, "touches must be a whole number, 1 or more; it is 0"),
     ],
 )
-def test_no_such_thing(small_skin, tmp_path, change, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_arguments(small_skin, tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
         learn_images(small_skin, tmp_path, **change)
 
 
@@ -186,7 +186,7 @@ def test_work_of_another_set_is_refused(small_skin, learnt):
 
 @pytest.mark.parametrize("package", ["xarray", "zarr"])
 def test_without_the_extra(small_skin, tmp_path, monkeypatch, package):
-    """Said before anything is simulated."""
+    """The message is raised before anything is simulated."""
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ImportError, match=rf"touches needs {package}: pip install 'jeit\[cluster\]'"):
         learn_images(small_skin, tmp_path)
@@ -197,14 +197,14 @@ class Stopped(Exception):
     pass
 
 
-def test_so_many_touches(small_skin, tmp_path, monkeypatch):
-    """In place of the preset's; more in the same folder are another set."""
+def test_the_number_of_touches(small_skin, tmp_path, monkeypatch):
+    """It replaces that of the preset. A larger number in the same folder is another set."""
     import zarr
 
     monkeypatch.setattr("jeit.touch.networks.learn.detection_noise", lambda skin: 1e-3)
 
-    def stop(said):
-        if said.startswith("touches held-out"):
+    def stop(message):
+        if message.startswith("touches held-out"):
             raise Stopped
 
     with pytest.raises(Stopped):

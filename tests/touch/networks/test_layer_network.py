@@ -13,8 +13,8 @@ PRESET = NetworkPreset(150, 30, TrainingPlan(rate=2e-3, batch=25, epochs=10, pat
 
 
 @pytest.mark.slow
-def test_touches_of_a_set_are_those_of_solving_anew(layer):
-    """To a millionth, of the least that is left to conduct where nothing does."""
+def test_touches_of_a_set_equal_new_solutions(layer):
+    """To a millionth, the conductivity that remains where nothing conducts."""
     indents = IndentSet(layer, touch_draws(layer), 3, seed=4, chunk=3)
     found = indents.solve(0)["change"]
     cells = indented_cells(layer, indents.draws.draw(jax.random.fold_in(jax.random.key(4), 0), 3))
@@ -28,8 +28,10 @@ def test_touches_of_a_set_are_those_of_solving_anew(layer):
 
 
 @pytest.mark.slow
-def test_it_learns(layer, tmp_path):
-    """It explains 0.54 of squared depth; linear images, which an untrained network of this design is, 0.42."""
+def test_training_explains_depth(layer, tmp_path):
+    """It explains 0.54 of the squared depth. Linear images, which an untrained network of this design gives, explain
+    0.42.
+    """
     learnt = learn_images(layer, tmp_path, preset=PRESET)
     assert learnt.standing.explained > 0.48
     assert learnt.standing.place["mean"] < 0.01

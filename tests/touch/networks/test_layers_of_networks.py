@@ -1,4 +1,4 @@
-"""Layers of image networks, against what they stand for."""
+"""Layers of image networks, against their definitions."""
 
 import equinox as eqx
 import jax
@@ -9,7 +9,7 @@ from jeit.touch.networks.three_stages import Convolution, repeat_pixels
 
 
 def test_a_convolution_of_a_doubled_image():
-    """In four ninths of the products: the same, edges included, and the same slopes."""
+    """With four ninths of the products the results are the same, including the edges, and so are the derivatives."""
     random = np.random.default_rng(0)
     layer = Convolution(5, 4, key=jax.random.key(0))
     layer = eqx.tree_at(lambda one: one.bias, layer, np.arange(4, dtype=np.float32))

@@ -1,4 +1,4 @@
-"""What a skin's channels feel of a depth map, against exact voltages."""
+"""Changes of a skin's channels under a depth map, against exact voltages."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ def sensed(small_skin):
     return LinearChannels.from_skin(small_skin)
 
 
-def felt(sensed, depth):
+def channel_changes(sensed, depth):
     return np.asarray(strength(jnp.asarray(depth))).reshape(len(depth), -1) @ sensed.operator.T
 
 
@@ -24,25 +24,25 @@ def missed(found, right):
 
 
 @pytest.mark.parametrize(("depth", "most"), [(0.5e-3, 0.04), (4e-3, 0.12), (7e-3, 0.25)])
-def test_nearly_the_exact_changes(small_skin, sensed, depth, most):
-    """Of a disc of 24 mm; without the square root 7 mm are missed by half."""
+def test_changes_are_nearly_exact(small_skin, sensed, depth, most):
+    """For a disc of 24 mm. Without the square root the error at 7 mm is a half."""
     touches = [[Indent(DiscIndenter(0.024), depth, place)] for place in [(0.0, 0.005), (0.02, -0.018), (-0.03, 0.01)]]
     maps = depth_maps(touches, image_places(small_skin, 48, 48)) / float(small_skin.thickness)
     exact = relative_changes(small_skin, touches)
-    assert missed(felt(sensed, maps), exact) < most
+    assert missed(channel_changes(sensed, maps), exact) < most
     if depth == 7e-3:
         assert missed(maps.reshape(3, -1) @ sensed.operator.T, exact) > 0.4
 
 
-def test_halved_pixels_feel_the_same(sensed):
-    """Of a map that is alike in each 2 × 2."""
+def test_halved_pixels_give_the_same_changes(sensed):
+    """For a map that is constant in each 2 × 2 block."""
     coarse = np.random.default_rng(0).uniform(size=(24, 24))
     fine = coarse.repeat(2, axis=0).repeat(2, axis=1)
     assert np.allclose(sensed.coarser_operator() @ coarse.ravel(), sensed.operator @ fine.ravel(), rtol=1e-12)
 
 
-def test_contacts(small_skin, sensed):
-    """Against a skin of other contacts: 1 % more at electrode 5."""
+def test_contact_impedance(small_skin, sensed):
+    """Against a skin with other contacts: 1 % more at electrode 5."""
     impedance = np.full(16, 1e-4)
     impedance[5] *= np.exp(0.01)
     other = small_skin.with_layout(small_skin.layout, impedance)
@@ -51,7 +51,7 @@ def test_contacts(small_skin, sensed):
 
 
 def test_strength():
-    """√ε apart at most from 2 sinh(s / 2) of e^−s = 1 − δ, and smooth beyond what it is clipped at."""
+    """At most √ε away from 2 sinh(s / 2) of e^−s = 1 − δ, and smooth beyond the clipping."""
     depth = np.linspace(0, 0.9, 10)
     assert np.allclose(strength(jnp.asarray(depth)), 2 * np.sinh(-np.log1p(-depth) / 2), rtol=1e-12)
     assert np.allclose(depth_from_strength(strength(jnp.asarray(depth))), depth, rtol=1e-6)
@@ -59,8 +59,8 @@ def test_strength():
     assert np.isfinite(slopes).all()
 
 
-def test_a_layer_feels_less_of_the_same_indent(layer):
-    """Its electrodes are below, and what is taken is above."""
+def test_a_layer_changes_less_at_the_same_depth(layer):
+    """Its electrodes are at the bottom, and material is removed at the top."""
     own = LinearChannels.from_skin(layer, (24, 24))
     touches = [[Indent(DiscIndenter(0.02), 2.5e-3, (0.002, 0.004))]]
     maps = depth_maps(touches, image_places(layer, 24, 24)) / float(layer.thickness)
@@ -70,11 +70,11 @@ def test_a_layer_feels_less_of_the_same_indent(layer):
     )
     rest = np.asarray(layer.model.voltages(conductivity))
     np.multiply.at(conductivity, np.asarray(touched.cells)[0], np.maximum(1 + np.asarray(touched.change)[0], 1e-9))
-    assert missed(felt(own, maps), (np.asarray(layer.model.voltages(conductivity)) / rest - 1)[None]) < 0.6
+    assert missed(channel_changes(own, maps), (np.asarray(layer.model.voltages(conductivity)) / rest - 1)[None]) < 0.6
 
 
-def test_bodies_that_are_pressed_in():
-    """All reach the depth that they are pressed to, near their origin; the largest is the wrench, 100 mm long."""
+def test_indenters():
+    """All reach their depth near the origin. The largest is the wrench, 100 mm long."""
     places = np.stack(np.meshgrid(np.linspace(-0.07, 0.07, 141), np.linspace(-0.03, 0.03, 61)), axis=-1)
     maps = depth_maps([[Indent(one, 2e-3)] for one in touching_bodies()], places)
     assert np.allclose(maps.max(axis=(1, 2)), 2e-3, rtol=0.1)

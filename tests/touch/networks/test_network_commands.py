@@ -1,4 +1,4 @@
-"""Measured frames imaged by a network, on the command line."""
+"""Measured frames imaged by a network on the command line."""
 
 import io
 import json
@@ -18,7 +18,7 @@ PLACES = ((0.01, -0.02), (-0.025, 0.01))
 
 @pytest.fixture(scope="module")
 def recorded(small_skin, tmp_path_factory):
-    """A folder with a file of the untouched skin, and one of two touches and a frame without one of its channels."""
+    """A folder with a file of the untouched skin, and one of two touches and a frame that lacks one channel."""
     folder = tmp_path_factory.mktemp("recorded")
     model = small_skin.model
     rest = np.asarray(model.voltages(small_skin.model_conductivity))
@@ -36,13 +36,13 @@ def recorded(small_skin, tmp_path_factory):
 def run(capsys):
     def call(*arguments):
         status = main([str(argument) for argument in arguments])
-        told = capsys.readouterr()
-        return status, told.out, told.err
+        printed = capsys.readouterr()
+        return status, printed.out, printed.err
 
     return call
 
 
-def told(folder):
+def table_of(folder):
     return np.genfromtxt(folder / "frames.csv", delimiter=",", skip_header=1)
 
 
@@ -53,7 +53,7 @@ def test_reconstruct(imaging, recorded, run, tmp_path):
     )  # fmt: skip
     assert (status, error) == (0, "")
     assert "1 frame imaged" in out
-    assert np.linalg.norm(told(tmp_path)[1:3] - PLACES[1]) < 0.015
+    assert np.linalg.norm(table_of(tmp_path)[1:3] - PLACES[1]) < 0.015
     with np.load(tmp_path / "depth.npz") as written:
         assert written["depth"].shape == (1, *SHAPE)
     assert json.loads((tmp_path / "report.json").read_text())["design"] == "unrolled"
@@ -61,7 +61,7 @@ def test_reconstruct(imaging, recorded, run, tmp_path):
 
 
 def test_stream(imaging, recorded, run, tmp_path):
-    """A frame without one of its channels is imaged; one of signs turned round is not."""
+    """A frame that lacks one channel is imaged. One with reversed signs is not."""
     with np.load(recorded / "touched.npz") as one:
         arrays = dict(one)
     with np.load(recorded / "rest.npz") as one:
@@ -71,16 +71,16 @@ def test_stream(imaging, recorded, run, tmp_path):
     status, out, error = run("stream", recorded / "touched.npz", *given)
     assert (status, error) == (0, "")
     assert "3 frames imaged" in out
-    assert (np.linalg.norm(told(tmp_path)[:, 1:3] - [*PLACES, PLACES[0]], axis=1) < 0.015).all()
+    assert (np.linalg.norm(table_of(tmp_path)[:, 1:3] - [*PLACES, PLACES[0]], axis=1) < 0.015).all()
     status, out, error = run("stream", tmp_path / "touched.npz", *given)
     assert (status, error) == (0, "")
     assert "frame 2: refused." in " ".join(out.split())
-    assert np.isnan(told(tmp_path)[2, 1:]).all()
+    assert np.isnan(table_of(tmp_path)[2, 1:]).all()
     assert json.loads((tmp_path / "report.json").read_text())["refused"] == [2]
 
 
-def test_a_table_that_nothing_describes(imaging, recorded, run, tmp_path):
-    """The network knows what its channels are; the file that the skin is described by is a description too."""
+def test_a_table_without_a_description(imaging, recorded, run, tmp_path):
+    """The network has the protocol, and a file of the skin also serves as a description."""
     for name in ("rest", "touched"):
         with np.load(recorded / f"{name}.npz") as one:
             np.savez(tmp_path / f"{name}.npz", frames=one["voltages"])
@@ -90,7 +90,7 @@ def test_a_table_that_nothing_describes(imaging, recorded, run, tmp_path):
         status, out, error = run("reconstruct", tmp_path / "touched.npz", *given, "--frame", -2, *more)
         assert (status, error) == (0, "")
         assert "in frame 1" in out
-        line = told(tmp_path)
+        line = table_of(tmp_path)
         assert line[0] == 1
         assert np.linalg.norm(line[1:3] - PLACES[1]) < 0.015
     (tmp_path / "skin.toml").write_text(SKIN.replace("grid-4x4", "grid-3x3"))
@@ -104,16 +104,16 @@ def test_a_table_that_nothing_describes(imaging, recorded, run, tmp_path):
 
 
 def test_an_untouched_skin(imaging, recorded, run, tmp_path):
-    """Nothing is said to be touched."""
+    """No touch is reported."""
     given = "--reference", recorded / "rest.npz", "--method", "network", "--model", imaging[0], "--output", tmp_path
     status, out, _ = run("stream", recorded / "rest.npz", *given)
     assert status == 0
     assert "untouched: nothing is deeper than noise makes it" in out
-    assert np.isnan(told(tmp_path)[1:3]).all()
+    assert np.isnan(table_of(tmp_path)[1:3]).all()
 
 
-def test_nothing_is_left_of_what_fails(imaging, recorded, run, tmp_path):
-    """No empty folder, and those above it stay away too."""
+def test_a_failed_command_leaves_no_files(imaging, recorded, run, tmp_path):
+    """No empty folder, and none of those above it that did not exist."""
     given = "--method", "network", "--model", imaging[0], "--output", tmp_path / "new" / "out"
     status, _, error = run("reconstruct", recorded / "touched.npz", *given)
     assert status == 1
@@ -132,7 +132,7 @@ def test_stream_from_standard_input(imaging, recorded, run, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--method", "network"), "--method network needs --model"),
         (("--model", "MODEL"), "--model is for --method network"),
@@ -140,12 +140,12 @@ def test_stream_from_standard_input(imaging, recorded, run, tmp_path, monkeypatc
         (("--method", "network", "--model", "nowhere"), "there is no such file"),
     ],
 )
-def test_what_does_not_go_together(imaging, recorded, run, tmp_path, options, said):
+def test_incompatible_options(imaging, recorded, run, tmp_path, options, message):
     options = [imaging[0] if one == "MODEL" else one for one in options]
     given = recorded / "touched.npz", "--reference", recorded / "rest.npz", "--output", tmp_path, *options
     status, _, error = run("reconstruct", *given)
     assert status == 1
-    assert said in error
+    assert message in error
 
 
 def test_another_protocol_is_refused(small_skin, imaging, recorded, run, tmp_path):

@@ -1,4 +1,4 @@
-"""Pictures of depth maps and of trainings."""
+"""Figures of depth maps and of training."""
 
 import numpy as np
 import pytest
@@ -16,8 +16,8 @@ def ax():
     return Figure().subplots()
 
 
-def test_a_map_lies_where_the_skin_is(ax):
-    """In millimetres of depth, the first row at the least y."""
+def test_a_map_is_drawn_at_the_position_of_the_skin(ax):
+    """In millimetres of depth, with the first row at the smallest y."""
     depth = np.zeros((8, 10))
     depth[0, 9] = 3e-3
     plot_depth_map(depth, EXTENT, title="one", ax=ax)
@@ -29,7 +29,7 @@ def test_a_map_lies_where_the_skin_is(ax):
 
 
 def test_losses(ax):
-    """Relative to those at first, with a mark at the best."""
+    """Relative to the initial losses, with a mark at the best."""
     course = Course([10, 20, 30], [1.0, 0.5, 0.2], [2.0, 0.8, 0.9])
     plot_losses({"maps": TrainingResult(None, course, "done")}, ax=ax)
     line, mark = ax.lines
@@ -37,7 +37,7 @@ def test_losses(ax):
     assert (mark.get_xdata()[0], mark.get_ydata()[0]) == (20, 0.4)
 
 
-def test_what_is_no_map(ax):
+def test_bad_maps(ax):
     with pytest.raises(ValueError, match=r"depth must be a map \(rows, columns\); it has shape \(3,\)"):
         plot_depth_map(np.zeros(3), EXTENT, ax=ax)
     with pytest.raises(ValueError, match="courses must be trainings by name"):

@@ -1,4 +1,4 @@
-"""Touches read from a store, some of its chunks at a time, and trained on."""
+"""Touches read from a store in groups of chunks, and training on them."""
 
 from typing import Any
 
@@ -35,13 +35,13 @@ def stored(small_skin, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def other(small_skin):
-    """Touches that nothing is learnt from."""
+    """Touches that are not in the training data."""
     solved = IndentSet(small_skin, touch_draws(small_skin), 40, seed=2, shape=(16, 16), chunk=40).solve(0)
     return TouchExamples(solved["change"], solved["depth"])
 
 
-def test_as_many_chunks_as_are_in_memory_at_once(stored):
-    """Six chunks of the store, the last of them half full, as even as may be."""
+def test_the_number_of_chunks_in_memory(stored):
+    """Six chunks of the store, the last of them half full, distributed as evenly as possible."""
     indents, path, found = stored
     assert StoredTouches(indents, path).rows("change").sizes == (110,)
     assert StoredTouches(indents, path, at_once=1).rows("change").sizes == (20, 20, 20, 20, 20, 10)
@@ -55,7 +55,9 @@ def test_as_many_chunks_as_are_in_memory_at_once(stored):
 
 
 def test_fingerprints(stored, small_skin, tmp_path):
-    """Of the touches, how they are parted, and which arrays are read; the same wherever the store lies."""
+    """They depend on the touches, on how they are split, and on which arrays are read, but not on the place of the
+    store.
+    """
     indents, path, _ = stored
     own = StoredTouches(indents, path, at_once=50)
     again = IndentSet(small_skin, touch_draws(small_skin), 110, shape=(16, 16), chunk=20)
@@ -74,7 +76,7 @@ def test_fingerprints(stored, small_skin, tmp_path):
     assert len({rows.fingerprint for rows in different}) == len(different)
 
 
-def test_touches_that_are_not_all_there(stored, small_skin, tmp_path):
+def test_incomplete_touches(stored, small_skin, tmp_path):
     def stop(now):
         if now.chunks == 2:
             raise KeyboardInterrupt
@@ -94,7 +96,7 @@ def test_mean_and_deviation(stored):
 
 
 def test_chunks_are_read_as_arrays_are_given(stored):
-    """Of one chunk: the same bits in the same order, so that trainings have the same rows."""
+    """For one chunk: the same bits in the same order, so that training has the same rows."""
     indents, path, found = stored
     arrays, touches = TouchExamples(found["change"].to_numpy(), found["depth"].to_numpy()), StoredTouches(indents, path)
     for names in (("change",), ("change", "depth")):
@@ -108,7 +110,7 @@ class Stopped(Exception):
 
 
 class Until(TrainingRuns):
-    """Trainings up to the one that begins with `unwanted`."""
+    """Training up to the stage whose name begins with `unwanted`."""
 
     unwanted = ""
 
@@ -119,7 +121,9 @@ class Until(TrainingRuns):
 
 
 class Looked(TrainingRuns):
-    """Trainings that are not done: what their objectives give of some rows, of the first in numbers, else in shape."""
+    """Training that does nothing but record the objectives for some rows, as numbers for the first stage, else as
+    shapes.
+    """
 
     losses: dict[str, Any]
 
@@ -135,8 +139,8 @@ class Looked(TrainingRuns):
         return TrainingResult(network, Course([1], [1.0], [1.0]), "done")
 
 
-def test_what_the_three_stages_are_taught(stored, other, small_skin, monkeypatch):
-    """Untrained, the first misses all that it is to redraw; the last leads from the first's ends, which stay."""
+def test_the_objectives_of_the_three_stages(stored, other, small_skin, monkeypatch):
+    """Untrained, the first stage reconstructs nothing. The last starts from the first's results, which are frozen."""
     random = np.random.default_rng(0)
     monkeypatch.setattr(
         "jeit.touch.networks.three_stages._draw_weights",
@@ -148,7 +152,7 @@ def test_what_the_three_stages_are_taught(stored, other, small_skin, monkeypatch
     found = train_three_stages(StoredTouches(indents, path, at_once=50), other, 1e-3, runs)
     assert list(runs.losses) == list(found.courses) == ["voltages", "maps", "projection"]
     assert all(loss.shape == () and held.shape == (40,) for loss, held, _ in runs.losses.values())
-    # Standardised changes have a mean square of about one, and so has what an untrained network misses of them.
+    # Standardised changes have a mean square of about one, and so has the error of an untrained network.
     assert 0.5 < runs.losses["voltages"][0] < 5
     assert runs.losses["voltages"][1].min() > 0
     trained = runs.losses["projection"][2]
@@ -161,7 +165,9 @@ def test_what_the_three_stages_are_taught(stored, other, small_skin, monkeypatch
 
 @pytest.fixture(scope="module")
 def three_stages(stored, other, tmp_path_factory):
-    """Trains the paper's network on three chunks, up to one of its trainings, in one folder; and the chunks read."""
+    """Trains the paper's network on three chunks, up to one of its stages, in one folder. Also returns the chunks that
+    were read.
+    """
     indents, path, _ = stored
     folder, loaded = tmp_path_factory.mktemp("trained"), []
     touches = StoredTouches(indents, path, at_once=50)
@@ -201,21 +207,23 @@ def paper(three_stages, maps):
 
 
 @pytest.mark.slow
-def test_a_training_s_state_is_kept_by_its_name(voltages):
+def test_the_state_of_a_training_has_its_name(voltages):
     assert voltages == {"voltages.training"}
 
 
 @pytest.mark.slow
-def test_what_is_trained_after_another_has_its_own_state(maps):
+def test_a_later_training_has_its_own_state(maps):
     assert maps == {"maps.training"}
 
 
 @pytest.mark.slow
 def test_three_trainings_of_the_paper_s_network(paper, small_skin):
-    """On a set larger than memory, whose three chunks are read one by one; the last leads from the first's ends."""
+    """On a set larger than memory, whose three chunks are read one by one. The last stage starts from the results of
+    the first.
+    """
     found, loaded = paper
     assert set(found.courses) == {"voltages", "maps", "projection"}
-    # What is kept of the two before is not trained again; their mean is that of all chunks.
+    # The saved results of the first two are not trained again. Their mean is that of all chunks.
     assert {name for name, _ in loaded} == {"change", "depth"}
     assert {number for name, number in loaded if name == "depth"} == {0, 1, 2}
     assert len([number for name, number in loaded if name == "depth"]) <= 3 * PLAN.epochs
@@ -229,7 +237,7 @@ def test_three_trainings_of_the_paper_s_network(paper, small_skin):
 
 @pytest.mark.slow
 def test_the_paper_s_network_learns_from_voltages(stored, other):
-    """Taught other touches' maps it learns none of them."""
+    """Trained on the maps of other touches it learns nothing."""
     found = stored[2]
     right = TouchExamples(found["change"].to_numpy(), found["depth"].to_numpy())
     runs = TrainingRuns(TrainingPlan(rate=3e-3, batch=20, epochs=12, patience=12), jax.random.key(1))
@@ -240,7 +248,7 @@ def test_the_paper_s_network_learns_from_voltages(stored, other):
     assert min(own.validation) < min(lost.validation)
 
 
-def test_shuffled_maps_are_another_s(other):
+def test_shuffled_maps_belong_to_other_touches(other):
     lost = shuffle_pairs(other)
     assert np.array_equal(lost.change, other.change)
     assert not np.array_equal(lost.depth, other.depth)
@@ -248,12 +256,12 @@ def test_shuffled_maps_are_another_s(other):
 
 
 @pytest.mark.slow
-def test_stopped_amid_chunks_it_goes_on_to_the_same_bits(paper, stored, other, tmp_path):
-    told = []
+def test_training_interrupted_between_chunks_continues_to_the_same_bits(paper, stored, other, tmp_path):
+    messages = []
 
-    def stop(said):
-        told.append(said)
-        if len(told) == 2 * PLAN.epochs + 1:
+    def stop(message):
+        messages.append(message)
+        if len(messages) == 2 * PLAN.epochs + 1:
             raise Stopped
 
     def train():

@@ -1,4 +1,4 @@
-"""Networks trained from arrays: they learn, stop early, and go on where they were killed, to the same bits."""
+"""Networks trained from arrays: they learn, stop early, and resume after a kill, to the same bits."""
 
 import os
 import signal
@@ -50,8 +50,8 @@ def trained():
     return fit_network(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY)
 
 
-def test_it_learns(trained):
-    """x y has a variance of 1/9; a straight line explains nothing of it."""
+def test_training_reduces_the_loss(trained):
+    """x y has a variance of 1/9. A straight line explains nothing of it."""
     assert trained.course.validation[trained.course.best] < 0.02 / 9
     assert float(held_out(trained.network, rows(300, 2)).mean()) < 0.03 / 9
     assert float(held_out(network(), rows(300, 2)).mean()) > 1 / 9
@@ -62,7 +62,7 @@ def test_the_best_network_is_kept(trained):
     assert found == pytest.approx(min(trained.course.validation), rel=1e-5)
 
 
-def test_a_key_decides_all(trained):
+def test_a_key_determines_everything(trained):
     again = fit_network(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY)
     other = fit_network(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=jax.random.key(4))
     assert bits(again.network) == bits(trained.network)
@@ -70,7 +70,7 @@ def test_a_key_decides_all(trained):
 
 
 def test_it_stops_early():
-    """Targets of noise: what is learnt of them makes others worse."""
+    """Targets of noise: training on some makes others worse."""
     inputs, _ = rows(64)
     noise = np.random.default_rng(1).normal(size=(64, 1)).astype(np.float32)
     other = np.random.default_rng(2).normal(size=(64, 1)).astype(np.float32)
@@ -84,16 +84,16 @@ class Stopped(Exception):
     pass
 
 
-def test_what_was_stopped_goes_on_to_the_same_bits(tmp_path):
-    """Also amid epochs, with rates that fall."""
+def test_interrupted_training_resumes_to_the_same_bits(tmp_path):
+    """Also within epochs, with decreasing rates."""
     plan = TrainingPlan(rate=1e-2, batch=32, epochs=3, look_every=4, seconds=0.0, decay=0.5, decay_epochs=1)
     given = network(), OBJECTIVE, rows(500), rows(100, 1), plan
     whole = fit_network(*given, key=KEY)
-    told = []
+    reports = []
 
-    def stop(said):
-        told.append(said)
-        if len(told) in (3, 7):
+    def stop(report):
+        reports.append(report)
+        if len(reports) in (3, 7):
             raise Stopped
 
     for _ in range(20):
@@ -102,7 +102,7 @@ def test_what_was_stopped_goes_on_to_the_same_bits(tmp_path):
             break
         except Stopped:
             continue
-    assert len(told) > 5
+    assert len(reports) > 5
     assert found.course == whole.course
     assert bits(found.network) == bits(whole.network)
     assert bits(fit_network(*given, key=KEY, checkpoint=tmp_path / "state").network) == bits(whole.network)
@@ -110,15 +110,14 @@ def test_what_was_stopped_goes_on_to_the_same_bits(tmp_path):
 
 @pytest.mark.slow
 def test_killed_at_any_moment(tmp_path, trained):
-    """By kill -9, after its first looks; its successor ends as one that was never killed."""
+    """By kill -9, after its first progress reports. The resumed training ends as one that was never killed."""
     script = tmp_path / "train.py"
     script.write_text(
         "import sys\n"
         f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "from test_fitting import KEY, OBJECTIVE, PLAN, fit_network, network, rows\n"
-        "def tell(said):\n    print(said, flush=True)\n"
-        "kept = sys.argv[1]\n"
-        "fit_network(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY, checkpoint=kept, progress=tell)\n",
+        "def show(report):\n    print(report, flush=True)\n"
+        "fit_network(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY, checkpoint=sys.argv[1], progress=show)\n",
         "utf-8",
     )
     command = [sys.executable, str(script), str(tmp_path / "killed")]
@@ -129,10 +128,10 @@ def test_killed_at_any_moment(tmp_path, trained):
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert process.returncode == -signal.SIGKILL
-    said = []
+    report = []
     given = network(), OBJECTIVE, rows(500), rows(100, 1), PLAN
-    found = fit_network(*given, key=KEY, checkpoint=tmp_path / "killed", progress=said.append)
-    assert 0 < len(said) < len(trained.course.steps)
+    found = fit_network(*given, key=KEY, checkpoint=tmp_path / "killed", progress=report.append)
+    assert 0 < len(report) < len(trained.course.steps)
     assert bits(found.network) == bits(trained.network)
 
 
@@ -170,8 +169,8 @@ def test_chunks():
 
 
 @pytest.mark.slow
-def test_what_was_stopped_amid_chunks_goes_on(tmp_path):
-    """Amid an epoch."""
+def test_training_interrupted_between_chunks_resumes(tmp_path):
+    """Within an epoch."""
     chunks = Chunks(rows(500), (200, 200, 100))
     found = fit_network(network(), OBJECTIVE, chunks, rows(100, 1), PLAN, key=KEY)
     given = network(), OBJECTIVE, Chunks(rows(500), (200, 200, 100)), rows(100, 1), PLAN
@@ -186,7 +185,7 @@ def test_what_was_stopped_amid_chunks_goes_on(tmp_path):
     assert bits(again.network) == bits(found.network)
 
 
-def test_every_epoch_takes_each_row_once_at_most():
+def test_every_epoch_uses_each_row_at_most_once():
     order = BatchOrder((70, 50), 16, [1, 2])
     legs = list(order.chunk_batches(0, 2 * order.batches_per_epoch, 3))
     for epoch in range(2):
@@ -200,7 +199,7 @@ def test_every_epoch_takes_each_row_once_at_most():
 
 
 class Counting(eqx.Module):
-    """A line, an offset that is not trained, and how many batches it has seen."""
+    """A line, an offset that is not trained, and a count of the batches."""
 
     slope: jax.Array
     offset: jax.Array
@@ -208,7 +207,7 @@ class Counting(eqx.Module):
 
 
 def test_leaves_that_are_not_trained():
-    """They stay, but for what the loss changes of them."""
+    """They change only by what the loss assigns to them."""
 
     def line(own, batch, key):
         inputs, targets = batch
@@ -230,7 +229,7 @@ def test_leaves_that_are_not_trained():
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"training": (np.zeros((3, 2)), np.zeros((4, 1)))}, "training must be arrays of one and the same number"),
         ({"validation": ()}, "validation must be arrays"),
@@ -238,14 +237,14 @@ def test_leaves_that_are_not_trained():
         ({"objective": loss}, "objective must be a TrainingObjective"),
     ],
 )
-def test_what_does_not_fit(change, said):
+def test_bad_arguments(change, message):
     given = {"objective": OBJECTIVE, "training": rows(10), "validation": rows(10), "key": KEY, **change}
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         fit_network(network(), given.pop("objective"), given.pop("training"), given.pop("validation"), **given)
 
 
 @pytest.mark.parametrize("change", [{"rate": 0.0}, {"batch": 0}, {"epochs": 1.5}, {"look_every": 0}, {"seconds": -1}])
-def test_no_plan(change):
+def test_bad_plans(change):
     with pytest.raises(ValueError, match=f"{next(iter(change))} must be"):
         TrainingPlan(**change)
 

@@ -1,4 +1,4 @@
-"""Networks as files: the same numbers come back, and nothing else is read."""
+"""Networks as files: the same numbers are read, and nothing else is."""
 
 import io
 import json
@@ -28,7 +28,7 @@ def written(tmp_path):
     return tmp_path / "network.jeit", network
 
 
-def test_it_comes_back(written):
+def test_a_saved_network_is_read(written):
     path, network = written
     head, again = read_model(path, KIND, 1, make)
     assert head["inputs"] == read_head(path, KIND, 1)["inputs"] == 3
@@ -47,7 +47,7 @@ def put(path, first, head, rest):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda first, head, rest: (b"something", head, rest), "of another kind"),
         (lambda first, head, rest: (first, {**head, "kind": "a map"}, rest), "it is 'a map'"),
@@ -63,10 +63,10 @@ def put(path, first, head, rest):
         (lambda first, head, rest: (first, head, b"x" * len(rest)), "magic string"),
     ],
 )
-def test_files_of_another_kind(written, change, said):
+def test_files_of_another_kind(written, change, message):
     path, _ = written
     put(path, *change(*parts(path)))
-    with pytest.raises(ValueError, match=said) as error:
+    with pytest.raises(ValueError, match=message) as error:
         read_model(path, KIND, 1, make)
     assert str(path) in str(error.value)
 
@@ -77,7 +77,7 @@ class Bomb:
 
 
 def test_nothing_is_executed(written):
-    """An array of objects, which NumPy would unpickle if it was allowed to."""
+    """An array of objects, which NumPy would unpickle if it were allowed to."""
     path, _ = written
     first, head, rest = parts(path)
     file = io.BytesIO()
@@ -108,7 +108,7 @@ def test_no_file(tmp_path):
         write_model(tmp_path / "large", KIND, 1, {"text": "x" * 2**21}, make(HEAD))
 
 
-def test_one_that_cannot_be_written_leaves_what_was_there(written):
+def test_a_failed_write_keeps_the_existing_file(written):
     path, network = written
     before = path.read_bytes()
     with pytest.raises(TypeError):

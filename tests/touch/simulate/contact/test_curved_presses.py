@@ -1,4 +1,6 @@
-"""Presses on curved skins: as on flat ones where these are the same, carried, and where they were pressed."""
+"""Presses on curved skins: equal to presses on flat skins where the skins are equivalent, with the full load, at the
+right place.
+"""
 
 import dataclasses
 
@@ -42,7 +44,7 @@ def raised(points) -> np.ndarray:
 
 
 def rolled(mesh: Mesh, radius: float) -> Mesh:
-    """A sheet laid onto a cylinder along y that it touches in the origin."""
+    """A sheet rolled onto a cylinder along y that touches the sheet at the origin."""
     x, y = np.asarray(mesh.points).T
     return Mesh.create(
         np.stack([radius * np.sin(x / radius), y, radius * (np.cos(x / radius) - 1)], axis=1), mesh.cells
@@ -55,7 +57,7 @@ def points_at(mesh: Mesh, nodes) -> PressedSkin:
 
 
 def pressed(skin: PressedSkin, presses) -> np.ndarray:
-    """Voltages of its model solved anew under each press: what frames are exact for."""
+    """Voltages of the model, solved anew for each press, which frames must equal."""
     found, touched = [], skin.touched(presses)
     for cells, change in zip(np.asarray(touched.cells), np.asarray(touched.change), strict=True):
         conductivity = np.array(skin.conductivity)
@@ -64,7 +66,7 @@ def pressed(skin: PressedSkin, presses) -> np.ndarray:
     return np.array(found)
 
 
-def test_far_enough_from_its_axis_a_bent_skin_is_flat():
+def test_a_slightly_bent_skin_is_equivalent_to_a_flat_one():
     flat = PLANE.mesh(num_points=300)
     wanted = np.stack(np.meshgrid([-0.03, 0, 0.03], [-0.025, 0, 0.025]), axis=-1).reshape(-1, 2)
     nodes = np.linalg.norm(np.asarray(flat.points)[:, None] - wanted, axis=-1).argmin(axis=0)
@@ -89,7 +91,7 @@ def test_far_enough_from_its_axis_a_bent_skin_is_flat():
 
 @pytest.mark.parametrize("kind", ["sheet", "layer", "inward"])
 def test_pressures_carry_the_load(kind):
-    """Normal to the skin they are; what of each goes along the press is the load."""
+    """They are normal to the skin. Their components along the press add up to the load."""
     core = tube(0.04, 0.1, num_points=500)
     skin = Skin.create(
         SurfaceLayout.spread(core, 8, 10e-3, outward=kind != "inward"),
@@ -116,8 +118,8 @@ def test_pressures_carry_the_load(kind):
     assert (along[pressure.any(axis=-1)] > 0.5).all()
 
 
-def test_a_ball_on_a_ball_touches_a_smaller_circle():
-    """Winkler's foundation: two balls of radii r, R have a gap ρ² / 2 (1/r + 1/R), and a⁴ = 4 W / π K (1/r + 1/R)."""
+def test_a_ball_on_a_ball_has_a_smaller_contact_circle():
+    """Winkler foundation: two balls of radii r, R have a gap ρ² / 2 (1/r + 1/R), and a⁴ = 4 W / π K (1/r + 1/R)."""
     surface = sphere(0.05, num_points=8000)
     samples, support = Samples.from_mesh(surface), Foundation(1e6, 4e-3)
     place = Triangles.of(surface).nearest([[0.02, 0.03, 0.04]]).points[0]
@@ -152,8 +154,8 @@ def test_a_weight_on_a_tube_rests_along_it():
 
 
 @pytest.mark.slow
-def test_a_press_on_a_tube_is_imaged_where_it_was():
-    """Of 40 mm radius, all round it: to half the electrodes' pitch of 40 mm with room to spare, 3 mm on average."""
+def test_a_press_on_a_tube_is_imaged_at_its_place():
+    """On a radius of 40 mm, all round: within half the electrodes' pitch of 40 mm by a wide margin, 3 mm on average."""
     fine, coarse = (tube(0.04, 0.1, cell_size=size) for size in (4e-3, 5e-3))
     centres = SurfaceLayout.spread(coarse, 16, 7e-3, contact_impedance=1e-4).centres
     skins = [
@@ -181,7 +183,7 @@ def test_a_press_on_a_tube_is_imaged_where_it_was():
 
 
 @pytest.mark.slow
-def test_a_moving_press_is_its_presses():
+def test_a_moving_press_equals_its_presses():
     arm = forearm(0.12, (0.03, 0.022), 0.04, num_points=300)
     layout = SurfaceLayout.spread(arm, 8, 12e-3, contact_impedance=1e-4)
     skin = PressedSkin(KEY, Skin.create(layout, num_layers=0).model, STILL)
@@ -195,7 +197,7 @@ def test_a_moving_press_is_its_presses():
     np.testing.assert_allclose(still, exact, atol=1e-8 * np.abs(exact - skin.rest()).max())
 
 
-def test_says_what_cannot_be_pressed():
+def test_bad_presses():
     surface = tube(0.04, 0.1, num_points=700)
     curved, flat = Samples.from_mesh(surface), Samples.from_mesh(PLANE.mesh(num_points=300))
     layer, shape = Foundation(1e6, 4e-3), ball_indenter(0.02)

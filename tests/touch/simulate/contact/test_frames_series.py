@@ -1,7 +1,7 @@
-"""Frames of a flat disc pressed on a round sheet, against the series of a disk with a disc of other conductivity.
+"""Frames of a flat disc pressed on a round sheet, against the series for a disk with a disc of other conductivity.
 
-An independent solution: nothing of meshes, presses or low-rank changes is in it. A disc away from the middle is moved
-there by a Möbius map of the disk onto itself, which leaves currents and potentials of points of the rim as they are.
+An independent solution without meshes, presses or low-rank updates. An off-centre disc is moved there by a Möbius map
+of the disk onto itself, which preserves currents and potentials at points of the boundary.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ def select(impedance):
 
 
 def pressed_disk(ratio: float) -> ConductingDisk:
-    """With the conductivity under the punch that the law gives its pressure of load over area."""
+    """With the conductivity under the punch by the material's law at its pressure, load over area."""
     change = VELOSTAT.change(LOAD / (np.pi * PUNCH**2))
     return ConductingDisk(RADIUS, SHEET, ratio, SHEET * (1 + float(change)))
 
@@ -48,7 +48,7 @@ def errors(electrodes, place, exact, levels) -> list[float]:
     return found
 
 
-def test_a_punch_in_the_middle():
+def test_a_punch_at_the_centre():
     widths, impedance = np.full(16, WIDTH), np.full(16, IMPEDANCE)
     pressed, rest = (
         arc_transfer_impedance(disk, ANGLES, widths, impedance, order=24)
@@ -59,9 +59,9 @@ def test_a_punch_in_the_middle():
     assert np.log2(found[0] / found[-1]) / 2 > 1.0
 
 
-def test_a_punch_away_from_the_middle():
+def test_a_punch_off_the_centre():
     away, size = 0.4, PUNCH / RADIUS
-    # w → (w − a) / (1 − a w) takes the circle of radius `size` round `away` to one round the middle.
+    # w → (w − a) / (1 − a w) maps the circle of radius `size` about `away` to one about the centre.
     low, high = away - size, away + size
     half = (1 + low * high) / (low + high)
     shift = half - np.sqrt(half**2 - 1)

@@ -1,4 +1,4 @@
-"""Indenters: their gaps where geometry gives them, however they are moved, turned and joined."""
+"""Indenters: their gaps from geometry, moved, rotated and combined."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_gap(indenter, point, gap):
         JoinedIndenters(DiscIndenter(0.01), ball_indenter(0.02)),
     ],
 )
-def test_nothing_beyond_reach_and_zero_somewhere(indenter):
+def test_gap_is_infinite_beyond_reach_and_zero_somewhere(indenter):
     points = np.random.default_rng(0).uniform(-1, 1, (40_000, 2)) * 1.2 * indenter.reach
     gap = indenter.gap(points)
     assert np.isinf(gap[np.linalg.norm(points, axis=1) > indenter.reach * (1 + 1e-12)]).all()

@@ -1,4 +1,4 @@
-"""Bodies held at a depth: their maps, what they change, and sets of them that a killed run goes on with."""
+"""Bodies at a given depth: their depth maps, the changes they cause, and sets that continue after a killed run."""
 
 import jax
 import numpy as np
@@ -34,7 +34,7 @@ def sheet():
 
 
 def test_a_ball_leaves_a_cap(sheet):
-    """Of π d² (R − d / 3)."""
+    """Of volume π d² (R − d / 3)."""
     places = image_places(sheet, 240, 240)
     (depth,) = depth_maps([[Indent(ball_indenter(0.02), 4e-3, (0.003, -0.004))]], places)
     volume = depth.sum() * (0.06 / 240) ** 2
@@ -42,7 +42,7 @@ def test_a_ball_leaves_a_cap(sheet):
     assert np.linalg.norm(places.reshape(-1, 2)[depth.argmax()] - (0.003, -0.004)) < 0.3e-3
 
 
-def test_turned_and_several(sheet):
+def test_rotated_and_several_bodies(sheet):
     places = image_places(sheet, 120, 120)
     bar = BarIndenter(0.03, 0.006)
     along, across = (depth_maps([[Indent(bar, 2e-3, angle=one)]], places)[0] for one in (0.0, np.pi / 2))
@@ -52,8 +52,8 @@ def test_turned_and_several(sheet):
 
 
 @pytest.mark.parametrize("num_layers", [0, 4])
-def test_what_is_indented_conducts_no_more(num_layers):
-    """The share of a skin's volume that cells lose is that of the indented body."""
+def test_indented_volume_does_not_conduct(num_layers):
+    """The fraction of the skin's volume that cells lose is that of the indented body."""
     skin = made(num_layers)
     depth = 4e-3
     cells = indented_cells(skin, [[Indent(DiscIndenter(0.03), depth)]])
@@ -64,7 +64,7 @@ def test_what_is_indented_conducts_no_more(num_layers):
 
 
 def test_changes_are_those_of_the_model(sheet):
-    """Against the model solved anew; and none where nothing is touched."""
+    """Against the model solved anew, and zero where nothing touches."""
     touch = [Indent(ball_indenter(0.02), 5e-3, (0.004, 0.002)), Indent(DiscIndenter(0.01), 2e-3, (-0.015, 0.0))]
     cells = indented_cells(sheet, [touch])
     conductivity = np.full(sheet.model.mesh.num_cells, float(sheet.model_conductivity))
@@ -89,7 +89,7 @@ def test_draws(draws):
     assert {len(touch) for touch in touches} == {1, 2}
 
 
-def test_a_set_goes_on(sheet, tmp_path):
+def test_a_set_is_resumed(sheet, tmp_path):
     """Stopped after its first chunk, it ends with the same arrays."""
     draws = IndentDraws([DiscIndenter(0.01)], sheet.outline, (1e-3, 6e-3), margin=5e-3, at_once=2)
     indents = IndentSet(sheet, draws, 8, seed=3, shape=(12, 12), chunk=4)
@@ -102,9 +102,9 @@ def test_a_set_goes_on(sheet, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         simulate_presses(indents, tmp_path / "killed.zarr", progress=stop)
     assert open_presses(indents, tmp_path / "killed.zarr").finished.sum() == 4
-    told = []
-    again = simulate_presses(indents, tmp_path / "killed.zarr", progress=told.append)
-    assert told[0].chunks == 1
+    reports = []
+    again = simulate_presses(indents, tmp_path / "killed.zarr", progress=reports.append)
+    assert reports[0].chunks == 1
     for name in ("change", "depth"):
         assert np.array_equal(again[name].to_numpy(), whole[name].to_numpy())
     depth = whole["depth"].to_numpy()
@@ -118,7 +118,7 @@ def test_a_set_goes_on(sheet, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda skin, draws: Indent("ball", 1e-3), "indenter must be an indenter"),
         (lambda skin, draws: Indent(DiscIndenter(0.01), 0.0), "depth must be a positive length"),
@@ -135,6 +135,6 @@ def test_a_set_goes_on(sheet, tmp_path):
         (lambda skin, draws: simulate_presses("set", "here"), "presses must be a PressSet"),
     ],
 )
-def test_what_cannot_be(sheet, draws, make, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_arguments(sheet, draws, make, message):
+    with pytest.raises(ValueError, match=message):
         make(sheet, draws)

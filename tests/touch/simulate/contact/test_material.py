@@ -26,7 +26,7 @@ KEY = jax.random.key(0)
 
 
 def follow(made, pressures, seconds):
-    """Effective pressure of one place in time."""
+    """Effective pressure at one place over time."""
     strain, found, before = unloaded_state(made, 1), [], seconds[0]
     for pressure, now in zip(pressures, seconds, strict=True):
         strain, effective = advance_state(made, strain, np.array([pressure]), now - before)
@@ -44,7 +44,7 @@ def test_conductivity_saturates():
     assert (np.diff(change, 2) < 0).all()
 
 
-def test_hysteresis_is_as_wide_as_said_whatever_the_rate():
+def test_the_width_of_hysteresis_does_not_depend_on_the_rate():
     up, down = np.linspace(0, 1e4, 101), np.linspace(1e4, 0, 101)
     for pace in (1e-3, 1e3):
         found = follow(HYSTERETIC, [*up, *down], pace * np.arange(202))
@@ -53,7 +53,7 @@ def test_hysteresis_is_as_wide_as_said_whatever_the_rate():
         assert found[-1] == 0
 
 
-def test_a_small_cycle_is_forgotten_within_a_larger_one():
+def test_a_minor_loop_is_forgotten_within_a_major_one():
     seconds = np.arange(6.0)
     small = follow(HYSTERETIC, [0, 5e3, 3e3, 8e3, 2e3, 4e3], seconds)
     np.testing.assert_allclose(small[[3, 4, 5]], follow(HYSTERETIC, [0, 0, 0, 8e3, 2e3, 4e3], seconds)[[3, 4, 5]])
@@ -70,14 +70,14 @@ def test_creep_of_a_step_is_exponential():
 
 
 @pytest.mark.parametrize("made", [CREEPING, BOTH])
-def test_steps_of_time_do_not_matter_while_load_is_linear(made):
+def test_time_steps_do_not_matter_while_load_is_linear(made):
     fine = np.linspace(0, 4, 4001)
     load = np.interp(fine, [0, 1, 2, 4], [0, 1e4, 1e4, 2e4])
     coarse = np.array([0, 1000, 2000, 4000])
     np.testing.assert_allclose(follow(made, load[coarse], fine[coarse]), follow(made, load, fine)[coarse], rtol=1e-10)
 
 
-def test_creep_goes_back_to_rest():
+def test_creep_recovers_at_rest():
     found = follow(BOTH, [1e4, 1e4, 0, 0, 0], [0.0, 100.0, 100.01, 110.0, 1000.0])
     assert 0.05e4 < found[3] < found[2] < 0.31e4
     assert abs(found[4]) < 1e-6
@@ -99,8 +99,8 @@ def test_gains_and_noise():
     np.testing.assert_array_equal(draw_gains(KEY, 0.05, 9), draw_gains(KEY, 0.05, 9))
 
 
-def test_materials_have_what_their_sources_print():
-    assert 1 / (material("velostat").conductivity * 1e-4) == pytest.approx(50e3)  # 500 Ω cm, 0.1 mm: Ω a square
+def test_materials_have_the_published_values():
+    assert 1 / (material("velostat").conductivity * 1e-4) == pytest.approx(50e3)  # 500 Ω cm, 0.1 mm: Ω per square
     fabric = material("conductive fabric")
     assert fabric.conductivity * fabric.thickness == pytest.approx(12.5e-3)
     assert material("hydrogel").thickness == 0.01
@@ -136,7 +136,7 @@ def test_impossible_materials_are_refused(make, message):
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (5, 7), (2, 3, 11), (0, 4)])
-def test_draws_are_those_of_jax_whatever_their_number(shape):
+def test_draws_are_those_of_jax_for_any_number(shape):
     drawn = standard_normal(KEY, shape)
     assert drawn.shape == shape
     np.testing.assert_allclose(drawn, jax.random.normal(KEY, shape), rtol=1e-14)

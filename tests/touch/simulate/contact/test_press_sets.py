@@ -1,4 +1,4 @@
-"""Sets of presses: what is drawn, what is stored, and what kill -9 leaves."""
+"""Sets of presses: their random draws, their store, and their state after kill -9."""
 
 import os
 import signal
@@ -34,7 +34,7 @@ xarray = pytest.importorskip("xarray")
 pytest.importorskip("zarr")
 KEY = jax.random.key(0)
 
-# The same in a process of its own, which dies while it writes its second chunk, after its voltages.
+# The same in another process, which is killed while it writes its second chunk, after the voltages.
 KILLED = """
 import os, signal, sys
 sys.path.insert(0, sys.argv[1])
@@ -61,7 +61,7 @@ Store.write_array = dying
 simulate_presses(presses, sys.argv[2])
 """
 
-# As they touch every cell, one program serves all chunks.
+# Presses touch every cell, so that one program serves all chunks.
 EVERYWHERE = DiscIndenter(0.3)
 
 
@@ -93,7 +93,7 @@ def solved(monkeypatch):
     return numbers
 
 
-def test_draws_are_spread_as_said():
+def test_draws_have_the_specified_distribution():
     draws = PressDraws([ball_indenter(0.02), BarIndenter(0.03, 0.01)], Disk(0.05), (0.1, 10.0), margin=0.01, at_once=3)
     touches = draws.draw(KEY, 3000)
     assert np.bincount([len(touch) for touch in touches]) == pytest.approx([0, 1000, 1000, 1000], abs=90)
@@ -110,7 +110,7 @@ def test_draws_are_spread_as_said():
     assert all(one[0].load == other[0].load for one, other in zip(few, again, strict=True))
 
 
-def test_xarray_opens_the_set_and_its_frames_are_the_skins(presses, whole):
+def test_xarray_opens_the_set_and_its_frames_are_those_of_the_skin(presses, whole):
     data = open_presses(presses, whole)
     assert dict(data.sizes) == {"touch": 16, "channel": 40, "press": 2, "axis": 2}
     assert data.finished.values.all()
@@ -121,17 +121,17 @@ def test_xarray_opens_the_set_and_its_frames_are_the_skins(presses, whole):
     made = presses.solve(1)
     np.testing.assert_array_equal(data.voltages.values[8:16], made["voltages"])
     np.testing.assert_array_equal(data.position.values[8:16], made["position"])
-    # Apart from the press the frames are of rest, and noise is 80 dB below it.
+    # Apart from the press the frames are those at rest, with noise 80 dB below.
     rest = presses.skin.rest()
     assert np.abs(data.voltages.values / rest - 1).max() < 0.5
 
 
 def test_a_finished_set_is_not_simulated_again(presses, whole, solved):
-    before, said = contents(whole), []
-    simulate_presses(presses, whole, progress=said.append)
+    before, reports = contents(whole), []
+    simulate_presses(presses, whole, progress=reports.append)
     assert solved == []
     assert contents(whole) == before
-    assert [now[:4] for now in said] == [(16, 16, 2, 2)]
+    assert [now[:4] for now in reports] == [(16, 16, 2, 2)]
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
@@ -148,7 +148,7 @@ def test_one_process_at_a_time_simulates_a_set(presses, whole):
 
 
 def test_stopped_within_a_chunk_and_resumed_the_store_is_the_same(presses, whole, tmp_path, solved, monkeypatch):
-    """While it writes the second chunk, after the voltages."""
+    """During the second chunk, after its voltages."""
     path, write, calls = tmp_path / "stopped.zarr", Store.write_array, []
 
     def stop(self, name, rows, values):
@@ -163,7 +163,7 @@ def test_stopped_within_a_chunk_and_resumed_the_store_is_the_same(presses, whole
             simulate_presses(presses, path)
     data = open_presses(presses, path)
     assert data.finished.values.sum() == 8
-    assert np.isfinite(data.voltages.values[8:16]).all()  # written, but not marked
+    assert np.isfinite(data.voltages.values[8:16]).all()  # written, but not marked as complete
     solved.clear()
     simulate_presses(presses, path)
     assert solved == [1]
@@ -177,7 +177,7 @@ def test_killed_within_a_chunk_and_resumed_the_store_is_the_same(presses, whole,
     assert ended.returncode == -signal.SIGKILL, ended.stderr
     data = open_presses(presses, path)
     assert data.finished.values.sum() == 8
-    assert np.isfinite(data.voltages.values[8:16]).all()  # written, but not marked
+    assert np.isfinite(data.voltages.values[8:16]).all()  # written, but not marked as complete
     simulate_presses(presses, path)
     assert solved == [1]
     assert contents(path) == contents(whole)

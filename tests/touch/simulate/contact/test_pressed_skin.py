@@ -1,4 +1,4 @@
-"""Frames of pressed skins: loads are carried, voltages are those of the model solved anew, time leaves its marks."""
+"""Frames of pressed skins: presses carry their loads, voltages are those of the solved model, and effects in time."""
 
 import dataclasses
 
@@ -30,7 +30,7 @@ from jeit.touch.simulate.contact.samples import Samples
 
 KEY = jax.random.key(0)
 VELOSTAT = material("velostat")
-# Nothing random, nothing in time.
+# No noise, no effects in time.
 STILL = dataclasses.replace(
     VELOSTAT, hysteresis=0.0, creep=(), conductivity_trend=0.0, conductivity_walk=0.0, contact_trend=0.0,
     contact_walk=0.0, noise=0.0, gain_spread=0.0,
@@ -60,7 +60,7 @@ def skin(model):
 
 
 def anew(skin, touched):
-    """The model solved for every touch."""
+    """The model solved anew for every touch."""
     found = []
     for cells, change in zip(np.asarray(touched.cells), np.asarray(touched.change), strict=True):
         conductivity = np.array(skin.conductivity)
@@ -73,7 +73,7 @@ def anew(skin, touched):
     "support", [Foundation(1e6, 2e-3), HalfSpace(3e6, pixels=24)], ids=["foundation", "half-space"]
 )
 def test_cells_carry_the_load(model, support):
-    """To rounding: also what hangs over the edge, and what falls between the samples."""
+    """To rounding, also where an indenter extends beyond the edge or lies between the samples."""
     samples = Samples.from_mesh(model.mesh)
     presses = [*PRESSES, Press(DiscIndenter(0.01), 1.0, (0.049, 0.0)), Press(ball_indenter(0.001), 1e-3, (0.0123, 0.0))]
     found = pressed_cells(samples, support, [(press,) for press in presses])
@@ -82,8 +82,8 @@ def test_cells_carry_the_load(model, support):
     assert samples.area.sum() * samples.points.shape[1] == pytest.approx(np.pi * 0.05**2, rel=5e-3)
 
 
-def test_a_ball_beyond_the_edge_is_carried_by_all_that_it_touches(model):
-    """Less of the skin is under it, so that it comes down farther, and touches more."""
+def test_all_of_a_ball_that_touches_at_the_edge_carries_load(model):
+    """Less of the skin is under it, so that it moves deeper and touches a larger area."""
     samples, layer, shape = Samples.from_mesh(model.mesh), Foundation(1e6, 2e-3), ball_indenter(0.02)
     found = pressed_cells(samples, layer, [(Press(shape, 2.0, (0.053, 0.0)),)])
     points = (samples.points - np.array([0.053, 0.0])).reshape(1, -1, 2)
@@ -103,7 +103,7 @@ def test_a_ball_beyond_the_edge_is_carried_by_all_that_it_touches(model):
     ],
     ids=["moved in its frame", "an edge", "a point"],
 )
-def test_what_falls_between_samples_presses_where_it_is(model, shape, place, spread):
+def test_an_indenter_between_samples_presses_at_its_place(model, shape, place, spread):
     samples = Samples.from_mesh(model.mesh)
     found = pressed_cells(samples, Foundation(1e6, 2e-3), [(Press(shape, 0.01),)])
     load = np.einsum("cs,c->cs", found.pressure[0], samples.area[found.cells[0]])
@@ -149,7 +149,7 @@ def test_a_layer_is_pressed_too():
     assert np.abs(anew(skin, touched) - skin.rest()).max() > 1e-4 * np.abs(skin.rest()).max()
 
 
-def test_several_at_once_press_as_their_sum(skin):
+def test_several_simultaneous_presses_are_summed(skin):
     near = [Press(DiscIndenter(0.01), 1.0, (0.0, 0.0)), Press(DiscIndenter(0.01), 2.0, (0.004, 0.0))]
     samples, support = Samples.from_mesh(skin.model.mesh), STILL.support
     both = pressed_cells(samples, support, [tuple(near)])
@@ -163,7 +163,7 @@ def test_several_at_once_press_as_their_sum(skin):
 
 
 @pytest.mark.slow
-def test_a_record_of_a_press_that_stays_is_its_frames(model):
+def test_a_recording_of_a_constant_press_equals_its_frames(model):
     creeping = dataclasses.replace(STILL, creep=VELOSTAT.creep, hysteresis=VELOSTAT.hysteresis)
     skin, press = PressedSkin(KEY, model, creeping), PRESSES[1]
     seconds = np.array([2.0, 3.0, 12.0])
@@ -173,7 +173,7 @@ def test_a_record_of_a_press_that_stays_is_its_frames(model):
     assert (np.diff(np.linalg.norm(found - skin.rest(), axis=1)) > 0).all()
 
 
-def test_a_stroke_leaves_a_trace_that_fades(model):
+def test_a_stroke_leaves_a_decaying_trace(model):
     skin = PressedSkin(KEY, model, dataclasses.replace(STILL, creep=((0.2, 1.0),)))
     seconds = np.array([0.0, 0.5, 1.0, 1.5, 1.6, 3.6, 60.0])
     place = np.array([[-0.02, 0.0], [0.0, 0.0], [0.02, 0.0], [0.02, 0.01], [0, 0], [0, 0], [0, 0]])
@@ -200,7 +200,7 @@ def test_noise_gains_and_keys(model):
 
 
 def test_drift_is_that_of_another_skin(model):
-    """Conductivity exactly; contacts, which neighbouring voltages hardly see, to first order."""
+    """Conductivity exactly. Contacts, to which neighbouring voltages are hardly sensitive, to first order."""
     drifting = dataclasses.replace(STILL, conductivity_trend=1e-4, contact_trend=-1e-4)
     skin = PressedSkin(KEY, model, drifting)
     found = skin.frames(KEY, [()], elapsed=300.0)[0]
@@ -215,7 +215,7 @@ def test_drift_is_that_of_another_skin(model):
     assert np.linalg.norm(-0.03 * slope - alone) < 0.05 * np.linalg.norm(alone)
 
 
-def test_walking_contacts_are_read_by_their_own_channels(model):
+def test_drifting_contacts_affect_their_own_channels(model):
     skin = PressedSkin(KEY, model, dataclasses.replace(STILL, contact_walk=1e-2))
     found = skin.frames(KEY, [(), ()], elapsed=100.0)
     np.testing.assert_array_equal(found[0], found[1])
@@ -228,7 +228,7 @@ def test_walking_contacts_are_read_by_their_own_channels(model):
     )
 
 
-def test_an_untouched_skin_drifts_in_time(model):
+def test_an_untouched_skin_drifts_over_time(model):
     skin, seconds = PressedSkin(KEY, model, material("velostat")), np.arange(20) * 5.0
     film = skin.record(KEY, [], seconds)
     assert film.shape == (20, model.protocol.num_measurements)
@@ -238,8 +238,8 @@ def test_an_untouched_skin_drifts_in_time(model):
     np.testing.assert_allclose(film, light, rtol=1e-6, atol=1e-9)
 
 
-def test_a_half_space_is_not_pressed_beside_its_edge(model):
-    """Its free contact is cut off at the edge: what is left of it would be scaled up to carry all of the load."""
+def test_a_half_space_is_not_pressed_at_its_edge(model):
+    """Its contact area would be cut off at the edge, and the rest scaled up to carry all of the load."""
     skin = PressedSkin(KEY, model, dataclasses.replace(STILL, support=HalfSpace(3e5, pixels=24)))
     with pytest.raises(ValueError, match="of its pressure would lie on the skin"):
         skin.touched([Press(ball_indenter(0.02), 2.0, (0.052, 0.0))])

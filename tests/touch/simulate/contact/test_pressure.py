@@ -1,4 +1,4 @@
-"""Pressure under indenters: Hertz, the flat punch, Winkler's closed forms; what is asked of every contact."""
+"""Pressure under indenters: Hertz, the flat punch, Winkler's closed forms, and conditions for every contact."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ SHAPES = {
 
 
 class Paraboloid(AbstractIndenter):
-    """r² / 2R: what Hertz takes a ball for."""
+    """r² / 2R, Hertz's approximation of a ball."""
 
     def gap(self, points):
         return np.sum(np.asarray(points) ** 2, axis=-1) / (2 * RADIUS)
@@ -49,7 +49,7 @@ class Paraboloid(AbstractIndenter):
 
 
 def hertz(support):
-    """Contact radius, greatest pressure and approach: Johnson, Contact Mechanics, 1985, equations 4.22 to 4.24."""
+    """Contact radius, maximum pressure and approach: Johnson, Contact Mechanics, 1985, equations 4.22 to 4.24."""
     radius = (3 * LOAD * RADIUS / (4 * support.plane_modulus)) ** (1 / 3)
     return radius, 3 * LOAD / (2 * np.pi * radius**2), radius**2 / RADIUS
 
@@ -69,12 +69,12 @@ def test_a_ball_on_a_half_space_is_hertz():
     assert found.values.max() == pytest.approx(peak, rel=1e-3)
     assert errors[-1] < 5e-3
     assert radii[-1] < 5e-3
-    # The root at the contact's edge leaves h^1.5 or so, up to how the edge falls on the pixels.
+    # The root at the contact's edge causes an error of order h^1.5, and the edge's position on the pixels varies it.
     assert np.log2(errors[0] / errors[-1]) / 2 > 0.9
 
 
 def test_a_flat_punch_on_a_half_space():
-    """F = 2 a E* δ, with p = F / (2π a √(a² − r²)): its error is that of a disc of pixels, and falls with them."""
+    """F = 2 a E* δ, with p = F / (2π a √(a² − r²)): the error is that of a disc of pixels, and falls with them."""
     errors = []
     for pixels in (32, 64, 128):
         support = HalfSpace(1e6, 0.5, pixels)
@@ -85,8 +85,10 @@ def test_a_flat_punch_on_a_half_space():
     assert errors[-1] < errors[0] / 2
 
 
-def test_the_surface_sinks_under_a_pressed_square():
-    """In the middle, of side 2a, by 8 a p log(1 + √2) / (π E*); at r, far off, by F / (π E* r) and a² / 6r² more."""
+def test_the_surface_sinks_under_a_square():
+    """At the centre of a square of side 2a by 8 a p log(1 + √2) / (π E*), and at a large distance r by F / (π E* r) and
+    a² / 6r² more.
+    """
     side, number = 0.01, 120
     points, pixel = raster((3 * side, 3 * side), number)
     pressure = np.where(np.abs(points).max(axis=-1) < side / 2, 1000.0, 0.0)
@@ -108,7 +110,7 @@ def test_a_ball_on_a_foundation(load):
 
 
 def test_a_flat_punch_on_a_foundation():
-    """Uniform pressure F / A; a hole in it raises it."""
+    """Uniform pressure F / A. A hole in the punch raises it."""
     area = np.pi * RADIUS**2
     assert float(LAYER.pressure(DiscIndenter(2 * RADIUS), 20.0).at(MIDDLE)[0]) == pytest.approx(20 / area, rel=5e-3)
     ring = LAYER.pressure(RingIndenter(2 * RADIUS, RADIUS), 20.0)
@@ -126,7 +128,7 @@ def test_load_is_carried_where_bodies_touch(support, shape):
     points, pixel = raster(window, 801)
     pressure = found.at(points)
     assert pressure.min() >= 0
-    # Cells of the sum are cut by edges: a share of pixel / width of the load.
+    # Cells of the sum are cut by edges: a fraction pixel / width of the load.
     assert pressure.sum() * pixel.prod() == pytest.approx(load, rel=0.05)
     assert (pressure[np.linalg.norm(points, axis=-1) > found.reach] == 0).all()
     assert found.at(points[400, 400]) == pressure[400, 400]
@@ -136,7 +138,9 @@ def test_load_is_carried_where_bodies_touch(support, shape):
 
 @pytest.mark.parametrize("shape", ["ball", "two", "prism", "rough"])
 def test_bodies_do_not_overlap(shape):
-    """Signorini: distance is zero under pressure, nowhere negative; also where pixels left and have to come back."""
+    """Signorini conditions: the distance is zero under pressure and nowhere negative, also where pixels leave the
+    contact and return.
+    """
     indenter = ROUGH if shape == "rough" else SHAPES[shape]
     support = HalfSpace(1e6, 0.5, 48)
     found = support.pressure(indenter, 3.0)

@@ -1,4 +1,4 @@
-"""Two coupled sheets: both limits, a series where the coupling is even, and how near the short form is."""
+"""Two coupled sheets: both limits, a series for uniform coupling, and the accuracy of the saturation formula."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ def pair():
     return sheets(600)
 
 
-def test_apart_they_are_the_lower_and_together_the_sum(pair):
+def test_separate_sheets_are_the_lower_one_and_coupled_ones_the_sum(pair):
     apart = pair.voltages(LOWER, UPPER, 0.0)
     np.testing.assert_allclose(apart, pair.model.voltages(LOWER), rtol=1e-6, atol=1e-8 * np.abs(apart).max())
     together = pair.voltages(LOWER, LOWER, 1e9 * LOWER / RADIUS**2)
@@ -39,7 +39,7 @@ def test_apart_they_are_the_lower_and_together_the_sum(pair):
 
 
 def test_conductivity_of_both_may_vary(pair):
-    """Cells of both sheets twice as good are both half as much."""
+    """Cells of both sheets with twice the conductivity equal halving both."""
     random = np.random.default_rng(0)
     lower, upper = np.exp(random.normal(size=(2, pair.model.mesh.num_cells))) * LOWER
     conductance = random.uniform(0, 1e3 * LOWER / RADIUS**2, len(lower))
@@ -91,10 +91,13 @@ def test_evenly_coupled_disks(strength):
 
 
 @pytest.mark.parametrize(("whole", "most", "near"), [(False, 1.0, 0.06), (True, 2.0, 0.08)], ids=["cut", "whole"])
-def test_a_touch_saturates_and_the_short_form_is_near(whole, most, near):
-    """A disc pressed harder and harder, g in proportion to pressure. The change of voltages grows and saturates: with
-    an upper sheet cut to the contact at that of a doubled conductivity, with a whole one of a tripled one, but for what
-    the sheet's edge adds. c p / (p + p½), p½ fitted at one load, is off by no more than `near`, a share of the most."""
+def test_a_touch_saturates_and_the_saturation_formula_is_close(whole, most, near):
+    """A disc pressed harder and harder, with g proportional to pressure.
+
+    The change of voltages grows and saturates: with an upper sheet cut to the contact, at that of a doubled
+    conductivity, with a whole one, at that of a tripled one, except for the contribution of the sheet's edge. c p / (p
+    + p½), with p½ fitted at one load, differs by no more than `near`, a fraction of the largest change.
+    """
     pair = sheets(1000)
     middles = np.asarray(centroids(pair.model.mesh))
     under = np.linalg.norm(middles - (0.015, 0.0), axis=1) < 0.01

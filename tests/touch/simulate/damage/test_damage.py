@@ -1,4 +1,4 @@
-"""Cuts, faults of electrodes and repair: what they do to voltages, and what is refused."""
+"""Cuts, faults of electrodes and repair: their effect on voltages, and refused input."""
 
 import dataclasses
 
@@ -35,7 +35,7 @@ def slit() -> ForwardModel:
     return disk_model(Cut([(-0.01, 0.0), (0.01, 0.0)]), 400)
 
 
-def test_a_cut_right_through_lets_nothing_pass():
+def test_a_complete_cut_blocks_the_current():
     cut = Cut([(0.003, -HEIGHT), (0.003, HEIGHT)])
     model = strip(cut)
     before, after = (
@@ -43,11 +43,11 @@ def test_a_cut_right_through_lets_nothing_pass():
         for values in (np.ones(model.mesh.num_cells), cut.conductivity(model.mesh, 1.0))
     )
     assert before == pytest.approx(WIDTH / HEIGHT, rel=0.02)
-    # Next to nothing conducts, over a band of one or two cells' width.
+    # Almost nothing conducts, over a band of one or two cells' width.
     assert after > 1e6 * 2.5e-4 / HEIGHT
 
 
-def test_a_slit_half_way_across_resists_as_the_formula_says():
+def test_the_resistance_of_a_half_slit_is_that_of_the_formula():
     """A strip seen from the side is a sheet cut to half its depth: longer by (4h/π) ln csc(π/4)."""
     cut = Cut([(0.002, -HEIGHT), (0.002, 0.0)])
     model = strip(cut, 4000)
@@ -57,10 +57,10 @@ def test_a_slit_half_way_across_resists_as_the_formula_says():
     )
     assert (after - before) * HEIGHT == pytest.approx(
         4 * HEIGHT / np.pi * np.log(np.sqrt(2)), rel=0.12
-    )  # a cell longer
+    )  # one cell longer
 
 
-def test_half_a_depth_is_less_than_a_whole_and_more_than_none():
+def test_half_the_depth_has_less_effect_than_all_and_more_than_none():
     cut = draw_cut(jax.random.key(3), Disk(0.05), length=(0.03, 0.03), bent=1.0)
     model = disk_model(cut)
     change = []
@@ -73,7 +73,7 @@ def test_half_a_depth_is_less_than_a_whole_and_more_than_none():
     assert len(cut.path) == 3
 
 
-def test_cuts_lie_within_and_are_as_long_as_asked():
+def test_cuts_are_inside_and_have_the_given_length():
     outline = Rectangle(0.2, 0.2, (0, 0))
     for number in range(40):
         cut = draw_cut(jax.random.key(number), outline, margin=0.004)
@@ -84,7 +84,7 @@ def test_cuts_lie_within_and_are_as_long_as_asked():
 
 
 @pytest.mark.parametrize("kind", FAULTS)
-def test_a_fault_is_in_the_channels_of_its_electrode(slit, kind):
+def test_a_fault_affects_the_channels_of_its_electrode(slit, kind):
     model = slit.with_protocol(two_terminal(16, current=1e-3))
     change = ElectrodeFault(5, kind).changes(jax.random.key(0), model, 1e-2, np.arange(30) / 10)
     rest = np.asarray(model.voltages(1e-2))
@@ -95,7 +95,7 @@ def test_a_fault_is_in_the_channels_of_its_electrode(slit, kind):
         assert (change[:, own].std(axis=0) > 0.1 * np.abs(rest[own])).all()
 
 
-def test_a_torn_wire_may_read_a_rail(slit):
+def test_a_torn_wire_may_read_the_end_of_the_range(slit):
     rest = np.asarray(slit.voltages(1e-2))
     read = rest + ElectrodeFault(2, "torn", rail=4.0).changes(jax.random.key(0), slit, 1e-2, np.arange(3.0))
     own = slit.protocol.channels_touching(2)
@@ -103,7 +103,7 @@ def test_a_torn_wire_may_read_a_rail(slit):
     np.testing.assert_allclose(read[:, ~own], np.tile(rest[~own], (3, 1)))
 
 
-def test_a_recording_goes_on_through_its_mishaps():
+def test_a_recording_continues_through_damage_and_repair():
     cut = Cut([(-0.012, 0.01), (0.012, 0.016)])
     model, film = disk_model(cut, 400), dataclasses.replace(material("velostat"), noise=0.0)
     skin = PressedSkin(jax.random.key(0), model, film)
@@ -112,8 +112,8 @@ def test_a_recording_goes_on_through_its_mishaps():
     whole = eqx.tree_at(lambda one: (one.conductivity, one.material), skin, (values, glued))
     seconds = np.arange(12) / 2
     press = MovingPress(DiscIndenter(0.012), np.where((seconds > 1) & (seconds < 5), 2.0, 0.0), (0.0, -0.02))
-    mishaps = [Mishap(2.0, damaged), Mishap(4.0, whole)]
-    found = record_mishaps(jax.random.key(1), skin, press, seconds, mishaps)
+    changes = [Mishap(2.0, damaged), Mishap(4.0, whole)]
+    found = record_mishaps(jax.random.key(1), skin, press, seconds, changes)
     plain = record_mishaps(jax.random.key(1), skin, press, seconds, [])
     exact = skin.record(jax.random.key(1), press, seconds)
     np.testing.assert_allclose(plain, exact, rtol=1e-6, atol=1e-9 * np.abs(exact).max())
@@ -125,7 +125,7 @@ def test_a_recording_goes_on_through_its_mishaps():
 
 
 @pytest.mark.parametrize(
-    ("ask", "said"),
+    ("ask", "message"),
     [
         (lambda: Cut([(0, 0)]), "path"),
         (lambda: Cut([(0, 0), (0, 0)]), "path"),
@@ -139,6 +139,6 @@ def test_a_recording_goes_on_through_its_mishaps():
         (lambda: Mishap(-1.0), "time"),
     ],
 )
-def test_what_cannot_be_is_refused(ask, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_input_is_refused(ask, message):
+    with pytest.raises(ValueError, match=message):
         ask()

@@ -1,4 +1,4 @@
-"""A long simulated recording of gestures: where loads are is where the skin changes, and nowhere else."""
+"""A long simulated recording of gestures: the skin changes where loads are, and nowhere else."""
 
 import jax
 import numpy as np
@@ -34,7 +34,7 @@ def test_the_skin_changes_where_it_is_touched(skin):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"key": 0}, "key must be one random key"),
         ({"skin": None}, "skin must be"),
@@ -43,9 +43,9 @@ def test_the_skin_changes_where_it_is_touched(skin):
         ({"pause": -1.0}, "pause must be"),
     ],
 )
-def test_what_cannot_be_is_said(skin, change, said):
+def test_bad_arguments(skin, change, message):
     given = {"key": KEY, "skin": skin, "people": [Person.draw(KEY)], "number": 2, "pause": 1.0} | change
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         simulate_gesture_stream(
             given["key"], given["skin"], SHEET, given["people"], given["number"], pause=given["pause"]
         )

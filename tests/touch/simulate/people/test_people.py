@@ -1,4 +1,6 @@
-"""People who touch: each in a way of their own, as Table I has it; sets of what the skin reads, made and kept."""
+"""Simulated people who touch: each with personal traits, as in Table I. Sets of the skin's readings, generated and
+saved.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -32,7 +34,7 @@ def skin(own=STILL):
 
 @cache
 def still_skin():
-    """One for all that do not change it."""
+    """One skin for all tests that do not change it."""
     return skin()
 
 
@@ -41,7 +43,7 @@ def motions(gesture, number=40):
     return [one.touch(key, gesture, SHEET) for one, key in zip(people, jax.random.split(KEY, number), strict=True)]
 
 
-def test_people_are_log_normal_about_a_gesture():
+def test_people_are_log_normally_distributed_about_a_gesture():
     medians = np.stack([Person.draw(key).medians for key in jax.random.split(KEY, 500)])
     for row, name in enumerate(GESTURES):
         own = MANNERS[name]
@@ -59,8 +61,8 @@ def test_one_person_varies_less_than_many():
     assert np.std(np.log(own)) < np.std(np.log(many))
 
 
-def test_gestures_are_as_the_table_says():
-    """Low and high loads, small and large contacts, short and long, still and displaced."""
+def test_gestures_agree_with_the_table():
+    """Low and high loads, small and large contacts, short and long, still and moving."""
     found = {}
     for name in GESTURES:
         rows = []
@@ -102,7 +104,7 @@ def test_the_same_key_is_the_same_touch():
 
 
 def test_recordings_together_are_those_of_each():
-    """Without noise and drift, which have keys of their own."""
+    """Without noise and drift, which have their own keys."""
     still = still_skin()
     seconds = np.arange(6) / 60
     press = MovingPress(DiscIndenter(0.03), [0, 1, 2, 2, 1, 0], (0.05, 0.02))
@@ -114,7 +116,7 @@ def test_recordings_together_are_those_of_each():
     assert still.record_each(KEY, []) == []
 
 
-def test_a_set_is_made_and_kept(tmp_path):
+def test_a_set_is_generated_and_saved(tmp_path):
     people = [Person.draw(key) for key in jax.random.split(KEY, 2)]
     noisy = skin(material("conductive fabric"))
     made = simulate_gestures(KEY, noisy, SHEET, people, 1, gestures=("tap", "slap"))
@@ -134,7 +136,7 @@ def test_a_set_is_made_and_kept(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("action", "said"),
+    ("action", "message"),
     [
         (lambda: Person.draw(0), "key must be one random key"),
         (lambda: Person(np.zeros((6, 4))), "medians have shape"),
@@ -154,6 +156,6 @@ def test_a_set_is_made_and_kept(tmp_path):
         (lambda: still_skin().record_each(KEY, [1]), r"recordings\[0\]"),
     ],
 )
-def test_what_cannot_be_is_said(action, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_arguments(action, message):
+    with pytest.raises(ValueError, match=message):
         action()

@@ -1,11 +1,10 @@
-"""Arrays of microphones drawn at random, that nobody tuned anything for, and what they hear: in NumPy, with none of
-jeit's decay models.
+"""Random arrays of microphones and the sound that they receive, computed in NumPy without jeit's decay models.
 
-A rectangular layer with a source on it sounds at many microphones beneath it. Sound takes the straight path and those
-of images behind the edges, each with its own reflection; along a path of length ρ its amplitude falls as a power of ρ,
-or as a body's near by and a sheet's far off, and as exp(−α(f) ρ), α growing with frequency; paths add with their
-phases. Then what no model of distances knows: coupling that differs from place to place, leaks between channels, gains,
-noise, taps that are not quite where they are said to be, dead microphones.
+A source on a rectangular layer is received by microphones beneath it. Sound takes the straight path and those of images
+in the edges, each with its own reflection. Along a path of length ρ its amplitude falls as a power of ρ, or as in a
+body nearby and as in a sheet at a distance, and as exp(−α(f) ρ), with α growing with frequency. Paths add with their
+phases. Effects that do not depend on distance are added: coupling that differs from place to place, leaks between
+channels, gains, noise, taps that are slightly displaced from their stated places, and dead microphones.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 RATE, SAMPLES = 2500.0, 500
-# When a burst begins and how long it is, in seconds of its 0.2; what is before and after is silence.
+# Start and length of a burst, in seconds of its 0.2. The rest is silence.
 ONSET, BURST = 0.06, 0.06
 SILENT = 5
 _LOW, _HIGH, _NOMINAL = 60.0, 900.0, 200.0
@@ -25,15 +24,19 @@ _LOW, _HIGH, _NOMINAL = 60.0, 900.0, 200.0
 
 @dataclass(frozen=True)
 class Ranges:
-    """Between which values each is drawn, uniformly, or evenly in the logarithm where both ends are positive and far
-    apart (`side`, `attenuation`, `speed`). Metres, hertz, decibels."""
+    """Intervals of the random parameters.
+
+    Each is drawn uniformly, or uniformly in the logarithm where both ends are positive and far apart (`side`,
+    `attenuation`, `speed`). Metres, hertz, decibels.
+    """
 
     side: tuple[float, float] = (0.08, 0.4)
     aspect: tuple[float, float] = (0.4, 1.0)
     microphones: tuple[int, int] = (6, 36)
     depth: tuple[float, float] = (0.001, 0.012)
-    # Of intensity: at which length it falls by e, at 200 Hz; how often it does not; by which power of the distance it
-    # spreads; how often near by as in a body and far off as in a sheet instead.
+    # Of intensity: the length at which it decays by a factor e, at 200 Hz, the probability that it does not, the power
+    # of the distance with which it spreads, and the probability that it spreads as in a body nearby and as in a sheet
+    # at a distance instead.
     attenuation: tuple[float, float] = (0.02, 0.3)
     lossless: float = 0.15
     frequency_exponent: tuple[float, float] = (0.0, 1.5)
@@ -53,7 +56,7 @@ class Ranges:
     dead: float = 0.15
 
 
-# What jeit's defaults were chosen on, and what they were judged on once: other numbers, other spans.
+# The ranges for the choice of jeit's defaults, and those for their single evaluation: other numbers, other intervals.
 DEVELOPMENT = Ranges(
     side=(0.12, 0.3),
     aspect=(0.6, 1.0),
@@ -79,13 +82,13 @@ REPORTED = Ranges()
 
 
 @dataclass(frozen=True)
-class HeardArray:
-    """What is known of an array, and what it hears.
+class SimulatedArray:
+    """The description of an array, and the sound that it receives.
 
-    `microphones` (M, 2), corners of its `outline` (4, 2), `places` (T, 2) at which taps are said to be, metres; their
-    sound, `taps` (T, M, S); where touches are, `touches` (N, 2), and their `sound` one after the other and `SILENT`
-    stretches as long of nothing, (M, (N + SILENT) S), at `RATE`. `sampled`: whether it is handed over as samples, or as
-    `intensity` of each burst above the floor. `law`: how sound falls off, in words.
+    `microphones` (M, 2), corners of its `outline` (4, 2), stated `places` (T, 2) of the taps, metres, and the sound of
+    the taps, `taps` (T, M, S). True places of the touches, `touches` (N, 2), and their `sound` one after the other with
+    `SILENT` silent intervals of the same length, (M, (N + SILENT) S), at `RATE`. `sampled`: whether the data are
+    samples or the `intensity` of each burst above the floor. `law`: the decay of sound, as text.
     """
 
     microphones: Float[np.ndarray, "M 2"]
@@ -98,19 +101,19 @@ class HeardArray:
     law: str
 
     def intensity(self, sound: Float[np.ndarray, "N M S"]) -> tuple[Float[np.ndarray, "N M"], Float[np.ndarray, " M"]]:
-        """Mean squares of each burst above the floor, and that floor, which is heard before the bursts of the taps."""
+        """Mean squares of each burst above the floor, and that floor, from the silence before the taps' bursts."""
         quiet, loud = round(ONSET * RATE), round((ONSET + BURST) * RATE)
         floor = (self.taps[:, :, : quiet - 10] ** 2).mean(axis=(0, 2))
         return (sound[:, :, quiet:loud] ** 2).mean(axis=2) - floor, floor
 
     @property
     def stretches(self) -> Float[np.ndarray, "L M S"]:
-        """The touches' sound, one by one, and the silence."""
+        """The sound of the touches, one by one, and the silence."""
         return self.sound.reshape(len(self.microphones), -1, SAMPLES).swapaxes(0, 1)
 
 
-def draw_array(ranges: Ranges, seed: int, *, touches: int = 40) -> HeardArray:
-    """The array that `seed` draws from `ranges`; the same seed, the same array."""
+def draw_array(ranges: Ranges, seed: int, *, touches: int = 40) -> SimulatedArray:
+    """The array drawn from `ranges` with `seed`, reproducibly."""
     rng = np.random.default_rng(seed)
     layer = _Layer.drawn(ranges, rng)
     count = len(layer.microphones)
@@ -125,27 +128,30 @@ def draw_array(ranges: Ranges, seed: int, *, touches: int = 40) -> HeardArray:
     off = rng.uniform(*ranges.misplaced) * rng.normal(size=places.shape)
     edge = 0.499 * layer.size
     spread = rng.uniform(*ranges.strength)
-    heard = layer.listen(np.clip(places + off, -edge, edge), np.exp(spread * rng.normal(size=len(places))), rng)
+    tap_sound = layer.listen(np.clip(places + off, -edge, edge), np.exp(spread * rng.normal(size=len(places))), rng)
     where = 0.9 * layer.size * (rng.random((touches, 2)) - 0.5)
     touched = layer.listen(where, np.exp(spread * rng.normal(size=touches)), rng)
     touched = np.concatenate([touched, np.zeros((SILENT, *touched.shape[1:]))])
-    # So loud, at the microphone that hears a tap best, is the mean tap above the noise.
-    loudest = (heard[:, :, round(ONSET * RATE) :] ** 2).mean(axis=2).max(axis=1).mean() * (SAMPLES / RATE) / BURST
+    # Level of the mean tap above the noise, at the microphone that receives it best.
+    loudest = (tap_sound[:, :, round(ONSET * RATE) :] ** 2).mean(axis=2).max(axis=1).mean() * (SAMPLES / RATE) / BURST
     level = loudest * 10 ** (-rng.uniform(*ranges.signal_to_noise) / 10)
     noise = np.sqrt(level * 10 ** (0.1 * rng.normal(size=count)))
     dead = np.flatnonzero(rng.random(count) < (ranges.dead / 3 if rng.random() < 3 * ranges.dead else 0.0))[: count - 5]
-    for sound in (heard, touched):
+    for sound in (tap_sound, touched):
         sound += noise[:, None] * rng.normal(size=sound.shape)
         sound[:, dead] = 0.0
     corners = 0.5 * layer.size * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     sampled = bool(rng.random() < 0.5)
     joined = touched.swapaxes(0, 1).reshape(count, -1)
-    return HeardArray(layer.microphones, corners, places, heard, where, joined, sampled, layer.law)
+    return SimulatedArray(layer.microphones, corners, places, tap_sound, where, joined, sampled, layer.law)
 
 
-def steep_array(length: float, seed: int = 0, **changed: Any) -> HeardArray:
-    """25 microphones under 200 × 200 mm in which intensity falls as exp(−r / `length`) beside its spreading, with edges
-    that reflect: what a / (r² + b) alone does not follow."""
+def steep_array(length: float, seed: int = 0, **changed: Any) -> SimulatedArray:
+    """25 microphones under 200 × 200 mm in which intensity falls as exp(−r / `length`) beside its spreading, with
+    reflecting edges.
+
+    a / (r² + b) alone does not describe it.
+    """
     steep = {"side": (0.2, 0.2), "aspect": (1.0, 1.0), "microphones": (25, 25), "attenuation": (length, length)}
     plain = {
         "lossless": 0.0,
@@ -168,14 +174,14 @@ class _Layer:
     depth: np.ndarray
     gain: np.ndarray
     leak: np.ndarray
-    loss: np.ndarray  # (F,) nepers of amplitude a metre
-    power: float  # of the distance; NaN: near by a body's, far off a sheet's
+    loss: np.ndarray  # (F,) nepers of amplitude per metre
+    power: float  # of the distance; NaN: a body's nearby, a sheet's at a distance
     thickness: float
     speed: float
     reflection: np.ndarray  # (2, 2): of the lower and upper edge along each axis
     frequencies: np.ndarray
     colour: np.ndarray  # (F,) amplitude of the source
-    waves: np.ndarray  # (W, M, 3): wave numbers and phase of what differs from place to place
+    waves: np.ndarray  # (W, M, 3): wave numbers and phase of the variation between places
     uneven: float
     law: str
 
@@ -202,11 +208,11 @@ class _Layer:
         law = f"{falls}, {1e3 * length:.0f} mm at 200 Hz, f^{exponent:.1f}"
         thickness, speed = rng.uniform(0.005, 0.02), np.exp(rng.uniform(*np.log(ranges.speed)))
         reflection, uneven = rng.uniform(*ranges.reflection, (2, 2)), rng.uniform(*ranges.uneven)
-        told = (loss, power, thickness, speed, reflection, frequencies[band], colour[band], waves, uneven, law)
-        return cls(size, microphones, depth, gain, leak, loss[band], *told[1:])
+        drawn_values = (loss, power, thickness, speed, reflection, frequencies[band], colour[band], waves, uneven, law)
+        return cls(size, microphones, depth, gain, leak, loss[band], *drawn_values[1:])
 
     def listen(self, places: np.ndarray, strengths: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """What a burst at each of `places` (N, 2) sounds like at the microphones, (N, M, SAMPLES), without noise."""
+        """Sound of a burst at each of `places` (N, 2) at the microphones, (N, M, SAMPLES), without noise."""
         result = np.empty((len(places), len(self.microphones), SAMPLES))
         times = np.arange(SAMPLES) / RATE - ONSET
         envelope = np.where((times >= 0) & (times <= BURST), np.sin(np.pi * np.clip(times / BURST, 0, 1)), 0.0)
@@ -234,7 +240,7 @@ class _Layer:
         return (self.gain * coupling)[:, None] * total
 
     def _images(self, axis: int, coordinate: float) -> tuple[np.ndarray, np.ndarray]:
-        """Of a coordinate behind the two edges of an axis, two deep, and how much of it each returns."""
+        """Images of a coordinate in the two edges of an axis, two orders, and the fraction that each returns."""
         side, (low, high) = self.size[axis], self.reflection[axis]
         images = [coordinate, -side - coordinate, side - coordinate, coordinate - 2 * side, coordinate + 2 * side]
         return np.array(images), np.array([1.0, low, high, low * high, low * high])
@@ -246,8 +252,7 @@ class _Layer:
 
 
 def _arranged(size: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Microphones in a grid, a grid that is none too exact, anywhere but not too near each other, or along the rim with
-    some in the middle."""
+    """Microphones in a grid, an irregular grid, at random with a least distance, or along the edge and inside."""
     way = rng.integers(4)
     if way < 2:
         columns = max(2, round(np.sqrt(count * size[0] / size[1])))
