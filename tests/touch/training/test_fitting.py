@@ -117,7 +117,8 @@ def test_killed_at_any_moment(tmp_path, trained):
         f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "from test_fitting import KEY, OBJECTIVE, PLAN, fit_network, network, rows\n"
         "def show(report):\n    print(report, flush=True)\n"
-        "fit_network(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY, checkpoint=sys.argv[1], progress=show)\n",
+        "fit_network(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY,\n"
+        "            checkpoint=sys.argv[1], progress=show)\n",
         "utf-8",
     )
     command = [sys.executable, str(script), str(tmp_path / "killed")]
