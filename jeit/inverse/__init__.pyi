@@ -7,8 +7,9 @@ from .linear.one_step import back_projection, one_step
 from .nonlinear.parametrisation import Parametrisation
 from .nonlinear.reconstruct import reconstruct
 from .placement import Uncertainty, place_electrodes
+from .prior.bases import DenseBasis
 from .prior.matern import Matern
-from .prior.priors import Gaussian, Laplace, Noser, Tikhonov
+from .prior.priors import AbstractPrior, Gaussian, Laplace, Noser, Tikhonov
 from .prior.total_variation import TotalVariation
 from .streaming.imager import Imager
 from .streaming.stream import stream
@@ -16,6 +17,8 @@ from .uncertainty import posterior
 
 __all__ = [
     "RULES",
+    "AbstractPrior",
+    "DenseBasis",
     "Gaussian",
     "Imager",
     "Laplace",
