@@ -35,6 +35,11 @@ def on_config(config):
     return config
 
 
+def on_page_markdown(markdown, page, config, files):
+    """Take out the style sheet that mkdocs-jupyter leaves at the end of a notebook, which would be shown as text."""
+    return re.sub(r"^ *<style>\s*\[.*?</style>", "", markdown, flags=re.DOTALL | re.MULTILINE)
+
+
 def on_page_content(html, page, config, files):
     """Begin a tutorial with a link that downloads its notebook, which stands beside the page."""
     name = page.file.src_uri.rpartition("/")[2]
