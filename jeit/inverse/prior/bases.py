@@ -111,8 +111,10 @@ class DenseBasis(AbstractBasis):
 
     **Example:**
 
-        basis = DenseBasis(np.linalg.cholesky(np.eye(40)))
-        image = basis.expand(np.ones(40))
+    ```python
+    basis = DenseBasis(np.linalg.cholesky(np.eye(40)))
+    image = basis.expand(np.ones(40))
+    ```
     """
 
     shapes: Float[Array, "m n"]
