@@ -37,7 +37,7 @@ def examples() -> list[Path]:
 
 
 @cache
-def _code() -> str:
+def code() -> str:
     """A digest of everything beneath the examples."""
     digest = hashlib.sha256(" ".join(f"{name} {metadata.version(name)}" for name in _BENEATH).encode())
     for top in (ROOT / "jeit", ROOT / "solvers"):
@@ -48,7 +48,7 @@ def _code() -> str:
 
 def picture(example: Path) -> Path:
     """Where the picture of an example is kept, whether it is there or not."""
-    digest = hashlib.sha256(_code().encode() + example.read_bytes()).hexdigest()
+    digest = hashlib.sha256(code().encode() + example.read_bytes()).hexdigest()
     return CACHE / f"{example.stem}-{digest[:16]}.png"
 
 

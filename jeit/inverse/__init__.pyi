@@ -25,7 +25,7 @@ from .nonlinear.parametrisation import (
 from .nonlinear.reconstruct import Reconstruction, reconstruct
 from .nonlinear.solvers import LBFGSB, GaussNewton, LevenbergMarquardt, OneStep, ProjectedGradient
 from .placement import ModelError, Placement, Uncertainty, place_electrodes
-from .prior.bases import pixels
+from .prior.bases import DenseBasis, pixels
 from .prior.matern import Matern
 from .prior.priors import AbstractPrior, Gaussian, Laplace, Noser, Tikhonov
 from .prior.total_variation import TotalVariation
@@ -53,6 +53,7 @@ __all__ = [
     "Calibration",
     "Choice",
     "ContactImpedance",
+    "DenseBasis",
     "ElectrodePosition",
     "Ellipsoid",
     "EllipsoidPrior",

@@ -102,8 +102,19 @@ class DiagonalBasis(AbstractBasis):
 class DenseBasis(AbstractBasis):
     """Basis whose shapes are the columns of a dense matrix, S = `shapes` (m, n).
 
-    Products are computed in the precision of `shapes`, which may be single. `left_out` (m,): prior variance of the
-    cells that the shapes do not represent, or None.
+    Products are computed in the precision of `shapes`, which may be single.
+
+    **Arguments:**
+
+    - `shapes`: (m, n), a shape in each column, in the unit of the image.
+    - `left_out`: (m,), prior variance of the cells that the shapes do not represent, or None.
+
+    **Example:**
+
+    ```python
+    basis = DenseBasis(np.linalg.cholesky(np.eye(40)))
+    image = basis.expand(np.ones(40))
+    ```
     """
 
     shapes: Float[Array, "m n"]
