@@ -15,7 +15,7 @@ from jeit.protocol import two_terminal
 from jeit.touch import (
     CellFinder,
     Cut,
-    Mishap,
+    DamageEvent,
     MovingPress,
     PressedSkin,
     SkinHealth,
@@ -24,7 +24,7 @@ from jeit.touch import (
     material,
     mend_cut,
     plot_health,
-    record_mishaps,
+    record_damage,
     watch,
 )
 
@@ -47,17 +47,17 @@ def main() -> float:
     values, glue = mend_cut(fine.mesh, whole.conductivity, cut, whole.material, 0.95)
     glued = eqx.tree_at(lambda one: (one.conductivity, one.material), whole, (values, glue))
 
-    def simulate(key: int, last: float, events: list[Mishap]) -> tuple[np.ndarray, np.ndarray]:
+    def simulate(key: int, last: float, events: list[DamageEvent]) -> tuple[np.ndarray, np.ndarray]:
         """Simulate a touch of 1.6 s every six seconds."""
         seconds = np.arange(0, last, 1 / RATE)
         places = np.random.default_rng(key).uniform(-0.08, 0.08, (int(last / 6) + 1, 2))
         load = np.interp(seconds % 6, [2, 2.4, 3.2, 3.6], [0, 5, 5, 0])
         press = MovingPress(ball_indenter(0.02), load, places[(seconds / 6).astype(int)])
-        return seconds, record_mishaps(jax.random.key(key), whole, press, seconds, events)
+        return seconds, record_damage(jax.random.key(key), whole, press, seconds, events)
 
     seconds, frames = simulate(1, 60.0, [])
     health = SkinHealth.fit(frames, seconds, model=coarse, conductivity=0.01, sign=-1, patience=20.0)
-    seconds, frames = simulate(2, 120.0, [Mishap(CUT_AT, torn), Mishap(MENDED_AT, glued)])
+    seconds, frames = simulate(2, 120.0, [DamageEvent(CUT_AT, torn), DamageEvent(MENDED_AT, glued)])
     before = watch(health, frames[seconds < MENDED_AT], seconds[seconds < MENDED_AT])
     after = watch(before, frames[seconds >= MENDED_AT], seconds[seconds >= MENDED_AT])
     for event in after.events:

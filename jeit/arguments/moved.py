@@ -59,6 +59,7 @@ _SOUNDS = {
     "wind": "simulate_wind",
 }
 _MARKS = {"Marks": "MapMarks", "plot_pairs": "plot_position_errors"}
+_DAMAGE = {"mended": "mend_cut", "Mishap": "DamageEvent", "record_mishaps": "record_damage"}
 _TRAINING = {"Objective": "TrainingObjective", "Plan": "TrainingPlan", "fit": "fit_network"}
 # For each package, the room whose names its renamed names are now, and the new name for each old one.
 _RENAMED = (
@@ -76,7 +77,7 @@ _RENAMED = (
     ("jeit.touch.networks", "jeit.touch", {"Preset": "NetworkPreset"}),
     ("jeit.touch.simulate", "jeit.touch", _INDENTERS),
     ("jeit.touch.simulate.contact", "jeit.touch", _INDENTERS),
-    ("jeit.touch.simulate.damage", "jeit.touch", {"mended": "mend_cut"}),
+    ("jeit.touch.simulate.damage", "jeit.touch", _DAMAGE),
     ("jeit.touch.training", "jeit.touch", _TRAINING),
     ("jeit.touch.training", "jeit.touch.training", {"Trained": "TrainingResult"}),
 )

@@ -20,7 +20,7 @@ from jeit.cli.options import (
     naming_options,
     remembering_files,
     remove_empty_folders,
-    telling_when_stopped,
+    reporting_when_stopped,
 )
 from jeit.start import discarded_damaged, quick_compilation
 
@@ -124,7 +124,7 @@ def _name_options(command) -> None:
     if command.callback is not None and options:
         command.callback = remembering_files(naming_options(options)(command.callback))
     if command.callback is not None:
-        command.callback = telling_when_stopped(command.callback)
+        command.callback = reporting_when_stopped(command.callback)
 
 
 def _explain(error: Exception) -> int:

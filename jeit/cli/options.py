@@ -96,7 +96,7 @@ class StoppedError(Exception):
     """Error raised when Ctrl-C stops a command, with the message to print."""
 
 
-def telling_when_stopped(command: Callable[..., Any]) -> Callable[..., Any]:
+def reporting_when_stopped(command: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap a command so that Ctrl-C raises `StoppedError`, since typer does not report `KeyboardInterrupt`."""
 
     @wraps(command)

@@ -137,7 +137,7 @@ _MAX_MESSAGE = 120
 _MEMORY_FACTORS = {".stl": 8, ".obj": 16}
 
 
-def read_loose(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
+def read_leniently(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Read points (n, 3) and triangles (m, 3) from an .stl or .obj file, in the file's unit, merging coincident points.
 
     Polygons are divided into triangles that share the polygon's first corner; degenerate triangles are removed. Raises

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from jeit.files import check_memory
 from jeit.files.limits import most_bytes
 from jeit.mesh import topology
-from jeit.mesh.cell_quality import read_loose
+from jeit.mesh.cell_quality import read_leniently
 from jeit.mesh.mesh import Mesh
 
 if TYPE_CHECKING:
@@ -241,7 +241,7 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
         raise ValueError(f"path: {path.name[:80]} does not work as a mesh file: it is empty.")
     kind = None if trusted else check_foreign(path)
     if path.suffix.lower() in _UNCONNECTED:
-        points, cells = read_loose(path, path.name[:80])
+        points, cells = read_leniently(path, path.name[:80])
         return _create_mesh(points * float(scale), cells, {})
     with bounded_inflation(path) if kind == "vtu" else nullcontext():
         content = _call_meshio(path, lambda meshio: meshio.read(path, file_format=kind))

@@ -73,7 +73,7 @@ from .simulate import (
     simulate_gestures,
     simulate_presses,
 )
-from .simulate.damage import Cut, ElectrodeFault, Mishap, draw_cut, mend_cut, record_mishaps
+from .simulate.damage import Cut, DamageEvent, ElectrodeFault, draw_cut, mend_cut, record_damage
 from .training import TrainingObjective, TrainingPlan, fit_network
 
 __all__ = [
@@ -82,6 +82,7 @@ __all__ = [
     "Contact",
     "ContactTracker",
     "Cut",
+    "DamageEvent",
     "DepthMapIndenter",
     "DiscIndenter",
     "ElectrodeFault",
@@ -102,7 +103,6 @@ __all__ = [
     "LogitBoostClassifier",
     "MapSchedule",
     "Material",
-    "Mishap",
     "MovingPress",
     "NamedTouch",
     "NetworkPreset",
@@ -163,7 +163,7 @@ __all__ = [
     "read_network",
     "read_presses",
     "read_skin",
-    "record_mishaps",
+    "record_damage",
     "relative_changes",
     "resting_frame",
     "simulate_gesture_stream",

@@ -237,7 +237,7 @@ def test_a_microphone_whose_response_does_not_depend_on_distance_is_reported(exa
     values = exact[0]
     fit = calibrated(with_one(exact, 12, np.full(NUMBER, 0.7)))
     assert not fit.calibration.usable[12]
-    assert fit.calibration.reasons[12] == "what it hears does not fall with distance"
+    assert fit.calibration.reasons[12] == "its intensity does not fall with distance"
     good = np.arange(COUNT) != 12
     assert fit.calibration.usable[good].all()
     expected = scaled("inverse-square", values, good)[0]

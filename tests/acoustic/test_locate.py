@@ -293,7 +293,7 @@ def test_dead_microphones(dead, microphone_array):
 
 def test_an_uncalibrated_microphone_is_not_used(microphone_array, touches):
     usable = np.arange(9) != 3
-    reasons = tuple("" if good else "what it hears does not fall with distance" for good in usable)
+    reasons = tuple("" if good else "its intensity does not fall with distance" for good in usable)
     power = touches[1].copy()
     power[:, 3] = 1e6
     power[0, 3] = np.nan
@@ -301,7 +301,7 @@ def test_an_uncalibrated_microphone_is_not_used(microphone_array, touches):
     assert not found.used[:, 3].any()
     assert found.used[:, usable].all()
     assert found.faults[3] == (
-        "NaN or infinite in 1 of 64 windows; not calibrated: what it hears does not fall with distance"
+        "NaN or infinite in 1 of 64 windows; not calibrated: its intensity does not fall with distance"
     )
     assert np.median(np.linalg.norm(found.position - touches[0], axis=1)) < 0.003
     assert coverage(found, touches[0]) > 0.85

@@ -141,7 +141,7 @@ def test_a_receptive_field_is_intensity_over_strength_against_distance(ax):
 
 
 def test_left_out_taps_are_red_and_unusable_microphones_have_a_reason(ax):
-    fit = fitted(reasons={2: "what it hears does not fall with distance", 4: DEAD}, outliers=[3, 7])
+    fit = fitted(reasons={2: "its intensity does not fall with distance", 4: DEAD}, outliers=[3, 7])
     plot_receptive_fields(fit, ax=ax)
     panel = ax.child_axes[0]
     taps, out = panel.collections
@@ -149,7 +149,7 @@ def test_left_out_taps_are_red_and_unusable_microphones_have_a_reason(ax):
     assert len(out.get_offsets()) == 2
     assert to_hex(out.get_edgecolor()[0]) == FOUND
     assert "left out" in named(ax)
-    assert ax.child_axes[2].texts[1].get_text().replace("\n", " ") == "what it hears does not fall with distance"
+    assert ax.child_axes[2].texts[1].get_text().replace("\n", " ") == "its intensity does not fall with distance"
     dead = ax.child_axes[4]
     assert dead.texts[1].get_text() == DEAD
     assert not dead.collections[0].get_offsets().size

@@ -71,10 +71,10 @@ def test_probabilities_are_limited_by_the_number_of_clips(folder):
     label."""
     listener = Listener.read(folder / "model")
     assert listener.doubt == pytest.approx(1 / 12)
-    labels = listener.hear(read_recording(folder / "one.wav"))
+    labels = listener.classify(read_recording(folder / "one.wav"))
     assert labels.probabilities.max() <= 1 - 1 / 24 + 1e-9
     np.testing.assert_allclose(labels.probabilities.sum(axis=1), 1)
-    hush = listener.hear(Recording(1e-9 * np.random.default_rng(0).normal(size=(1, RATE)), RATE))
+    hush = listener.classify(Recording(1e-9 * np.random.default_rng(0).normal(size=(1, RATE)), RATE))
     assert hush.whole == ("", 0.0)
 
 
@@ -124,14 +124,14 @@ def test_a_recording_is_classified(folder, tmp_path, capsys):
     assert "as a whole low" in printed
     with open(tmp_path / "events.csv", encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ["time_s", "heard", "probability", "p_high", "p_low", "microphone"]
+    assert list(rows[0]) == ["time_s", "sound", "probability", "p_high", "p_low", "microphone"]
     assert float(rows[0]["p_high"]) + float(rows[0]["p_low"]) == pytest.approx(1, abs=1e-5)
     report = json.loads((tmp_path / "report.json").read_text("utf-8"))
-    assert report["whole"]["heard"] == "low"
+    assert report["whole"]["sound"] == "low"
     assert len(rows) == report["windows"]
     assert (tmp_path / "timeline.png").stat().st_size > 5_000
-    labels = Listener.read(model).hear(read_recording(folder / "one.wav"))
-    assert [row["heard"] for row in rows] == labels.named.tolist()
+    labels = Listener.read(model).classify(read_recording(folder / "one.wav"))
+    assert [row["sound"] for row in rows] == labels.named.tolist()
 
 
 def test_folders_within_a_class_are_held_out_together(folder, tmp_path):
@@ -172,7 +172,7 @@ def test_sounds_are_located_with_a_calibration(tmp_path):
     with open(tmp_path / "out" / "events.csv", encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["x_m"]]
     assert len(rows) >= 2
-    assert {row["heard"] for row in rows} == {"pat"}
+    assert {row["sound"] for row in rows} == {"pat"}
     found = np.array([[float(row["x_m"]), float(row["y_m"])] for row in rows])
     assert np.abs(found - [-0.03, 0.04]).max() < 0.01
 
@@ -279,10 +279,10 @@ def test_unusual_recordings_are_classified(folder, tmp_path, capsys):
         report = json.loads((tmp_path / name / "report.json").read_text("utf-8"))
         assert report["windows"] >= 1
         if name in ("silent", "nothing"):
-            assert report["whole"]["heard"] is None
+            assert report["whole"]["sound"] is None
             assert report["windows_of_each"] == {"quiet": report["windows"]}
         if name in ("holed", "stereo"):
-            assert report["whole"]["heard"] == "low"
+            assert report["whole"]["sound"] == "low"
             assert report["notes"]
     capsys.readouterr()
     wavfile.write(tmp_path / "fast.wav", 48_000, np.repeat(loud, 3).astype(np.float32))

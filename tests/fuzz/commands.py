@@ -78,10 +78,10 @@ def _nine_microphones(folder: Path) -> None:
 
     A compiled program searches for changes since the calibration, and is seldom needed here.
     """
-    from microphone_arrays import array, hear
+    from microphone_arrays import array, received_power
 
     READERS["calibration"].make(folder)
-    rng, strength = np.random.default_rng(0), np.sqrt(hear(array(9), [[0.02, 0.01]])[0])
+    rng, strength = np.random.default_rng(0), np.sqrt(received_power(array(9), [[0.02, 0.01]])[0])
     samples = 1e-3 * rng.normal(size=(8000, 9))
     samples[3000:3400] += 0.05 * rng.normal(size=(400, 1)) * strength / strength.max()
     scipy.io.wavfile.write(folder / "a.wav", 8000, samples.astype("f4"))

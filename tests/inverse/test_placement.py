@@ -11,7 +11,7 @@ from jeit.data.imageable import rounding_of_difference
 from jeit.electrodes import FaceDiscs, FacePatches, NodeElectrodes, SheetDiscs
 from jeit.electrodes.face_patches import body_mesh
 from jeit.forward.changes import PlacementSensitivity, shift_electrodes
-from jeit.imaging import preparation
+from jeit.imaging import calibration
 from jeit.imaging.preparation import prepare_difference
 from jeit.inverse import relative_noise
 from jeit.inverse.placement import ModelError, Uncertainty, _PlacementProblem, place_electrodes
@@ -104,7 +104,7 @@ def test_the_background_is_fitted_to_channels_far_from_the_drives(tank):
 def test_positions_that_increase_the_relative_misfit_are_rejected(tank, monkeypatch):
     """Even if they explain the small voltages."""
     _, voltages = tank
-    monkeypatch.setattr(preparation, "_WORSE", 1e-3)
+    monkeypatch.setattr(calibration, "_WORSE", 1e-3)
     prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=1500)
     assert prepared.calibration.shift is None
     assert prepared.calibration.model_error is not None

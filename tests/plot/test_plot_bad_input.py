@@ -36,8 +36,8 @@ SKIN = Rectangle(0.2, 0.2)
         (lambda: plot_raster(MAP, (0, 1, 0, 1), mesh=SKIN), "mesh must be a Mesh, .*; it is a Rectangle"),
         (lambda: plot_mesh(Disk(0.05)), "mesh must be a Mesh, .*; it is a Disk"),
         (lambda: ColourScale(limit="x"), "limit must be finite.*; it is 'x'"),
-        (lambda: plot_loss_map(MAP, SKIN, marks=(0.1, 0.1)), "marks must be Marks, such as .*; it is a tuple"),
-        (lambda: plot_loss_map(MAP, SKIN, marks=np.zeros(2)), "marks must be Marks"),
+        (lambda: plot_loss_map(MAP, SKIN, marks=(0.1, 0.1)), "marks must be MapMarks, such as .*; it is a tuple"),
+        (lambda: plot_loss_map(MAP, SKIN, marks=np.zeros(2)), "marks must be MapMarks"),
         (lambda: plot_loss_map(MAP, SKIN, method="liklihood"), r"did you mean 'likelihood'\?"),
         (lambda: plot_track(MAP, MAP, SKIN), "track must be a Track"),
         (

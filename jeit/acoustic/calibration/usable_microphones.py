@@ -92,7 +92,7 @@ def _reasons_and_explained(fit: TapFit, faults, explained=None) -> tuple[tuple[s
         spread = np.var(level[k, used])
         share[k] = 1 - np.mean((level - expected)[k, used] ** 2) / spread if spread > 0 else 0.0
         if falls[k] < _LEAST_DECREASE:
-            reasons.append("what it hears does not fall with distance")
+            reasons.append("its intensity does not fall with distance")
         elif used.sum() >= needed and not share[k] >= _LEAST_EXPLAINED:
             reasons.append(f"its model explains {100 * max(share[k], 0):.0f} % of what it received")
         elif received < needed:

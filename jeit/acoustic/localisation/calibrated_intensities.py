@@ -81,8 +81,10 @@ def _with_floor_of_silence(recorded: Intensities, quiet: Intensities) -> Intensi
             f"silence '{quiet.name}' is {ratio:.3g} times as loud as the quietest windows of '{recorded.name}': record "
             "the array untouched, at the same gain."
         )
-    spoilt = [("" if good else f"in the silence: {fault}") for good, fault in zip(known, quiet.faults, strict=True)]
-    faults = ["; ".join(filter(None, pair)) for pair in zip(recorded.faults, spoilt, strict=True)]
+    silence_faults = [
+        ("" if good else f"in the silence: {fault}") for good, fault in zip(known, quiet.faults, strict=True)
+    ]
+    faults = ["; ".join(filter(None, pair)) for pair in zip(recorded.faults, silence_faults, strict=True)]
     return dataclasses.replace(
         recorded,
         power=recorded.power + recorded.floor - quiet.floor,

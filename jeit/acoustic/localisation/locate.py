@@ -272,7 +272,7 @@ def _setup_notes(
             for one, other in exchanged
         ]
         notes += [
-            f"microphone {one} does not hear as when it was calibrated: without it, one source explains the others. "
+            f"microphone {one} does not measure as when it was calibrated: without it, one source explains the others. "
             "The places are not corrected: make its channel NaN and locate again, or calibrate anew."
             for one in altered
         ]

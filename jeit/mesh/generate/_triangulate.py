@@ -287,14 +287,14 @@ def _insert_circumcentres(front: Front, points: np.ndarray, bad: np.ndarray, ang
     # A segment is encroached upon if a new node lies in the circle whose diameter is the segment.
     near = KDTree(centre).query_ball_point(middle, half * (1 - 1e-9))
     encroached = np.array([len(n) > 0 for n in near])
-    spoilt = np.zeros(len(centre), bool)
+    affected = np.zeros(len(centre), bool)
     for index in np.flatnonzero(encroached):
-        spoilt[near[index]] = True
+        affected[near[index]] = True
     outside = ~within(front.curves, centre)
-    lost = np.flatnonzero(outside & ~spoilt)
+    lost = np.flatnonzero(outside & ~affected)
     if lost.size:
         encroached[KDTree(middle).query(centre[lost])[1]] = True
-    accepted = centre[~spoilt & ~outside]
+    accepted = centre[~affected & ~outside]
     if len(accepted):
         accepted = accepted[clear_of_outline(front, points, accepted, np.zeros(len(accepted)))]
     halved = np.flatnonzero(encroached & divisible)

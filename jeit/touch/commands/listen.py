@@ -50,7 +50,7 @@ def _top(context: typer.Context) -> None:
 
 
 @listen.command("recording", cls=_NamedByGroup, hidden=True)
-def hear(
+def classify_recording(
     recording: Annotated[
         Path,
         typer.Argument(
@@ -102,7 +102,7 @@ def hear(
         if not isinstance(sound, Recording):
             raise ValueError(f"{recording.name}: it holds intensities; sounds can be classified only in samples.")
         step("listen")
-        labels = listener.hear(sound, calibration=known)
+        labels = listener.classify(sound, calibration=known)
         step("write")
         write_sound_labels(labels, output, model=str(model))
     if not quiet:
@@ -223,7 +223,7 @@ def _print_summary(console, result: "SoundLabels") -> None:
     console.print(pairs(result.name, rows))
     console.print()
     placed = result.position is not None
-    names = ("heard", "from / s", "to / s", "sure / %", *(("x / mm", "y / mm") if placed else ()))
+    names = ("sound", "from / s", "to / s", "sure / %", *(("x / mm", "y / mm") if placed else ()))
     table = Table(*names, box=None, padding=(0, 2, 0, 0))
     for column in table.columns[1:]:
         column.justify = "right"

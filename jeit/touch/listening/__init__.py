@@ -1,7 +1,7 @@
 """Classify touches, or any other sounds, from microphone recordings, every 0.1 s.
 
 `read_clips` reads clips from folders, one per class. `Listener.fit` trains a classifier on them: a network, boosted
-trees on hand-made features, or a linear discriminant, whichever is most accurate on held-out clips. `Listener.hear`
+trees on hand-made features, or a linear discriminant, whichever is most accurate on held-out clips. `Listener.classify`
 classifies the windows of a recording. The features are those of `sound_images`, feature images after Park et al.
 (2022), and `sound_features`.
 """

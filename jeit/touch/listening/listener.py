@@ -56,7 +56,7 @@ class Listener:
 
     ```python
     listener = Listener.fit(clips, method="linear")
-    print(listener.hear(recordings[0]).whole)
+    print(listener.classify(recordings[0]).whole)
     ```
     """
 
@@ -98,7 +98,7 @@ class Listener:
         description of the progress. Raises `ValueError` for invalid clips, key or method; `ImportError` without the
         extra `learn`.
         """
-        need_extra("learn", "learning what is heard")
+        need_extra("learn", "learning to classify sounds")
         check_kind("clips", clips, LabelledClips, "clips as of read_clips(folder)")
         check_name("method", method, METHODS)
         key = jax.random.key(0) if key is None else key
@@ -166,7 +166,7 @@ class Listener:
             clips.name,
         )
 
-    def hear(self, recording: Recording, *, calibration: Calibration | None = None) -> SoundLabels:
+    def classify(self, recording: Recording, *, calibration: Calibration | None = None) -> SoundLabels:
         """Classify every window of a recording; windows are 0.5 s long and begin every 0.1 s.
 
         A shorter recording is padded with silence. With a `calibration` of the microphones, places are estimated where

@@ -45,7 +45,7 @@ class SoundLabels:
     **Example:**
 
     ```python
-    sounds = listener.hear(recordings[0])
+    sounds = listener.classify(recordings[0])
     print(isinstance(sounds, SoundLabels), sounds.whole, sounds.events)
     ```
     """

@@ -218,14 +218,14 @@ def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes
 
     **Arguments:**
 
-    - `labels`: the classified recording, as from `Listener.hear`.
+    - `labels`: the classified recording, as from `Listener.classify`.
     - `title`: title of the plot.
     - `ax`: axes to draw into; by default new ones.
 
     **Example:**
 
     ```python
-    ax = plot_sound_labels(listener.hear(recordings[0]))
+    ax = plot_sound_labels(listener.classify(recordings[0]))
     ax.figure.savefig("sounds.png")
     ```
     """

@@ -61,7 +61,7 @@ def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
             "relative_noise": network.noise,
             "share_of_squared_depth_explained": learnt.standing.explained,
             "error_of_a_ball_m": learnt.standing.place,
-            "depth_of_a_ball_told": learnt.standing.deepest,
+            "estimated_depth_of_a_ball": learnt.standing.deepest,
             "trainings": trainings,
             "seconds": learnt.seconds,
             "versions": {package: version_of(package) for package in _PACKAGES},

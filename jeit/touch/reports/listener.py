@@ -42,14 +42,14 @@ def write_listener(listener: Listener, folder: str | Path) -> None:
 def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -> None:
     """Write `events.csv`, `report.json` and the picture `timeline.png` of classified sounds into a folder.
 
-    The table has a line for each window, every 0.1 s: `time_s`, the middle of the window; `heard`, the most probable
+    The table has a line for each window, every 0.1 s: `time_s`, the middle of the window; `sound`, the most probable
     name, empty if the window is quiet; `probability`, the probability of this name, and `p_…`, those of all names;
     `microphone`, the number, from 0, of the loudest microphone; and, if positions were estimated, `x_m`, `y_m` (`z_m`)
     and `std_x_m` …, empty for windows without a position.
 
     **Arguments:**
 
-    - `labels`: the classified recording, as from `Listener.hear`.
+    - `labels`: the classified recording, as from `Listener.classify`.
     - `folder`: the folder, which is created if needed.
     - `model`: name of the listener, for the report.
 
@@ -58,7 +58,7 @@ def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -
     **Example:**
 
     ```python
-    sounds = listener.hear(recordings[0])
+    sounds = listener.classify(recordings[0])
     write_sound_labels(sounds, "out", model="listener")
     ```
     """
@@ -102,7 +102,7 @@ def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
     names, counts = np.unique(labels.named, return_counts=True)
     events = [
         {
-            "heard": one.name or None,
+            "sound": one.name or None,
             "from_s": one.start,
             "to_s": one.end,
             "probability": one.probability if one.name else None,
@@ -117,7 +117,7 @@ def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
             "windows": len(labels),
             "window_s": LENGTH,
             "every_s": EVERY,
-            "whole": {"heard": whole or None, "probability": probability if whole else None},
+            "whole": {"sound": whole or None, "probability": probability if whole else None},
             "windows_of_each": {name or "quiet": count for name, count in zip(names, counts, strict=True)},
             "events": events,
             "notes": list(labels.notes),
@@ -174,7 +174,7 @@ def _table_columns(labels: SoundLabels) -> dict[str, list]:
     """Columns of `events.csv`, by name."""
     columns: dict[str, list] = {
         "time_s": [f"{time:.4f}" for time in labels.times],
-        "heard": labels.named.tolist(),
+        "sound": labels.named.tolist(),
         "probability": _format_numbers(labels.probability),
         **{f"p_{name}": _format_numbers(own) for name, own in zip(labels.names, labels.probabilities.T, strict=True)},
         "microphone": labels.strongest.tolist(),

@@ -15,7 +15,7 @@ from jeit.touch.health import HealthEvent, SkinHealth
 HEALTH_FILES = ("events.csv", "report.json", "health.png")
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
 _EVENTS = (
-    "event", "kind", "status", "time", "told", "frame", "electrode", "channels", "strength", "length_m",
+    "event", "kind", "status", "time", "noticed", "frame", "electrode", "channels", "strength", "length_m",
     "length_deviation_m", "path_m", "reason",
 )  # fmt: skip
 
@@ -55,7 +55,7 @@ def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:
                     "kind": one.kind,
                     "status": one.status,
                     "time": one.time,
-                    "told": one.noticed,
+                    "noticed": one.noticed,
                     "frame": one.frame,
                     "electrode": None if one.electrode is None else one.electrode + 1,
                     "channels": np.flatnonzero(one.channels),

@@ -15,7 +15,7 @@ from jeit.touch import CellFinder, SkinHealth, find_contacts, watch
 from jeit.touch.health import EventKind, EventStatus
 from jeit.touch.plots import plot_health
 from jeit.touch.simulate import DiscIndenter, MovingPress, PressedSkin, material
-from jeit.touch.simulate.damage import Cut, Mishap, record_mishaps
+from jeit.touch.simulate.damage import Cut, DamageEvent, record_damage
 
 CUT = Cut([(-0.005, 0.014), (0.02, 0.024)])
 MATERIAL = material("velostat")
@@ -51,7 +51,7 @@ def press(places, starts, load=2.0, last=1.0) -> MovingPress:
 @pytest.fixture(scope="module")
 def health(skin) -> SkinHealth:
     places = 0.03 * np.array([(np.cos(a), np.sin(a)) for a in np.arange(6)])
-    frames = record_mishaps(jax.random.key(1), skin, press(places, 2.0 + 4.5 * np.arange(6)), SECONDS, [])
+    frames = record_damage(jax.random.key(1), skin, press(places, 2.0 + 4.5 * np.arange(6)), SECONDS, [])
     return SkinHealth.fit(frames, SECONDS, patience=9.0, model=disk_model(700), conductivity=SHEET)
 
 
@@ -59,7 +59,7 @@ def health(skin) -> SkinHealth:
 def after(skin, damaged, health) -> SkinHealth:
     """The cut occurs during a touch."""
     touch = press([(-0.02, -0.02)], PRESSED[:1], last=PRESSED[1] - PRESSED[0])
-    frames = record_mishaps(jax.random.key(2), skin, touch, SECONDS, [Mishap(DAMAGED, damaged)])
+    frames = record_damage(jax.random.key(2), skin, touch, SECONDS, [DamageEvent(DAMAGED, damaged)])
     return watch(health, frames, SECONDS)
 
 

@@ -41,8 +41,8 @@ def test_materials_are_classified_and_listeners_are_saved(method, learnt, tmp_pa
     again = Listener.read(tmp_path)
     others, right = clips(6, seed=1), 0
     for number in range(len(others)):
-        sound_labels = listener.hear(others.clip(number))
-        same = again.hear(others.clip(number))
+        sound_labels = listener.classify(others.clip(number))
+        same = again.classify(others.clip(number))
         np.testing.assert_allclose(same.probabilities, sound_labels.probabilities, rtol=1e-4, atol=1e-7)
         np.testing.assert_allclose(sound_labels.probabilities.sum(axis=1), 1)
         right += sound_labels.whole[0] == others.labels[number]
@@ -78,7 +78,7 @@ def test_the_best_method_on_held_out_clips_is_selected(learnt, tmp_path, monkeyp
     for method, listener in learnt.items():
         assert listener.standing is not None
         assert listener.standing.tried == [(method, tried[method])]
-    sound_labels, same = (one.hear(few.clip(0)) for one in (on, through))
+    sound_labels, same = (one.classify(few.clip(0)) for one in (on, through))
     np.testing.assert_array_equal(sound_labels.probabilities, same.probabilities)
 
 
@@ -89,16 +89,16 @@ def test_silent_windows_are_quiet(learnt):
     long = np.zeros((1, 4 * 44_100))
     for second in (0, 2):
         long[:, second * 44_100 + 22_050 :][:, : tap.samples.shape[1]] += tap.samples
-    sound_labels = learnt["linear"].hear(Recording(long, 44_100.0, name="long"))
+    sound_labels = learnt["linear"].classify(Recording(long, 44_100.0, name="long"))
     assert sound_labels.whole[0] == "metal"
     # At its edges a window contains little of a tap, and may be assigned to another class.
     assert np.mean(sound_labels.named[sound_labels.loud] == "metal") > 0.6
     assert sound_labels.quiet.sum() > 10
     assert [event.name for event in sound_labels.events].count("") >= 2
-    nothing = learnt["linear"].hear(Recording(np.zeros((1, 44_100)), 44_100.0))
+    nothing = learnt["linear"].classify(Recording(np.zeros((1, 44_100)), 44_100.0))
     assert set(nothing.named) == {""}
     assert nothing.whole == ("", 0.0)
-    faint = learnt["linear"].hear(Recording(1e-6 * tap.samples, 44_100.0))
+    faint = learnt["linear"].classify(Recording(1e-6 * tap.samples, 44_100.0))
     assert "quieter than anything" in faint.notes[0]
     assert faint.whole == ("", 0.0)
 
@@ -106,21 +106,21 @@ def test_silent_windows_are_quiet(learnt):
 def test_unlike_recordings_are_refused_with_the_difference(learnt):
     tap = struck(np.random.default_rng(4), "glass")
     mono = learnt["linear"]
-    both = mono.hear(Recording(tap.samples.repeat(2, axis=0), tap.rate))
+    both = mono.classify(Recording(tap.samples.repeat(2, axis=0), tap.rate))
     assert "2 channels were mixed" in both.notes[0]
-    np.testing.assert_allclose(both.probabilities, mono.hear(tap).probabilities)
+    np.testing.assert_allclose(both.probabilities, mono.classify(tap).probabilities)
     with pytest.raises(ValueError, match=r"has 8000 samples a second, sound up to 4000 Hz, and.* up to 22050 Hz"):
-        mono.hear(Recording(tap.samples[:, :8000], 8000.0))
+        mono.classify(Recording(tap.samples[:, :8000], 8000.0))
     stereo = LabelledClips.from_recordings(
         [Recording(one.samples.repeat(2, axis=0), one.rate) for one in clips(3).recordings], clips(3).labels
     )
     two = Listener.fit(stereo, method="linear")
     assert two.channels == 2
     with pytest.raises(ValueError, match="has 1 microphone, and the listener was learnt from clips of 2"):
-        two.hear(tap)
+        two.classify(tap)
     holes = tap.samples.copy()
     holes[:, 10:20] = np.nan
-    assert "10 samples not finite" in mono.hear(Recording(holes, tap.rate)).notes[0]
+    assert "10 samples not finite" in mono.classify(Recording(holes, tap.rate)).notes[0]
 
 
 def test_few_clips_are_enough_and_the_unknown_error_is_reported():
@@ -148,14 +148,14 @@ def test_gain_does_not_matter_unless_loudness_is_a_feature(method):
     assert not listener.loudness
     others = clips(2, seed=1)
     for number in range(len(others)):
-        sound_labels, softer = (listener.hear(_at(gain, others.clip(number))) for gain in (1.0, 0.2))
+        sound_labels, softer = (listener.classify(_at(gain, others.clip(number))) for gain in (1.0, 0.2))
         np.testing.assert_allclose(softer.probabilities, sound_labels.probabilities, atol=1e-3)
         assert not softer.quiet[softer.loud].any()
     soft = [_at(gain, one) for gain in (0.05, 1.0) for one in clips(4).recordings]
     listener = Listener.fit(LabelledClips.from_recordings(soft, ["soft"] * 12 + ["hard"] * 12), method=method)
     assert listener.loudness
-    assert listener.hear(_at(0.05, others.clip(0))).whole[0] == "soft"
-    assert listener.hear(others.clip(0)).whole[0] == "hard"
+    assert listener.classify(_at(0.05, others.clip(0))).whole[0] == "soft"
+    assert listener.classify(others.clip(0)).whole[0] == "hard"
 
 
 def test_one_recording_of_many_taps_is_split_into_clips():
@@ -191,7 +191,7 @@ def test_a_class_of_few_clips_is_predicted_as_often():
     listener = Listener.fit(
         LabelledClips.from_recordings([struck(random, name) for name in labels], labels), method="linear"
     )
-    assert all(listener.hear(struck(random, "glass")).whole[0] == "glass" for _ in range(10))
+    assert all(listener.classify(struck(random, "glass")).whole[0] == "glass" for _ in range(10))
 
 
 def test_no_group_is_on_both_sides_and_every_class_is_in_training():
@@ -219,7 +219,7 @@ def test_different_rates_and_channels_are_reported():
     assert "1 or 2 channels" in labelled.notes[0]
     assert "1 of 4 clips have fewer than 44100" in labelled.notes[1]
     listener = Listener.fit(labelled, method="linear")
-    assert listener.hear(mixed[1]).names == ("metal", "wood")
+    assert listener.classify(mixed[1]).names == ("metal", "wood")
 
 
 @pytest.mark.parametrize(

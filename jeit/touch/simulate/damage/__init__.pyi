@@ -1,12 +1,12 @@
 from .cut import Cut, draw_cut, mend_cut
-from .recording import FAULTS, ElectrodeFault, Mishap, record_mishaps
+from .recording import FAULTS, DamageEvent, ElectrodeFault, record_damage
 
 __all__ = [
     "FAULTS",
     "Cut",
+    "DamageEvent",
     "ElectrodeFault",
-    "Mishap",
     "draw_cut",
     "mend_cut",
-    "record_mishaps",
+    "record_damage",
 ]

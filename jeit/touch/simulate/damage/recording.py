@@ -44,8 +44,8 @@ class ElectrodeFault(Module):
     **Example:**
 
     ```python
-    mishap = Mishap(1.0, faults=(ElectrodeFault(3, "dead"),))
-    frames = record_mishaps(key, skin, [], np.arange(4.0), [mishap])
+    event = DamageEvent(1.0, faults=(ElectrodeFault(3, "dead"),))
+    frames = record_damage(key, skin, [], np.arange(4.0), [event])
     ```
     """
 
@@ -136,7 +136,7 @@ def check_fault(name: str, value) -> None:
     check_kind(name, value, ElectrodeFault, 'an ElectrodeFault(3, "dead")')
 
 
-class Mishap(Module):
+class DamageEvent(Module):
     """A change of a skin during a recording.
 
     **Fields**: `time`: when it happens, seconds; `skin`: the skin from then on, with the same channels and gains, or
@@ -145,8 +145,8 @@ class Mishap(Module):
     **Example:**
 
     ```python
-    mishap = Mishap(time=1.0, faults=(ElectrodeFault(3, "torn"),))
-    frames = record_mishaps(key, skin, [], np.arange(4.0), [mishap])
+    event = DamageEvent(time=1.0, faults=(ElectrodeFault(3, "torn"),))
+    frames = record_damage(key, skin, [], np.arange(4.0), [event])
     ```
     """
 
@@ -165,16 +165,16 @@ class Mishap(Module):
             check_fault(f"faults[{number}]", fault)
 
 
-def record_mishaps(
+def record_damage(
     key: Array,
     skin: PressedSkin,
     motions: MovingPress | Sequence[MovingPress],
     seconds: Float[np.ndarray, " T"],
-    mishaps: Sequence[Mishap],
+    events: Sequence[DamageEvent],
 ) -> Float[np.ndarray, "T M"]:
-    """Simulate voltages (T, M) of a skin under moving presses with mishaps.
+    """Simulate voltages (T, M) of a skin under moving presses with events.
 
-    Each mishap sets the skin and the faults until the next one. Drift, gains and noise continue through all of them.
+    Each event sets the skin and the faults until the next one. Drift, gains and noise continue through all of them.
     Every frame is solved with its own conductivity.
 
     **Arguments:**
@@ -183,29 +183,29 @@ def record_mishaps(
     - `skin`: the skin.
     - `motions`: the presses; `[]` for none.
     - `seconds`: times (T,), seconds.
-    - `mishaps`: the mishaps, in order of time.
+    - `events`: the events, in order of time.
 
-    Raises `ValueError` for invalid mishaps, for a skin with other channels, and as `PressedSkin.touched_in_time`.
+    Raises `ValueError` for invalid events, for a skin with other channels, and as `PressedSkin.touched_in_time`.
 
     **Example:**
 
     ```python
-    mishap = Mishap(2.0, faults=(ElectrodeFault(3, "torn"),))
-    frames = record_mishaps(key, skin, [], np.arange(4.0), [mishap])
+    event = DamageEvent(2.0, faults=(ElectrodeFault(3, "torn"),))
+    frames = record_damage(key, skin, [], np.arange(4.0), [event])
     ```
     """
     check_key(key)
     check_kind("skin", skin, PressedSkin, "a PressedSkin")
-    check_kind("mishaps", mishaps, (list, tuple), "a list of them, [] for none")
-    for number, one in enumerate(mishaps):
-        check_kind(f"mishaps[{number}]", one, Mishap, "a Mishap(time, skin)")
+    check_kind("events", events, (list, tuple), "a list of them, [] for none")
+    for number, one in enumerate(events):
+        check_kind(f"events[{number}]", one, DamageEvent, "a DamageEvent(time, skin)")
         if one.skin is not None and one.skin.gain.shape != skin.gain.shape:
-            raise ValueError(f"mishaps[{number}] has a skin of {one.skin.gain.size} channels, not of {skin.gain.size}.")
+            raise ValueError(f"events[{number}] has a skin of {one.skin.gain.size} channels, not of {skin.gain.size}.")
     seconds = np.asarray(seconds, float)
-    ends = [*(one.time for one in mishaps), np.inf]
+    ends = [*(one.time for one in events), np.inf]
     if list(ends) != sorted(ends):
-        raise ValueError("mishaps must be in order of their times.")
-    stages = [Mishap(0.0, skin), *mishaps]
+        raise ValueError("events must be in order of their times.")
+    stages = [DamageEvent(0.0, skin), *events]
     found, now = np.zeros((len(seconds), skin.gain.size)), skin
     for number, (stage, end) in enumerate(zip(stages, ends, strict=True)):
         now = now if stage.skin is None else stage.skin

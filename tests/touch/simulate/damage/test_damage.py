@@ -13,7 +13,7 @@ from jeit.layout import ring
 from jeit.mesh import Disk, Rectangle
 from jeit.protocol import adjacent, two_terminal
 from jeit.touch.simulate import DiscIndenter, MovingPress, PressedSkin, material
-from jeit.touch.simulate.damage import FAULTS, Cut, ElectrodeFault, Mishap, draw_cut, mend_cut, record_mishaps
+from jeit.touch.simulate.damage import FAULTS, Cut, DamageEvent, ElectrodeFault, draw_cut, mend_cut, record_damage
 
 WIDTH, HEIGHT = 0.06, 0.03
 
@@ -112,9 +112,9 @@ def test_a_recording_continues_through_damage_and_repair():
     whole = eqx.tree_at(lambda one: (one.conductivity, one.material), skin, (values, glued))
     seconds = np.arange(12) / 2
     press = MovingPress(DiscIndenter(0.012), np.where((seconds > 1) & (seconds < 5), 2.0, 0.0), (0.0, -0.02))
-    changes = [Mishap(2.0, damaged), Mishap(4.0, whole)]
-    found = record_mishaps(jax.random.key(1), skin, press, seconds, changes)
-    plain = record_mishaps(jax.random.key(1), skin, press, seconds, [])
+    changes = [DamageEvent(2.0, damaged), DamageEvent(4.0, whole)]
+    found = record_damage(jax.random.key(1), skin, press, seconds, changes)
+    plain = record_damage(jax.random.key(1), skin, press, seconds, [])
     exact = skin.record(jax.random.key(1), press, seconds)
     np.testing.assert_allclose(plain, exact, rtol=1e-6, atol=1e-9 * np.abs(exact).max())
     np.testing.assert_array_equal(found[seconds < 2], plain[seconds < 2])
@@ -136,7 +136,7 @@ def test_a_recording_continues_through_damage_and_repair():
         (lambda: Cut([(0, 0), (0.01, 0)], 0.5).conductivity(Disk(0.05).mesh(num_points=200), 1.0), "thickness"),
         (lambda: ElectrodeFault(-1), "electrode"),
         (lambda: ElectrodeFault(1, "lost"), "kind"),  # pyright: ignore[reportArgumentType]
-        (lambda: Mishap(-1.0), "time"),
+        (lambda: DamageEvent(-1.0), "time"),
     ],
 )
 def test_bad_input_is_refused(ask, message):
