@@ -214,6 +214,7 @@ def with_one(exact, k, response):
     return power
 
 
+@pytest.mark.slow
 def test_a_microphone_whose_b_tends_to_zero_does_not_affect_the_others(exact):
     """Its response is a / r²: b tends to zero, less than a square millimetre, and stays within bounds. The others
     remain exact.
@@ -232,6 +233,7 @@ def test_a_microphone_whose_b_tends_to_zero_does_not_affect_the_others(exact):
     np.testing.assert_allclose(relative[0, others], 0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_microphone_whose_response_does_not_depend_on_distance_is_reported(exact):
     """b tends to infinity: it is held at its bound, flagged, and not used."""
     values = exact[0]

@@ -67,6 +67,7 @@ def gradient_of(weight, method, located):
     return jax.grad(lambda x: jnp.sum(weight * located(method, *x)[0]))
 
 
+@pytest.mark.slow
 @quick_likelihood
 def test_forward_mode_can_be_reversed(method, moving):
     point, _, located = moving

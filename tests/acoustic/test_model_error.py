@@ -103,6 +103,7 @@ def test_unchanged_gains():
     assert 1 < np.median(ratio) < 1.3**4
 
 
+@pytest.mark.slow
 def test_ellipses_of_a_single_touch_include_the_gains():
     """One touch contains little information about the gains: 24 recordings of one touch each, with different gains."""
     microphone_array, places = array(16, microphones=SIXTEEN, relative=ERROR), inside(24, reach=0.9)

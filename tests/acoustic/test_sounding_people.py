@@ -34,6 +34,7 @@ def coherence(samples: np.ndarray) -> float:
     return float((shared - np.eye(len(samples))).max())
 
 
+@pytest.mark.slow
 def test_wind_has_the_power_of_its_sources(skin):
     """All at one place, with the skin's own spectrum: the power received from a steady source of that strength."""
     blown = simulate_wind(skin, KEY, WHERE, strength=2.0, radius=1e-9, gusts=0.0, slope=1.0, duration=8.0, noise=False)

@@ -143,6 +143,7 @@ def test_drawn_bursts_have_the_expected_power(small):
     np.testing.assert_allclose(spread.samples, taps.samples * spread.strengths[:, None, None], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_chunks_of_a_calibration_do_not_matter(small, monkeypatch):
     places = [(0.0, 0.01), (0.03, 0.02), (-0.08, 0.0)]
     whole = simulate_calibration_taps(small, KEY, places, repeats=2, duration=0.1)
@@ -227,6 +228,7 @@ def test_noise_has_its_power_in_its_band(small):
     assert not recording.active.any()
 
 
+@pytest.mark.slow
 def test_keys_determine_everything(small):
     line = [(-0.05, 0.0), (0.05, 0.0)]
     for made in (

@@ -88,6 +88,7 @@ def test_one_rule_quietly(tank, run, tmp_path):
     assert [entry["rule"] for entry in written["rules"]] == ["l-curve", "gcv"]
 
 
+@pytest.mark.slow
 def test_reconstruct_reports_a_choice_at_the_edge_of_the_range(tank, run, tmp_path):
     files = (tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv")
     status, output, error = run(
@@ -99,6 +100,7 @@ def test_reconstruct_reports_a_choice_at_the_edge_of_the_range(tank, run, tmp_pa
     assert "not to be" in " ".join(output.split())
 
 
+@pytest.mark.slow
 def test_a_rule_that_cannot_choose_is_refused_alone(tank, capsys):
     """With only one of every two reciprocal channels, the data contain no estimate of the noise."""
     pairs, _ = read(tank.folder / "rest.csv").protocol.reciprocal_pairs()

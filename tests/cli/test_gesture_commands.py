@@ -111,6 +111,7 @@ def test_a_table_with_a_given_rate_gives_the_same_labels(files, model, run, tmp_
     assert [one["gesture"] for one in events(tmp_path)] == list(GESTURES)
 
 
+@pytest.mark.slow
 def test_gestures_on_standard_input_are_classified(files, model, run, tmp_path, monkeypatch):
     folder, stream = files
     lines = "\n".join(" ".join(map(repr, map(float, row))) for row in stream.voltages[:420])

@@ -133,6 +133,7 @@ def test_a_cut_is_located_on_a_described_skin(cut, run, tmp_path, monkeypatch):
     assert report["with_a_model"]
 
 
+@pytest.mark.slow
 def test_limitations_of_the_recordings_are_noted(files, run, tmp_path):
     hurt, healthy = (np.loadtxt(files / name, delimiter=",") for name in ("hurt.csv", "healthy.csv"))
     still = hurt.copy()

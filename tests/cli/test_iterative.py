@@ -53,6 +53,7 @@ def test_iterative_images(method, tank, run, tmp_path):
     assert "labels" not in content
 
 
+@pytest.mark.slow
 def test_segmentation(tank, run, tmp_path):
     status, printed, error = run(
         "reconstruct", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv",
@@ -149,6 +150,7 @@ def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
     assert not (tmp_path / "out" / "images.npz").exists()
 
 
+@pytest.mark.slow
 def test_a_stream_uses_the_description_of_its_reference(tank, run, tmp_path):
     """The reference is an NPZ file of jeit with its description beside it; the frames lie elsewhere without one."""
     write_table(read(tank.folder / "rest.csv"), tmp_path / "empty.npz")

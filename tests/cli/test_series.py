@@ -61,6 +61,7 @@ def test_results_are_written(recording, tmp_path, capsys):
     assert "1.3 Hz (resolution 0.34 Hz)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_frames_without_times_are_numbered(recording, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(recording)
     given = ["--description", "untimed.toml", "--num-points", "250", "-o", str(tmp_path)]

@@ -92,6 +92,7 @@ def test_a_frame_in_progress_is_finished(tank, streamed, tmp_path, monkeypatch):
     assert read(tmp_path / "out") == (2, 2)
 
 
+@pytest.mark.slow
 def test_while_images_are_written_and_by_a_second_signal(tank, streamed, tmp_path, monkeypatch):
     from jeit.report.growing import GrowingRows
 

@@ -65,6 +65,7 @@ def test_run_stop_resume_and_report(file, run, monkeypatch):
     assert "another study, or of this one before it was changed" in failed(run("study", "resume", file))
 
 
+@pytest.mark.slow
 def test_a_stopped_study_is_resumed(file, run, monkeypatch):
     def stopped(*_):
         signal.raise_signal(signal.SIGINT)

@@ -76,6 +76,7 @@ current = 1e-3
 """
 
 
+@pytest.mark.slow
 def test_a_described_skin_is_imaged(tmp_path, run):
     """The description is of the kind that measured tables have."""
     skin = tmp_path / "skin.toml"

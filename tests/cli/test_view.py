@@ -37,6 +37,7 @@ def no_display(monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
 
 
+@pytest.mark.slow
 def test_a_solid_is_shown_from_several_sides(run, solid, tmp_path):
     status, output, error = run(
         "view", solid, "--output", tmp_path / "out", "--plane-mm", "x=20", "--plane-mm", "0,0,30/1,1,0",
@@ -71,6 +72,7 @@ def test_with_a_display_a_window_opens(run, solid, tmp_path, monkeypatch):
     assert not (tmp_path / "view").exists()
 
 
+@pytest.mark.slow
 def test_a_sheet_an_iterative_and_a_complex_image(run, tmp_path):
     sheet = disk(0.05, num_points=200)
     values = np.where(np.asarray(centroids(sheet))[:, 0] > 0, 1e-3, -1e-3)

@@ -36,6 +36,7 @@ def raised(points) -> np.ndarray:
     return np.column_stack([points, np.zeros(len(points))])
 
 
+@pytest.mark.slow
 def test_places_are_spread_by_distance_along_the_surface():
     mesh = forearm(0.2, 0.025, 0.045, num_points=500)
     places = spread(mesh, 20, margin=0.01)

@@ -88,6 +88,7 @@ def test_the_panels_of_scores_have_the_unit_of_the_maps(folder):
     np.testing.assert_allclose(drawn, 1e3 * data.minimum.values)
 
 
+@pytest.mark.slow
 def test_the_report_of_an_unfinished_study_omits_what_is_missing(folder, tmp_path):
     study = read_study(folder / "study.toml")
     store = Store(study, tmp_path / "half.zarr")

@@ -51,6 +51,7 @@ def test_progress_counts_up_and_estimates_the_remaining_time(study, store_path):
     assert study_progress(study, store_path)[:4] == reports[-1][:4]
 
 
+@pytest.mark.slow
 def test_exact_maps_are_reported_one_by_one_and_resumed_to_the_same_store(tmp_path, store_path, watch_chunks):
     """Of conducting touches. One map against a model of its own."""
     text = changed(touch="exact = true\ncontrast = 5") + '[scores]\nwanted = "mean"'

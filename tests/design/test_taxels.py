@@ -167,6 +167,7 @@ def test_a_batch_of_layouts_equals_a_loop(layouts, found):
         assert float(one.two_point_discrimination) == pytest.approx(float(alone.two_point_discrimination))
 
 
+@pytest.mark.slow
 def test_similarity_has_a_derivative(layouts):
     """The gradient against a central difference, with fixed clusters and an insensitive place, without a direction."""
     changes = 1e6 * layouts[0]

@@ -220,6 +220,7 @@ def test_one_step_is_kept_where_gauss_newton_fails(monkeypatch):
     assert "Gauss-Newton found no image. it fails." in result.why
 
 
+@pytest.mark.slow
 def test_the_noise_of_an_image_is_the_scatter_of_images():
     """Repeated frames of a small change: images scatter as predicted from one of them."""
     electrodes = BoundaryElectrodes(ring(RADIUS, 8), 0.01, 0.05)

@@ -72,6 +72,7 @@ def test_the_protocol_is_found(kind, tmp_path):
     np.testing.assert_allclose(np.asarray(data.read(rod).voltages)[0], voltages[1])
 
 
+@pytest.mark.slow
 def test_magnitudes_with_gains(tmp_path):
     """As recorded by an instrument with one converter for each pair of electrodes."""
     voltages, protocol = simulated(KINDS[2])
@@ -116,6 +117,7 @@ def test_an_insufficient_explanation_is_reported(tmp_path):
         find_description(saved(tmp_path, random[:, :1])[0], DISK, RING)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "deviation", "fault"),
     [
@@ -137,6 +139,7 @@ def test_the_order_of_different_channels_supports_an_explanation(kind, deviation
         assert not find_description(rod, DISK, RING, reference=empty, known=kind).fault
 
 
+@pytest.mark.slow
 def test_a_column_of_other_data_is_not_explained_away(tmp_path):
     """Frames of the empty body are similar, and any description explains a few channels."""
     voltages, _ = simulated(KINDS[0])
@@ -158,6 +161,7 @@ def test_a_column_of_other_data_is_not_explained_away(tmp_path):
         find_description(tmp_path / "wide.csv", DISK, RING, keys=("a", None))
 
 
+@pytest.mark.slow
 def test_a_square_table_is_transposed_where_its_columns_are_similar(tmp_path):
     voltages, protocol = simulated(KINDS[0])
     noise = 1 + 1e-4 * np.random.default_rng(2).normal(size=(2, 40, 40))
@@ -171,6 +175,7 @@ def test_a_square_table_is_transposed_where_its_columns_are_similar(tmp_path):
     np.testing.assert_allclose(data.read(tmp_path / "rod.csv").mean_frame().voltages[0], voltages[1], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_frame_of_16_similar_lines(tmp_path):
     """One line for each drive of a ring: the same from every electrode."""
     voltages, protocol = simulated(KINDS[0])

@@ -135,6 +135,7 @@ def test_a_sphere_that_oscillates_ten_times_a_second():
     )  # it is at half height
 
 
+@pytest.mark.slow
 def test_a_spike_in_one_channel_changes_no_image(chest):
     """It is replaced, with a note. The frame is not refused."""
     few = chest.frames(slice(0, 6))

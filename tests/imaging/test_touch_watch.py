@@ -240,6 +240,7 @@ def test_bad_arguments(made, learnt, watch):
     assert slow.gap == 0.25
 
 
+@pytest.mark.slow
 def test_a_dead_electrode_of_many_leaves_an_image():
     """The part that only excluded channels determine has no inverse. With sixteen electrodes and a common one it was
     NaN.

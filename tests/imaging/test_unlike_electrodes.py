@@ -87,6 +87,7 @@ def test_the_challenges_tank_has_one_between_its_last_electrodes(data_folder):
         assert set(prepare_difference(*frames, num_points=600).unlike_electrodes) == {29, 30, 31}
 
 
+@pytest.mark.slow
 def test_a_body_is_segmented_although_an_electrode_is_missing():
     """By the challenge's score, which equals that of the truth except for the outline."""
     used = np.asarray(TRUTH.protocol.mask_without([0]))

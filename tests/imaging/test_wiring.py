@@ -96,6 +96,7 @@ def test_the_opposite_sign_is_detected_also_beside_an_exchange():
     assert "opposite sign" in wiring.explanation
 
 
+@pytest.mark.slow
 def test_a_sign_that_explains_a_frame_alone_is_reported_alone_and_without_unavailable_remedies():
     """One of many permutations may explain slightly more."""
     angle = 2 * np.pi * np.arange(64) / 64
@@ -111,6 +112,7 @@ def test_a_sign_that_explains_a_frame_alone_is_reported_alone_and_without_unavai
         prepare_difference(measured(model, oval, turned, sign=-1, conductivity=0.03), empty)
 
 
+@pytest.mark.slow
 def test_a_shifted_first_electrode_is_detected_where_the_body_shows_it():
     domain = Polygon(np.array([[0, 0], [0.1, 0], [0.08, 0.06], [0, 0.05]]))
     electrodes = BoundaryElectrodes(perimeter(domain, COUNT, start=0.013), 0.008, 0.05)

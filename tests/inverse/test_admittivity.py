@@ -177,6 +177,7 @@ def test_both_parts_of_an_image(frames, tmp_path):
     assert np.iscomplexobj(np.load(tmp_path / "image.npz")["raster"])
 
 
+@pytest.mark.slow
 def test_two_frequencies_of_one_body(fine):
     """One disc conducts at the second frequency only. The whole body changes by a fifth, and another disc has equal
     contrast at both frequencies, so that neither appears."""

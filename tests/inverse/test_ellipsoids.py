@@ -334,6 +334,7 @@ def test_refined_cells_know_their_parent_cells(coarse):
     np.testing.assert_allclose(np.bincount(there.cell, volume), np.asarray(measures(coarse.mesh)), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_edges_are_refined_while_the_mesh_grows_little():
     coarse = model(400)
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])

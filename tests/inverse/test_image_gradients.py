@@ -168,6 +168,7 @@ def test_batches_of_linear_images():
     np.testing.assert_allclose(batch, one_by_one, rtol=0, atol=1e-9 * abs(one_by_one).max())
 
 
+@pytest.mark.slow
 def test_batches_of_reconstructions_and_their_status():
     """Compiled in a batch against one after the other: one that converged, one that did not, and one of NaN."""
 

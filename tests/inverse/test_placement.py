@@ -82,6 +82,7 @@ def test_positions_that_explain_the_reference_are_kept(tank):
     np.testing.assert_array_equal(prepared.model.electrodes.position, DESCRIBED.position)
 
 
+@pytest.mark.slow
 def test_the_background_is_fitted_to_channels_far_from_the_drives(tank):
     """Voltages next to the drives are 30 % larger than in a sheet, as where current spreads over the height of a tank.
     A fit to these, the largest, would give a background that is 9 % too low."""

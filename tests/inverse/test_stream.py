@@ -223,6 +223,7 @@ def test_a_memory_reduces_noise_and_keeps_the_press(method, small, noisy):
     assert abs(press[1].mean() - 0.9) < abs(press[0].mean() - 0.9)
 
 
+@pytest.mark.slow
 def test_a_memory_with_gauss_newton_equals_the_linear_one(small, noisy):
     """For changes and noise a hundred times smaller, one step from the predicted image is the filter's update."""
     rest, (frames, noise) = pressed(small, 1.0), noisy

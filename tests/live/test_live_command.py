@@ -191,6 +191,7 @@ def test_a_recording_is_played_from_its_beginning(files):
     np.testing.assert_array_equal(frames, noisy(40, seed=3))
 
 
+@pytest.mark.slow
 def test_contacts_are_shown_on_request(served, run):
     assert run("live", "demo", "--contacts", "--method", "one-step", "-q")[0] == 0
     assert served.session.scene.title == "Contacts, Conductivity change, simulated tank"

@@ -293,6 +293,7 @@ def test_requested_local_refinement():
     assert size[middle < 0.004].max() < 0.4 * size[middle > 0.03].mean()
 
 
+@pytest.mark.slow
 def test_voltages_of_shells_are_differentiable():
     """Of a bent layer, with respect to its nodes, by Taylor remainders."""
     import equinox as eqx

@@ -93,6 +93,7 @@ def no_pictures(what):
         raise InterruptedError
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_a_stream(calibrated, tmp_path):
     def peak(number):
         tracemalloc.start()

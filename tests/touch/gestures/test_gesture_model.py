@@ -67,6 +67,7 @@ def test_data_of_one_person_are_reported_as_such():
     assert "not on people" in note
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_network")
 def test_a_class_that_one_person_never_made():
     """Folds without it do not fail, and a class that never occurs is never predicted."""

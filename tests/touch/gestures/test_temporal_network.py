@@ -40,6 +40,7 @@ def test_the_sequence_is_the_time_course():
     assert own["speed"].mean() * duration == pytest.approx(moved, rel=0.2)
 
 
+@pytest.mark.slow
 def test_an_order_in_time_is_learnt(monkeypatch):
     """Classes with the same values in rising or falling order: no mean or maximum distinguishes them."""
     rng = np.random.default_rng(0)

@@ -36,6 +36,7 @@ def damage() -> np.ndarray:
     return 0.05 * np.where(random.random(NUMBER) < 0.3, random.choice([-1, 1], NUMBER), 0.0)
 
 
+@pytest.mark.slow
 def test_healthy_touches_are_no_events(health):
     reported = [len(watch(health, recording(seed, 300)).events) for seed in range(1, 41)]
     assert sum(map(bool, reported)) == 0

@@ -51,6 +51,7 @@ def _one_step():
     return schedule.rates(), schedule.radii((4, 4))
 
 
+@pytest.mark.slow
 def test_maps_trained_together_equal_those_trained_alone():
     frames = np.random.default_rng(3).normal(size=(60, 5))
     keys, schedules = [jax.random.key(0), jax.random.key(1)], [MapSchedule(100, 50), MapSchedule(50, 100, (0.1, 0.1))]

@@ -224,6 +224,7 @@ def few_trees(monkeypatch):
     monkeypatch.setattr(labels, "_TREES", 15)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_trees")
 def test_keys_pressed_together():
     """Six keys, each with its own pattern, which saturate together."""

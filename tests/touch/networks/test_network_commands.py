@@ -60,6 +60,7 @@ def test_reconstruct(imaging, recorded, run, tmp_path):
     assert (tmp_path / "depth.png").stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_stream(imaging, recorded, run, tmp_path):
     """A frame that lacks one channel is imaged. One with reversed signs is not."""
     with np.load(recorded / "touched.npz") as one:
@@ -79,6 +80,7 @@ def test_stream(imaging, recorded, run, tmp_path):
     assert json.loads((tmp_path / "report.json").read_text())["refused"] == [2]
 
 
+@pytest.mark.slow
 def test_a_table_without_a_description(imaging, recorded, run, tmp_path):
     """The network has the protocol, and a file of the skin also serves as a description."""
     for name in ("rest", "touched"):

@@ -139,6 +139,7 @@ class Looked(TrainingRuns):
         return TrainingResult(network, Course([1], [1.0], [1.0]), "done")
 
 
+@pytest.mark.slow
 def test_the_objectives_of_the_three_stages(stored, other, small_skin, monkeypatch):
     """Untrained, the first stage reconstructs nothing. The last starts from the first's results, which are frozen."""
     random = np.random.default_rng(0)

@@ -161,6 +161,7 @@ class Chunks:
         return tuple(one[first : first + self.sizes[number]] for one in self.arrays)
 
 
+@pytest.mark.slow
 def test_chunks():
     """A set larger than memory is learnt as well, chunk by chunk."""
     chunks = Chunks(rows(500), (200, 200, 100))

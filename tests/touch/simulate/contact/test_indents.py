@@ -89,6 +89,7 @@ def test_draws(draws):
     assert {len(touch) for touch in touches} == {1, 2}
 
 
+@pytest.mark.slow
 def test_a_set_is_resumed(sheet, tmp_path):
     """Stopped after its first chunk, it ends with the same arrays."""
     draws = IndentDraws([DiscIndenter(0.01)], sheet.outline, (1e-3, 6e-3), margin=5e-3, at_once=2)

@@ -199,6 +199,7 @@ def test_noise_gains_and_keys(model):
     assert not np.array_equal(noisy.gain, PressedSkin(jax.random.key(1), model, noisy.material).gain)
 
 
+@pytest.mark.slow
 def test_drift_is_that_of_another_skin(model):
     """Conductivity exactly. Contacts, to which neighbouring voltages are hardly sensitive, to first order."""
     drifting = dataclasses.replace(STILL, conductivity_trend=1e-4, contact_trend=-1e-4)

@@ -103,6 +103,7 @@ def test_a_torn_wire_may_read_the_end_of_the_range(slit):
     np.testing.assert_allclose(read[:, ~own], np.tile(rest[~own], (3, 1)))
 
 
+@pytest.mark.slow
 def test_a_recording_continues_through_damage_and_repair():
     cut = Cut([(-0.012, 0.01), (0.012, 0.016)])
     model, film = disk_model(cut, 400), dataclasses.replace(material("velostat"), noise=0.0)

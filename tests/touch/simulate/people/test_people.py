@@ -103,6 +103,7 @@ def test_the_same_key_is_the_same_touch():
     assert first.load.shape != other.load.shape or not np.allclose(first.load, other.load)
 
 
+@pytest.mark.slow
 def test_recordings_together_are_those_of_each():
     """Without noise and drift, which have their own keys."""
     still = still_skin()
