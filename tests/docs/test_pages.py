@@ -177,7 +177,7 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "docs/contacts.md": _contacts,
     "docs/design.md": _design,
     "docs/gestures.md": _gestures,
-    "docs/health.md": _health,
+    "docs/how-to/detect-damage.md": _health,
     "docs/hearing.md": _hearing,
     "docs/pressing.md": _pressing,
 }
@@ -192,7 +192,7 @@ TYPED = [
     "docs/hearing.md",
     "docs/learning.md",
     "docs/gestures.md",
-    "docs/health.md",
+    "docs/how-to/detect-damage.md",
     "docs/how-to/choose-the-hyperparameter.md",
     "README.md",
 ]
