@@ -275,6 +275,6 @@ CASE = Case(
     "six gestures classified by LogitBoost and others, beside the paper's",
     run,
     25,
-    page=("docs/gestures.md", "gestures"),
+    page=("docs/explanation/gestures.md", "gestures"),
     pictures=True,
 )

@@ -359,7 +359,7 @@ CASE = Case(
     "self-organising maps of a skin's frames, beside the paper's",
     run,
     6,
-    page=("docs/maps.md", "kohonen"),
+    page=("docs/explanation/map-experiments.md", "kohonen"),
     pictures=True,
     timed=False,
 )

@@ -176,8 +176,8 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "README.md": _readme,
     "docs/contacts.md": _contacts,
     "docs/design.md": _design,
-    "docs/gestures.md": _gestures,
-    "docs/health.md": _health,
+    "docs/how-to/classify-gestures.md": _gestures,
+    "docs/how-to/detect-damage.md": _health,
     "docs/hearing.md": _hearing,
     "docs/pressing.md": _pressing,
 }
@@ -191,8 +191,8 @@ TYPED = [
     "docs/how-to/image-a-series.md",
     "docs/hearing.md",
     "docs/learning.md",
-    "docs/gestures.md",
-    "docs/health.md",
+    "docs/how-to/classify-gestures.md",
+    "docs/how-to/detect-damage.md",
     "docs/how-to/choose-the-hyperparameter.md",
     "README.md",
 ]
