@@ -73,12 +73,18 @@ def _contacts(names: dict, folder: Path, printed: list[str]) -> None:
     assert len(printed) == 3
 
 
-def _design(names: dict, folder: Path, printed: list[str]) -> None:
+def _compare_layouts(names: dict, folder: Path, printed: list[str]) -> None:
     assert (folder / "sensitivity.png").stat().st_size > 10_000
+    least, mean, _ = (float(one) for one in printed[0].split())
+    assert 0 < least < mean
+
+
+def _optimise(names: dict, folder: Path, printed: list[str]) -> None:
     assert names["found"].scores.worst > 1.3 * names["scores"].worst
     assert names["protocol"].num_measurements == 94
-    assert len(printed) == 5
+    assert len(printed) == 4
     assert "least Θ 19.5 mV, A 0.056" in printed
+    assert (folder / "layout.svg").is_file()
 
 
 def _gestures(names: dict, folder: Path, printed: list[str]) -> None:
@@ -173,9 +179,10 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "docs/how-to/get-error-bars.md": _error_bars,
     "docs/how-to/export-an-image.md": _export,
     "docs/how-to/model-a-surface.md": _surfaces,
+    "docs/how-to/compare-layouts.md": _compare_layouts,
+    "docs/how-to/optimise-a-layout.md": _optimise,
     "README.md": _readme,
     "docs/contacts.md": _contacts,
-    "docs/design.md": _design,
     "docs/gestures.md": _gestures,
     "docs/health.md": _health,
     "docs/hearing.md": _hearing,
