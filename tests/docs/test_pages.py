@@ -79,6 +79,12 @@ def _compare_layouts(names: dict, folder: Path, printed: list[str]) -> None:
     assert 0 < least < mean
 
 
+def _teach(names: dict, folder: Path, printed: list[str]) -> None:
+    assert float(printed[-1].split()[0]) < 1  # mm
+    assert (folder / "learnt.skops").is_file()
+    assert (folder / "out" / "touches.csv").is_file()
+
+
 def _optimise(names: dict, folder: Path, printed: list[str]) -> None:
     assert names["found"].scores.worst > 1.3 * names["scores"].worst
     assert names["protocol"].num_measurements == 94
@@ -181,6 +187,7 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "docs/how-to/model-a-surface.md": _surfaces,
     "docs/how-to/compare-layouts.md": _compare_layouts,
     "docs/how-to/optimise-a-layout.md": _optimise,
+    "docs/how-to/teach-a-skin.md": _teach,
     "README.md": _readme,
     "docs/contacts.md": _contacts,
     "docs/gestures.md": _gestures,
@@ -197,7 +204,7 @@ TYPED = [
     "docs/how-to/check-a-measurement.md",
     "docs/how-to/image-a-series.md",
     "docs/hearing.md",
-    "docs/learning.md",
+    "docs/how-to/teach-a-skin.md",
     "docs/gestures.md",
     "docs/health.md",
     "docs/how-to/choose-the-hyperparameter.md",
