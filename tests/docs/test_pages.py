@@ -79,6 +79,11 @@ def _compare_layouts(names: dict, folder: Path, printed: list[str]) -> None:
     assert 0 < least < mean
 
 
+def _curved(names: dict, folder: Path, printed: list[str]) -> None:
+    assert all((folder / name).stat().st_size > 10_000 for name in ("skin.png", "unrolled.png"))
+    assert float(printed[1]) < 10  # mm
+
+
 def _teach(names: dict, folder: Path, printed: list[str]) -> None:
     assert float(printed[-1].split()[0]) < 1  # mm
     assert (folder / "learnt.skops").is_file()
@@ -188,6 +193,7 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "docs/how-to/compare-layouts.md": _compare_layouts,
     "docs/how-to/optimise-a-layout.md": _optimise,
     "docs/how-to/teach-a-skin.md": _teach,
+    "docs/how-to/design-a-curved-skin.md": _curved,
     "README.md": _readme,
     "docs/contacts.md": _contacts,
     "docs/gestures.md": _gestures,
