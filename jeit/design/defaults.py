@@ -14,7 +14,7 @@ THICKNESS = 10e-3  # m
 CONDUCTIVITY = 1.0  # S/m
 # The paper gives no value. With this one, the contact resistance of an electrode 6 mm in diameter is 3.5 ohm, 4 % of
 # the spreading resistance 1/(4σr) = 83 ohm of a deep skin of 1 S/m, so the skin dominates. The results in
-# docs/design.md are computed with this value.
+# docs/reference/layout-figures.md are computed with this value.
 CONTACT_IMPEDANCE = 1e-4  # ohm·m²
 # Two-terminal measurements between the nearest electrodes: as many pairs as in the paper, or all if there are fewer.
 PROTOCOL = "two-terminal"

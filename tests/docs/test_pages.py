@@ -73,12 +73,29 @@ def _contacts(names: dict, folder: Path, printed: list[str]) -> None:
     assert len(printed) == 3
 
 
-def _design(names: dict, folder: Path, printed: list[str]) -> None:
+def _compare_layouts(names: dict, folder: Path, printed: list[str]) -> None:
     assert (folder / "sensitivity.png").stat().st_size > 10_000
+    least, mean, _ = (float(one) for one in printed[0].split())
+    assert 0 < least < mean
+
+
+def _curved(names: dict, folder: Path, printed: list[str]) -> None:
+    assert all((folder / name).stat().st_size > 10_000 for name in ("skin.png", "unrolled.png"))
+    assert float(printed[1]) < 10  # mm
+
+
+def _teach(names: dict, folder: Path, printed: list[str]) -> None:
+    assert float(printed[-1].split()[0]) < 1  # mm
+    assert (folder / "learnt.skops").is_file()
+    assert (folder / "out" / "touches.csv").is_file()
+
+
+def _optimise(names: dict, folder: Path, printed: list[str]) -> None:
     assert names["found"].scores.worst > 1.3 * names["scores"].worst
     assert names["protocol"].num_measurements == 94
-    assert len(printed) == 5
+    assert len(printed) == 4
     assert "least Θ 19.5 mV, A 0.056" in printed
+    assert (folder / "layout.svg").is_file()
 
 
 def _gestures(names: dict, folder: Path, printed: list[str]) -> None:
@@ -173,9 +190,12 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "docs/how-to/get-error-bars.md": _error_bars,
     "docs/how-to/export-an-image.md": _export,
     "docs/how-to/model-a-surface.md": _surfaces,
+    "docs/how-to/compare-layouts.md": _compare_layouts,
+    "docs/how-to/optimise-a-layout.md": _optimise,
+    "docs/how-to/teach-a-skin.md": _teach,
+    "docs/how-to/design-a-curved-skin.md": _curved,
     "README.md": _readme,
     "docs/contacts.md": _contacts,
-    "docs/design.md": _design,
     "docs/how-to/classify-gestures.md": _gestures,
     "docs/how-to/detect-damage.md": _health,
     "docs/hearing.md": _hearing,
@@ -190,9 +210,9 @@ TYPED = [
     "docs/how-to/check-a-measurement.md",
     "docs/how-to/image-a-series.md",
     "docs/hearing.md",
-    "docs/learning.md",
     "docs/how-to/classify-gestures.md",
     "docs/how-to/detect-damage.md",
+    "docs/how-to/teach-a-skin.md",
     "docs/how-to/choose-the-hyperparameter.md",
     "README.md",
 ]

@@ -1,4 +1,4 @@
-"""Every figure of docs/design.md's "The paper's comparison".
+"""Every figure of docs/reference/layout-figures.md.
 
 The paper's two layouts touched all over, for several margins, thicknesses and kinds of touch, optimised layouts, and
 measurements selected from all possible ones. The figures are of accuracy, not of time.
@@ -43,7 +43,7 @@ CASE = Case(
     "the paper's layouts compared on simulated skins, optimised layouts, chosen measurements",
     run,
     12,
-    page=("docs/design.md", "figures"),
+    page=("docs/reference/layout-figures.md", "figures"),
     pictures=True,
     timed=False,
 )
