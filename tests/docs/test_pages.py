@@ -174,7 +174,7 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "docs/how-to/export-an-image.md": _export,
     "docs/how-to/model-a-surface.md": _surfaces,
     "README.md": _readme,
-    "docs/contacts.md": _contacts,
+    "docs/how-to/find-contacts.md": _contacts,
     "docs/design.md": _design,
     "docs/gestures.md": _gestures,
     "docs/health.md": _health,
