@@ -179,7 +179,7 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "docs/gestures.md": _gestures,
     "docs/health.md": _health,
     "docs/how-to/locate-a-tap-by-its-sound.md": _hearing,
-    "docs/pressing.md": _pressing,
+    "docs/how-to/simulate-presses.md": _pressing,
 }
 
 
