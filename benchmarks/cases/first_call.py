@@ -36,7 +36,7 @@ def image(length):
     reconstruct(model, model.voltages(1.1), 1.0, prior=Gaussian(length), hyperparameter=3.0)
 """
 )
-# A simulated skin, tapped and touched, as in docs/hearing.md.
+# A simulated skin, tapped and touched, as in docs/how-to/calibrate-microphones.md.
 _SKIN = """
 import jax
 from jeit.acoustic import Recording, Taps, write_recording, write_taps

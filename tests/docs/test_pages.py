@@ -111,7 +111,7 @@ def _health(names: dict, folder: Path, printed: list[str]) -> None:
 
 def _hearing(names: dict, folder: Path, printed: list[str]) -> None:
     assert len(names["path"].touches) == 3
-    microphones = names["fit"].calibration.microphone_array.microphones
+    microphones = names["calibration"].microphone_array.microphones
     assert names["jacobian"].shape == names["power"].shape[:1] + microphones.shape
     assert (folder / "track.png").stat().st_size > 10_000
 
@@ -195,11 +195,11 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "docs/how-to/teach-a-skin.md": _teach,
     "docs/how-to/design-a-curved-skin.md": _curved,
     "README.md": _readme,
-    "docs/contacts.md": _contacts,
+    "docs/how-to/find-contacts.md": _contacts,
+    "docs/how-to/locate-a-tap-by-its-sound.md": _hearing,
+    "docs/how-to/simulate-presses.md": _pressing,
     "docs/how-to/classify-gestures.md": _gestures,
     "docs/how-to/detect-damage.md": _health,
-    "docs/hearing.md": _hearing,
-    "docs/pressing.md": _pressing,
 }
 
 
@@ -209,7 +209,8 @@ TYPED = [
     "docs/how-to/find-the-wiring.md",
     "docs/how-to/check-a-measurement.md",
     "docs/how-to/image-a-series.md",
-    "docs/hearing.md",
+    "docs/how-to/calibrate-microphones.md",
+    "docs/how-to/locate-a-tap-by-its-sound.md",
     "docs/how-to/classify-gestures.md",
     "docs/how-to/detect-damage.md",
     "docs/how-to/teach-a-skin.md",
@@ -357,9 +358,11 @@ def test_readme_is_short():
 
 
 def test_commands_on_hearing_take_what_its_scripts_write():
-    """Whoever follows the page has every file that it names."""
-    page = ROOT / "docs" / "hearing.md"
-    script = "\n".join(blocks(page, "python"))
-    named = {word for line in commands(page) for word in line.split() if word.endswith((".npz", ".wav", ".json"))}
+    """Whoever follows the two pages has every file that they name."""
+    names = ("calibrate-microphones.md", "locate-a-tap-by-its-sound.md")
+    pages = [ROOT / "docs" / "how-to" / name for name in names]
+    script = "\n".join(block for page in pages for block in blocks(page, "python"))
+    lines = [line for page in pages for line in commands(page)]
+    named = {word for line in lines for word in line.split() if word.endswith((".npz", ".wav", ".json"))}
     assert {"taps.npz", "recording.npz"} <= named
     assert not [name for name in named if f'"{name}"' not in script]
