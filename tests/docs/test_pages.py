@@ -211,9 +211,9 @@ TYPED = [
     "docs/how-to/image-a-series.md",
     "docs/how-to/calibrate-microphones.md",
     "docs/how-to/locate-a-tap-by-its-sound.md",
+    "docs/how-to/teach-a-skin.md",
     "docs/how-to/classify-gestures.md",
     "docs/how-to/detect-damage.md",
-    "docs/how-to/teach-a-skin.md",
     "docs/how-to/choose-the-hyperparameter.md",
     "README.md",
 ]
