@@ -32,7 +32,7 @@ LONG = [
     report.write_stream,
     touch.simulate.PressedSkin.frames,
     touch.simulate.PressedSkin.record,
-    acoustic.simulate.calibration_taps,
+    acoustic.simulate_calibration_taps,
     touch.simulate.simulate_presses,
     touch.LearntSkin.fit,
 ]

@@ -40,12 +40,12 @@ def image(length):
 _SKIN = """
 import jax
 from jeit.acoustic import Recording, Taps, write_recording, write_taps
-from jeit.acoustic.simulate import SoundingSkin, calibration_taps, microphone_grid, pat
+from jeit.acoustic import SoundingSkin, microphone_grid, simulate_calibration_taps, simulate_pat
 skin, outline = SoundingSkin(jax.random.key(0)), [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
-taps = calibration_taps(skin, jax.random.key(1), microphone_grid(9))
+taps = simulate_calibration_taps(skin, jax.random.key(1), microphone_grid(9))
 taps = Taps(skin.microphones, outline, taps.positions, samples=taps.samples, rate=taps.rate)
 write_taps("taps.npz", taps)
-sound = pat(skin, jax.random.key(2), (0.03, 0.02))
+sound = simulate_pat(skin, jax.random.key(2), (0.03, 0.02))
 write_recording("recording.npz", Recording(sound.samples, sound.rate))
 """
 _CALIBRATED = (

@@ -150,7 +150,7 @@ def plot_depth_map(
 def plot_losses(courses: Mapping[str, TrainingResult], *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the loss on held-out touches during each training, relative to the first evaluation, and mark its minimum.
 
-    `courses`: results of `jeit.touch.training.fit` by name. Raises `ValueError` for anything else.
+    `courses`: results of `jeit.touch.fit_network` by name. Raises `ValueError` for anything else.
     """
     check_kind("courses", courses, Mapping, "trainings by name, such as learnt.courses")
     ax = axes_or_new(ax)
