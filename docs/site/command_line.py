@@ -58,8 +58,10 @@ def _row(name: str, annotation: Any, default: Any) -> str:
     info, plain, options = get_args(annotation)[1], _plain(annotation), _options(name, annotation)
     value = info.metavar or _VALUES.get(getattr(plain, "__name__", ""), name.upper())
     shown = ", ".join(f"`{option}`" if plain is bool else f"`{option} {value}`" for option in options)
-    told = "required" if default is inspect.Parameter.empty else "" if default is None or default is False else default
-    cells = (shown or f"`{info.metavar or name.upper()}`", info.help, told)
+    default_text = (
+        "required" if default is inspect.Parameter.empty else "" if default is None or default is False else default
+    )
+    cells = (shown or f"`{info.metavar or name.upper()}`", info.help, default_text)
     return "| " + " | ".join(" ".join(str(cell).split()).replace("|", "\\|") for cell in cells) + " |"
 
 

@@ -68,11 +68,11 @@ def on_page_markdown(markdown, page, config, files):
 
     def moved(match: re.Match) -> str:
         words, anchor, path = match[1], match[3] or "", (here.parent / match[2]).resolve()
-        told = path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else ""
-        if told.startswith("docs/"):
-            return f"[{words}]({told.removeprefix('docs/')}{anchor})" if uri in inside else match[0]
-        if told in OUTSIDE and path.is_file():
-            return f"[{words}]({posixpath.relpath(OUTSIDE[told], folder)}{anchor})"
+        repository_path = path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else ""
+        if repository_path.startswith("docs/"):
+            return f"[{words}]({repository_path.removeprefix('docs/')}{anchor})" if uri in inside else match[0]
+        if repository_path in OUTSIDE and path.is_file():
+            return f"[{words}]({posixpath.relpath(OUTSIDE[repository_path], folder)}{anchor})"
         return words if path.exists() else match[0]
 
     return markdown if uri.startswith("api/") else _LINK.sub(moved, markdown)

@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any, get_origin
 
 import reference
 
@@ -32,12 +33,14 @@ def names(room: str) -> dict[str, object]:
     return {name: thing for name, thing in found.items() if not isinstance(thing, ModuleType)}
 
 
-def signature(thing: object) -> str:
-    """Names of the parameters of a function or class, `=…` behind those that have a default."""
-    try:
-        parameters = list(inspect.signature(thing).parameters.values())  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+def signature(thing: Any) -> str:
+    """Names of the parameters of a function or class, `=…` behind those that have a default.
+
+    Enumerations and aliases of types are called as Python defines it, each version otherwise, and show none.
+    """
+    if isinstance(thing, enum.EnumType) or get_origin(thing) is not None:
         return ""
+    parameters = list(inspect.signature(thing).parameters.values())
     shown, starred = [], False
     for one in parameters:
         starred |= one.kind is one.VAR_POSITIONAL

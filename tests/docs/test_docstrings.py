@@ -80,8 +80,8 @@ def faults(path: Path) -> list[str]:
             if not re.search(rf"\b[Rr]aise|{error}", f"{said} {said_of_class}"):
                 found.append(f"{name}: does not say that it raises {error}")
         arguments = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
-        told = any(pattern.search(text) for pattern in (UNITS, ELSEWHERE) for text in (said, said_of_class))
-        if not told and any(one.arg == "conductivity" for one in arguments):
+        stated = any(pattern.search(text) for pattern in (UNITS, ELSEWHERE) for text in (said, said_of_class))
+        if not stated and any(one.arg == "conductivity" for one in arguments):
             found.append(f"{name}: does not say the unit of its conductivity")
     return found
 

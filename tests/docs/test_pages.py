@@ -303,10 +303,10 @@ def test_a_wrong_command_is_found(line, wrong):
     assert wrong in (fault(line) or "")
 
 
-def test_every_command_is_told_of():
+def test_every_command_is_documented():
     """Every command stands in the README or a guide, and its own page says every option."""
-    told = " ".join(line for page in PAGES for line in commands(page))
-    assert [path for path in COMMANDS if " ".join(path[:2]) not in told] == []
+    documented = " ".join(line for page in PAGES for line in commands(page))
+    assert [path for path in COMMANDS if " ".join(path[:2]) not in documented] == []
     page = command_line.page()
     for function in COMMANDS.values():
         for option in command_line.parameters(function)[0]:
