@@ -98,3 +98,11 @@ def test_unreadable_formats_are_refused_with_how_to_convert_them(start, tmp_path
     (tmp_path / "tap.m4a").write_bytes(start + bytes(100))
     with pytest.raises(ValueError, match=r"tap\.m4a: a format that is not read .*ffmpeg -i 'tap\.m4a' 'tap\.wav'"):
         read_recording(tmp_path / "tap.m4a")
+
+
+def test_a_sound_that_would_not_fit_in_memory_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    """Samples take up to sixteen times the bytes of their file."""
+    wavfile.write(tmp_path / "long.wav", 8000, np.zeros(8000, np.uint8))
+    monkeypatch.setenv("JEIT_FILE_GB", "0.0001")
+    with pytest.raises(ValueError, match=r"long.wav would take 0.000129 GB in memory, more than the 0.0001 GB"):
+        read_recording(tmp_path / "long.wav")

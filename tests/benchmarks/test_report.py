@@ -40,7 +40,8 @@ def test_a_section_contains_the_judged_figures_and_their_origin(root):
     text = (root / "benchmarks" / "RESULTS.md").read_text("utf-8")
     for part in ("## first", "What it does.", "commit 1234567, 2030-01-02", "jeit: a note", "**What it took**"):
         assert part in text
-    assert "| < 2 s | 1.00 s   | met |" in text
+    assert "| < 2 s | 1.00 s   | met |" in text  # padded to the heading, to be read as text
+    assert "| a job | 1.00 s | SciPy: 2.00 s | 2.0× | same to 1e-12 |" in (root / "README.md").read_text("utf-8")
     assert "3.00 s in all; the case's own process took 100 MB at most" in text
 
 
