@@ -15,7 +15,7 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Body, Mesh
 from jeit.protocol import Protocol
 
-# Columns beside voltages that a table may have by mistake.
+# Maximum number of superfluous columns, such as times, for which an error about the shape suggests them.
 _COLUMNS = 4
 # Maximum plausible voltage on an electrode, in volts.
 _LARGEST = 1000.0

@@ -39,7 +39,7 @@ _UNKNOWN = 100
 
 
 class Table(BaseModel):
-    """Base of tables of keys: unknown keys are rejected, and so are text and booleans in place of numbers."""
+    """Base class of the tables of a file: rejects unknown keys, and text or booleans where a number is expected."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True, defer_build=True)
 

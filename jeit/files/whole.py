@@ -41,7 +41,7 @@ _UNFINISHED = re.compile(r"\.jeit-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.part")
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[BinaryIO]:
     """Context that yields a file to write to, which replaces `path` once it is completely on the disk. If the process
-    is killed before, the old file remains.
+    is killed before that, the old file remains.
 
     A link at `path` is replaced, not followed. Raises `OSError` if the file cannot be written.
     """

@@ -96,7 +96,7 @@ def compare_on_data(
     - `settings`: prior, mesh, calibration, and search for inclusions.
     - `rules`: names in `jeit.inverse.RULES`; default: all.
 
-    Raises `ValueError` for unknown rules, and as `image_difference`.
+    Raises `ValueError` for unknown rules, and in the same cases as `image_difference`.
 
     **Example:**
 

@@ -111,7 +111,7 @@ class PreparedDifference:
 
     @property
     def uncertainty(self) -> Uncertainty:
-        """How accurately the sensor is described."""
+        """Standard deviations of the described positions, sizes and contacts of the sensor."""
         return self.reference.uncertainty or Uncertainty()
 
     @property

@@ -94,7 +94,7 @@ def prepare_imager(
     - `measurement`: the frames to image, if they are available; their protocol must be that of the reference.
     - `progress`: called with the name of each step when it begins.
 
-    Raises `ValueError` for another protocol, and as `image_difference`.
+    Raises `ValueError` for another protocol, and in the same cases as `image_difference`.
 
     **Example:**
 

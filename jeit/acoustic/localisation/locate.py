@@ -184,7 +184,7 @@ def _locate_frames(
 
 def _initial_status(most_likely: SourceEstimate, estimate: SourceEstimate) -> np.ndarray:
     """Status of the frames with a touch, before a fit of two sources is tried. `most_likely`: maximum-likelihood
-    estimates, from which the status follows; `estimate`: estimates of the selected method."""
+    estimates, which determine the status; `estimate`: estimates of the selected method."""
     misfit, freedom = np.asarray(most_likely.misfit), np.asarray(most_likely.freedom)
     excess = np.asarray(most_likely.excess)
     rivalled = np.asarray(most_likely.rival) < _RIVAL

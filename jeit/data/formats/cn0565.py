@@ -31,7 +31,7 @@ DESCRIPTION = "lines of Analog Devices' CN0565 kit ('!V' and hexadecimal numbers
 # A frame may follow the time that a terminal puts before it.
 _LINE = re.compile(rb"^[^!\r\n]{0,80}!V[ \t]{0,8}([0-9A-Fa-fxX, \t]*)(.*)$", re.MULTILINE)
 _WORD = re.compile(rb"(?:0[xX])?([0-9A-Fa-f]{1,8})")
-# Bytes by which a file is recognised, and the fewest numbers of a line that is one.
+# Number of bytes read to recognise a file; minimum count of numbers in a line of data.
 _HEAD, _FEWEST = 65536, 8
 _COUNTS = (8, 16, 32)
 _CURRENT = 1e-3

@@ -253,7 +253,8 @@ class Stars(Bodies):
     def covered(self, k: int, row) -> Covered:
         """Coverage of cells by star k, whose coefficients are `row`."""
         centre, log_radius, waves = self._values(k, row)
-        # Upper limit of the outline's distance from the centre; cells farther out by `_REACH` widths are not covered.
+        # Upper limit of the distance of the outline from the centre. The star does not cover cells that lie farther
+        # outside than `_REACH` times the width of its blurred edge.
         farthest = np.exp(np.minimum(log_radius + np.abs(waves).sum(), np.log(10 * self.span)))
         cells = np.flatnonzero(np.abs(self.points[:, 0] - centre) < farthest + _REACH * self.width)
         offset, width = self.points[cells] - centre, self.width[cells, None]

@@ -158,7 +158,8 @@ def _connect(neighbour, near: Bool[Array, "L m"], root):
 
 
 def _transforms_across_sides(local, opposite):
-    """Rotation (h, 2) and translation (h, 2) from the plane of each side's triangle into that of the neighbour."""
+    """Rotation (h, 2), as cosine and sine, and translation (h, 2) for each half-edge (a side of one triangle), from the
+    plane of its triangle into that of the triangle on the other side."""
     xp = namespace(local)
     start, end = local.reshape(-1, 2), xp.roll(local, -1, axis=1).reshape(-1, 2)
     own, other = end - start, start[opposite] - end[opposite]

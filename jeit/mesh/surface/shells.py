@@ -173,7 +173,7 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
 
 
 def _fold_positions(places: np.ndarray, corners: np.ndarray, across: int, num_folds: int | None) -> np.ndarray:
-    """Positions of the folds across the sheet, including both of its sides."""
+    """Coordinates in metres, across the sheet, of the lines along which it is bent, its two borders included."""
     width = np.ptp(places)
     ordered = np.sort(places)
     rows = ordered[np.concatenate([[True], np.diff(ordered) > _LINE_TOLERANCE * width])]

@@ -94,7 +94,7 @@ def _check_extent(network: ImageNetwork, measurement: Measurement) -> None:
 
 
 def stream_depths(network: ImageNetwork, frames: Iterable, rest: Float[np.ndarray, " M"]) -> Iterator[FrameDepth]:
-    """Image frames one after the other, relative to a frame of the untouched skin.
+    """Reconstruct an image of each frame in turn, relative to a frame of the untouched skin.
 
     The network is compiled before the first frame is requested. A frame is refused, and the stream continues, if it has
     another number of channels, if too many of its channels are missing, or if its map is unreliable (see

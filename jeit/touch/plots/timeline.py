@@ -80,7 +80,7 @@ def plot_timeline(
     - `title`: title of the plot.
     - `ax`: axes to draw into; by default new ones.
 
-    Raises `ValueError` for elements that are not named touches.
+    Raises `ValueError` if an item of the list is not a `NamedTouch`.
 
     **Example:**
 
@@ -144,7 +144,7 @@ def plot_touch_paths(
     - `title`: title of the plot.
     - `ax`: axes to draw into; by default new ones.
 
-    Raises `ValueError` for elements that are not named touches.
+    Raises `ValueError` if an item of the list is not a `NamedTouch`.
 
     **Example:**
 

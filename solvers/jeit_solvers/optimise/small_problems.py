@@ -289,8 +289,8 @@ def minimise_small(
 
 
 def _first_true_indices(flags: Bool[Array, " F"], max_count: int) -> Int[Array, " i"]:
-    """Indices of the first true entries: in NumPy at most `max_count` of them; in JAX exactly `max_count`, filled up
-    with F."""
+    """Indices of the first true entries: in NumPy at most `max_count` of them; in JAX exactly `max_count`, where
+    missing ones are F, the number of flags."""
     if isinstance(flags, np.ndarray):
         return host.flatnonzero(flags)[:max_count]
     return jnp.nonzero(flags, size=max_count, fill_value=flags.size)[0]
