@@ -14,9 +14,9 @@ from small_networks import SKIN
 QUICK = """
 import sys
 from jeit.cli import main
-from jeit.touch.networks import PRESETS, Preset
-from jeit.touch.training import Plan
-PRESETS["quick"] = Preset(1000, 250, Plan(rate=2e-3, batch=32, epochs=1))
+from jeit.touch.networks import PRESETS, NetworkPreset
+from jeit.touch.training import TrainingPlan
+PRESETS["quick"] = NetworkPreset(1000, 250, TrainingPlan(rate=2e-3, batch=32, epochs=1))
 sys.exit(main(sys.argv[1:]))
 """
 
