@@ -33,9 +33,9 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
 # Tracing creates many small objects, which would trigger Python's garbage collection again and again.
 gc.set_threshold(100_000, 20, 50)
 
-# The same programs are compiled in every run: keep them.
+# The same programs are compiled in every run, and many in both workers: keep them all.
 jax.config.update("jax_compilation_cache_dir", str(ROOT / ".jax_cache"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 # Most of a test's time is compilation. Compile quickly and run a little slower; XLA_FLAGS="" tests the users' settings.
 from jeit.start import quick_compilation  # noqa: E402, after JAX's cache folder is set
@@ -49,6 +49,15 @@ def pytest_configure(config):
         for module in OWN_MODULES:
             for category in DEPRECATIONS:
                 config.addinivalue_line("filterwarnings", f"error::{category}:{module}")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Mark the tests of `repeated.txt` as slow: quicker ones reach the same code (see `find_repeated.py`)."""
+    repeated = set((ROOT / "tests" / "repeated.txt").read_text("utf-8").splitlines())
+    for item in items:
+        if item.nodeid in repeated:
+            item.add_marker(pytest.mark.slow)
 
 
 def _shared(variable: str, folder: str) -> Path | None:
