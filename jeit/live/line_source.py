@@ -1,9 +1,12 @@
-"""Frames from lines of a connection, which is made again whenever it is lost."""
+"""Frames from lines of a connection, which is made again whenever it is lost, and frames that are read ahead."""
 
 from __future__ import annotations
 
+import queue
+import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 
 from jeit.live.connections import AbstractConnection
 from jeit.live.lines import LineBuffer, LineReading
@@ -13,6 +16,8 @@ from jeit.live.sources import CONNECTED, ENDED, AbstractSource
 # Seconds of waiting for bytes at a time, before connecting again (doubled with each failure), without any byte until
 # that is reported, and between comments of a device that are reported.
 _WAIT, _FIRST_DELAY, _LONGEST_DELAY, _SILENT, _BETWEEN = 0.2, 0.25, 2.0, 3.0, 2.0
+# Maximum number of frames that wait for a program that does not read them yet.
+_MAX_AHEAD = 20_000
 
 
 class LineSource(AbstractSource):
@@ -27,6 +32,10 @@ class LineSource(AbstractSource):
         super().__init__(name)
         self.device, self.reading, self.rate = connection, reading, rate
         self._note, self._noted = "", -float("inf")
+
+    def end_when_lost(self) -> None:
+        """End when the connection is lost; see `AbstractSource.end_when_lost`."""
+        self.device.lasting = False
 
     def __iter__(self) -> Iterator[LiveFrame]:
         self.begun = time.monotonic()
@@ -109,3 +118,49 @@ class LineSource(AbstractSource):
                 return
             arrived = time.monotonic()
         yield self.frame(values, arrived)
+
+
+class ReadAhead(AbstractSource):
+    """A source that a thread of its own reads from now on, so that frames keep the time of their arrival, and none is
+    lost, while a program prepares to image them. At most 20,000 frames wait; the loss of later ones is reported.
+    """
+
+    def __init__(self, source: AbstractSource):
+        self._source = source
+        self._waiting: queue.Queue[LiveFrame | BaseException | None] = queue.Queue()
+        threading.Thread(target=self._read, name="jeit live ahead", daemon=True).start()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._source, name)
+
+    def __iter__(self) -> Iterator[LiveFrame]:
+        while (frame := self._waiting.get()) is not None:
+            if isinstance(frame, BaseException):
+                raise frame
+            if self._source.closing.is_set():
+                return
+            yield frame
+
+    def close(self) -> None:
+        """End the iteration soon, without the frames that wait."""
+        self._source.close()
+        self._waiting.put(None)
+
+    def end_when_lost(self) -> None:
+        """End when the connection is lost; see `AbstractSource.end_when_lost`."""
+        self._source.end_when_lost()
+
+    def _read(self) -> None:
+        num_lost = 0
+        try:
+            for frame in self._source:
+                if self._waiting.qsize() >= _MAX_AHEAD:
+                    num_lost += 1
+                    continue
+                if num_lost:
+                    self._source.say(f"{num_lost} frames were lost: the program did not read them.")
+                    num_lost = 0
+                self._waiting.put(frame)
+        except Exception as error:  # raised where the frames are read
+            self._waiting.put(error)
+        self._waiting.put(None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,8 +25,8 @@ from jeit.live.views.conductivity import ConductivityView
 _NETWORK, _SKIN, _GESTURES = "network.jeit", "skin.skops", "gestures.skops"
 # Fewest frames of an undisturbed sensor, and most of which a reference is made.
 _FEWEST, _MOST = 3, 10_000
-# Seconds between looks at the connection of a source.
-_LOOK = 0.3
+# Seconds between looks at the connection of a source; seconds in which lines that were sent before arrive.
+_LOOK, _BURST = 0.3, 0.05
 
 
 class Prepared(NamedTuple):
@@ -105,7 +106,7 @@ def prepare(
                 "reference is missing: give a measured file of the undisturbed sensor, or a description, and the first "
                 "frames are the reference."
             )
-        still, opened = first_frames(opened, untouched, report)
+        still, opened = first_frames(opened, untouched, report, rate=rate)
         measured = described_reference(described, still)
     else:
         still = frames_of(measured)
@@ -118,10 +119,16 @@ def prepare(
 
 
 def first_frames(
-    source: AbstractSource, seconds: float, report: Callable[[str], None] | None = None
+    source: AbstractSource,
+    seconds: float,
+    report: Callable[[str], None] | None = None,
+    *,
+    rate: float | None = None,
 ) -> tuple[Float[np.ndarray, "N M"], AbstractSource]:
     """Read the frames of the first `seconds` of a source, and return them with a source of those that follow.
 
+    Lines that were sent before the program could read them arrive all at once. The number of frames is therefore
+    `seconds` times the frame rate: `rate`, frames/s, or else that of the frames that arrive one after the other.
     Frames that are no numbers, or of another length than most, are left out; a recording is played from its beginning
     nevertheless. `report` is called with what is done, and with the reason while a device is waited for. Raises
     `ValueError` if fewer than three frames remain.
@@ -129,7 +136,7 @@ def first_frames(
     if isinstance(source, PlayedRecording):
         return _enough(list(source.frames[source.seconds <= seconds]), seconds), source
     with _reporting(source, f"undisturbed, {seconds:g} s", report or (lambda said: None)):
-        return _first_frames(source, seconds)
+        return _first_frames(source, seconds, rate)
 
 
 @contextmanager
@@ -154,17 +161,22 @@ def _reporting(source: AbstractSource, task: str, report: Callable[[str], None])
         thread.join()
 
 
-def _first_frames(source: AbstractSource, seconds: float) -> tuple[Float[np.ndarray, "N M"], AbstractSource]:
-    coming, rows = iter(source), []
-    begun = None
-    for frame in coming:
-        begun = frame.second if begun is None else begun
-        if not isinstance(frame.values, str):
-            rows.append(frame.values)
-        if frame.second - begun >= seconds or len(rows) >= _MOST:
+def _first_frames(
+    source: AbstractSource, seconds: float, rate: float | None
+) -> tuple[Float[np.ndarray, "N M"], AbstractSource]:
+    frames, first = iter(source), []
+    number = None if rate is None else max(round(rate * seconds), _FEWEST)
+    for frame in frames:
+        is_late = number is None and frame.second - (first or [frame])[0].second >= seconds
+        if is_late or len(first) >= (number or _MOST):
+            frames = chain([frame], frames)
             break
+        if number is None or not isinstance(frame.values, str):
+            first.append(frame)
+    if number is None and (measured_rate := _rate_of_arrival(first)) is not None:
+        number = max(round(measured_rate * seconds), _FEWEST)
     try:
-        still = _enough(rows, seconds)
+        still = _enough([frame.values for frame in first[:number] if not isinstance(frame.values, str)], seconds)
     except ValueError:
         source.close()
         raise
@@ -173,7 +185,14 @@ def _first_frames(source: AbstractSource, seconds: float) -> tuple[Float[np.ndar
             f"The sensor changed by {100 * change:.2g} % in the first {seconds:g} s, which are the reference: take a "
             "new one while nothing touches the sensor."
         )
-    return still, _Continued(source, coming)
+    return still, _Continued(source, chain(first[len(first) if number is None else number :], frames))
+
+
+def _rate_of_arrival(frames: list[LiveFrame]) -> float | None:
+    """The rate of frames, frames/s, without those at the beginning that arrived all at once; None if all did."""
+    arrivals = np.array([frame.arrived for frame in frames])
+    late = arrivals[arrivals > (arrivals[:1] + _BURST)]
+    return (len(late) - 1) / (late[-1] - late[0]) if len(late) > 2 and late[-1] > late[0] else None
 
 
 def _enough(rows: list[np.ndarray], seconds: float) -> Float[np.ndarray, "N M"]:
@@ -204,6 +223,10 @@ class _Continued(AbstractSource):
     def close(self) -> None:
         """End the iteration soon."""
         self._source.close()
+
+    def end_when_lost(self) -> None:
+        """End when the connection is lost; see `AbstractSource.end_when_lost`."""
+        self._source.end_when_lost()
 
 
 def _with_sound(source: str, calibration: str | Path, rate: float | None) -> tuple[AbstractSource, AbstractView]:
@@ -251,7 +274,7 @@ def _with_model(
         measured = getattr(opened, "reference", None) if measured is None else measured
         still = frames_of(measured) if still is None and measured is not None else still
     if still is None and not (isinstance(model, LearntSkin) and model.mean_reference is None):
-        still, opened = first_frames(opened, untouched, report)
+        still, opened = first_frames(opened, untouched, report, rate=rate)
     if isinstance(model, LearntSkin):
         from jeit.live.views.learnt import LearntSkinView
 

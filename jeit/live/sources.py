@@ -58,6 +58,10 @@ class AbstractSource(abc.ABC):
         """End the iteration soon, also while it waits for a device."""
         self.closing.set()
 
+    def end_when_lost(self) -> None:
+        """End when a connection is lost, instead of waiting for it; sources without connections end anyway."""
+        return
+
     def say(self, sentence: str) -> None:
         """Keep a report about the source, with its time."""
         self.messages.append((time.monotonic() - self.begun, sentence[:_LONGEST]))
@@ -140,10 +144,10 @@ def open_source(
     kind = text.partition(":")[0]
     if text == "-" or kind in ("serial", "tcp"):
         from jeit.live.connections import connection_to
-        from jeit.live.line_source import LineSource
+        from jeit.live.line_source import LineSource, ReadAhead
         from jeit.live.lines import LineReading
 
-        return LineSource(text, connection_to(text), LineReading(description, reference), rate)
+        return ReadAhead(LineSource(text, connection_to(text), LineReading(description, reference), rate))
     path = Path(text)
     if text and path.is_dir():
         from jeit.live.folder_source import WatchedFolder

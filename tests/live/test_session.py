@@ -212,9 +212,10 @@ def test_a_reference_that_a_view_refuses_is_reported():
 
 def test_a_reference_taken_while_the_sensor_changes_is_refused():
     moved = noisy(30) * (1 + 0.02 * np.linspace(0, 1, 30)[:, None])
-    view = Blank()
-    with Session(Given(list(moved), pause=1e-3), view) as session:
+    source, view = Given(list(moved), gates=(1,)), Blank()
+    with Session(source, view) as session:
         session.take_reference(20)
+        source.gates[1].set()
         session.wait()
         assert view.references == []
         assert any("The old reference stays: the sensor changed by" in one for one in texts(session))

@@ -14,9 +14,10 @@ from jeit.data import write_table
 from jeit.live import folder_source, line_source
 from jeit.live.connections import SerialPort, Server, StandardInput, connection_to
 from jeit.live.folder_source import WatchedFolder
-from jeit.live.line_source import LineSource
+from jeit.live.line_source import LineSource, ReadAhead
 from jeit.live.lines import LineReading
-from jeit.live.sources import PlayedRecording, open_source
+from jeit.live.preparation import first_frames
+from jeit.live.sources import AbstractSource, PlayedRecording, open_source
 
 FRAMES = noisy(12)
 posix = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals and pipes of POSIX")
@@ -96,6 +97,65 @@ def test_lines_of_a_pipe_with_garbage_between_them():
     os.close(read)
 
 
+class Scheduled(AbstractSource):
+    """Frames that arrive at given times, without waiting."""
+
+    def __init__(self, seconds):
+        super().__init__("scheduled")
+        self.seconds = seconds
+
+    def __iter__(self):
+        for number, second in enumerate(self.seconds):
+            yield self.frame(np.array([number, 0.0]), self.begun + second)
+
+
+@pytest.mark.parametrize("rate", [None, 20.0])
+def test_frames_that_were_sent_before_the_program_could_read_count_into_the_reference(rate):
+    """Sixteen lines wait in the pipe; the following ones arrive at 20 frames/s. The first second has 20 frames."""
+    source = Scheduled([*np.linspace(0, 1e-3, 16), *(0.05 * np.arange(1, 60))])
+    still, following = first_frames(source, 1.0, rate=rate)
+    assert list(still[:, 0]) == list(range(20))
+    assert [frame.number for frame in following] == list(range(20, 75))
+
+
+def test_lines_that_have_all_arrived_are_the_reference_as_far_as_a_second_reads_them():
+    still, following = first_frames(Scheduled([*np.linspace(0, 1e-3, 16), 2.0, 2.1]), 1.0)
+    assert (len(still), [frame.number for frame in following]) == (16, [16, 17])
+
+
+@posix
+def test_frames_that_wait_for_the_program_keep_the_time_of_their_arrival():
+    read, write = os.pipe()
+    source = ReadAhead(LineSource("-", StandardInput(read), LineReading()))
+    for values in FRAMES[:3]:
+        os.write(write, line(values))
+        time.sleep(0.1)
+    os.close(write)
+    frames = list(source)
+    np.testing.assert_array_equal([frame.values for frame in frames], FRAMES[:3])
+    assert np.diff([frame.arrived for frame in frames]).min() > 0.05
+    os.close(read)
+
+
+@posix
+def test_frames_beyond_those_that_can_wait_are_counted(monkeypatch):
+    monkeypatch.setattr(line_source, "_MAX_AHEAD", 4)
+    read, write = os.pipe()
+    os.write(write, b"".join(map(line, FRAMES)))
+    lines = LineSource("-", StandardInput(read), LineReading())
+    source = ReadAhead(lines)
+    while lines._number < len(FRAMES):
+        time.sleep(0.005)
+    time.sleep(0.05)
+    frames = iter(source)
+    numbers = [next(frames).number for _ in range(4)]
+    os.write(write, line(FRAMES[0]))
+    os.close(write)
+    assert [*numbers, *(frame.number for frame in frames)] == [0, 1, 2, 3, 12]
+    assert any("8 frames were lost" in text for _, text in source.messages)
+    os.close(read)
+
+
 @posix
 def test_available_lines_are_replayed_at_a_rate():
     read, write = os.pipe()
@@ -162,6 +222,20 @@ def test_a_server_that_disconnects_and_returns():
         assert reading.reported("the other side has closed the connection")
     listening.close()
     np.testing.assert_array_equal(reading.numbers, FRAMES)
+
+
+def test_a_source_ends_with_its_server_on_request():
+    listening = socket.create_server(("127.0.0.1", 0))
+    source = open_source(f"tcp:127.0.0.1:{listening.getsockname()[1]}")
+    source.end_when_lost()
+    with Reading(source) as reading:
+        peer, _ = listening.accept()
+        peer.sendall(line(FRAMES[0]))
+        peer.close()
+        reading.thread.join(5)
+        assert not reading.thread.is_alive()
+    listening.close()
+    np.testing.assert_array_equal(reading.numbers, FRAMES[:1])
 
 
 def test_a_missing_server_is_awaited_and_can_be_cancelled():

@@ -159,6 +159,8 @@ def live(
     if not quiet:
         for _, note in ready.source.messages.copy():
             console.print(f"  note: {note}", soft_wrap=True)
+    if until_end:
+        ready.source.end_when_lost()
     recorder = Recorder(output, reference=ready.reference)
     if record:
         recorder.start()
