@@ -150,17 +150,20 @@ def read_pair(
     reference = data if reference is None and reference_key is not None else reference
     base = None if reference is None else read_file("--reference", reference, format, description, key=reference_key)
     measurement = read_file("DATA", data, format, description, like=base, key=key)
-    if frames is None:
-        return measurement, base
     whole = measurement if base is None else base
+    return measurement, base if frames is None else reference_of_frames(whole, frames)
+
+
+def reference_of_frames(measurement: "Measurement", frames: str) -> "Measurement":
+    """Return the `frames` of a measurement that --reference-frames names, such as "0-17" or "5"."""
     spelled = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", frames.strip())
     first, last = (int(spelled[1]), int(spelled[2] or spelled[1])) if spelled else (0, -1)
-    if not first <= last < whole.num_frames:
+    if not first <= last < measurement.num_frames:
         raise ValueError(
             f"--reference-frames: give FIRST-LAST, such as 0-17, or one number, of the frames 0 to "
-            f"{whole.num_frames - 1} of '{whole.name}'; it is {frames!r}."
+            f"{measurement.num_frames - 1} of '{measurement.name}'; it is {frames!r}."
         )
-    return measurement, whole.frames(slice(first, last + 1))
+    return measurement.frames(slice(first, last + 1))
 
 
 def in_options(said: str, options: dict[str, str]) -> str:

@@ -47,12 +47,24 @@ def test_own_frames_and_a_file_of_them_give_the_same_image(tank, recording, run,
     np.testing.assert_allclose(own, file, rtol=1e-6)
 
 
-@pytest.mark.parametrize("command", ["choose", "series", "reconstruct"])
+@pytest.mark.parametrize("command", ["choose", "series", "reconstruct", "stream"])
 def test_other_commands_accept_frames_too(recording, run, tmp_path, command):
     status, _, error = run(command, recording, "--reference-frames", "5", "--output", tmp_path / "out")
     assert status != 0
     assert "--reference-frames: give FIRST-LAST" in error
-    own = {"series": ("--rate", 10), "choose": ("--rule", "gcv", "--quiet"), "reconstruct": ("--method", "one-step")}
-    asked = ("--num-points", 250, "--output", tmp_path, *own[command])
+    own = {
+        "series": ("--rate", 10),
+        "choose": ("--rule", "gcv", "--quiet"),
+        "reconstruct": ("--method", "one-step"),
+        "stream": ("--method", "one-step", "--film", "none"),
+    }
+    asked = ("--num-points", 250, "--output", tmp_path / "images", *own[command])
     status, _, error = run(command, recording, "--reference-frames", "0-1", *asked)
     assert (status, error) == (0, "")
+
+
+def test_a_stream_needs_a_reference_or_frames_of_it(tank, recording, run, tmp_path):
+    for data, hint in ((recording, "or --reference-frames"), ("-", "--reference is missing")):
+        status, _, error = run("stream", data, "--output", tmp_path)
+        assert status == 1
+        assert hint in error

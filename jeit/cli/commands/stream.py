@@ -18,11 +18,14 @@ from jeit.cli.options import (
     Key,
     Model,
     Quiet,
+    ReferenceFrames,
     ReferenceKey,
     make_folder,
     naming_options,
     number_or_name,
     read_file,
+    read_pair,
+    reference_of_frames,
 )
 
 
@@ -35,13 +38,18 @@ def stream(
             show_default=False,
         ),
     ],
-    reference: Annotated[
-        Path,
-        typer.Option(help="Measured file of the undisturbed body; says protocol and electrodes.", show_default=False),
-    ],
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for frames.csv, images.npz and pictures.", show_default=False)
     ],
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            help="Measured file of the undisturbed body; says protocol and electrodes. Needed unless "
+            "--reference-frames are given.",
+            show_default=False,
+        ),
+    ] = None,
+    reference_frames: ReferenceFrames = None,
     key: Key = None,
     reference_key: ReferenceKey = None,
     format: Format = None,
@@ -97,7 +105,10 @@ def stream(
             "rate": rate,
             "film": None if film in ("film.gif", "none") else film,
             "as-is": as_is or None,
+            "reference-frames": reference_frames,
         }
+        if reference is None:
+            raise ValueError(f"--reference is needed with --method {NETWORK}.")
         given = data if data == "-" else Path(data), reference, format, description
         image_by_network(model, given, output, method=method, unused_options=unused, quiet=quiet, streamed=True)
         return
@@ -130,13 +141,24 @@ def stream(
     wanted = None if film == "none" else film
     with naming_options({"film": "--film"}):
         films = () if wanted is None else (check_film(wanted),)
+    if reference is None and (reference_frames is None or data == "-"):
+        raise ValueError(
+            "--reference is missing: give a measured file of the undisturbed body"
+            + ("." if data == "-" else ", or --reference-frames, the frames of DATA that are of it, such as 0-17.")
+        )
     console = plain_console()
     with Stopping() as stopping:
         make_folder(output, ("frames.csv", "images.npz", "frames.png", *films))
         with Steps(console, quiet=quiet) as step:
             step("read")
-            empty = read_file("--reference", reference, format, description, key=reference_key)
-            measured = empty if data == "-" else read_file("DATA", Path(data), format, description, empty, key)
+            if data == "-":
+                empty = read_file("--reference", Path(reference or ""), format, description, key=reference_key)
+                empty = empty if reference_frames is None else reference_of_frames(empty, reference_frames)
+                measured = empty
+            else:
+                keys = (key, reference_key)
+                measured, base = read_pair(Path(data), reference, reference_frames, format, description, keys)
+                empty = measured if base is None else base
             imager, calibration = prepare_imager(empty, settings, measurement=measured, progress=step)
         if data == "-":
             frames, number = parse_frames(sys.stdin), None

@@ -133,7 +133,7 @@ def classify_change(
     for one in electrodes:
         own = touching[one] & healthy.used  # pyright: ignore[reportOptionalSubscript]
         kind = kind_of_fault(frames, reference, healthy.noise, own)
-        reason = f"Nearly all of the change is in the {int(own.sum())} channels of electrode {one}."
+        reason = f"Nearly all of the change is in the {int(own.sum())} channels of electrode {one + 1}."
         faults.append(Finding(kind, reason, True, electrode=one, own=own))
     # A cut right beside an electrode also changes almost only that electrode's channels. But it does not fluctuate, and
     # does not increase the current at the electrode.

@@ -103,7 +103,8 @@ def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndar
     if known.brief or len(healthy.frames) < _FEW:
         doubts.append(
             f"the healthy recording has {len(healthy.frames)} frames, few beside the length of touches, or at all: "
-            "findings may be false, and damage may be missed. Give forty of the longest touches, and a minute."
+            "findings may be false, and damage may be missed. Give forty of the longest touches, and a minute; or a "
+            f"shorter patience than {health.patience:.3g}, if no touch lasts that long."
         )
     silent = np.flatnonzero(known.used & ~there.any(axis=0))
     if silent.size:
