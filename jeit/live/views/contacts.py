@@ -130,8 +130,7 @@ def _noise_of(images: ConductivityView, still: Float[np.ndarray, "N M"]) -> Imag
     found = np.array([one for one in imaged if one is not None])
     if len(found) < _LEAST_FRAMES or not found.std(axis=0).any():
         return None
-    factor = (found - found.mean(axis=0)) / np.sqrt(len(found) - 1)
-    return ImageNoise(np.sqrt((factor**2).sum(axis=0)), factor)
+    return ImageNoise.of_images(found)
 
 
 class GestureView(AbstractView):

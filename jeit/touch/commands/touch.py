@@ -7,14 +7,14 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.options import Quiet, make_folder, naming_options
+from jeit.cli.options import Quiet, check_positive, make_folder, naming_options
 from jeit.touch.commands.touch_health import health
 from jeit.touch.commands.touch_watch import gestures, watch
 
 touch = typer.Typer(
     name="touch",
-    help="Skins that learn, from recorded presses and without a model, where, how hard and by what they are touched; "
-    "gestures, named as they end; and damage.",
+    help="Contacts of a recording; skins that learn, from recorded presses and without a model, where, how hard and by "
+    "what they are touched; gestures, named as they end; and damage.",
 )
 touch.command()(gestures)
 touch.command()(watch)
@@ -23,12 +23,101 @@ touch.command()(health)
 
 # Number of nodes of the mesh for images; contacts are located more finely than its cells.
 _NODES = 400
+# Frame rate of a recording without times, in frames/s.
+_USUAL_RATE = 10.0
+# Maximum number of touches that are printed.
+_MOST_TOUCHES = 30
 
 
 @touch.callback(invoke_without_command=True)
 def _top(context: typer.Context) -> None:
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
+
+
+@touch.command()
+def contacts(
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            help="Frames of the skin: .npz with frames (F, M) and seconds (F,), or a table with a frame a line.",
+            show_default=False,
+        ),
+    ],
+    skin: Annotated[
+        Path,
+        typer.Option(metavar="SKIN.toml", help="Geometry, electrodes and protocol of the skin.", show_default=False),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for contacts.csv, contacts.png.", show_default=False)
+    ],
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="File of frames of the untouched skin; by default the first frames of the recording."),
+    ] = None,
+    untouched: Annotated[
+        float, typer.Option(help="Seconds at the beginning in which nobody touches the skin, without a --reference.")
+    ] = 1.0,
+    rate: Annotated[
+        float | None, typer.Option(help="Frames per second, if the recording has no times (default 10).")
+    ] = None,
+    lowers: Annotated[
+        bool, typer.Option("--lowers", help="A touch lowers conductivity, as on hydrogel (default: it raises it).")
+    ] = False,
+    weakest: Annotated[
+        float,
+        typer.Option(help="Least change of a contact, relative to the strongest of its frame; below are side lobes."),
+    ] = 0.4,
+    quiet: Quiet = False,
+) -> None:
+    """Find all contacts in the frames of a recording, without learning: when, where, and which belong to one touch.
+
+    Writes contacts.csv, a line for each contact in each frame, report.json with the touches, and contacts.png.
+    """
+    import numpy as np
+
+    from jeit.arguments import counted
+    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.data import load_description, read_frame_recording
+    from jeit.touch import TouchImages, untouched_frames
+    from jeit.touch.reports.touch_watch import CONTACT_FILES, find_recorded_contacts, write_contacts
+
+    check_positive({"--untouched": untouched} | ({} if rate is None else {"--rate": rate}))
+    if not 0 <= weakest <= 1:
+        raise ValueError(f"--weakest must be between 0 and 1; it is {weakest:g}.")
+    make_folder(output, CONTACT_FILES)
+    console = plain_console()
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        with naming_options({"description": "--skin"}):
+            description = load_description(skin)
+        recorded = read_frame_recording(recording, description)
+        seconds = recorded.seconds
+        if seconds is None:
+            seconds = np.arange(len(recorded.frames)) / (rate or _USUAL_RATE)
+        with naming_options({"untouched": "--untouched"}):
+            still = (
+                untouched_frames(recorded, seconds, untouched)
+                if reference is None
+                else read_frame_recording(reference, description).frames
+            )
+        step("prepare")
+        images = TouchImages.prepare(description, still, progress=step.report)
+        step("find")
+        found = find_recorded_contacts(
+            images, recorded.frames, seconds, still, sign=-1 if lowers else 1, weakest=weakest
+        )
+        step("write")
+        write_contacts(found, images, output, name=recording.name)
+    if quiet:
+        return
+    console.print(f"\n{counted(len(seconds), 'frame')}: {counted(len(found.touches), 'touch')}")
+    if recorded.seconds is None and rate is None:
+        console.print(f"  note: no times are known: {_USUAL_RATE:g} frames a second are assumed; see --rate")
+    for note in found.notes:
+        console.print(f"  note: {note}", soft_wrap=True)
+    _print_touches(console, found.touches, images.background)
+    say_written(console, output / "contacts.csv", "report.json", "contacts.png")
 
 
 @touch.command()
@@ -167,6 +256,25 @@ def predict(
     console.print("\n" + "; ".join(said))
     _print_notes(console, touches.notes)
     say_written(console, output / "touches.csv", "report.json", "touches.png")
+
+
+def _print_touches(console, touches, background: float) -> None:
+    """Print when and where each touch begins and ends, and its strongest change relative to the background."""
+    from rich.table import Table
+
+    names = ("touch", "from / s", "to / s", "first place / mm", "last place / mm", "strongest change")
+    table = Table(*names, box=None, padding=(0, 2, 0, 0))
+    for column in table.columns:
+        column.justify = "right"
+    for path in touches[:_MOST_TOUCHES]:
+        places = [f"({1e3 * x:+.1f}, {1e3 * y:+.1f})" for x, y in path.position[[0, -1]]]
+        peak = path.peak[abs(path.peak).argmax()] / background
+        table.add_row(str(path.number), f"{path.onset:.2f}", f"{path.offset:.2f}", *places, f"{100 * peak:+.0f} %")
+    if touches:
+        console.print()
+        console.print(table)
+    if len(touches) > _MOST_TOUCHES:
+        console.print(f"  {len(touches) - _MOST_TOUCHES} more in report.json")
 
 
 def _print_notes(console, notes) -> None:

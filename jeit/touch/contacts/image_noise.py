@@ -75,6 +75,20 @@ class ImageNoise(Module):
         return cls._from_factor(strayed / np.sqrt(len(frames) - 1))
 
     @classmethod
+    def of_images(cls, images: Float[np.ndarray, "n m"]) -> "ImageNoise":
+        """Estimate the noise from at least ten images (n, m) of the untouched skin. Raises `ValueError` for fewer
+        images, NaN, and images that are all the same."""
+        images = real_array("images", images, "changes of conductivity (n, m)")
+        if images.ndim != 2 or len(images) < _LEAST_FRAMES or not np.isfinite(images).all():
+            raise ValueError(
+                f"images has shape {images.shape}; give {counted(_LEAST_FRAMES, 'image')} or more of the untouched "
+                "skin, (n, m), without NaN."
+            )
+        if (images == images[0]).all():
+            raise ValueError("images are all the same and show no noise. Give those of frames that were read.")
+        return cls._from_factor((images - images.mean(axis=0)) / np.sqrt(len(images) - 1))
+
+    @classmethod
     def of_channels(cls, reconstruction: LinearReconstruction, deviation: ArrayLike) -> "ImageNoise":
         """Compute the noise from the standard deviations of independent channels, (M,) or one number for all, volts.
 
