@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jeit.touch.learnt.imaged import ContactFeatures, ImageFeatures, ImageReconstruction
 
 # Minimum number of frames with the same targets as another frame, from which the noise of frames is estimated.
-_FEWEST = 20
+_MIN_REPEATED_FRAMES = 20
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,13 @@ class WhitenedChanges:
         group, count = _group_equal_rows(answers)
         means = np.zeros((len(count), changes.shape[1]))
         np.add.at(means, group, changes / count[group, None])
-        left = ((changes - means[group]) / scale)[count[group] > 1]
-        if not left.any():
+        residuals = ((changes - means[group]) / scale)[count[group] > 1]
+        if not residuals.any():
             return cls(np.diag(1 / scale))
-        freedom = len(left) - np.sum(count > 1)
-        values, vectors = np.linalg.eigh(len(left) / freedom * ledoit_wolf(left, assume_centered=True)[0])
+        degrees_of_freedom = len(residuals) - np.sum(count > 1)
+        values, vectors = np.linalg.eigh(
+            len(residuals) / degrees_of_freedom * ledoit_wolf(residuals, assume_centered=True)[0]
+        )
         values = np.maximum(values, 1e-12 * values.max())
         return cls((vectors / np.sqrt(values)) @ vectors.T / scale[:, None])
 
@@ -51,7 +53,7 @@ class WhitenedChanges:
 
 def are_repeated(answers: Float[np.ndarray, "N d"]) -> bool:
     """Whether enough frames have the same answers as another frame to estimate their noise."""
-    return int(np.sum(_group_equal_rows(answers)[1] - 1)) >= _FEWEST
+    return int(np.sum(_group_equal_rows(answers)[1] - 1)) >= _MIN_REPEATED_FRAMES
 
 
 def _group_equal_rows(targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,7 +64,7 @@ def _group_equal_rows(targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 # Maximum number of principal components; number of presses required for each.
-_MOST, _PRESSES_EACH = 60, 3
+_MAX_COMPONENTS, _PRESSES_PER_COMPONENT = 60, 3
 
 
 def _differences(changes, reference, unit):
@@ -145,7 +147,7 @@ class Features:
         if not rotated or isinstance(made, ContactFeatures):
             return cls(form, unit, mean, deviation, None, made)
         rows = np.linalg.svd((values - mean) / deviation, full_matrices=False)[2]
-        components = rows[: max(2, min(_MOST, len(values) // _PRESSES_EACH))].T
+        components = rows[: max(2, min(_MAX_COMPONENTS, len(values) // _PRESSES_PER_COMPONENT))].T
         return cls(form, unit, mean, deviation, components, made)
 
     def __call__(self, changes: np.ndarray, reference: np.ndarray) -> Float[np.ndarray, "n k"]:
@@ -169,8 +171,9 @@ def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tu
 
 
 def _infinite_where_zero(deviation: np.ndarray) -> np.ndarray:
-    known = deviation > 1e-9 * max(deviation.max(), 1e-300)
-    return np.where(known, deviation, np.inf)
+    """Replace standard deviations that are negligible compared with the largest one by infinity."""
+    is_nonzero = deviation > 1e-9 * max(deviation.max(), 1e-300)
+    return np.where(is_nonzero, deviation, np.inf)
 
 
 @dataclass(frozen=True)
@@ -187,13 +190,13 @@ class Forms:
     def available(
         cls, answers: Float[np.ndarray, "N d"], imaged: ImageReconstruction | None, *, has_reference: bool
     ) -> "Forms":
-        """Select the forms that can be computed from the data."""
+        """Return the forms that can be computed from the data."""
         makers: dict[str, Maker] = {"whitened": WhitenedChanges.learn} if are_repeated(answers) else {}
         if imaged is not None:
             makers |= {"contacts": lambda changes, answers: ContactFeatures(imaged)}
             makers |= {"images": lambda changes, answers: ImageFeatures(imaged)}
-        plain = [form for form in FORMS if has_reference or form != "ratios"]
-        return cls((*plain, *makers), makers)
+        unlearnt_forms = [form for form in FORMS if has_reference or form != "ratios"]
+        return cls((*unlearnt_forms, *makers), makers)
 
     def learn(self, form: str, changes, reference, answers, *, rotated: bool = True) -> Features:
         """Fit features of one form, as `Features.learn` does."""

@@ -26,8 +26,8 @@ from jeit_solvers import number_of_cores
 
 # Number of presses from which length and noise are estimated; maximum number of centres. If there are no more presses
 # than this, all are centres.
-_TUNED_ON, _CENTRES = 400, 640
-_AT_ONCE = 512
+_NUM_TUNING_PRESSES, _MAX_CENTRES = 400, 640
+_CHUNK_SIZE = 512
 
 
 @dataclass(frozen=True)
@@ -47,18 +47,18 @@ class GaussianProcess:
     def fit(cls, features, targets) -> "GaussianProcess":
         """Fit standardised `targets` (N, d) to `features` (N, k)."""
         order = np.random.default_rng(0).permutation(len(features))
-        some = order[:_TUNED_ON]
-        length, noise = _estimate_length_and_noise(features[some], targets[some])
-        chosen = np.sort(order[:_CENTRES])
-        centres = features[chosen]
-        among = _matern_kernel(cdist(centres, centres) / length)
+        tuning_presses = order[:_NUM_TUNING_PRESSES]
+        length, noise = _estimate_length_and_noise(features[tuning_presses], targets[tuning_presses])
+        centre_indices = np.sort(order[:_MAX_CENTRES])
+        centres = features[centre_indices]
+        centre_kernel = _matern_kernel(cdist(centres, centres) / length)
         if len(centres) == len(features):
-            matrix, load = among + noise * np.eye(len(among)), targets[chosen]
+            matrix, right_side = centre_kernel + noise * np.eye(len(centre_kernel)), targets[centre_indices]
         else:
-            across = _matern_kernel(cdist(features, centres) / length)
-            matrix, load = across.T @ across + noise * among, across.T @ targets
+            press_kernel = _matern_kernel(cdist(features, centres) / length)
+            matrix, right_side = press_kernel.T @ press_kernel + noise * centre_kernel, press_kernel.T @ targets
             matrix += 1e-8 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
-        return cls(centres, cho_solve(cho_factor(matrix), load), length)
+        return cls(centres, cho_solve(cho_factor(matrix), right_side), length)
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """Predict targets (n, d)."""
@@ -70,12 +70,13 @@ class GaussianProcess:
             squared = np.sum(rows**2, axis=1)[:, None] + squares - 2 * rows @ scaled.T
             return _matern_kernel(np.sqrt(np.maximum(squared, 0.0))) @ self.weights
 
-        return apply_in_parts(predict_rows, features, _AT_ONCE)
+        return apply_in_parts(predict_rows, features, _CHUNK_SIZE)
 
 
 def _matern_kernel(distance: np.ndarray) -> np.ndarray:
-    scaled = np.sqrt(3.0) * distance
-    return (1 + scaled) * np.exp(-scaled)
+    """Evaluate the Matérn kernel of order 3/2 at distances divided by the length."""
+    scaled_distance = np.sqrt(3.0) * distance
+    return (1 + scaled_distance) * np.exp(-scaled_distance)
 
 
 def _estimate_length_and_noise(features: np.ndarray, targets: np.ndarray) -> tuple[float, float]:
@@ -83,34 +84,36 @@ def _estimate_length_and_noise(features: np.ndarray, targets: np.ndarray) -> tup
 
     The variance of the function follows from these two in closed form.
     """
-    apart = cdist(features, features)
-    usual = float(np.sqrt(np.mean(apart**2))) or 1.0
+    distances = cdist(features, features)
+    mean_distance = float(np.sqrt(np.mean(distances**2))) or 1.0
 
-    def negative_log_likelihood(logs: np.ndarray) -> float:
-        matrix = _matern_kernel(apart / (usual * np.exp(logs[0]))) + np.exp(logs[1]) * np.eye(len(apart))
+    def negative_log_likelihood(log_parameters: np.ndarray) -> float:
+        matrix = _matern_kernel(distances / (mean_distance * np.exp(log_parameters[0]))) + np.exp(
+            log_parameters[1]
+        ) * np.eye(len(distances))
         try:
             factor = cho_factor(matrix, lower=True)
         except np.linalg.LinAlgError:
             return 1e12
-        size = np.mean(np.sum(targets * cho_solve(factor, targets), axis=0) / len(targets))
-        return float(2 * np.sum(np.log(np.diag(factor[0]))) + len(targets) * np.log(max(size, 1e-300)))
+        variance = np.mean(np.sum(targets * cho_solve(factor, targets), axis=0) / len(targets))
+        return float(2 * np.sum(np.log(np.diag(factor[0]))) + len(targets) * np.log(max(variance, 1e-300)))
 
     bounds = [(np.log(0.05), np.log(50.0)), (np.log(1e-6), np.log(1e3))]
     starts = [(0.5, np.log(0.05)), (2.0, np.log(0.3))]
-    tuned = min(
+    optimum = min(
         (
             minimize(negative_log_likelihood, start, method="Nelder-Mead", bounds=bounds, options={"maxfev": 60})
             for start in starts
         ),
-        key=lambda found: found.fun,
+        key=lambda result: result.fun,
     )
-    return usual * float(np.exp(tuned.x[0])), float(np.exp(tuned.x[1]))
+    return mean_distance * float(np.exp(optimum.x[0])), float(np.exp(optimum.x[1]))
 
 
 _ALPHAS = np.logspace(-2, 5, 15)
-_TREES = 100
+_NUM_TREES = 100
 # Maximum number of times that each press is presented to a map, in each phase.
-_SHOWN = 50
+_MAX_PRESENTATIONS = 50
 
 
 def ridge(features, targets) -> Any:
@@ -125,7 +128,7 @@ def trees(features, targets) -> Any:
     from sklearn.ensemble import HistGradientBoostingRegressor
 
     options = {"max_iter": 100, "max_leaf_nodes": 15, "min_samples_leaf": 8, "l2_regularization": 1.0}
-    models = [HistGradientBoostingRegressor(random_state=0, **options).fit(features, one) for one in targets.T]
+    models = [HistGradientBoostingRegressor(random_state=0, **options).fit(features, target) for target in targets.T]
     return Forest.from_boosted_regressors(models)
 
 
@@ -134,17 +137,17 @@ def forest(features, targets) -> Any:
     from sklearn.ensemble import ExtraTreesRegressor
 
     targets = targets[:, 0] if targets.shape[1] == 1 else targets
-    found = ExtraTreesRegressor(_TREES, max_features=0.3, min_samples_leaf=2, random_state=0).fit(features, targets)
-    return Forest.from_averaged_trees(found.estimators_)
+    trees = ExtraTreesRegressor(_NUM_TREES, max_features=0.3, min_samples_leaf=2, random_state=0).fit(features, targets)
+    return Forest.from_averaged_trees(trees.estimators_)
 
 
 def som(features, targets) -> Any:
     """Fit a self-organising map, which interpolates between the mean targets of the presses that each neuron won."""
     import jax
 
-    shown = min(MapSchedule().ordering, _SHOWN * len(features))
-    learnt = SelfOrganisingMap.fit(features, jax.random.key(0), schedule=MapSchedule(shown, shown))
-    return PlacedMap.learn(learnt, features, targets)
+    num_steps = min(MapSchedule().ordering, _MAX_PRESENTATIONS * len(features))
+    fitted_map = SelfOrganisingMap.fit(features, jax.random.key(0), schedule=MapSchedule(num_steps, num_steps))
+    return PlacedMap.learn(fitted_map, features, targets)
 
 
 REGRESSORS: dict[str, Callable[..., Any]] = {
@@ -163,18 +166,18 @@ OF_CHANNELS = ("forest",)
 
 
 # For the ensembles of Russo et al. (2017): number of members; number of leaves of a boosted tree.
-_MEMBERS, _LEAVES = 30, 21
+_NUM_MEMBERS, _MAX_LEAVES = 30, 21
 # Shrinkage of covariances if a class has fewer presses than twice the number of features; minimum variance of a class
 # along any axis, relative to the maximum.
-_SHRUNK, _LEAST = 0.1, 1e-4
+_SHRINKAGE, _MIN_VARIANCE_RATIO = 0.1, 1e-4
 
 
 def tree(features, label) -> Any:
     """Fit a decision tree."""
     from sklearn.tree import DecisionTreeClassifier
 
-    found = DecisionTreeClassifier(min_samples_leaf=2, random_state=0).fit(features, label)
-    return Forest.from_classification_trees([_with_numbered_classes(found)], np.ones(1), np.unique(label), votes=False)
+    fitted_tree = DecisionTreeClassifier(min_samples_leaf=2, random_state=0).fit(features, label)
+    return Forest.from_classification_trees([_number_classes(fitted_tree)], np.ones(1), np.unique(label), votes=False)
 
 
 def linear_discriminant(features, label) -> Any:
@@ -207,27 +210,29 @@ class QuadraticDiscriminant:
 
         If a class has too few presses for a covariance, all covariances are shrunk towards multiples of the identity.
         """
-        classes, number = np.unique(label, return_inverse=True)
-        shrunk, size = covariance_shrinkage(features, label), features.shape[1]
-        everywhere = np.mean(np.var(features, axis=0))
+        classes, class_indices = np.unique(label, return_inverse=True)
+        shrinkage, num_features = covariance_shrinkage(features, label), features.shape[1]
+        mean_variance = np.mean(np.var(features, axis=0))
         means, whiten, offset = [], [], []
-        for one in range(len(classes)):
-            own = features[number == one]
-            covariance = np.cov(own.T, bias=len(own) < 2).reshape(size, size)
-            covariance = (1 - shrunk) * covariance + shrunk * np.trace(covariance) / size * np.eye(size)
+        for class_index in range(len(classes)):
+            class_features = features[class_indices == class_index]
+            covariance = np.cov(class_features.T, bias=len(class_features) < 2).reshape(num_features, num_features)
+            covariance = (1 - shrinkage) * covariance + shrinkage * np.trace(covariance) / num_features * np.eye(
+                num_features
+            )
             values, axes = np.linalg.eigh(covariance)
-            values = np.maximum(values, _LEAST * max(values.max(), _LEAST * everywhere))
-            means.append(own.mean(axis=0))
+            values = np.maximum(values, _MIN_VARIANCE_RATIO * max(values.max(), _MIN_VARIANCE_RATIO * mean_variance))
+            means.append(class_features.mean(axis=0))
             whiten.append(axes / np.sqrt(values))
-            offset.append(np.log(len(own) / len(features)) - 0.5 * np.sum(np.log(values)))
+            offset.append(np.log(len(class_features) / len(features)) - 0.5 * np.sum(np.log(values)))
         return cls(np.array(means), np.array(whiten), np.array(offset), classes)
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Compute the logarithms (n, C) of each class's density times its share of the presses, up to a constant."""
-        found = np.empty((len(features), len(self.offset)))
-        for one, (mean, whiten, offset) in enumerate(zip(self.mean, self.whiten, self.offset, strict=True)):
-            found[:, one] = offset - 0.5 * np.sum(((features - mean) @ whiten) ** 2, axis=1)
-        return found
+        scores = np.empty((len(features), len(self.offset)))
+        for class_index, (mean, whiten, offset) in enumerate(zip(self.mean, self.whiten, self.offset, strict=True)):
+            scores[:, class_index] = offset - 0.5 * np.sum(((features - mean) @ whiten) ** 2, axis=1)
+        return scores
 
 
 def linear_svm(features, label) -> Any:
@@ -249,11 +254,11 @@ def boosted_trees(features, label) -> Any:
     from sklearn.ensemble import AdaBoostClassifier
     from sklearn.tree import DecisionTreeClassifier
 
-    one = DecisionTreeClassifier(max_leaf_nodes=_LEAVES, random_state=0)
-    found = AdaBoostClassifier(one, n_estimators=_MEMBERS, random_state=0).fit(features, label)
-    members, weights = found.estimators_, found.estimator_weights_[: len(found.estimators_)]
+    base_tree = DecisionTreeClassifier(max_leaf_nodes=_MAX_LEAVES, random_state=0)
+    ensemble = AdaBoostClassifier(base_tree, n_estimators=_NUM_MEMBERS, random_state=0).fit(features, label)
+    members, weights = ensemble.estimators_, ensemble.estimator_weights_[: len(ensemble.estimators_)]
     return Forest.from_classification_trees(
-        [_with_numbered_classes(one, found) for one in members], weights, np.unique(label), votes=True
+        [_number_classes(member, ensemble) for member in members], weights, np.unique(label), votes=True
     )
 
 
@@ -263,14 +268,14 @@ def bagged_trees(features, label) -> Any:
     from sklearn.ensemble import BaggingClassifier
     from sklearn.tree import DecisionTreeClassifier
 
-    bagged = BaggingClassifier(
-        DecisionTreeClassifier(random_state=0), _MEMBERS, n_jobs=number_of_cores(), random_state=0
+    classifier = BaggingClassifier(
+        DecisionTreeClassifier(random_state=0), _NUM_MEMBERS, n_jobs=number_of_cores(), random_state=0
     )
     with parallel_config("threading"):
-        found = bagged.fit(features, label)
-    weights = np.full(_MEMBERS, 1 / _MEMBERS)
+        ensemble = classifier.fit(features, label)
+    weights = np.full(_NUM_MEMBERS, 1 / _NUM_MEMBERS)
     return Forest.from_classification_trees(
-        [_with_numbered_classes(one) for one in found.estimators_], weights, np.unique(label), votes=False
+        [_number_classes(member) for member in ensemble.estimators_], weights, np.unique(label), votes=False
     )
 
 
@@ -279,9 +284,11 @@ def subspace_discriminant(features, label) -> Any:
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
     from sklearn.ensemble import BaggingClassifier
 
-    one = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
-    found = BaggingClassifier(one, _MEMBERS, bootstrap=False, max_features=0.5, random_state=0).fit(features, label)
-    return LinearEnsemble.from_bagged(found, features.shape[1])
+    discriminant = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
+    ensemble = BaggingClassifier(discriminant, _NUM_MEMBERS, bootstrap=False, max_features=0.5, random_state=0).fit(
+        features, label
+    )
+    return LinearEnsemble.from_bagged(ensemble, features.shape[1])
 
 
 @dataclass(frozen=True)
@@ -301,23 +308,27 @@ class LinearEnsemble:
         members = bagged.estimators_
         weights = np.zeros((len(members), len(bagged.classes_), num_features))
         intercepts = np.zeros(weights.shape[:2])
-        for one, some, weight, intercept in zip(members, bagged.estimators_features_, weights, intercepts, strict=True):
-            binary = len(one.coef_) == 1  # two classes: only the log-odds of the second are given
-            weight[-1 if binary else slice(None), some] = one.coef_[0] if binary else one.coef_
-            intercept[-1 if binary else slice(None)] = one.intercept_[0] if binary else one.intercept_
+        for member, feature_indices, weight, intercept in zip(
+            members, bagged.estimators_features_, weights, intercepts, strict=True
+        ):
+            is_binary = len(member.coef_) == 1  # two classes: only the log-odds of the second are given
+            weight[-1 if is_binary else slice(None), feature_indices] = member.coef_[0] if is_binary else member.coef_
+            intercept[-1 if is_binary else slice(None)] = member.intercept_[0] if is_binary else member.intercept_
         return cls(weights, intercepts, bagged.classes_)
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Compute the probabilities (n, C) of the classes, averaged over the ensemble."""
-        found = np.zeros((len(features), len(self.classes_)))
+        summed_probabilities = np.zeros((len(features), len(self.classes_)))
         for weight, intercept in zip(self.weights, self.intercepts, strict=True):
-            found += probabilities(features @ weight.T + intercept, 1.0)
-        return found / len(self.weights)
+            summed_probabilities += probabilities(features @ weight.T + intercept, 1.0)
+        return summed_probabilities / len(self.weights)
 
 
-def _with_numbered_classes(tree, among=None):
-    """Replace the classes of a tree by their indices, among the classes of the ensemble `among` if it is given."""
-    tree.classes_ = np.arange(len(tree.classes_)) if among is None else np.searchsorted(among.classes_, tree.classes_)
+def _number_classes(tree, ensemble=None):
+    """Replace the classes of a tree by their indices, among the classes of the `ensemble` if it is given."""
+    tree.classes_ = (
+        np.arange(len(tree.classes_)) if ensemble is None else np.searchsorted(ensemble.classes_, tree.classes_)
+    )
     return tree
 
 
@@ -336,8 +347,8 @@ CLASSIFIERS: dict[str, Callable[..., Any]] = {
 
 def covariance_shrinkage(features, label) -> float:
     """Shrinkage of the covariances of classes; 0 if every class has at least twice as many presses as features."""
-    fewest = np.unique(label, return_counts=True)[1].min()
-    return _SHRUNK if fewest < 2 * features.shape[1] else 0.0
+    min_presses = np.unique(label, return_counts=True)[1].min()
+    return _SHRINKAGE if min_presses < 2 * features.shape[1] else 0.0
 
 
 def log_odds(model, features) -> Float[np.ndarray, "n C"]:
@@ -350,21 +361,23 @@ def log_odds(model, features) -> Float[np.ndarray, "n C"]:
         return np.log(np.maximum(model.predict_proba(features), 1e-6))
     if hasattr(model, "pair_odds"):
         return model.pair_odds(features)
-    said = model.decision_function(features)
-    return np.column_stack([-said, said]) if said.ndim == 1 else said
+    scores = model.decision_function(features)
+    return np.column_stack([-scores, scores]) if scores.ndim == 1 else scores
 
 
 def probabilities(odds: np.ndarray, sharpness: float) -> Float[np.ndarray, "n C"]:
     """Compute the probability of each class (n, C) from its log-odds times the `sharpness`."""
     scaled = sharpness * odds
-    powers = np.exp(scaled - scaled.max(axis=1, keepdims=True))
-    return powers / powers.sum(axis=1, keepdims=True)
+    exponentials = np.exp(scaled - scaled.max(axis=1, keepdims=True))
+    return exponentials / exponentials.sum(axis=1, keepdims=True)
 
 
 def fit_sharpness(odds: np.ndarray, true_classes: np.ndarray) -> float:
-    """Choose the sharpness that maximises the likelihood of the true classes `true_classes` (N,) of held-out
-    presses."""
+    """Choose the sharpness that maximises the likelihood of the `true_classes` (N,) of held-out presses."""
     candidates = np.geomspace(0.02, 50, 60)
     rows = np.arange(len(true_classes))
-    likely = [np.mean(np.log(np.maximum(probabilities(odds, one)[rows, true_classes], 1e-9))) for one in candidates]
-    return float(candidates[int(np.argmax(likely))])
+    log_likelihoods = [
+        np.mean(np.log(np.maximum(probabilities(odds, candidate)[rows, true_classes], 1e-9)))
+        for candidate in candidates
+    ]
+    return float(candidates[int(np.argmax(log_likelihoods))])
