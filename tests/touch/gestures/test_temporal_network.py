@@ -9,8 +9,8 @@ from made_touches import KINDS, touch, touches
 from jeit.touch.gestures import GestureModel, touch_features
 from jeit.touch.gestures.features import (
     COURSE_FEATURES,
-    SEQUENCE_FEATURES,
     NUM_SEQUENCE_INSTANTS,
+    SEQUENCE_FEATURES,
     SEQUENCE_VALUES,
     course_features,
     sequence_features,
