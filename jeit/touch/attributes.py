@@ -127,8 +127,8 @@ def contact_area(area: ArrayLike, found: ArrayLike) -> ContactArea:
     if len(area) < 2 or (area == area[0]).all():
         raise ValueError("area: give two different areas, or more.")
     gain, least = np.polyfit(area, found, 1)
-    varies = found.std() > 0
-    return ContactArea(float(gain), float(least), float(np.corrcoef(area, found)[0, 1]) if varies else 0.0)
+    has_variation = found.std() > 0
+    return ContactArea(float(gain), float(least), float(np.corrcoef(area, found)[0, 1]) if has_variation else 0.0)
 
 
 def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, float]:

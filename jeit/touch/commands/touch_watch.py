@@ -179,8 +179,8 @@ def watch(
                 console.print(f"  note: {frame.note}", soft_wrap=True)
             # In a live stream, a touch is printed once it is classified; in a file, once it has ended, with its final
             # prediction.
-            finished = frame.ended if stream != "-" else () if frame.named is None else (frame.named,)
-            for touch in () if quiet else finished:
+            finished_touches = frame.ended if stream != "-" else () if frame.named is None else (frame.named,)
+            for touch in () if quiet else finished_touches:
                 console.print(_describe_touch(touch))
 
         written = write_watch(watch.follow(stopping.until(frames)), watch, output, name=stream, progress=show)

@@ -114,7 +114,7 @@ def sequence_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> T
     courses = _time_courses(touches)
     course_values = course_features(touches)
     num_columns = NUM_SEQUENCE_INSTANTS * len(SEQUENCE_VALUES)
-    values = np.array([_sampled_course(course).ravel() for course in courses]).reshape(len(courses), num_columns)
+    values = np.array([_sample_course(course).ravel() for course in courses]).reshape(len(courses), num_columns)
     units = ("image", "1", "image", "m²", "1", "m/s", "m", "m") * NUM_SEQUENCE_INSTANTS
     return TouchFeatures(np.hstack([course_values.values, values]), SEQUENCE_FEATURES, (*course_values.units, *units))
 
@@ -174,7 +174,7 @@ def _further_features(course: ChangeCourse) -> list[float]:
     ]
 
 
-def _sampled_course(course: ChangeCourse) -> Float[np.ndarray, "T c"]:
+def _sample_course(course: ChangeCourse) -> Float[np.ndarray, "T c"]:
     """Sample the quantities `SEQUENCE_VALUES` at `NUM_SEQUENCE_INSTANTS` instants of a touch."""
     seconds = course.seconds
     instants = np.linspace(seconds[0], seconds[-1], NUM_SEQUENCE_INSTANTS)
@@ -185,8 +185,8 @@ def _sampled_course(course: ChangeCourse) -> Float[np.ndarray, "T c"]:
     )
     steps = np.linalg.norm(np.diff(centroids, axis=0, prepend=centroids[:1]), axis=1)
     speed = steps / max((seconds[-1] - seconds[0]) / (NUM_SEQUENCE_INSTANTS - 1), 1e-9)
-    centred = centroids - centroids.mean(axis=0)
-    positions_along = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
+    centred_path = centroids - centroids.mean(axis=0)
+    positions_along = centred_path @ np.linalg.svd(centred_path, full_matrices=False)[2][0]
     positions_along = positions_along - positions_along[0]
     largest_displacement = positions_along[np.abs(positions_along).argmax()]
     change, mean, area, half = (

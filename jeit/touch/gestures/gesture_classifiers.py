@@ -22,7 +22,7 @@ from jeit.touch.learnt.methods import CLASSIFIERS, log_odds
 from jeit.touch.learnt.temporal_network import TemporalNetwork
 
 
-def logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest:
+def fit_logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest:
     """Fit a `LogitBoostClassifier()`, as Silvera Tawil et al. (2011) do, and convert it to a forest, which is
     faster."""
     from jeit.touch.gestures.logit_boost import LogitBoostClassifier
@@ -30,15 +30,15 @@ def logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest
     return Forest.from_stumps(LogitBoostClassifier().fit(features, label))
 
 
-def temporal_network(features: Float[np.ndarray, "n k"], label: np.ndarray) -> TemporalNetwork:
+def fit_temporal_network(features: Float[np.ndarray, "n k"], label: np.ndarray) -> TemporalNetwork:
     """Fit a small neural network to features computed by `sequence_features`."""
     return TemporalNetwork.fit(features, label, whole=len(COURSE_FEATURES), values=len(SEQUENCE_VALUES))
 
 
 GESTURE_CLASSIFIERS: dict[str, Callable[..., Any]] = {
-    "logit-boost": logit_boost,
+    "logit-boost": fit_logit_boost,
     **CLASSIFIERS,
-    "temporal-network": temporal_network,
+    "temporal-network": fit_temporal_network,
 }
 """Functions that fit classifiers, by name: LogitBoost, the nine of learnt skins, and a network for the time course."""
 

@@ -231,8 +231,14 @@ class GestureModel:
         """
         values = FEATURE_FORMS[self.form](touches).values
         if not len(values):
-            empty = np.empty(0)
-            return Gestures(empty.astype(str), empty, np.empty((0, len(self.names))), self.names, empty.astype(bool))
+            empty_array = np.empty(0)
+            return Gestures(
+                empty_array.astype(str),
+                empty_array,
+                np.empty((0, len(self.names))),
+                self.names,
+                empty_array.astype(bool),
+            )
         odds = np.full((len(values), len(self.names)), -1e3)
         odds[:, self.model.classes_] = log_odds(self.model, self.scale(values))
         shares = probabilities(odds, self.sharpness)

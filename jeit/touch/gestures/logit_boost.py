@@ -154,13 +154,17 @@ def _fit_stumps(X: np.ndarray, class_indicators: np.ndarray, probability: np.nda
             .tree_
         )
         has_split = tree.node_count > 1
-        below, above = (float(tree.value[node, 0, 0]) for node in ((1, 2) if has_split else (0, 0)))
+        value_below, value_above = (float(tree.value[node, 0, 0]) for node in ((1, 2) if has_split else (0, 0)))
         feature_and_threshold = (int(tree.feature[0]), float(tree.threshold[0])) if has_split else (0, np.inf)
         stumps.append(
-            (*feature_and_threshold, (num_classes - 1) / num_classes * below, (num_classes - 1) / num_classes * above)
+            (
+                *feature_and_threshold,
+                (num_classes - 1) / num_classes * value_below,
+                (num_classes - 1) / num_classes * value_above,
+            )
         )
-    feature, threshold, below, above = (np.array(column) for column in zip(*stumps, strict=True))
-    return feature, threshold, below, above
+    feature, threshold, value_below, value_above = (np.array(column) for column in zip(*stumps, strict=True))
+    return feature, threshold, value_below, value_above
 
 
 def _stump_values(X: np.ndarray, feature, threshold, below, above) -> Float[np.ndarray, "n J"]:
@@ -186,8 +190,12 @@ def _largest_step(score, increments, class_indices, step: float, min_likelihood:
 
 def _log_likelihood(score: np.ndarray, class_indices: np.ndarray) -> float:
     """Compute the mean natural log-likelihood of the classes `class_indices` (n,) for the scores (n, J)."""
-    shifted = score - score.max(axis=1, keepdims=True)
-    return float(np.mean(shifted[np.arange(len(class_indices)), class_indices] - np.log(np.exp(shifted).sum(axis=1))))
+    shifted_scores = score - score.max(axis=1, keepdims=True)
+    return float(
+        np.mean(
+            shifted_scores[np.arange(len(class_indices)), class_indices] - np.log(np.exp(shifted_scores).sum(axis=1))
+        )
+    )
 
 
 def _softmax(score: np.ndarray) -> Float[np.ndarray, "n J"]:

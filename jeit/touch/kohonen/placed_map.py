@@ -175,7 +175,7 @@ class PlacedMap:
             )
         else:
             neurons, regularisation = (
-                placed_neurons.around[placed_neurons.neurons.winners(frames)[:, 1]],
+                placed_neurons.grid_neighbours[placed_neurons.neurons.winners(frames)[:, 1]],
                 _REGULARISATION_ON_GRID,
             )
         shares, residuals = np.empty(neurons.shape), np.empty(frames.shape)
@@ -195,19 +195,20 @@ class PlacedMap:
         neurons = SelfOrganisingMap(self.learnt.weights[self.placed][None], self.learnt.scale)
         places, grid = (self.places if self.fitted is None else self.fitted)[self.placed], np.argwhere(self.placed)
         # Sorted by the larger of the distances in rows and columns: the first is the neuron itself.
-        neighbours_on_grid = KDTree(grid).query(grid, min(_NUM_ON_GRID, len(grid)), p=np.inf)[1].reshape(len(grid), -1)
-        return _PlacedNeurons(neurons, places, neighbours_on_grid)
+        grid_neighbours = KDTree(grid).query(grid, min(_NUM_ON_GRID, len(grid)), p=np.inf)[1].reshape(len(grid), -1)
+        return _PlacedNeurons(neurons, places, grid_neighbours)
 
 
 class _PlacedNeurons(NamedTuple):
     """The neurons that have a place, as a map of one row.
 
-    `places` (k, d): the places that estimates use; `around` (k, q): indices of the neurons around each on the grid.
+    `places` (k, d): the places that estimates use; `grid_neighbours` (k, q): indices of the neurons around each on the
+    grid.
     """
 
     neurons: SelfOrganisingMap
     places: Float[np.ndarray, "k d"]
-    around: Int[np.ndarray, "k q"]
+    grid_neighbours: Int[np.ndarray, "k q"]
 
 
 class _Estimate(NamedTuple):

@@ -159,11 +159,11 @@ def _select_groups(model: _TouchSum, groups: list[np.ndarray], variance: float) 
     remaining_groups = list(groups)
     while remaining_groups:
         new_residuals = [model.fit_shares(np.any([*selected_groups, group], axis=0))[1] for group in remaining_groups]
-        best = int(np.argmin(new_residuals))
-        if residual - new_residuals[best] < _MIN_RESIDUAL_DECREASE * variance:
+        best_index = int(np.argmin(new_residuals))
+        if residual - new_residuals[best_index] < _MIN_RESIDUAL_DECREASE * variance:
             break
-        selected_groups.append(remaining_groups.pop(best))
-        residual = new_residuals[best]
+        selected_groups.append(remaining_groups.pop(best_index))
+        residual = new_residuals[best_index]
     return selected_groups
 
 

@@ -43,8 +43,8 @@ class Neighbourhood:
         """Fit to the scores of presses (N, K)."""
         stored_scores = scores[:: -(-len(scores) // _MAX_STORED_PRESSES), :_NUM_SCORES]
         size = float(np.median(np.linalg.norm(stored_scores, axis=1))) or 1.0
-        unscaled = cls(stored_scores, size, 1.0)
-        distances = unscaled._relative_distances(stored_scores, skip_first=True)
+        unscaled_neighbourhood = cls(stored_scores, size, 1.0)
+        distances = unscaled_neighbourhood._relative_distances(stored_scores, skip_first=True)
         return cls(stored_scores, size, max(float(np.quantile(distances, _USUAL_QUANTILE)), 1e-6))
 
     def __call__(self, scores: Float[np.ndarray, "n K"]) -> Float[np.ndarray, " n"]:
@@ -201,8 +201,8 @@ class Channels:
             relative_deviations, tried_scores, tried_residual = self._deviations(
                 completed_changes[tried_frames], has_reading[tried_frames], is_working
             )
-            agrees = (relative_deviations <= 1) == is_working
-            is_completed = agrees.all(axis=1)
+            agrees_with_pattern = (relative_deviations <= 1) == is_working
+            is_completed = agrees_with_pattern.all(axis=1)
             is_completed[0] = True
             num_unique_frames = num_unique_frames + 1 if is_completed.sum() == 1 else 0
             rows = tried_frames[is_completed]
@@ -240,8 +240,8 @@ class Channels:
         They are divided by the maximum deviation of a working channel, and infinite for readings that are not
         `has_reading` (n, m). Also returns the frames' scores (n, k) and residuals (n, m).
         """
-        weighted = self.patterns * (alive / self.noise**2)[:, None]
-        gain = weighted @ np.linalg.inv(weighted.T @ self.patterns + np.diag(1 / self.spread**2))
+        weighted_patterns = self.patterns * (alive / self.noise**2)[:, None]
+        gain = weighted_patterns @ np.linalg.inv(weighted_patterns.T @ self.patterns + np.diag(1 / self.spread**2))
         scores = changes @ gain
         residual = (changes - scores @ self.patterns.T) / self.noise
         variance_factor = 1 - np.einsum(
@@ -257,8 +257,10 @@ class Channels:
     ) -> Float[np.ndarray, "n m-a"]:
         """Predict the most likely readings of the channels that are not `alive` (m,) from those that are."""
         dead_directions = self.directions[~alive] * self.weight
-        predicted = dead_directions @ (alive_readings @ self.directions[alive]).T
-        return np.linalg.solve(np.eye(len(dead_directions)) - dead_directions @ self.directions[~alive].T, predicted).T
+        right_sides = dead_directions @ (alive_readings @ self.directions[alive]).T
+        return np.linalg.solve(
+            np.eye(len(dead_directions)) - dead_directions @ self.directions[~alive].T, right_sides
+        ).T
 
     def prediction_errors(self, alive: Bool[np.ndarray, "n m"], max_errors: int) -> Float[np.ndarray, "q n m"]:
         """Compute the errors of readings that are predicted for frames with some channels `alive`.
@@ -304,8 +306,8 @@ class Channels:
     @cached_property
     def _score_matrix(self) -> Float[np.ndarray, "m k"]:
         """Matrix that maps the readings of all channels to scores, if all channels are alive."""
-        weighted = self.patterns / self.noise[:, None] ** 2
-        return np.linalg.solve(weighted.T @ self.patterns + np.diag(1 / self.spread**2), weighted.T).T
+        weighted_patterns = self.patterns / self.noise[:, None] ** 2
+        return np.linalg.solve(weighted_patterns.T @ self.patterns + np.diag(1 / self.spread**2), weighted_patterns.T).T
 
 
 def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "m r"]]:
@@ -316,8 +318,8 @@ def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"
     else:  # the smaller of the two matrices
         squares, combinations = np.linalg.eigh(scaled @ scaled.T)
         directions = scaled.T @ combinations / np.sqrt(np.maximum(squares, 1e-300))
-    significant = np.flatnonzero(squares > _ROUNDING_ERROR * squares[-1])[::-1]
-    return squares[significant] / num_frames, directions[:, significant]
+    significant_indices = np.flatnonzero(squares > _ROUNDING_ERROR * squares[-1])[::-1]
+    return squares[significant_indices] / num_frames, directions[:, significant_indices]
 
 
 def _fit_patterns(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -325,9 +327,9 @@ def _fit_patterns(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray,
 
     The noise is the part of each channel that the patterns do not explain.
     """
-    explained = np.cumsum(variance) / np.sum(variance)
+    explained_fractions = np.cumsum(variance) / np.sum(variance)
     num_patterns = min(
-        int(np.searchsorted(explained, 1 - _NOISE_VARIANCE_FRACTION)) + 1,
+        int(np.searchsorted(explained_fractions, 1 - _NOISE_VARIANCE_FRACTION)) + 1,
         _MAX_PATTERNS,
         max(1, len(scaled) // _PRESSES_PER_PATTERN),
     )
@@ -341,15 +343,15 @@ def _fit_patterns(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray,
 def _leave_one_out_errors(scaled, variance, directions) -> Float[np.ndarray, "2 D m"]:
     """Compute mean squared prediction errors of channels, for covariances with each of the diagonals.
 
-    Returns two arrays (D, m): the error of each channel as predicted by the others, and this error times `unexplained`,
-    one minus the weight of the channel in its own prediction; `prediction_errors` uses the second.
+    Returns two arrays (D, m): the error of each channel as predicted by the others, and this error times
+    `residual_factor`, one minus the weight of the channel in its own prediction; `prediction_errors` uses the second.
     """
     scores, errors = scaled @ directions, []
     for diagonal in _DIAGONALS:
         weight = variance / (variance + diagonal)
-        unexplained = 1 - np.sum(directions**2 * weight, axis=1)
+        residual_factor = 1 - np.sum(directions**2 * weight, axis=1)
         mean_square = np.mean((scaled - (scores * weight) @ directions.T) ** 2, axis=0)
-        errors.append((mean_square / unexplained**2, mean_square / unexplained))
+        errors.append((mean_square / residual_factor**2, mean_square / residual_factor))
     return np.swapaxes(np.array(errors), 0, 1)
 
 
@@ -358,12 +360,12 @@ def _most_likely_scores(changes, alive, patterns, spread, noise) -> tuple[np.nda
 
     Residuals are 0 for channels that are not `alive` (n, m).
     """
-    weighted = patterns / noise[:, None] ** 2
+    weighted_patterns = patterns / noise[:, None] ** 2
     prior = np.diag(1 / spread**2)
-    scores = np.linalg.solve(weighted.T @ patterns + prior, weighted.T @ changes.T).T
+    scores = np.linalg.solve(weighted_patterns.T @ patterns + prior, weighted_patterns.T @ changes.T).T
     for frame in np.flatnonzero(~alive.all(axis=1)):
-        alive_weighted = weighted * alive[frame, :, None]
-        scores[frame] = np.linalg.solve(alive_weighted.T @ patterns + prior, alive_weighted.T @ changes[frame])
+        alive_patterns = weighted_patterns * alive[frame, :, None]
+        scores[frame] = np.linalg.solve(alive_patterns.T @ patterns + prior, alive_patterns.T @ changes[frame])
     return scores, np.where(alive, (changes - scores @ patterns.T) / noise, 0.0)
 
 
@@ -385,19 +387,21 @@ def choose_channels(
     unexplained. Products of the targets are explained too, since places are not linear in voltages.
     """
     products = [targets[:, i] * targets[:, j] for i in range(targets.shape[1]) for j in range(i + 1)]
-    unexplained = np.column_stack([targets, *(product - product.mean() for product in products[:20])])
-    unexplained = unexplained - unexplained.mean(axis=0)
+    unexplained_targets = np.column_stack([targets, *(product - product.mean() for product in products[:20])])
+    unexplained_targets = unexplained_targets - unexplained_targets.mean(axis=0)
     candidates = scaled - scaled.mean(axis=0)
     initial_norms = np.sum(candidates**2, axis=0)
-    selected: list[int] = []
+    selected_channels: list[int] = []
     for _ in range(min(num_channels, scaled.shape[1])):
         norms = np.sum(candidates**2, axis=0)
-        gain = np.sum((candidates.T @ unexplained) ** 2, axis=1) / np.where(norms > 1e-8 * initial_norms, norms, np.inf)
-        gain[selected] = -1
+        gain = np.sum((candidates.T @ unexplained_targets) ** 2, axis=1) / np.where(
+            norms > 1e-8 * initial_norms, norms, np.inf
+        )
+        gain[selected_channels] = -1
         best_channel = int(gain.argmax())
-        selected.append(best_channel)
+        selected_channels.append(best_channel)
         if norms[best_channel] > 1e-8 * initial_norms[best_channel]:
             direction = candidates[:, best_channel] / np.sqrt(norms[best_channel])
-            unexplained = unexplained - np.outer(direction, direction @ unexplained)
+            unexplained_targets = unexplained_targets - np.outer(direction, direction @ unexplained_targets)
             candidates = candidates - np.outer(direction, direction @ candidates)
-    return np.array(selected)
+    return np.array(selected_channels)

@@ -67,30 +67,30 @@ def _group_equal_rows(targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 _MAX_COMPONENTS, _PRESSES_PER_COMPONENT = 60, 3
 
 
-def _differences(changes, reference, unit):
+def _divide_by_unit(changes, reference, unit):
     """Features (n, m): changes divided by the `unit` of each channel."""
     return changes / unit
 
 
-def _ratios(changes, reference, unit):
+def _divide_by_reference(changes, reference, unit):
     """Features (n, m): changes relative to the reference."""
     size = np.maximum(np.abs(reference), 1e-3 * np.sqrt(np.mean(reference**2, axis=1, keepdims=True)))
     return changes / np.where(size > 0, size, 1.0)
 
 
-def _compressed(changes, reference, unit):
+def _compress_changes(changes, reference, unit):
     """Features (n, m): changes, divided by `unit`, on a scale that compresses large ones."""
     return np.sign(changes) * np.log1p(np.abs(changes) / unit)
 
 
-def _normalised(changes, reference, unit):
+def _normalise_scaled_changes(changes, reference, unit):
     """Features (n, m + 1): changes divided by `unit` and by the frame's root mean square, and its logarithm."""
     size = np.sqrt(np.mean((changes / unit) ** 2, axis=1, keepdims=True))
     size = np.where(size > 0, size, 1.0)
     return np.hstack([changes / unit / size, np.log(size)])
 
 
-def _shapes(changes, reference, unit):
+def _normalise_changes(changes, reference, unit):
     """Features (n, m + 1): changes divided by the frame's root mean square, and its logarithm; no `unit` is used."""
     size = np.sqrt(np.mean(changes**2, axis=1, keepdims=True))
     size = np.where(size > 0, size, 1.0)
@@ -99,11 +99,11 @@ def _shapes(changes, reference, unit):
 
 # Forms of features: functions of changes (n, m), the reference (n, m), and a unit (m,) for each channel.
 FORMS = {
-    "differences": _differences,
-    "ratios": _ratios,
-    "compressed": _compressed,
-    "normalised": _normalised,
-    "shapes": _shapes,
+    "differences": _divide_by_unit,
+    "ratios": _divide_by_reference,
+    "compressed": _compress_changes,
+    "normalised": _normalise_scaled_changes,
+    "shapes": _normalise_changes,
 }
 # Functions that fit a learnt form of features to changes (N, m) and targets (N, d).
 Maker = Callable[[np.ndarray, np.ndarray], WhitenedChanges | ContactFeatures | ImageFeatures]
@@ -143,7 +143,7 @@ class Features:
             unit, values, mean, deviation = standardisation(form, changes, reference)
         else:
             unit, values = np.ones(changes.shape[1]), made(changes)
-            mean, deviation = values.mean(axis=0), _infinite_where_zero(made.deviation(values))
+            mean, deviation = values.mean(axis=0), _replace_zeros_by_infinity(made.deviation(values))
         if not rotated or isinstance(made, ContactFeatures):
             return cls(form, unit, mean, deviation, None, made)
         rows = np.linalg.svd((values - mean) / deviation, full_matrices=False)[2]
@@ -153,8 +153,8 @@ class Features:
     def __call__(self, changes: np.ndarray, reference: np.ndarray) -> Float[np.ndarray, "n k"]:
         """Compute the features (n, k) of changes (n, m)."""
         values = FORMS[self.form](changes, reference, self.unit) if self.made is None else self.made(changes)
-        standard = (values - self.mean) / self.deviation
-        return standard if self.components is None else standard @ self.components
+        standardised_values = (values - self.mean) / self.deviation
+        return standardised_values if self.components is None else standardised_values @ self.components
 
 
 def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -167,10 +167,10 @@ def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tu
     unit = np.median(size, axis=0)
     unit = np.where(unit > 0, unit, np.mean(size, axis=0))
     values = FORMS[form](changes, reference, np.where(unit > 0, unit, 1.0))
-    return np.where(unit > 0, unit, 1.0), values, values.mean(axis=0), _infinite_where_zero(values.std(axis=0))
+    return np.where(unit > 0, unit, 1.0), values, values.mean(axis=0), _replace_zeros_by_infinity(values.std(axis=0))
 
 
-def _infinite_where_zero(deviation: np.ndarray) -> np.ndarray:
+def _replace_zeros_by_infinity(deviation: np.ndarray) -> np.ndarray:
     """Replace standard deviations that are negligible compared with the largest one by infinity."""
     is_nonzero = deviation > 1e-9 * max(deviation.max(), 1e-300)
     return np.where(is_nonzero, deviation, np.inf)

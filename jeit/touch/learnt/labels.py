@@ -83,18 +83,18 @@ def learn_labels(
         results.append(_hold_out(name, form, forms, changes, reference, true_classes, folds))
     results.sort(key=_error_rate)
     results = [result for result in results if method in ("auto", result.method)]
-    best = results[0]
-    features = forms.learn(best.form, changes, reference, true_classes[:, None])
+    best_result = results[0]
+    features = forms.learn(best_result.form, changes, reference, true_classes[:, None])
     feature_values = features(changes, reference)
     notes = []
-    if best.method == "quadratic-discriminant" and covariance_shrinkage(feature_values, true_classes):
+    if best_result.method == "quadratic-discriminant" and covariance_shrinkage(feature_values, true_classes):
         min_presses = np.bincount(true_classes).min()
         notes.append(
             f"quadratic discriminant: a class has only {min_presses} presses for {feature_values.shape[1]} features; "
             f"covariances are shrunk by {covariance_shrinkage(feature_values, true_classes):g}."
         )
-    model = CLASSIFIERS[best.method](feature_values, true_classes)
-    return LearntLabels(features, model, classes, fit_sharpness(best.odds, true_classes), notes), results
+    model = CLASSIFIERS[best_result.method](feature_values, true_classes)
+    return LearntLabels(features, model, classes, fit_sharpness(best_result.odds, true_classes), notes), results
 
 
 def _error_rate(result: LabelMethodResult) -> float:
@@ -226,9 +226,9 @@ def learn_keys(
                         model = _fit_logistic(rotated_features[0], training_answers, strength)
                         odds[name][is_held_out, key] = model.decision_function(rotated_features[1])
                     else:
-                        selected = _select_features(training_features, training_answers)
-                        model = _CHANNEL_METHODS[kind](training_features[:, selected], training_answers)
-                        class_odds = log_odds(model, held_out_features[:, selected])
+                        selected_features = _select_features(training_features, training_answers)
+                        model = _CHANNEL_METHODS[kind](training_features[:, selected_features], training_answers)
+                        class_odds = log_odds(model, held_out_features[:, selected_features])
                         odds[name][is_held_out, key] = class_odds[:, 1] - class_odds[:, 0]
         progress(f"keys, fold {fold + 1} of {folds.max() + 1}")
 
@@ -262,9 +262,11 @@ def _fit_key(name: str, changes, reference, answers, odds) -> tuple[Standardised
     sharpness = fit_sharpness(np.column_stack([np.zeros(len(odds)), odds]), answers)
     if kind == "linear":
         return features, _fit_rotated(values, answers, strength), sharpness
-    selected = _select_features(values, answers)
-    selected_features = StandardisedFeatures(features.form, features.unit, features.mean, features.deviation, selected)
-    return selected_features, _CHANNEL_METHODS[kind](values[:, selected], answers), sharpness
+    feature_indices = _select_features(values, answers)
+    key_features = StandardisedFeatures(
+        features.form, features.unit, features.mean, features.deviation, feature_indices
+    )
+    return key_features, _CHANNEL_METHODS[kind](values[:, feature_indices], answers), sharpness
 
 
 def _fit_rotated(values, answers, strength):

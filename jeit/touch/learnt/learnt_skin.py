@@ -300,7 +300,7 @@ class LearntSkin:
             )
         return reference
 
-    def _prediction_notes(self, alive: np.ndarray, unlike: np.ndarray) -> tuple[str, ...]:
+    def _prediction_notes(self, alive: np.ndarray, is_unlike: np.ndarray) -> tuple[str, ...]:
         notes = []
         used_channels = np.flatnonzero(self.channels.used)
         alive = alive[:, used_channels]
@@ -316,10 +316,10 @@ class LearntSkin:
                 f"{100 * np.mean(~alive):.2g} % of the readings disagree with the prediction from the other "
                 f"channels and were replaced by it."
             )
-        if unlike.any():
+        if is_unlike.any():
             notes.append(
-                f"{int(unlike.sum())} of {len(unlike)} frames are unlike all frames of the training set: they have no "
-                "prediction."
+                f"{int(is_unlike.sum())} of {len(is_unlike)} frames are unlike all frames of the training set: they "
+                "have no prediction."
             )
         return tuple(notes)
 

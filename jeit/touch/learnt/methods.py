@@ -62,13 +62,13 @@ class GaussianProcess:
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """Predict targets (n, d)."""
-        scaled = self.centres / self.length
-        squares = np.sum(scaled**2, axis=1)
+        scaled_centres = self.centres / self.length
+        squared_norms = np.sum(scaled_centres**2, axis=1)
 
         def predict_rows(rows: np.ndarray) -> np.ndarray:
             rows = rows / self.length
-            squared = np.sum(rows**2, axis=1)[:, None] + squares - 2 * rows @ scaled.T
-            return _matern_kernel(np.sqrt(np.maximum(squared, 0.0))) @ self.weights
+            squared_distances = np.sum(rows**2, axis=1)[:, None] + squared_norms - 2 * rows @ scaled_centres.T
+            return _matern_kernel(np.sqrt(np.maximum(squared_distances, 0.0))) @ self.weights
 
         return apply_in_parts(predict_rows, features, _CHUNK_SIZE)
 
@@ -116,14 +116,14 @@ _NUM_TREES = 100
 _MAX_PRESENTATIONS = 50
 
 
-def ridge(features, targets) -> Any:
+def fit_ridge(features, targets) -> Any:
     """Fit ridge regression, with the penalty that generalised cross-validation chooses."""
     from sklearn.linear_model import RidgeCV
 
     return RidgeCV(_ALPHAS).fit(features, targets)
 
 
-def trees(features, targets) -> Any:
+def fit_gradient_boosting(features, targets) -> Any:
     """Fit gradient-boosted regression trees, one model for each target."""
     from sklearn.ensemble import HistGradientBoostingRegressor
 
@@ -132,16 +132,18 @@ def trees(features, targets) -> Any:
     return Forest.from_boosted_regressors(models)
 
 
-def forest(features, targets) -> Any:
+def fit_extra_trees(features, targets) -> Any:
     """Fit trees with random splits, whose predictions are averaged (Geurts et al. 2006)."""
     from sklearn.ensemble import ExtraTreesRegressor
 
     targets = targets[:, 0] if targets.shape[1] == 1 else targets
-    trees = ExtraTreesRegressor(_NUM_TREES, max_features=0.3, min_samples_leaf=2, random_state=0).fit(features, targets)
-    return Forest.from_averaged_trees(trees.estimators_)
+    ensemble = ExtraTreesRegressor(_NUM_TREES, max_features=0.3, min_samples_leaf=2, random_state=0).fit(
+        features, targets
+    )
+    return Forest.from_averaged_trees(ensemble.estimators_)
 
 
-def som(features, targets) -> Any:
+def fit_self_organising_map(features, targets) -> Any:
     """Fit a self-organising map, which interpolates between the mean targets of the presses that each neuron won."""
     import jax
 
@@ -151,18 +153,18 @@ def som(features, targets) -> Any:
 
 
 REGRESSORS: dict[str, Callable[..., Any]] = {
-    "ridge": ridge,
+    "ridge": fit_ridge,
     "neighbours": NearestNeighbours.fit_regressor,
     "gaussian-process": GaussianProcess.fit,
-    "trees": trees,
-    "forest": forest,
+    "trees": fit_gradient_boosting,
+    "forest": fit_extra_trees,
     "network": Network.train,
-    "som": som,
+    "som": fit_self_organising_map,
 }
 # Methods that are quick enough to be tried on every form of the features.
-QUICK = ("ridge", "neighbours")
+QUICK_METHODS = ("ridge", "neighbours")
 # Methods that select few informative channels: they use the channels instead of principal components.
-OF_CHANNELS = ("forest",)
+CHANNEL_METHODS = ("forest",)
 
 
 # For the ensembles of Russo et al. (2017): number of members; number of leaves of a boosted tree.
@@ -172,7 +174,7 @@ _NUM_MEMBERS, _MAX_LEAVES = 30, 21
 _SHRINKAGE, _MIN_VARIANCE_RATIO = 0.1, 1e-4
 
 
-def tree(features, label) -> Any:
+def fit_decision_tree(features, label) -> Any:
     """Fit a decision tree."""
     from sklearn.tree import DecisionTreeClassifier
 
@@ -180,7 +182,7 @@ def tree(features, label) -> Any:
     return Forest.from_classification_trees([_number_classes(fitted_tree)], np.ones(1), np.unique(label), votes=False)
 
 
-def linear_discriminant(features, label) -> Any:
+def fit_linear_discriminant(features, label) -> Any:
     """Fit a linear discriminant: normal classes with a common covariance, with Ledoit-Wolf shrinkage."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
@@ -235,21 +237,21 @@ class QuadraticDiscriminant:
         return scores
 
 
-def linear_svm(features, label) -> Any:
+def fit_linear_svm(features, label) -> Any:
     """Fit a support vector machine with a linear kernel."""
     from sklearn.svm import SVC
 
     return SupportVectorMachine.from_scikit_learn(SVC(kernel="linear").fit(features, label))
 
 
-def quadratic_svm(features, label) -> Any:
+def fit_quadratic_svm(features, label) -> Any:
     """Fit a support vector machine with a quadratic kernel."""
     from sklearn.svm import SVC
 
     return SupportVectorMachine.from_scikit_learn(SVC(kernel="poly", degree=2, coef0=1.0).fit(features, label))
 
 
-def boosted_trees(features, label) -> Any:
+def fit_boosted_trees(features, label) -> Any:
     """Fit decision trees by AdaBoost, in which each tree has one weighted vote."""
     from sklearn.ensemble import AdaBoostClassifier
     from sklearn.tree import DecisionTreeClassifier
@@ -262,7 +264,7 @@ def boosted_trees(features, label) -> Any:
     )
 
 
-def bagged_trees(features, label) -> Any:
+def fit_bagged_trees(features, label) -> Any:
     """Fit decision trees, each independently to a bootstrap sample of the presses."""
     from joblib import parallel_config
     from sklearn.ensemble import BaggingClassifier
@@ -279,7 +281,7 @@ def bagged_trees(features, label) -> Any:
     )
 
 
-def subspace_discriminant(features, label) -> Any:
+def fit_subspace_discriminant(features, label) -> Any:
     """Fit an ensemble of linear discriminants, each to a random half of the features."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
     from sklearn.ensemble import BaggingClassifier
@@ -333,15 +335,15 @@ def _number_classes(tree, ensemble=None):
 
 
 CLASSIFIERS: dict[str, Callable[..., Any]] = {
-    "tree": tree,
-    "linear-discriminant": linear_discriminant,
+    "tree": fit_decision_tree,
+    "linear-discriminant": fit_linear_discriminant,
     "quadratic-discriminant": QuadraticDiscriminant.fit,
-    "linear-svm": linear_svm,
-    "quadratic-svm": quadratic_svm,
+    "linear-svm": fit_linear_svm,
+    "quadratic-svm": fit_quadratic_svm,
     "nearest": NearestNeighbours.fit_classifier,
-    "boosted-trees": boosted_trees,
-    "bagged-trees": bagged_trees,
-    "subspace-discriminant": subspace_discriminant,
+    "boosted-trees": fit_boosted_trees,
+    "bagged-trees": fit_bagged_trees,
+    "subspace-discriminant": fit_subspace_discriminant,
 }
 
 
@@ -367,8 +369,8 @@ def log_odds(model, features) -> Float[np.ndarray, "n C"]:
 
 def probabilities(odds: np.ndarray, sharpness: float) -> Float[np.ndarray, "n C"]:
     """Compute the probability of each class (n, C) from its log-odds times the `sharpness`."""
-    scaled = sharpness * odds
-    exponentials = np.exp(scaled - scaled.max(axis=1, keepdims=True))
+    scaled_odds = sharpness * odds
+    exponentials = np.exp(scaled_odds - scaled_odds.max(axis=1, keepdims=True))
     return exponentials / exponentials.sum(axis=1, keepdims=True)
 
 

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from jeit.touch.learnt.extras import apply_over_folds
 from jeit.touch.learnt.features import Features, Forms
 from jeit.touch.learnt.imaged import ImageReconstruction
-from jeit.touch.learnt.methods import OF_CHANNELS, QUICK, REGRESSORS
+from jeit.touch.learnt.methods import CHANNEL_METHODS, QUICK_METHODS, REGRESSORS
 
 _NUM_SIMILAR, _TARGET_COVERAGES = 40, ((1.0, 0.6827), (1.96, 0.95))
 # Number of similar presses from which a variance is estimated; pairs of a multiple of the standard deviation and the
@@ -188,11 +188,11 @@ def learn_numbers(
     cross_validation = _CrossValidation(changes, reference, targets, folds, forms)
     results = []
     for form in forms.names:
-        for quick_method in QUICK:
+        for quick_method in QUICK_METHODS:
             progress(f"{quick_method} on {form}")
             results.append(cross_validation.hold_out(quick_method, form))
     best_forms = list(dict.fromkeys(result.form for result in sorted(results, key=_mean_error)))[:2]
-    slower_methods = [name for name in REGRESSORS if name not in QUICK and method in ("auto", BLEND, name)]
+    slower_methods = [name for name in REGRESSORS if name not in QUICK_METHODS and method in ("auto", BLEND, name)]
     for slower_method in slower_methods:
         for form in best_forms if slower_method in ("gaussian-process", "forest") else best_forms[:1]:
             progress(f"{slower_method} on {form}")
@@ -217,13 +217,13 @@ def learn_numbers(
     members = []
     for result in chosen_results:
         progress(f"{result.method}, all presses")
-        features = forms.learn(result.form, changes, reference, targets, rotated=result.method not in OF_CHANNELS)
+        features = forms.learn(result.form, changes, reference, targets, rotated=result.method not in CHANNEL_METHODS)
         model = REGRESSORS[result.method](
             features(changes, reference), (targets - cross_validation.mean) / cross_validation.scale
         )
         members.append((features, model))
-    held_out_at_ends = (folds == 0) | (folds == folds.max())
-    spread = DeviationModel.learn(predictions, changes, predictions - targets, held_out_at_ends)
+    is_in_end_fold = (folds == 0) | (folds == folds.max())
+    spread = DeviationModel.learn(predictions, changes, predictions - targets, is_in_end_fold)
     return LearntNumbers(members, cross_validation.mean, cross_validation.scale, spread), results
 
 
@@ -271,7 +271,7 @@ class _CrossValidation:
         def predict(fold: int) -> None:
             is_held_out = self.folds == fold
             training_features, held_out_features = self._fold_features(
-                form, fold, is_held_out, rotated=method not in OF_CHANNELS
+                form, fold, is_held_out, rotated=method not in CHANNEL_METHODS
             )
             model = REGRESSORS[method](training_features, (self.targets[~is_held_out] - self.mean) / self.scale)
             predictions[is_held_out] = self.mean + self.scale * np.asarray(model.predict(held_out_features)).reshape(

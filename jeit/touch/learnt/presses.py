@@ -375,14 +375,14 @@ def estimate_lag(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) 
     errors = {lag: _place_errors(scores, positions, folds, lag) for lag in range(-_MAX_LAG, _MAX_LAG + 1)}
     guess_error = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
     mean_errors = {lag: float(place_errors.mean()) for lag, place_errors in errors.items()}
-    best, second_best = sorted(mean_errors, key=lambda lag: mean_errors[lag])[:2]
-    min_difference = _MIN_STANDARD_ERRORS * float(errors[best].std()) / np.sqrt(len(positions))
+    best_lag, second_best_lag = sorted(mean_errors, key=lambda lag: mean_errors[lag])[:2]
+    min_difference = _MIN_STANDARD_ERRORS * float(errors[best_lag].std()) / np.sqrt(len(positions))
     is_clear = (
-        mean_errors[0] > _MAX_GUESS_ERROR_RATIO * guess_error > mean_errors[best]
-        and mean_errors[second_best] - mean_errors[best] > min_difference
+        mean_errors[0] > _MAX_GUESS_ERROR_RATIO * guess_error > mean_errors[best_lag]
+        and mean_errors[second_best_lag] - mean_errors[best_lag] > min_difference
     )
-    best = best if is_clear else 0
-    return best, mean_errors[0], mean_errors[best]
+    best_lag = best_lag if is_clear else 0
+    return best_lag, mean_errors[0], mean_errors[best_lag]
 
 
 def aligned_slices(num_rows: int, lag: int) -> tuple[slice, slice]:

@@ -55,8 +55,10 @@ class TemporalNetwork:
             hidden = _relu(
                 _neighbouring_steps(hidden, np) @ self.second[network_index].T + self.second_bias[network_index]
             )
-            pooled = np.concatenate([features[:, : self.whole], hidden.mean(axis=1), hidden.max(axis=1)], axis=1)
-            dense = _relu(pooled @ self.dense[network_index].T + self.dense_bias[network_index])
+            pooled_features = np.concatenate(
+                [features[:, : self.whole], hidden.mean(axis=1), hidden.max(axis=1)], axis=1
+            )
+            dense = _relu(pooled_features @ self.dense[network_index].T + self.dense_bias[network_index])
             odds = dense @ self.last[network_index].T + self.last_bias[network_index]
             exponentials = np.exp(odds - odds.max(axis=1, keepdims=True))
             summed_probabilities += exponentials / exponentials.sum(axis=1, keepdims=True)
@@ -95,15 +97,15 @@ def _relu(values):
 
 def _neighbouring_steps(course, engine):
     """Concatenate each time step with the two before and the two after it (n, T, 5 c); zeros beyond the ends."""
-    half, length = _KERNEL_SIZE // 2, course.shape[-2]
-    padded = engine.pad(course, ((0, 0), (half, half), (0, 0)))
+    half_width, num_steps = _KERNEL_SIZE // 2, course.shape[-2]
+    padded_course = engine.pad(course, ((0, 0), (half_width, half_width), (0, 0)))
     return engine.concatenate(
-        [padded[:, first_step : first_step + length] for first_step in range(_KERNEL_SIZE)], axis=-1
+        [padded_course[:, first_step : first_step + num_steps] for first_step in range(_KERNEL_SIZE)], axis=-1
     )
 
 
 @functools.cache
-def _compiled_training(num_steps: int, whole: int, values: int, classes: int) -> Callable[..., Any]:
+def _compiled_training(num_steps: int, whole: int, values: int, num_classes: int) -> Callable[..., Any]:
     """Return a function that trains networks in `num_steps` steps, compiled once for each shape.
 
     The function returns weights and biases, layer by layer, from features, indices of the classes, the rows of each
@@ -118,7 +120,7 @@ def _compiled_training(num_steps: int, whole: int, values: int, classes: int) ->
         (_HIDDEN_SIZE, _KERNEL_SIZE * values),
         (_HIDDEN_SIZE, _KERNEL_SIZE * _HIDDEN_SIZE),
         (_DENSE_SIZE, whole + 2 * _HIDDEN_SIZE),
-        (classes, _DENSE_SIZE),
+        (num_classes, _DENSE_SIZE),
     ]
 
     def log_odds(weights, features, key):
@@ -126,20 +128,26 @@ def _compiled_training(num_steps: int, whole: int, values: int, classes: int) ->
         course = features[:, whole:].reshape(len(features), -1, values)
         hidden = jax.nn.relu(_neighbouring_steps(course, jnp) @ first.T + first_bias)
         hidden = jax.nn.relu(_neighbouring_steps(hidden, jnp) @ second.T + second_bias)
-        pooled = jnp.concatenate([features[:, :whole], hidden.mean(axis=1), hidden.max(axis=1)], axis=1)
-        pooled = pooled * jax.random.bernoulli(key, 1 - _DROPOUT_RATE, pooled.shape) / (1 - _DROPOUT_RATE)
-        return jax.nn.relu(pooled @ dense.T + dense_bias) @ last.T + last_bias
+        pooled_features = jnp.concatenate([features[:, :whole], hidden.mean(axis=1), hidden.max(axis=1)], axis=1)
+        pooled_features = (
+            pooled_features * jax.random.bernoulli(key, 1 - _DROPOUT_RATE, pooled_features.shape) / (1 - _DROPOUT_RATE)
+        )
+        return jax.nn.relu(pooled_features @ dense.T + dense_bias) @ last.T + last_bias
 
     def loss(weights, features, class_indices, key):
-        for_noise, for_dropping = jax.random.split(key)
-        noisy = features + _FEATURE_NOISE * jax.random.normal(for_noise, features.shape, features.dtype)
-        wanted = (1 - _LABEL_SMOOTHING) * jax.nn.one_hot(class_indices, classes) + _LABEL_SMOOTHING / classes
-        return -jnp.mean(jnp.sum(wanted * jax.nn.log_softmax(log_odds(weights, noisy, for_dropping)), axis=1))
+        noise_key, dropout_key = jax.random.split(key)
+        noisy_features = features + _FEATURE_NOISE * jax.random.normal(noise_key, features.shape, features.dtype)
+        target_probabilities = (1 - _LABEL_SMOOTHING) * jax.nn.one_hot(
+            class_indices, num_classes
+        ) + _LABEL_SMOOTHING / num_classes
+        return -jnp.mean(
+            jnp.sum(target_probabilities * jax.nn.log_softmax(log_odds(weights, noisy_features, dropout_key)), axis=1)
+        )
 
     def draw_weights(key):
         weights = []
-        for step_key, size in zip(jax.random.split(key, len(sizes)), sizes, strict=True):
-            weights += [jnp.sqrt(2 / size[1]) * jax.random.normal(step_key, size, jnp.float32)]
+        for layer_key, size in zip(jax.random.split(key, len(sizes)), sizes, strict=True):
+            weights += [jnp.sqrt(2 / size[1]) * jax.random.normal(layer_key, size, jnp.float32)]
             weights += [jnp.zeros(size[0], jnp.float32)]
         return tuple(weights)
 

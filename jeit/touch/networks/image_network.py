@@ -33,7 +33,7 @@ DESIGNS = ("unrolled", "three-stages")
 _FILE_KIND, _FILE_VERSION = "a jeit image network", 1
 # Maximum number of steps of an unrolled network.
 _MAX_STEPS = 100
-FILE = "network.jeit"
+NETWORK_FILE = "network.jeit"
 # Maximum number of frames that are imaged at once; larger batches would exceed the processor's cache. JAX compiles a
 # program for each power of two up to this number.
 _MAX_BATCH_SIZE = 64
@@ -284,7 +284,7 @@ def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
     ```
     """
     path = Path(path)
-    path = path / FILE if path.is_dir() else path
+    path = path / NETWORK_FILE if path.is_dir() else path
     head, network = read_model(path, _FILE_KIND, _FILE_VERSION, _untrained_network)
     low_x, high_x, low_y, high_y = map(float, head["extent_m"])
     image_network = ImageNetwork(

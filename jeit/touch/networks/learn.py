@@ -21,7 +21,7 @@ from jeit.arguments.extras import need_extra
 from jeit.design import Skin, touches_away_from_the_edge
 from jeit.design.study.store import OtherContents, Store
 from jeit.layout import Layout
-from jeit.touch.networks.image_network import DESIGNS, FILE, ImageNetwork, write_network
+from jeit.touch.networks.image_network import DESIGNS, NETWORK_FILE, ImageNetwork, write_network
 from jeit.touch.networks.linear_channels import (
     LinearChannels,
     depth_centroids,
@@ -180,16 +180,16 @@ def train_three_stages(
     Both autoencoders are fixed while the projection is trained. `noise`: standard deviation of relative changes.
     """
     shape = validation.depth.shape[1:]
-    network_start = ThreeStages(validation.change.shape[1], shape, key=runs.key)
+    initial_network = ThreeStages(validation.change.shape[1], shape, key=runs.key)
     mean, deviation = mean_and_deviation(training.rows("change"))
     noisy_deviation = np.hypot(deviation, noise)
-    network_start = eqx.tree_at(
+    initial_network = eqx.tree_at(
         lambda network: (network.mean, network.deviation),
-        network_start,
+        initial_network,
         (jnp.asarray(mean, jnp.float32), jnp.asarray(noisy_deviation, jnp.float32)),
     )
     noise_scale = jnp.asarray(noise / noisy_deviation, jnp.float32)
-    changes = MappedRows(training.rows("change"), network_start.standardise, f"standardised under noise of {noise}")
+    changes = MappedRows(training.rows("change"), initial_network.standardise, f"standardised under noise of {noise}")
     voltage_key, depth_key = (jax.random.fold_in(runs.key, number) for number in (1, 2))
 
     def denoising_loss(network, batch, key):
@@ -206,7 +206,7 @@ def train_three_stages(
             VoltageAutoencoder(validation.change.shape[1], key=voltage_key),
             TrainingObjective(denoising_loss, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=1)),
             changes,
-            network_start.standardise(jnp.asarray(validation.change, jnp.float32)),
+            initial_network.standardise(jnp.asarray(validation.change, jnp.float32)),
         ),
         "maps": runs.run(
             "maps",
@@ -219,11 +219,11 @@ def train_three_stages(
         ),
     }
     trained_parts = (trainings["voltages"].network.encoder, trainings["maps"].network.decoder)
-    network_start = eqx.tree_at(lambda network: (network.encoder, network.decoder), network_start, trained_parts)
+    initial_network = eqx.tree_at(lambda network: (network.encoder, network.decoder), initial_network, trained_parts)
     is_trained = eqx.tree_at(
         lambda network: network.projection,
-        jax.tree.map(lambda _: False, network_start),
-        jax.tree.map(eqx.is_inexact_array, network_start.projection),
+        jax.tree.map(lambda _: False, initial_network),
+        jax.tree.map(eqx.is_inexact_array, initial_network.projection),
     )
 
     def projection_loss(network, batch, key):
@@ -233,7 +233,7 @@ def train_three_stages(
 
     rows = training.rows("change", "depth"), _add_noise(validation, noise)
     trainings["projection"] = runs.run(
-        "projection", network_start, TrainingObjective(projection_loss, _map_errors, is_trained), *rows
+        "projection", initial_network, TrainingObjective(projection_loss, _map_errors, is_trained), *rows
     )
     return TrainedNetwork(trainings["projection"].network, trainings)
 
@@ -476,10 +476,10 @@ def learn_images(
     runs = TrainingRuns(preset.plan_of(design), key, work, progress)
     if design == "unrolled":
         channels = LinearChannels.from_skin(skin, SHAPE)
-        start_network = Unrolled(held_out_examples.change.shape[1], SHAPE, key=jax.random.fold_in(key, 3))
+        initial_network = Unrolled(held_out_examples.change.shape[1], SHAPE, key=jax.random.fold_in(key, 3))
         pixel_positions = image_places(skin, SHAPE[1], SHAPE[0])
-        start_network = start_network.adapted_to_skin(channels, pixel_positions, skin.layout.centres, noise)
-        trained_network = train_unrolled(start_network, channels, sets["learnt"], held_out_examples, noise, runs)
+        initial_network = initial_network.adapted_to_skin(channels, pixel_positions, skin.layout.centres, noise)
+        trained_network = train_unrolled(initial_network, channels, sets["learnt"], held_out_examples, noise, runs)
     else:
         trained_network = train_three_stages(sets["learnt"], held_out_examples, noise, runs)
     seconds["training"] = time.monotonic() - start - seconds["touches"]
@@ -487,7 +487,7 @@ def learn_images(
     report("standing")
     standing = evaluate_network(network, skin, test_examples)
     seconds["all"] = time.monotonic() - start
-    write_network(network, Path(folder) / FILE)
+    write_network(network, Path(folder) / NETWORK_FILE)
     return LearntImages(network, trained_network.courses, standing, seconds)
 
 

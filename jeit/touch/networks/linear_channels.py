@@ -187,8 +187,8 @@ def strength(depth):
     In two dimensions, patches with e^s and e^−s times the conductivity change voltages oppositely, to first order in
     their size (Keller's duality). The strength 2 sinh(s / 2), with log(1 − δ) = −s, has this property.
     """
-    clipped = jnp.clip(depth, 0.0, _MAX_DEPTH)
-    return clipped / jnp.sqrt(1 - clipped) + (depth - clipped)
+    clipped_depth = jnp.clip(depth, 0.0, _MAX_DEPTH)
+    return clipped_depth / jnp.sqrt(1 - clipped_depth) + (depth - clipped_depth)
 
 
 def depth_from_strength(strength):

@@ -111,8 +111,8 @@ class Chain(Module):
 def repeat_pixels(image: Float[Array, "b r c i"]) -> Float[Array, "b s d i"]:
     """Enlarge images to twice the rows and columns: each pixel becomes 2 × 2 equal pixels."""
     num_images, rows, columns, num_channels = image.shape
-    repeated = jnp.broadcast_to(image[:, :, None, :, None], (num_images, rows, 2, columns, 2, num_channels))
-    return repeated.reshape(num_images, 2 * rows, 2 * columns, num_channels)
+    repeated_image = jnp.broadcast_to(image[:, :, None, :, None], (num_images, rows, 2, columns, 2, num_channels))
+    return repeated_image.reshape(num_images, 2 * rows, 2 * columns, num_channels)
 
 
 def channels_to_pixels(image: Float[Array, "b r c 4"]) -> Float[Array, "b s d"]:

@@ -68,14 +68,14 @@ class Unrolled(Module):
     """Network from relative changes (b, M) to depth maps (b, rows, columns), divided by the skin's thickness.
 
     **Fields**: `operator` (M, P): response of the channels to the pixels; `imagers` (M, p, k): transposed matrices of
-    the linear images, on pixels twice as wide; `still` (rows / 2, columns / 2, s): constant images that describe the
-    skin; `steps`: networks that correct the map; `shape`: (rows, columns) of the maps. Only `steps` are trained; the
-    others depend on the skin.
+    the linear images, on pixels twice as wide; `constant_images` (rows / 2, columns / 2, s): constant images that
+    describe the skin; `steps`: networks that correct the map; `shape`: (rows, columns) of the maps. Only `steps` are
+    trained; the others depend on the skin.
     """
 
     operator: Float[Array, "M P"]
     imagers: Float[Array, "M p k"]
-    still: Float[Array, "r c s"]
+    constant_images: Float[Array, "r c s"]
     steps: tuple[Refinement, ...]
     shape: tuple[int, int] = eqx.field(static=True)
 
@@ -85,7 +85,7 @@ class Unrolled(Module):
         num_images = len(_NOISE_MULTIPLES) + 1
         self.operator = jnp.zeros((num_channels, shape[0] * shape[1]), jnp.float32)
         self.imagers = jnp.zeros((num_channels, rows * columns, num_images), jnp.float32)
-        self.still = jnp.zeros((rows, columns, 2), jnp.float32)
+        self.constant_images = jnp.zeros((rows, columns, 2), jnp.float32)
         keys = jax.random.split(key, num_steps)
         self.steps = tuple(
             Refinement(num_images + 2 + (4 if step_index else 0), key=step_key)
@@ -127,7 +127,7 @@ class Unrolled(Module):
         arrays = [
             jnp.asarray(round_relative(array), jnp.float32) for array in (channels.operator, imagers, constant_images)
         ]
-        return eqx.tree_at(lambda network: (network.operator, network.imagers, network.still), self, arrays)
+        return eqx.tree_at(lambda network: (network.operator, network.imagers, network.constant_images), self, arrays)
 
     @property
     def trained(self) -> "Unrolled":
@@ -150,7 +150,7 @@ class Unrolled(Module):
     def maps_after_steps(self, changes: Float[Array, "b M"]) -> list[Float[Array, "b r c"]]:
         """Compute the depth maps (b, rows, columns) after each step of the network."""
         num_frames, (rows, columns) = len(changes), (self.shape[0] // 2, self.shape[1] // 2)
-        constant_images = jnp.broadcast_to(self.still, (num_frames, *self.still.shape))
+        constant_images = jnp.broadcast_to(self.constant_images, (num_frames, *self.constant_images.shape))
         maps_of_steps = []
         for step in self.steps:
             residual = changes - self.predicted_changes(maps_of_steps[-1]) if maps_of_steps else changes

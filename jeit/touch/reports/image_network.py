@@ -122,7 +122,7 @@ class WrittenDepths:
 
 
 def write_depths(
-    found: Iterable[FrameDepth],
+    frame_depths: Iterable[FrameDepth],
     network: ImageNetwork,
     folder: str | Path,
     *,
@@ -136,10 +136,10 @@ def write_depths(
     its maximum depth. At the end, `depth.npz` with all maps, `depth.png` and `report.json` are written. The number of
     frames is not limited: their maps are kept on disk, not in memory.
 
-    `found`: the frames that `stream_depths` yields. Maps of refused frames are NaN; if no depth exceeds the noise
-    floor, the centroid is left empty. `progress` is called with every frame, and `drawing` as by `write_stream`. Each
-    file is written completely or not at all. Raises `ValueError` if `folder` cannot be a folder, and if no frame was
-    imaged, in which case no file remains; `OSError` on a full disk.
+    `frame_depths`: the frames that `stream_depths` yields. Maps of refused frames are NaN; if no depth exceeds the
+    noise floor, the centroid is left empty. `progress` is called with every frame, and `drawing` as by `write_stream`.
+    Each file is written completely or not at all. Raises `ValueError` if `folder` cannot be a folder, and if no frame
+    was imaged, in which case no file remains; `OSError` on a full disk.
     """
     result_folder = results_folder(folder, DEPTH_FILES)
     for file_name in DEPTH_FILES[1:]:
@@ -149,7 +149,7 @@ def write_depths(
     with GrowingRows(result_folder, network.shape) as rows:
         statistics = _FrameStatistics(network)
         with GrowingTable(result_folder / "frames.csv", ("frame", "x_m", "y_m", "depth_m")) as table:
-            for frame in found:
+            for frame in frame_depths:
                 table_row, depth = statistics.add_frame(frame)
                 with reporting_partial_results(rows):
                     table.write(table_row)

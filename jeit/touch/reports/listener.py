@@ -98,7 +98,7 @@ def report_listener(listener: Listener) -> dict[str, Any]:
 
 def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
     """Report the classified sounds as plain numbers, strings, lists and dictionaries; unknown values are None."""
-    whole_name, probability = labels.whole
+    recording_class, probability = labels.whole
     names, counts = np.unique(labels.named, return_counts=True)
     events = [
         {
@@ -117,7 +117,7 @@ def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
             "windows": len(labels),
             "window_s": LENGTH,
             "every_s": EVERY,
-            "whole": {"sound": whole_name or None, "probability": probability if whole_name else None},
+            "whole": {"sound": recording_class or None, "probability": probability if recording_class else None},
             "windows_of_each": {name or "quiet": count for name, count in zip(names, counts, strict=True)},
             "events": events,
             "notes": list(labels.notes),

@@ -267,8 +267,8 @@ class _CompiledTraining:
             )
         finite_losses = [value if np.isfinite(value) else np.inf for value in course.validation]
         course = course._replace(validation=finite_losses)
-        best = state.arrays if course.best == len(finite_losses) - 1 else state.best
-        return State(state.step, course, state.arrays, state.optimiser, best, jnp.zeros(()))
+        best_arrays = state.arrays if course.best == len(finite_losses) - 1 else state.best
+        return State(state.step, course, state.arrays, state.optimiser, best_arrays, jnp.zeros(()))
 
 
 def _end_reason(state: State, plan: TrainingPlan, last_batch: int) -> str | None:
