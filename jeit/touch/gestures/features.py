@@ -127,6 +127,7 @@ def _time_courses(touches) -> list[ChangeCourse]:
 
 
 def _seven_features(course: ChangeCourse) -> list[float]:
+    """Compute the features of one touch, in the order of `FEATURES`."""
     peak_frame = int(course.peak.argmax())
     intervals = np.diff(course.seconds)
     rate = np.mean(np.abs(np.diff(course.peak)) / intervals) if intervals.size else 0.0
@@ -142,6 +143,7 @@ def _seven_features(course: ChangeCourse) -> list[float]:
 
 
 def _further_features(course: ChangeCourse) -> list[float]:
+    """Compute the features of one touch that `COURSE_FEATURES` adds to the seven, in its order."""
     has_centroid = np.isfinite(course.centroid[:, 0])  # a frame below the level has no centroid
     centroids, seconds = course.centroid[has_centroid], course.seconds[has_centroid]
     steps = np.linalg.norm(np.diff(centroids, axis=0), axis=1)

@@ -277,6 +277,7 @@ class GestureModel:
 
 
 def _check_labels_and_people(touches, labels, people) -> tuple[np.ndarray, np.ndarray | None]:
+    """Convert the labels and people of touches to arrays (n,). Raises `ValueError` if they do not match the touches."""
     check_kind("touches", touches, (list, tuple), "a list of touches, such as of find_touches")
     label_array = np.asarray(labels)
     if label_array.shape != (len(touches),) or label_array.dtype.kind not in "UT":

@@ -258,6 +258,7 @@ class _Session:
             self.drift = self.drift + np.where(is_usable, share * (self.frame - self.reference), 0.0)
 
     def _classify(self, touch: StreamTouch) -> NamedTouch:
+        """Predict the gesture of a touch, with the time since its last frame arrived."""
         gestures = self.watch.model.predict([touch])
         return NamedTouch(
             number=self.num_ended_touches + 1,

@@ -116,7 +116,7 @@ def _training_sets_cover(fold: np.ndarray, positions: np.ndarray | None, kinds: 
 
 
 def _largest_distance(positions: np.ndarray, fold: np.ndarray) -> float:
-    """Mean distance of held-out presses from the nearest other press, in the fold in which it is largest."""
+    """Compute the mean distance of held-out presses from the nearest other press, in the fold where it is largest."""
     unit = positions.std(axis=0).max() or 1.0
     return max(
         KDTree(positions[fold != fold_index]).query(positions[fold == fold_index])[0].mean() + 1e-3 * unit

@@ -159,6 +159,8 @@ class Forest:
 
     @classmethod
     def _pack_trees(cls, trees: list[tuple], start: np.ndarray, classes: np.ndarray) -> "Forest":
+        """Create a forest from trees, each a tuple of arrays: tested features, thresholds, left and right children,
+        whether a node is a leaf, and the values of the nodes."""
         max_nodes, depth = max(len(tree[0]) for tree in trees), 1
         feature, left, right = (np.zeros((len(trees), max_nodes), np.int32) for _ in range(3))
         threshold = np.zeros((len(trees), max_nodes))

@@ -47,7 +47,7 @@ class WhitenedChanges:
         return changes @ self.root
 
     def deviation(self, values: Float[np.ndarray, "N m"]) -> Float[np.ndarray, " m"]:
-        """Unit of each feature, the same for all: the root mean square of their standard deviations."""
+        """Return the unit of the features, the same for all: the root mean square of their standard deviations."""
         return np.full(values.shape[1], np.sqrt(np.mean(values.var(axis=0))))
 
 
@@ -68,30 +68,31 @@ _MAX_COMPONENTS, _PRESSES_PER_COMPONENT = 60, 3
 
 
 def _divide_by_unit(changes, reference, unit):
-    """Features (n, m): changes divided by the `unit` of each channel."""
+    """Compute features (n, m): changes divided by the `unit` of each channel."""
     return changes / unit
 
 
 def _divide_by_reference(changes, reference, unit):
-    """Features (n, m): changes relative to the reference."""
+    """Compute features (n, m): changes relative to the reference."""
     size = np.maximum(np.abs(reference), 1e-3 * np.sqrt(np.mean(reference**2, axis=1, keepdims=True)))
     return changes / np.where(size > 0, size, 1.0)
 
 
 def _compress_changes(changes, reference, unit):
-    """Features (n, m): changes, divided by `unit`, on a scale that compresses large ones."""
+    """Compute features (n, m): changes, divided by `unit`, on a scale that compresses large ones."""
     return np.sign(changes) * np.log1p(np.abs(changes) / unit)
 
 
 def _normalise_scaled_changes(changes, reference, unit):
-    """Features (n, m + 1): changes divided by `unit` and by the frame's root mean square, and its logarithm."""
+    """Compute features (n, m + 1): changes divided by `unit` and by the frame's root mean square, and its logarithm."""
     size = np.sqrt(np.mean((changes / unit) ** 2, axis=1, keepdims=True))
     size = np.where(size > 0, size, 1.0)
     return np.hstack([changes / unit / size, np.log(size)])
 
 
 def _normalise_changes(changes, reference, unit):
-    """Features (n, m + 1): changes divided by the frame's root mean square, and its logarithm; no `unit` is used."""
+    """Compute features (n, m + 1): changes divided by the frame's root mean square, and its logarithm, without
+    `unit`."""
     size = np.sqrt(np.mean(changes**2, axis=1, keepdims=True))
     size = np.where(size > 0, size, 1.0)
     return np.hstack([changes / size, np.log(size)])

@@ -66,7 +66,7 @@ def check_seal(path: Path) -> None:
 
 
 def _seal(members: dict[str, bytes]) -> bytes:
-    """Checksum of the names and contents of an archive's members."""
+    """Compute a checksum of the names and contents of an archive's members."""
     digest = hashlib.sha256()
     for name in sorted(members):
         digest.update(f"{name} {len(members[name])}\n".encode() + members[name])

@@ -89,7 +89,7 @@ class ContactFeatures:
         return apply_in_parts(lambda rows: self.imaged.contacts(rows @ self.imaged.matrix), changes, _CHUNK_SIZE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
-        """Unit of each feature: its standard deviation."""
+        """Return the unit of each feature, its standard deviation."""
         return values.std(axis=0)
 
 
@@ -113,7 +113,7 @@ class ImageFeatures:
         return apply_in_parts(features, changes, _CHUNK_SIZE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
-        """Unit of each feature.
+        """Return the unit of each feature.
 
         For the contact and the logarithm, it is a fraction of the feature's standard deviation; for all cells of the
         image, it is the root mean square of their standard deviations.

@@ -102,6 +102,7 @@ def _error_rate(result: LabelMethodResult) -> float:
 
 
 def _hold_out(method, form, forms: Forms, changes, reference, true_classes, folds) -> LabelMethodResult:
+    """Predict the classes of all presses by cross-validation of a method on one form of the features."""
     num_classes = true_classes.max() + 1
     odds = np.full((len(true_classes), num_classes), -1e3)
 
@@ -246,7 +247,7 @@ def learn_keys(
 
 
 def _key_methods() -> dict[str, tuple[str, float]]:
-    """Candidate methods by name: the kind of classifier, and the constant C of logistic regression."""
+    """Return the candidate methods by name: the kind of classifier, and the constant C of logistic regression."""
     candidates = {}
     for form in _KEY_FORMS:
         candidates |= {f"logistic, C = {strength:g} on {form}": ("linear", strength) for strength in _INVERSE_PENALTIES}
@@ -256,6 +257,10 @@ def _key_methods() -> dict[str, tuple[str, float]]:
 
 
 def _fit_key(name: str, changes, reference, answers, odds) -> tuple[StandardisedFeatures, Any, float]:
+    """Fit the method `name` to one key; returns its features, its classifier, and the sharpness of probabilities.
+
+    `answers` (N,): 1 where the key is pressed; `odds` (N,): log-odds of held-out presses, for the sharpness.
+    """
     kind, strength = _key_methods()[name]
     features = StandardisedFeatures.learn(name.partition(" on ")[2], changes, reference)
     values = features(changes, reference)

@@ -348,7 +348,8 @@ CLASSIFIERS: dict[str, Callable[..., Any]] = {
 
 
 def covariance_shrinkage(features, label) -> float:
-    """Shrinkage of the covariances of classes; 0 if every class has at least twice as many presses as features."""
+    """Return the shrinkage of the covariances of classes; 0 if every class has at least twice as many presses as
+    features."""
     min_presses = np.unique(label, return_counts=True)[1].min()
     return _SHRINKAGE if min_presses < 2 * features.shape[1] else 0.0
 

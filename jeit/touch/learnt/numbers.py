@@ -83,6 +83,7 @@ class DeviationModel:
         return self.factor * self._local_deviations(where, leave_one_out=True)
 
     def _local_deviations(self, where: np.ndarray, *, leave_one_out: bool = False) -> np.ndarray:
+        """Estimate standard deviations (n, d) from the errors of the held-out presses that are nearest to `where`."""
         num_neighbours = min(_NUM_SIMILAR, len(self.where) - 1)
         neighbours = np.asarray(self._search_tree.query(where, num_neighbours + leave_one_out)[1])[
             :, int(leave_one_out) :

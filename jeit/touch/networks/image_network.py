@@ -83,7 +83,7 @@ class ImageNetwork:
         return cls(network, design, float(skin.thickness), shape, extent, float(noise), made_for)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Fields without the compiled programs, which are not pickled but compiled again."""
+        """Return the fields without the compiled programs, which are not pickled but compiled again."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def depth(self, voltages: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "*n rows columns"]:
@@ -323,8 +323,8 @@ def _untrained_network(head: dict[str, Any]) -> ThreeStages | Unrolled:
 
 
 def _describe_protocol(protocol: Protocol) -> dict[str, Any]:
-    """Numbers of channels and electrodes of a protocol, and a hash of its drive and measurement patterns, for any
-    current."""
+    """Return the numbers of channels and electrodes of a protocol, and a hash of its drive and measurement patterns,
+    for any current."""
     drive_patterns, measurement_patterns = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
     patterns = (
         np.round(

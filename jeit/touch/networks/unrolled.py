@@ -136,15 +136,15 @@ class Unrolled(Module):
         return eqx.tree_at(lambda network: network.steps, all_false, jax.tree.map(eqx.is_inexact_array, self.steps))
 
     def covariance(self, pixel_positions: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "M M"]:
-        """Covariance (M, M) of the changes of channels for strengths of the prior, with pixels at `pixel_positions` (r,
-        c, 2), metres."""
+        """Compute the covariance (M, M) of the changes of channels for strengths of the prior, with pixels at
+        `pixel_positions` (r, c, 2), metres."""
         rows, columns = self.shape[0] // 2, self.shape[1] // 2
         operator = np.asarray(self.operator, float).reshape(-1, rows, 2, columns, 2).sum(axis=(2, 4))
         operator = operator.reshape(len(operator), -1)
         return operator @ _covariance(pixel_positions[::2, ::2].reshape(-1, 2)) @ operator.T
 
     def predicted_changes(self, maps: Float[Array, "b r c"]) -> Float[Array, "b M"]:
-        """Relative changes (b, M) that the forward model predicts for maps."""
+        """Compute the relative changes (b, M) that the forward model predicts for maps."""
         return strength(maps).reshape(len(maps), -1) @ self.operator.T
 
     def maps_after_steps(self, changes: Float[Array, "b M"]) -> list[Float[Array, "b r c"]]:
@@ -171,7 +171,8 @@ class Unrolled(Module):
 
 
 def _covariance(pixel_positions: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p p"]:
-    """Gaussian covariance of the strengths of pixels at `pixel_positions`, as a function of their distance."""
+    """Compute the Gaussian covariance of the strengths of pixels at `pixel_positions`, as a function of their
+    distance."""
     length = _CORRELATION_LENGTH * np.ptp(pixel_positions, axis=0).max()
     squared_distances = ((pixel_positions[:, None] - pixel_positions) ** 2).sum(axis=-1)
     return _STRENGTH_DEVIATION**2 * np.exp(-squared_distances / (2 * length**2))

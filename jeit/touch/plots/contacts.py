@@ -98,7 +98,7 @@ def check_contacts(contacts) -> None:
 
 
 def largest_magnitude(values: np.ndarray) -> float:
-    """Maximum magnitude of the finite values; 0 if there are none."""
+    """Return the maximum magnitude of the finite values; 0 if there are none."""
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 

@@ -87,6 +87,7 @@ def plot_health(
 
 
 def _draw_cut(ax: Axes, event: HealthEvent) -> None:
+    """Draw the path of a cut, labelled with its length and time; a mended cut is dashed."""
     is_mended, path = event.status == EventStatus.MENDED, np.asarray(event.path)
     colour = _MENDED_COLOUR if is_mended else _CUT_COLOUR
     style = (0, (2.5, 1.5)) if is_mended else "-"

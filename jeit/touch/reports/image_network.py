@@ -236,6 +236,7 @@ class _FrameStatistics:
 def _draw_depths(
     maps: Float[np.ndarray, "k rows columns"], numbers: Int[np.ndarray, " k"], deepest: float, network: ImageNetwork
 ):
+    """Draw depth maps of the frames `numbers`; `deepest`: maximum depth of all frames, metres."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_depth_map

@@ -115,6 +115,7 @@ def _open_file(path: Path, kind: str) -> Iterator[BinaryIO]:
 
 
 def _read_header(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:
+    """Read the header of a file. Raises `ValueError` if the file is of another kind or version."""
     if file.read(len(_MAGIC)) != _MAGIC:
         raise ValueError("it is a file of another kind")
     line = file.readline(_MAX_HEADER_SIZE + 1)
