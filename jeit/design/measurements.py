@@ -332,7 +332,7 @@ def _greedy_selection(candidates: Candidates, number: int, criterion: Criterion)
     F are the rows f_i, with the best candidate as the next pivot.
 
     Choosing candidate p changes the posterior covariance from C to C - uuᵀ with u = C f_p / √(1 + f_pᵀC f_p). The rows
-    of `known` are the vectors u found so far.
+    of `directions` are the vectors u found so far.
     """
     rows, weight = candidates.rows, candidates.weight
 
@@ -346,7 +346,7 @@ def _greedy_selection(candidates: Candidates, number: int, criterion: Criterion)
         direction = covariance(directions, rows[best_candidate]) / jnp.sqrt(1 + variances[best_candidate])
         projections = rows @ direction
         if criterion == "A":
-            # Update f_jᵀCVC f_j to the new C, which changes C f_j by a multiple of `seen`.
+            # Update f_jᵀCVC f_j to the new C, which changes C f_j by a multiple of `projections`.
             weighted_direction = weight @ direction
             weighted_projections = rows @ covariance(directions, weighted_direction)
             reductions = jnp.maximum(

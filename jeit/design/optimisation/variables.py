@@ -74,7 +74,7 @@ class Variables(Module):
     - `low`, `size` (2,): lower left corner and side lengths of the bounding box of the centres, metres.
     - `images` (k, 2, 2): matrices of the symmetry; `order` (L,): index of each electrode among the images of the
       generators.
-    - `given`: the initial parameters; `start`: the variables that correspond to them.
+    - `initial`: the initial parameters; `start`: the variables that correspond to them.
     - `sizes` (G), `contacts` (G), `thickness` (1): ranges of the radii, contact impedances and thickness; None if these
       are not varied.
     - `pitch`: mean spacing of the electrodes, metres: the side of a square with the area available to each.
@@ -84,7 +84,7 @@ class Variables(Module):
     size: np.ndarray
     images: np.ndarray
     order: np.ndarray
-    given: Varied
+    initial: Varied
     sizes: Range | None
     contacts: Range | None
     thickness: Range | None
@@ -93,12 +93,12 @@ class Variables(Module):
 
     @classmethod
     def create(
-        cls, outline: Domain, given: Varied, *, symmetry=None, sizes=False, contacts=None, thickness=None
+        cls, outline: Domain, initial: Varied, *, symmetry=None, sizes=False, contacts=None, thickness=None
     ) -> "Variables":
-        """Create the variables from the `given` parameters. Raises `ValueError` for settings that contradict them."""
+        """Create the variables from the `initial` parameters. Raises `ValueError` for settings that contradict them."""
         if symmetry is not None:
             check_name("symmetry", symmetry, filter(None, _IMAGES), ", or None")
-        centres, radii = np.asarray(given.centres), np.asarray(given.radii)
+        centres, radii = np.asarray(initial.centres), np.asarray(initial.radii)
         images = np.array(_IMAGES[symmetry], float).reshape(-1, 2, 2)
         x_min, x_max, y_min, y_max = outline.extent
         if symmetry == "rotate-4" and not np.isclose(x_max - x_min, y_max - y_min):
@@ -129,14 +129,14 @@ class Variables(Module):
         if size_range is not None:
             start.append(size_range.variables(radii[is_generator]))
         if contact_range is not None:
-            start.append(contact_range.variables(np.asarray(given.contact_impedance)[is_generator]))
+            start.append(contact_range.variables(np.asarray(initial.contact_impedance)[is_generator]))
         if thickness_range is not None:
-            start.append(thickness_range.variables(np.asarray(given.thickness)[None]))
+            start.append(thickness_range.variables(np.asarray(initial.thickness)[None]))
         radii, impedance = (
             jnp.tile(jnp.asarray(values)[is_generator], len(images))[order]
-            for values in (radii, given.contact_impedance)
+            for values in (radii, initial.contact_impedance)
         )
-        symmetric_parameters = Varied(given.centres, radii, impedance, given.thickness)
+        symmetric_parameters = Varied(initial.centres, radii, impedance, initial.thickness)
         pitch = float(np.sqrt(np.prod(size) / len(order)))
         ranges = size_range, contact_range, thickness_range
         return cls(low, size, images, order, symmetric_parameters, *ranges, np.concatenate(start), pitch)
@@ -159,7 +159,7 @@ class Variables(Module):
     def smallest(self) -> Float[np.ndarray, " L"]:
         """Minimum radii (L,) of the electrodes, metres."""
         if self.sizes is None:
-            return np.asarray(self.given.radii)
+            return np.asarray(self.initial.radii)
         return np.tile(self.sizes.lower, len(self.images))[self.order]
 
     def varied(self, variables: Float[Array, " v"]) -> Varied:
@@ -170,7 +170,7 @@ class Variables(Module):
             variables[2 * num_generators :],
         )
         centres = jnp.einsum("kij,gj->kgi", self.images, offsets).reshape(-1, 2) + self.low + self.size / 2
-        _, radii, contact_impedance, thickness = self.given
+        _, radii, contact_impedance, thickness = self.initial
         if self.sizes is not None:
             radii, remaining_variables = (
                 self._values_of_images(self.sizes.values(remaining_variables[:num_generators])),

@@ -62,7 +62,7 @@ class Manner:
         return np.array([*(parameters[1] for parameters in self._word_parameters), _PATH_SPREAD, _PATH_SPREAD])
 
     @property
-    def within(self) -> float:
+    def touch_spread(self) -> float:
         """Standard deviation of the logarithms of `TRAITS` among touches of one person."""
         return _TOUCH_SPREAD
 
@@ -221,6 +221,6 @@ class Person(Module):
         if min(high_x - low_x, high_y - low_y) < _MIN_SKIN_SIDE:
             raise ValueError(f"outline must be {1e3 * _MIN_SKIN_SIDE:g} mm wide and high at least, for a hand.")
         rng = np.random.default_rng(np.asarray(jax.random.bits(key, (4,))).tolist())
-        log_deviations = MANNERS[gesture].within * rng.normal(size=len(TRAITS))
+        log_deviations = MANNERS[gesture].touch_spread * rng.normal(size=len(TRAITS))
         traits = self.medians[GESTURES.index(gesture)] * np.exp(log_deviations)
         return gesture_motion(rng, gesture, traits, outline, float(rate))
