@@ -99,18 +99,18 @@ def compare(
     check_at_least({"--pairs": (pairs, 0), "--taxels": (taxels, 1), "--seed": (seed, 0)})
     if not 0 <= margin < float("inf"):
         raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
-    both = [skins.read_with_outline(name, width, height) for name in (first, second)]
+    layouts = [skins.read_with_outline(name, width, height) for name in (first, second)]
     make_folder(output, _FILES)
     console = plain_console()
     with naming_options(_OPTION_NAMES), Steps(console, quiet=quiet) as step:
-        check_same_outline(*both)
+        check_same_outline(*layouts)
         step("mesh")
-        protocols = [skin_protocol(one, num_pairs=pairs) for one in both]
+        protocols = [skin_protocol(compared_layout, num_pairs=pairs) for compared_layout in layouts]
         material = {"thickness": 1e-3 * thickness, "conductivity": conductivity}
-        made = skins_of(both, protocols, **material, cell_size=1e-3 * cell)
+        skins_to_compare = skins_of(layouts, protocols, **material, cell_size=1e-3 * cell)
         result = compare_layouts(
-            made[0],
-            made[1],
+            skins_to_compare[0],
+            skins_to_compare[1],
             margin=1e-3 * margin,
             places=places,
             contrast=contrast,
@@ -131,14 +131,19 @@ def _print_comparison(console, result: "LayoutComparison") -> None:
     from jeit.design.reports.layouts import distinct_names
 
     figures = result.figures
-    table = Table("", *distinct_names([one["layout"] for one in figures]), box=None, padding=(0, 2, 0, 0))
+    table = Table(
+        "", *distinct_names([layout_figures["layout"] for layout_figures in figures]), box=None, padding=(0, 2, 0, 0)
+    )
     for column in table.columns[1:]:
         column.justify = "right"
     for name, key, factor in _QUANTITIES:
-        table.add_row(name, *(f"{factor * one[key]:.3g}" for one in figures))
+        table.add_row(name, *(f"{factor * layout_figures[key]:.3g}" for layout_figures in figures))
         if key == "taxel_count":
-            for part in ("mean", "std", "max"):
-                table.add_row(f"taxel area, {part} / cm²", *(f"{one['taxel_area_cm2'][part]:.3g}" for one in figures))
+            for statistic in ("mean", "std", "max"):
+                table.add_row(
+                    f"taxel area, {statistic} / cm²",
+                    *(f"{layout_figures['taxel_area_cm2'][statistic]:.3g}" for layout_figures in figures),
+                )
     console.print()
     console.print(table)
     console.print("blind spot: less sensitive than the other layout's least sensitive place", style="dim")

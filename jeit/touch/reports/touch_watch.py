@@ -414,7 +414,7 @@ def _report_contacts(found: RecordedContacts, images: TouchImages, name: str) ->
             ],
             "notes": list(found.notes),
             "units": {"onset": "s", "position": "m", "path_length": "m", "peak": "S", "background": "S"},
-            "versions": {package: version_of(package) for package in _PACKAGES[:3]},
+            "versions": {package: version_of(package) for package in _WATCH_PACKAGES[:3]},
         }
     )
 
