@@ -115,8 +115,8 @@ _REASONS = {
 }
 _TRACED_REASON = "It was fitted inside a transformation of JAX; the status says how that ended."
 
-# Relative misfit above which `Calibration.note` doubts the model. The misfit is 1 % for the KIT4 tanks and 8 % for the Kuopio challenge,
-# whose geometry is known.
+# Relative misfit above which `Calibration.note` doubts the model. The misfit is 1 % for the KIT4 tanks and 8 % for the
+# Kuopio challenge, whose geometry is known.
 _LARGE_MISFIT = 0.12
 # The largest voltage of a frame must lie between this number and its reciprocal, in volts.
 _MIN_VOLTAGE = 1e-30
@@ -184,7 +184,8 @@ class Calibration(Module):
         if self.shift is not None:
             distances = 1e3 * np.linalg.norm(np.asarray(self.shift), axis=1)
             return (
-                f"electrodes were estimated to be up to {distances.max():.2g} mm from where they are described (root mean "
+                f"electrodes were estimated to be up to {distances.max():.2g} mm from where they are described (root "
+                f"mean "
                 f"square {np.sqrt(np.mean(distances**2)):.2g} mm), which explains the reference far better. If the "
                 "description is exact, look for another cause: contacts, channels, order."
             )
@@ -198,8 +199,9 @@ class Calibration(Module):
         else:
             possible_errors, alternative = "radius, width of the electrodes", ", or the body deeper than a sheet"
         return (
-            f"the model misses {100 * float(self.misfit):.0f} % of the reference: {possible_errors}, protocol or gain may be "
-            f"others than described{alternative}. An error that is the same in both frames hardly moves the image of a "
+            f"the model misses {100 * float(self.misfit):.0f} % of the reference: {possible_errors}, protocol or "
+            f"gain may be others than described{alternative}. An error that is the same in both frames hardly moves "
+            f"the image of a "
             "change; but do not trust the size of the change, nor the background conductivity."
         )
 

@@ -8,7 +8,8 @@ information,
 
     ‖W^½ (T u - y)‖² = (u - ŷ)ᵀ G (u - ŷ) + c,   G = TᵀWT,   ŷ = G⁻¹TᵀWy,
 
-where c does not depend on u, and least squares with ŷ is much cheaper, because the work grows with the square of the number of channels.
+where c does not depend on u, and least squares with ŷ is much cheaper, because the work grows with the square of the
+number of channels.
 """
 
 from __future__ import annotations

@@ -137,9 +137,9 @@ def greit_noise_figure(target: float, eigenvalues, signal, data_ratio: float, im
     The noise figure is the signal-to-noise ratio of the data divided by that of the image, for one target (Adler et
     al., Physiol. Meas. 30, S35, 2009); in contrast, `noise_figure` draws signals from the prior.
 
-    With the eigendecomposition YYᵀ = VΛVᵀ, the image of data y is XYᵀV (Λ + λ²)⁻¹ Vᵀy. `signal`: Vᵀy; `image_modes`: XYᵀV;
-    `data_ratio`: signal-to-noise ratio of the data; `measure`: areas of the cells. White noise of unit variance in the data
-    gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².
+    With the eigendecomposition YYᵀ = VΛVᵀ, the image of data y is XYᵀV (Λ + λ²)⁻¹ Vᵀy. `signal`: Vᵀy; `image_modes`:
+    XYᵀV; `data_ratio`: signal-to-noise ratio of the data; `measure`: areas of the cells. White noise of unit variance
+    in the data gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².
     """
     weight = measure / measure.sum()
     noise_gain = weight @ image_modes**2
@@ -155,7 +155,8 @@ def greit_noise_figure(target: float, eigenvalues, signal, data_ratio: float, im
     if below_target.size == 0 or below_target[0] == 0:
         min_figure, max_figure = target * np.exp([excesses.min(), excesses.max()])
         raise ValueError(
-            f"noise_figure: no hyperparameter gives {target:g}; here it lies between {min_figure:.3g} and {max_figure:.3g}. A "
+            f"noise_figure: no hyperparameter gives {target:g}; here it lies between {min_figure:.3g} and "
+            f"{max_figure:.3g}. A "
             "larger radius brings it down; a larger noise_figure takes a noisier image."
         )
     bracket = (grid[below_target[0] - 1], grid[below_target[0]])

@@ -183,7 +183,8 @@ def _place_targets(mesh: Mesh, middle, radius: float, num_targets: int) -> tuple
 
 
 def _hexagonal_lattice(lower_corner, upper_corner, centre, spacing: float) -> np.ndarray:
-    """Points (k, 2) of a hexagonal grid with a point at `centre` that covers the box from `lower_corner` to `upper_corner`."""
+    """Points (k, 2) of a hexagonal grid with a point at `centre` that covers the box from `lower_corner` to
+    `upper_corner`."""
     steps = spacing * np.array([1, np.sqrt(0.75)])
     (first, bottom), (last, top) = (
         np.floor((lower_corner - centre) / steps) - 1,
@@ -194,7 +195,8 @@ def _hexagonal_lattice(lower_corner, upper_corner, centre, spacing: float) -> np
 
 
 def _cubic_lattice(lower_corner, upper_corner, centre, spacing: float) -> np.ndarray:
-    """Points (k, 3) of a cubic grid with a point at `centre` that covers the box from `lower_corner` to `upper_corner`."""
+    """Points (k, 3) of a cubic grid with a point at `centre` that covers the box from `lower_corner` to
+    `upper_corner`."""
     first, last = np.floor((lower_corner - centre) / spacing) - 1, np.ceil((upper_corner - centre) / spacing) + 1
     steps = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
     return centre + spacing * np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -229,8 +231,8 @@ def _sample_points(mesh: Mesh, spacing: float) -> Iterator[tuple[np.ndarray, np.
 
 
 def _desired_images(mesh: Mesh, positions, integrals, radius: float) -> scipy.sparse.csc_array:
-    """Desired images X (m, K): a disc around each position, with half its height at `radius` and the integral `integrals`
-    (K,) over the body."""
+    """Desired images X (m, K): a disc around each position, with half its height at `radius` and the integral
+    `integrals` (K,) over the body."""
     cell_measures, cell_centres = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
     pairs = KDTree(cell_centres).sparse_distance_matrix(
         KDTree(positions), (1 + _EDGE_HALF_WIDTH) * radius, output_type="ndarray"
