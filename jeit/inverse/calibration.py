@@ -185,9 +185,8 @@ class Calibration(Module):
             distances = 1e3 * np.linalg.norm(np.asarray(self.shift), axis=1)
             return (
                 f"electrodes were estimated to be up to {distances.max():.2g} mm from where they are described (root "
-                f"mean "
-                f"square {np.sqrt(np.mean(distances**2)):.2g} mm), which explains the reference far better. If the "
-                "description is exact, look for another cause: contacts, channels, order."
+                f"mean square {np.sqrt(np.mean(distances**2)):.2g} mm), which explains the reference far better. If "
+                "the description is exact, look for another cause: contacts, channels, order."
             )
         if not float(self.misfit) > _LARGE_MISFIT:
             return ""
@@ -201,8 +200,7 @@ class Calibration(Module):
         return (
             f"the model misses {100 * float(self.misfit):.0f} % of the reference: {possible_errors}, protocol or "
             f"gain may be others than described{alternative}. An error that is the same in both frames hardly moves "
-            f"the image of a "
-            "change; but do not trust the size of the change, nor the background conductivity."
+            "the image of a change; but do not trust the size of the change, nor the background conductivity."
         )
 
 

@@ -156,8 +156,7 @@ def greit_noise_figure(target: float, eigenvalues, signal, data_ratio: float, im
         min_figure, max_figure = target * np.exp([excesses.min(), excesses.max()])
         raise ValueError(
             f"noise_figure: no hyperparameter gives {target:g}; here it lies between {min_figure:.3g} and "
-            f"{max_figure:.3g}. A "
-            "larger radius brings it down; a larger noise_figure takes a noisier image."
+            f"{max_figure:.3g}. A larger radius brings it down; a larger noise_figure takes a noisier image."
         )
     bracket = (grid[below_target[0] - 1], grid[below_target[0]])
     return float(np.exp(scipy.optimize.root_scalar(excess, bracket=bracket, rtol=1e-10).root))

@@ -101,7 +101,7 @@ def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[
     if standard_deviation.shape not in ((), measured.shape) or standard_deviation.dtype.kind not in "iuf":
         raise ValueError(
             f"noise is {standard_deviation.dtype} of shape {standard_deviation.shape}; give one real number, or one "
-            f"for each channel."
+            "for each channel."
         )
     xp = namespace(standard_deviation, measured)
     deviation = (

@@ -283,8 +283,7 @@ class TotalVariation(AbstractPrior):
 def _raise_not_quadratic(missing_quantity: str) -> NoReturn:
     raise ValueError(
         f"prior: total variation has no {missing_quantity}, so there is no linear image with it; take reconstruct, "
-        f"or an Imager "
-        "with gauss-newton or levenberg-marquardt, or another prior."
+        "or an Imager with gauss-newton or levenberg-marquardt, or another prior."
     )
 
 

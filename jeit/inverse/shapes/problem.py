@@ -71,8 +71,7 @@ class SmoothField:
         if image_sizes != (problem_sizes := (len(bodies_problem.data.weight), len(bodies_problem.background))):
             raise ValueError(
                 f"smooth is an image of {image_sizes[0]} independent channels and {image_sizes[1]} cells, and the "
-                f"data of bodies "
-                f"have {problem_sizes[0]} and {problem_sizes[1]}; give one by the same model and mask."
+                f"data of bodies have {problem_sizes[0]} and {problem_sizes[1]}; give one by the same model and mask."
             )
         image = on_host(image)
         zero_coefficients: Any = np.zeros_like(image.coefficients)

@@ -285,7 +285,7 @@ def choose_solver(
     cost = (
         f"a factorisation takes {fronts.num_operations:.1e} operations, about {seconds:.1g} s, and "
         f"{_format_bytes(factor_memory)}; multigrid takes about {multigrid_seconds:.1g} s and {multigrid_memory} for "
-        f"32 solutions"
+        "32 solutions"
     )
     if factor_memory > allowed_memory or seconds > _DIRECT_TIME_FACTOR * multigrid_seconds:
         comparison = f"{cost}; {_format_bytes(allowed_memory)} are allowed"

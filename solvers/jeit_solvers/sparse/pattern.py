@@ -167,8 +167,8 @@ class SparsityPattern(Module):
             missing_rows = np.flatnonzero(~on_diagonal)
             raise ValueError(
                 f"{caller}: {missing_rows.size} of {size} rows {reason}, the first are {missing_rows[:5].tolist()}. "
-                f"A matrix "
-                "with this pattern cannot be positive definite: leave these unknowns out, and number the rest 0..n-1."
+                "A matrix with this pattern cannot be positive definite: leave these unknowns out, and number the rest "
+                "0..n-1."
             )
         below = unique[size:]
         rows = np.concatenate([np.arange(size), below // size])
