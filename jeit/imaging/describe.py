@@ -54,9 +54,9 @@ _RELATIVE_CONTACT = 0.01
 class Candidate:
     """Possible interpretation of a file. **Fields**: `protocol`: the table `[protocol]` of a description, without the
     current; `frames`: number of frames; `spread`: deviation of the frames of the empty body from their mean, relative;
-    `reciprocity`: error of the mean, None if no two channels are reciprocal; `measurement`: the mean, so read;
-    `wiring`: how a uniform body explains it; `gains`: of its measurement patterns, where these explain what breaks
-    reciprocity."""
+    `reciprocity`: error of the mean, None if no two channels are reciprocal; `measurement`: the mean frame,
+    read with this protocol; `wiring`: the wiring with which a uniform body explains it; `gains`: gains of the
+    measurement patterns, if they explain the reciprocity error."""
 
     protocol: dict[str, Any]
     frames: int
@@ -75,7 +75,7 @@ class Candidate:
 
     @property
     def reversed_signs(self) -> bool:
-        """Whether a uniform body explains the voltages with the opposite sign, and as they are otherwise."""
+        """Whether a uniform body explains the voltages with the opposite sign and an otherwise unchanged wiring."""
         return self.wiring is not None and self.wiring == Wiring(tuple(range(len(self.wiring.places))), "", True)
 
     @property
@@ -239,8 +239,9 @@ def _described_body(
 
 @dataclass(frozen=True)
 class _Numbers:
-    """The numbers of a file: a function that arranges them in frames of one of several numbers of channels, their shape
-    in words, numbers that a frame may have, and what a description has to say of their arrangement."""
+    """The numbers of a file. **Fields**: `frames`: function that arranges them in frames with one of several numbers of
+    channels; `shape`: their shape in words; `sizes`: possible numbers of values in a frame; `data`: entries of `[data]`
+    that describe their arrangement."""
 
     path: Path
     frames: Callable[[Sequence[int]], Frames]
@@ -371,7 +372,7 @@ def _protocol(table: dict, path: Path) -> Protocol | None:
 
 
 def _measurement_of(numbers: _Numbers, description: Description, protocol: Protocol) -> Measurement | None:
-    """The measurement of numbers that are of this protocol; None if they do not fit it."""
+    """The measurement in which the numbers are read with this protocol; None if they do not fit it."""
     try:
         frames = numbers.frames([protocol.num_measurements])
         if frames.table.shape[1] != protocol.num_measurements:
@@ -395,7 +396,7 @@ def _with_misfit(candidate: Candidate, models: dict[int, ForwardModel]) -> Candi
 
 
 def _with_gains(candidate: Candidate, models: dict[int, ForwardModel]) -> Candidate:
-    """The candidate with gains of its measurements, if they explain most of what breaks reciprocity."""
+    """The candidate with gains of its measurements, if they explain most of the reciprocity error."""
     if candidate.reciprocity is None or candidate.reciprocity < _MIN_GAIN_ERROR:
         return candidate
     gains, error = channel_gains(candidate.measurement)
@@ -411,7 +412,7 @@ def _with_gains(candidate: Candidate, models: dict[int, ForwardModel]) -> Candid
 
 
 def _contact_impedance(winner: Candidate, model: ForwardModel) -> float:
-    """A contact impedance to begin with: a hundredth of the size of the body over the conductivity that explains the
+    """Initial contact impedance: a hundredth of the size of the body, divided by the conductivity that explains the
     empty body."""
     size = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
     winner_model = model.with_protocol(winner.measurement.protocol)
@@ -431,8 +432,8 @@ def _text(
     rivals: Sequence[Candidate],
     tables: dict[str, dict[str, Any]],
 ) -> str:
-    """The description in TOML, with the evidence as comments. `shape` of the numbers in words; `data`: what `[data]`
-    has to say of their arrangement."""
+    """The description in TOML, with the evidence as comments. `shape`: shape of the numbers in words; `data`:
+    entries of `[data]` that describe their arrangement."""
     notes = [note for note in best.measurement.notes if not note.startswith("[protocol]")]
     reversed_signs = best.reversed_signs or any("polarity" in note for note in notes)
     remark = "no two channels are reciprocal" if best.reciprocity is None else f"broken by {percent(best.reciprocity)}"

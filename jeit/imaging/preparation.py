@@ -167,9 +167,12 @@ class PreparedDifference:
 
     @property
     def accuracy(self) -> Accuracy:
-        """Errors of the difference, from which intervals are computed: noise, the unknown part of electrode positions
-        and contacts, and the share of the difference that equals the misfit of the reference, at least 2 %; and of all
-        strengths, the part of that misfit that noise does not explain, and in a solid the discretisation."""
+        """Errors of the difference, from which intervals are computed.
+
+        The errors of the voltages are noise, the unknown part of electrode positions and contacts, and a share of the
+        difference that equals the misfit of the reference, at least 2 %. The errors of all strengths are the part of
+        that misfit that noise does not explain and, in a solid, the discretisation.
+        """
         model_error = self.calibration.model_error
         if model_error is None:  # a reference that the described places explain still leaves them uncertain
             reference = np.asarray(self.reference.voltages)[0]

@@ -198,7 +198,8 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
 def _explained(
     misfit_of: Callable[[Wiring], Wiring], described_wiring: Wiring, best_wiring: Wiring, orders: Iterable[str]
 ) -> Wiring:
-    """The wiring that explains a frame far better than `best_wiring`, the described one, or that."""
+    """The wiring that explains a frame far better than `best_wiring`, which is the described one; otherwise
+    `best_wiring`."""
     num_electrodes = len(described_wiring.places)
 
     def best_of(wirings: Iterable[Wiring], last_best: Wiring) -> Wiring:
@@ -225,8 +226,8 @@ def _explained(
 
 
 def _has_one_sign(model: ForwardModel, measurement: Measurement) -> bool | None:
-    """Whether all voltages have one sign; False if they have the signs of a uniform body with the described wiring, as
-    magnitudes are given on reading; None if neither."""
+    """True if all voltages have one sign; False if they have the signs of a uniform body with the described wiring,
+    which magnitudes are given when they are read; None otherwise."""
     used = np.asarray(measurement.mask)[0]
     signs = np.sign(np.real(np.asarray(measurement.filled())[0]))[used]
     expected = np.sign(select_channels(on_host(model.protocol), _impedances(model)[0]))[used]

@@ -47,13 +47,13 @@ _MIN_NOISE = 0.1
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """How accurately a sensor is described, as standard deviations. All but the first are shares: 0.1 is 10 %.
+    """Uncertainty of the description of a sensor, as standard deviations. All but the first are relative: 0.1 is 10 %.
 
     **Fields**: `position`: of electrode positions, metres, in every direction in which they can move; default: 0.0175
-    of the width of the body, 2° of a disk. `drift`: of the logarithm of each contact impedance, from the reference to
-    the frame. `size`: of the lengths of the body, relative. `other`: of whatever else differs from the model, as a
-    share of the difference of the two frames; the misfit of the reference, if that is larger. Raises `ValueError` for
-    values that are negative or not finite, and for sizes and others above 1.
+    of the width of the body, which is 2° on a disk. `drift`: of the logarithm of each contact impedance, from the
+    reference to the frame. `size`: of the lengths of the body, relative. `other`: of all other errors of the model, as
+    a share of the difference of the two frames; if the misfit of the reference is larger, it is used instead. Raises
+    `ValueError` for values that are negative or not finite, and for sizes and others above 1.
 
     **Example:**
 

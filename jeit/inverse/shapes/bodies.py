@@ -86,10 +86,10 @@ class BodyPrior(abc.ABC):
 
 @dataclass(frozen=True)
 class Quantities:
-    """What the data determine of a body: posterior medians, and 68 % intervals, None at an end that is left open.
+    """Properties of a body that the data determine: posterior medians, and 68 % intervals, with None for an open end.
 
     **Fields**: `change`, `change_interval`: change of conductivity relative to the background; `measure`,
-    `measure_interval`: area, m², or volume, m³; `strength`, `strength_interval`: that times (ρ - 1) / (ρ + n - 1),
+    `measure_interval`: area, m², or volume, m³; `strength`, `strength_interval`: `measure` times (ρ - 1) / (ρ + n - 1),
     where ρ is the conductivity relative to the background and n the number of axes along which the body is bounded (2
     in a sheet and for a column, else 3), negative for resistive bodies.
 

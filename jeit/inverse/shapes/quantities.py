@@ -45,7 +45,7 @@ _INTERVAL_PROBABILITIES, _NUM_CONTRASTS, _NUM_NORMAL_DEVIATES = (0.16, 0.84), 24
 
 
 class Accuracy(NamedTuple):
-    """How accurately a difference of two frames is known. **Fields**: `noise` (M,): standard deviation of the channels,
+    """Accuracy of a difference of two frames. **Fields**: `noise` (M,): standard deviation of the channels,
     volts, of all errors but those of `model_error`, the unknown part of electrode positions and contact impedances,
     if any; relative standard deviations `size`, of the lengths of the described domain, and `strength`, of all
     strengths, from errors of the background and the fields.

@@ -1,6 +1,6 @@
 """PARDISO, the direct solver of Intel's oneMKL, for sparse symmetric systems on a CPU.
 
-A user names it where jeit's own factorisation takes too much memory or time (Schenk and Gärtner, Future Gener. Comput.
+Users select it where jeit's own factorisation takes too much memory or time (Schenk and Gärtner, Future Gener. Comput.
 Syst. 20, 2004). Complex symmetric systems are solved as real symmetric ones of twice the size, since pypardiso, the
 binding, passes real matrices only.
 """
