@@ -14,7 +14,7 @@ from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import find_inclusions
 from jeit.imaging import ImagingSettings, automatic, calibration, prepare_difference
-from jeit.imaging.automatic import unsound
+from jeit.imaging.automatic import linear_image_fault
 from jeit.imaging.method import METHODS
 from jeit.inverse import Gaussian, calibrate, reconstruct
 from jeit.inverse.uncertainty import image_noise
@@ -138,7 +138,7 @@ def test_noise_damps_images_which_then_are_not_sound():
     relative = [one.quality.difference_noise.relative for one in (sound, noisy)]
     assert relative[0] < 0.3 < relative[1]
     faults = [
-        unsound(prepare_difference(*pair, num_points=450), one.change)
+        linear_image_fault(prepare_difference(*pair, num_points=450), one.change)
         for pair, one in zip(pairs, (sound, noisy), strict=True)
     ]
     assert faults[0] == ""
