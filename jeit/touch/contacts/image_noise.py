@@ -79,9 +79,9 @@ class ImageNoise(Module):
         """Estimate the noise from at least ten images (n, m) of the untouched skin. Raises `ValueError` for fewer
         images, NaN, and images that are all the same."""
         images = real_array("images", images, "changes of conductivity (n, m)")
-        if images.ndim != 2 or len(images) < _MIN_FRAMES or not np.isfinite(images).all():
+        if images.ndim != 2 or len(images) < _MIN_NUM_FRAMES or not np.isfinite(images).all():
             raise ValueError(
-                f"images has shape {images.shape}; give {counted(_MIN_FRAMES, 'image')} or more of the untouched "
+                f"images has shape {images.shape}; give {counted(_MIN_NUM_FRAMES, 'image')} or more of the untouched "
                 "skin, (n, m), without NaN."
             )
         if (images == images[0]).all():
