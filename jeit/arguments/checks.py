@@ -104,10 +104,11 @@ Interval = tuple[float | None, float | None]
 
 
 def interval_text(interval: Interval, written: Callable[[float], str]) -> str:
-    """An interval as text, each end as `written`; "at least" or "at most" the known end where the other one is open."""
+    """An interval as text, each end as `written`. Where one end is open, "at least" or "at most" the known end, or
+    "beyond" it if it is a decrease, of which "at most -90 %" might mean a smaller one."""
     low, high = interval
     if low is None:
-        return "not determined" if high is None else f"at most {written(high)}"
+        return "not determined" if high is None else f"{'beyond' if high < 0 else 'at most'} {written(high)}"
     return f"at least {written(low)}" if high is None else f"{written(low)} to {written(high)}"
 
 

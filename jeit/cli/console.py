@@ -179,7 +179,10 @@ def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Tabl
         strength = with_interval(one.strength, one.strength_interval, lambda value: _three_digits(1e6 * value))
         rows.append([measure, change, strength])
     table = _with_places(inclusions, [f"{noun}\n/ {unit}", "change\n/ %", f"strength\n/ {unit}"], rows)
-    table.caption, table.caption_justify = "below each value its 68 % interval", "left"
+    table.caption, table.caption_justify = (
+        "below size, change and strength their 68 % intervals; places have none",
+        "left",
+    )
     return table
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy import sparse
 
 from jeit.arguments.checks import Interval
 from jeit.image.segmentation import basins, shared_facets
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from jeit.image.plane import TriangleSurface
 
 _SURFACE_COLUMNS, _SURFACE_ROWS = 48, 24
+# Edge of the strongest region, as a share of its peak.
+_REGION_LEVEL = 0.5
 
 
 class SolidForm(Module):
@@ -167,6 +170,38 @@ def find_inclusions(
         least_significance=least_significance,
     )
     return [inclusion for inclusion, _ in regions]
+
+
+class StrongestRegion:
+    """Computes where an image is strongest: the centroid of the connected region around its peak in which the change
+    exceeds half of the peak, weighted by area (volume) and change.
+
+    The peak itself is drawn to electrodes, where voltages are most sensitive; the centroid is less so. What depends
+    on the `mesh` alone is computed in advance.
+    """
+
+    def __init__(self, mesh: Mesh):
+        shared = np.asarray(mesh.cells if mesh.dimension == 3 else shared_facets(mesh))
+        rows, columns = np.nonzero(shared >= 0)  # facets of the boundary are not shared
+        entries = np.ones(len(rows), np.float32), (rows, shared[rows, columns])
+        self._incidence = sparse.csr_array(entries, shape=(len(shared), int(shared.max()) + 1))
+        self._transposed = sparse.csr_array(self._incidence.T)
+        self._measures, self._centroids = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
+
+    def __call__(self, change: Float[np.ndarray, " m"]) -> tuple[Float[np.ndarray, " d"], float]:
+        """Return the centroid, in metres, and the peak, with its sign, of a change (m,)."""
+        peak = int(np.abs(change).argmax())
+        relative = change / change[peak] if change[peak] else np.zeros_like(change)
+        candidates = relative >= _REGION_LEVEL
+        region = np.zeros(len(change), np.float32)
+        region[peak] = 1
+        count = 0
+        while count != (count := int(region.sum())):
+            region = ((self._incidence @ (self._transposed @ region) > 0) & candidates).astype(np.float32)
+            region[peak] = 1
+        cells = region > 0
+        weight = self._measures[cells] * np.maximum(relative[cells], _REGION_LEVEL)
+        return weight @ self._centroids[cells] / weight.sum(), float(change[peak])
 
 
 def inclusion_regions(

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Inexact, UInt8
 from jeit.arguments import brief, page, percent, picture
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
-from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster, SolidForm
 from jeit.image.inclusions import inclusion_regions
@@ -30,11 +30,14 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import KINDS, Ellipsoid, ShapeReconstruction, Star
 from jeit.inverse.uncertainty import image_noise
-from jeit.mesh import Mesh
+from jeit.mesh import Domain, Mesh
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array
 
 _MIDDLE = 0.5
+# Minimum width of electrodes relative to their distance that raises no doubt; misfit of the reference above which it
+# may have been exchanged with the frame, and ratio of the misfits below which that is likely.
+_MIN_RELATIVE_WIDTH, _MIN_SUSPICIOUS_MISFIT, _MAX_EXCHANGED_MISFIT = 0.005, 0.1, 0.5
 # Maximum misfit of an image's voltages, in standard deviations, that raises no doubt.
 _MISFIT = 3.0
 # Minimum share of usable voltages that raises no doubt, and ranges of plausible conductivities: of solids in S/m, from
@@ -218,9 +221,40 @@ def _doubts_of_data(imaged: ImagedDifference) -> list[str]:
             f"only {used.sum()} of {used.size} voltages are left ({percent(float(usable_share))}): they determine "
             "little of what is where."
         )
-    if doubt := _doubt_of_units(imaged):
-        doubts.append(doubt)
-    return doubts
+    return [*doubts, *filter(None, (_doubt_of_units(imaged), _doubt_of_lengths(imaged), _doubt_of_order(imaged)))]
+
+
+def _doubt_of_lengths(imaged: ImagedDifference) -> str:
+    """Whether electrodes on the edge of a sheet are so narrow that lengths may be in another unit; empty if not."""
+    electrodes, domain = imaged.measurement.electrodes, imaged.measurement.domain
+    if not isinstance(electrodes, BoundaryElectrodes) or not isinstance(domain, Domain):
+        return ""
+    width, pitch = float(np.max(electrodes.width)), domain.perimeter / electrodes.num_electrodes
+    if width > _MIN_RELATIVE_WIDTH * pitch:
+        return ""
+    x_min, x_max, _, _ = domain.extent
+    return (
+        f"the electrodes are {1e3 * width:.3g} mm wide and {1e3 * pitch:.3g} mm apart, on a body {x_max - x_min:.3g} m "
+        "wide: are all lengths in metres?"
+    )
+
+
+def _doubt_of_order(imaged: ImagedDifference) -> str:
+    """Whether the frame fits an undisturbed body much better than the reference does; empty if not."""
+    misfit = float(imaged.calibration.misfit)
+    if not misfit > _MIN_SUSPICIOUS_MISFIT:
+        return ""
+    usable = np.asarray(imaged.measurement.mask)[0] & np.asarray(imaged.reference.mask)[0]
+    frame = np.asarray(imaged.measurement.voltages)[0][usable]
+    predicted = np.asarray(imaged.calibration.voltages)[usable]
+    scale = np.vdot(predicted, frame) / np.vdot(predicted, predicted)
+    frame_misfit = float(np.linalg.norm(frame - scale * predicted) / np.linalg.norm(frame))
+    if frame_misfit > _MAX_EXCHANGED_MISFIT * misfit:
+        return ""
+    return (
+        f"the frame fits an undisturbed body better ({percent(frame_misfit)} misfit) than the reference does "
+        f"({percent(misfit)}): are the two exchanged?"
+    )
 
 
 def _doubt_of_units(imaged: ImagedDifference) -> str:

@@ -151,11 +151,11 @@ def test_bodies_are_searched_in_solids_where_data_can_determine_them(monkeypatch
 )
 def test_thin_data_and_impossible_units_are_doubted(background, dimension, left, volts, expected):
     used = np.arange(10) < 10 * left
-    frame = SimpleNamespace(mask=used[None], voltages=np.full((1, 10), volts), notes=())
+    frame = SimpleNamespace(mask=used[None], voltages=np.full((1, 10), volts), notes=(), electrodes=None, domain=None)
     image: Any = SimpleNamespace(
         measurement=frame,
         reference=frame,
-        calibration=SimpleNamespace(conductivity=background),
+        calibration=SimpleNamespace(conductivity=background, misfit=0.0),
         mesh=SimpleNamespace(dimension=dimension),
     )
     doubts = difference._doubts_of_data(image)
@@ -261,8 +261,10 @@ def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_an
         alternatives=(body(False, np.log(6)), None),
         alternative_deviations=(0.5, np.nan),
     )
-    calibration = SimpleNamespace(conductivity=BATH)
-    frame = SimpleNamespace(mask=np.ones((1, 2), bool), voltages=np.ones((1, 2)), notes=())
+    calibration = SimpleNamespace(conductivity=BATH, misfit=0.0)
+    frame = SimpleNamespace(
+        mask=np.ones((1, 2), bool), voltages=np.ones((1, 2)), notes=(), electrodes=None, domain=None
+    )
     whole = SimpleNamespace(measurement=frame, reference=frame, mesh=SimpleNamespace(dimension=3))
     image: Any = SimpleNamespace(shapes=shapes, reconstruction=shapes, calibration=calibration, **vars(whole))
     own = Quantities(2.0, (1.7, 2.3), 3e-5, (2e-5, None), 1.5e-5, (1.4e-5, 1.6e-5))

@@ -302,10 +302,13 @@ def _wrapped(text: Text, counts: Sequence[int]) -> tuple[int, int] | None:
         if any(count in shape or count + 1 in shape for count in counts):
             return None
     fitting = []
-    for count in counts:
-        whole = int(ends[-1]) // count
+    for number, count in enumerate(counts):
+        whole, left = divmod(int(ends[-1]), count)
+        # A remainder beside frames of another length than the described one: rather a line is missing.
+        if number and left:
+            continue
         if whole and text.lengths[0] < count and np.isin(count * np.arange(1, whole + 1), ends).all():
-            fitting.append((count, int(ends[-1]) - whole * count))
+            fitting.append((count, left))
     return min(fitting, key=lambda one: one[1] > 0, default=None)  # rather one without a rest
 
 

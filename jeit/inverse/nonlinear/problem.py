@@ -54,7 +54,10 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
     check_mask(mask)
     voltages = _as_float_array(voltages)
     if voltages.dtype.kind == "c":
-        raise ValueError("voltages are complex; reconstruct from their real part or magnitude.")
+        raise ValueError(
+            "voltages are complex, and this method takes real ones: image their change by one_step, repeatedly for an "
+            "absolute image. Real parts and magnitudes alone give biased conductivities."
+        )
     if voltages.dtype.kind not in "biuf":
         raise ValueError(f"voltages are {voltages.dtype}; give real numbers, in volts.")
     shape = (model.protocol.num_measurements,)
