@@ -13,6 +13,7 @@ from jeit.design.commands import skins
 from jeit.design.commands.layout_optimise import optimise
 
 if TYPE_CHECKING:
+    from jeit.design import Skin
     from jeit.design.comparison import LayoutComparison
 
 layout = typer.Typer(name="layout", help="Compare and optimise layouts of electrodes.")
@@ -125,6 +126,12 @@ def compare(
         say_written(console, output / "report.json", "comparison.png")
 
 
+def _model_text(skin: "Skin") -> str:
+    """The kind of model that a skin has, in words."""
+    thickness = f"{1e3 * float(skin.thickness):g} mm thick"
+    return f"a layer {thickness}" if skin.model.mesh.dimension == 3 else f"a sheet, {thickness}"
+
+
 def _print_comparison(console, result: "LayoutComparison") -> None:
     from rich.table import Table
 
@@ -146,5 +153,16 @@ def _print_comparison(console, result: "LayoutComparison") -> None:
                 )
     console.print()
     console.print(table)
-    console.print("blind spot: less sensitive than the other layout's least sensitive place", style="dim")
+    skin = result.skins[0]
+    pairs = " and ".join(f"{one.model.protocol.num_measurements}" for one in result.skins)
+    notes = [
+        f"{_model_text(skin)}; two-terminal measurements: {pairs}",
+        f"touched at {result.places} × {result.places} places, {1e3 * result.margin:g} mm or more from the edge, to "
+        f"{result.contrast:g} times its conductivity",
+        "blind spot: less sensitive than the other layout's least sensitive place",
+    ]
+    if len({one.model.protocol.num_measurements for one in result.skins}) > 1:
+        notes.append("sensitivities are norms over all measurements: more measurements alone make them larger")
+    for note in notes:
+        console.print(note, style="dim", highlight=False, soft_wrap=True)
     console.print()

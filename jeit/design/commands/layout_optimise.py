@@ -27,7 +27,7 @@ _QUANTITIES = (
     ("mean_variance", "mean variance", 1.0),
     ("log_information_nats", "log information / nats", 1.0),
     ("largest_variance", "largest variance", 1.0),
-    ("mean_localisation_error_m", "mean localisation error / mm", 1e3),
+    ("mean_localisation_error_m", "mean bound of the place / mm", 1e3),
 )
 
 
@@ -117,6 +117,13 @@ def _print_improvement(console, result: "ImprovedLayout") -> None:
     ]
     console.print(pairs(result.start.name, rows))
     console.print(f"  {report['status']}: {report['reason']}", soft_wrap=True)
+    console.print(
+        "  on a sheet that is touched everywhere, with all two-terminal pairs: 'jeit layout compare' computes figures "
+        "of a layer\n  the bound of the place is the error that noise alone causes",
+        style="dim",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def _parse_region(text: str, outline: "Domain") -> "Disk | Rectangle":
