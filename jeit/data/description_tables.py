@@ -14,14 +14,14 @@ from jeit.inverse import Uncertainty
 
 # Maximum numbers of vertices of a polygon and of its holes: each side is compared with every other side, and each hole
 # with every other hole.
-_MOST_VERTICES, _MOST_HOLES = 4096, 64
-_COUNT = Number(2, MOST_ELECTRODES, beyond="Channels grow with its square; in Python there is no such limit.")
-_INDEX = Number(0, MOST_ELECTRODES)
+_MAX_VERTICES, _MAX_HOLES = 4096, 64
+_ELECTRODE_COUNT = Number(2, MOST_ELECTRODES, beyond="Channels grow with its square; in Python there is no such limit.")
+_ELECTRODE_INDEX = Number(0, MOST_ELECTRODES)
 
 Length = Annotated[float, Number(1e-9, 1e3, "m")]
 Sizes = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-9, 1e3, "m", single=True)]
-Place = Annotated[np.ndarray, Numbers(((2, 2),), -1e3, 1e3, "m")]
-Loop = Annotated[np.ndarray, Numbers(((3, _MOST_VERTICES), (2, 2)), -1e3, 1e3, "m")]
+PlanePoint = Annotated[np.ndarray, Numbers(((2, 2),), -1e3, 1e3, "m")]
+PolygonVertices = Annotated[np.ndarray, Numbers(((3, _MAX_VERTICES), (2, 2)), -1e3, 1e3, "m")]
 Positions = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES), (2, 3)), -1e3, 1e3, "m")]
 # A single number means one ring of electrodes, just as a single size applies to all electrodes.
 Levels = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 0, 1e3, "m", single=True)]
@@ -32,7 +32,7 @@ Pairs = Annotated[np.ndarray, Numbers(((1, math.inf), (2, 2)), 0, MOST_ELECTRODE
 Indices = Annotated[np.ndarray, Numbers(((1, math.inf),), 0, 2**31 - 1, kind=int)]
 Gains = Annotated[np.ndarray, Numbers(((1, math.inf),), 1e-6, 1e6)]
 Reading = Literal["adjacent", "mean", "mean-removed", "against"]
-Choices = Annotated[np.ndarray, Numbers(((1, math.inf), (1, math.inf)), kind=bool)]
+SelectionMask = Annotated[np.ndarray, Numbers(((1, math.inf), (1, math.inf)), kind=bool)]
 
 
 class DiskTable(Table):
@@ -41,7 +41,7 @@ class DiskTable(Table):
     what = "a disk"
     shape: Literal["disk"]
     radius: Length
-    centre: Place = np.zeros(2)
+    centre: PlanePoint = np.zeros(2)
     thickness: Length | None = None
 
 
@@ -52,7 +52,7 @@ class RectangleTable(Table):
     shape: Literal["rectangle"]
     width: Length
     height: Length
-    centre: Place = np.zeros(2)
+    centre: PlanePoint = np.zeros(2)
     thickness: Length | None = None
 
 
@@ -61,17 +61,17 @@ class PolygonTable(Table):
 
     what = "a polygon"
     shape: Literal["polygon"]
-    vertices: Loop
-    holes: Annotated[list[Loop], FailFast()] = Field(default=[], max_length=_MOST_HOLES)
+    vertices: PolygonVertices
+    holes: Annotated[list[PolygonVertices], FailFast()] = Field(default=[], max_length=_MAX_HOLES)
     thickness: Length | None = None
 
     @model_validator(mode="after")
     def _check_size(self) -> "PolygonTable":
-        number = len(self.vertices) + sum(map(len, self.holes))
-        if number > _MOST_VERTICES:
+        num_points = len(self.vertices) + sum(map(len, self.holes))
+        if num_points > _MAX_VERTICES:
             raise fault(
-                f"and holes are {number} points, and each side is compared with every other: give {_MOST_VERTICES} at "
-                "most, or a mesh.",
+                f"and holes are {num_points} points, and each side is compared with every other: give {_MAX_VERTICES} "
+                "at most, or a mesh.",
                 "vertices",
             )
         return self
@@ -108,7 +108,7 @@ class PlacedTable(Table):
     """Base class of the tables of electrodes with positions, i.e. of all kinds except facets."""
 
     layout: Literal["ring", "perimeter"] | None = None
-    number: Annotated[int, _COUNT] | None = None
+    number: Annotated[int, _ELECTRODE_COUNT] | None = None
     start_angle_degrees: Annotated[float, Number(-3600, 3600, "degrees")] = 90.0
     clockwise: bool = False
     start: Annotated[float, Number(-1e3, 1e3, "m")] = 0.0
@@ -117,11 +117,11 @@ class PlacedTable(Table):
 
     @model_validator(mode="after")
     def _check_positions(self) -> "PlacedTable":
-        round_it = ("layout", "number", "start_angle_degrees", "clockwise", "start", "levels")
+        layout_keys = ("layout", "number", "start_angle_degrees", "clockwise", "start", "levels")
         if self.positions is not None:
-            idle = [key for key in round_it if key in self.model_fields_set]
-            if idle:
-                raise fault("has no effect beside positions; leave out one or the other.", idle[0])
+            unused_keys = [key for key in layout_keys if key in self.model_fields_set]
+            if unused_keys:
+                raise fault("has no effect beside positions; leave out one or the other.", unused_keys[0])
         elif self.layout is None:
             raise fault("is missing; give it, or positions.", "layout")
         elif self.number is None:
@@ -176,7 +176,7 @@ class FacetsTable(Table):
 class DrivenTable(Table):
     """Base class of the tables of protocols with a current amplitude."""
 
-    number: Annotated[int, _COUNT] | None = None
+    number: Annotated[int, _ELECTRODE_COUNT] | None = None
     name: Word | None = None
     current: Annotated[float, Number(1e-15, 1e12, "in current_unit")] | None = None
     current_from_name: Word | None = None
@@ -213,8 +213,8 @@ class SkipTable(DrivenTable):
 
     what = "the protocol 'skip'"
     kind: Literal["skip"]
-    skipped: Annotated[int, _INDEX]
-    measurement_skipped: Annotated[int, _INDEX] | None = None
+    skipped: Annotated[int, _ELECTRODE_INDEX]
+    measurement_skipped: Annotated[int, _ELECTRODE_INDEX] | None = None
     driven_electrodes: bool = False
     reciprocal: Literal["all", "half"] = "all"
     order: Literal["rotating", "fixed"] = "rotating"
@@ -235,7 +235,7 @@ class AgainstOneTable(DrivenTable):
 
     what = "the protocol 'all_against_one'"
     kind: Literal["all_against_one"]
-    common: Annotated[int, _INDEX] = 0
+    common: Annotated[int, _ELECTRODE_INDEX] = 0
     measurement: Literal["common", "adjacent"] = "common"
     driven_electrodes: bool | None = None
     reciprocal: Literal["all", "half"] = "all"
@@ -246,8 +246,8 @@ class ReferenceTable(DrivenTable):
 
     what = "the protocol 'reference_electrode'"
     kind: Literal["reference_electrode"]
-    skipped: Annotated[int, _INDEX] = 0
-    reference: Annotated[int, _INDEX] | None = None
+    skipped: Annotated[int, _ELECTRODE_INDEX] = 0
+    reference: Annotated[int, _ELECTRODE_INDEX] | None = None
     driven_electrodes: bool = False
     order: Literal["rotating", "fixed"] = "rotating"
 
@@ -264,7 +264,7 @@ class AllAtOnceTable(DrivenTable):
     """Base class of the tables of protocols that drive all electrodes at once: how their potentials are read."""
 
     measurement: Reading = "mean-removed"
-    reference: Annotated[int, _INDEX] | None = None
+    reference: Annotated[int, _ELECTRODE_INDEX] | None = None
 
 
 class TrigonometricTable(AllAtOnceTable):
@@ -294,7 +294,7 @@ class OptimalTable(Table):
     drives: Annotated[int, Number(1, MOST_ELECTRODES)] | None = None
     power: Annotated[float, Number(1e-15, 1e3, "W")] | None = None
     measurement: Reading = "mean-removed"
-    reference: Annotated[int, _INDEX] | None = None
+    reference: Annotated[int, _ELECTRODE_INDEX] | None = None
     current: Annotated[float, Number(1e-15, 1e12, "in current_unit")] | None = None
     current_unit: Literal["A", "mA", "uA", "µA"] = "A"
 
@@ -316,7 +316,7 @@ class MeasuredTable(Table):
     measurement_key: Word | None = None
     patterns_in: Literal["columns", "rows"] = "columns"
     measurement: Reading = "mean-removed"
-    reference: Annotated[int, _INDEX] | None = None
+    reference: Annotated[int, _ELECTRODE_INDEX] | None = None
     current_unit: Literal["A", "mA", "uA", "µA"] = "A"
 
 
@@ -340,7 +340,7 @@ class MatricesTable(Table):
     name: Word = "matrices"
     drive: Patterns
     measurement: Patterns
-    select: Choices | None = None
+    select: SelectionMask | None = None
 
 
 class ChannelsTable(Table):
@@ -382,8 +382,8 @@ class DataTable(Table):
         if self.axes and sorted(self.axes) != ["electrodes", "frames", "patterns"]:
             raise fault("must be electrodes, patterns and frames, each once, in the order of the array.", "axes")
         if self.frames == "mean" and (self.frame_names or self.frame_rate is not None):
-            idle = "frame_names" if self.frame_names else "frame_rate"
-            raise fault("has no use where the frames are averaged; leave it out.", idle)
+            unused_key = "frame_names" if self.frame_names else "frame_rate"
+            raise fault("has no use where the frames are averaged; leave it out.", unused_key)
         return self
 
 

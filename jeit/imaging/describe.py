@@ -219,7 +219,7 @@ def _described_body(
             "what is said of it."
         )
     placed, written = {**electrodes, "number": number}, {**electrodes, "number": number}
-    if format == "quadrupoles" and (places := quadrupoles.places(path)) is not None:
+    if format == "quadrupoles" and (places := quadrupoles.electrode_positions(path)) is not None:
         sizes = {key: value for key, value in electrodes.items() if key not in ("layout", "levels")}
         placed, written = {**sizes, "positions": places.tolist()}, sizes
     tables = {"geometry": geometry, "electrodes": {"contact_impedance": 1.0, **placed}}
@@ -255,7 +255,7 @@ class _Numbers:
             table, usual = _array(path, key, other)
             said = " × ".join(map(str, table.shape))
             sizes = tuple(sorted({*table.shape, table.size}, reverse=True))
-            return cls(path, lambda counts: frames_in_table(table, counts, _FOUND_OUT, usual=usual), said, sizes)
+            return cls(path, lambda counts: frames_in_table(table, counts, _FOUND_OUT, default_axis=usual), said, sizes)
         if key is not None:
             raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
         if openeit.recognises(path):
