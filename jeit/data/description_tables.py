@@ -38,7 +38,7 @@ SelectionMask = Annotated[np.ndarray, Numbers(((1, math.inf), (1, math.inf)), ki
 class DiskTable(Table):
     """Table of a disk or, with a thickness, of a cylinder."""
 
-    what = "a disk"
+    subject = "a disk"
     shape: Literal["disk"]
     radius: Length
     centre: PlanePoint = np.zeros(2)
@@ -48,7 +48,7 @@ class DiskTable(Table):
 class RectangleTable(Table):
     """Table of a rectangle or, with a thickness, of a box."""
 
-    what = "a rectangle"
+    subject = "a rectangle"
     shape: Literal["rectangle"]
     width: Length
     height: Length
@@ -59,7 +59,7 @@ class RectangleTable(Table):
 class PolygonTable(Table):
     """Table of a polygon or, with a thickness, of an upright solid with that base."""
 
-    what = "a polygon"
+    subject = "a polygon"
     shape: Literal["polygon"]
     vertices: PolygonVertices
     holes: Annotated[list[PolygonVertices], FailFast()] = Field(default=[], max_length=_MAX_HOLES)
@@ -80,7 +80,7 @@ class PolygonTable(Table):
 class BoxTable(Table):
     """Table of a box."""
 
-    what = "a box"
+    subject = "a box"
     shape: Literal["box"]
     width: Length
     depth: Length
@@ -90,7 +90,7 @@ class BoxTable(Table):
 class CylinderTable(Table):
     """Table of a cylinder."""
 
-    what = "a cylinder"
+    subject = "a cylinder"
     shape: Literal["cylinder"]
     radius: Length
     height: Length
@@ -99,7 +99,7 @@ class CylinderTable(Table):
 class MeshTable(Table):
     """Table of a mesh in a file beside the description. `scale`: length of its unit in metres."""
 
-    what = "a mesh"
+    subject = "a mesh"
     mesh: Word
     scale: Annotated[float, Number(1e-9, 1e3, "m")] = 1.0
 
@@ -132,7 +132,7 @@ class PlacedTable(Table):
 class BoundaryTable(PlacedTable):
     """Table of electrodes that are arcs on the edge of a sheet. `contact_impedance` in ohm·m."""
 
-    what = "electrodes of kind 'boundary'"
+    subject = "electrodes of kind 'boundary'"
     kind: Literal["boundary"] = "boundary"
     width: Sizes
     contact_impedance: Impedances
@@ -141,7 +141,7 @@ class BoundaryTable(PlacedTable):
 class DiscTable(PlacedTable):
     """Table of electrodes that are discs."""
 
-    what = "electrodes of kind 'disc'"
+    subject = "electrodes of kind 'disc'"
     kind: Literal["disc"]
     radius: Sizes
     contact_impedance: Impedances
@@ -150,7 +150,7 @@ class DiscTable(PlacedTable):
 class PatchTable(PlacedTable):
     """Table of electrodes that are rectangles on a solid."""
 
-    what = "electrodes of kind 'patch'"
+    subject = "electrodes of kind 'patch'"
     kind: Literal["patch"]
     width: Sizes
     height: Sizes
@@ -160,14 +160,14 @@ class PatchTable(PlacedTable):
 class PointTable(PlacedTable):
     """Table of electrodes that are points."""
 
-    what = "electrodes of kind 'point'"
+    subject = "electrodes of kind 'point'"
     kind: Literal["point"]
 
 
 class FacetsTable(Table):
     """Table of electrodes that are named groups of facets of a mesh."""
 
-    what = "electrodes of kind 'facets'"
+    subject = "electrodes of kind 'facets'"
     kind: Literal["facets"]
     tags: Annotated[list[Word], Field(min_length=1, max_length=MOST_ELECTRODES), FailFast()]
     contact_impedance: Impedances
@@ -201,7 +201,7 @@ class DrivenTable(Table):
 class AdjacentTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.adjacent`."""
 
-    what = "the protocol 'adjacent'"
+    subject = "the protocol 'adjacent'"
     kind: Literal["adjacent"]
     driven_electrodes: bool = False
     reciprocal: Literal["all", "half"] = "all"
@@ -211,7 +211,7 @@ class AdjacentTable(DrivenTable):
 class SkipTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.skip`."""
 
-    what = "the protocol 'skip'"
+    subject = "the protocol 'skip'"
     kind: Literal["skip"]
     skipped: Annotated[int, _ELECTRODE_INDEX]
     measurement_skipped: Annotated[int, _ELECTRODE_INDEX] | None = None
@@ -223,7 +223,7 @@ class SkipTable(DrivenTable):
 class OppositeTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.opposite`."""
 
-    what = "the protocol 'opposite'"
+    subject = "the protocol 'opposite'"
     kind: Literal["opposite"]
     drives: Literal["distinct", "all"] = "distinct"
     driven_electrodes: bool = False
@@ -233,7 +233,7 @@ class OppositeTable(DrivenTable):
 class AgainstOneTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.all_against_one`."""
 
-    what = "the protocol 'all_against_one'"
+    subject = "the protocol 'all_against_one'"
     kind: Literal["all_against_one"]
     common: Annotated[int, _ELECTRODE_INDEX] = 0
     measurement: Literal["common", "adjacent"] = "common"
@@ -244,7 +244,7 @@ class AgainstOneTable(DrivenTable):
 class ReferenceTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.reference_electrode`. `number`: number of electrodes on the boundary."""
 
-    what = "the protocol 'reference_electrode'"
+    subject = "the protocol 'reference_electrode'"
     kind: Literal["reference_electrode"]
     skipped: Annotated[int, _ELECTRODE_INDEX] = 0
     reference: Annotated[int, _ELECTRODE_INDEX] | None = None
@@ -255,7 +255,7 @@ class ReferenceTable(DrivenTable):
 class TwoTerminalTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.two_terminal`."""
 
-    what = "the protocol 'two_terminal'"
+    subject = "the protocol 'two_terminal'"
     kind: Literal["two_terminal"]
     pairs: Pairs | None = None
 
@@ -270,7 +270,7 @@ class AllAtOnceTable(DrivenTable):
 class TrigonometricTable(AllAtOnceTable):
     """Table of the arguments of `jeit.protocol.trigonometric`."""
 
-    what = "the protocol 'trigonometric'"
+    subject = "the protocol 'trigonometric'"
     kind: Literal["trigonometric"]
     measurement: Reading = "adjacent"
 
@@ -278,7 +278,7 @@ class TrigonometricTable(AllAtOnceTable):
 class HaarTable(AllAtOnceTable):
     """Table of the arguments of `jeit.protocol.haar`."""
 
-    what = "the protocol 'haar'"
+    subject = "the protocol 'haar'"
     kind: Literal["haar"]
 
 
@@ -286,7 +286,7 @@ class OptimalTable(Table):
     """Table of the arguments of `jeit.protocol.optimal`. `transfer`, `other`: transfer impedances in ohm; `drives`:
     number of drive patterns; `power`: watts."""
 
-    what = "the protocol 'optimal'"
+    subject = "the protocol 'optimal'"
     kind: Literal["optimal"]
     name: Word | None = None
     transfer: Patterns
@@ -309,7 +309,7 @@ class MeasuredTable(Table):
     """Table of a protocol whose currents are stored in the data file. `drive_key`, `measurement_key`: names of its
     matrices."""
 
-    what = "a protocol of measured currents"
+    subject = "a protocol of measured currents"
     kind: Literal["measured"]
     name: Word | None = None
     drive_key: Word = "current_patterns"
@@ -323,7 +323,7 @@ class MeasuredTable(Table):
 class BipolarTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.bipolar`."""
 
-    what = "the protocol 'bipolar'"
+    subject = "the protocol 'bipolar'"
     kind: Literal["bipolar"]
     drive_pairs: Pairs
     measurement_pairs: Pairs
@@ -335,7 +335,7 @@ class MatricesTable(Table):
     """Table of a protocol that combines every drive pattern, in amperes, with the measurement patterns chosen by
     `select`."""
 
-    what = "a protocol of matrices"
+    subject = "a protocol of matrices"
     kind: Literal["matrices"]
     name: Word = "matrices"
     drive: Patterns
@@ -347,7 +347,7 @@ class ChannelsTable(Table):
     """Table of a protocol that gives for each channel the indices, from 0, of its drive pattern (in amperes) and
     measurement pattern."""
 
-    what = "a protocol of channels"
+    subject = "a protocol of channels"
     kind: Literal["channels"]
     name: Word = "channels"
     drive: Patterns
@@ -359,7 +359,7 @@ class ChannelsTable(Table):
 class DataTable(Table):
     """Table of the arrangement of the numbers in a file."""
 
-    what = "[data]"
+    subject = "[data]"
     frames_in: Literal["rows", "columns"] | None = None
     delimiter: Annotated[str, Field(max_length=10)] | None = None
     skip_rows: Annotated[int, Number(0, 10**9)] | None = None
@@ -390,14 +390,14 @@ class DataTable(Table):
 class NotesTable(Table):
     """Table of sentences that are copied to the notes of the measurement."""
 
-    what = "[notes]"
+    subject = "[notes]"
     text: Annotated[list[Annotated[str, Field(max_length=10_000)]], FailFast()] = Field(default=[])
 
 
 class UncertaintyTable(Table):
     """Table of how accurately the sensor is described."""
 
-    what = "[uncertainty]"
+    subject = "[uncertainty]"
     position: Annotated[float, Number(0, 1e3, "m")] | None = None
     position_degrees: Annotated[float, Number(0, 90, "degrees")] | None = None
     contact_drift_percent: Annotated[float, Number(0, 1000, "%")] = 100 * Uncertainty().drift
@@ -420,14 +420,15 @@ ConstructedTable = (
 ProtocolTable = ConstructedTable | OptimalTable | MatricesTable | ChannelsTable | MeasuredTable
 
 _SHAPE = OneOf(
-    "shape", DiskTable, RectangleTable, PolygonTable, BoxTable, CylinderTable, mark="mesh", other=MeshTable,
-    meant={"circle": "disk", "tank": "cylinder", "tube": "cylinder", "cube": "box", "cuboid": "box",
-           "square": "rectangle"},
+    "shape", DiskTable, RectangleTable, PolygonTable, BoxTable, CylinderTable,
+    alternative_key="mesh", alternative_table=MeshTable,
+    synonyms={"circle": "disk", "tank": "cylinder", "tube": "cylinder", "cube": "box", "cuboid": "box",
+              "square": "rectangle"},
 )  # fmt: skip
 _ELECTRODES = OneOf(
     "kind", BoundaryTable, DiscTable, PatchTable, PointTable, FacetsTable,
-    meant={"strip": "patch", "plate": "patch", "bar": "patch", "rectangle": "patch", "square": "patch",
-           "circle": "disc", "round": "disc", "arc": "boundary", "edge": "boundary", "mesh": "facets"},
+    synonyms={"strip": "patch", "plate": "patch", "bar": "patch", "rectangle": "patch", "square": "patch",
+              "circle": "disc", "round": "disc", "arc": "boundary", "edge": "boundary", "mesh": "facets"},
 )  # fmt: skip
 _PROTOCOL = OneOf(
     "kind", AdjacentTable, SkipTable, OppositeTable, AgainstOneTable, ReferenceTable, TwoTerminalTable,
@@ -438,7 +439,7 @@ _PROTOCOL = OneOf(
 class DescriptionTable(Table):
     """Table of a whole description."""
 
-    what = "a description"
+    subject = "a description"
     title: Annotated[str, Field(max_length=1000)] = ""
     geometry: Annotated[GeometryTable, _SHAPE] | None = None
     electrodes: Annotated[ElectrodesTable, _ELECTRODES] | None = None
