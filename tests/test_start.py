@@ -78,10 +78,10 @@ def test_oldest_entries_are_discarded_beyond_the_limits(tmp_path, monkeypatch):
         path = tmp_path / "kind" / f"{number}-cache"
         path.write_bytes(b"x" * 100)
         os.utime(path, (number, number))
-    monkeypatch.setattr(jax_setup, "_MOST_FILES", 4)
+    monkeypatch.setattr(jax_setup, "_MAX_FILES", 4)
     jax_setup._discard_oldest(tmp_path)
     assert sorted(path.name[0] for path in tmp_path.rglob("*-cache")) == ["2", "3", "4", "5"]
-    monkeypatch.setattr(jax_setup, "_MOST_BYTES", 250)
+    monkeypatch.setattr(jax_setup, "_MAX_BYTES", 250)
     jax_setup._discard_oldest(tmp_path)
     assert sorted(path.name[0] for path in tmp_path.rglob("*-cache")) == ["4", "5"]
 

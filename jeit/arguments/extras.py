@@ -22,14 +22,14 @@ EXTRAS = {
 
 # Maximum number of characters of the reason why a package cannot be imported, which precedes the advice what to
 # install.
-_REASON = 120
+_MAX_REASON = 120
 
 
 def need_extra(extra: str, task: str) -> None:
     """Raise `ImportError`, naming what to install, if a package of `extra` is missing; `task` names what needs it."""
-    missing = [package for module, package in EXTRAS[extra].items() if _is_missing(module)]
-    if missing:
-        names = " and ".join(", ".join(missing).rsplit(", ", 1))
+    missing_packages = [package for module, package in EXTRAS[extra].items() if _is_missing(module)]
+    if missing_packages:
+        names = " and ".join(", ".join(missing_packages).rsplit(", ", 1))
         raise ImportError(f"{task} needs {names}: {how_to_install(extra)}.")
 
 
@@ -42,11 +42,13 @@ def optional(module: str, task: str, otherwise: str = "") -> ModuleType:
     try:
         return importlib.import_module(module)
     except (ImportError, OSError) as error:  # OSError: a system library that the package loads
-        extra = next(extra for extra, held in EXTRAS.items() if module.partition(".")[0] in held)
+        extra = next(extra for extra, modules in EXTRAS.items() if module.partition(".")[0] in modules)
         package = EXTRAS[extra][module.partition(".")[0]]
-        why = "" if _is_missing(module.partition(".")[0]) else f", which cannot be imported ({str(error)[:_REASON]})"
+        reason = (
+            "" if _is_missing(module.partition(".")[0]) else f", which cannot be imported ({str(error)[:_MAX_REASON]})"
+        )
         raise ImportError(
-            f"{task} needs {package}{why}: {how_to_install(extra)}.{otherwise and f' {otherwise}'}"
+            f"{task} needs {package}{reason}: {how_to_install(extra)}.{otherwise and f' {otherwise}'}"
         ) from error
 
 

@@ -127,6 +127,6 @@ def with_moved_names(page: str, find: Callable[[str], Any] | None = None) -> Cal
 
 def _forward(old: str, new: str) -> Any:
     home, _, name = new.rpartition(".")
-    found = getattr(importlib.import_module(home), name)
+    attribute = getattr(importlib.import_module(home), name)
     warnings.warn(f"{old} is now {new}; the old name is removed in version 1.1.", DeprecationWarning, stacklevel=3)
-    return found
+    return attribute

@@ -26,7 +26,7 @@ from jeit.start import discarded_damaged, quick_compilation
 
 # Commands that run the same compiled program many times. Full optimisation by the compiler makes a frame three times as
 # fast.
-_REPEATING = (
+_FULLY_OPTIMISED = (
     "study",
     "live",
     "stream",
@@ -39,10 +39,10 @@ _REPEATING = (
 )
 
 # Warnings of future changes in other packages, which are useful to programmers but not to users of the command line.
-_FOR_PROGRAMMERS = (DeprecationWarning, PendingDeprecationWarning, FutureWarning)
+_DEVELOPER_WARNINGS = (DeprecationWarning, PendingDeprecationWarning, FutureWarning)
 
 # Maximum number of characters of an error message.
-_LONGEST = 390
+_MAX_MESSAGE = 390
 
 
 def application(commands: Iterable[str] = COMMANDS) -> typer.Typer:
@@ -55,7 +55,7 @@ def application(commands: Iterable[str] = COMMANDS) -> typer.Typer:
         help="Electrical impedance tomography, from a measured tank or skin to an image; and passive acoustic "
         "tomography, from a skin's microphones to where it was touched.",
     )
-    app.callback(invoke_without_command=True)(_top)
+    app.callback(invoke_without_command=True)(_print_version_or_help)
     for name in commands:
         command = getattr(importlib.import_module(COMMANDS[name]), name.replace("-", "_"))
         if isinstance(command, typer.Typer):
@@ -65,7 +65,7 @@ def application(commands: Iterable[str] = COMMANDS) -> typer.Typer:
     return app
 
 
-def _top(
+def _print_version_or_help(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Say which version this is.")] = False,
 ) -> None:
@@ -86,22 +86,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for output in (sys.stdout, sys.stderr):
         if isinstance(output, io.TextIOWrapper):
             output.reconfigure(errors="replace")  # avoids errors on terminals without Greek letters
-    given = sys.argv[1:] if arguments is None else list(arguments)
-    command = as_command(given)
+    arguments_given = sys.argv[1:] if arguments is None else list(arguments)
+    command = as_command(arguments_given)
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = _shown_once()
+            warnings.showwarning = _create_warning_printer()
             if arguments is None:
-                _start(quickly=not " ".join(given[:2]).startswith(_REPEATING))
-            status = command.main(args=given, prog_name="jeit", standalone_mode=False)
-    except (KeyboardInterrupt, StoppedError) as stopped:
+                _set_up_process(compile_quickly=not " ".join(arguments_given[:2]).startswith(_FULLY_OPTIMISED))
+            status = command.main(args=arguments_given, prog_name="jeit", standalone_mode=False)
+    except (KeyboardInterrupt, StoppedError) as stop:
         remove_empty_folders()
-        return _fail(str(stopped) or "stopped.", 130)
+        return _print_error(str(stop) or "stopped.", 130)
     except Exception as error:
         remove_empty_folders()
         if os.environ.get("JEIT_DEBUG"):
             raise
-        return _explain(error)
+        return _report_error(error)
     return status if isinstance(status, int) else 0
 
 
@@ -110,49 +110,53 @@ def as_command(arguments: Sequence[str] = ()):
 
     If the first of the `arguments` is the name of a command, only that command is imported.
     """
-    called = arguments[0] if arguments else None
-    command = typer.main.get_command(application([called] if called in COMMANDS else COMMANDS))
+    command_name = arguments[0] if arguments else None
+    command = typer.main.get_command(application([command_name] if command_name in COMMANDS else COMMANDS))
     _name_options(command)
     return command
 
 
 def _name_options(command) -> None:
     """Make the error messages of all commands name options instead of Python arguments."""
-    for one in getattr(command, "commands", {}).values():
-        _name_options(one)
-    options = {one.name: max(one.opts, key=len) for one in command.params if one.param_type_name == "option"}
+    for subcommand in getattr(command, "commands", {}).values():
+        _name_options(subcommand)
+    options = {
+        parameter.name: max(parameter.opts, key=len)
+        for parameter in command.params
+        if parameter.param_type_name == "option"
+    }
     if command.callback is not None and options:
         command.callback = remembering_files(naming_options(options)(command.callback))
     if command.callback is not None:
         command.callback = reporting_when_stopped(command.callback)
 
 
-def _explain(error: Exception) -> int:
+def _report_error(error: Exception) -> int:
     """Report an error in one line on standard error; return the exit status."""
     if hasattr(error, "format_message"):  # an error of click or typer about the usage of the command
         context = getattr(error, "ctx", None)
         path = context.command_path if context is not None else "jeit"
         message = error.format_message().rstrip(".")  # pyright: ignore[reportAttributeAccessIssue]
-        return _fail(f"{message}. See '{path} --help'.", 2)
+        return _print_error(f"{message}. See '{path} --help'.", 2)
     if type(error).__name__ == "Abort":
-        return _fail("stopped.", 130)
+        return _print_error("stopped.", 130)
     if isinstance(error, ValueError) or (isinstance(error, ImportError) and "pip install" in str(error)):
-        return _fail(str(error), 1)
+        return _print_error(str(error), 1)
     if isinstance(error, ImportError):
-        return _fail(f"a package that this command needs cannot be imported ({error}); install it anew.", 1)
+        return _print_error(f"a package that this command needs cannot be imported ({error}); install it anew.", 1)
     if isinstance(error, OSError):
-        where = f"{error.filename}: " if error.filename else ""
-        return _fail(f"{where}{str(error.strerror or error).rstrip('.')}.", 1)
+        file_name = f"{error.filename}: " if error.filename else ""
+        return _print_error(f"{file_name}{str(error.strerror or error).rstrip('.')}.", 1)
     if isinstance(error, MemoryError):
-        return _fail("there is not enough memory; ask for fewer --num-points.", 1)
-    return _fail(
+        return _print_error("there is not enough memory; ask for fewer --num-points.", 1)
+    return _print_error(
         f"this should not have happened: {type(error).__name__}: {error}. "
         "Run again with JEIT_DEBUG=1 for the traceback, and report it.",
         1,
     )
 
 
-def _fail(message: str, status: int) -> int:
+def _print_error(message: str, status: int) -> int:
     print(f"jeit: {_one_line(message)}", file=sys.stderr)
     return status
 
@@ -160,29 +164,29 @@ def _fail(message: str, status: int) -> int:
 def _one_line(message: str) -> str:
     """Convert text to one line of printable characters, shortened in the middle if it is too long."""
     line = "".join(letter if letter.isprintable() else "�" for letter in " ".join(message.split()))
-    half = (_LONGEST - 3) // 2
-    return line if len(line) <= _LONGEST else f"{line[:half]} … {line[-half:]}"
+    half_length = (_MAX_MESSAGE - 3) // 2
+    return line if len(line) <= _MAX_MESSAGE else f"{line[:half_length]} … {line[-half_length:]}"
 
 
-def _shown_once() -> Callable[..., None]:
+def _create_warning_printer() -> Callable[..., None]:
     """Create a function that prints each warning only once, since the same objects are often created repeatedly."""
-    shown: set[str] = set()
+    printed: set[str] = set()
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:
-        said = str(message)
-        if issubclass(category, _FOR_PROGRAMMERS) and not os.environ.get("JEIT_DEBUG"):
+        text = str(message)
+        if issubclass(category, _DEVELOPER_WARNINGS) and not os.environ.get("JEIT_DEBUG"):
             return
-        if said not in shown and not discarded_damaged(said):
-            shown.add(said)
-            print(f"jeit: warning: {_one_line(said)}", file=sys.stderr)
+        if text not in printed and not discarded_damaged(text):
+            printed.add(text)
+            print(f"jeit: warning: {_one_line(text)}", file=sys.stderr)
 
     return show
 
 
-def _start(*, quickly: bool) -> None:
-    """Set up the process. `quickly`: whether to compile quickly, for commands that spend most of their time on
+def _set_up_process(*, compile_quickly: bool) -> None:
+    """Set up the process. `compile_quickly`: whether to compile quickly, for commands that spend most of their time on
     compilation. XLA_FLAGS set by the user take precedence."""
-    if quickly:
+    if compile_quickly:
         os.environ.setdefault("XLA_FLAGS", quick_compilation())
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # hides messages about fonts and unwritable folders
     # Imports and tracing create many small objects, which Python's garbage collector would scan repeatedly.

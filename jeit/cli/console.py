@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 
 # Maximum width of a table, in characters.
-_WIDTH = 80
+_MAX_TABLE_WIDTH = 80
 # Seconds from which a step shows how long it has taken.
-_SOME_SECONDS = 2.0
+_MIN_SHOWN_SECONDS = 2.0
 # Parts done of a step, and their share from which the time left is estimated. "12 of at most 60" states none.
-_PARTS, _SOME_PARTS = re.compile(r"(\d[\d,]*) of (\d[\d,]*)"), 0.05
+_PROGRESS, _MIN_SHARE = re.compile(r"(\d[\d,]*) of (\d[\d,]*)"), 0.05
 _PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
 
@@ -53,7 +53,7 @@ class Steps:
         self._finish()
         self._step, self._start = step, time.perf_counter()
         if not self.quiet:
-            self._status = self.console.status(_UnderWay(f"{step} …", self._start))
+            self._status = self.console.status(_StepLine(f"{step} …", self._start))
             self._status.start()
 
     @property
@@ -65,10 +65,10 @@ class Steps:
         """Show the progress within the current step beside its spinner; of a `detail` such as "frame 12 of 100" the
         time that is left, too."""
         if self._status is not None:
-            parts = _PARTS.search(detail)
-            done, number = (int(one.replace(",", "")) for one in parts.groups()) if parts else (0, 0)
+            match = _PROGRESS.search(detail)
+            num_done, num_parts = (int(digits.replace(",", "")) for digits in match.groups()) if match else (0, 0)
             now = time.perf_counter()
-            self._status.update(_UnderWay(f"{self._step} … {detail}", self._start, done, number, now))
+            self._status.update(_StepLine(f"{self._step} … {detail}", self._start, num_done, num_parts, now))
 
     def __enter__(self) -> "Steps":
         return self
@@ -88,28 +88,28 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class _UnderWay:
+class _StepLine:
     """Line beside the spinner: a step, and the seconds since its `start`, once it takes some; and those that are left
-    at the same pace, where `done` and `number` of its parts are known and some are done."""
+    at the same pace, where `num_done` of its `num_parts` parts are known to be done."""
 
     step: str
     start: float
-    done: int = 0
-    number: int = 0
+    num_done: int = 0
+    num_parts: int = 0
     reported: float = 0.0
 
     def __rich__(self) -> Text:
         seconds = time.perf_counter() - self.start
-        said = f"{self.step}  {seconds:.0f} s" if seconds >= _SOME_SECONDS else self.step
-        if seconds >= _SOME_SECONDS and _SOME_PARTS * self.number <= self.done < self.number:
-            taken = self.reported - self.start
-            left = max(taken * self.number / self.done - seconds, 0)
-            said += f", about {_rounded(left)} left"
-        return Text(said)
+        text = f"{self.step}  {seconds:.0f} s" if seconds >= _MIN_SHOWN_SECONDS else self.step
+        if seconds >= _MIN_SHOWN_SECONDS and _MIN_SHARE * self.num_parts <= self.num_done < self.num_parts:
+            elapsed = self.reported - self.start
+            seconds_left = max(elapsed * self.num_parts / self.num_done - seconds, 0)
+            text += f", about {_rounded_duration(seconds_left)} left"
+        return Text(text)
 
 
-def _rounded(seconds: float) -> str:
-    """A duration to one or two digits: an estimate has no more."""
+def _rounded_duration(seconds: float) -> str:
+    """Format a duration with one or two digits, the accuracy of the estimate."""
     if seconds < 100:
         return f"{seconds:.0f} s" if seconds < 10 else f"{5 * round(seconds / 5)} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
@@ -154,14 +154,14 @@ def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, *, background:
 
     `unit`: unit of conductivity. `background`: conductivity of the reference, if known.
     """
-    unit, peaks = in_one_unit([one.peak for one in inclusions], unit)
-    noun, size_unit, digits = _size(inclusions)
-    more = ["of back-\nground"] if background else []
+    unit, peaks = in_one_unit([inclusion.peak for inclusion in inclusions], unit)
+    noun, size_unit, digits = _size_format(inclusions)
+    share_columns = ["of back-\nground"] if background else []
     rows = []
     for inclusion, peak in zip(inclusions, peaks, strict=True):
         share = [percent(inclusion.peak / background)] if background else []
         rows.append([f"{1e6 * inclusion.area:.{digits}f}", peak, *share])
-    return _with_places(inclusions, [f"{noun}\n/ {size_unit}", f"peak change\n/ {unit}", *more], rows)
+    return _inclusion_table_with(inclusions, [f"{noun}\n/ {size_unit}", f"peak change\n/ {unit}", *share_columns], rows)
 
 
 def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Table:
@@ -170,19 +170,19 @@ def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Tabl
     `background`: conductivity of the reference, S/m (2-D: S). If the data leave an end of an interval open, only the
     other end is given.
     """
-    noun, unit, _ = _size(inclusions)
+    noun, unit, _ = _size_format(inclusions)
     rows = []
-    for one in inclusions:
-        measure = with_interval(one.area, one.area_interval, lambda value: _three_digits(1e6 * value))
-        share = one.peak / background
-        change = with_interval(share, one.contrast_interval, lambda value: _three_digits(100 * value, "+"))
-        strength = with_interval(one.strength, one.strength_interval, lambda value: _three_digits(1e6 * value))
-        rows.append([measure, change, strength])
-    table = _with_places(inclusions, [f"{noun}\n/ {unit}", "change\n/ %", f"strength\n/ {unit}"], rows)
-    table.caption, table.caption_justify = (
-        "below size, change and strength their 68 % intervals; places have none",
-        "left",
-    )
+    for inclusion in inclusions:
+        size = with_interval(inclusion.area, inclusion.area_interval, lambda value: _three_digits(1e6 * value))
+        share = inclusion.peak / background
+        change = with_interval(share, inclusion.contrast_interval, lambda value: _three_digits(100 * value, "+"))
+        strength = with_interval(
+            inclusion.strength, inclusion.strength_interval, lambda value: _three_digits(1e6 * value)
+        )
+        rows.append([size, change, strength])
+    table = _inclusion_table_with(inclusions, [f"{noun}\n/ {unit}", "change\n/ %", f"strength\n/ {unit}"], rows)
+    table.caption = "below size, change and strength their 68 % intervals; places have none"
+    table.caption_justify = "left"
     return table
 
 
@@ -191,35 +191,39 @@ def _three_digits(value: float, sign: str = "") -> str:
     return f"{float(f'{value:.3g}'):{sign}g}"
 
 
-def with_interval(value: float | None, interval: Interval | None, written: Callable[[float], str]) -> str:
+def with_interval(value: float | None, interval: Interval | None, format_value: Callable[[float], str]) -> str:
     """A value above its interval, as text; only the interval where one of its ends is open."""
     if value is None or interval is None:
-        return "not known" if value is None else written(value)
-    text = interval_text(interval, written)
-    return text if None in interval else f"{written(value)}\n{text}"
+        return "not known" if value is None else format_value(value)
+    text = interval_text(interval, format_value)
+    return text if None in interval else f"{format_value(value)}\n{text}"
 
 
-def _size(inclusions: "Sequence[Inclusion]") -> tuple[str, str, int]:
-    """What sizes are, their unit, and their number of decimals. The same factor 1e6 converts square metres to mm² and
-    cubic metres to cm³."""
-    return ("volume", "cm³", 2) if any(one.is_solid for one in inclusions) else ("area", "mm²", 0)
+def _size_format(inclusions: "Sequence[Inclusion]") -> tuple[str, str, int]:
+    """Return the name of the size of inclusions, its unit, and its number of decimals. The same factor 1e6 converts
+    square metres to mm² and cubic metres to cm³."""
+    return ("volume", "cm³", 2) if any(inclusion.is_solid for inclusion in inclusions) else ("area", "mm²", 0)
 
 
-def _with_places(inclusions: "Sequence[Inclusion]", columns: list[str], rows: list[list[str]]) -> Table:
+def _inclusion_table_with(inclusions: "Sequence[Inclusion]", columns: list[str], rows: list[list[str]]) -> Table:
     """Create a table of inclusions by kind and place, with more `columns`, in 80 characters."""
-    dimension = max((len(one.centroid) for one in inclusions), default=2)
-    close = {"box": None, "padding": (0, 2), "collapse_padding": True}
+    dimension = max((len(inclusion.centroid) for inclusion in inclusions), default=2)
+    table_style = {"box": None, "padding": (0, 2), "collapse_padding": True}
 
-    def table_of(parted: str) -> Table:
-        """Create the table; `parted` separates the kind of a body from the word "column"."""
-        table = Table("inclusion", *(f"{axis} / mm" for axis in "xyz"[:dimension]), *columns, **close)
-        table.columns[0].min_width = max((len(one.kind) for one in inclusions), default=0)
+    def table_of(separator: str) -> Table:
+        """Create the table; `separator` separates the kind of a body from the word "column"."""
+        table = Table("inclusion", *(f"{axis} / mm" for axis in "xyz"[:dimension]), *columns, **table_style)
+        table.columns[0].min_width = max((len(inclusion.kind) for inclusion in inclusions), default=0)
         for column in table.columns[1:]:
             column.justify = "right"
         for inclusion, row in zip(inclusions, rows, strict=True):
-            kind = f"{inclusion.kind}{parted}column" if inclusion.is_column else inclusion.kind
+            kind = f"{inclusion.kind}{separator}column" if inclusion.is_column else inclusion.kind
             table.add_row(kind, *(f"{1e3 * value:.1f}" for value in inclusion.centroid), *row)
         return table
 
-    whole = table_of(" ")
-    return whole if Console(width=_WIDTH + 1).measure(whole).maximum <= _WIDTH else table_of("\n")
+    table_on_one_line = table_of(" ")
+    return (
+        table_on_one_line
+        if Console(width=_MAX_TABLE_WIDTH + 1).measure(table_on_one_line).maximum <= _MAX_TABLE_WIDTH
+        else table_of("\n")
+    )

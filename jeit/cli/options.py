@@ -70,11 +70,11 @@ NETWORK = "network"
 """Value of `--method` of `reconstruct` and `stream` for imaging by a network, besides the methods of `jeit.imaging`."""
 
 # Folders created by `make_folder`, inner folders first.
-_MADE: list[Path] = []
+_CREATED_FOLDERS: list[Path] = []
 # Input files of the current command.
-_GIVEN: list[Path] = []
+_INPUT_FILES: list[Path] = []
 # Options that name output files.
-_WRITTEN = ("output", "page", "film")
+_OUTPUT_OPTIONS = ("output", "page", "film")
 
 
 def remembering_files(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -82,11 +82,11 @@ def remembering_files(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(command)
     def call(**values: Any) -> Any:
-        _GIVEN.clear()
+        _INPUT_FILES.clear()
         for name, value in values.items():
             with suppress(OSError, ValueError):
-                if name not in _WRITTEN and isinstance(value, str | Path) and Path(value).is_file():
-                    _GIVEN.append(Path(value))
+                if name not in _OUTPUT_OPTIONS and isinstance(value, str | Path) and Path(value).is_file():
+                    _INPUT_FILES.append(Path(value))
         return command(**values)
 
     return call
@@ -100,9 +100,9 @@ def reporting_when_stopped(command: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap a command so that Ctrl-C raises `StoppedError`, since typer does not report `KeyboardInterrupt`."""
 
     @wraps(command)
-    def call(*given: Any, **values: Any) -> Any:
+    def call(*arguments: Any, **values: Any) -> Any:
         try:
-            return command(*given, **values)
+            return command(*arguments, **values)
         except KeyboardInterrupt:
             raise StoppedError("stopped.") from None
 
@@ -115,8 +115,8 @@ def naming_options(options: dict[str, str]) -> Iterator[None]:
     try:
         yield
     except (ValueError, FileNotFoundError) as error:
-        said = str(error)
-        if (renamed := in_options(said, options)) == said:
+        message = str(error)
+        if (renamed := in_options(message, options)) == message:
             raise
         raise ValueError(renamed) from error
 
@@ -148,16 +148,18 @@ def read_pair(
     used as reference. `keys`: names of the arrays of DATA and of the reference."""
     key, reference_key = keys
     reference = data if reference is None and reference_key is not None else reference
-    base = None if reference is None else read_file("--reference", reference, format, description, key=reference_key)
-    measurement = read_file("DATA", data, format, description, like=base, key=key)
-    whole = measurement if base is None else base
-    return measurement, base if frames is None else reference_of_frames(whole, frames)
+    reference_measurement = (
+        None if reference is None else read_file("--reference", reference, format, description, key=reference_key)
+    )
+    measurement = read_file("DATA", data, format, description, like=reference_measurement, key=key)
+    reference_source = measurement if reference_measurement is None else reference_measurement
+    return measurement, reference_measurement if frames is None else reference_of_frames(reference_source, frames)
 
 
 def reference_of_frames(measurement: "Measurement", frames: str) -> "Measurement":
     """Return the `frames` of a measurement that --reference-frames names, such as "0-17" or "5"."""
-    spelled = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", frames.strip())
-    first, last = (int(spelled[1]), int(spelled[2] or spelled[1])) if spelled else (0, -1)
+    match = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", frames.strip())
+    first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
     if not first <= last < measurement.num_frames:
         raise ValueError(
             f"--reference-frames: give FIRST-LAST, such as 0-17, or one number, of the frames 0 to "
@@ -166,7 +168,7 @@ def reference_of_frames(measurement: "Measurement", frames: str) -> "Measurement
     return measurement.frames(slice(first, last + 1))
 
 
-def in_options(said: str, options: dict[str, str]) -> str:
+def in_options(message: str, options: dict[str, str]) -> str:
     """Replace Python arguments by options in an error message, at its beginning or where written as `name=`.
 
     For options in millimetres, whose names end in "-mm", the question whether lengths were given in metres is removed.
@@ -176,12 +178,12 @@ def in_options(said: str, options: dict[str, str]) -> str:
     questions = IN_MILLIMETRES, "are both in metres?"
 
     for argument, option in options.items():
-        if said.startswith((f"{argument} ", f"{argument}:")):
+        if message.startswith((f"{argument} ", f"{argument}:")):
             for question in questions if option.endswith("-mm") else ():
-                said = said.replace(f"; {question}", ".")
-            said = option + said.removeprefix(argument)
-        said = re.sub(rf"\b{argument}=(?!\w)", option, said)
-    return said
+                message = message.replace(f"; {question}", ".")
+            message = option + message.removeprefix(argument)
+        message = re.sub(rf"\b{argument}=(?!\w)", option, message)
+    return message
 
 
 def check_positive(options: dict[str, float]) -> None:
@@ -193,44 +195,44 @@ def check_positive(options: dict[str, float]) -> None:
 
 def check_at_least(options: dict[str, tuple[int | None, int]]) -> None:
     """Check options, given as pairs of value and minimum. Raises `ValueError` for values below their minimum."""
-    for name, (value, least) in options.items():
-        if value is not None and value < least:
-            raise ValueError(f"{name} must be at least {least}; it is {value}.")
+    for name, (value, minimum) in options.items():
+        if value is not None and value < minimum:
+            raise ValueError(f"{name} must be at least {minimum}; it is {value}.")
 
 
-def check_within(name: str, value: float, least: float, most: float, unit: str = "") -> None:
-    """Check an option that must be a number from `least` to `most`. Raises `ValueError` otherwise."""
-    if not least <= value <= most:
+def check_within(name: str, value: float, minimum: float, maximum: float, unit: str = "") -> None:
+    """Check an option that must be a number from `minimum` to `maximum`. Raises `ValueError` otherwise."""
+    if not minimum <= value <= maximum:
         unit = f" {unit}" if unit else ""
-        raise ValueError(f"{name} must be from {least:g} to {most:g}{unit}; it is {value:g}.")
+        raise ValueError(f"{name} must be from {minimum:g} to {maximum:g}{unit}; it is {value:g}.")
 
 
 def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json", "image.vtu")) -> None:
     """Create the folder for result files of the given names before the computation; `remove_empty_folders` undoes it.
     Raises `ValueError` if the path cannot be a folder, and if a result would overwrite an input file of the command."""
     for name in names:
-        if any((output / name).exists() and (output / name).samefile(one) for one in _GIVEN):
+        if any((output / name).exists() and (output / name).samefile(input_file) for input_file in _INPUT_FILES):
             raise ValueError(
                 f"--output {output}: {name} in it was given, and would be written over; give another folder."
             )
     from jeit.report.folder import results_folder
 
-    missing = [one for one in (output, *output.parents) if not one.exists()]
+    missing_folders = [folder for folder in (output, *output.parents) if not folder.exists()]
     with naming_options({"folder": "--output"}):
         results_folder(output, names)
-    _MADE.extend(missing)
+    _CREATED_FOLDERS.extend(missing_folders)
 
 
 def remove_empty_folders() -> None:
     """Remove the empty folders among those created by `make_folder`."""
-    while _MADE:
+    while _CREATED_FOLDERS:
         with suppress(OSError):
-            _MADE.pop(0).rmdir()
+            _CREATED_FOLDERS.pop(0).rmdir()
 
 
-def number_or_name(text: str, number: type = float):
+def number_or_name(text: str, number_type: type = float):
     """Convert text to a number; return the text itself if it is not a number."""
     try:
-        return number(text)
+        return number_type(text)
     except ValueError:
         return text

@@ -18,9 +18,9 @@ from jeit.cli.console import Steps
 from jeit.cli.options import remove_empty_folders
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_NO_MORE = object()
+_END_OF_FRAMES = object()
 # Interval between reports of the number of frames received, in seconds.
-_EVERY = 0.25
+_REPORT_INTERVAL = 0.25
 
 
 class _StoppedError(Exception):
@@ -35,7 +35,7 @@ class Stopping:
     def __init__(self) -> None:
         self.signal: int | None = None
         self._streaming, self._waiting = False, False
-        self._earlier: dict[int, Any] = {}
+        self._earlier_handlers: dict[int, Any] = {}
 
     def until(self, frames: Iterable) -> Iterator:
         """Iterate over the frames until a signal arrives."""
@@ -46,9 +46,9 @@ class Stopping:
                 self._waiting = True
                 if self.signal is not None:
                     return
-                frame = next(source, _NO_MORE)
+                frame = next(source, _END_OF_FRAMES)
                 self._waiting = False
-                if frame is _NO_MORE:
+                if frame is _END_OF_FRAMES:
                     return
                 yield frame
         except KeyboardInterrupt:
@@ -59,48 +59,48 @@ class Stopping:
     def before(self, pictures: Sequence[str], step: Steps) -> Callable[[str], None]:
         """Create a function that reports writing and drawing as steps, and skips drawing after a signal."""
 
-        def report(what: str) -> None:
-            part = "draw" if what.partition(":")[0] in pictures else "write"
-            if part == "draw" and self.signal is not None:
+        def report(task: str) -> None:
+            step_name = "draw" if task.partition(":")[0] in pictures else "write"
+            if step_name == "draw" and self.signal is not None:
                 raise _StoppedError
-            if step.under_way != part:
-                step(part)
-            step.report(what)
+            if step.under_way != step_name:
+                step(step_name)
+            step.report(task)
 
         return report
 
     @contextmanager
-    def ending(self, come: "FrameCounter", *files: str) -> Iterator[None]:
+    def ending(self, frame_counter: "FrameCounter", *files: str) -> Iterator[None]:
         """Context manager that exits the command at its end if a signal has arrived, and prints the number of frames
         received and the `files` that contain them."""
         try:
             yield
-            held = f"; {' and '.join(files)} have them"
+            hint = f"; {' and '.join(files)} have them"
         except (_StoppedError, ValueError) as error:
             if self.signal is None:
                 raise
-            held = f"; {' and '.join(files)} have them" if isinstance(error, _StoppedError) else ""
+            hint = f"; {' and '.join(files)} have them" if isinstance(error, _StoppedError) else ""
         except KeyboardInterrupt:
-            if self.signal is None or come.number:
+            if self.signal is None or frame_counter.number:
                 raise
-            held = ""  # stopped during compilation, before the first frame
+            hint = ""  # stopped during compilation, before the first frame
         if self.signal is not None:
-            self._end(f" after {counted(come.number, 'frame')}{held}")
+            self._end(f" after {counted(frame_counter.number, 'frame')}{hint}")
 
-    def _end(self, said: str) -> NoReturn:
+    def _end(self, detail: str) -> NoReturn:
         remove_empty_folders()
-        print(f"jeit: stopped{said}.", file=sys.stderr)
+        print(f"jeit: stopped{detail}.", file=sys.stderr)
         raise typer.Exit(128 + (self.signal or 0))
 
     def __enter__(self) -> "Stopping":
         if threading.current_thread() is threading.main_thread():
-            handled = [one for one in _SIGNALS if signal.getsignal(one) is not signal.SIG_IGN]
-            self._earlier = {one: signal.signal(one, self._stop) for one in handled}
+            handled_signals = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+            self._earlier_handlers = {number: signal.signal(number, self._stop) for number in handled_signals}
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_) -> None:
-        for one, handler in self._earlier.items():
-            signal.signal(one, handler)
+        for number, handler in self._earlier_handlers.items():
+            signal.signal(number, handler)
         if kind is KeyboardInterrupt and self.signal is not None:
             self._end("")
 
@@ -116,13 +116,13 @@ class FrameCounter:
     known."""
 
     def __init__(self, step: Steps, number: int | None = None):
-        self._step, self._of = step, "" if number is None else f" of {number:,}"
-        self.number, self._last = 0, 0.0
+        self._step, self._total_text = step, "" if number is None else f" of {number:,}"
+        self.number, self._last_report = 0, 0.0
 
     def one_more(self) -> None:
         """Count a frame."""
         self.number += 1
         now = time.monotonic()
-        if now - self._last > _EVERY:
-            self._last = now
-            self._step.report(f"frame {self.number:,}{self._of}")
+        if now - self._last_report > _REPORT_INTERVAL:
+            self._last_report = now
+            self._step.report(f"frame {self.number:,}{self._total_text}")

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
 # Size of the body divided by the length that a key gives.
-_ACROSS = {"radius": 2.0, "width": 1.0, "depth": 1.0, "height": 1.0, "thickness": 1.0}
+_SIZE_FACTORS = {"radius": 2.0, "width": 1.0, "depth": 1.0, "height": 1.0, "thickness": 1.0}
 
 
 def warn_large_body(table: GeometryTable, body: Body, origin: str) -> None:
@@ -34,26 +34,31 @@ def warn_large_body(table: GeometryTable, body: Body, origin: str) -> None:
     metres."""
     from jeit.data.description_tables import PolygonTable  # already imported when the table was read
 
-    lengths = {key: float(getattr(table, key, None) or 0) for key in _ACROSS}
-    large = {key: length for key, length in lengths.items() if _ACROSS[key] * length > LARGE}
+    lengths = {key: float(getattr(table, key, None) or 0) for key in _SIZE_FACTORS}
+    large_lengths = {key: length for key, length in lengths.items() if _SIZE_FACTORS[key] * length > LARGE}
     if isinstance(body, OwnMesh):
-        place, size = "mesh", _extent(body.given.points)
-        give = {unit: f"scale = {factor * getattr(table, 'scale', 1.0):g}" for unit, factor in _UNITS.items()}
-    elif isinstance(table, PolygonTable) and not large:
-        place, size = "vertices", _extent(table.vertices)
-        give = {unit: f"{factor:g} times those" for unit, factor in _UNITS.items()}
+        key_names, size = "mesh", _extent(body.given.points)
+        suggestions = {unit: f"scale = {factor * getattr(table, 'scale', 1.0):g}" for unit, factor in _UNITS.items()}
+    elif isinstance(table, PolygonTable) and not large_lengths:
+        key_names, size = "vertices", _extent(table.vertices)
+        suggestions = {unit: f"{factor:g} times those" for unit, factor in _UNITS.items()}
     else:
-        place, size = ", geometry.".join(large), max((_ACROSS[key] * large[key] for key in large), default=0.0)
-        give = {
-            unit: " and ".join(f"{factor * length:g}" for length in large.values()) for unit, factor in _UNITS.items()
+        key_names, size = (
+            ", geometry.".join(large_lengths),
+            max((_SIZE_FACTORS[key] * large_lengths[key] for key in large_lengths), default=0.0),
+        )
+        suggestions = {
+            unit: " and ".join(f"{factor * length:g}" for length in large_lengths.values())
+            for unit, factor in _UNITS.items()
         }
     if not size > LARGE:
         return
-    said = " and ".join(f"{length:g} m" for length in large.values()) or f"{size:.3g} m"
+    length_text = " and ".join(f"{length:g} m" for length in large_lengths.values()) or f"{size:.3g} m"
     warnings.warn(
-        f"{origin}: geometry.{place}: {said} {'are' if len(large) > 1 else 'is'} large for what electrodes are put on. "
-        f"If the lengths are millimetres, give {give['millimetres']}, if centimetres, {give['centimetres']}, if "
-        f"inches, {give['inches']}, and so all other lengths: jeit computes in metres.",
+        f"{origin}: geometry.{key_names}: {length_text} {'are' if len(large_lengths) > 1 else 'is'} large for what "
+        f"electrodes are put on. If the lengths are millimetres, give {suggestions['millimetres']}, if centimetres, "
+        f"{suggestions['centimetres']}, if inches, {suggestions['inches']}, and so all other lengths: jeit computes in "
+        "metres.",
         UserWarning,
         stacklevel=5,
     )
@@ -65,8 +70,8 @@ def _extent(points) -> float:
 
 # Maximum distance of an electrode from the surface as a fraction of its smaller dimension, and maximum overhang beyond
 # the wall as a fraction of its height.
-_MOST_OFF = 0.1
-_MOST_OUT = 0.02
+_MAX_SURFACE_DISTANCE = 0.1
+_MAX_OVERHANG = 0.02
 
 
 def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
@@ -74,38 +79,46 @@ def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
     (patches), or that extend above or below the wall."""
     if isinstance(electrodes, FacePatches):
         height = np.asarray(electrodes.height)
-        smaller = np.minimum(electrodes.width, height)
+        smaller_sizes = np.minimum(electrodes.width, height)
     elif isinstance(electrodes, FaceDiscs):
-        smaller, height = 2 * np.asarray(electrodes.radius), np.zeros(electrodes.num_electrodes)
+        smaller_sizes, height = 2 * np.asarray(electrodes.radius), np.zeros(electrodes.num_electrodes)
     else:
         return
-    place = np.asarray(electrodes.position)
-    check_on_surface(place, _MOST_OFF * smaller, lambda places: _surface_distance(body, places)[0])
-    check_apart(place, smaller)
+    positions = np.asarray(electrodes.position)
+    check_on_surface(
+        positions, _MAX_SURFACE_DISTANCE * smaller_sizes, lambda points: _surface_distance(body, points)[0]
+    )
+    check_apart(positions, smaller_sizes)
     if isinstance(electrodes, FacePatches):
         x_min, x_max, y_min, y_max = body.extent
-        sides = x_max - x_min, y_max - y_min
-        across = max(sides) if isinstance(body.outline, Disk | Rectangle) else float(np.hypot(*sides))
-        check_size("width", np.asarray(electrodes.width), across, "the body")
-    z, top = place[:, 2], body.thickness
-    out, on_wall = np.maximum(height / 2 - z, z + height / 2 - top), _surface_distance(body, place)[1]
-    for number in np.flatnonzero(on_wall & (out > _MOST_OUT * height))[:1]:
-        low, high = z[number] - height[number] / 2, z[number] + height[number] / 2
-        key = "height: " if height[number] > top else ""
+        side_lengths = x_max - x_min, y_max - y_min
+        max_width = max(side_lengths) if isinstance(body.outline, Disk | Rectangle) else float(np.hypot(*side_lengths))
+        check_size("width", np.asarray(electrodes.width), max_width, "the body")
+    z, body_height = positions[:, 2], body.thickness
+    overhangs, on_wall = np.maximum(height / 2 - z, z + height / 2 - body_height), _surface_distance(body, positions)[1]
+    for electrode_index in np.flatnonzero(on_wall & (overhangs > _MAX_OVERHANG * height))[:1]:
+        lower_end, upper_end = (
+            z[electrode_index] - height[electrode_index] / 2,
+            z[electrode_index] + height[electrode_index] / 2,
+        )
+        key = "height: " if height[electrode_index] > body_height else ""
         raise ValueError(
-            f"{key}electrode {number + 1} reaches from {low:.4g} to {high:.4g} m, and its wall from 0 to {top:.4g} m: "
-            "give the size of what lies on the wall, and its middle."
+            f"{key}electrode {electrode_index + 1} reaches from {lower_end:.4g} to {upper_end:.4g} m, and its wall "
+            f"from 0 to {body_height:.4g} m: give the size of what lies on the wall, and its middle."
         )
 
 
-def _surface_distance(body: Solid, place: Float[np.ndarray, "L 3"]):
-    """Distance of places from the surface, in metres, and whether the wall is nearer than the lids."""
-    z = place[:, 2]
-    within, between = np.asarray(body.outline.signed_distance(place[:, :2])), np.minimum(z, body.thickness - z)
-    off_wall, off_lid = np.abs(within), np.abs(between)
+def _surface_distance(body: Solid, points: Float[np.ndarray, "L 3"]):
+    """Return the distance of points (L, 3) from the surface, in metres, and whether the wall is nearer than a lid."""
+    z = points[:, 2]
+    wall_distances, lid_distances = (
+        np.asarray(body.outline.signed_distance(points[:, :2])),
+        np.minimum(z, body.thickness - z),
+    )
+    to_wall, to_lid = np.abs(wall_distances), np.abs(lid_distances)
     # Outside the body, the distances beyond the wall and beyond the lid are the legs of a right triangle.
-    outside = np.hypot(np.minimum(within, 0), np.minimum(between, 0))
-    return np.where(outside > 0, outside, np.minimum(off_wall, off_lid)), off_wall <= off_lid
+    outside_distances = np.hypot(np.minimum(wall_distances, 0), np.minimum(lid_distances, 0))
+    return np.where(outside_distances > 0, outside_distances, np.minimum(to_wall, to_lid)), to_wall <= to_lid
 
 
 def _box(width: float, depth: float, height: float) -> Solid:
@@ -125,14 +138,16 @@ ELECTRODES: dict[str, dict[int, type[Any]]] = {
     "point": {2: PointElectrodes, 3: PointElectrodes},
 }
 """Classes of electrodes with positions, by kind and number of coordinates."""
-_SIZES = {"boundary": ("width",), "disc": ("radius",), "patch": ("width", "height"), "point": ()}
+_SIZE_FIELDS = {"boundary": ("width",), "disc": ("radius",), "patch": ("width", "height"), "point": ()}
 # Keys of a shape's table that are not arguments of its constructor.
-_NO_ARGUMENT = {"shape", "thickness"}
+_NON_ARGUMENT_KEYS = {"shape", "thickness"}
 
 
 def described_body(table: GeometryTable, folder: Path, origin: str) -> Body:
-    """The body of a table `[geometry]`; the file of a mesh is looked for in `folder`. Raises `ValueError` if it is not
-    valid, and warns if lengths are too large for metres."""
+    """Construct the body of a table `[geometry]`; the file of a mesh is looked for in `folder`.
+
+    Raises `ValueError` if it is not valid, and warns if lengths are too large for metres.
+    """
     with size_checked():
         body = _body(table, folder, origin)
     warn_large_body(table, body, origin)
@@ -143,8 +158,8 @@ def _body(table: GeometryTable, folder: Path, origin: str) -> Body:
     from jeit.data.description_tables import MeshTable  # already imported when the table was read
 
     if isinstance(table, MeshTable):
-        return _own_mesh(table, folder, origin)
-    arguments = {name: getattr(table, name) for name in type(table).model_fields if name not in _NO_ARGUMENT}
+        return _mesh_from_file(table, folder, origin)
+    arguments = {name: getattr(table, name) for name in type(table).model_fields if name not in _NON_ARGUMENT_KEYS}
     try:
         body = SHAPES[table.shape](**arguments)
         thickness = getattr(table, "thickness", None)
@@ -153,7 +168,7 @@ def _body(table: GeometryTable, folder: Path, origin: str) -> Body:
         raise located(error, origin, "geometry") from None
 
 
-def _own_mesh(table: MeshTable, folder: Path, origin: str) -> OwnMesh:
+def _mesh_from_file(table: MeshTable, folder: Path, origin: str) -> OwnMesh:
     file = folder / table.mesh
     if Path(table.mesh).name != table.mesh or ":" in table.mesh:
         raise located(f"must be the name of a file beside {origin}, without folders.", origin, "geometry.mesh")
@@ -168,37 +183,41 @@ def _own_mesh(table: MeshTable, folder: Path, origin: str) -> OwnMesh:
 
 
 def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str) -> AbstractElectrodes:
-    """The electrodes of a table `[electrodes]`, on a body if one is described. Raises `ValueError` if they are not
-    valid."""
+    """Construct the electrodes of a table `[electrodes]`, on a body if one is described.
+
+    Raises `ValueError` if they are not valid.
+    """
     try:
         if table.kind == "facets":
             return _facets(table, body)
         position = _positions(table, body, origin)
-        coordinates = position.shape[-1]
-        if coordinates not in ELECTRODES[table.kind]:
+        num_coordinates = position.shape[-1]
+        if num_coordinates not in ELECTRODES[table.kind]:
             raise ValueError(
-                f"positions: {coordinates} coordinates are not those of kind = '{table.kind}', which lies on "
+                f"positions: {num_coordinates} coordinates are not those of kind = '{table.kind}', which lies on "
                 f"{'an edge: give x and y' if table.kind == 'boundary' else 'a solid: give x, y and z'}."
             )
-        make = ELECTRODES[table.kind][coordinates]
+        constructor = ELECTRODES[table.kind][num_coordinates]
         if table.kind == "point":
-            return make(position)
-        made = make(position, *(getattr(table, size) for size in _SIZES[table.kind]), table.contact_impedance)
+            return constructor(position)
+        electrodes = constructor(
+            position, *(getattr(table, size) for size in _SIZE_FIELDS[table.kind]), table.contact_impedance
+        )
         if isinstance(body, Solid):
-            check_on_solid(made, body)
-        elif isinstance(body, OwnMesh) and isinstance(made, FacePatches):
-            made.check(body.given)
-        return made
+            check_on_solid(electrodes, body)
+        elif isinstance(body, OwnMesh) and isinstance(electrodes, FacePatches):
+            electrodes.check(body.given)
+        return electrodes
     except ValueError as error:
-        raise located(_of_keys(str(error)), origin, "electrodes") from None
+        raise located(_with_description_key(str(error)), origin, "electrodes") from None
 
 
-def _of_keys(message: str) -> str:
+def _with_description_key(message: str) -> str:
     """Replace the argument name at the beginning of a message about electrodes by the corresponding key of the
     description."""
-    argument, colon, rest = message.partition(": ")
+    argument, colon, problem = message.partition(": ")
     key = {"position": "positions", "positions": "positions", "width": "width", "height": "height"}.get(argument)
-    return f"electrodes.{key}{colon}{rest}" if key else message
+    return f"electrodes.{key}{colon}{problem}" if key else message
 
 
 def _facets(table: FacetsTable, body: Body | None) -> AbstractElectrodes:
@@ -221,19 +240,21 @@ def _positions(table: PlacedTable, body: Body | None, origin: str) -> np.ndarray
     if not isinstance(body, Solid):
         if table.levels is not None:
             raise ValueError("levels are heights on a solid, and this is a sheet; leave them out, or give a thickness.")
-        return _around(table, outline, table.number)
+        return _edge_positions(table, outline, table.number)
     if table.levels is None:
         raise ValueError("on a solid it needs 'levels', heights in metres.")
     levels = np.atleast_1d(table.levels)
     check_electrodes(f"{origin}: electrodes", len(levels) * table.number)
     if levels.max() > body.thickness:
         raise ValueError(f"levels must be heights from 0 to {body.thickness:g} m; one is {levels.max():g}.")
-    around = _around(table, outline, table.number)
+    level_positions = _edge_positions(table, outline, table.number)
     # Electrodes are ordered level after level, with the same number on each level.
-    return np.concatenate([np.column_stack([around, np.full(len(around), level)]) for level in levels])
+    return np.concatenate(
+        [np.column_stack([level_positions, np.full(len(level_positions), level)]) for level in levels]
+    )
 
 
-def _around(table: PlacedTable, outline: Domain, number: int) -> np.ndarray:
+def _edge_positions(table: PlacedTable, outline: Domain, number: int) -> np.ndarray:
     """Positions (L, 2) along the edge of an outline."""
     if table.layout == "perimeter":
         return perimeter(outline, number, start=table.start)
@@ -248,7 +269,7 @@ def _around(table: PlacedTable, outline: Domain, number: int) -> np.ndarray:
     )
 
 
-def located(error: Exception | str, origin: str, where: str) -> ValueError:
-    """A `ValueError` with the file and the key that an error concerns, cut to 400 characters."""
+def located(error: Exception | str, origin: str, key: str) -> ValueError:
+    """Return a `ValueError` that names the file and the key that an error concerns, cut to 400 characters."""
     text = str(error).removeprefix(f"{origin}: ")
-    return ValueError(f"{origin[:80]}: {text if text.startswith(where) else f'{where}: {text}'}"[:400])
+    return ValueError(f"{origin[:80]}: {text if text.startswith(key) else f'{key}: {text}'}"[:400])

@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 PROTOCOL_ARRAYS = ("drive", "measurement", "drive_index", "measurement_index")
 _CURRENT_UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
 # Keys that are not passed to a constructor as options.
-_COMMON = {"kind", "number", "name", "current", "current_from_name", "current_unit"}
+_NON_OPTION_KEYS = {"kind", "number", "name", "current", "current_from_name", "current_unit"}
 # Keys whose values are indices of electrodes, from 0.
-_NUMBERING = ("common", "reference", "pairs", "drive_pairs", "measurement_pairs")
+_ELECTRODE_KEYS = ("common", "reference", "pairs", "drive_pairs", "measurement_pairs")
 # Estimated memory of a protocol in use: bytes for every channel in addition to its pattern, and number of copies of the
 # patterns.
-_CHANNEL, _COPIES = 64, 2
+_BYTES_PER_CHANNEL, _NUM_COPIES = 64, 2
 
 
 def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:
@@ -41,11 +41,11 @@ def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: P
     """
     try:
         if table.kind == "matrices":
-            channels = len(table.drive) * len(table.measurement)
-            _check_size(len(table.drive), len(table.measurement), table.drive.shape[1], channels, origin)
+            num_channels = len(table.drive) * len(table.measurement)
+            _check_size(len(table.drive), len(table.measurement), table.drive.shape[1], num_channels, origin)
             return protocols.from_matrices(table.drive, table.measurement, table.select, name=table.name)
         if table.kind == "channels":
-            return Protocol(**{part: getattr(table, part) for part in PROTOCOL_ARRAYS}, name=table.name)
+            return Protocol(**{name: getattr(table, name) for name in PROTOCOL_ARRAYS}, name=table.name)
         if table.kind == "measured":
             return protocol_of_file(table, path)
         if table.kind == "optimal":
@@ -55,51 +55,57 @@ def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: P
         raise located(error, origin, "protocol") from None
 
 
-# Options that a description may leave out, and their values: those of the constructors first.
-_OPEN = {"driven_electrodes": (False, True), "order": ("rotating", "fixed"), "reciprocal": ("all", "half"),
+# Options that a description may leave out, and their possible values; the default of the constructor comes first.
+_OPTION_VALUES = {"driven_electrodes": (False, True), "order": ("rotating", "fixed"), "reciprocal": ("all", "half"),
          "drives": ("distinct", "all")}  # fmt: skip
 
 
 def variants(table: ProtocolTable) -> list[tuple[ProtocolTable, str]]:
-    """The table, and with other values of the options that it does not state, each with these in the words of a
-    description."""
+    """Return the table, then copies of it with other values of the options that it does not state, each with the text
+    that states these options in a description."""
     fields = type(table).model_fields
-    left = [name for name in _OPEN if name in fields and name not in table.model_fields_set]
-    left = [name for name in left if fields[name].default in _OPEN[name]]
-    found = []
-    for values in product(*(_OPEN[name] for name in left)):
-        changed = {name: one for name, one in zip(left, values, strict=True) if one != fields[name].default}
-        said = [f"{name} = " + ("true" if one is True else f'"{one}"') for name, one in changed.items()]
-        found.append((table.model_copy(update=changed), ", ".join(said)))
-    return found
+    open_options = [name for name in _OPTION_VALUES if name in fields and name not in table.model_fields_set]
+    open_options = [name for name in open_options if fields[name].default in _OPTION_VALUES[name]]
+    alternatives = []
+    for values in product(*(_OPTION_VALUES[name] for name in open_options)):
+        changed_options = {
+            name: value for name, value in zip(open_options, values, strict=True) if value != fields[name].default
+        }
+        assignments = [
+            f"{name} = " + ("true" if value is True else f'"{value}"') for name, value in changed_options.items()
+        ]
+        alternatives.append((table.model_copy(update=changed_options), ", ".join(assignments)))
+    return alternatives
 
 
 def _construct(table: ConstructedTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:
-    """The protocol made by the constructor that `kind` names."""
-    # For a protocol with a reference electrode, `number` counts only the electrodes on the boundary.
-    apart = 1 if table.kind == "reference_electrode" else 0
-    number = table.number if num_electrodes is None or table.number is not None else num_electrodes - apart
-    if number is None:
+    """Call the protocol constructor that `kind` names."""
+    # For a protocol with a reference electrode, `num_boundary` counts only the electrodes on the boundary.
+    num_references = 1 if table.kind == "reference_electrode" else 0
+    num_boundary = (
+        table.number if num_electrodes is None or table.number is not None else num_electrodes - num_references
+    )
+    if num_boundary is None:
         raise ValueError("protocol needs 'number' (of electrodes), or a table [electrodes].")
-    options = {name: getattr(table, name) for name in table.model_fields_set - _COMMON}
-    for name in _NUMBERING:
-        given = options.get(name)
-        largest = None if given is None else int(np.max(given))
-        if largest is not None and largest >= number + apart:
+    options = {name: getattr(table, name) for name in table.model_fields_set - _NON_OPTION_KEYS}
+    for name in _ELECTRODE_KEYS:
+        indices = options.get(name)
+        largest_index = None if indices is None else int(np.max(indices))
+        if largest_index is not None and largest_index >= num_boundary + num_references:
             raise ValueError(
-                f"protocol.{name} has electrode {largest}, and there are {number + apart}, numbered from 0 to "
-                f"{number + apart - 1}."
+                f"protocol.{name} has electrode {largest_index}, and there are {num_boundary + num_references}, "
+                f"numbered from 0 to {num_boundary + num_references - 1}."
             )
-    _check_size(*_counts(table.kind, number, options), origin)
-    made = getattr(protocols, table.kind)(number, current=_current(table, path), **options)
-    return made if table.name is None else replace(made, name=table.name)
+    _check_size(*_max_counts(table.kind, num_boundary, options), origin)
+    protocol = getattr(protocols, table.kind)(num_boundary, current=_current_amplitude(table, path), **options)
+    return protocol if table.name is None else replace(protocol, name=table.name)
 
 
 def _optimal(table: OptimalTable, origin: str) -> Protocol:
-    count = len(table.transfer)
-    _check_size(count, count, count, count**2, origin)
+    num_electrodes = len(table.transfer)
+    _check_size(num_electrodes, num_electrodes, num_electrodes, num_electrodes**2, origin)
     current = 1e-3 if table.current is None else table.current * _CURRENT_UNITS[table.current_unit]
-    made = protocols.optimal(
+    protocol = protocols.optimal(
         table.transfer,
         table.other,
         number=table.drives,
@@ -108,48 +114,50 @@ def _optimal(table: OptimalTable, origin: str) -> Protocol:
         reference=table.reference,
         current=current,
     )
-    return made if table.name is None else replace(made, name=table.name)
+    return protocol if table.name is None else replace(protocol, name=table.name)
 
 
-def _counts(kind: str, number: int, options: dict[str, Any]) -> tuple[int, int, int, int]:
+def _max_counts(kind: str, num_electrodes: int, options: dict[str, Any]) -> tuple[int, int, int, int]:
     """Upper bounds of the numbers of drive patterns, measurement patterns, electrodes and channels of a protocol."""
     if kind == "two_terminal":
-        pairs = number * (number - 1) // 2 if options.get("pairs") is None else len(options["pairs"])
-        return pairs, pairs, number, pairs
+        num_pairs = (
+            num_electrodes * (num_electrodes - 1) // 2 if options.get("pairs") is None else len(options["pairs"])
+        )
+        return num_pairs, num_pairs, num_electrodes, num_pairs
     if kind == "bipolar":
-        drives, measurements = len(options["drive_pairs"]), len(options["measurement_pairs"])
-        return drives, measurements, number, drives * measurements
-    return number, number, number, number**2
+        num_drives, num_measurements = len(options["drive_pairs"]), len(options["measurement_pairs"])
+        return num_drives, num_measurements, num_electrodes, num_drives * num_measurements
+    return num_electrodes, num_electrodes, num_electrodes, num_electrodes**2
 
 
-def _check_size(drives: int, measurements: int, number: int, channels: int, origin: str) -> None:
-    patterns = number * (drives + measurements + channels)
-    check_memory(f"{origin}: protocol", 8 * _COPIES * patterns + _CHANNEL * channels)
+def _check_size(num_drives: int, num_measurements: int, num_electrodes: int, num_channels: int, origin: str) -> None:
+    num_entries = num_electrodes * (num_drives + num_measurements + num_channels)
+    check_memory(f"{origin}: protocol", 8 * _NUM_COPIES * num_entries + _BYTES_PER_CHANNEL * num_channels)
 
 
-def _current(table: DrivenTable, path: Path) -> float:
+def _current_amplitude(table: DrivenTable, path: Path) -> float:
     """Amplitude of the current in amperes."""
     unit = _CURRENT_UNITS[table.current_unit]
     if table.current_from_name is None:
         assert table.current is not None
         return table.current * unit
-    found = number_in_name(table.current_from_name, path.name)
-    if found is None:
+    amplitude = number_in_name(table.current_from_name, path.name)
+    if amplitude is None:
         raise ValueError(
             f"protocol.current_from_name = {table.current_from_name[:60]!r} finds no current in the name "
             f"{path.name[:60]!r}. Give 'current' instead."
         )
-    return found * unit
+    return amplitude * unit
 
 
 def number_in_name(pattern: str, name: str) -> float | None:
     """The first number, such as 30 or 0.5, in a file `name` at the place where the `pattern` has {current}; * in the
     pattern matches any text. None if the name does not match."""
-    before, _, after = pattern.partition("{current}")
+    prefix, _, suffix = pattern.partition("{current}")
     start = 0
     while start < len(name):
         end = _number_end(name, start)
-        if end > start and _matches(before, name[:start]) and _matches(after, name[end:]):
+        if end > start and _matches(prefix, name[:start]) and _matches(suffix, name[end:]):
             return float(name[start:end])
         start = max(end, start + 1)
     return None
@@ -170,18 +178,18 @@ def _number_end(text: str, start: int) -> int:
 def _matches(pattern: str, text: str) -> bool:
     """Whether a text matches a pattern in which * stands for any text. Each part is matched at its earliest place, so
     no part is searched for twice."""
-    first, *others = pattern.split("*")
-    if not others:
+    first_part, *later_parts = pattern.split("*")
+    if not later_parts:
         return pattern == text
-    *middle, last = others
-    if not (text.startswith(first) and text.endswith(last) and len(text) >= len(first) + len(last)):
+    *middle_parts, last_part = later_parts
+    if not (text.startswith(first_part) and text.endswith(last_part) and len(text) >= len(first_part) + len(last_part)):
         return False
-    place, end = len(first), len(text) - len(last)
-    for part in middle:
-        found = text.find(part, place, end)
-        if found < 0:
+    position, end = len(first_part), len(text) - len(last_part)
+    for part in middle_parts:
+        match_start = text.find(part, position, end)
+        if match_start < 0:
             return False
-        place = found + len(part)
+        position = match_start + len(part)
     return True
 
 
@@ -191,33 +199,41 @@ def protocol_of_file(table: MeasuredTable, path: Path) -> Protocol:
     Raises `ValueError` if the file or a variable does not exist, and if the matrices are not a valid protocol.
     """
     keys = (table.drive_key,) if table.measurement_key is None else (table.drive_key, table.measurement_key)
-    drive, *own = (_matrix(one, key, path) for one, key in zip(_read(path, keys), keys, strict=True))
-    turned = table.patterns_in == "columns"
-    drive, own = (drive.T, [one.T for one in own]) if turned else (drive, own)
+    drive, *measurement_matrices = (
+        _checked_matrix(matrix, key, path) for matrix, key in zip(_read_matrices(path, keys), keys, strict=True)
+    )
+    is_transposed = table.patterns_in == "columns"
+    drive, measurement_matrices = (
+        (drive.T, [matrix.T for matrix in measurement_matrices]) if is_transposed else (drive, measurement_matrices)
+    )
     check_electrodes(path.name, drive.shape[1])
-    rows = own[0] if own else measurement_patterns(drive.shape[1], table.measurement, table.reference)
-    check_memory(f"{path.name}: the protocol", 64 * len(drive) * len(rows))
+    measurement = (
+        measurement_matrices[0]
+        if measurement_matrices
+        else measurement_patterns(drive.shape[1], table.measurement, table.reference)
+    )
+    check_memory(f"{path.name}: the protocol", 64 * len(drive) * len(measurement))
     # Currents measured by an instrument sum to zero only within its errors.
     drive = _balanced(drive, table.drive_key, path) * _CURRENT_UNITS[table.current_unit]
-    read = table.measurement_key or table.measurement
-    name = table.name or f"{len(drive)} measured currents, {read}, {drive.shape[1]} electrodes"
-    return from_matrices(drive, rows, name=name)
+    measurement_name = table.measurement_key or table.measurement
+    name = table.name or f"{len(drive)} measured currents, {measurement_name}, {drive.shape[1]} electrodes"
+    return from_matrices(drive, measurement, name=name)
 
 
-def _read(path: Path, keys: tuple[str, ...]) -> list[np.ndarray]:
+def _read_matrices(path: Path, keys: tuple[str, ...]) -> list[np.ndarray]:
     if not path.is_file() or path.suffix.lower() not in (".mat", ".npz"):
         raise ValueError(f"kind = 'measured' takes the currents from a .mat or .npz file; {path.name[:60]!r} is none.")
     if path.suffix.lower() == ".mat":
         content = matlab.load(path, *keys)
         return [matlab.numbers(content, key, path) for key in keys]
     arrays = npz_arrays(path, *keys)
-    missing = [key for key in keys if key not in arrays]
-    if missing:
-        raise ValueError(f"{path.name}: there is no array '{missing[0][:60]}'; the file has {listed(arrays[''])}.")
+    missing_keys = [key for key in keys if key not in arrays]
+    if missing_keys:
+        raise ValueError(f"{path.name}: there is no array '{missing_keys[0][:60]}'; the file has {listed(arrays[''])}.")
     return [arrays[key] for key in keys]
 
 
-def _matrix(values: np.ndarray, key: str, path: Path) -> np.ndarray:
+def _checked_matrix(values: np.ndarray, key: str, path: Path) -> np.ndarray:
     if values.ndim != 2 or values.dtype.kind not in "fiu" or not np.isfinite(values).all():
         raise ValueError(
             f"{path.name}: '{key[:60]}' must be a matrix of real numbers, without NaN, a column for every pattern; it "
@@ -228,12 +244,12 @@ def _matrix(values: np.ndarray, key: str, path: Path) -> np.ndarray:
 
 def _balanced(drive: np.ndarray, key: str, path: Path) -> np.ndarray:
     """Currents minus their mean; raises `ValueError` if the mean is not small."""
-    excess, size = np.abs(drive.sum(axis=1)), np.abs(drive).max(axis=1)
-    worst = int(np.argmax(excess - 0.05 * size))
-    if excess[worst] > 0.05 * size[worst]:
+    net_currents, largest_currents = np.abs(drive.sum(axis=1)), np.abs(drive).max(axis=1)
+    worst_index = int(np.argmax(net_currents - 0.05 * largest_currents))
+    if net_currents[worst_index] > 0.05 * largest_currents[worst_index]:
         raise ValueError(
-            f"{path.name}: pattern {worst} of '{key[:60]}' sums to {excess[worst]:.3g}, and its largest current is "
-            f"{size[worst]:.3g}: current that goes in must come out. Is there a pattern in every column? Else say "
-            "patterns_in = 'rows'."
+            f"{path.name}: pattern {worst_index} of '{key[:60]}' sums to {net_currents[worst_index]:.3g}, and its "
+            f"largest current is {largest_currents[worst_index]:.3g}: current that goes in must come out. Is there a "
+            "pattern in every column? Else say patterns_in = 'rows'."
         )
     return drive - drive.mean(axis=1, keepdims=True)

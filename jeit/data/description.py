@@ -64,7 +64,7 @@ _VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
 
 @dataclass(frozen=True)
 class TableLayout:
-    """Arrangement of the numbers in a data file (section `[data]`); None: to be found out."""
+    """Arrangement of the numbers in a data file (section `[data]`). None: it is detected from the numbers."""
 
     frames_in: str | None = None
     delimiter: str | None = None
@@ -110,16 +110,19 @@ class Description:
     uncertainty: Uncertainty | None = None
 
     def protocols(self, path: str | Path) -> list[tuple[Protocol, str]]:
-        """The protocols that agree with the description, each with the options that it does not state: first
-        `protocol`, with their usual values, then with others, named in words."""
-        first = self.protocol(path)
-        if first is None or self.protocol_section is None:
+        """The protocols that agree with the description, each with the text of the options that it does not state:
+        first `protocol`, for which they have their default values, then protocols with other values."""
+        default_protocol = self.protocol(path)
+        if default_protocol is None or self.protocol_section is None:
             return []
-        number, found = None if self.electrodes is None else self.electrodes.num_electrodes, [(first, "")]
-        for table, said in variants(self.protocol_section)[1:]:
+        num_electrodes, candidates = (
+            None if self.electrodes is None else self.electrodes.num_electrodes,
+            [(default_protocol, "")],
+        )
+        for table, options in variants(self.protocol_section)[1:]:
             with suppress(ValueError):  # no channel is left
-                found.append((described_protocol(table, number, Path(path), self.origin), said))
-        return found
+                candidates.append((described_protocol(table, num_electrodes, Path(path), self.origin), options))
+        return candidates
 
     def protocol(self, path: str | Path) -> Protocol | None:
         """The protocol of the file at `path`, or None if none is described. The name of the file may state the current.
@@ -128,8 +131,8 @@ class Description:
         """
         if self.protocol_section is None:
             return None
-        number = None if self.electrodes is None else self.electrodes.num_electrodes
-        return described_protocol(self.protocol_section, number, Path(path), self.origin)
+        num_electrodes = None if self.electrodes is None else self.electrodes.num_electrodes
+        return described_protocol(self.protocol_section, num_electrodes, Path(path), self.origin)
 
     @property
     def patterns_measured(self) -> bool:
@@ -162,9 +165,9 @@ class Description:
         """
         domain, electrodes, protocol = self.domain, self.electrodes, self.protocol(path)
         if domain is None or electrodes is None or protocol is None:
-            said = {"geometry": domain, "electrodes": electrodes, "protocol": protocol}
-            missing = ", ".join(f"[{section}]" for section, one in said.items() if one is None)
-            raise ValueError(f"{self.origin}: a model needs {missing} too; describe it.")
+            sections = {"geometry": domain, "electrodes": electrodes, "protocol": protocol}
+            missing_sections = ", ".join(f"[{section}]" for section, value in sections.items() if value is None)
+            raise ValueError(f"{self.origin}: a model needs {missing_sections} too; describe it.")
         mesh = body_mesh(domain, electrodes, num_points)
         return ForwardModel(mesh, electrodes, protocol)
 
@@ -230,8 +233,10 @@ def _uncertainty(table: UncertaintyTable, domain: Body | None, origin: str) -> U
                 f"{origin}: [uncertainty] position_degrees is of a disk or a cylinder; give position, in metres."
             )
         position = float(np.deg2rad(table.position_degrees) * np.asarray(outline.radius))
-    drift, size, other = (one / 100 for one in (table.contact_drift_percent, table.size_percent, table.other_percent))
-    return Uncertainty(position, drift, size, other)
+    drift, size, other_error = (
+        percentage / 100 for percentage in (table.contact_drift_percent, table.size_percent, table.other_percent)
+    )
+    return Uncertainty(position, drift, size, other_error)
 
 
 def _layout(data: DataTable) -> TableLayout:

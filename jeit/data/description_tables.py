@@ -14,14 +14,14 @@ from jeit.inverse import Uncertainty
 
 # Maximum numbers of vertices of a polygon and of its holes: each side is compared with every other side, and each hole
 # with every other hole.
-_MOST_VERTICES, _MOST_HOLES = 4096, 64
-_COUNT = Number(2, MOST_ELECTRODES, beyond="Channels grow with its square; in Python there is no such limit.")
-_INDEX = Number(0, MOST_ELECTRODES)
+_MAX_VERTICES, _MAX_HOLES = 4096, 64
+_ELECTRODE_COUNT = Number(2, MOST_ELECTRODES, beyond="Channels grow with its square; in Python there is no such limit.")
+_ELECTRODE_INDEX = Number(0, MOST_ELECTRODES)
 
 Length = Annotated[float, Number(1e-9, 1e3, "m")]
 Sizes = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-9, 1e3, "m", single=True)]
-Place = Annotated[np.ndarray, Numbers(((2, 2),), -1e3, 1e3, "m")]
-Loop = Annotated[np.ndarray, Numbers(((3, _MOST_VERTICES), (2, 2)), -1e3, 1e3, "m")]
+PlanePoint = Annotated[np.ndarray, Numbers(((2, 2),), -1e3, 1e3, "m")]
+PolygonVertices = Annotated[np.ndarray, Numbers(((3, _MAX_VERTICES), (2, 2)), -1e3, 1e3, "m")]
 Positions = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES), (2, 3)), -1e3, 1e3, "m")]
 # A single number means one ring of electrodes, just as a single size applies to all electrodes.
 Levels = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 0, 1e3, "m", single=True)]
@@ -32,7 +32,7 @@ Pairs = Annotated[np.ndarray, Numbers(((1, math.inf), (2, 2)), 0, MOST_ELECTRODE
 Indices = Annotated[np.ndarray, Numbers(((1, math.inf),), 0, 2**31 - 1, kind=int)]
 Gains = Annotated[np.ndarray, Numbers(((1, math.inf),), 1e-6, 1e6)]
 Reading = Literal["adjacent", "mean", "mean-removed", "against"]
-Choices = Annotated[np.ndarray, Numbers(((1, math.inf), (1, math.inf)), kind=bool)]
+SelectionMask = Annotated[np.ndarray, Numbers(((1, math.inf), (1, math.inf)), kind=bool)]
 
 
 _UNKNOWN_IMPEDANCE = "; if it is not known, write {}, which the reference frame corrects"
@@ -41,40 +41,40 @@ _UNKNOWN_IMPEDANCE = "; if it is not known, write {}, which the reference frame 
 class DiskTable(Table):
     """Table of a disk or, with a thickness, of a cylinder."""
 
-    what = "a disk"
+    subject = "a disk"
     shape: Literal["disk"]
     radius: Length
-    centre: Place = np.zeros(2)
+    centre: PlanePoint = np.zeros(2)
     thickness: Length | None = None
 
 
 class RectangleTable(Table):
     """Table of a rectangle or, with a thickness, of a box."""
 
-    what = "a rectangle"
+    subject = "a rectangle"
     shape: Literal["rectangle"]
     width: Length
     height: Length
-    centre: Place = np.zeros(2)
+    centre: PlanePoint = np.zeros(2)
     thickness: Length | None = None
 
 
 class PolygonTable(Table):
     """Table of a polygon or, with a thickness, of an upright solid with that base."""
 
-    what = "a polygon"
+    subject = "a polygon"
     shape: Literal["polygon"]
-    vertices: Loop
-    holes: Annotated[list[Loop], FailFast()] = Field(default=[], max_length=_MOST_HOLES)
+    vertices: PolygonVertices
+    holes: Annotated[list[PolygonVertices], FailFast()] = Field(default=[], max_length=_MAX_HOLES)
     thickness: Length | None = None
 
     @model_validator(mode="after")
     def _check_size(self) -> "PolygonTable":
-        number = len(self.vertices) + sum(map(len, self.holes))
-        if number > _MOST_VERTICES:
+        num_points = len(self.vertices) + sum(map(len, self.holes))
+        if num_points > _MAX_VERTICES:
             raise fault(
-                f"and holes are {number} points, and each side is compared with every other: give {_MOST_VERTICES} at "
-                "most, or a mesh.",
+                f"and holes are {num_points} points, and each side is compared with every other: give {_MAX_VERTICES} "
+                "at most, or a mesh.",
                 "vertices",
             )
         return self
@@ -83,7 +83,7 @@ class PolygonTable(Table):
 class BoxTable(Table):
     """Table of a box."""
 
-    what = "a box"
+    subject = "a box"
     shape: Literal["box"]
     width: Length
     depth: Length
@@ -93,7 +93,7 @@ class BoxTable(Table):
 class CylinderTable(Table):
     """Table of a cylinder."""
 
-    what = "a cylinder"
+    subject = "a cylinder"
     shape: Literal["cylinder"]
     radius: Length
     height: Length
@@ -102,7 +102,7 @@ class CylinderTable(Table):
 class MeshTable(Table):
     """Table of a mesh in a file beside the description. `scale`: length of its unit in metres."""
 
-    what = "a mesh"
+    subject = "a mesh"
     mesh: Word
     scale: Annotated[float, Number(1e-9, 1e3, "m")] = 1.0
 
@@ -111,7 +111,7 @@ class PlacedTable(Table):
     """Base class of the tables of electrodes with positions, i.e. of all kinds except facets."""
 
     layout: Literal["ring", "perimeter"] | None = None
-    number: Annotated[int, _COUNT] | None = None
+    number: Annotated[int, _ELECTRODE_COUNT] | None = None
     start_angle_degrees: Annotated[float, Number(-3600, 3600, "degrees")] = 90.0
     clockwise: bool = False
     start: Annotated[float, Number(-1e3, 1e3, "m")] = 0.0
@@ -120,11 +120,11 @@ class PlacedTable(Table):
 
     @model_validator(mode="after")
     def _check_positions(self) -> "PlacedTable":
-        round_it = ("layout", "number", "start_angle_degrees", "clockwise", "start", "levels")
+        layout_keys = ("layout", "number", "start_angle_degrees", "clockwise", "start", "levels")
         if self.positions is not None:
-            idle = [key for key in round_it if key in self.model_fields_set]
-            if idle:
-                raise fault("has no effect beside positions; leave out one or the other.", idle[0])
+            unused_keys = [key for key in layout_keys if key in self.model_fields_set]
+            if unused_keys:
+                raise fault("has no effect beside positions; leave out one or the other.", unused_keys[0])
         elif self.layout is None:
             raise fault("is missing; give it, or positions.", "layout")
         elif self.number is None:
@@ -135,7 +135,7 @@ class PlacedTable(Table):
 class BoundaryTable(PlacedTable):
     """Table of electrodes that are arcs on the edge of a sheet. `contact_impedance` in ohm·m."""
 
-    what = "electrodes of kind 'boundary'"
+    subject = "electrodes of kind 'boundary'"
     hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("0.01 (ohm·m)")}
     kind: Literal["boundary"] = "boundary"
     width: Sizes
@@ -145,7 +145,7 @@ class BoundaryTable(PlacedTable):
 class DiscTable(PlacedTable):
     """Table of electrodes that are discs."""
 
-    what = "electrodes of kind 'disc'"
+    subject = "electrodes of kind 'disc'"
     hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("1e-3 (ohm·m²)")}
     kind: Literal["disc"]
     radius: Sizes
@@ -155,7 +155,7 @@ class DiscTable(PlacedTable):
 class PatchTable(PlacedTable):
     """Table of electrodes that are rectangles on a solid."""
 
-    what = "electrodes of kind 'patch'"
+    subject = "electrodes of kind 'patch'"
     hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("1e-3 (ohm·m²)")}
     kind: Literal["patch"]
     width: Sizes
@@ -166,14 +166,14 @@ class PatchTable(PlacedTable):
 class PointTable(PlacedTable):
     """Table of electrodes that are points."""
 
-    what = "electrodes of kind 'point'"
+    subject = "electrodes of kind 'point'"
     kind: Literal["point"]
 
 
 class FacetsTable(Table):
     """Table of electrodes that are named groups of facets of a mesh."""
 
-    what = "electrodes of kind 'facets'"
+    subject = "electrodes of kind 'facets'"
     hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("1e-3 (ohm·m²)")}
     kind: Literal["facets"]
     tags: Annotated[list[Word], Field(min_length=1, max_length=MOST_ELECTRODES), FailFast()]
@@ -183,7 +183,7 @@ class FacetsTable(Table):
 class DrivenTable(Table):
     """Base class of the tables of protocols with a current amplitude."""
 
-    number: Annotated[int, _COUNT] | None = None
+    number: Annotated[int, _ELECTRODE_COUNT] | None = None
     name: Word | None = None
     current: Annotated[float, Number(1e-15, 1e12, "in current_unit")] | None = None
     current_from_name: Word | None = None
@@ -212,7 +212,7 @@ class DrivenTable(Table):
 class AdjacentTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.adjacent`."""
 
-    what = "the protocol 'adjacent'"
+    subject = "the protocol 'adjacent'"
     kind: Literal["adjacent"]
     driven_electrodes: bool = False
     reciprocal: Literal["all", "half"] = "all"
@@ -222,10 +222,10 @@ class AdjacentTable(DrivenTable):
 class SkipTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.skip`."""
 
-    what = "the protocol 'skip'"
+    subject = "the protocol 'skip'"
     kind: Literal["skip"]
-    skipped: Annotated[int, _INDEX]
-    measurement_skipped: Annotated[int, _INDEX] | None = None
+    skipped: Annotated[int, _ELECTRODE_INDEX]
+    measurement_skipped: Annotated[int, _ELECTRODE_INDEX] | None = None
     driven_electrodes: bool = False
     reciprocal: Literal["all", "half"] = "all"
     order: Literal["rotating", "fixed"] = "rotating"
@@ -234,7 +234,7 @@ class SkipTable(DrivenTable):
 class OppositeTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.opposite`."""
 
-    what = "the protocol 'opposite'"
+    subject = "the protocol 'opposite'"
     kind: Literal["opposite"]
     drives: Literal["distinct", "all"] = "distinct"
     driven_electrodes: bool = False
@@ -244,9 +244,9 @@ class OppositeTable(DrivenTable):
 class AgainstOneTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.all_against_one`."""
 
-    what = "the protocol 'all_against_one'"
+    subject = "the protocol 'all_against_one'"
     kind: Literal["all_against_one"]
-    common: Annotated[int, _INDEX] = 0
+    common: Annotated[int, _ELECTRODE_INDEX] = 0
     measurement: Literal["common", "adjacent"] = "common"
     driven_electrodes: bool | None = None
     reciprocal: Literal["all", "half"] = "all"
@@ -255,10 +255,10 @@ class AgainstOneTable(DrivenTable):
 class ReferenceTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.reference_electrode`. `number`: number of electrodes on the boundary."""
 
-    what = "the protocol 'reference_electrode'"
+    subject = "the protocol 'reference_electrode'"
     kind: Literal["reference_electrode"]
-    skipped: Annotated[int, _INDEX] = 0
-    reference: Annotated[int, _INDEX] | None = None
+    skipped: Annotated[int, _ELECTRODE_INDEX] = 0
+    reference: Annotated[int, _ELECTRODE_INDEX] | None = None
     driven_electrodes: bool = False
     order: Literal["rotating", "fixed"] = "rotating"
 
@@ -266,7 +266,7 @@ class ReferenceTable(DrivenTable):
 class TwoTerminalTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.two_terminal`."""
 
-    what = "the protocol 'two_terminal'"
+    subject = "the protocol 'two_terminal'"
     kind: Literal["two_terminal"]
     pairs: Pairs | None = None
 
@@ -275,13 +275,13 @@ class AllAtOnceTable(DrivenTable):
     """Base class of the tables of protocols that drive all electrodes at once: how their potentials are read."""
 
     measurement: Reading = "mean-removed"
-    reference: Annotated[int, _INDEX] | None = None
+    reference: Annotated[int, _ELECTRODE_INDEX] | None = None
 
 
 class TrigonometricTable(AllAtOnceTable):
     """Table of the arguments of `jeit.protocol.trigonometric`."""
 
-    what = "the protocol 'trigonometric'"
+    subject = "the protocol 'trigonometric'"
     kind: Literal["trigonometric"]
     measurement: Reading = "adjacent"
 
@@ -289,7 +289,7 @@ class TrigonometricTable(AllAtOnceTable):
 class HaarTable(AllAtOnceTable):
     """Table of the arguments of `jeit.protocol.haar`."""
 
-    what = "the protocol 'haar'"
+    subject = "the protocol 'haar'"
     kind: Literal["haar"]
 
 
@@ -297,7 +297,7 @@ class OptimalTable(Table):
     """Table of the arguments of `jeit.protocol.optimal`. `transfer`, `other`: transfer impedances in ohm; `drives`:
     number of drive patterns; `power`: watts."""
 
-    what = "the protocol 'optimal'"
+    subject = "the protocol 'optimal'"
     kind: Literal["optimal"]
     name: Word | None = None
     transfer: Patterns
@@ -305,7 +305,7 @@ class OptimalTable(Table):
     drives: Annotated[int, Number(1, MOST_ELECTRODES)] | None = None
     power: Annotated[float, Number(1e-15, 1e3, "W")] | None = None
     measurement: Reading = "mean-removed"
-    reference: Annotated[int, _INDEX] | None = None
+    reference: Annotated[int, _ELECTRODE_INDEX] | None = None
     current: Annotated[float, Number(1e-15, 1e12, "in current_unit")] | None = None
     current_unit: Literal["A", "mA", "uA", "µA"] = "A"
 
@@ -320,21 +320,21 @@ class MeasuredTable(Table):
     """Table of a protocol whose currents are stored in the data file. `drive_key`, `measurement_key`: names of its
     matrices."""
 
-    what = "a protocol of measured currents"
+    subject = "a protocol of measured currents"
     kind: Literal["measured"]
     name: Word | None = None
     drive_key: Word = "current_patterns"
     measurement_key: Word | None = None
     patterns_in: Literal["columns", "rows"] = "columns"
     measurement: Reading = "mean-removed"
-    reference: Annotated[int, _INDEX] | None = None
+    reference: Annotated[int, _ELECTRODE_INDEX] | None = None
     current_unit: Literal["A", "mA", "uA", "µA"] = "A"
 
 
 class BipolarTable(DrivenTable):
     """Table of the arguments of `jeit.protocol.bipolar`."""
 
-    what = "the protocol 'bipolar'"
+    subject = "the protocol 'bipolar'"
     kind: Literal["bipolar"]
     drive_pairs: Pairs
     measurement_pairs: Pairs
@@ -346,19 +346,19 @@ class MatricesTable(Table):
     """Table of a protocol that combines every drive pattern, in amperes, with the measurement patterns chosen by
     `select`."""
 
-    what = "a protocol of matrices"
+    subject = "a protocol of matrices"
     kind: Literal["matrices"]
     name: Word = "matrices"
     drive: Patterns
     measurement: Patterns
-    select: Choices | None = None
+    select: SelectionMask | None = None
 
 
 class ChannelsTable(Table):
     """Table of a protocol that gives for each channel the indices, from 0, of its drive pattern (in amperes) and
     measurement pattern."""
 
-    what = "a protocol of channels"
+    subject = "a protocol of channels"
     kind: Literal["channels"]
     name: Word = "channels"
     drive: Patterns
@@ -370,7 +370,7 @@ class ChannelsTable(Table):
 class DataTable(Table):
     """Table of the arrangement of the numbers in a file."""
 
-    what = "[data]"
+    subject = "[data]"
     frames_in: Literal["rows", "columns"] | None = None
     delimiter: Annotated[str, Field(max_length=10)] | None = None
     skip_rows: Annotated[int, Number(0, 10**9)] | None = None
@@ -393,22 +393,22 @@ class DataTable(Table):
         if self.axes and sorted(self.axes) != ["electrodes", "frames", "patterns"]:
             raise fault("must be electrodes, patterns and frames, each once, in the order of the array.", "axes")
         if self.frames == "mean" and (self.frame_names or self.frame_rate is not None):
-            idle = "frame_names" if self.frame_names else "frame_rate"
-            raise fault("has no use where the frames are averaged; leave it out.", idle)
+            unused_key = "frame_names" if self.frame_names else "frame_rate"
+            raise fault("has no use where the frames are averaged; leave it out.", unused_key)
         return self
 
 
 class NotesTable(Table):
     """Table of sentences that are copied to the notes of the measurement."""
 
-    what = "[notes]"
+    subject = "[notes]"
     text: Annotated[list[Annotated[str, Field(max_length=10_000)]], FailFast()] = Field(default=[])
 
 
 class UncertaintyTable(Table):
     """Table of how accurately the sensor is described."""
 
-    what = "[uncertainty]"
+    subject = "[uncertainty]"
     position: Annotated[float, Number(0, 1e3, "m")] | None = None
     position_degrees: Annotated[float, Number(0, 90, "degrees")] | None = None
     contact_drift_percent: Annotated[float, Number(0, 1000, "%")] = 100 * Uncertainty().drift
@@ -431,14 +431,15 @@ ConstructedTable = (
 ProtocolTable = ConstructedTable | OptimalTable | MatricesTable | ChannelsTable | MeasuredTable
 
 _SHAPE = OneOf(
-    "shape", DiskTable, RectangleTable, PolygonTable, BoxTable, CylinderTable, mark="mesh", other=MeshTable,
-    meant={"circle": "disk", "tank": "cylinder", "tube": "cylinder", "cube": "box", "cuboid": "box",
-           "square": "rectangle"},
+    "shape", DiskTable, RectangleTable, PolygonTable, BoxTable, CylinderTable,
+    alternative_key="mesh", alternative_table=MeshTable,
+    synonyms={"circle": "disk", "tank": "cylinder", "tube": "cylinder", "cube": "box", "cuboid": "box",
+              "square": "rectangle"},
 )  # fmt: skip
 _ELECTRODES = OneOf(
     "kind", BoundaryTable, DiscTable, PatchTable, PointTable, FacetsTable,
-    meant={"strip": "patch", "plate": "patch", "bar": "patch", "rectangle": "patch", "square": "patch",
-           "circle": "disc", "round": "disc", "arc": "boundary", "edge": "boundary", "mesh": "facets"},
+    synonyms={"strip": "patch", "plate": "patch", "bar": "patch", "rectangle": "patch", "square": "patch",
+              "circle": "disc", "round": "disc", "arc": "boundary", "edge": "boundary", "mesh": "facets"},
 )  # fmt: skip
 _PROTOCOL = OneOf(
     "kind", AdjacentTable, SkipTable, OppositeTable, AgainstOneTable, ReferenceTable, TwoTerminalTable,
@@ -449,7 +450,7 @@ _PROTOCOL = OneOf(
 class DescriptionTable(Table):
     """Table of a whole description."""
 
-    what = "a description"
+    subject = "a description"
     title: Annotated[str, Field(max_length=1000)] = ""
     geometry: Annotated[GeometryTable, _SHAPE] | None = None
     electrodes: Annotated[ElectrodesTable, _ELECTRODES] | None = None

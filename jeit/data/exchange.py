@@ -44,9 +44,9 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
     write_table(pressed, "pressed.npz")
     ```
     """
-    file = Path(path)
-    if file.suffix.lower() != ".npz":
-        raise ValueError(f"write_table: {file.name} must end in .npz.")
+    data_path = Path(path)
+    if data_path.suffix.lower() != ".npz":
+        raise ValueError(f"write_table: {data_path.name} must end in .npz.")
     lines = [f"title = {_toml(measurement.name)}"]
     if measurement.domain is not None:
         lines += ["", "[geometry]", *assignments(_geometry(measurement.domain))]
@@ -54,20 +54,20 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
         lines += ["", "[electrodes]", *assignments(_electrodes(measurement.electrodes))]
     protocol = measurement.protocol
     lines += ["", "[protocol]", *assignments(_protocol(protocol))]
-    if (known := measurement.uncertainty) is not None:
-        shares = {"contact_drift": known.drift, "size": known.size, "other": known.other}
-        said = {} if known.position is None else {"position": known.position}
-        said |= {f"{name}_percent": 100 * share for name, share in shares.items()}
-        lines += ["", "[uncertainty]", *assignments(said)]
+    if (uncertainty := measurement.uncertainty) is not None:
+        relative_errors = {"contact_drift": uncertainty.drift, "size": uncertainty.size, "other": uncertainty.other}
+        section = {} if uncertainty.position is None else {"position": uncertainty.position}
+        section |= {f"{name}_percent": 100 * relative_error for name, relative_error in relative_errors.items()}
+        lines += ["", "[uncertainty]", *assignments(section)]
     component = "complex" if np.iscomplexobj(measurement.voltages) else "real"
     lines += ["", "[data]", *assignments({"frames_in": "rows", "component": component, "polarity": "normal"})]
-    arrays: dict[str, Any] = {part: np.asarray(getattr(protocol, part)) for part in PROTOCOL_ARRAYS}
+    arrays: dict[str, Any] = {array: np.asarray(getattr(protocol, array)) for array in PROTOCOL_ARRAYS}
     if measurement.times is not None:
         arrays["times"] = np.asarray(measurement.times)
-    description = file.with_suffix(".toml")
-    with whole_files(file.parent) as made:
+    description_path = data_path.with_suffix(".toml")
+    with whole_files(data_path.parent) as temporary_folder:
         np.savez_compressed(
-            made / file.name,
+            temporary_folder / data_path.name,
             voltages=np.asarray(measurement.voltages),
             mask=np.asarray(measurement.mask),
             frame_names=np.array(measurement.frame_names, str),
@@ -75,22 +75,22 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
             protocol_name=np.asarray(protocol.name),
             **arrays,
         )
-        (made / description.name).write_text("\n".join(lines) + "\n", "utf-8")
-    return file, description
+        (temporary_folder / description_path.name).write_text("\n".join(lines) + "\n", "utf-8")
+    return data_path, description_path
 
 
 def _geometry(domain: Body) -> dict:
-    described = domain.describe()
-    if described["shape"] not in OUTLINES:
+    section = domain.describe()
+    if section["shape"] not in OUTLINES:
         raise ValueError(
             f"write_table: a description cannot say {type(domain).__name__}; it knows {', '.join(OUTLINES)} and solids "
             "above them. Set domain to None; save a mesh with jeit.mesh.write, and name it in [geometry] mesh."
         )
-    return described
+    return section
 
 
 def _electrodes(electrodes: AbstractElectrodes) -> dict:
-    kind = next((name for name, known in ELECTRODES.items() if type(electrodes) in known.values()), None)
+    kind = next((name for name, classes in ELECTRODES.items() if type(electrodes) in classes.values()), None)
     geometry = {name: np.asarray(values).tolist() for name, values in electrodes.geometry().items()} if kind else {}
     positions = geometry.pop("position", None)
     if positions is None:
@@ -98,15 +98,15 @@ def _electrodes(electrodes: AbstractElectrodes) -> dict:
             f"write_table: a description cannot say {type(electrodes).__name__}; it knows {', '.join(ELECTRODES)}. Set "
             "electrodes to None, or save the model instead."
         )
-    described = {"kind": kind, **geometry, "positions": positions}
+    section = {"kind": kind, **geometry, "positions": positions}
     if electrodes.is_point:
-        return described
-    return {**described, "contact_impedance": np.asarray(electrodes.contact_impedance).tolist()}
+        return section
+    return {**section, "contact_impedance": np.asarray(electrodes.contact_impedance).tolist()}
 
 
 def _protocol(protocol: Protocol) -> dict:
-    parts = {part: np.asarray(getattr(protocol, part)).tolist() for part in PROTOCOL_ARRAYS}
-    return {"kind": "channels", "name": protocol.name, **parts}
+    arrays = {name: np.asarray(getattr(protocol, name)).tolist() for name in PROTOCOL_ARRAYS}
+    return {"kind": "channels", "name": protocol.name, **arrays}
 
 
 def assignments(section: dict[str, Any]) -> list[str]:
@@ -141,19 +141,21 @@ def from_pyeit(mesh: Any, protocol: Any, *, current: float = 1.0) -> ForwardMode
     ```
     """
     fields = {"mesh": (mesh, ("node", "element", "el_pos")), "protocol": (protocol, ("ex_mat", "meas_mat"))}
-    for name, (given, needed) in fields.items():
-        missing = [one for one in needed if not hasattr(given, one)]
-        if missing:
-            raise ValueError(f"{name} has no {missing[0]}; give the {name} that pyEIT made, such as of its `create`.")
-    points, nodes = np.asarray(mesh.node, float), np.asarray(mesh.el_pos, int)
+    for name, (instance, attributes) in fields.items():
+        missing_attributes = [attribute for attribute in attributes if not hasattr(instance, attribute)]
+        if missing_attributes:
+            raise ValueError(
+                f"{name} has no {missing_attributes[0]}; give the {name} that pyEIT made, such as of its `create`."
+            )
+    points, electrode_nodes = np.asarray(mesh.node, float), np.asarray(mesh.el_pos, int)
     cells = np.asarray(mesh.element, int)
     points = points[:, : cells.shape[1] - 1]  # pyEIT gives meshes of the plane a coordinate z = 0
-    drive = current * pair_patterns(np.asarray(protocol.ex_mat, int), len(nodes))
-    pairs = [np.asarray(one, int)[:, :2] for one in protocol.meas_mat]
-    measurement = pair_patterns(np.concatenate(pairs), len(nodes))
-    index = np.repeat(np.arange(len(pairs)), [len(one) for one in pairs])
-    made = from_channels(drive, measurement, index, name="pyEIT's protocol")
-    return ForwardModel(Mesh.create(points, cells), NodeElectrodes(nodes), made)
+    drive = current * pair_patterns(np.asarray(protocol.ex_mat, int), len(electrode_nodes))
+    pairs = [np.asarray(drive_pairs, int)[:, :2] for drive_pairs in protocol.meas_mat]
+    measurement = pair_patterns(np.concatenate(pairs), len(electrode_nodes))
+    drive_index = np.repeat(np.arange(len(pairs)), [len(drive_pairs) for drive_pairs in pairs])
+    jeit_protocol = from_channels(drive, measurement, drive_index, name="pyEIT's protocol")
+    return ForwardModel(Mesh.create(points, cells), NodeElectrodes(electrode_nodes), jeit_protocol)
 
 
 def from_eidors(path: str | Path, variable: str | None = None) -> ForwardModel:
@@ -183,37 +185,45 @@ def from_eidors(path: str | Path, variable: str | None = None) -> ForwardModel:
         raise ValueError(f"path: there is no file {file}. Check the name and the working directory.")
     check_memory(file.name, file.stat().st_size)
     with read_as(f"{file.name} is not a readable .mat file of version 7 or less"):
-        held = scipy.io.loadmat(str(file), simplify_cells=True, spmatrix=False)
-    models = {name: found for name, one in held.items() if (found := _forward_model(one)) is not None}
+        variables = scipy.io.loadmat(str(file), simplify_cells=True, spmatrix=False)
+    models = {name: model for name, value in variables.items() if (model := _forward_model(value)) is not None}
     if variable is None and len(models) != 1:
-        said = f"has the models {listed(sorted(models))}; name one" if models else "has no model; save a fwd_model"
-        raise ValueError(f"variable: {file.name} {said}.")
+        problem = f"has the models {listed(sorted(models))}; name one" if models else "has no model; save a fwd_model"
+        raise ValueError(f"variable: {file.name} {problem}.")
     name = next(iter(models)) if variable is None else variable
     if name not in models:
         raise ValueError(f"variable: {file.name} has no model {name!r}; it has {listed(sorted(models)) or 'none'}.")
-    given = models[name]
-    mesh = Mesh.create(np.asarray(given["nodes"], float), np.asarray(given["elems"], int) - 1)
-    parts = [given["electrode"]] if isinstance(given["electrode"], dict) else list(given["electrode"])
-    nodes = [np.atleast_1d(np.asarray(one["nodes"], int)) - 1 for one in parts]
-    if all(len(one) == 1 for one in nodes):
-        electrodes: AbstractElectrodes = NodeElectrodes(np.concatenate(nodes))
+    fwd_model = models[name]
+    mesh = Mesh.create(np.asarray(fwd_model["nodes"], float), np.asarray(fwd_model["elems"], int) - 1)
+    electrode_tables = (
+        [fwd_model["electrode"]] if isinstance(fwd_model["electrode"], dict) else list(fwd_model["electrode"])
+    )
+    electrode_nodes = [np.atleast_1d(np.asarray(table["nodes"], int)) - 1 for table in electrode_tables]
+    if all(len(node_list) == 1 for node_list in electrode_nodes):
+        electrodes: AbstractElectrodes = NodeElectrodes(np.concatenate(electrode_nodes))
     else:
-        electrodes = electrodes_from_nodes(mesh, nodes, np.array([float(one["z_contact"]) for one in parts]))
-    stimulation = given["stimulation"]
-    steps = [stimulation] if isinstance(stimulation, dict) else list(stimulation)
-    drive = np.stack([_dense(one["stim_pattern"]).ravel() for one in steps])
-    patterns = [_dense(one["meas_pattern"]).reshape(-1, drive.shape[1]) for one in steps]
-    index = np.repeat(np.arange(len(steps)), [len(one) for one in patterns])
-    return ForwardModel(mesh, electrodes, from_channels(drive, np.concatenate(patterns), index, name=f"of {file.stem}"))
+        electrodes = electrodes_from_nodes(
+            mesh, electrode_nodes, np.array([float(table["z_contact"]) for table in electrode_tables])
+        )
+    stimulation = fwd_model["stimulation"]
+    stimulations = [stimulation] if isinstance(stimulation, dict) else list(stimulation)
+    drive = np.stack([_dense(entry["stim_pattern"]).ravel() for entry in stimulations])
+    measurement_patterns = [_dense(entry["meas_pattern"]).reshape(-1, drive.shape[1]) for entry in stimulations]
+    drive_index = np.repeat(np.arange(len(stimulations)), [len(rows) for rows in measurement_patterns])
+    return ForwardModel(
+        mesh,
+        electrodes,
+        from_channels(drive, np.concatenate(measurement_patterns), drive_index, name=f"of {file.stem}"),
+    )
 
 
-def _forward_model(one: Any) -> dict[str, Any] | None:
-    """The `fwd_model` that a variable is or has; None if it has none."""
-    if not isinstance(one, dict):
+def _forward_model(value: Any) -> dict[str, Any] | None:
+    """Return the `fwd_model` that a variable is or contains; None if there is none."""
+    if not isinstance(value, dict):
         return None
-    if {"nodes", "elems", "electrode", "stimulation"} <= one.keys():
-        return one
-    return _forward_model(one.get("fwd_model"))
+    if {"nodes", "elems", "electrode", "stimulation"} <= value.keys():
+        return value
+    return _forward_model(value.get("fwd_model"))
 
 
 def _dense(matrix: Any) -> np.ndarray:

@@ -39,25 +39,26 @@ def join(measurements: Sequence[Measurement]) -> Measurement:
     if not measurements:
         raise ValueError("measurements: there is none; give at least one.")
     first, *others = measurements
-    for one in others:
-        if one.protocol is not first.protocol and not one.protocol.same_patterns(first.protocol):
+    for other in others:
+        if other.protocol is not first.protocol and not other.protocol.same_patterns(first.protocol):
             raise ValueError(
-                f"'{one.name}' ({one.protocol.name}) is read otherwise than '{first.name}'; join one set-up's."
+                f"'{other.name}' ({other.protocol.name}) is read otherwise than '{first.name}'; join one set-up's."
             )
-    names = tuple(name for one in measurements for name in one.frame_names)
-    held: list[Any] = [one.times for one in measurements]
-    times = None if any(one is None for one in held) else np.concatenate([np.asarray(one) for one in held])
-    mask = np.concatenate([np.asarray(one.mask) for one in measurements])
+    names = tuple(name for measurement in measurements for name in measurement.frame_names)
+    time_arrays: list[Any] = [measurement.times for measurement in measurements]
+    lacks_times = any(times is None for times in time_arrays)
+    times = None if lacks_times else np.concatenate([np.asarray(times) for times in time_arrays])
+    mask = np.concatenate([np.asarray(measurement.mask) for measurement in measurements])
     return replace(
         first,
-        voltages=np.concatenate([np.asarray(one.voltages) for one in measurements]),
+        voltages=np.concatenate([np.asarray(measurement.voltages) for measurement in measurements]),
         mask=mask,
         frame_names=names if len(names) == len(mask) else (),
         times=None if times is None or (np.diff(times) <= 0).any() else times,
     )
 
 
-_FRAMES, _TIMES = ("voltages", "frames"), ("seconds", "time")
+_FRAME_KEYS, _TIME_KEYS = ("voltages", "frames"), ("seconds", "time")
 
 
 @dataclass(frozen=True)
@@ -113,21 +114,21 @@ def read_frame_recording(path: str | Path, description: Description | None = Non
         raise ValueError(f"'{path}': give frames as {', '.join(table.SUFFIXES)}.")
     layout = TableLayout() if description is None else description.layout
     protocol = None if description is None else description.protocol(path)
-    channels = None if protocol is None else protocol.num_measurements
+    num_channels = None if protocol is None else protocol.num_measurements
     try:
-        arrays = npz_arrays(path, *_FRAMES, *_TIMES, "reference", *layout.keys) if path.suffix == ".npz" else {}
+        arrays = npz_arrays(path, *_FRAME_KEYS, *_TIME_KEYS, "reference", *layout.keys) if path.suffix == ".npz" else {}
         (values, heading), seconds = _table(path, arrays, layout), None
         in_rows = not arrays and layout.frames_in != "columns" and layout.time_column is not False
-        if in_rows and channels is not None and values.shape[1] == channels + 1:
-            values, seconds, _ = frames_in_table(values, [channels], layout, heading)
-        frames = _frames(values, layout, path.name, channels)
-        seconds = next((_times(arrays[one], one, len(frames)) for one in _TIMES if one in arrays), seconds)
+        if in_rows and num_channels is not None and values.shape[1] == num_channels + 1:
+            values, seconds, _ = frames_in_table(values, [num_channels], layout, heading)
+        frames = _frames(values, layout, path.name, num_channels)
+        seconds = next((_times(arrays[key], key, len(frames)) for key in _TIME_KEYS if key in arrays), seconds)
         reference = None
         if "reference" in arrays:
             reference = _checked("reference", np.atleast_2d(arrays["reference"]) * layout.scale, frames.shape[1])
         elif "reference" in layout.frame_names and len(layout.frame_names) == len(frames):
-            own = np.array(layout.frame_names) == "reference"
-            frames, reference = frames[~own], frames[own]
+            is_reference = np.array(layout.frame_names) == "reference"
+            frames, reference = frames[~is_reference], frames[is_reference]
     except ValueError as error:
         raise ValueError(f"'{path}': {error}") from None
     return FrameRecording(frames, seconds, reference, path.name)
@@ -138,45 +139,51 @@ def _table(path: Path, arrays: dict[str, np.ndarray], layout: TableLayout) -> tu
     if not arrays:
         values, heading = table.numbers(path, layout)
         return np.atleast_2d(values), heading
-    key = next((one for one in (*layout.keys, *_FRAMES) if one in arrays), None)
+    key = next((name for name in (*layout.keys, *_FRAME_KEYS) if name in arrays), None)
     if key is None:
         raise ValueError(f"there is no array 'frames'; the file holds {', '.join(arrays[''][:12])}.")
     return np.atleast_2d(arrays[key]), ()
 
 
-def _frames(given: np.ndarray, layout: TableLayout, name: str, channels: int | None) -> Float[np.ndarray, "F M"]:
+def _frames(values: np.ndarray, layout: TableLayout, name: str, num_channels: int | None) -> Float[np.ndarray, "F M"]:
     """Frames of a table, in volts."""
-    if given.dtype.kind not in "iufc":
-        raise ValueError(f"frames are {given.dtype}; give numbers, in volts.")
-    frames = table.frames_from(given, layout, name)
+    if values.dtype.kind not in "iufc":
+        raise ValueError(f"frames are {values.dtype}; give numbers, in volts.")
+    frames = table.frames_from(values, layout, name)
     if np.iscomplexobj(frames):
         raise ValueError("frames are complex; choose a part with [data] component: real, imaginary or magnitude.")
-    return _checked("frames", readings(frames) * layout.scale, frames.shape[-1] if channels is None else channels)
+    return _checked(
+        "frames", readings(frames) * layout.scale, frames.shape[-1] if num_channels is None else num_channels
+    )
 
 
-def _checked(name: str, given: np.ndarray, channels: int) -> Float[np.ndarray, "F M"]:
-    if given.dtype.kind not in "iuf" or given.ndim != 2 or given.shape[1] != channels:
-        raise ValueError(f"{name} have shape {given.shape}; give one row for each frame, of {channels} channels.")
-    if not len(given):
+def _checked(name: str, values: np.ndarray, num_channels: int) -> Float[np.ndarray, "F M"]:
+    if values.dtype.kind not in "iuf" or values.ndim != 2 or values.shape[1] != num_channels:
+        raise ValueError(f"{name} have shape {values.shape}; give one row for each frame, of {num_channels} channels.")
+    if not len(values):
         raise ValueError(f"{name}: there is none.")
-    return readings(given.astype(float))
+    return readings(values.astype(float))
 
 
-def _times(given: np.ndarray, name: str, number: int) -> Float[np.ndarray, " F"]:
-    if given.dtype.kind not in "iuf" or given.shape != (number,):
-        raise ValueError(f"{name} is {given.dtype} of shape {given.shape}; give seconds for each of {number} frames.")
-    seconds = given.astype(float)
+def _times(values: np.ndarray, name: str, num_frames: int) -> Float[np.ndarray, " F"]:
+    if values.dtype.kind not in "iuf" or values.shape != (num_frames,):
+        raise ValueError(
+            f"{name} is {values.dtype} of shape {values.shape}; give seconds for each of {num_frames} frames."
+        )
+    seconds = values.astype(float)
     if not np.isfinite(seconds).all():
         raise ValueError(f"{name}: some are not finite.")
-    if number > 1 and seconds[0] == seconds[-1] and not np.diff(seconds).any():
+    if num_frames > 1 and seconds[0] == seconds[-1] and not np.diff(seconds).any():
         raise ValueError(f"{name} are all {seconds[0]:g}: give when each frame came.")
-    falls = np.flatnonzero(np.diff(seconds) < 0)
-    if falls.size:
-        raise ValueError(f"{name} fall after frame {falls[0]}, {seconds[falls[0]]:g} s: sort frames by time.")
+    falling_frames = np.flatnonzero(np.diff(seconds) < 0)
+    if falling_frames.size:
+        raise ValueError(
+            f"{name} fall after frame {falling_frames[0]}, {seconds[falling_frames[0]]:g} s: sort frames by time."
+        )
     return seconds
 
 
-_ARRAYS = ("gesture", "person", "start", "seconds", "voltages", "reference", "untouched")
+_ARRAY_NAMES = ("gesture", "person", "start", "seconds", "voltages", "reference", "untouched")
 
 
 @dataclass(frozen=True)
@@ -208,35 +215,42 @@ class GestureSet:
 
     def __post_init__(self):
         """Raises `ValueError` for arrays whose shapes do not match, and for wrong types of values."""
-        for name, kinds, said in (
+        for name, dtype_kinds, expected in (
             ("gesture", "U", "text"),
             ("person", "iuU", "whole numbers or text"),
             ("start", "iu", "whole numbers"),
         ):
-            own = getattr(self, name)
-            if own.dtype.kind not in kinds:
-                raise ValueError(f"{name} is {own.dtype}; give {said}.")
+            values = getattr(self, name)
+            if values.dtype.kind not in dtype_kinds:
+                raise ValueError(f"{name} is {values.dtype}; give {expected}.")
         for name in ("seconds", "voltages", "reference", "untouched"):
             if getattr(self, name).dtype.kind not in "fiu":
                 raise ValueError(f"{name} is {getattr(self, name).dtype}; give real numbers.")
         if self.gesture.ndim != 1 or self.voltages.ndim != 2:
             raise ValueError("gesture must be (n,) and voltages (F, M), one row for each frame.")
-        number, (frames, channels) = len(self.gesture), self.voltages.shape
-        wanted = {"person": (number,), "start": (number + 1,), "seconds": (frames,), "reference": (channels,)}
-        for name, shape in wanted.items():
+        num_recordings, (num_frames, num_channels) = len(self.gesture), self.voltages.shape
+        expected_shapes = {
+            "person": (num_recordings,),
+            "start": (num_recordings + 1,),
+            "seconds": (num_frames,),
+            "reference": (num_channels,),
+        }
+        for name, shape in expected_shapes.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(
-                    f"{name} has shape {getattr(self, name).shape}; with {number} gestures and voltages ({frames}, "
-                    f"{channels}) it is {shape}."
+                    f"{name} has shape {getattr(self, name).shape}; with {num_recordings} gestures and voltages "
+                    f"({num_frames}, {num_channels}) it is {shape}."
                 )
-        if self.untouched.shape[1:] != (channels,):
-            raise ValueError(f"untouched has shape {self.untouched.shape}; give (u, {channels}), as the voltages have.")
+        if self.untouched.shape[1:] != (num_channels,):
+            raise ValueError(
+                f"untouched has shape {self.untouched.shape}; give (u, {num_channels}), as the voltages have."
+            )
         if (np.diff(self.start) < 0).any():
             raise ValueError("start falls: give where each recording begins among the frames, in their order.")
-        if self.start[0] or self.start[-1] != frames:
+        if self.start[0] or self.start[-1] != num_frames:
             raise ValueError(
                 f"start goes from {self.start[0]} to {self.start[-1]}; give 0 first, and last the number of frames, "
-                f"{frames}."
+                f"{num_frames}."
             )
         if not np.isfinite(self.seconds).all():
             raise ValueError("seconds must be finite.")
@@ -247,8 +261,8 @@ class GestureSet:
 
     def recording(self, number: int) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T M"]]:
         """Times (T,), seconds, and voltages (T, M) of one recording."""
-        own = slice(self.start[number], self.start[number + 1])
-        return self.seconds[own], self.voltages[own].astype(float)
+        frames = slice(self.start[number], self.start[number + 1])
+        return self.seconds[frames], self.voltages[frames].astype(float)
 
     def changes(self, number: int) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T M"]]:
         """Times (T,), seconds, and changes (T, M) from the reference, volts, of one recording."""
@@ -258,7 +272,7 @@ class GestureSet:
     def write(self, path: str | Path) -> None:
         """Write the set to an NPZ file. Raises `OSError` if the file cannot be written."""
         with written_whole(path) as file:
-            np.savez_compressed(file, **{name: getattr(self, name) for name in _ARRAYS})
+            np.savez_compressed(file, **{name: getattr(self, name) for name in _ARRAY_NAMES})
 
     @classmethod
     def read(cls, path: str | Path) -> "GestureSet":
@@ -266,10 +280,10 @@ class GestureSet:
         Raises `OSError` if there is no file and `ValueError` if it is of another kind. Nothing in the file is
         executed."""
         try:
-            arrays = npz_arrays(Path(path), *_ARRAYS, otherwise="not a set of gestures")
+            arrays = npz_arrays(Path(path), *_ARRAY_NAMES, otherwise="not a set of gestures")
             if "gesture" in arrays:
                 arrays.setdefault("person", np.zeros(arrays["gesture"].shape, int))
-            need(arrays, *_ARRAYS)
-            return cls(**{name: arrays[name] for name in _ARRAYS})
+            need(arrays, *_ARRAY_NAMES)
+            return cls(**{name: arrays[name] for name in _ARRAY_NAMES})
         except ValueError as error:
             raise ValueError(f"'{path}': {error}") from None

@@ -30,20 +30,20 @@ MOST_OPPOSITE_SIGNS = 0.75
 # here one half.
 MOST_DIFFERENCE_RECIPROCITY_ERROR = 0.63
 # Cosine of the angle between a frame and its reference below which one of them has the opposite sign.
-_LEAST_COSINE = -0.5
+_MIN_COSINE = -0.5
 # Maximum share of a difference that is rounding of the voltages.
-_MOST_ROUNDING = 0.7
-# A spike contradicts the other channels by as many robust standard deviations, by as much as channels change typically,
-# and by more than all channels together that are left; at most so many in a frame.
-_SPIKE, _SPIKE_SHARE, _MOST_SPIKES = 10.0, 0.5, 8
-# Of two channels that contradict each other, the one is at fault that changed so many times as much.
-_CULPRIT = 3.0
-# Share of a channel that the others leave free, below which they say nothing of it; and rounding.
-_FREE = 1e-6
-# Most operations to find which changes bodies can give, a second or less.
-_MOST_OPERATIONS = 2e9
-# Most kinds of masks of frames for which that is done.
-_MOST_MASKS = 8
+_MAX_ROUNDING = 0.7
+# A spike contradicts the other channels by this many robust standard deviations and by more than the typical change
+# of a channel, and explains this share of the unexplained power; maximum number of spikes in a frame.
+_SPIKE_DEVIATIONS, _SPIKE_SHARE, _MAX_SPIKES = 10.0, 0.5, 8
+# Of two channels that contradict each other, one is at fault if it changed by this factor more than the other.
+_FAULT_RATIO = 3.0
+# Minimum share of a channel that the other channels leave undetermined; smaller values are rounding errors.
+_MIN_FREE_SHARE = 1e-6
+# Maximum number of operations to find which changes a body can cause; these take up to a second.
+_MAX_OPERATIONS = 2e9
+# Maximum number of distinct masks of frames for which these changes are found.
+_MAX_MASKS = 8
 
 
 @dataclass(frozen=True)
@@ -121,16 +121,19 @@ def check_same_setup(measurement: Measurement, reference: Measurement) -> None:
             f"'{measurement.name}' and the reference '{reference.name}' are not both complex. Read both with "
             "the same component (real, imaginary, magnitude or complex)."
         )
-    for one, prefix in ((measurement, ""), (reference, "the reference ")):
-        if not np.asarray(one.mask).any():
+    for each_measurement, prefix in ((measurement, ""), (reference, "the reference ")):
+        if not np.asarray(each_measurement.mask).any():
             raise ValueError(
-                f"{prefix}'{one.name}' has no usable voltage: each is NaN, infinite, or masked for what its notes say. "
-                "Give another frame."
+                f"{prefix}'{each_measurement.name}' has no usable voltage: each is NaN, infinite, or masked for what "
+                "its notes say. Give another frame."
             )
     common = np.asarray(measurement.mask).any(axis=0) & np.asarray(reference.mask).any(axis=0)
     if not common.any():
         raise ValueError(f"'{measurement.name}' and the reference '{reference.name}' have no usable channel in common.")
-    sizes = [np.median(np.abs(np.asarray(m.mean_frame().voltages)[0, common])) for m in (measurement, reference)]
+    sizes = [
+        np.median(np.abs(np.asarray(compared.mean_frame().voltages)[0, common]))
+        for compared in (measurement, reference)
+    ]
     ratio = sizes[0] / sizes[1] if sizes[1] > 0 else np.inf
     if not 1 / 100 < ratio < 100:
         raise ValueError(
@@ -163,34 +166,47 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
     check_same_setup(measurement, reference)
     mean = reference.mean_frame()
     reference_signs, reference_error = impossible_signs(mean), reciprocity_error(mean)
-    trusted = np.asarray(relative_noise(np.abs(np.asarray(mean.voltages)[0]), np.asarray(mean.mask)[0]))
+    deviations = np.asarray(relative_noise(np.abs(np.asarray(mean.voltages)[0]), np.asarray(mean.mask)[0]))
     results = []
     for index in range(measurement.num_frames):
         frame = measurement.frame(index)
-        both = np.asarray(frame.mask) & np.asarray(mean.mask)
+        common_mask = np.asarray(frame.mask) & np.asarray(mean.mask)
         change = Measurement(
-            np.where(both, np.asarray(frame.voltages) - np.asarray(mean.voltages), np.nan), both, measurement.protocol
+            np.where(common_mask, np.asarray(frame.voltages) - np.asarray(mean.voltages), np.nan),
+            common_mask,
+            measurement.protocol,
         )
         size = float(np.linalg.norm(np.asarray(change.filled())))
-        relative = size / float(np.linalg.norm(np.where(both, np.asarray(mean.filled()), 0)) or np.inf)
-        signs = [float(s[0]) for s in (impossible_signs(frame), reference_signs) if s is not None]
-        usable = int(both.sum())
-        alike = _cosine(*(np.where(both, np.asarray(one.filled()), 0).ravel() for one in (frame, mean)))
-        error = reciprocity_error(change, trusted) if usable and size > 0 else None
-        own = {f"the reference '{reference.name}'": reference_error, "the frame": reciprocity_error(frame)}
-        wrong = max(signs) if signs else None
+        relative_difference = size / float(
+            np.linalg.norm(np.where(common_mask, np.asarray(mean.filled()), 0)) or np.inf
+        )
+        signs = [float(shares[0]) for shares in (impossible_signs(frame), reference_signs) if shares is not None]
+        num_usable = int(common_mask.sum())
+        cosine = _cosine(
+            *(np.where(common_mask, np.asarray(each_frame.filled()), 0).ravel() for each_frame in (frame, mean))
+        )
+        error = reciprocity_error(change, deviations) if num_usable and size > 0 else None
+        own_errors = {f"the reference '{reference.name}'": reference_error, "the frame": reciprocity_error(frame)}
+        impossible_share = max(signs) if signs else None
         rounding = float(np.linalg.norm(rounding_of_difference(frame, mean))) / size if size > 0 else 0.0
         results.append(
             FrameQuality(
-                difference=relative,
-                difference_noise=estimate_noise(change) if usable and size > 0 else None,
-                trusted_noise=reciprocity_noise(change, trusted) if usable and size > 0 else None,
+                difference=relative_difference,
+                difference_noise=estimate_noise(change) if num_usable and size > 0 else None,
+                trusted_noise=reciprocity_noise(change, deviations) if num_usable and size > 0 else None,
                 difference_reciprocity_error=error,
-                impossible_signs=wrong,
-                usable_channels=usable,
+                impossible_signs=impossible_share,
+                usable_channels=num_usable,
                 rounding=rounding,
-                reason=_reason(
-                    measurement.protocol.num_electrodes, usable, relative, rounding, wrong, error, own, alike
+                reason=_rejection_reason(
+                    measurement.protocol.num_electrodes,
+                    num_usable,
+                    relative_difference,
+                    rounding,
+                    impossible_share,
+                    error,
+                    own_errors,
+                    cosine,
                 ),
             )
         )
@@ -220,43 +236,50 @@ def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool 
     ```
     """
     mean = reference.mean_frame()
-    base, known = np.asarray(mean.voltages)[0], np.asarray(mean.mask)[0]
-    weight = np.asarray(relative_noise(as_array(np.abs(np.where(known, base, 0))), as_array(known)))
+    base_voltages, known_channels = np.asarray(mean.voltages)[0], np.asarray(mean.mask)[0]
+    weight = np.asarray(
+        relative_noise(as_array(np.abs(np.where(known_channels, base_voltages, 0))), as_array(known_channels))
+    )
     voltages, masks = np.array(measurement.voltages), np.asarray(measurement.mask)
     spikes, filled = np.zeros(masks.shape, bool), np.zeros(masks.shape, bool)
-    kinds, kind, count = np.unique(masks & known, axis=0, return_inverse=True, return_counts=True)
-    for one in np.argsort(-count)[:_MOST_MASKS]:
-        mask = kinds[one]
+    distinct_masks, mask_index, count = np.unique(
+        masks & known_channels, axis=0, return_inverse=True, return_counts=True
+    )
+    for index in np.argsort(-count)[:_MAX_MASKS]:
+        mask = distinct_masks[index]
         basis = _possible_changes(measurement, weight, mask)
         if basis is None:
             continue
-        for frame in np.flatnonzero(kind.ravel() == one):
-            change = ((voltages[frame] - base) / weight)[mask]
+        for frame in np.flatnonzero(mask_index.ravel() == index):
+            change = ((voltages[frame] - base_voltages) / weight)[mask]
             rounding = rounding_of_difference(measurement.frame(int(frame)), mean) / weight
-            found = np.isin(np.arange(len(change)), _spikes(change, basis, rounding[mask]))
-            spikes[frame, mask] = found
-            if fill and found.any():
+            is_spike = np.isin(np.arange(len(change)), _spikes(change, basis, rounding[mask]))
+            spikes[frame, mask] = is_spike
+            if fill and is_spike.any():
                 # Rows of the basis that those of the other channels span are determined by them.
-                share = basis[found] @ np.linalg.pinv(basis[~found])
-                determined = np.linalg.norm(share @ basis[~found] - basis[found], axis=1) < _FREE
-                places = np.flatnonzero(mask)[found][determined]
-                voltages[frame, places] = base[places] + weight[places] * (share @ change[~found])[determined]
-                filled[frame, places] = True
-    said = f"spikes, which contradict the other channels ({_listed_spikes(spikes)})."
+                weights = basis[is_spike] @ np.linalg.pinv(basis[~is_spike])
+                determined = np.linalg.norm(weights @ basis[~is_spike] - basis[is_spike], axis=1) < _MIN_FREE_SHARE
+                determined_channels = np.flatnonzero(mask)[is_spike][determined]
+                voltages[frame, determined_channels] = (
+                    base_voltages[determined_channels]
+                    + weight[determined_channels] * (weights @ change[~is_spike])[determined]
+                )
+                filled[frame, determined_channels] = True
+    reason = f"spikes, which contradict the other channels ({_listed_spikes(spikes)})."
     if filled.any():
-        note = f"{counted(int(filled.sum()), 'voltage')} replaced by what others determine: {said}"
+        note = f"{counted(int(filled.sum()), 'voltage')} replaced by what others determine: {reason}"
         measurement = replace(measurement, voltages=voltages, notes=(*measurement.notes, note))
-    return measurement.masked(~spikes | filled, said) if (spikes & ~filled).any() else measurement
+    return measurement.masked(~spikes | filled, reason) if (spikes & ~filled).any() else measurement
 
 
 def _listed_spikes(spikes: Bool[np.ndarray, "F M"]) -> str:
     """Channels with spikes, and their frames if there are several."""
     frames, channels = np.nonzero(spikes)
-    said = [
+    labels = [
         f"channel {k + 1}" + (f" of frame {f}" if len(spikes) > 1 else "")
         for f, k in zip(frames, channels, strict=True)
     ]
-    return ", ".join(said[:_MOST_SPIKES]) + (" …" if len(said) > _MOST_SPIKES else "")
+    return ", ".join(labels[:_MAX_SPIKES]) + (" …" if len(labels) > _MAX_SPIKES else "")
 
 
 def _possible_changes(
@@ -267,7 +290,7 @@ def _possible_changes(
     drive = np.asarray(measurement.protocol.channel_drive)[mask]
     read = np.asarray(measurement.protocol.channel_measurement)[mask]
     row, column = np.triu_indices(drive.shape[1])
-    if len(drive) * len(row) * min(len(drive), len(row)) > _MOST_OPERATIONS or not len(drive):
+    if len(drive) * len(row) * min(len(drive), len(row)) > _MAX_OPERATIONS or not len(drive):
         return None
     drive = drive / np.abs(drive).max()
     products = drive[:, row] * read[:, column] + drive[:, column] * read[:, row]
@@ -281,50 +304,54 @@ def _spikes(
 ) -> list[int]:
     """Indices of the channels with spikes in a change (n,), weighted; `rounding`: its standard deviation.
 
-    A channel that may read anything adds its unit vector to the basis. What that explains, `gain`, is compared with
-    what was left unexplained before.
+    A channel that may read anything adds its unit vector to the basis. The power that this vector explains, `gain`, is
+    compared with the power that was unexplained before.
     """
     unexplained, free = change - basis @ (basis.T @ change), 1 - np.sum(basis**2, axis=1)
-    left, found, spikes = np.ones(len(change), bool), [], []
-    for _ in range(_MOST_SPIKES):
-        contradicted = left & (free > _FREE)
-        size = np.where(contradicted, np.abs(unexplained) / np.sqrt(np.maximum(free, _FREE)), 0)
-        worst = np.flatnonzero(size > (1 - _FREE) * size.max())
-        if not 0 < len(worst) <= 2:
+    is_remaining, faulty, spikes = np.ones(len(change), bool), [], []
+    for _ in range(_MAX_SPIKES):
+        is_contradicted = is_remaining & (free > _MIN_FREE_SHARE)
+        size = np.where(is_contradicted, np.abs(unexplained) / np.sqrt(np.maximum(free, _MIN_FREE_SHARE)), 0)
+        worst_channels = np.flatnonzero(size > (1 - _MIN_FREE_SHARE) * size.max())
+        if not 0 < len(worst_channels) <= 2:
             break
-        deviation = max(1.4826 * float(np.median(size[contradicted])), float(rounding[worst].max()))
-        if not size.max() > _SPIKE * deviation:
+        deviation = max(1.4826 * float(np.median(size[is_contradicted])), float(rounding[worst_channels].max()))
+        if not size.max() > _SPIKE_DEVIATIONS * deviation:
             break
-        one = np.zeros(len(change))
-        one[worst[0]] = 1
+        direction = np.zeros(len(change))
+        direction[worst_channels[0]] = 1
         for _ in range(2):  # twice, for orthogonality
-            one = one - basis @ (basis.T @ one)
-        one = one / np.linalg.norm(one)
-        before, gain = float(np.sum(np.abs(unexplained) ** 2)), float(np.abs(one @ unexplained) ** 2)
-        off = float((size[worst] / np.sqrt(free[worst])).max())
-        basis = np.column_stack([basis, one])
-        unexplained, free = unexplained - one * (one @ unexplained), free - one**2
-        found += _at_fault(change, worst)
-        left[worst] = False
-        typical = float(np.sqrt(np.mean(np.abs(change[left]) ** 2)))
-        if off > typical and gain > _SPIKE_SHARE * before:
-            spikes = [*found]
+            direction = direction - basis @ (basis.T @ direction)
+        direction = direction / np.linalg.norm(direction)
+        unexplained_power, gain = float(np.sum(np.abs(unexplained) ** 2)), float(np.abs(direction @ unexplained) ** 2)
+        deviation_size = float((size[worst_channels] / np.sqrt(free[worst_channels])).max())
+        basis = np.column_stack([basis, direction])
+        unexplained, free = unexplained - direction * (direction @ unexplained), free - direction**2
+        faulty += _faulty_channels(change, worst_channels)
+        is_remaining[worst_channels] = False
+        typical_change = float(np.sqrt(np.mean(np.abs(change[is_remaining]) ** 2)))
+        if deviation_size > typical_change and gain > _SPIKE_SHARE * unexplained_power:
+            spikes = [*faulty]
     return spikes
 
 
-def _at_fault(change: Inexact[np.ndarray, " n"], worst: np.ndarray) -> list[int]:
-    """Of one or two channels that contradict the others, or each other, that which changed far more, or all."""
-    size = np.abs(change[worst])
-    alone = size.max() > _CULPRIT * size.min()
-    return [int(worst[size.argmax()])] if alone else worst.tolist()
+def _faulty_channels(change: Inexact[np.ndarray, " n"], channels: np.ndarray) -> list[int]:
+    """Return the faulty ones among one or two channels that contradict the others or each other: the channel that
+    changed far more, or both."""
+    size = np.abs(change[channels])
+    is_single = size.max() > _FAULT_RATIO * size.min()
+    return [int(channels[size.argmax()])] if is_single else channels.tolist()
 
 
 def rounding_of_difference(frame: Measurement, reference: Measurement) -> Float[np.ndarray, " M"]:
     """Standard deviation (M,), volts, of the difference of two frames due to the rounding of both; 0 where a channel is
     not usable in both."""
-    each = [rounding_deviation(np.asarray(one.voltages)[0], np.asarray(one.mask)[0]) for one in (frame, reference)]
-    both = np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0]
-    return np.where(both, np.hypot(*each), 0.0)
+    deviations = [
+        rounding_deviation(np.asarray(measurement.voltages)[0], np.asarray(measurement.mask)[0])
+        for measurement in (frame, reference)
+    ]
+    common_mask = np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0]
+    return np.where(common_mask, np.hypot(*deviations), 0.0)
 
 
 def check_imageable(measurement: Measurement, reference: Measurement) -> list[FrameQuality]:
@@ -347,62 +374,65 @@ def check_imageable(measurement: Measurement, reference: Measurement) -> list[Fr
     qualities = assess(measurement, reference)
     for index, quality in enumerate(qualities):
         if not quality.imageable:
-            where = f", frame {index}" if measurement.num_frames > 1 else ""
-            raise ValueError(f"'{measurement.name}'{where} cannot be imaged: {quality.reason}")
+            frame_text = f", frame {index}" if measurement.num_frames > 1 else ""
+            raise ValueError(f"'{measurement.name}'{frame_text} cannot be imaged: {quality.reason}")
     return qualities
 
 
-def _reason(
-    electrodes: int,
-    usable: int,
-    difference: float,
+def _rejection_reason(
+    num_electrodes: int,
+    num_usable: int,
+    relative_difference: float,
     rounding: float,
-    signs: float | None,
-    reciprocity: float | None,
-    own: dict[str, float | None],
-    alike: float,
+    impossible_share: float | None,
+    difference_error: float | None,
+    own_errors: dict[str, float | None],
+    cosine: float,
 ) -> str:
-    """Why a frame cannot be imaged; empty if it can. `own`: reciprocity errors of frame and reference by name; `alike`:
-    cosine of the angle between them."""
-    if usable < electrodes:
-        return f"only {counted(usable, 'channel')} usable in both it and its reference, for {electrodes} electrodes."
-    if difference < 1e-12:
+    """Why a frame cannot be imaged; empty if it can. `own_errors`: reciprocity errors of frame and reference by name;
+    `cosine`: cosine of the angle between them."""
+    if num_usable < num_electrodes:
+        return (
+            f"only {counted(num_usable, 'channel')} usable in both it and its reference, for {num_electrodes} "
+            "electrodes."
+        )
+    if relative_difference < 1e-12:
         return "it equals its reference, so there is no difference to image. Is it the same file?"
-    if rounding > _MOST_ROUNDING:
+    if rounding > _MAX_ROUNDING:
         return (
-            f"its difference from the reference, {percent(difference)}, is mostly rounding of the voltages: record "
-            "them with more digits."
+            f"its difference from the reference, {percent(relative_difference)}, is mostly rounding of the voltages: "
+            "record them with more digits."
         )
-    if signs is not None and signs > MOST_OPPOSITE_SIGNS:
+    if impossible_share is not None and impossible_share > MOST_OPPOSITE_SIGNS:
         return (
-            f"{percent(signs)} of the voltages have a sign that no passive body gives: reverse the polarity of it, or "
-            "of its reference."
+            f"{percent(impossible_share)} of the voltages have a sign that no passive body gives: reverse the polarity "
+            "of it, or of its reference."
         )
-    if signs is not None and signs > MOST_IMPOSSIBLE_SIGNS:
+    if impossible_share is not None and impossible_share > MOST_IMPOSSIBLE_SIGNS:
         return (
-            f"too noisy: {percent(signs)} of the voltages have a sign that no passive body gives, so that "
+            f"too noisy: {percent(impossible_share)} of the voltages have a sign that no passive body gives, so that "
             "more than half of them lie below the instrument's noise or offset. Measure with more current or gain."
         )
-    if alike < _LEAST_COSINE:
+    if cosine < _MIN_COSINE:
         return (
             "its voltages have the opposite sign of its reference's: reverse the polarity of it, or of its reference."
         )
-    for name, error in own.items():
+    for name, error in own_errors.items():
         if error is not None and error > MOST_DIFFERENCE_RECIPROCITY_ERROR:
             return (
                 f"{name} breaks reciprocity by {percent(error)} on its own: it is too noisy, or its channels are in "
                 "another order than described. See `jeit info`."
             )
-    if reciprocity is not None and reciprocity > MOST_DIFFERENCE_RECIPROCITY_ERROR:
+    if difference_error is not None and difference_error > MOST_DIFFERENCE_RECIPROCITY_ERROR:
         return (
-            f"too noisy: the difference from the reference breaks reciprocity by {percent(reciprocity)}, "
+            f"too noisy: the difference from the reference breaks reciprocity by {percent(difference_error)}, "
             "so that its noise is more than half its signal. Average more frames, or use more current."
         )
     return ""
 
 
-def _cosine(one: np.ndarray, other: np.ndarray) -> float:
+def _cosine(first: np.ndarray, second: np.ndarray) -> float:
     """Cosine of the angle between two frames as vectors: 1 if they differ by a positive factor only, 0 if one is
     zero."""
-    size = float(np.linalg.norm(one) * np.linalg.norm(other))
-    return float(np.real(np.vdot(one, other))) / size if size > 0 else 0.0
+    size = float(np.linalg.norm(first) * np.linalg.norm(second))
+    return float(np.real(np.vdot(first, second))) / size if size > 0 else 0.0

@@ -160,17 +160,17 @@ class Measurement(Module):
 
         Raises `ValueError` for frames that do not exist, and if no frame is selected.
         """
-        chosen = np.arange(self.num_frames)[which] if isinstance(which, slice) else np.atleast_1d(np.asarray(which))
-        if chosen.dtype == bool and chosen.shape == (self.num_frames,):
-            chosen = np.flatnonzero(chosen)
-        if chosen.ndim != 1 or not chosen.size or chosen.dtype.kind not in "iu":
+        indices = np.arange(self.num_frames)[which] if isinstance(which, slice) else np.atleast_1d(np.asarray(which))
+        if indices.dtype == bool and indices.shape == (self.num_frames,):
+            indices = np.flatnonzero(indices)
+        if indices.ndim != 1 or not indices.size or indices.dtype.kind not in "iu":
             raise ValueError(
                 f"which: give a slice, whole numbers or a mask of {self.num_frames} frames that leaves some; got "
-                f"{chosen.dtype} of shape {chosen.shape}."
+                f"{indices.dtype} of shape {indices.shape}."
             )
-        if chosen.min() < 0 or chosen.max() >= self.num_frames or (np.diff(chosen) <= 0).any():
+        if indices.min() < 0 or indices.max() >= self.num_frames or (np.diff(indices) <= 0).any():
             raise ValueError(f"which: frames run from 0 to {self.num_frames - 1}; give numbers in rising order.")
-        return self._frames(chosen)
+        return self._frames(indices)
 
     def frame(self, which: int | str) -> "Measurement":
         """A single frame as a measurement, given by its index from 0 (negative from the end) or by its name.
@@ -183,9 +183,11 @@ class Measurement(Module):
         """The index, from 0, of a frame given as in `frame`. Raises `ValueError` for a frame that does not exist."""
         if isinstance(which, str):
             if which not in self.frame_names:
-                known = ", ".join(self.frame_names) or "none: give a number"
-                meant = did_you_mean(which, self.frame_names)
-                raise ValueError(f"'{self.name}' has no frame named {which!r}{meant}. Named frames: {known}.")
+                known_names = ", ".join(self.frame_names) or "none: give a number"
+                suggestion = did_you_mean(which, self.frame_names)
+                raise ValueError(
+                    f"'{self.name}' has no frame named {which!r}{suggestion}. Named frames: {known_names}."
+                )
             which = self.frame_names.index(which)
         if not -self.num_frames <= which < self.num_frames:
             raise ValueError(f"'{self.name}' has frames 0 to {self.num_frames - 1}; there is no frame {which}.")
@@ -197,10 +199,10 @@ class Measurement(Module):
         Raises `ValueError` if the file has no frame of that name, or no other frame.
         """
         if "reference" not in self.frame_names or self.num_frames < 2:
-            some = "say which (--reference-frames 0-17; measurement.frames(slice(0, 18))), or "
+            alternative = "say which (--reference-frames 0-17; measurement.frames(slice(0, 18))), or "
             raise ValueError(
                 f"'{self.name}' holds no reference frame of its own. Measure the undisturbed body and give that file "
-                f"as the reference; or, if frames of this one are that, {some if self.num_frames > 1 else ''}"
+                f"as the reference; or, if frames of this one are that, {alternative if self.num_frames > 1 else ''}"
                 'name one "reference" in the description: [data] frame_names.'
             )
         index = self.frame_names.index("reference")
@@ -221,13 +223,13 @@ class Measurement(Module):
 
         `usable`: boolean, (M,) or (F, M); `reason`: added to the notes. Raises `ValueError` for another shape.
         """
-        extra = jnp.asarray(usable)
-        if extra.dtype != bool or extra.shape not in ((self.num_channels,), self.mask.shape):
+        usable_array = jnp.asarray(usable)
+        if usable_array.dtype != bool or usable_array.shape not in ((self.num_channels,), self.mask.shape):
             raise ValueError(
-                f"usable has shape {extra.shape} of {extra.dtype}; give booleans of shape "
+                f"usable has shape {usable_array.shape} of {usable_array.dtype}; give booleans of shape "
                 f"({self.num_channels},) or {self.mask.shape}."
             )
-        mask = self.mask & extra
+        mask = self.mask & usable_array
         note = reason
         if has_values(mask):
             number = int(self.mask.sum() - mask.sum())
@@ -253,8 +255,8 @@ class Measurement(Module):
         times = None if self.times is None else np.asarray(self.times)[index]
         return self._replace(*_rows(self.voltages, self.mask, index), frame_names=names, times=times)
 
-    def _replace(self, voltages, mask, **others) -> "Measurement":
-        kept = {"frame_names": self.frame_names, "notes": self.notes, "times": self.times, **others}
+    def _replace(self, voltages, mask, **changes) -> "Measurement":
+        fields = {"frame_names": self.frame_names, "notes": self.notes, "times": self.times, **changes}
         return Measurement(
             voltages,
             mask,
@@ -264,13 +266,13 @@ class Measurement(Module):
             name=self.name,
             source=self.source,
             uncertainty=self.uncertainty,
-            **kept,
+            **fields,
         )
 
 
-def _check_times(times: np.ndarray, number: int) -> None:
-    if times.shape != (number,):
-        raise ValueError(f"times have shape {times.shape}; give seconds for each of {number} frames.")
+def _check_times(times: np.ndarray, num_frames: int) -> None:
+    if times.shape != (num_frames,):
+        raise ValueError(f"times have shape {times.shape}; give seconds for each of {num_frames} frames.")
     if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise ValueError("times must be finite and rise from frame to frame, in seconds; sort the frames by time.")
 

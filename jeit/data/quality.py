@@ -21,10 +21,10 @@ from jeit.protocol import Protocol
 from jeit.protocol.reciprocity import transfer_between_drives
 
 # Maximum number of frames from which a recording is judged; a longer one is sampled evenly.
-_MOST_FRAMES = 32
+_MAX_FRAMES = 32
 # Rounding: largest number of significant digits, relative accuracy of multiples of a step (single precision), and
 # smallest number of voltages that can show it.
-_MOST_DIGITS, _EXACTLY, _LEAST_ROUNDED = 5, 1e-6, 16
+_MAX_DIGITS, _RELATIVE_ACCURACY, _MIN_VOLTAGES = 5, 1e-6, 16
 
 
 @dataclass(frozen=True)
@@ -99,10 +99,10 @@ def channel_reciprocity_error(measurement: Measurement) -> Float[np.ndarray, "F 
     if len(pairs) == 0:
         return np.abs(result)
     first, second = pairs.T
-    both = mask[:, first] & mask[:, second]
+    usable_pairs = mask[:, first] & mask[:, second]
     error = voltages[:, first] - voltages[:, second] / ratio
-    result[:, first] = np.where(both, error, np.nan)
-    result[:, second] = np.where(both, -error * ratio, np.nan)
+    result[:, first] = np.where(usable_pairs, error, np.nan)
+    result[:, second] = np.where(usable_pairs, -error * ratio, np.nan)
     return np.real(result) if np.isrealobj(voltages) else np.abs(result)
 
 
@@ -152,22 +152,22 @@ def expected_signs(protocol: Protocol, order: Int[np.ndarray, " L"]) -> Int[np.n
     electrodes as they follow each other along the boundary. Channels that do not drive and measure by pairs of
     electrodes get 0.
     """
-    count = protocol.num_electrodes
-    rank = np.empty(count, dtype=int)
+    num_electrodes = protocol.num_electrodes
+    rank = np.empty(num_electrodes, dtype=int)
     rank[order] = np.arange(len(order))
     drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
-    pairs = (np.count_nonzero(drive, axis=1) == 2) & (np.count_nonzero(measurement, axis=1) == 2)
+    uses_pairs = (np.count_nonzero(drive, axis=1) == 2) & (np.count_nonzero(measurement, axis=1) == 2)
     source = rank[drive.argmax(axis=1)]
     # Ranks counted from the source: the potential falls along the arc from 0 to sink, and rises along the arc from sink
-    # to count.
-    sink = (rank[drive.argmin(axis=1)] - source) % count
-    plus = (rank[measurement.argmax(axis=1)] - source) % count
-    minus = (rank[measurement.argmin(axis=1)] - source) % count
-    falling = (plus <= sink) & (minus <= sink)
-    signs = np.where(falling, np.sign(minus - plus), 0)
-    plus, minus = np.where(plus == 0, count, plus), np.where(minus == 0, count, minus)
-    rising = (plus >= sink) & (minus >= sink) & ~falling
-    return np.where(pairs, np.where(rising, np.sign(plus - minus), signs), 0)
+    # to num_electrodes.
+    sink = (rank[drive.argmin(axis=1)] - source) % num_electrodes
+    plus = (rank[measurement.argmax(axis=1)] - source) % num_electrodes
+    minus = (rank[measurement.argmin(axis=1)] - source) % num_electrodes
+    is_falling = (plus <= sink) & (minus <= sink)
+    signs = np.where(is_falling, np.sign(minus - plus), 0)
+    plus, minus = np.where(plus == 0, num_electrodes, plus), np.where(minus == 0, num_electrodes, minus)
+    is_rising = (plus >= sink) & (minus >= sink) & ~is_falling
+    return np.where(uses_pairs, np.where(is_rising, np.sign(plus - minus), signs), 0)
 
 
 def impossible_signs(
@@ -195,12 +195,12 @@ def impossible_signs(
     if order is None:
         return None
     signs = expected_signs(measurement.protocol, order)
-    known = np.asarray(measurement.mask) & (signs != 0)
-    wrong = known & (np.sign(np.real(np.asarray(measurement.voltages))) == -signs)
-    count = known.sum(axis=1)
-    if not count.any():
+    has_known_sign = np.asarray(measurement.mask) & (signs != 0)
+    has_wrong_sign = has_known_sign & (np.sign(np.real(np.asarray(measurement.voltages))) == -signs)
+    num_known = has_known_sign.sum(axis=1)
+    if not num_known.any():
         return None
-    return wrong.sum(axis=1) / np.maximum(count, 1)
+    return has_wrong_sign.sum(axis=1) / np.maximum(num_known, 1)
 
 
 def boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
@@ -229,25 +229,29 @@ def rounding_deviation(voltages: Float[np.ndarray, " M"], mask: Bool[np.ndarray,
     The coarsest rounding that agrees with all usable voltages is taken; its error is uniform within ± half a step.
     Reciprocal voltages are rounded alike, so reciprocity does not show this error.
     """
-    size, mask = np.abs(np.real(np.asarray(voltages))), np.asarray(mask)
-    values = size[mask & (size > 0)]
-    if len(values) < _LEAST_ROUNDED:
-        return np.zeros(len(size))
-    each = np.where(mask, np.maximum(size, values.min()), values.min())
-    steps = [10.0 ** (np.floor(np.log10(each) + _EXACTLY) - digits) for digits in range(_MOST_DIGITS)]
-    apart = np.diff(np.unique(np.append(0, values)))
-    least = apart[apart > _EXACTLY * values.max()].min()
-    steps += [np.full(len(size), least / part) for part in (1, 2, 3)]
-    rounded = [one for one in steps if _are_multiples(size[mask], one[mask])]
-    coarsest = max(rounded, key=lambda one: float(np.log(one[mask]).sum()), default=np.zeros(len(size)))
+    voltage_magnitudes, mask = np.abs(np.real(np.asarray(voltages))), np.asarray(mask)
+    values = voltage_magnitudes[mask & (voltage_magnitudes > 0)]
+    if len(values) < _MIN_VOLTAGES:
+        return np.zeros(len(voltage_magnitudes))
+    magnitudes = np.where(mask, np.maximum(voltage_magnitudes, values.min()), values.min())
+    steps = [10.0 ** (np.floor(np.log10(magnitudes) + _RELATIVE_ACCURACY) - digits) for digits in range(_MAX_DIGITS)]
+    gaps = np.diff(np.unique(np.append(0, values)))
+    smallest_gap = gaps[gaps > _RELATIVE_ACCURACY * values.max()].min()
+    steps += [np.full(len(voltage_magnitudes), smallest_gap / divisor) for divisor in (1, 2, 3)]
+    candidates = [step for step in steps if _are_multiples(voltage_magnitudes[mask], step[mask])]
+    coarsest = max(
+        candidates, key=lambda step: float(np.log(step[mask]).sum()), default=np.zeros(len(voltage_magnitudes))
+    )
     return coarsest / np.sqrt(12)
 
 
 def _are_multiples(values: np.ndarray, step: np.ndarray) -> bool:
-    """Whether values are multiples of their steps, of which none has more than `_MOST_DIGITS` digits."""
-    count = values / step
-    off = np.abs(count - np.round(count))
-    return bool((count < 10**_MOST_DIGITS).all() and (off <= _EXACTLY * np.maximum(count, 1)).all())
+    """Whether values are multiples of their steps, of which none has more than `_MAX_DIGITS` digits."""
+    quotients = values / step
+    remainders = np.abs(quotients - np.round(quotients))
+    return bool(
+        (quotients < 10**_MAX_DIGITS).all() and (remainders <= _RELATIVE_ACCURACY * np.maximum(quotients, 1)).all()
+    )
 
 
 def _asymmetry(
@@ -261,12 +265,13 @@ def _asymmetry(
     in the diagonal alone.
     """
     protocol = measurement.protocol
-    frames = np.unique(np.linspace(0, measurement.num_frames - 1, _MOST_FRAMES).round().astype(int))
+    frames = np.unique(np.linspace(0, measurement.num_frames - 1, _MAX_FRAMES).round().astype(int))
     voltages = np.nan_to_num(np.asarray(measurement.voltages)[frames])
     masks = np.asarray(measurement.mask)[frames]
-    parts = []
+
+    mask_results = []
     for mask in np.unique(masks, axis=0):
-        transfer, known, gain = transfer_between_drives(
+        transfer, is_known, gain = transfer_between_drives(
             np.asarray(protocol.drive),
             np.asarray(protocol.measurement),
             np.asarray(protocol.drive_index),
@@ -275,17 +280,19 @@ def _asymmetry(
             mask,
             deviation,
         )
-        row, column = np.nonzero(np.triu(known & known.T, k=1))
+        row, column = np.nonzero(np.triu(is_known & is_known.T, k=1))
         upper, lower = transfer[:, row, column], transfer[:, column, row]
         noise = np.hypot(gain[row, column], gain[column, row])
         size = np.sqrt((np.abs(upper) ** 2 + np.abs(lower) ** 2) / 2)
-        own = np.flatnonzero(np.diag(known))
+        diagonal_drives = np.flatnonzero(np.diag(is_known))
         # In ‖T‖² a diagonal entry counts once, and an off-diagonal pair, which is one entry here, counts twice.
-        diagonal = np.abs(transfer[:, own, own]) / np.sqrt(2)
+        diagonal = np.abs(transfer[:, diagonal_drives, diagonal_drives]) / np.sqrt(2)
         if deviation is not None:
-            size, diagonal = size / noise, diagonal / (np.sqrt(2) * gain[own, own])
-        parts.append((upper - lower, np.broadcast_to(noise, upper.shape), np.concatenate([size, diagonal], axis=1)))
-    error, noise, signal = (np.concatenate([part[k].ravel() for part in parts]) for k in range(3))
+            size, diagonal = size / noise, diagonal / (np.sqrt(2) * gain[diagonal_drives, diagonal_drives])
+        mask_results.append(
+            (upper - lower, np.broadcast_to(noise, upper.shape), np.concatenate([size, diagonal], axis=1))
+        )
+    error, noise, signal = (np.concatenate([arrays[k].ravel() for arrays in mask_results]) for k in range(3))
     return error, noise, signal
 
 
@@ -296,9 +303,9 @@ def _robust_deviation(values: np.ndarray) -> float:
 
 
 # Maximum number of electrodes listed in a note.
-_MOST = 40
+_MAX_LISTED = 40
 # Maximum difference between the fractions of impossible signs of two orders that can be due to noise.
-_CHANCE = 0.01
+_MAX_CHANCE_DIFFERENCE = 0.01
 
 
 def order_note(measurement: Measurement) -> str | None:
@@ -307,18 +314,24 @@ def order_note(measurement: Measurement) -> str | None:
     order = boundary_order(measurement)
     if order is None or len(order) < 4 or follows(order):
         return None
-    listed = ", ".join(str(number + 1) for number in _from_the_first(order)[:_MOST])
-    more = " …" if len(order) > _MOST else ""
-    note = f"going round the edge, the positions of the electrodes come in the order {listed}{more}"
-    here, numbered = (impossible_signs(measurement, one) for one in (order, np.arange(len(order))))
-    if here is None or numbered is None or abs(here.mean() - numbered.mean()) <= _CHANCE:
+    listed = ", ".join(str(number + 1) for number in _starting_at_first(order)[:_MAX_LISTED])
+    ellipsis = " …" if len(order) > _MAX_LISTED else ""
+    note = f"going round the edge, the positions of the electrodes come in the order {listed}{ellipsis}"
+    position_signs, number_signs = (
+        impossible_signs(measurement, electrode_order) for electrode_order in (order, np.arange(len(order)))
+    )
+    if (
+        position_signs is None
+        or number_signs is None
+        or abs(position_signs.mean() - number_signs.mean()) <= _MAX_CHANCE_DIFFERENCE
+    ):
         return f"{note}. If they are not numbered so, rows of the positions are exchanged."
-    if here.mean() < numbered.mean():
+    if position_signs.mean() < number_signs.mean():
         return f"{note}; the signs of the voltages agree."
     return (
-        f"{note}, and the voltages contradict it: {100 * here.mean():.0f} % of their signs are impossible at these "
-        f"positions, {100 * numbered.mean():.0f} % if the electrodes followed each other by their numbers. Rows of the "
-        "positions are exchanged: mend them, or every image is wrong."
+        f"{note}, and the voltages contradict it: {100 * position_signs.mean():.0f} % of their signs are impossible at "
+        f"these positions, {100 * number_signs.mean():.0f} % if the electrodes followed each other by their numbers. "
+        "Rows of the positions are exchanged: mend them, or every image is wrong."
     )
 
 
@@ -328,7 +341,7 @@ def follows(order: Int[np.ndarray, " L"]) -> bool:
     return bool((steps == 1).all() or (steps == len(order) - 1).all())
 
 
-def _from_the_first(order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " L"]:
+def _starting_at_first(order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " L"]:
     """The order rotated to begin at the first electrode, in the direction in which most numbers increase."""
     steps = (np.roll(order, -1) - order) % len(order)
     if (steps == len(order) - 1).sum() > (steps == 1).sum():

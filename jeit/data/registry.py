@@ -13,7 +13,7 @@ from jeit.data.measurement import Measurement
 from jeit.files import check_memory
 
 # Maximum bytes of memory per byte of text.
-_IN_MEMORY = 4
+_MEMORY_FACTOR = 4
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,9 @@ def format_with_protocol(path: Path) -> str | None:
     """Name of the format of a file that states its protocol, so that only the body is to be described; or None."""
     if not path.is_file():
         return None
-    return next((name for name, one in FORMATS.items() if one.own_protocol and one.recognises(path)), None)
+    return next(
+        (name for name, candidate in FORMATS.items() if candidate.own_protocol and candidate.recognises(path)), None
+    )
 
 
 def read(
@@ -110,10 +112,10 @@ def read(
     file = Path(path)
     if file.is_dir():
         sciospec = FORMATS["sciospec"]
-        members = sorted(one for one in file.iterdir() if one.is_file() and sciospec.recognises(one))
+        members = sorted(member for member in file.iterdir() if member.is_file() and sciospec.recognises(member))
         if not members or format not in (None, "sciospec"):
             raise ValueError(f"{file} is a folder. Give one data file in it.")
-        check_memory(file.name, _IN_MEMORY * sum(one.stat().st_size for one in members))
+        check_memory(file.name, _MEMORY_FACTOR * sum(member.stat().st_size for member in members))
         return replace(sciospec.reader.read_all(members, description), name=file.name, source=str(file))
     if not file.is_file():
         raise ValueError(f"path: there is no file {file}. Check the name and the working directory.")
@@ -121,25 +123,26 @@ def read(
         raise ValueError(f"{file.name} is empty.")
     name = _recognise(file, description, like) if format is None else format
     check_name("format", name, FORMATS)
-    chosen = FORMATS[name]
-    reader = chosen.reader
-    if chosen.borrows:
+    file_format = FORMATS[name]
+    reader = file_format.reader
+    if file_format.borrows:
         return reader.read(file, description=description, like=like, key=key)
     if key is not None:
         raise ValueError(f"key: files of format '{name}' have no choice of arrays; leave it out.")
-    if chosen.described:
+    if file_format.described:
         return reader.read(file, description=description)
     if description is not None:
         raise ValueError(f"Format '{name}' describes itself; tables and files of instruments take a description.")
-    return reader.read(file, description=chosen.bundled) if chosen.bundled else reader.read(file)
+    return reader.read(file, description=file_format.bundled) if file_format.bundled else reader.read(file)
 
 
 def _recognise(file: Path, description: str | Path | None, like: Measurement | None) -> str:
-    """Name of the format of a file. Raises `ValueError`, with what it probably is, if it is of none."""
-    described = description is not None or like is not None
+    """Return the name of the format of a file. Raises `ValueError`, with what the file probably is, if it has no known
+    format."""
+    has_description = description is not None or like is not None
     for name, candidate in FORMATS.items():
         if candidate.recognises(file):
-            if name == "table" and not described and candidate.reader.find_description(file) is None:
+            if name == "table" and not has_description and candidate.reader.find_description(file) is None:
                 _check_mark(file)
             return name
     _check_mark(file)
@@ -147,30 +150,35 @@ def _recognise(file: Path, description: str | Path | None, like: Measurement | N
         from jeit.data.formats import eidors, kit4, ktc2023
         from jeit.files import matlab
 
-        if described or eidors.find_description(file) is not None:
+        if has_description or eidors.find_description(file) is not None:
             return "eidors"
         names = matlab.variable_names(file)
-        for one in (kit4, ktc2023):
-            lacking = [min(kind - names, key=len) for kind in one.VARIABLES if len(kind & names) == len(kind) - 1]
-            if lacking:
+        for reader in (kit4, ktc2023):
+            missing_variables = [
+                min(kind - names, key=len) for kind in reader.VARIABLES if len(kind & names) == len(kind) - 1
+            ]
+            if missing_variables:
                 raise ValueError(
-                    f"{file.name} looks like {one.DESCRIPTION}, but lacks the variable {lacking[0]}: add it, or put a "
-                    "description beside the file."
+                    f"{file.name} looks like {reader.DESCRIPTION}, but lacks the variable {missing_variables[0]}: add "
+                    "it, or put a description beside the file."
                 )
-        held = listed(sorted(names))
+        listed_names = listed(sorted(names))
         raise ValueError(
-            f"{file.name} is a .mat file of no known kind; it holds {held}. `jeit describe {file.name}` finds out what "
-            f"it can, and writes a description. Known: {kit4.DESCRIPTION}; {ktc2023.DESCRIPTION}; {eidors.DESCRIPTION}."
+            f"{file.name} is a .mat file of no known kind; it holds {listed_names}. `jeit describe {file.name}` finds "
+            f"out what it can, and writes a description. Known: {kit4.DESCRIPTION}; {ktc2023.DESCRIPTION}; "
+            f"{eidors.DESCRIPTION}."
         )
-    ending = file.suffix.lower()
-    if known := [name for name, one in FORMATS.items() if ending in one.endings]:
+    suffix = file.suffix.lower()
+    if known_formats := [name for name, candidate in FORMATS.items() if suffix in candidate.endings]:
         raise ValueError(
-            f"{file.name}: its content is that of no known kind of file ending in '{ending}' ({', '.join(known)}). Is "
-            "its start damaged, or is it of another program?"
+            f"{file.name}: its content is that of no known kind of file ending in '{suffix}' "
+            f"({', '.join(known_formats)}). Is its start damaged, or is it of another program?"
         )
     with file.open("rb") as content:
-        head = content.read(_HEAD)
-    hint = next((f" It is {said}." for mark, said in _KINDS.items() if head.startswith(mark)), "")
+        head = content.read(_HEAD_BYTES)
+    hint = next(
+        (f" It is {explanation}." for mark, explanation in _OTHER_PROGRAMS.items() if head.startswith(mark)), ""
+    )
     if not hint and _is_text(head):
         hint = f" It is text: if it is a table of numbers, name it {file.stem[:40]}.txt."
     raise ValueError(
@@ -178,9 +186,9 @@ def _recognise(file: Path, description: str | Path | None, like: Measurement | N
     )
 
 
-_HEAD = 65536
-# Marks by which damaged and misnamed files of a format are known.
-_MARKS = {
+_HEAD_BYTES = 65536
+# Marks by which damaged and misnamed files of a format are recognised.
+_FORMAT_MARKS = {
     "draeger": rb"Draeger EIT-Software|Framerate \[Hz\]:",
     "carefusion": rb"E\0I\0T\0_\0F\0i\0l\0e",
     "sciospec": rb"(?m)^MeasurementChannels(?:IndependentFromInjectionPattern)?:",
@@ -188,7 +196,7 @@ _MARKS = {
     "openeit": rb"(?mi)^\s{0,40}magnitudes\s{0,40}:",
 }
 # First bytes of files of other programs, and what to do with these.
-_KINDS = {
+_OTHER_PROGRAMS = {
     b"PK\x03\x04": "a spreadsheet or another archive: export its numbers as CSV",
     b"\x89HDF": "HDF5: save the arrays as .npz, or by MATLAB with `save(name, '-v7')`",
     b"MATLAB": "a file of MATLAB: name it .mat",
@@ -198,11 +206,11 @@ _KINDS = {
 
 
 def _check_mark(file: Path) -> None:
-    """Raise `ValueError` if a file has a mark of a format that does not recognise it: with what is damaged, or its
-    ending."""
+    """Raise `ValueError` if a file has the mark of a format that does not recognise it; the message states what is
+    damaged, or that the suffix is wrong."""
     with file.open("rb") as content:
-        head = content.read(_HEAD)
-    for name, mark in _MARKS.items():
+        head = content.read(_HEAD_BYTES)
+    for name, mark in _FORMAT_MARKS.items():
         if not re.search(mark, head):
             continue
         reader, endings = FORMATS[name].reader, FORMATS[name].endings

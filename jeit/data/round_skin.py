@@ -106,15 +106,15 @@ def simulate_press(
     ```
     """
     check_kind("skin", skin, RoundSkin, "a RoundSkin, such as RoundSkin(radius=0.05)")
-    where = np.asarray(position, float)
-    if where.shape != (2,) or not np.isfinite(where).all():
+    centre = np.asarray(position, float)
+    if centre.shape != (2,) or not np.isfinite(centre).all():
         raise ValueError(f"position: give (x, y) in metres, not {position!r}.")
     if not (np.isfinite(radius) and radius > 0):
         raise ValueError(f"radius: the contact must be of positive size, in metres; it is {radius}.")
-    if np.hypot(*where) + radius > skin.radius:
+    if np.hypot(*centre) + radius > skin.radius:
         raise ValueError(
-            f"position: a press at ({where[0]:g}, {where[1]:g}) m with a contact of radius {radius:g} m reaches beyond "
-            f"the skin, whose radius is {skin.radius:g} m. Positions are in metres from its centre."
+            f"position: a press at ({centre[0]:g}, {centre[1]:g}) m with a contact of radius {radius:g} m reaches "
+            f"beyond the skin, whose radius is {skin.radius:g} m. Positions are in metres from its centre."
         )
     if not (np.isfinite(strength) and strength > -1 and strength != 0):
         raise ValueError(f"strength: the relative change must be above -1 and not zero; it is {strength}.")
@@ -123,7 +123,7 @@ def simulate_press(
     check_key(key)
     model = skin.model()
     points = centroids(model.mesh)
-    pressed = pressed_conductivity(points, skin.conductivity, where, radius, strength)
+    pressed = pressed_conductivity(points, skin.conductivity, centre, radius, strength)
     frames = np.stack([model.voltages(pressed), model.voltages(skin.conductivity)])
     frames += noise * np.sqrt(np.mean(frames**2)) * np.asarray(jax.random.normal(key, frames.shape))
     measured = screen(

@@ -16,9 +16,9 @@ from jeit.mesh import Body, Mesh
 from jeit.protocol import Protocol
 
 # Maximum number of superfluous columns, such as times, for which an error about the shape suggests them.
-_COLUMNS = 4
+_MAX_EXTRA_COLUMNS = 4
 # Maximum plausible voltage on an electrode, in volts.
-_LARGEST = 1000.0
+_MAX_VOLTAGE = 1000.0
 
 
 def screen(
@@ -68,43 +68,45 @@ def screen(
     name = name.encode("utf-8", "backslashreplace").decode()  # the name of a file may not be valid text
     values = _as_frames(voltages, protocol, name)
     usable = np.ones(values.shape, dtype=bool)
-    found = list(notes)
+    note_list = list(notes)
 
-    def exclude(bad: np.ndarray, reason: str) -> None:
-        new = int((usable & bad).sum())
-        if new:
-            usable[bad] = False
-            found.append(f"{new} of {values.size} voltages masked: {reason}")
+    def exclude(is_bad: np.ndarray, reason: str) -> None:
+        num_masked = int((usable & is_bad).sum())
+        if num_masked:
+            usable[is_bad] = False
+            note_list.append(f"{num_masked} of {values.size} voltages masked: {reason}")
 
     if mask is not None:
-        given = np.broadcast_to(np.asarray(mask), values.shape)
-        if given.dtype != bool:
-            raise ValueError(f"mask is {given.dtype}; give booleans, True where a voltage is usable.")
-        exclude(~given, "excluded by the mask given.")
+        given_mask = np.broadcast_to(np.asarray(mask), values.shape)
+        if given_mask.dtype != bool:
+            raise ValueError(f"mask is {given_mask.dtype}; give booleans, True where a voltage is usable.")
+        exclude(~given_mask, "excluded by the mask given.")
     values = readings(values)
     exclude(np.isnan(values), "NaN, infinite or beyond any instrument (an electrode missing or not connected).")
-    dead = ~np.any(np.where(usable, values, 0) != 0, axis=1)
-    if dead.all():
+    is_dead = ~np.any(np.where(usable, values, 0) != 0, axis=1)
+    if is_dead.all():
         raise ValueError(
             f"{name}: every usable voltage is zero, NaN or missing; there is nothing measured in it. Was the "
             "instrument on, and is this the right variable or column?"
         )
-    exclude(np.broadcast_to(dead[:, None], values.shape), f"all zero: {int(dead.sum())} of {len(dead)} frames.")
+    exclude(
+        np.broadcast_to(is_dead[:, None], values.shape), f"all zero: {int(is_dead.sum())} of {len(is_dead)} frames."
+    )
     exclude(_saturated(values, usable, saturation), "saturated (stuck at an end of the instrument's range).")
-    dead, alive = _currents(values, usable, protocol)
-    exclude(dead[:, np.asarray(protocol.drive_index)], "their drive's current did not flow.")
-    driven, reads = (np.asarray(one) != 0 for one in (protocol.drive, protocol.channel_measurement))
-    unconnected = (dead @ driven) & ~(alive @ driven)
-    numbers = ", ".join(str(one + 1) for one in np.flatnonzero(unconnected.any(axis=0)))
-    said = f"they read electrode {numbers}, through which no drive's current flowed: is it connected?"
-    exclude(unconnected @ reads.T, said)
+    is_dead, is_alive = _current_flow(values, usable, protocol)
+    exclude(is_dead[:, np.asarray(protocol.drive_index)], "their drive's current did not flow.")
+    driven, reads = (np.asarray(patterns) != 0 for patterns in (protocol.drive, protocol.channel_measurement))
+    unconnected = (is_dead @ driven) & ~(is_alive @ driven)
+    numbers = ", ".join(str(electrode + 1) for electrode in np.flatnonzero(unconnected.any(axis=0)))
+    connection_note = f"they read electrode {numbers}, through which no drive's current flowed: is it connected?"
+    exclude(unconnected @ reads.T, connection_note)
     largest = np.abs(values[usable]).max(initial=0)
-    if largest > _LARGEST:
-        found.append(f"the largest voltage is {largest:.3g} V: are voltages in volts, and currents in amperes?")
+    if largest > _MAX_VOLTAGE:
+        note_list.append(f"the largest voltage is {largest:.3g} V: are voltages in volts, and currents in amperes?")
     if not usable.any():
-        raise ValueError(f"{name}: no usable voltage is left. {' '.join(found)}")
-    described = {"electrodes": electrodes, "domain": domain, "name": name, "source": source, "frame_names": frame_names}
-    measurement = Measurement(values, usable, protocol, notes=tuple(found), **described)
+        raise ValueError(f"{name}: no usable voltage is left. {' '.join(note_list)}")
+    fields = {"electrodes": electrodes, "domain": domain, "name": name, "source": source, "frame_names": frame_names}
+    measurement = Measurement(values, usable, protocol, notes=tuple(note_list), **fields)
     note = order_note(measurement)
     return measurement if note is None else replace(measurement, notes=(*measurement.notes, note))
 
@@ -130,43 +132,43 @@ def _as_frames(voltages, protocol: Protocol, name: str) -> np.ndarray:
     if values.dtype.kind not in "fiuc":
         raise ValueError(f"{name}: voltages are {values.dtype}; they must be numbers, in volts.")
     values = np.atleast_2d(values.astype(complex if values.dtype.kind == "c" else float))
-    channels = protocol.num_measurements
-    if values.ndim != 2 or values.shape[0] == 0 or values.shape[1] != channels:
-        hint = " It looks transposed: give one row per frame." if values.shape[0] == channels else ""
-        if values.ndim == 2 and 0 < (more := values.shape[1] - channels) <= _COLUMNS:
-            hint = f" There are {more} too many: are there times, counters or states among them? Leave them out."
-        hint = hint or _hint_of_number(values.size, channels)
+    num_channels = protocol.num_measurements
+    if values.ndim != 2 or values.shape[0] == 0 or values.shape[1] != num_channels:
+        hint = " It looks transposed: give one row per frame." if values.shape[0] == num_channels else ""
+        if values.ndim == 2 and 0 < (num_extra := values.shape[1] - num_channels) <= _MAX_EXTRA_COLUMNS:
+            hint = f" There are {num_extra} too many: are there times, counters or states among them? Leave them out."
+        hint = hint or _hint_of_number(values.size, num_channels)
         raise ValueError(
-            f"{name}: the data have shape {values.shape}, but the protocol '{protocol.name}' has {channels} "
-            f"channels, so (frames, {channels}) is needed.{hint} Or describe the protocol that the data "
+            f"{name}: the data have shape {values.shape}, but the protocol '{protocol.name}' has {num_channels} "
+            f"channels, so (frames, {num_channels}) is needed.{hint} Or describe the protocol that the data "
             "were measured with."
         )
     return values
 
 
-def _saturated(values: np.ndarray, usable: np.ndarray, limit: float | None) -> Bool[np.ndarray, "F M"]:
-    if limit is not None:
-        if not np.isfinite(limit) or limit <= 0:
-            raise ValueError(f"saturation must be a positive voltage in volts; got {limit!r}.")
+def _saturated(values: np.ndarray, usable: np.ndarray, saturation: float | None) -> Bool[np.ndarray, "F M"]:
+    if saturation is not None:
+        if not np.isfinite(saturation) or saturation <= 0:
+            raise ValueError(f"saturation must be a positive voltage in volts; got {saturation!r}.")
         with np.errstate(invalid="ignore"):
-            return np.abs(values) >= limit * (1 - 1e-9)
+            return np.abs(values) >= saturation * (1 - 1e-9)
     result = np.zeros(values.shape, dtype=bool)
-    parts = [np.real(values), np.imag(values)] if np.iscomplexobj(values) else [values]
-    for part in parts:
-        for frame, (row, good) in enumerate(zip(part, usable, strict=True)):
-            if good.sum() < 8:
+    components = [np.real(values), np.imag(values)] if np.iscomplexobj(values) else [values]
+    for component in components:
+        for frame, (row, row_usable) in enumerate(zip(component, usable, strict=True)):
+            if row_usable.sum() < 8:
                 continue
-            level, inverse, count = np.unique(row[good], return_inverse=True, return_counts=True)
-            for end in (0, len(level) - 1):
+            levels, level_index, counts = np.unique(row[row_usable], return_inverse=True, return_counts=True)
+            for extreme in (0, len(levels) - 1):
                 # A coarse converter or a simulated symmetric body also produces exactly equal extremes, but then values
                 # in between repeat as often; in saturated data only the extreme value repeats.
-                others = np.delete(count, [0, len(level) - 1]) if len(level) > 2 else np.zeros(1)
-                if level[end] != 0 and count[end] >= 4 and count[end] >= 4 * others.max(initial=0):
-                    result[frame, np.flatnonzero(good)[inverse == end]] = True
+                other_counts = np.delete(counts, [0, len(levels) - 1]) if len(levels) > 2 else np.zeros(1)
+                if levels[extreme] != 0 and counts[extreme] >= 4 and counts[extreme] >= 4 * other_counts.max(initial=0):
+                    result[frame, np.flatnonzero(row_usable)[level_index == extreme]] = True
     return result
 
 
-def _currents(
+def _current_flow(
     values: np.ndarray, usable: np.ndarray, protocol: Protocol
 ) -> tuple[Bool[np.ndarray, "F S"], Bool[np.ndarray, "F S"]]:
     """Masks (F, S) of the drives without current, whose voltages are a thousand times smaller than those of the median
@@ -176,5 +178,5 @@ def _currents(
     np.maximum.at(largest.T, index, np.where(usable, np.abs(values), -1.0).T)
     if protocol.num_drives < 3:
         return np.zeros(largest.shape, dtype=bool), largest >= 0
-    least = 1e-3 * np.median(np.maximum(largest, 0), axis=1, keepdims=True)
-    return (largest >= 0) & (largest < least), largest >= least
+    threshold = 1e-3 * np.median(np.maximum(largest, 0), axis=1, keepdims=True)
+    return (largest >= 0) & (largest < threshold), largest >= threshold

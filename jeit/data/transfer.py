@@ -16,9 +16,9 @@ from jeit.files import check_memory
 from jeit.protocol import Protocol
 
 # Singular values smaller than this fraction of the largest one belong to combinations that were not measured.
-_UNKNOWN = 1e-9
+_MIN_SINGULAR_VALUE = 1e-9
 # Estimated number of copies of the equations in memory while they are solved.
-_COPIES = 4
+_NUM_COPIES = 4
 
 
 def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]:
@@ -40,27 +40,34 @@ def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]
     impedance = transfer_impedance(complete)
     ```
     """
-    protocol, count = measurement.protocol, measurement.protocol.num_electrodes
-    basis = scipy.linalg.null_space(np.ones((1, count)))
-    rows, columns = np.triu_indices(count - 1)
-    check_memory(f"the transfer impedance of '{measurement.name}'", 8 * _COPIES * len(rows) * measurement.num_channels)
-    drive, reading = np.asarray(protocol.channel_drive) @ basis, np.asarray(protocol.channel_measurement) @ basis
-    forms = drive[:, rows] * reading[:, columns] + np.where(rows == columns, 0, drive[:, columns] * reading[:, rows])
+    protocol, num_electrodes = measurement.protocol, measurement.protocol.num_electrodes
+    basis = scipy.linalg.null_space(np.ones((1, num_electrodes)))
+    rows, columns = np.triu_indices(num_electrodes - 1)
+    check_memory(
+        f"the transfer impedance of '{measurement.name}'", 8 * _NUM_COPIES * len(rows) * measurement.num_channels
+    )
+    drive, measurement_patterns = (
+        np.asarray(protocol.channel_drive) @ basis,
+        np.asarray(protocol.channel_measurement) @ basis,
+    )
+    products = drive[:, rows] * measurement_patterns[:, columns] + np.where(
+        rows == columns, 0, drive[:, columns] * measurement_patterns[:, rows]
+    )
     size = np.abs(drive).max()
     voltages, masks = np.asarray(measurement.filled()), np.asarray(measurement.mask)
-    found = np.empty((measurement.num_frames, count, count), voltages.dtype)
+    impedances = np.empty((measurement.num_frames, num_electrodes, num_electrodes), voltages.dtype)
     for mask in np.unique(masks, axis=0):
-        inverse = np.linalg.pinv(forms[mask] / size, rcond=_UNKNOWN) / size
-        if np.linalg.norm(inverse @ forms[mask] - np.eye(len(rows))) > 1e-6 * len(rows):
+        inverse = np.linalg.pinv(products[mask] / size, rcond=_MIN_SINGULAR_VALUE) / size
+        if np.linalg.norm(inverse @ products[mask] - np.eye(len(rows))) > 1e-6 * len(rows):
             raise ValueError(
                 f"'{measurement.name}': its {int(mask.sum())} usable channels leave the transfer impedance open, "
-                f"{len(rows)} numbers. It takes {count - 1} independent currents, read on all electrodes."
+                f"{len(rows)} numbers. It takes {num_electrodes - 1} independent currents, read on all electrodes."
             )
         for frame in np.flatnonzero((masks == mask).all(axis=1)):
-            upper = np.zeros((count - 1, count - 1), voltages.dtype)
+            upper = np.zeros((num_electrodes - 1, num_electrodes - 1), voltages.dtype)
             upper[rows, columns] = inverse @ voltages[frame, mask]
-            found[frame] = basis @ (upper + np.triu(upper, 1).T) @ basis.T
-    return found
+            impedances[frame] = basis @ (upper + np.triu(upper, 1).T) @ basis.T
+    return impedances
 
 
 def as_driven(reference: Measurement, measurement: Measurement) -> Measurement:
@@ -110,12 +117,14 @@ def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
             f"protocol has {protocol.num_electrodes} electrodes, and '{measurement.name}' "
             f"{measurement.protocol.num_electrodes}; both must be of the same body."
         )
-    drive, reading = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
+    drive_patterns, measurement_patterns = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
     impedance = transfer_impedance(measurement)
-    voltages = np.stack([np.einsum("km,km->k", reading @ one, drive) for one in impedance])
-    same = protocol.name == measurement.protocol.name
-    reads = "other currents of that name read" if same else f"'{protocol.name}' reads"
-    note = f"'{measurement.name}' was measured with '{measurement.protocol.name}', and turned into what {reads}."
+    voltages = np.stack(
+        [np.einsum("km,km->k", measurement_patterns @ transfer, drive_patterns) for transfer in impedance]
+    )
+    has_same_name = protocol.name == measurement.protocol.name
+    explanation = "other currents of that name read" if has_same_name else f"'{protocol.name}' reads"
+    note = f"'{measurement.name}' was measured with '{measurement.protocol.name}', and turned into what {explanation}."
     return Measurement(
         voltages,
         np.ones(voltages.shape, bool),

@@ -1,4 +1,5 @@
-"""What a description leaves out, found from the voltages: the order of channels, the channels measured, and the sign.
+"""Estimation of what a description does not state from the voltages: the order of channels, the measured channels, and
+the sign.
 
 The order is the one that obeys reciprocity. The sign is known wherever electrodes follow each other along an edge, see
 `jeit.data.quality.expected_signs`.
@@ -19,10 +20,11 @@ from jeit.mesh import Solid
 from jeit.protocol import Protocol
 from jeit.protocol.patterns import shares_electrode
 
-# Reciprocity error above which the described order is doubted, and ratio to it below which another one is taken.
-_DOUBTED, _BETTER = 0.25, 0.4
+# Maximum reciprocity error for which the described order is trusted, and maximum ratio to it of the error of an order
+# that replaces it.
+_MAX_TRUSTED_ERROR, _MAX_ERROR_RATIO = 0.25, 0.4
 # Cosine of the angle between a frame and its reference below which one of them has the opposite sign.
-_OPPOSITE = -0.5
+_OPPOSITE_COSINE = -0.5
 
 
 def fitting_protocol(
@@ -36,29 +38,34 @@ def fitting_protocol(
     """
     if not protocols:
         return None, ()
-    fitting = [one for one in protocols if one[0].num_measurements == frames.shape[-1]]
+    fitting = [candidate for candidate in protocols if candidate[0].num_measurements == frames.shape[-1]]
     if not fitting:
         return protocols[0][0], ()
     reason = f"for {counted(frames.shape[-1], 'number')} are in a frame"
-    if like is not None and (same := [one for one in fitting if one[0].same_patterns(like.protocol)]):
-        fitting, reason = [*same, *fitting], f"as of '{like.name}'"
-    chosen, said = fitting[0]
-    first = _error(frames, chosen)
-    if _DOUBTED < first < np.inf:
-        errors = [_error(frames, one) for one, _ in fitting]
-        best = int(np.argmin(errors))
-        if errors[best] < min(_DOUBTED, _BETTER * first):
-            chosen, said = fitting[best]
-            reason = f"for reciprocity is broken by {percent(errors[best])} so, by {percent(first)} in the usual order"
-    return chosen, (f"[protocol] {said} is taken, {reason}.",) if said else ()
+    if like is not None and (
+        same_protocols := [candidate for candidate in fitting if candidate[0].same_patterns(like.protocol)]
+    ):
+        fitting, reason = [*same_protocols, *fitting], f"as of '{like.name}'"
+    chosen_protocol, options = fitting[0]
+    first_error = _mean_frame_error(frames, chosen_protocol)
+    if _MAX_TRUSTED_ERROR < first_error < np.inf:
+        errors = [_mean_frame_error(frames, candidate) for candidate, _ in fitting]
+        best_index = int(np.argmin(errors))
+        if errors[best_index] < min(_MAX_TRUSTED_ERROR, _MAX_ERROR_RATIO * first_error):
+            chosen_protocol, options = fitting[best_index]
+            best_error = percent(errors[best_index])
+            reason = f"for reciprocity is broken by {best_error} so, by {percent(first_error)} in the usual order"
+    return chosen_protocol, (f"[protocol] {options} is taken, {reason}.",) if options else ()
 
 
-def _error(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> float:
-    """Reciprocity error of the mean frame; infinite if nothing is known of it."""
+def _mean_frame_error(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> float:
+    """Reciprocity error of the mean frame; infinite if it cannot be computed."""
     values = readings(np.atleast_2d(frames))
-    known = np.isfinite(values).all(axis=0)
-    mean = np.where(known, np.where(np.isfinite(values), values, 0).mean(axis=0), 0)
-    error = reciprocity_error(Measurement(mean[None], known[None], protocol)) if known.any() and mean.any() else None
+    is_known = np.isfinite(values).all(axis=0)
+    mean = np.where(is_known, np.where(np.isfinite(values), values, 0).mean(axis=0), 0)
+    error = (
+        reciprocity_error(Measurement(mean[None], is_known[None], protocol)) if is_known.any() and mean.any() else None
+    )
     return np.inf if error is None else error
 
 
@@ -75,32 +82,34 @@ def with_signs(measurement: Measurement, like: Measurement | None = None) -> Mea
     or the opposite sign of those of the same sensor, `like`; with a note if any is changed."""
     values, usable = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     if like is not None and like.protocol.same_patterns(measurement.protocol):
-        both = usable.all(axis=0) & np.asarray(like.mask).all(axis=0)
-        ours, theirs = (np.real(np.asarray(one.voltages)).mean(axis=0)[both] for one in (measurement, like))
+        common = usable.all(axis=0) & np.asarray(like.mask).all(axis=0)
+        ours, theirs = (np.real(np.asarray(each.voltages)).mean(axis=0)[common] for each in (measurement, like))
         size = np.linalg.norm(ours) * np.linalg.norm(theirs)
-        if size and ours @ theirs > -_OPPOSITE * size:
+        if size and ours @ theirs > -_OPPOSITE_COSINE * size:
             return measurement  # as of the reference, whatever that says of the sign
-        if size and ours @ theirs < _OPPOSITE * size:
-            said = f"the voltages are reversed, to agree with '{like.name}' (polarity = \"reversed\")."
-            return _changed(measurement, -values, said)
-    known = np.real(values[usable])
-    one_way = (known >= 0).all() or (known <= 0).all()
+        if size and ours @ theirs < _OPPOSITE_COSINE * size:
+            note = f"the voltages are reversed, to agree with '{like.name}' (polarity = \"reversed\")."
+            return _with_voltages(measurement, -values, note)
+    known_voltages = np.real(values[usable])
+    has_one_sign = (known_voltages >= 0).all() or (known_voltages <= 0).all()
     signs = _signs(measurement)
-    if signs is None or not one_way or not (signs[usable.any(axis=0)] != 0).all() or not known.any():
+    if signs is None or not has_one_sign or not (signs[usable.any(axis=0)] != 0).all() or not known_voltages.any():
         return measurement
     changed = np.abs(np.real(values)) * signs
     if (changed[usable] == np.real(values)[usable]).all():
         return measurement
     if (changed[usable] == -np.real(values)[usable]).all():
-        said = 'all voltages have one sign, the opposite of what a body gives: it is reversed (polarity = "reversed").'
-        return _changed(measurement, -values, said)
+        note = 'all voltages have one sign, the opposite of what a body gives: it is reversed (polarity = "reversed").'
+        return _with_voltages(measurement, -values, note)
     if np.iscomplexobj(values):
         return measurement
-    return _changed(measurement, changed, "the voltages are magnitudes: they are given the signs that a body gives.")
+    return _with_voltages(
+        measurement, changed, "the voltages are magnitudes: they are given the signs that a body gives."
+    )
 
 
-def _changed(measurement: Measurement, values, said: str) -> Measurement:
-    return replace(measurement, voltages=values, notes=(*measurement.notes, said))
+def _with_voltages(measurement: Measurement, values, note: str) -> Measurement:
+    return replace(measurement, voltages=values, notes=(*measurement.notes, note))
 
 
 def _signs(measurement: Measurement) -> Float[np.ndarray, " M"] | None:
@@ -119,20 +128,22 @@ def channel_gains(measurement: Measurement) -> tuple[Float[np.ndarray, " K"] | N
     and the reciprocity error that is left; None if reciprocity does not determine them."""
     protocol, values = measurement.protocol, np.asarray(measurement.voltages)[0]
     pairs, ratio = protocol.reciprocal_pairs()
-    used = np.asarray(measurement.mask)[0] & (values != 0)
-    pairs, ratio = pairs[used[pairs].all(axis=1)], ratio[used[pairs].all(axis=1)]
-    read, number = np.asarray(protocol.measurement_index), len(protocol.measurement)
-    if len(pairs) < number:
+    is_used = np.asarray(measurement.mask)[0] & (values != 0)
+    pairs, ratio = pairs[is_used[pairs].all(axis=1)], ratio[is_used[pairs].all(axis=1)]
+    measurement_index, num_patterns = np.asarray(protocol.measurement_index), len(protocol.measurement)
+    if len(pairs) < num_patterns:
         return None, None
     # log |v_b / (r v_a)| is the difference of the logarithms of the two gains.
     first, second = pairs.T
-    apart = np.log(np.abs(values[second] / (ratio * values[first])))
-    rows = np.zeros((len(pairs), number))
-    rows[np.arange(len(pairs)), read[second]] += 1
-    rows[np.arange(len(pairs)), read[first]] -= 1
-    if np.linalg.matrix_rank(rows) < number - 1:
+    log_ratios = np.log(np.abs(values[second] / (ratio * values[first])))
+    rows = np.zeros((len(pairs), num_patterns))
+    rows[np.arange(len(pairs)), measurement_index[second]] += 1
+    rows[np.arange(len(pairs)), measurement_index[first]] -= 1
+    if np.linalg.matrix_rank(rows) < num_patterns - 1:
         return None, None
     weight = np.sqrt(np.abs(values[first] * values[second]))[:, None]
-    gains = np.exp(np.linalg.lstsq(weight * rows, weight[:, 0] * apart, rcond=None)[0])
-    left = reciprocity_error(replace(measurement, voltages=np.asarray(measurement.voltages) / gains[read]))
-    return gains, left
+    gains = np.exp(np.linalg.lstsq(weight * rows, weight[:, 0] * log_ratios, rcond=None)[0])
+    remaining_error = reciprocity_error(
+        replace(measurement, voltages=np.asarray(measurement.voltages) / gains[measurement_index])
+    )
+    return gains, remaining_error

@@ -15,7 +15,7 @@ from typing import Any
 MOST_ELECTRODES = 1024
 """Maximum number of electrodes that a file may describe: the number of channels of a protocol grows with its square."""
 
-_VARIABLE, _USUAL = "JEIT_FILE_GB", 1.0
+_LIMIT_VARIABLE, _DEFAULT_GIGABYTES = "JEIT_FILE_GB", 1.0
 
 
 class TooLarge(ValueError):
@@ -28,45 +28,47 @@ def check_memory(name: str, size: float) -> None:
 
     The limit is a gigabyte, or the value of the environment variable JEIT_FILE_GB, in gigabytes.
     """
-    most = _most()
-    if size > 1e9 * most:
+    max_gigabytes = _max_gigabytes()
+    if size > 1e9 * max_gigabytes:
         raise TooLarge(
-            f"{name} would take {size / 1e9:.3g} GB in memory, more than the {most:g} GB that a file may. If that is "
-            f"meant, allow it by setting the environment variable {_VARIABLE}={size / 1e9 + 0.5:.0f}."
+            f"{name} would take {size / 1e9:.3g} GB in memory, more than the {max_gigabytes:g} GB that a file may. If "
+            f"that is meant, allow it by setting the environment variable {_LIMIT_VARIABLE}={size / 1e9 + 0.5:.0f}."
         )
 
 
-def check_electrodes(name: str, number: int) -> None:
+def check_electrodes(name: str, num_electrodes: int) -> None:
     """Raise `ValueError` if the file `name` describes more than `MOST_ELECTRODES`."""
-    if number > MOST_ELECTRODES:
+    if num_electrodes > MOST_ELECTRODES:
         raise ValueError(
-            f"{name} describes {number} electrodes, more than {MOST_ELECTRODES}, whose {MOST_ELECTRODES**2 // 10**6} "
-            "million channels are no longer imaged; in Python there is no such limit."
+            f"{name} describes {num_electrodes} electrodes, more than {MOST_ELECTRODES}, whose "
+            f"{MOST_ELECTRODES**2 // 10**6} million channels are no longer imaged; in Python there is no such limit."
         )
 
 
 def most_bytes() -> float:
     """Maximum memory in bytes for the content of a file, from the environment. Raises `ValueError` if the variable is
     not a positive number."""
-    return 1e9 * _most()
+    return 1e9 * _max_gigabytes()
 
 
-def _most() -> float:
+def _max_gigabytes() -> float:
     """Maximum memory in gigabytes for the content of a file, from the environment."""
     try:
-        most = float(os.environ.get(_VARIABLE, _USUAL))
+        gigabytes = float(os.environ.get(_LIMIT_VARIABLE, _DEFAULT_GIGABYTES))
     except ValueError:
-        most = -1.0
-    if not 0 < most < float("inf"):
-        raise ValueError(f"{_VARIABLE} must be a positive number of gigabytes; it is {os.environ[_VARIABLE][:40]!r}.")
-    return most
+        gigabytes = -1.0
+    if not 0 < gigabytes < float("inf"):
+        raise ValueError(
+            f"{_LIMIT_VARIABLE} must be a positive number of gigabytes; it is {os.environ[_LIMIT_VARIABLE][:40]!r}."
+        )
+    return gigabytes
 
 
 KEY = 40
 """Maximum number of characters of a key in a message."""
 # Maximum number of characters of a message, of faults that are described in sentences, and of further faults that are
 # listed by their keys.
-_LONGEST, _FAULTS, _KEYS = 390, 4, 10
+_MAX_MESSAGE, _MAX_SENTENCES, _MAX_KEYS = 390, 4, 10
 ALL = "; there are "
 """Text that precedes a list of all valid words in a message."""
 
@@ -74,40 +76,52 @@ ALL = "; there are "
 def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) -> str:
     """Combine several faults in the file `origin` into one message: the first of the `sentences` in any case, further
     ones as far as there is room, and up to ten of the `keys` of the others."""
-    first = cut(f"{cut(origin, 2 * KEY)}: {sentences[0]}", _LONGEST - 20)
-    shown = 1
-    for number in range(min(len(sentences), _FAULTS), 0, -1):
+    first_sentence = cut(f"{cut(origin, 2 * KEY)}: {sentences[0]}", _MAX_MESSAGE - 20)
+    num_shown = 1
+    for num_sentences in range(min(len(sentences), _MAX_SENTENCES), 0, -1):
         # If a message proposes a valid word, its list of all valid words is omitted first to save room.
-        rest = [f"{one.split(ALL)[0]}." if "?)" + ALL in one else one for one in sentences[1:number]]
-        for others in (sentences[1:number], rest):
-            message = " ".join([first, *others, *_more(keys[number:], len(sentences) - number, _KEYS)])
-            if len(message) <= _LONGEST:
+        short_sentences = [
+            f"{sentence.split(ALL)[0]}." if "?)" + ALL in sentence else sentence
+            for sentence in sentences[1:num_sentences]
+        ]
+        for later_sentences in (sentences[1:num_sentences], short_sentences):
+            message = " ".join(
+                [
+                    first_sentence,
+                    *later_sentences,
+                    *_further_faults(keys[num_sentences:], len(sentences) - num_sentences, _MAX_KEYS),
+                ]
+            )
+            if len(message) <= _MAX_MESSAGE:
                 return message
-    while len(" ".join([first, *_more(keys[1:], len(sentences) - 1, shown)])) <= _LONGEST and shown < _KEYS:
-        shown += 1
-    return " ".join([first, *_more(keys[1:], len(sentences) - 1, shown - 1)])
+    while (
+        len(" ".join([first_sentence, *_further_faults(keys[1:], len(sentences) - 1, num_shown)])) <= _MAX_MESSAGE
+        and num_shown < _MAX_KEYS
+    ):
+        num_shown += 1
+    return " ".join([first_sentence, *_further_faults(keys[1:], len(sentences) - 1, num_shown - 1)])
 
 
-def _more(keys: Sequence[str], number: int, most: int) -> list[str]:
-    """Text about `number` further faults, of which at most `most` are named by their keys."""
-    named = keys[:most]
-    said = [f"Wrong too: {', '.join(named)}."] if named else []
-    return [*said, f"And {number - len(named)} more."] if number > len(named) else said
+def _further_faults(keys: Sequence[str], num_faults: int, max_keys: int) -> list[str]:
+    """Text about `num_faults` further faults, of which at most `max_keys` are named by their keys."""
+    named_keys = keys[:max_keys]
+    sentences = [f"Wrong too: {', '.join(named_keys)}."] if named_keys else []
+    return [*sentences, f"And {num_faults - len(named_keys)} more."] if num_faults > len(named_keys) else sentences
 
 
-def cut(text: str, most: int) -> str:
-    """Shorten a text to `most` characters, with an ellipsis at its end."""
-    return text if len(text) <= most else f"{text[: most - 1]}…"
+def cut(text: str, max_length: int) -> str:
+    """Shorten a text to `max_length` characters, with an ellipsis at its end."""
+    return text if len(text) <= max_length else f"{text[: max_length - 1]}…"
 
 
-_LONGEST_REASON = 120
+_MAX_REASON = 120
 
 
 @contextmanager
-def read_as(said: str) -> Iterator[None]:
-    """Context for reading files with other packages: their errors become a `ValueError` with the text `said`, such as
-    "not a readable WAV file", and the reason in brackets. Errors about a missing file or missing permission are passed
-    on.
+def read_as(message: str) -> Iterator[None]:
+    """Context for reading files with other packages: their errors become a `ValueError` with the text `message`, such
+    as "not a readable WAV file", and the reason in brackets. Errors about a missing file or missing permission are
+    passed on.
 
     Warnings of the packages are suppressed, since a file that can be read counts as valid.
     """
@@ -118,29 +132,29 @@ def read_as(said: str) -> Iterator[None]:
     except Exception as error:  # of any type, since the readers of other packages do not check content
         if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError):
             raise
-        raise ValueError(f"{said} ({reason(error)}).") from None
+        raise ValueError(f"{message} ({reason(error)}).") from None
 
 
 def reason(error: Exception) -> str:
     """Message of an error in one short line; the type of the error if it has no message."""
     text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-    return text if len(text) <= _LONGEST_REASON else f"{text[: _LONGEST_REASON - 1]}…"
+    return text if len(text) <= _MAX_REASON else f"{text[: _MAX_REASON - 1]}…"
 
 
 # Maximum size in bytes of a hand-written file; bytes of memory per byte of text.
-_MOST_WRITTEN, _TEXT = 2**22, 4
+_MAX_TOML_BYTES, _BYTES_PER_CHARACTER = 2**22, 4
 # Maximum number of parts of a dotted key.
-_DEEPEST = 32
+_MAX_KEY_PARTS = 32
 
 
-def read_text(path: str | Path, *, encoding: str = "utf-8", most: int | None = None) -> str:
-    """Read the text of a file of at most `most` bytes, or at most what fits in memory (`check_memory`).
+def read_text(path: str | Path, *, encoding: str = "utf-8", max_bytes: int | None = None) -> str:
+    """Read the text of a file of at most `max_bytes` bytes, or at most what fits in memory (`check_memory`).
 
     Raises `ValueError`, with the file's name, for larger files, `UnicodeError`, which is a `ValueError`, for files that
     are not text, and `OSError` if the file does not exist.
     """
     path = Path(path)
-    check_size(path, most)
+    check_size(path, max_bytes)
     content = path.read_bytes()
     try:
         return content.decode(encoding)
@@ -148,25 +162,27 @@ def read_text(path: str | Path, *, encoding: str = "utf-8", most: int | None = N
         raise UnicodeError(f"{path.name} is no text in UTF-8.") from None
 
 
-def check_size(path: Path, most: int | None = None) -> None:
-    """Raise `ValueError` for a file of more than `most` bytes, or whose content exceeds the memory limit
+def check_size(path: Path, max_bytes: int | None = None) -> None:
+    """Raise `ValueError` for a file of more than `max_bytes` bytes, or whose content exceeds the memory limit
     (`check_memory`)."""
     size = path.stat().st_size
-    if most is not None and size > most:
-        raise ValueError(f"{path.name} has {size} bytes, and a file of its kind {most} at most: is it the right one?")
-    check_memory(path.name, _TEXT * size)
+    if max_bytes is not None and size > max_bytes:
+        raise ValueError(
+            f"{path.name} has {size} bytes, and a file of its kind {max_bytes} at most: is it the right one?"
+        )
+    check_memory(path.name, _BYTES_PER_CHARACTER * size)
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Read the tables of a hand-written TOML file. Raises `ValueError`, with the file's name and the line, for invalid
     TOML, and `OSError` if the file does not exist."""
-    return parsed_toml(read_text(path, most=_MOST_WRITTEN), Path(path).name)
+    return parsed_toml(read_text(path, max_bytes=_MAX_TOML_BYTES), Path(path).name)
 
 
 def parsed_toml(text: str, name: str) -> dict[str, Any]:
     """Parse `text` from the TOML file `name`. Raises `ValueError` for invalid TOML."""
-    if any(_dots(line) > _DEEPEST for line in text.splitlines()):
-        raise ValueError(f"{name} has a key of more than {_DEEPEST} parts; none is of so many.")
+    if any(_max_dots(line) > _MAX_KEY_PARTS for line in text.splitlines()):
+        raise ValueError(f"{name} has a key of more than {_MAX_KEY_PARTS} parts; none is of so many.")
     try:
         return tomllib.loads(text)
     except RecursionError:
@@ -175,20 +191,20 @@ def parsed_toml(text: str, name: str) -> dict[str, Any]:
         raise ValueError(f"{name} is no TOML file: {reason(error)}.") from None
 
 
-def _dots(line: str) -> int:
+def _max_dots(line: str) -> int:
     """Maximum number of dots in a key on a line of TOML: the parser's time grows with its square."""
     if "=" not in line:
         return line.count(".") if line.lstrip().startswith("[") and "," not in line else 0
-    before = [part.rpartition("{")[2].rpartition(",")[2] for part in line.split("=")[:-1]]
-    return max(part.count(".") for part in before)
+    prefixes = [part.rpartition("{")[2].rpartition(",")[2] for part in line.split("=")[:-1]]
+    return max(part.count(".") for part in prefixes)
 
 
-def read_json(path: str | Path, *, most: int = 2**26) -> Any:
-    """Read a JSON file of at most `most` bytes. Raises `ValueError`, with the file's name and the position, for invalid
-    JSON, and `OSError` if the file does not exist."""
+def read_json(path: str | Path, *, max_bytes: int = 2**26) -> Any:
+    """Read a JSON file of at most `max_bytes` bytes. Raises `ValueError`, with the file's name and the position, for
+    invalid JSON, and `OSError` if the file does not exist."""
     path = Path(path)
     try:
-        return json.loads(read_text(path, most=most))
+        return json.loads(read_text(path, max_bytes=max_bytes))
     except RecursionError:
         raise ValueError(f"{path.name} is nested too deep.") from None
     except json.JSONDecodeError as error:

@@ -21,16 +21,16 @@ from jeit.files.limits import check_memory, read_as
 
 # Length in bytes of the file header, and of the beginning of an element, which holds flags, shape and name; type
 # numbers of elements.
-_HEADER, _BEGINNING = 128, 4096
-_MATRIX, _COMPRESSED = 14, 15
+_HEADER_BYTES, _PREFIX_BYTES = 128, 4096
+_MATRIX_TYPE, _COMPRESSED_TYPE = 14, 15
 # Class numbers of arrays in the file: of sparse arrays, and of numeric arrays with their NumPy types.
-_SPARSE = 5
-_NUMERIC = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+_SPARSE_CLASS = 5
+_NUMERIC_CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
 # NumPy types of stored numbers by their type number in the file; flag of complex arrays.
-_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-_COMPLEX = 0x800
+_STORED_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_COMPLEX_FLAG = 0x800
 # Maximum number of bytes of one number in memory, and of everything else in an element.
-_BYTES, _BESIDE = 16, 2**16
+_MAX_NUMBER_BYTES, _MAX_OTHER_BYTES = 16, 2**16
 
 
 class _Variable(NamedTuple):
@@ -38,49 +38,57 @@ class _Variable(NamedTuple):
     shape: tuple[int, ...]
     kind: int
     complex: bool
-    begin: int  # where the numbers begin in the uncompressed element
+    numbers_start: int  # where the numbers begin in the uncompressed element
     content: bytes  # the element as stored in the file, without its tag
-    packed: bool
+    is_compressed: bool
     order: str  # byte order: "<" or ">"
 
     @property
     def size(self) -> int:
         """Maximum memory of the variable in bytes, from its declared shape."""
-        return _BYTES * math.prod(self.shape)
+        return _MAX_NUMBER_BYTES * math.prod(self.shape)
 
 
 def variable_names(path: Path) -> set[str]:
     """Names of the variables in a .mat file. Raises `ValueError` when it is not a readable .mat file."""
     if _is_format_4(path):
-        with read_as(_unreadable(path)):
+        with read_as(_unreadable_message(path)):
             return {name for name, _, _ in scipy.io.whosmat(str(path))}
-    return {one.name for one in _variables(path)}
+    return {variable.name for variable in _variables(path)}
 
 
 def shapes(path: Path) -> dict[str, tuple[int, ...]]:
     """Shapes of the numeric variables in a .mat file, by name. Raises `ValueError` as `variable_names`."""
     if _is_format_4(path):
-        with read_as(_unreadable(path)):
+        with read_as(_unreadable_message(path)):
             return {name: shape for name, shape, kind in scipy.io.whosmat(str(path)) if kind != "char"}
-    return {one.name: one.shape for one in _variables(path) if one.kind in (_SPARSE, *_NUMERIC)}
+    return {
+        variable.name: variable.shape
+        for variable in _variables(path)
+        if variable.kind in (_SPARSE_CLASS, *_NUMERIC_CLASSES)
+    }
 
 
-def load(path: Path, *wanted: str) -> dict[str, np.ndarray]:
-    """Read the numeric ones of the variables `wanted`, by name. Sparse matrices are converted to dense arrays; the key
+def load(path: Path, *names: str) -> dict[str, np.ndarray]:
+    """Read those of the variables `names` that are numeric. Sparse matrices are converted to dense arrays; the key
     "" holds the names of all variables in the file. Other variables are not unpacked.
 
     Raises `ValueError` if the file cannot be read, and if the variables would not fit in memory (`check_memory`).
     """
     if _is_format_4(path):
-        with read_as(_unreadable(path)):  # format 4 is never compressed, so it holds fewer numbers than bytes
-            read = scipy.io.loadmat(str(path), variable_names=list(wanted), spmatrix=False)
-        return {"": np.array(sorted(variable_names(path)), dtype=str)} | _plain(read, wanted)
-    held = _variables(path)
-    asked = [one for one in held if one.name in wanted and one.kind in (_SPARSE, *_NUMERIC)]
-    check_memory(path.name, sum(one.size for one in asked))
-    with read_as(_unreadable(path)):
-        values = {one.name: _values(one) for one in asked}
-    return {"": np.array(sorted({one.name for one in held}), dtype=str)} | values
+        with read_as(_unreadable_message(path)):  # format 4 is never compressed, so it holds fewer numbers than bytes
+            content = scipy.io.loadmat(str(path), variable_names=list(names), spmatrix=False)
+        return {"": np.array(sorted(variable_names(path)), dtype=str)} | _dense_arrays(content, names)
+    variables = _variables(path)
+    requested = [
+        variable
+        for variable in variables
+        if variable.name in names and variable.kind in (_SPARSE_CLASS, *_NUMERIC_CLASSES)
+    ]
+    check_memory(path.name, sum(variable.size for variable in requested))
+    with read_as(_unreadable_message(path)):
+        values = {variable.name: _values(variable) for variable in requested}
+    return {"": np.array(sorted({variable.name for variable in variables}), dtype=str)} | values
 
 
 def numbers(content: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
@@ -95,13 +103,13 @@ def numbers(content: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
     return value
 
 
-def _plain(read: dict, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
+def _dense_arrays(content: dict, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Arrays that SciPy read from a file of format 4, with sparse matrices converted to dense arrays."""
-    found = {name: read[name] for name in wanted if name in read}
-    return {name: value.toarray() if hasattr(value, "toarray") else value for name, value in found.items()}
+    arrays = {name: content[name] for name in names if name in content}
+    return {name: value.toarray() if hasattr(value, "toarray") else value for name, value in arrays.items()}
 
 
-def _unreadable(path: Path) -> str:
+def _unreadable_message(path: Path) -> str:
     return f"{path.name} is not a readable .mat file; is it complete?"
 
 
@@ -116,97 +124,97 @@ def _is_format_4(path: Path) -> bool:
 def _variables(path: Path) -> list[_Variable]:
     """Headers of the variables in a file of format 5. Raises `ValueError` for other formats."""
     content = path.read_bytes()
-    if len(content) >= _HEADER and (content[:8] == b"\x89HDF\r\n\x1a\n" or 2 in content[124:126]):
+    if len(content) >= _HEADER_BYTES and (content[:8] == b"\x89HDF\r\n\x1a\n" or 2 in content[124:126]):
         raise ValueError(
             f"{path.name} was saved in MATLAB's version 7.3 (HDF5). Save it again with `save(name, '-v7')`."
         )
-    with read_as(_unreadable(path)):
+    with read_as(_unreadable_message(path)):
         return [*_elements(content)]
 
 
 def _elements(content: bytes) -> Iterator[_Variable]:
     """Headers of the arrays in the file, in their order; of compressed arrays only the beginning is decompressed."""
-    if len(content) < _HEADER or content[126:128] not in (b"IM", b"MI"):
+    if len(content) < _HEADER_BYTES or content[126:128] not in (b"IM", b"MI"):
         raise ValueError("it is of another kind")
     order = "<" if content[126:128] == b"IM" else ">"
-    place = _HEADER
-    while place + 8 <= len(content):
-        kind, size = struct.unpack_from(f"{order}II", content, place)
-        start, packed = place + 8, kind == _COMPRESSED
+    offset = _HEADER_BYTES
+    while offset + 8 <= len(content):
+        kind, size = struct.unpack_from(f"{order}II", content, offset)
+        start, is_compressed = offset + 8, kind == _COMPRESSED_TYPE
         if start + size > len(content):
             raise ValueError("it is cut short")
         element = content[start : start + size]
-        if packed:
-            beginning = zlib.decompressobj().decompress(element, _BEGINNING)
-            kind, beginning = struct.unpack_from(f"{order}I", beginning)[0], beginning[8:]
+        if is_compressed:
+            prefix = zlib.decompressobj().decompress(element, _PREFIX_BYTES)
+            kind, prefix = struct.unpack_from(f"{order}I", prefix)[0], prefix[8:]
         else:
-            beginning = element[:_BEGINNING]
-        if kind == _MATRIX:
-            yield _Variable(*_header(beginning, order), element, packed, order)
-        place = start + size
+            prefix = element[:_PREFIX_BYTES]
+        if kind == _MATRIX_TYPE:
+            yield _Variable(*_header(prefix, order), element, is_compressed, order)
+        offset = start + size
 
 
-def _header(beginning: bytes, order: str) -> tuple[str, tuple[int, ...], int, bool, int]:
+def _header(prefix: bytes, order: str) -> tuple[str, tuple[int, ...], int, bool, int]:
     """Name, shape, class, whether complex, and offset of the numbers, read from the first three sub-elements of an
     array."""
-    _, flags, place = _part(beginning, 0, order)
-    _, shape, place = _part(beginning, place, order)
-    _, name, place = _part(beginning, place, order)
-    flag = struct.unpack_from(f"{order}I", flags)[0]
+    _, flags, offset = _sub_element(prefix, 0, order)
+    _, shape, offset = _sub_element(prefix, offset, order)
+    _, name, offset = _sub_element(prefix, offset, order)
+    flag_bits = struct.unpack_from(f"{order}I", flags)[0]
     lengths = struct.unpack(f"{order}{len(shape) // 4}i", shape)
     if len(lengths) < 2 or any(length < 0 for length in lengths):
         raise ValueError("an array of it has no length, or a negative one")
-    return name.decode("latin-1"), lengths, flag & 0xFF, bool(flag & _COMPLEX), place
+    return name.decode("latin-1"), lengths, flag_bits & 0xFF, bool(flag_bits & _COMPLEX_FLAG), offset
 
 
-def _part(content: bytes, place: int, order: str) -> tuple[int, bytes, int]:
+def _sub_element(content: bytes, offset: int, order: str) -> tuple[int, bytes, int]:
     """Type and bytes of a sub-element, and the offset of the next one. Sub-elements of four bytes or less are stored
     inside their own tag."""
-    kind = struct.unpack_from(f"{order}I", content, place)[0]
+    kind = struct.unpack_from(f"{order}I", content, offset)[0]
     if kind >> 16:
-        kind, size, start, after = kind & 0xFFFF, kind >> 16, place + 4, place + 8
+        kind, size, start, next_offset = kind & 0xFFFF, kind >> 16, offset + 4, offset + 8
     else:
-        size, start = struct.unpack_from(f"{order}I", content, place + 4)[0], place + 8
-        after = start + -(-size // 8) * 8
+        size, start = struct.unpack_from(f"{order}I", content, offset + 4)[0], offset + 8
+        next_offset = start + -(-size // 8) * 8
     if start + size > len(content):
         raise ValueError("what it says of an array is cut short, or too long")
-    return kind, content[start : start + size], after
+    return kind, content[start : start + size], next_offset
 
 
-def _numbers(content: bytes, place: int, order: str) -> tuple[np.ndarray, int]:
+def _numbers(content: bytes, offset: int, order: str) -> tuple[np.ndarray, int]:
     """Numbers of a sub-element, and the offset of the next one."""
-    kind, stored, place = _part(content, place, order)
-    if kind not in _STORED:
+    kind, raw_bytes, offset = _sub_element(content, offset, order)
+    if kind not in _STORED_TYPES:
         raise ValueError(f"an array of it is stored as type {kind}")
-    return np.frombuffer(stored, np.dtype(order + _STORED[kind])), place
+    return np.frombuffer(raw_bytes, np.dtype(order + _STORED_TYPES[kind])), offset
 
 
 def _values(variable: _Variable) -> np.ndarray:
     """The numbers of a variable as an array of its shape; sparse matrices are converted to dense arrays."""
-    content, place, order = _unpacked(variable), variable.begin, variable.order
-    rows = starts = None
-    if variable.kind == _SPARSE:
-        rows, place = _numbers(content, place, order)
-        starts, place = _numbers(content, place, order)
-    values, place = _numbers(content, place, order)
+    content, offset, order = _decompressed(variable), variable.numbers_start, variable.order
+    rows = column_starts = None
+    if variable.kind == _SPARSE_CLASS:
+        rows, offset = _numbers(content, offset, order)
+        column_starts, offset = _numbers(content, offset, order)
+    values, offset = _numbers(content, offset, order)
     if variable.complex:
-        values = values + 1j * _numbers(content, place, order)[0]
-    if rows is None or starts is None:
+        values = values + 1j * _numbers(content, offset, order)[0]
+    if rows is None or column_starts is None:
         values = values.reshape(variable.shape, order="F")
-        return values if variable.complex else values.astype(_NUMERIC[variable.kind])
-    columns = np.repeat(np.arange(variable.shape[1]), np.diff(starts))
+        return values if variable.complex else values.astype(_NUMERIC_CLASSES[variable.kind])
+    columns = np.repeat(np.arange(variable.shape[1]), np.diff(column_starts))
     dense = np.zeros(variable.shape, complex if variable.complex else float)
     dense[rows[: len(columns)], columns] = values[: len(columns)]
     return dense
 
 
-def _unpacked(variable: _Variable) -> bytes:
+def _decompressed(variable: _Variable) -> bytes:
     """Content of an element without its tag, decompressed. Raises `ValueError` if it is larger than its shape
     implies."""
-    if not variable.packed:
+    if not variable.is_compressed:
         return variable.content
-    most = variable.size + _BESIDE
-    element = zlib.decompressobj().decompress(variable.content, most + 1)
-    if len(element) > most:
+    max_bytes = variable.size + _MAX_OTHER_BYTES
+    element = zlib.decompressobj().decompress(variable.content, max_bytes + 1)
+    if len(element) > max_bytes:
         raise ValueError(f"'{variable.name[:40]}' is larger than its shape {variable.shape} says")
     return element[8:]

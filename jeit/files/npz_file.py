@@ -16,10 +16,10 @@ import numpy as np
 
 from jeit.files.limits import TooLarge, check_memory, reason
 
-_COPIES = 2
+_NUM_COPIES = 2
 # Maximum size in bytes of an archive member that is not an array, such as a JSON header.
-_MOST_TEXT = 2**24
-_ARRAY, _ARCHIVE = b"\x93NUM", b"PK\x03\x04"
+_MAX_TEXT_BYTES = 2**24
+_NPY_MARK, _ZIP_MARK = b"\x93NUM", b"PK\x03\x04"
 # Errors that NumPy and zipfile raise for files that are damaged, encrypted, or compressed by an unknown method.
 FAULTS = (
     ValueError,
@@ -38,38 +38,38 @@ FAULTS = (
 
 
 def npz_arrays(
-    path: Path, *keys: str, otherwise: str = "not an NPZ file", every: bool = False
+    path: Path, *keys: str, otherwise: str = "not an NPZ file", read_all: bool = False
 ) -> dict[str, np.ndarray]:
-    """Read the arrays `keys`, or `every` array, of an NPZ file, omitting missing ones. The entry "" contains the names
-    of all arrays in the file.
+    """Read the arrays `keys` of an NPZ file, or all arrays if `read_all`, omitting missing ones. The entry "" contains
+    the names of all arrays in the file.
 
     Other arrays are not read. Raises `ValueError` for files that are not NPZ files (with the text `otherwise`), damaged
     files, arrays of objects, and arrays that exceed the memory limit (`check_memory`); `OSError` if the file does not
     exist.
     """
     with path.open("rb") as file:
-        start = file.read(4)
-        if start == _ARRAY:
+        mark = file.read(4)
+        if mark == _NPY_MARK:
             raise ValueError(
                 "it holds a single array without names; save it with numpy.savez and the names of its arrays."
             )
-        if start != _ARCHIVE:
+        if mark != _ZIP_MARK:
             raise ValueError(f"{otherwise}; save the arrays with numpy.savez.")
         file.seek(0)
         try:
             with zipfile.ZipFile(file) as archive:
-                members = {one.filename.removesuffix(".npy"): one for one in archive.infolist()}
-                asked = {name: one for name, one in members.items() if every or name in keys}
-                headers = {name: _member_header(archive, name, one) for name, one in asked.items()}
-                check_memory(path.name, sum(one.memory for one in headers.values()))
+                members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+                requested = {name: info for name, info in members.items() if read_all or name in keys}
+                headers = {name: _member_header(archive, name, info) for name, info in requested.items()}
+                check_memory(path.name, sum(header.memory for header in headers.values()))
                 arrays = {}
-                for name, one in asked.items():
-                    with archive.open(one) as member:
-                        arrays[name] = _read(member)
+                for name, info in requested.items():
+                    with archive.open(info) as member:
+                        arrays[name] = _read_array(member)
         except TooLarge:
             raise
         except (*FAULTS, OSError) as error:  # a member may claim to lie before the start of the file
-            raise _unreadable("NPZ file of plain arrays", error) from None
+            raise _unreadable_error("NPZ file of plain arrays", error) from None
     return {"": np.array([*members], dtype=str), **arrays}
 
 
@@ -80,15 +80,15 @@ def npy_array(path: Path) -> np.ndarray:
         try:
             header = _header(file)
             check_memory(path.name, header.memory)
-            left = path.stat().st_size - file.tell()
-            if header.size > left:
-                raise ValueError(f"it says {header.size} bytes of numbers, and has {left}; is it cut off?")
+            num_bytes_left = path.stat().st_size - file.tell()
+            if header.size > num_bytes_left:
+                raise ValueError(f"it says {header.size} bytes of numbers, and has {num_bytes_left}; is it cut off?")
             file.seek(0)
-            return _read(file)
+            return _read_array(file)
         except TooLarge:
             raise
         except FAULTS as error:
-            raise _unreadable("NPY file of plain numbers", error) from None
+            raise _unreadable_error("NPY file of plain numbers", error) from None
 
 
 def check_archive(path: Path) -> None:
@@ -97,24 +97,24 @@ def check_archive(path: Path) -> None:
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
-            check_memory(path.name, sum(one.file_size for one in members))
-            for one in members:
-                if one.filename.endswith(".npy"):
-                    _member_header(archive, one.filename, one)
-                elif one.file_size > _MOST_TEXT:
-                    raise ValueError(f"'{one.filename[:40]}' in it has {one.file_size} bytes of text")
+            check_memory(path.name, sum(member.file_size for member in members))
+            for member in members:
+                if member.filename.endswith(".npy"):
+                    _member_header(archive, member.filename, member)
+                elif member.file_size > _MAX_TEXT_BYTES:
+                    raise ValueError(f"'{member.filename[:40]}' in it has {member.file_size} bytes of text")
     except (TooLarge, FileNotFoundError):
         raise
     except (*FAULTS, OSError) as error:
-        raise _unreadable("archive", error) from None
+        raise _unreadable_error("archive", error) from None
 
 
 def need(arrays: dict[str, np.ndarray], *keys: str) -> None:
     """Raise `ValueError` if one of the arrays `keys` is missing; the message lists the arrays of the file."""
-    missing = [key for key in keys if key not in arrays]
-    if missing:
-        held = ", ".join(str(name)[:40] for name in arrays[""][:12]) or "nothing"
-        raise ValueError(f"there is no array '{missing[0]}'; the file holds {held}.")
+    missing_keys = [key for key in keys if key not in arrays]
+    if missing_keys:
+        array_names = ", ".join(str(name)[:40] for name in arrays[""][:12]) or "nothing"
+        raise ValueError(f"there is no array '{missing_keys[0]}'; the file holds {array_names}.")
 
 
 class _Header(NamedTuple):
@@ -129,7 +129,7 @@ class _Header(NamedTuple):
     @property
     def memory(self) -> int:
         """Memory in bytes for two copies of the data in double precision."""
-        return _COPIES * math.prod(self.shape) * max(self.dtype.itemsize, 8)
+        return _NUM_COPIES * math.prod(self.shape) * max(self.dtype.itemsize, 8)
 
 
 def _header(file: IO[bytes]) -> _Header:
@@ -137,8 +137,8 @@ def _header(file: IO[bytes]) -> _Header:
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise ValueError(f"an array of it is in format {version}")
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(file)
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(file)
     if dtype.hasobject:
         raise ValueError("it holds objects, which would be executed")
     if any(length < 0 for length in shape) or math.prod(shape) > 2**62:
@@ -160,15 +160,15 @@ def _member_header(archive: zipfile.ZipFile, name: str, member: zipfile.ZipInfo)
     return header
 
 
-def _read(file: IO[bytes]) -> np.ndarray:
+def _read_array(file: IO[bytes]) -> np.ndarray:
     array = np.lib.format.read_array(file, allow_pickle=False)
     if array.dtype.kind == "U" and array.size and array.dtype.itemsize:
-        letters = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("=")).reshape(-1).view(np.uint32)
-        if letters.max() > sys.maxunicode:
+        code_points = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("=")).reshape(-1).view(np.uint32)
+        if code_points.max() > sys.maxunicode:
             raise ValueError("a text in it holds what is no letter")
     return array
 
 
-def _unreadable(kind: str, error: Exception) -> ValueError:
+def _unreadable_error(kind: str, error: Exception) -> ValueError:
     hint = "" if "object" not in str(error).lower() else " as numbers and text, not objects"
     return ValueError(f"not a readable {kind} ({reason(error)}); write it again{hint}.")

@@ -3,7 +3,7 @@
 A table is defined by a class derived from `Table`, with one line per key:
 
     class SkinTable(Table):
-        what = "a skin"
+        subject = "a skin"
         model: Literal["sheet", "layer"] = "sheet"
         width_mm: Annotated[float, Number(5, 5000, "mm")]
 
@@ -30,12 +30,12 @@ from jeit.arguments import IN_MILLIMETRES, describe, did_you_mean
 from jeit.files.limits import ALL, KEY, cut, faults_message
 
 # Maximum number of characters of a list of names in a message.
-_NAMES = 160
+_MAX_LIST_LENGTH = 160
 # Keys of sizes that a message mentions along with the shape that is probably meant.
-_SIZES = ("radius", "width", "depth", "height", "vertices", "tags")
-_LARGEST = sys.float_info.max
+_SIZE_KEYS = ("radius", "width", "depth", "height", "vertices", "tags")
+_MAX_FLOAT = sys.float_info.max
 # Maximum number of unknown keys of a table that are examined.
-_UNKNOWN = 100
+_MAX_UNKNOWN_KEYS = 100
 
 
 class Table(BaseModel):
@@ -43,68 +43,72 @@ class Table(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True, defer_build=True)
 
-    what: ClassVar[str] = "the file"
+    subject: ClassVar[str] = "the file"
     """Name in messages of the thing that the table describes, such as "a study"."""
     hints: ClassVar[dict[str, str]] = {}
     """What to write for a missing key whose value is often not known; continues the sentence "give it"."""
 
     @model_validator(mode="wrap")
     @classmethod
-    def _in_words(cls, given: Any, made: Callable[[Any], Any]) -> Any:
+    def _word_faults(cls, value: Any, validate: Callable[[Any], Any]) -> Any:
         """Convert each fault to a sentence that begins with the key."""
-        if isinstance(given, Mapping) and len(given) > len(cls.model_fields) + _UNKNOWN:
+        if isinstance(value, Mapping) and len(value) > len(cls.model_fields) + _MAX_UNKNOWN_KEYS:
             # Otherwise each of possibly a million unknown keys would be reported.
-            unknown = itertools.islice((key for key in given if key not in cls.model_fields), _UNKNOWN)
-            given = {key: given[key] for key in [*(key for key in cls.model_fields if key in given), *unknown]}
+            unknown = itertools.islice((key for key in value if key not in cls.model_fields), _MAX_UNKNOWN_KEYS)
+            value = {key: value[key] for key in [*(key for key in cls.model_fields if key in value), *unknown]}
         try:
-            return made(cls._spelled(given) if isinstance(given, Mapping) else given)
+            return validate(cls._with_known_spelling(value) if isinstance(value, Mapping) else value)
         except ValidationError as error:
-            faults = [
-                InitErrorDetails(type=fault(cls._said(one)), loc=_steps(one), input=0)
-                for one in error.errors(include_url=False)
+            line_errors = [
+                InitErrorDetails(type=fault(cls._fault_message(details)), loc=_fault_path(details), input=0)
+                for details in error.errors(include_url=False)
             ]
-            raise ValidationError.from_exception_data(cls.what, faults) from None
+            raise ValidationError.from_exception_data(cls.subject, line_errors) from None
 
     @classmethod
-    def _spelled(cls, given: Mapping[Any, Any]) -> dict[Any, Any]:
-        """The table, with hyphens and underscores in words as in the words that a key may have."""
-        known = {key: one.annotation for key, one in cls.model_fields.items()}
-        return {key: spelled(value, _words(known[key])) if key in known else value for key, value in given.items()}
+    def _with_known_spelling(cls, table: Mapping[Any, Any]) -> dict[Any, Any]:
+        """Return the table; text values that differ from an allowed word only by hyphens and underscores are replaced
+        by that word."""
+        key_annotations = {key: field.annotation for key, field in cls.model_fields.items()}
+        return {
+            key: spelled(value, _allowed_words(key_annotations[key])) if key in key_annotations else value
+            for key, value in table.items()
+        }
 
     @classmethod
-    def _said(cls, one: Any) -> str:
-        given, context = one["input"], one.get("ctx", {})
-        match one["type"]:
+    def _fault_message(cls, details: Any) -> str:
+        value, context = details["input"], details.get("ctx", {})
+        match details["type"]:
             case "fault":
                 return context["said"]
             case "missing":
-                return f"is missing; give it{cls.hints.get(str(one['loc'][-1]), '')}."
+                return f"is missing; give it{cls.hints.get(str(details['loc'][-1]), '')}."
             case "extra_forbidden":
-                known = [*cls.model_fields]
-                meant = did_you_mean(str(one["loc"][-1])[:KEY], known)
-                return f"is no key of {cls.what}{meant}{ALL}{_few(known)}."
+                known_keys = [*cls.model_fields]
+                suggestion = did_you_mean(str(details["loc"][-1])[:KEY], known_keys)
+                return f"is no key of {cls.subject}{suggestion}{ALL}{_list_names(known_keys)}."
             case "literal_error":
-                return not_among(given, re.findall("'([^']+)'", context["expected"]))
-            case "bool_type" if not isinstance(given, list):
-                return f"must be true or false, without quotes; it is {describe(given)}."
+                return not_among(value, re.findall("'([^']+)'", context["expected"]))
+            case "bool_type" if not isinstance(value, list):
+                return f"must be true or false, without quotes; it is {describe(value)}."
             case "bool_type":
                 return "takes one value, not a list: true or false."
             case "string_type":
-                return f"must be text in quotes; it is {describe(given)}."
+                return f"must be text in quotes; it is {describe(value)}."
             case "string_too_short":
                 return "is empty text; write some."
             case "string_too_long":
-                return f"is text of {len(given)} characters; write {context['max_length']} or fewer."
+                return f"is text of {len(value)} characters; write {context['max_length']} or fewer."
             case "list_type":
-                return f"must be a list; it is {describe(given)}."
+                return f"must be a list; it is {describe(value)}."
             case "too_short":
                 return f"has {context['actual_length']} things in it; give {context['min_length']} at least."
             case "too_long":
                 return f"has more than the {context['max_length']} that it may."
             case "model_type":
-                return f"must be a table, with keys of its own; it is {describe(given)}."
+                return f"must be a table, with keys of its own; it is {describe(value)}."
             case kind:
-                return f"is {describe(given)}, which cannot be ({kind})."
+                return f"is {describe(value)}, which cannot be ({kind})."
 
 
 T = TypeVar("T", bound=Table)
@@ -115,25 +119,25 @@ Words = Annotated[list[Word], FailFast()]
 """A list of lines of text."""
 
 
-def spelled(given: Any, words: Iterable[str]) -> Any:
-    """The one of `words` that differs from `given` by hyphens and underscores alone, or `given`."""
-    if not isinstance(given, str):
-        return given
-    return next((word for word in words if word.replace("_", "-") == given.replace("_", "-")), given)
+def spelled(value: Any, words: Iterable[str]) -> Any:
+    """Return the word in `words` that differs from `value` by hyphens and underscores alone, or `value`."""
+    if not isinstance(value, str):
+        return value
+    return next((word for word in words if word.replace("_", "-") == value.replace("_", "-")), value)
 
 
-def _words(annotation: Any) -> list[str]:
+def _allowed_words(annotation: Any) -> list[str]:
     """Words that a key with this annotation may have."""
-    inner = get_args(annotation)
+    arguments = get_args(annotation)
     if get_origin(annotation) is Literal:
-        return [one for one in inner if isinstance(one, str)]
-    return [word for one in inner if get_origin(one) is Literal for word in _words(one)]
+        return [argument for argument in arguments if isinstance(argument, str)]
+    return [word for argument in arguments if get_origin(argument) is Literal for word in _allowed_words(argument)]
 
 
-def fault(said: str, key: str = "") -> PydanticCustomError:
-    """Error for checks of a table to raise: the message `said` about the `key` in the table, or about the table itself.
-    The name is put before the message."""
-    return PydanticCustomError("fault", "{said}", {"said": said, "key": key})
+def fault(message: str, key: str = "") -> PydanticCustomError:
+    """Error for checks of a table to raise: the message `message` about the `key` in the table, or about the table
+    itself. The name is put before the message."""
+    return PydanticCustomError("fault", "{said}", {"said": message, "key": key})
 
 
 @dataclass(frozen=True)
@@ -150,50 +154,50 @@ class Number:
     beyond: str = ""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        swept = get_origin(source) is list
-        whole = (get_args(source)[0] if swept else source) is int
+        is_swept = get_origin(source) is list
+        is_integer = (get_args(source)[0] if is_swept else source) is int
 
-        def read(given: Any) -> Any:
-            if swept:
-                return [self.read(one, whole, " or a list of them") for one in _swept_values(given)]
-            if isinstance(given, list):
+        def read(value: Any) -> Any:
+            if is_swept:
+                return [self.read(item, is_integer, " or a list of them") for item in _swept_values(value)]
+            if isinstance(value, list):
                 raise fault("takes one value, not a list.")
-            return self.read(given, whole)
+            return self.read(value, is_integer)
 
         return core_schema.no_info_plain_validator_function(read)
 
-    def read(self, given: Any, whole: bool = False, otherwise: str = "") -> float:
+    def read(self, value: Any, is_integer: bool = False, otherwise: str = "") -> float:
         """Check and convert a number. Raises `fault` for invalid values."""
-        if not _is_number(given, whole):
-            wanted = "a whole number" if whole else "a number"
-            raise fault(f"must be {wanted}{otherwise}, {self.span}; it is {describe(given)}.")
-        if given > _LARGEST and math.isinf(self.high):
-            raise fault(f"is {describe(given)}, beyond double precision.")
-        if not self.low <= given <= self.high:
-            shown = f"{given:g}" if isinstance(given, float) else describe(given)
-            hint = f" {self.beyond}" if self.beyond and given > self.high else "" if whole else self._hint(given)
-            raise fault(f"is {shown}, and must be {self.span}.{hint}")
-        return int(given) if whole else float(given)
+        if not _is_number(value, is_integer):
+            expected = "a whole number" if is_integer else "a number"
+            raise fault(f"must be {expected}{otherwise}, {self.span}; it is {describe(value)}.")
+        if value > _MAX_FLOAT and math.isinf(self.high):
+            raise fault(f"is {describe(value)}, beyond double precision.")
+        if not self.low <= value <= self.high:
+            value_text = f"{value:g}" if isinstance(value, float) else describe(value)
+            hint = f" {self.beyond}" if self.beyond and value > self.high else "" if is_integer else self._hint(value)
+            raise fault(f"is {value_text}, and must be {self.span}.{hint}")
+        return int(value) if is_integer else float(value)
 
     @property
     def span(self) -> str:
         """The range and the unit, as text."""
-        low = "above 0" if 0 < self.low < 1e-300 else f"from {_plain(self.low)}"
+        low = "above 0" if 0 < self.low < 1e-300 else f"from {_number_text(self.low)}"
         high = " up" if low[0] == "f" else ""
-        high = high if math.isinf(self.high) else f" to {_plain(self.high)}"
+        high = high if math.isinf(self.high) else f" to {_number_text(self.high)}"
         return f"{low}{high}{f' {self.unit}' if self.unit else ''}"
 
-    def _hint(self, given: float) -> str:
+    def _hint(self, value: float) -> str:
         """Propose a value for a number that is off by a factor of 1000; not for units without such prefixes."""
-        if self.unit in ("", "%", "degrees") or math.isinf(self.high) or abs(given) > 1e100:
+        if self.unit in ("", "%", "degrees") or math.isinf(self.high) or abs(value) > 1e100:
             return ""
-        for larger, metric in ((True, "metres"), (False, "micrometres")):
-            if not (self.low <= 1000 * given <= self.high if larger else self.low <= given / 1000 <= self.high):
+        for is_larger, metric in ((True, "metres"), (False, "micrometres")):
+            if not (self.low <= 1000 * value <= self.high if is_larger else self.low <= value / 1000 <= self.high):
                 continue
             if self.unit == "m":
-                return "" if larger else f" {given:g} mm are {given / 1000:g} m. {IN_MILLIMETRES.capitalize()}"
-            other = f"in {metric}" if self.unit == "mm" else "off by a factor of 1000"
-            return f" Is it {other}? Then write {1000 * given if larger else given / 1000:g}."
+                return "" if is_larger else f" {value:g} mm are {value / 1000:g} m. {IN_MILLIMETRES.capitalize()}"
+            suggestion = f"in {metric}" if self.unit == "mm" else "off by a factor of 1000"
+            return f" Is it {suggestion}? Then write {1000 * value if is_larger else value / 1000:g}."
         return ""
 
 
@@ -215,48 +219,54 @@ class Numbers:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_plain_validator_function(self._read)
 
-    def _read(self, given: Any) -> np.ndarray:
-        given = given.tolist() if isinstance(given, np.ndarray) else given
-        if self.single and not isinstance(given, (list, tuple)):
+    def _read(self, values: Any) -> np.ndarray:
+        values = values.tolist() if isinstance(values, np.ndarray) else values
+        if self.single and not isinstance(values, (list, tuple)):
             number = Number(self.low, self.high, self.unit)
-            return np.asarray(number.read(given, self.kind is int, f" or a list, {self._counts}"))
-        rows = self._counted(given, 0) if len(self.axes) == 2 else [given]
+            return np.asarray(number.read(values, self.kind is int, f" or a list, {self._expected_counts}"))
+        rows = self._check_length(values, 0) if len(self.axes) == 2 else [values]
         for row in rows:
-            if len(self._counted(row, -1)) != len(rows[0]):
-                raise fault(f"must be {self._wanted}; it has rows of {len(rows[0])} and of {len(row)}.")
-        wrong = next((item for row in rows for item in row if not self._right(item)), None)
-        if wrong is not None:
-            raise fault(f"must be {self._wanted}; it has {describe(wrong)} in it.")
-        return np.array(given, self.kind)
+            if len(self._check_length(row, -1)) != len(rows[0]):
+                raise fault(f"must be {self._expected}; it has rows of {len(rows[0])} and of {len(row)}.")
+        invalid_item = next((item for row in rows for item in row if not self._is_valid(item)), None)
+        if invalid_item is not None:
+            raise fault(f"must be {self._expected}; it has {describe(invalid_item)} in it.")
+        return np.array(values, self.kind)
 
-    def _counted(self, given: Any, axis: int) -> Any:
-        if not isinstance(given, (list, tuple)):
-            which = "it is" if axis == 0 or len(self.axes) == 1 else "a row is"
-            raise fault(f"must be {self._wanted}; {which} {describe(given)}.")
-        least, most = self.axes[axis]
-        if not least <= len(given) <= most:
+    def _check_length(self, values: Any, axis: int) -> Any:
+        if not isinstance(values, (list, tuple)):
+            subject = "it is" if axis == 0 or len(self.axes) == 1 else "a row is"
+            raise fault(f"must be {self._expected}; {subject} {describe(values)}.")
+        minimum, maximum = self.axes[axis]
+        if not minimum <= len(values) <= maximum:
             raise fault(
-                f"must be {self._wanted}; it has {len(given)}{' in a row' if axis and len(self.axes) == 2 else ''}."
+                f"must be {self._expected}; it has {len(values)}{' in a row' if axis and len(self.axes) == 2 else ''}."
             )
-        return given
+        return values
 
-    def _right(self, item: Any) -> bool:
+    def _is_valid(self, item: Any) -> bool:
         if self.kind is bool:
             return isinstance(item, bool)
-        return _is_number(item, self.kind is int) and max(self.low, -_LARGEST) <= item <= min(self.high, _LARGEST)
+        return _is_number(item, self.kind is int) and max(self.low, -_MAX_FLOAT) <= item <= min(self.high, _MAX_FLOAT)
 
     @property
-    def _counts(self) -> str:
+    def _expected_counts(self) -> str:
         return " × ".join(
-            str(least) if least == most else f"{least} or more" if math.isinf(most) else f"{least} to {most:g}"
-            for least, most in self.axes
+            str(minimum)
+            if minimum == maximum
+            else f"{minimum} or more"
+            if math.isinf(maximum)
+            else f"{minimum} to {maximum:g}"
+            for minimum, maximum in self.axes
         )
 
     @property
-    def _wanted(self) -> str:
+    def _expected(self) -> str:
         name = {float: "numbers", int: "whole numbers", bool: "true or false"}[self.kind]
         unbounded = math.isinf(self.low)
-        return f"{self._counts} {name}{'' if unbounded else f', {Number(self.low, self.high, self.unit).span}'}"
+        return (
+            f"{self._expected_counts} {name}{'' if unbounded else f', {Number(self.low, self.high, self.unit).span}'}"
+        )
 
 
 class Swept:
@@ -264,15 +274,17 @@ class Swept:
     one."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        def read(given: Any, inner: Callable[[list], list]) -> list:
-            if isinstance(given, list):
-                return inner(_swept_values(given))
+        def read(value: Any, validate: Callable[[list], list]) -> list:
+            if isinstance(value, list):
+                return validate(_swept_values(value))
             try:
-                return inner([given])
+                return validate([value])
             except ValidationError as error:
-                one = error.errors(include_url=False)[0]
-                alone = InitErrorDetails(type=one["type"], loc=one["loc"][1:], input=given, ctx=one.get("ctx", {}))
-            raise ValidationError.from_exception_data("", [alone])
+                first_fault = error.errors(include_url=False)[0]
+                line_error = InitErrorDetails(
+                    type=first_fault["type"], loc=first_fault["loc"][1:], input=value, ctx=first_fault.get("ctx", {})
+                )
+            raise ValidationError.from_exception_data("", [line_error])
 
         return core_schema.no_info_wrap_validator_function(read, handler(source))
 
@@ -293,100 +305,105 @@ class OneOf:
         self,
         key: str,
         *tables: type[Table],
-        mark: str = "",
-        other: type[Table] | None = None,
-        meant: Mapping[str, str] | None = None,
+        alternative_key: str = "",
+        alternative_table: type[Table] | None = None,
+        synonyms: Mapping[str, str] | None = None,
     ):
-        self.key, self.mark, self.other, self.meant = key, mark, other, meant or {}
-        self.tables = {word: one for one in tables for word in get_args(one.model_fields[key].annotation)}
-        self.usual = next((one for one in tables if not one.model_fields[key].is_required()), None)
+        self.key, self.synonyms = key, synonyms or {}
+        self.alternative_key, self.alternative_table = alternative_key, alternative_table
+        self.tables = {word: table for table in tables for word in get_args(table.model_fields[key].annotation)}
+        self.default_table = next((table for table in tables if not table.model_fields[key].is_required()), None)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_plain_validator_function(self._read)
 
-    def _read(self, given: Any) -> Table:
-        if not isinstance(given, Mapping):
-            raise fault(f"must be a table, with keys of its own; it is {describe(given)}.")
-        if self.other is not None and self.mark in given:
-            return self.other.model_validate(given)
-        if self.key not in given:
-            if self.usual is None:
-                end = f", or {self.mark}" if self.mark else ""
-                raise fault(f"is missing; give it, one of {_few(self.tables)}{end}.", self.key)
-            return self.usual.model_validate(given)
-        word = spelled(given[self.key], self.tables)
+    def _read(self, value: Any) -> Table:
+        if not isinstance(value, Mapping):
+            raise fault(f"must be a table, with keys of its own; it is {describe(value)}.")
+        if self.alternative_table is not None and self.alternative_key in value:
+            return self.alternative_table.model_validate(value)
+        if self.key not in value:
+            if self.default_table is None:
+                ending = f", or {self.alternative_key}" if self.alternative_key else ""
+                raise fault(f"is missing; give it, one of {_list_names(self.tables)}{ending}.", self.key)
+            return self.default_table.model_validate(value)
+        word = spelled(value[self.key], self.tables)
         if not (isinstance(word, str) and word in self.tables):
-            raise fault(not_among(word, self.tables, self._likely(word)), self.key)
-        return self.tables[word].model_validate({**given, self.key: word})
+            raise fault(not_among(word, self.tables, self._suggestion(word)), self.key)
+        return self.tables[word].model_validate({**value, self.key: word})
 
-    def _likely(self, word: Any) -> str:
+    def _suggestion(self, word: Any) -> str:
         """Text that proposes the valid word that is probably meant by `word`, with the sizes that it needs."""
-        meant = self.meant.get(word.lower().rstrip("s")) if isinstance(word, str) else None
-        if meant is None:
+        valid_word = self.synonyms.get(word.lower().rstrip("s")) if isinstance(word, str) else None
+        if valid_word is None:
             return ""
-        sizes = [name for name, one in self.tables[meant].model_fields.items() if one.is_required() and name in _SIZES]
-        return f" (did you mean {meant!r}, with {' and '.join(sizes)}?)"
+        sizes = [
+            name
+            for name, field in self.tables[valid_word].model_fields.items()
+            if field.is_required() and name in _SIZE_KEYS
+        ]
+        return f" (did you mean {valid_word!r}, with {' and '.join(sizes)}?)"
 
 
-def validated(table: type[T], given: Any, origin: str) -> T:
-    """Validate `given` and return the table. Raises one `ValueError` of at most 400 characters that begins with
+def validated(table: type[T], content: Any, origin: str) -> T:
+    """Validate `content` and return the table. Raises one `ValueError` of at most 400 characters that begins with
     `origin`, the file's name, and has a sentence on each faulty key, or on as many as there is room for."""
     try:
-        return table.model_validate(given)
+        return table.model_validate(content)
     except ValidationError as error:
         faults = error.errors(include_url=False, include_input=False)
-    keys = [_place(_steps(one)) for one in faults]
-    said = [f"{key}{one['msg']}" for key, one in zip(keys, faults, strict=True)]
-    raise ValueError(faults_message(origin, said, [key.strip() for key in keys]))
+    keys = [_full_key_name(_fault_path(details)) for details in faults]
+    sentences = [f"{key}{details['msg']}" for key, details in zip(keys, faults, strict=True)]
+    raise ValueError(faults_message(origin, sentences, [key.strip() for key in keys]))
 
 
-def not_among(given: Any, words: Iterable[str], likely: str = "") -> str:
-    """Message about a word that is not one of `words`; `likely`: text that proposes a word, if known."""
-    known = [*words]
-    meant = likely or did_you_mean(given[:KEY] if isinstance(given, str) else given, known)
-    return f"must be one of {_few(known)}; it is {describe(given)}{meant}."
+def not_among(value: Any, words: Iterable[str], suggestion_text: str = "") -> str:
+    """Message about a word that is not one of `words`; `suggestion_text`: text that proposes a word, if known."""
+    known_words = [*words]
+    suggestion = suggestion_text or did_you_mean(value[:KEY] if isinstance(value, str) else value, known_words)
+    return f"must be one of {_list_names(known_words)}; it is {describe(value)}{suggestion}."
 
 
-def _steps(one: Any) -> tuple[int | str, ...]:
+def _fault_path(error: Any) -> tuple[int | str, ...]:
     """Path of keys to a fault."""
-    key = one.get("ctx", {}).get("key")
-    return (*one["loc"], key) if key else one["loc"]
+    key = error.get("ctx", {}).get("key")
+    return (*error["loc"], key) if key else error["loc"]
 
 
-def _place(steps: tuple[int | str, ...]) -> str:
+def _full_key_name(path: tuple[int | str, ...]) -> str:
     """Full name of the key that a fault is about, such as microphones[3].b."""
-    said = ""
-    for step in steps:
-        said += f"[{step}]" if isinstance(step, int) else f"{'.' if said else ''}{_key(step)}"
-    return f"{said} " if said else ""
+    name = ""
+    for part in path:
+        name += f"[{part}]" if isinstance(part, int) else f"{'.' if name else ''}{_short_key(part)}"
+    return f"{name} " if name else ""
 
 
-def _key(name: str) -> str:
-    short = cut(name, KEY)
-    return short if re.fullmatch(r"[\w.-]+…?", short) else repr(short)
+def _short_key(name: str) -> str:
+    shortened = cut(name, KEY)
+    return shortened if re.fullmatch(r"[\w.-]+…?", shortened) else repr(shortened)
 
 
-def _swept_values(given: Any) -> list:
+def _swept_values(value: Any) -> list:
     """Values of a swept key as a list."""
-    if not isinstance(given, list):
-        return [given]
-    if not given:
+    if not isinstance(value, list):
+        return [value]
+    if not value:
         raise fault("is an empty list; give one value at least.")
-    plain = [one for one in given if isinstance(one, (str, Real))]
-    if len(set(plain)) < len(plain):
+    scalars = [item for item in value if isinstance(item, (str, Real))]
+    if len(set(scalars)) < len(scalars):
         raise fault("lists a value twice; give each once.")
-    return given
+    return value
 
 
-def _is_number(given: Any, whole: bool) -> bool:
-    if isinstance(given, bool) or not isinstance(given, Integral if whole else Real):
+def _is_number(value: Any, is_integer: bool) -> bool:
+    if isinstance(value, bool) or not isinstance(value, Integral if is_integer else Real):
         return False
-    return not isinstance(given, float) or math.isfinite(given)
+    return not isinstance(value, float) or math.isfinite(value)
 
 
-def _plain(number: float) -> str:
+def _number_text(number: float) -> str:
     return str(number) if isinstance(number, int) else f"{number:g}"
 
 
-def _few(names: Iterable[str]) -> str:
-    return cut(", ".join(names), _NAMES)
+def _list_names(names: Iterable[str]) -> str:
+    return cut(", ".join(names), _MAX_LIST_LENGTH)

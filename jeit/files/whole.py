@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 
-def boot() -> str:
+def boot_identifier() -> str:
     """Identifier of the current boot of the system, which containers share; "" if unknown."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
@@ -35,7 +35,7 @@ def is_alive(pid: object) -> bool:
     return True
 
 
-_UNFINISHED = re.compile(r"\.jeit-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.part")
+_UNFINISHED_NAME = re.compile(r"\.jeit-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.part")
 
 
 @contextmanager
@@ -47,15 +47,15 @@ def written_whole(path: str | Path) -> Iterator[BinaryIO]:
     """
     path = Path(path)
     clear_unfinished(path.parent)
-    other = path.parent / _unfinished()
+    temporary_path = path.parent / _unfinished_name()
     try:
-        with other.open("xb") as file:
+        with temporary_path.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        other.replace(path)
+        temporary_path.replace(path)
     finally:
-        other.unlink(missing_ok=True)
+        temporary_path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -65,32 +65,32 @@ def whole_files(folder: Path) -> Iterator[Path]:
     Links in `folder` with the same names are replaced, not followed. Raises `OSError` if the files cannot be written.
     """
     clear_unfinished(folder)
-    beside = folder / _unfinished()
-    beside.mkdir()
+    temporary_folder = folder / _unfinished_name()
+    temporary_folder.mkdir()
     try:
-        yield beside
-        for one in sorted(beside.iterdir()):
-            with one.open("rb") as file:
+        yield temporary_folder
+        for file_path in sorted(temporary_folder.iterdir()):
+            with file_path.open("rb") as file:
                 os.fsync(file.fileno())
-        for one in sorted(beside.iterdir()):
-            one.replace(folder / one.name)
+        for file_path in sorted(temporary_folder.iterdir()):
+            file_path.replace(folder / file_path.name)
     finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(temporary_folder, ignore_errors=True)
 
 
 def clear_unfinished(folder: Path) -> None:
     """Remove unfinished files that killed processes of this machine have left in a folder."""
     with suppress(OSError):
-        for one in folder.iterdir():
-            made = _UNFINISHED.fullmatch(one.name)
-            if made and made[1] == _machine() and not is_alive(int(made[2])):
-                shutil.rmtree(one, ignore_errors=True) if one.is_dir() and not one.is_symlink() else one.unlink()
+        for path in folder.iterdir():
+            match = _UNFINISHED_NAME.fullmatch(path.name)
+            if match and match[1] == _machine_hash() and not is_alive(int(match[2])):
+                shutil.rmtree(path, ignore_errors=True) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
-def _unfinished() -> str:
-    return f".jeit-{_machine()}-{os.getpid()}-{secrets.token_hex(4)}.part"
+def _unfinished_name() -> str:
+    return f".jeit-{_machine_hash()}-{os.getpid()}-{secrets.token_hex(4)}.part"
 
 
-def _machine() -> str:
+def _machine_hash() -> str:
     """Hash of the current boot of this machine, eight characters; processes of other machines cannot be checked."""
-    return f"{zlib.crc32(boot().encode()):08x}"
+    return f"{zlib.crc32(boot_identifier().encode()):08x}"

@@ -219,7 +219,7 @@ def _described_body(
             "what is said of it."
         )
     placements, entries = {**electrodes, "number": number}, {**electrodes, "number": number}
-    if format == "quadrupoles" and (places := quadrupoles.places(path)) is not None:
+    if format == "quadrupoles" and (places := quadrupoles.electrode_positions(path)) is not None:
         sizes = {key: value for key, value in electrodes.items() if key not in ("layout", "levels")}
         placements, entries = {**sizes, "positions": places.tolist()}, sizes
     tables = {"geometry": geometry, "electrodes": {"contact_impedance": 1.0, **placements}}
@@ -256,7 +256,9 @@ class _Numbers:
             table, axis = _array(path, key, excluded)
             shape = " × ".join(map(str, table.shape))
             sizes = tuple(sorted({*table.shape, table.size}, reverse=True))
-            return cls(path, lambda counts: frames_in_table(table, counts, _UNKNOWN_LAYOUT, usual=axis), shape, sizes)
+            return cls(
+                path, lambda counts: frames_in_table(table, counts, _UNKNOWN_LAYOUT, default_axis=axis), shape, sizes
+            )
         if key is not None:
             raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
         if openeit.recognises(path):

@@ -138,7 +138,7 @@ def _check_unit(centres: np.ndarray, diameters: np.ndarray, titles: list[str]) -
 def _read_lines(path: Path, length_columns: Sequence[str]) -> list[tuple[int, str]]:
     """Read the lines that are neither empty nor comments, with their numbers from 1."""
     try:
-        text = read_text(path, encoding="utf-8-sig", most=MOST_BYTES)
+        text = read_text(path, encoding="utf-8-sig", max_bytes=MOST_BYTES)
     except UnicodeError:
         raise ValueError("this is not a text file in UTF-8; in the spreadsheet, save it as 'CSV UTF-8'.") from None
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)]

@@ -55,32 +55,32 @@ def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.nda
 def bisect_with_parents(mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]]) -> tuple[Mesh, Int[np.ndarray, " m"]]:
     """Refine a mesh as `bisect` does. Also returns, for each cell of the new mesh, the index of the cell of the given
     mesh that contains it. Raises `ValueError` as `bisect` does."""
-    division = _SplitMesh.from_mesh(mesh)
-    parent = np.arange(len(division.cells))
-    wanted = _exceeds_size(division, slice(None), size)
-    while wanted.any():
-        points, cells = division.points, division.cells
-        near = _is_node_of(cells[wanted], len(points))
+    split_mesh = _SplitMesh.from_mesh(mesh)
+    parent = np.arange(len(split_mesh.cells))
+    exceeds_size = _exceeds_size(split_mesh, slice(None), size)
+    while exceeds_size.any():
+        points, cells = split_mesh.points, split_mesh.cells
+        is_near = _is_node_of(cells[exceeds_size], len(points))
         while True:
-            some = np.flatnonzero(near[cells].any(axis=1))
-            edges, number, rank = _edges(points, cells[some])
-            longest = _longest_edge_of_cell(number, rank)
-            marked = np.zeros(len(edges), bool)
-            marked[longest[wanted[some]]] = True
+            near_cells = np.flatnonzero(is_near[cells].any(axis=1))
+            edges, edge_indices, rank = _edges(points, cells[near_cells])
+            longest = _longest_edge_of_cell(edge_indices, rank)
+            is_marked = np.zeros(len(edges), bool)
+            is_marked[longest[exceeds_size[near_cells]]] = True
             # If a marked edge is not the longest edge of a cell, mark that cell's longest edge, which is split first.
-            while not marked[more := longest[marked[number].any(axis=1)]].all():
-                marked[more] = True
-            if near[edges[marked]].all():
+            while not is_marked[added_edges := longest[is_marked[edge_indices].any(axis=1)]].all():
+                is_marked[added_edges] = True
+            if is_near[edges[is_marked]].all():
                 break
-            near |= _is_node_of(edges[marked], len(points))
-        chosen = edges[marked & _is_longest_around(number, rank)]
-        if len(points) + len(chosen) > MOST_POINTS:
+            is_near |= _is_node_of(edges[is_marked], len(points))
+        split_edges = edges[is_marked & _is_longest_around(edge_indices, rank)]
+        if len(points) + len(split_edges) > MOST_POINTS:
             raise ValueError(f"size asks for more than {MOST_POINTS:,} nodes; give longer edges. Are they in metres?")
-        division, came = division.split(chosen, points[chosen].mean(axis=1))
-        parent = parent[came]
-        new, wanted = np.bincount(came)[came] > 1, wanted[came]
-        wanted[new] = _exceeds_size(division, new, size)
-    return division.mesh(mesh.tags), parent
+        split_mesh, origin = split_mesh.split(split_edges, points[split_edges].mean(axis=1))
+        parent = parent[origin]
+        is_new, exceeds_size = np.bincount(origin)[origin] > 1, exceeds_size[origin]
+        exceeds_size[is_new] = _exceeds_size(split_mesh, is_new, size)
+    return split_mesh.mesh(mesh.tags), parent
 
 
 def cut(mesh: Mesh, level: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray, " n"]]) -> Mesh:
@@ -104,19 +104,21 @@ def cut(mesh: Mesh, level: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray
     cut(mesh, circle).num_cells
     ```
     """
-    division, value = _move_nodes_onto(_SplitMesh.from_mesh(mesh), level)
+    split_mesh, levels = _move_nodes_onto(_SplitMesh.from_mesh(mesh), level)
     while True:
-        points, cells = division.points, division.cells
-        side = np.sign(value)[cells]
-        some = np.flatnonzero(side.min(axis=1) * side.max(axis=1) < 0)
-        if not len(some):
-            return division.mesh(mesh.tags)
-        some = np.flatnonzero(_is_node_of(cells[some], len(points))[cells].any(axis=1))
-        edges, number, rank = _edges(points, cells[some])
-        crossed = np.prod(np.sign(value)[edges], axis=1) < 0
-        chosen = edges[crossed & _is_longest_around(number, np.where(crossed, rank, -1))]
-        division, _ = division.split(chosen, _zero_on_edges(points[chosen], value[chosen[:, 0]], level))
-        value = np.append(value, np.zeros(len(chosen)))
+        points, cells = split_mesh.points, split_mesh.cells
+        side = np.sign(levels)[cells]
+        crossed_cells = np.flatnonzero(side.min(axis=1) * side.max(axis=1) < 0)
+        if not len(crossed_cells):
+            return split_mesh.mesh(mesh.tags)
+        crossed_cells = np.flatnonzero(_is_node_of(cells[crossed_cells], len(points))[cells].any(axis=1))
+        edges, edge_indices, rank = _edges(points, cells[crossed_cells])
+        is_crossed = np.prod(np.sign(levels)[edges], axis=1) < 0
+        split_edges = edges[is_crossed & _is_longest_around(edge_indices, np.where(is_crossed, rank, -1))]
+        split_mesh, _ = split_mesh.split(
+            split_edges, _zero_on_edges(points[split_edges], levels[split_edges[:, 0]], level)
+        )
+        levels = np.append(levels, np.zeros(len(split_edges)))
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,7 @@ class _SplitMesh:
     def from_mesh(cls, mesh: Mesh) -> _SplitMesh:
         """Copy the arrays of a mesh; no edge is split yet."""
         check_kind("mesh", mesh, Mesh, "a mesh, such as jeit.mesh.disk or jeit.mesh.read return")
-        points, cells, facets = (np.asarray(one) for one in (mesh.points, mesh.cells, mesh.facets))
+        points, cells, facets = (np.asarray(array) for array in (mesh.points, mesh.cells, mesh.facets))
         return cls(points, cells, facets, np.arange(len(facets)))
 
     def mesh(self, tags) -> Mesh:
@@ -148,50 +150,53 @@ class _SplitMesh:
     def split(self, edges: Int[np.ndarray, "e 2"], middles: Float[np.ndarray, "e s"]) -> tuple[_SplitMesh, np.ndarray]:
         """Split `edges`, of which no cell may have two, at their `middles`, metres. Returns the new division, and for
         each of its cells the index of the cell that contains it."""
-        node = len(self.points) + np.arange(len(edges))
-        cells, came = _split_simplices(self.cells, edges, node, len(self.points))
-        facets, side = _split_simplices(self.facets, edges, node, len(self.points))
-        return _SplitMesh(np.concatenate([self.points, middles]), cells, facets, self.side[side]), came
+        new_nodes = len(self.points) + np.arange(len(edges))
+        cells, origin = _split_simplices(self.cells, edges, new_nodes, len(self.points))
+        facets, side = _split_simplices(self.facets, edges, new_nodes, len(self.points))
+        return _SplitMesh(np.concatenate([self.points, middles]), cells, facets, self.side[side]), origin
 
 
-def _exceeds_size(division: _SplitMesh, selected_cells, size) -> Bool[np.ndarray, " m"]:
+def _exceeds_size(split_mesh: _SplitMesh, selected_cells, size) -> Bool[np.ndarray, " m"]:
     """Whether the longest edge of each cell exceeds the allowed length. Raises `ValueError` for invalid results of
     `size`."""
-    cells = division.cells[selected_cells]
-    most = np.asarray(size(division.points[cells]))
-    if most.shape != (len(cells),) or not (most > 0).all():
+    cells = split_mesh.cells[selected_cells]
+    max_lengths = np.asarray(size(split_mesh.points[cells]))
+    if max_lengths.shape != (len(cells),) or not (max_lengths > 0).all():
         raise ValueError(
             f"size must give one number per cell, metres, above zero (numpy.inf leaves it); of {len(cells)} cells it "
-            f"gave {describe(most)}."
+            f"gave {describe(max_lengths)}."
         )
-    return _longest_edge_lengths(division.points, cells) > most
+    return _longest_edge_lengths(split_mesh.points, cells) > max_lengths
 
 
-def _move_nodes_onto(division: _SplitMesh, level) -> tuple[_SplitMesh, Float[np.ndarray, " n"]]:
+def _move_nodes_onto(split_mesh: _SplitMesh, level) -> tuple[_SplitMesh, Float[np.ndarray, " n"]]:
     """Move nodes that are near the surface level = 0 onto it, along edges. Nodes of the boundary stay, and nodes whose
     movement would leave a cell with hardly any volume. Also returns the level at all nodes."""
-    points, cells = division.points, division.cells
-    value = np.asarray(level(points))
-    if value.shape != (len(points),) or not np.isfinite(value).all():
+    points, cells = split_mesh.points, split_mesh.cells
+    levels = np.asarray(level(points))
+    if levels.shape != (len(points),) or not np.isfinite(levels).all():
         raise ValueError(
-            f"level must give one finite number per point; of {len(points)} points it gave {describe(value)}."
+            f"level must give one finite number per point; of {len(points)} points it gave {describe(levels)}."
         )
-    side = np.sign(value)[cells]
+    side = np.sign(levels)[cells]
     edges, _, _ = _edges(points, cells[side.min(axis=1) * side.max(axis=1) < 0])
-    edges = edges[np.prod(np.sign(value)[edges], axis=1) < 0]
-    place = _zero_on_edges(points[edges], value[edges[:, 0]], level)
-    distance = np.linalg.norm(points[edges] - place[:, None], axis=2) / _edge_lengths(points[edges])[:, None]
-    ends, order = edges.ravel(), np.argsort(-distance.ravel())  # a node's nearest crossing is assigned last
-    nearest, target = np.full(len(points), np.inf), points.copy()
-    nearest[ends[order]], target[ends[order]] = distance.ravel()[order], np.repeat(place, 2, axis=0)[order]
-    moves = (nearest < _MAX_MOVE) & ~_is_node_of(division.facets, len(points))
-    before = _volumes(points, cells)
+    edges = edges[np.prod(np.sign(levels)[edges], axis=1) < 0]
+    crossings = _zero_on_edges(points[edges], levels[edges[:, 0]], level)
+    distance = np.linalg.norm(points[edges] - crossings[:, None], axis=2) / _edge_lengths(points[edges])[:, None]
+    end_nodes, order = edges.ravel(), np.argsort(-distance.ravel())  # a node's nearest crossing is assigned last
+    nearest_distance, target = np.full(len(points), np.inf), points.copy()
+    nearest_distance[end_nodes[order]], target[end_nodes[order]] = (
+        distance.ravel()[order],
+        np.repeat(crossings, 2, axis=0)[order],
+    )
+    is_moved = (nearest_distance < _MAX_MOVE) & ~_is_node_of(split_mesh.facets, len(points))
+    volumes_before = _volumes(points, cells)
     while True:
-        moved = np.where(moves[:, None], target, points)
-        crushed = _volumes(moved, cells) < _MIN_VOLUME_RATIO * before
-        if not crushed.any():
-            return replace(division, points=moved), np.where(moves, 0, value)
-        moves &= ~_is_node_of(cells[crushed], len(points))
+        moved_points = np.where(is_moved[:, None], target, points)
+        is_crushed = _volumes(moved_points, cells) < _MIN_VOLUME_RATIO * volumes_before
+        if not is_crushed.any():
+            return replace(split_mesh, points=moved_points), np.where(is_moved, 0, levels)
+        is_moved &= ~_is_node_of(cells[is_crushed], len(points))
 
 
 def _zero_on_edges(
@@ -200,12 +205,12 @@ def _zero_on_edges(
     """Locate the point on each edge where the level is zero, by bisection. `first_level` (e,): levels at the first
     ends; the level at the other ends has the opposite sign."""
     low, high = np.zeros((len(ends), 1)), np.ones((len(ends), 1))
-    start, along = ends[:, 0], ends[:, 1] - ends[:, 0]
+    start, direction = ends[:, 0], ends[:, 1] - ends[:, 0]
     for _ in range(_BISECTION_STEPS):
         middle = (low + high) / 2
-        same = (level(start + middle * along) * first_level > 0)[:, None]
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
-    return start + high * along
+        is_same_sign = (level(start + middle * direction) * first_level > 0)[:, None]
+        low, high = np.where(is_same_sign, middle, low), np.where(is_same_sign, high, middle)
+    return start + high * direction
 
 
 def _edges(points, simplices) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "m k"], Int[np.ndarray, " e"]]:
@@ -249,9 +254,9 @@ def _is_longest_around(edge_indices, rank) -> Bool[np.ndarray, " e"]:
 
 def _is_node_of(simplices, num_points: int) -> Bool[np.ndarray, " n"]:
     """Whether each node belongs to any of the simplices."""
-    there = np.zeros(num_points, bool)
-    there[simplices] = True
-    return there
+    is_node = np.zeros(num_points, bool)
+    is_node[simplices] = True
+    return is_node
 
 
 def _volumes(points, cells) -> Float[np.ndarray, " m"]:
@@ -263,20 +268,23 @@ def _volumes(points, cells) -> Float[np.ndarray, " m"]:
     return np.linalg.det(sides)
 
 
-def _split_simplices(simplices, edges, node, num_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Split each simplex that has one of the `edges` into two at the new `node`. Also returns the index of the original
-    simplex that contains each result."""
-    some = np.flatnonzero(_is_node_of(edges, num_points)[simplices].sum(axis=1) > 1)
-    key = edges @ [num_points, 1]
-    order = np.argsort(key)
-    ends = _edge_nodes(simplices[some])
-    own = ends @ [num_points, 1]
-    place = order[np.minimum(np.searchsorted(key[order], own), len(key) - 1)]
-    split = key[place] == own
-    has = split.any(axis=1)
-    some, which = some[has], np.argmax(split[has], axis=1)
-    rows = np.flatnonzero(has)
-    middle = node[place[rows, which]][:, None]
-    halves = [np.where(simplices[some] == end[:, None], middle, simplices[some]) for end in ends[rows, which].T]
-    whole = np.delete(np.arange(len(simplices)), some)
-    return np.concatenate([simplices[whole], *halves]), np.concatenate([whole, some, some])
+def _split_simplices(simplices, edges, new_nodes, num_points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Split each simplex that has one of the `edges` into two at the `new_nodes`. Also returns the index of the
+    original simplex that contains each result."""
+    candidates = np.flatnonzero(_is_node_of(edges, num_points)[simplices].sum(axis=1) > 1)
+    split_keys = edges @ [num_points, 1]
+    order = np.argsort(split_keys)
+    ends = _edge_nodes(simplices[candidates])
+    edge_keys = ends @ [num_points, 1]
+    edge_positions = order[np.minimum(np.searchsorted(split_keys[order], edge_keys), len(split_keys) - 1)]
+    is_split = split_keys[edge_positions] == edge_keys
+    has_split_edge = is_split.any(axis=1)
+    candidates, split_edge = candidates[has_split_edge], np.argmax(is_split[has_split_edge], axis=1)
+    rows = np.flatnonzero(has_split_edge)
+    middle_nodes = new_nodes[edge_positions[rows, split_edge]][:, None]
+    halves = [
+        np.where(simplices[candidates] == end[:, None], middle_nodes, simplices[candidates])
+        for end in ends[rows, split_edge].T
+    ]
+    unsplit = np.delete(np.arange(len(simplices)), candidates)
+    return np.concatenate([simplices[unsplit], *halves]), np.concatenate([unsplit, candidates, candidates])

@@ -80,13 +80,13 @@ def _triangle_measures(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     edges = np.roll(corners, -1, axis=1) - corners
     length = np.linalg.norm(edges, axis=2)
     if corners.shape[2] == 2:
-        doubled = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
+        doubled_areas = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
     else:
-        doubled = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    before = -np.roll(edges, 1, axis=1)
-    angle = np.degrees(np.arctan2(doubled[:, None], (edges * before).sum(axis=2))).min(axis=1)
+        doubled_areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    previous_edges = -np.roll(edges, 1, axis=1)
+    angle = np.degrees(np.arctan2(doubled_areas[:, None], (edges * previous_edges).sum(axis=2))).min(axis=1)
     # r = 2 A / (a + b + c) and R = a b c / (4 A).
-    return angle, 2 * (doubled / length.sum(axis=1)) * (2 * doubled / length.prod(axis=1))
+    return angle, 2 * (doubled_areas / length.sum(axis=1)) * (2 * doubled_areas / length.prod(axis=1))
 
 
 def _tetrahedron_measures(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -111,18 +111,18 @@ def merge_points(points: np.ndarray, cells: np.ndarray, tolerance: float) -> tup
 
     The first point of each group is kept. Cells of which two corners are merged are removed.
     """
-    close = KDTree(points).query_pairs(tolerance, output_type="ndarray")
-    graph = coo_array((np.ones(len(close)), close.T), shape=(len(points), len(points)))
+    close_pairs = KDTree(points).query_pairs(tolerance, output_type="ndarray")
+    graph = coo_array((np.ones(len(close_pairs)), close_pairs.T), shape=(len(points), len(points)))
     _, label = connected_components(graph, directed=False)
-    _, first, number = np.unique(label, return_index=True, return_inverse=True)
+    _, first_points, group_index = np.unique(label, return_index=True, return_inverse=True)
     # Number the groups in the order of their first points.
-    order = np.argsort(first)
-    place = np.empty(len(order), int)
-    place[order] = np.arange(len(order))
-    renumbered = place[number][cells]
+    order = np.argsort(first_points)
+    new_index = np.empty(len(order), int)
+    new_index[order] = np.arange(len(order))
+    renumbered = new_index[group_index][cells]
     ordered = np.sort(renumbered, axis=1)
-    whole = (ordered[:, 1:] != ordered[:, :-1]).all(axis=1)
-    return points[first[order]], renumbered[whole]
+    is_valid = (ordered[:, 1:] != ordered[:, :-1]).all(axis=1)
+    return points[first_points[order]], renumbered[is_valid]
 
 
 # Layout of a triangle in a binary .stl file: a normal, three corners, and two bytes of attributes.
@@ -143,39 +143,40 @@ def read_leniently(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     Polygons are divided into triangles that share the polygon's first corner; degenerate triangles are removed. Raises
     `ValueError` with the file's `name` if the file contains no valid triangles.
     """
-    ending = path.suffix.lower()
-    check_memory(name, _MEMORY_FACTORS[ending] * path.stat().st_size)
+    suffix = path.suffix.lower()
+    check_memory(name, _MEMORY_FACTORS[suffix] * path.stat().st_size)
     content = path.read_bytes()
     try:
-        points, cells = _parse_stl(content) if ending == ".stl" else _parse_obj(content)
+        points, cells = _parse_stl(content) if suffix == ".stl" else _parse_obj(content)
     except (ValueError, IndexError, OverflowError) as error:
-        said = " ".join(str(error).split())
-        said = said if len(said) <= _MAX_MESSAGE else f"{said[:_MAX_MESSAGE]} …"
-        raise ValueError(f"path: {name} does not work as a mesh file: {said}.") from None
+        message = " ".join(str(error).split())
+        message = message if len(message) <= _MAX_MESSAGE else f"{message[:_MAX_MESSAGE]} …"
+        raise ValueError(f"path: {name} does not work as a mesh file: {message}.") from None
     if not len(cells):
         raise ValueError(f"path: {name} does not work as a mesh file: there are no triangles in it.")
     if not np.isfinite(points[cells]).all():
         raise ValueError(f"path: {name} does not work as a mesh file: a coordinate is no finite number.")
-    used, number = np.unique(cells, return_inverse=True)
-    points, cells = points[used], number.reshape(cells.shape)
-    size, place = float(np.ptp(points, axis=0).max()), points[0].tolist()
+    used_points, new_index = np.unique(cells, return_inverse=True)
+    points, cells = points[used_points], new_index.reshape(cells.shape)
+    size, first_point = float(np.ptp(points, axis=0).max()), points[0].tolist()
     points, cells = merge_points(points, cells, _MERGE_TOLERANCE * float(np.abs(points).max()))
     if not len(cells):
         raise ValueError(
             f"path: {name} does not work as a mesh file: no triangle in it has an area. All that it holds lies within "
-            f"{size:.3g} of {place}. Were its digits lost? Write it again, in millimetres, and read it with scale=1e-3."
+            f"{size:.3g} of {first_point}. Were its digits lost? Write it again, in millimetres, and read it with "
+            "scale=1e-3."
         )
     return points, cells
 
 
 def _parse_stl(content: bytes) -> tuple[np.ndarray, np.ndarray]:
-    number = int.from_bytes(content[_STL_HEADER_BYTES - 4 : _STL_HEADER_BYTES], "little")
-    if len(content) == _STL_HEADER_BYTES + number * _STL_TRIANGLE.itemsize:
+    num_triangles = int.from_bytes(content[_STL_HEADER_BYTES - 4 : _STL_HEADER_BYTES], "little")
+    if len(content) == _STL_HEADER_BYTES + num_triangles * _STL_TRIANGLE.itemsize:
         corners = np.frombuffer(content, _STL_TRIANGLE, offset=_STL_HEADER_BYTES)["corners"].astype(float)
     elif content[:5].lower() != b"solid":
         raise ValueError("it is neither a text that begins with 'solid' nor as long as its number of triangles asks")
     else:
-        corners = np.array([[float(value) for value in found] for found in _VERTEX.findall(content)])
+        corners = np.array([[float(value) for value in coordinates] for coordinates in _VERTEX.findall(content)])
         if corners.size % 9:
             raise ValueError("a facet has not three vertices")
     points = corners.reshape(-1, 3)
@@ -200,10 +201,10 @@ def _parse_obj(content: bytes) -> tuple[np.ndarray, np.ndarray]:
     return np.array(points, float).reshape(-1, 3), array
 
 
-def _vertex_index(value: bytes, count: int) -> int:
+def _vertex_index(value: bytes, num_vertices: int) -> int:
     """Vertex index of a corner of a face, given as vertex/texture/normal; negative numbers count back from the last
     vertex."""
     number = int(value.split(b"/")[0])
-    if number == 0 or number < -count:
-        raise ValueError(f"a face names vertex {number}, and {count} came before it")
-    return number - 1 if number > 0 else count + number
+    if number == 0 or number < -num_vertices:
+        raise ValueError(f"a face names vertex {number}, and {num_vertices} came before it")
+    return number - 1 if number > 0 else num_vertices + number

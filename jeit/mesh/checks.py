@@ -33,11 +33,11 @@ def check_points(points: ArrayLike) -> np.ndarray:
     if array.ndim != 2 or array.shape[1] not in (2, 3):
         hint = " Transpose the array." if array.ndim == 2 and array.shape[0] in (2, 3) else ""
         raise ValueError(f"points: expected shape (n, 2) or (n, 3), got {array.shape}.{hint}")
-    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-    if bad.size:
+    invalid_nodes = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if invalid_nodes.size:
         raise ValueError(
-            f"points: {bad.size} node(s) hold NaN or infinity, first node {bad[0]}: {array[bad[0]].tolist()}. "
-            "Drop these nodes and the cells that use them."
+            f"points: {invalid_nodes.size} node(s) hold NaN or infinity, first node {invalid_nodes[0]}: "
+            f"{array[invalid_nodes[0]].tolist()}. Drop these nodes and the cells that use them."
         )
     if not len(array):
         raise ValueError("points: the array is empty; a mesh needs at least one cell.")
@@ -58,25 +58,27 @@ def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray
     array = array.astype(np.int64)
     if num_points > MOST_POINTS:
         raise ValueError(f"points: {num_points} nodes are more than the {MOST_POINTS} that jeit can index.")
-    low, high = int(array.min()), int(array.max())
-    if low < 0 or high >= num_points:
-        hint = " They look one-based: subtract 1." if low >= 1 and high == num_points else ""
+    lowest_index, highest_index = int(array.min()), int(array.max())
+    if lowest_index < 0 or highest_index >= num_points:
+        hint = " They look one-based: subtract 1." if lowest_index >= 1 and highest_index == num_points else ""
         raise ValueError(
-            f"cells: node indices run from {low} to {high}, but the mesh has nodes 0 to {num_points - 1}.{hint}"
+            f"cells: node indices run from {lowest_index} to {highest_index}, but the mesh has nodes 0 to "
+            f"{num_points - 1}.{hint}"
         )
     ordered = np.sort(array, axis=1)
-    repeated = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
-    if repeated.size:
+    repeated_cells = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
+    if repeated_cells.size:
         raise ValueError(
-            f"cells: cell {repeated[0]} uses a node twice: {array[repeated[0]].tolist()}. Remove such cells."
+            f"cells: cell {repeated_cells[0]} uses a node twice: {array[repeated_cells[0]].tolist()}. Remove such "
+            "cells."
         )
     order = np.lexsort(ordered.T[::-1])
-    twice = np.flatnonzero((ordered[order][1:] == ordered[order][:-1]).all(axis=1))
-    if twice.size:
-        pair = np.sort(order[twice[0] : twice[0] + 2]).tolist()
+    duplicates = np.flatnonzero((ordered[order][1:] == ordered[order][:-1]).all(axis=1))
+    if duplicates.size:
+        pair = np.sort(order[duplicates[0] : duplicates[0] + 2]).tolist()
         raise ValueError(
-            f"cells: {twice.size} cell(s) are duplicated, first cells {pair[0]} and {pair[1]} with nodes "
-            f"{ordered[order[twice[0]]].tolist()}. Keep one of each."
+            f"cells: {duplicates.size} cell(s) are duplicated, first cells {pair[0]} and {pair[1]} with nodes "
+            f"{ordered[order[duplicates[0]]].tolist()}. Keep one of each."
         )
     unused = np.setdiff1d(np.arange(num_points), array)
     if unused.size:
@@ -92,12 +94,12 @@ def check_coinciding(points: np.ndarray) -> None:
     if len(points) < 2:
         return
     distance, neighbour = map(np.asarray, KDTree(points).query(points, k=2))
-    close = np.flatnonzero(distance[:, 1] <= _COINCIDENT_DISTANCE * np.ptp(points, axis=0).max())
-    if close.size:
-        first = int(close[0])
-        other = int(neighbour[first, 1] if neighbour[first, 1] != first else neighbour[first, 0])
+    close_nodes = np.flatnonzero(distance[:, 1] <= _COINCIDENT_DISTANCE * np.ptp(points, axis=0).max())
+    if close_nodes.size:
+        first = int(close_nodes[0])
+        neighbour_index = int(neighbour[first, 1] if neighbour[first, 1] != first else neighbour[first, 0])
         raise ValueError(
-            f"points: {close.size} nodes coincide with another, first nodes {first} and {other} at "
+            f"points: {close_nodes.size} nodes coincide with another, first nodes {first} and {neighbour_index} at "
             f"{points[first].tolist()}. Merge them, or the mesh has an invisible crack there."
         )
 
@@ -117,27 +119,27 @@ def orient(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     dimension = cells.shape[1] - 1
     corners = points[cells]
     size = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    flat = np.flatnonzero(np.abs(measure) <= _MIN_MEASURE * size**dimension)
-    if flat.size:
+    flat_cells = np.flatnonzero(np.abs(measure) <= _MIN_MEASURE * size**dimension)
+    if flat_cells.size:
         name = "area" if dimension == 2 else "volume"
         raise ValueError(
-            f"cells: {flat.size} cell(s) have no {name}, first cell {flat[0]} with nodes {cells[flat[0]].tolist()}: "
-            "its nodes lie on one line or plane. Remove it or move a node."
+            f"cells: {flat_cells.size} cell(s) have no {name}, first cell {flat_cells[0]} with nodes "
+            f"{cells[flat_cells[0]].tolist()}: its nodes lie on one line or plane. Remove it or move a node."
         )
     swapped = cells.copy()
     swapped[:, [-2, -1]] = cells[:, [-1, -2]]
     return np.where((measure > 0)[:, None], cells, swapped)
 
 
-def check_connected(first: np.ndarray, second: np.ndarray, count: int) -> None:
-    """Raise `ValueError` if the `count` cells are not connected; `first` and `second` list the pairs that share a
+def check_connected(first: np.ndarray, second: np.ndarray, num_cells: int) -> None:
+    """Raise `ValueError` if the `num_cells` cells are not connected; `first` and `second` list the pairs that share a
     facet."""
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
-    parts, label = connected_components(graph, directed=False)
-    if parts > 1:
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(num_cells, num_cells))
+    num_parts, label = connected_components(graph, directed=False)
+    if num_parts > 1:
         sizes = np.bincount(label)
         raise ValueError(
-            f"cells: the mesh falls into {parts} separate parts of {np.sort(sizes)[::-1][:5].tolist()} cells. "
+            f"cells: the mesh falls into {num_parts} separate parts of {np.sort(sizes)[::-1][:5].tolist()} cells. "
             "No current flows between them: keep one part, or merge the nodes along their common boundary."
         )
 
@@ -169,18 +171,18 @@ def locate_tags(tags: Mapping[str, ArrayLike], facets: np.ndarray) -> dict[str, 
 
 
 def _match_facets(name: str, nodes: np.ndarray, facets: np.ndarray) -> np.ndarray:
-    count = int(max(facets.max(), nodes.max())) + 1
-    keys = topology.facet_keys(facets, count)
+    num_nodes = int(max(facets.max(), nodes.max())) + 1
+    keys = topology.facet_keys(facets, num_nodes)
     order = np.argsort(keys)
-    wanted = topology.facet_keys(nodes, count)
-    place = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
-    missing = np.flatnonzero((keys[order][place] != wanted) | (nodes.min(axis=1) < 0))
-    if missing.size:
+    tag_keys = topology.facet_keys(nodes, num_nodes)
+    facet_positions = np.minimum(np.searchsorted(keys[order], tag_keys), len(keys) - 1)
+    missing_facets = np.flatnonzero((keys[order][facet_positions] != tag_keys) | (nodes.min(axis=1) < 0))
+    if missing_facets.size:
         raise ValueError(
-            f"tags: {name!r} names the facet with nodes {nodes[missing[0]].tolist()}, which is not on the boundary "
-            "of the mesh. Tags group boundary facets only."
+            f"tags: {name!r} names the facet with nodes {nodes[missing_facets[0]].tolist()}, which is not on the "
+            "boundary of the mesh. Tags group boundary facets only."
         )
-    return order[place]
+    return order[facet_positions]
 
 
 LARGE = 10.0
@@ -192,26 +194,28 @@ _SIZE_CHECKED: ContextVar[bool] = ContextVar("size_checked", default=False)
 def size_checked() -> Iterator[None]:
     """Context manager or decorator that suppresses warnings about large sizes, for meshes made from a body or another
     mesh whose size has been checked before."""
-    before = _SIZE_CHECKED.set(True)
+    token = _SIZE_CHECKED.set(True)
     try:
         yield
     finally:
-        _SIZE_CHECKED.reset(before)
+        _SIZE_CHECKED.reset(token)
 
 
-def warn_large(extent: float, name: str, across: float = 1.0, *, of_file: bool = False) -> None:
+def warn_large(extent: float, name: str, size_factor: float = 1.0, *, of_file: bool = False) -> None:
     """Warn if a length of `extent` metres is probably in another unit, because the object is too large.
 
-    `across`: size of the object divided by this length; `of_file`: whether the length may come from a file, for which
-    the message suggests a scale. Inside `size_checked` there is no warning.
+    `size_factor`: size of the object divided by this length; `of_file`: whether the length may come from a file, for
+    which the message suggests a scale. Inside `size_checked` there is no warning.
     """
-    if not across * extent > LARGE or _SIZE_CHECKED.get():
+    if not size_factor * extent > LARGE or _SIZE_CHECKED.get():
         return
-    scale = [f" (a file is read with scale={one})" if of_file else "" for one in ("1e-3", "1e-2", "0.0254")]
+    scale_hints = [
+        f" (a file is read with scale={unit_scale})" if of_file else "" for unit_scale in ("1e-3", "1e-2", "0.0254")
+    ]
     warnings.warn(
         f"{name}: {extent:g} m is large for what electrodes are put on. If the lengths are millimetres, give "
-        f"{1e-3 * extent:g}{scale[0]}, if centimetres, {1e-2 * extent:g}{scale[1]}, if inches, "
-        f"{0.0254 * extent:g}{scale[2]}: jeit computes in metres.",
+        f"{1e-3 * extent:g}{scale_hints[0]}, if centimetres, {1e-2 * extent:g}{scale_hints[1]}, if inches, "
+        f"{0.0254 * extent:g}{scale_hints[2]}: jeit computes in metres.",
         UserWarning,
         stacklevel=4,
     )

@@ -61,7 +61,7 @@ _LONG_INTEGER = re.compile(rb"(?<![\w.+-])\d{8,}(?![\d.eE])")
 _MSH_NODE = np.dtype([("number", "<i4"), ("place", "<f8", 3)])
 # Maximum accepted node number: meshio allocates an array as long as the largest node number.
 _MAX_NODE_NUMBER = 10**7
-_reading = threading.Lock()
+_reading_lock = threading.Lock()
 
 
 def check_foreign(path: Path) -> str:
@@ -99,32 +99,32 @@ def _check_numbers(path: Path) -> None:
             f"path: {path.name[:80]} is a binary file of Gmsh's format {version[:8].decode('ascii', 'replace')}; save "
             "it as text, or in version 2.2."
         )
-    numbers = [int(found[2][:20]) for found in _MSH_COUNTS.finditer(content)]
+    numbers = [int(match[2][:20]) for match in _MSH_COUNTS.finditer(content)]
     if binary == b"1":
-        for found in _MSH_COUNTS.finditer(content):
-            count = min(int(found[2][:20]), (len(content) - found.end()) // _MSH_NODE.itemsize)
-            if found[1] == b"Nodes" and count:
-                numbers.append(int(np.frombuffer(content, _MSH_NODE, count, found.end())["number"].max()))
+        for match in _MSH_COUNTS.finditer(content):
+            count = min(int(match[2][:20]), (len(content) - match.end()) // _MSH_NODE.itemsize)
+            if match[1] == b"Nodes" and count:
+                numbers.append(int(np.frombuffer(content, _MSH_NODE, count, match.end())["number"].max()))
     else:
-        numbers += [int(found[0][:20]) for found in _LONG_INTEGER.finditer(content)]
-    most = max(_MAX_NODE_NUMBER, len(content))
-    if max(numbers, default=0) > most:
+        numbers += [int(match[0][:20]) for match in _LONG_INTEGER.finditer(content)]
+    max_number = max(_MAX_NODE_NUMBER, len(content))
+    if max(numbers, default=0) > max_number:
         raise ValueError(
             f"path: {path.name[:80]} does not work as a mesh file: it counts to {max(numbers)}, and a file of its size "
-            f"has {most} nodes and cells at most."
+            f"has {max_number} nodes and cells at most."
         )
 
 
 def _check_counts(path: Path) -> None:
     """Raise `ValueError` for a VTK file that declares more points or cells than a file of its size can contain."""
     content = path.read_bytes()
-    for found in _VTK_COUNTS.finditer(content):
-        counts = [int(one[:20]) for one in found[2].split()]
-        number = math.prod(counts) if found[1].upper() == b"DIMENSIONS" else max(counts)
-        if number > max(len(content), 1000):
+    for match in _VTK_COUNTS.finditer(content):
+        counts = [int(digits[:20]) for digits in match[2].split()]
+        num_items = math.prod(counts) if match[1].upper() == b"DIMENSIONS" else max(counts)
+        if num_items > max(len(content), 1000):
             raise ValueError(
-                f"path: {path.name[:80]} does not work as a mesh file: it counts to {number} in {found[1].decode()}, "
-                f"and has {len(content)} bytes; grids with implicit ends are not read."
+                f"path: {path.name[:80]} does not work as a mesh file: it counts to {num_items} in "
+                f"{match[1].decode()}, and has {len(content)} bytes; grids with implicit ends are not read."
             )
 
 
@@ -136,13 +136,13 @@ def _check_prologue(path: Path) -> None:
     """Raise `ValueError` for an XML file with a document type, which can declare entities."""
     parser = expat.ParserCreate()
 
-    def declared(*_: Any) -> None:
+    def reject_doctype(*_: Any) -> None:
         raise ValueError(f"path: {path.name[:80]} has a document type (<!DOCTYPE), which mesh files have no use for.")
 
-    def begun(*_: Any) -> None:
+    def stop_parsing(*_: Any) -> None:
         raise _FirstElement
 
-    parser.StartDoctypeDeclHandler, parser.StartElementHandler = declared, begun
+    parser.StartDoctypeDeclHandler, parser.StartElementHandler = reject_doctype, stop_parsing
     try:
         with path.open("rb") as file:
             parser.ParseFile(file)
@@ -173,28 +173,30 @@ def bounded_inflation(path: Path) -> Iterator[None]:
     """Context in which meshio raises `ValueError` if the decompressed data of a VTU file exceed the memory limit."""
     from meshio.vtu import _vtu  # takes a tenth of a second
 
-    own, left = _vtu.__dict__, most_bytes()
-    starts: dict[str, Callable[[], Any]] = {"zlib": zlib.decompressobj, "lzma": lzma.LZMADecompressor}
-    modules = {name: own[name] for name in starts if name in own}
+    vtu_names, num_bytes_left = _vtu.__dict__, most_bytes()
+    decompressors: dict[str, Callable[[], Any]] = {"zlib": zlib.decompressobj, "lzma": lzma.LZMADecompressor}
+    modules = {name: vtu_names[name] for name in decompressors if name in vtu_names}
 
-    def bounded(start: Callable[[], Any]) -> Callable[[bytes], bytes]:
+    def bounded_decompress(create_decompressor: Callable[[], Any]) -> Callable[[bytes], bytes]:
         def decompress(data: bytes) -> bytes:
-            nonlocal left
-            out = start().decompress(data, int(left) + 1)
-            left -= len(out)
-            if left < 0:
+            nonlocal num_bytes_left
+            content = create_decompressor().decompress(data, int(num_bytes_left) + 1)
+            num_bytes_left -= len(content)
+            if num_bytes_left < 0:
                 check_memory(f"{path.name[:80]}, unpacked,", most_bytes() + 1)
-            return out
+            return content
 
         return decompress
 
-    with _reading:
+    with _reading_lock:
         try:
             for name, module in modules.items():
-                own[name] = types.SimpleNamespace(**{**vars(module), "decompress": bounded(starts[name])})
+                vtu_names[name] = types.SimpleNamespace(
+                    **{**vars(module), "decompress": bounded_decompress(decompressors[name])}
+                )
             yield
         finally:
-            own.update(modules)
+            vtu_names.update(modules)
 
 
 _CELL_TYPES = {2: "triangle", 3: "tetra"}
@@ -248,7 +250,7 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
     try:
         return _from_meshio(content, float(scale), path.name[:80])
     except _READ_ERRORS as error:
-        raise ValueError(f"path: {path.name[:80]} holds no mesh ({_short(error)}).") from None
+        raise ValueError(f"path: {path.name[:80]} holds no mesh ({_shorten_message(error)}).") from None
 
 
 def write(
@@ -299,8 +301,8 @@ def write(
         options = {"file_format": "gmsh22"}
         physical = [np.full(mesh.num_cells, 1)]
         field_data["domain"] = np.array([1, mesh.dimension])
-        for number, (tag, index) in enumerate(sorted(mesh.tags.items()), start=2):
-            facets = np.asarray(mesh.facets)[np.asarray(index)]
+        for number, (tag, facet_indices) in enumerate(sorted(mesh.tags.items()), start=2):
+            facets = np.asarray(mesh.facets)[np.asarray(facet_indices)]
             blocks.append((_FACET_TYPES[mesh.dimension], facets))
             physical.append(np.full(len(facets), number))
             field_data[tag] = np.array([number, mesh.dimension - 1])
@@ -316,8 +318,10 @@ def write(
 def _check_data(argument: str, name: str, value: ArrayLike, length: int) -> np.ndarray:
     array = np.asarray(value)
     if array.ndim < 1 or len(array) != length:
-        what = "cell" if argument == "cell_data" else "node"
-        raise ValueError(f"{argument}: {name!r} needs one value per {what}, {length} in all, got shape {array.shape}.")
+        entity = "cell" if argument == "cell_data" else "node"
+        raise ValueError(
+            f"{argument}: {name!r} needs one value per {entity}, {length} in all, got shape {array.shape}."
+        )
     if np.iscomplexobj(array):
         raise ValueError(f"{argument}: {name!r} is complex, which mesh files cannot hold. Write its parts separately.")
     return array
@@ -328,58 +332,66 @@ def _call_meshio(path: Path, action: Any, *, writing: bool = False) -> Any:
     interpreter."""
     import meshio  # takes a tenth of a second
 
-    said = io.StringIO()
+    output = io.StringIO()
     try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
             return action(meshio)
     except OSError:
         raise
     except (Exception, SystemExit) as error:
         if "GB in memory" in str(error):
             raise
-        own = isinstance(error, meshio.ReadError | meshio.WriteError | SystemExit)
-        words = _short((said.getvalue().strip() or str(error)).replace(f"{path.parent}{os.sep}", "")) if own else ""
-        fault = words if writing and words else "its content does not fit its format, or is cut off"
-        says = f", which says: {words}" if words and not writing else ""
+        is_meshio_error = isinstance(error, meshio.ReadError | meshio.WriteError | SystemExit)
+        message = (
+            _shorten_message((output.getvalue().strip() or str(error)).replace(f"{path.parent}{os.sep}", ""))
+            if is_meshio_error
+            else ""
+        )
+        fault = message if writing and message else "its content does not fit its format, or is cut off"
+        explanation = f", which says: {message}" if message and not writing else ""
         raise ValueError(
             f"path: {path.name[:80]} does not work as a mesh file: {fault}. The ending of the name gives the format: "
-            f".vtu, .vtk, .msh, .inp and others that meshio knows{says}."
+            f".vtu, .vtk, .msh, .inp and others that meshio knows{explanation}."
         ) from None
 
 
-def _short(error: BaseException | str) -> str:
+def _shorten_message(error: BaseException | str) -> str:
     """Shorten a message to one line."""
-    said = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-    return said if len(said) <= _MAX_MESSAGE else f"{said[: _MAX_MESSAGE - 1]}…"
+    message = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+    return message if len(message) <= _MAX_MESSAGE else f"{message[: _MAX_MESSAGE - 1]}…"
 
 
 def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
-    kinds = {block.type for block in content.cells}
-    dimension = 3 if "tetra" in kinds else 2
-    if not kinds:
+    cell_types = {block.type for block in content.cells}
+    dimension = 3 if "tetra" in cell_types else 2
+    if not cell_types:
         raise ValueError(f"path: {source} does not work as a mesh file: there are no cells in it.")
-    if _CELL_TYPES[dimension] not in kinds:
+    if _CELL_TYPES[dimension] not in cell_types:
         raise ValueError(
-            f"path: {source} holds cells of type {sorted(kinds)}, but jeit needs linear triangles or tetrahedra. "
+            f"path: {source} holds cells of type {sorted(cell_types)}, but jeit needs linear triangles or tetrahedra. "
             "Save it with elements of order 1 and without quadrilaterals or hexahedra."
         )
-    if mixed := kinds & ({"quad"} if dimension == 2 else {"hexahedron", "wedge", "pyramid"}):
-        raise ValueError(f"path: {source} mixes in cells of type {sorted(mixed)}. Split them into simplices first.")
+    if other_types := cell_types & ({"quad"} if dimension == 2 else {"hexahedron", "wedge", "pyramid"}):
+        raise ValueError(
+            f"path: {source} mixes in cells of type {sorted(other_types)}. Split them into simplices first."
+        )
     points = np.asarray(content.points, dtype=float) * scale
     cells = np.concatenate([block.data for block in content.cells if block.type == _CELL_TYPES[dimension]])
-    used, inverse = np.unique(cells, return_inverse=True)
+    used_points, inverse = np.unique(cells, return_inverse=True)
     cells = inverse.reshape(cells.shape)
-    points = points[used]
-    number = np.full(len(content.points), -1)
-    number[used] = np.arange(len(used))
+    points = points[used_points]
+    new_index = np.full(len(content.points), -1)
+    new_index[used_points] = np.arange(len(used_points))
     # The cells are not yet oriented, so boundary facets are found as the facets that occur once.
-    keys, occurrences = np.unique(topology.facet_keys(topology.cell_facets(cells), len(used)), return_counts=True)
+    keys, occurrences = np.unique(
+        topology.facet_keys(topology.cell_facets(cells), len(used_points)), return_counts=True
+    )
     boundary = keys[occurrences == 1]
     tags = {}
     for name, facets in _facet_groups(content, _FACET_TYPES[dimension]).items():
-        nodes = number[facets]
+        nodes = new_index[facets]
         nodes = nodes[(nodes >= 0).all(axis=1)]
-        nodes = nodes[np.isin(topology.facet_keys(nodes, len(used)), boundary)]
+        nodes = nodes[np.isin(topology.facet_keys(nodes, len(used_points)), boundary)]
         if len(nodes):
             tags[name] = nodes
     return _create_mesh(points, cells, tags)
@@ -394,20 +406,20 @@ def _create_mesh(points: np.ndarray, cells: np.ndarray, tags: Mapping[str, Array
 
 def _facet_groups(content: meshio.Mesh, facet_type: str) -> dict[str, np.ndarray]:
     """Facets (t, d) of each named group in the file."""
-    found: dict[str, list[np.ndarray]] = {}
-    order = 2 if facet_type == "triangle" else 1
-    names = {int(value[0]): name for name, value in content.field_data.items() if int(value[1]) == order}
+    groups: dict[str, list[np.ndarray]] = {}
+    facet_dimension = 2 if facet_type == "triangle" else 1
+    names = {int(value[0]): name for name, value in content.field_data.items() if int(value[1]) == facet_dimension}
     physical = content.cell_data.get("gmsh:physical", [])
-    for block, numbers in zip(content.cells, physical, strict=False):
+    for block, group_numbers in zip(content.cells, physical, strict=False):
         if block.type != facet_type:
             continue
-        for value in np.unique(numbers):
+        for value in np.unique(group_numbers):
             if value > 0:
                 name = names.get(int(value), f"physical_{value}")
-                found.setdefault(name, []).append(block.data[np.asarray(numbers) == value])
-    if not found:
+                groups.setdefault(name, []).append(block.data[np.asarray(group_numbers) == value])
+    if not groups:
         for name, members in content.cell_sets.items():
-            for block, chosen in zip(content.cells, members, strict=False):
-                if block.type == facet_type and np.size(chosen) and not name.startswith("gmsh:"):
-                    found.setdefault(name, []).append(block.data[np.asarray(chosen)])
-    return {name: np.concatenate(facets) for name, facets in found.items()}
+            for block, set_members in zip(content.cells, members, strict=False):
+                if block.type == facet_type and np.size(set_members) and not name.startswith("gmsh:"):
+                    groups.setdefault(name, []).append(block.data[np.asarray(set_members)])
+    return {name: np.concatenate(facets) for name, facets in groups.items()}

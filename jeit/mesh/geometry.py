@@ -87,20 +87,20 @@ def gradients(mesh: Mesh) -> Float[Array, "m k s"]:
         a, b = edges[:, 0], edges[:, 1]
         normal = xp.cross(a, b)
         determinant = xp.sum(normal**2, axis=-1)[:, None]
-        others = xp.stack([xp.cross(b, normal), xp.cross(normal, a)], axis=1)
+        later_gradients = xp.stack([xp.cross(b, normal), xp.cross(normal, a)], axis=1)
     elif mesh.dimension == 2:
         a, b = edges[:, 0], edges[:, 1]
         determinant = _cross(a, b)[:, None]
-        others = xp.stack([xp.stack([b[:, 1], -b[:, 0]], -1), xp.stack([-a[:, 1], a[:, 0]], -1)], axis=1)
+        later_gradients = xp.stack([xp.stack([b[:, 1], -b[:, 0]], -1), xp.stack([-a[:, 1], a[:, 0]], -1)], axis=1)
     else:
         a, b, c = edges[:, 0], edges[:, 1], edges[:, 2]
         normal = xp.cross(b, c)
         determinant = xp.sum(a * normal, axis=-1)[:, None]
-        others = xp.stack([normal, xp.cross(c, a), xp.cross(a, b)], axis=1)
-    others = others / determinant[:, :, None]
+        later_gradients = xp.stack([normal, xp.cross(c, a), xp.cross(a, b)], axis=1)
+    later_gradients = later_gradients / determinant[:, :, None]
     # Explicit sum, because XLA converts a sum over such a short axis into a slow matrix product.
-    first = -functools.reduce(operator.add, [others[:, k] for k in range(mesh.dimension)])
-    return xp.concatenate([first[:, None], others], axis=1)
+    first_gradient = -functools.reduce(operator.add, [later_gradients[:, k] for k in range(mesh.dimension)])
+    return xp.concatenate([first_gradient[:, None], later_gradients], axis=1)
 
 
 @either_engine
@@ -174,12 +174,12 @@ def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
     if mesh.dimension != 2:
         raise ValueError("mesh: arc length is defined on the boundary of 2-D meshes only, this one is 3-D.")
     xp = namespace(mesh)
-    first = xp.concatenate([xp.ones(1, bool), mesh.facets[1:, 0] != mesh.facets[:-1, 1]])
+    is_loop_start = xp.concatenate([xp.ones(1, bool), mesh.facets[1:, 0] != mesh.facets[:-1, 1]])
     # Sums over all pairs of facets, because XLA converts a cumulative sum into dozens of small operations.
     order = np.arange(mesh.num_facets)
-    loop = xp.sum((order <= order[:, None]) & first, axis=1)
-    earlier = (order < order[:, None]) & (loop == loop[:, None])
-    return loop, xp.sum(xp.where(earlier, facet_measures(mesh), 0), axis=1)
+    loop = xp.sum((order <= order[:, None]) & is_loop_start, axis=1)
+    is_earlier = (order < order[:, None]) & (loop == loop[:, None])
+    return loop, xp.sum(xp.where(is_earlier, facet_measures(mesh), 0), axis=1)
 
 
 def interior_facets(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:

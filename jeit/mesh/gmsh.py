@@ -70,10 +70,10 @@ def from_gmsh(
         raise ValueError(
             "source: Gmsh has no current model. Build one with the gmsh module, or give a file or outline."
         )
-    own = not gmsh.isInitialized()
-    if own:
+    owns_session = not gmsh.isInitialized()
+    if owns_session:
         gmsh.initialize(interruptible=False)
-    quiet = gmsh.option.getNumber("General.Terminal")
+    terminal_setting = gmsh.option.getNumber("General.Terminal")
     gmsh.option.setNumber("General.Terminal", 0)
     name = str(source)
     try:
@@ -87,8 +87,8 @@ def from_gmsh(
             _mesh_with_gmsh(gmsh, source, cell_size, dimension, path, name)
             return read(path, scale=scale)
     finally:
-        gmsh.option.setNumber("General.Terminal", quiet)
-        if own:
+        gmsh.option.setNumber("General.Terminal", terminal_setting)
+        if owns_session:
             gmsh.finalize()
 
 
@@ -112,20 +112,20 @@ def _mesh_with_gmsh(
         dimension = dimension or max(gmsh.model.getDimension(), 2)
         gmsh.model.mesh.generate(dimension)
         # If there is any physical group, Gmsh omits all cells that are in none.
-        grouped = {
+        grouped_entities = {
             entity
             for group in gmsh.model.getPhysicalGroups(dimension)
             for entity in gmsh.model.getEntitiesForPhysicalGroup(*group)
         }
-        rest = [entity for _, entity in gmsh.model.getEntities(dimension) if entity not in grouped]
-        added = [(dimension, gmsh.model.addPhysicalGroup(dimension, rest))] if rest else []
+        ungrouped = [entity for _, entity in gmsh.model.getEntities(dimension) if entity not in grouped_entities]
+        added_groups = [(dimension, gmsh.model.addPhysicalGroup(dimension, ungrouped))] if ungrouped else []
         gmsh.option.setNumber("Mesh.MshFileVersion", 2.2)
         gmsh.write(str(path))
-        if added:
-            gmsh.model.removePhysicalGroups(added)
+        if added_groups:
+            gmsh.model.removePhysicalGroups(added_groups)
     except Exception as error:
-        said = str(error).replace(str(source), name[:40]).rstrip(".")[:80]
-        raise ValueError(f"source: Gmsh could not mesh the geometry: {said}.") from error
+        message = str(error).replace(str(source), name[:40]).rstrip(".")[:80]
+        raise ValueError(f"source: Gmsh could not mesh the geometry: {message}.") from error
 
 
 class _GmshPen:

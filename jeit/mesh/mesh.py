@@ -121,9 +121,9 @@ class Mesh(Module):
             from jeit.mesh import _surface
 
             indices = _surface.orient_surface(indices, coordinates)
-        first, second, single = topology.pair_facets(indices)
+        first, second, single_facets = topology.pair_facets(indices)
         checks.check_connected(first // (dimension + 1), second // (dimension + 1), len(indices))
-        facets = topology.cell_facets(indices)[single]
+        facets = topology.cell_facets(indices)[single_facets]
         if dimension == 2:
             facets = topology.order_loops(facets, coordinates) if len(facets) else facets
         located = checks.locate_tags(tags or {}, facets)

@@ -35,15 +35,17 @@ def graded_box(outline: Rectangle, height: float, planes: Sequence[Float[np.ndar
     """
     x_min, x_max, y_min, y_max = outline.extent
     ends = [(x_min, x_max), (y_min, y_max), (0.0, height)]
-    stops = [_distinct_positions(given, low, high) for given, (low, high) in zip(planes, ends, strict=True)]
-    most = max(high - low for low, high in ends)
+    stops = [_distinct_positions(positions, low, high) for positions, (low, high) in zip(planes, ends, strict=True)]
+    max_extent = max(high - low for low, high in ends)
     size = _largest_cell_size(
-        lambda size: float(np.prod([len(_divide_axis(one, size)) for one in stops])), num_points, most
+        lambda size: float(np.prod([len(_divide_axis(axis_stops, size)) for axis_stops in stops])),
+        num_points,
+        max_extent,
     )
-    along = [_divide_axis(one, size) for one in stops]
-    points = np.stack(np.meshgrid(*along[:2], indexing="ij"), axis=-1).reshape(-1, 2)
-    plane = Mesh.create(points, _grid_triangles(len(along[0]), len(along[1])))
-    return layer(outline.tagged(plane), height, heights=along[2])
+    node_positions = [_divide_axis(axis_stops, size) for axis_stops in stops]
+    points = np.stack(np.meshgrid(*node_positions[:2], indexing="ij"), axis=-1).reshape(-1, 2)
+    plane = Mesh.create(points, _grid_triangles(len(node_positions[0]), len(node_positions[1])))
+    return layer(outline.tagged(plane), height, heights=node_positions[2])
 
 
 def graded_layers(
@@ -54,60 +56,66 @@ def graded_layers(
     stops = _distinct_positions(planes, 0.0, height)
     area = float(outline.area)
 
-    def nodes(size: float) -> float:
+    def count_nodes(size: float) -> float:
         # Because of the refinement at the rims, the mean cell is about a third smaller than the largest.
         return len(_divide_axis(stops, size)) * (1 + 1.1 * area / (0.65 * size) ** 2)
 
-    def levels(number: int) -> Float[np.ndarray, " n"]:
-        return _divide_axis(stops, _largest_cell_size(nodes, number, max(height, np.sqrt(area))))
+    def layer_heights(num_nodes: int) -> Float[np.ndarray, " n"]:
+        return _divide_axis(stops, _largest_cell_size(count_nodes, num_nodes, max(height, np.sqrt(area))))
 
-    heights = levels(num_points)
+    heights = layer_heights(num_points)
     refine = Refine(rims, factor=1 / _SMALLEST_CELL, growth=_CELL_GROWTH) if len(rims) else None
-    number = max(4, round(num_points / len(heights)))
-    with nodes_of_solid(num_points, lambda asked: round(asked / len(levels(asked)))):
+    num_nodes = max(4, round(num_points / len(heights)))
+    with nodes_of_solid(num_points, lambda num_requested: round(num_requested / len(layer_heights(num_requested)))):
         if isinstance(outline, Disk) and len(rims):
             offset = rims - np.asarray(outline.centre)
             on_edge = np.abs(np.hypot(*offset.T) - float(outline.radius)) < _MERGE_DISTANCE * float(outline.radius)
             angles = np.arctan2(offset[on_edge, 1], offset[on_edge, 0])
-            plane = outline.mesh(num_points=number, refine=refine, boundary_points=angles if len(angles) else None)
+            plane = outline.mesh(num_points=num_nodes, refine=refine, boundary_points=angles if len(angles) else None)
         else:
-            plane = outline.mesh(num_points=number, refine=refine)
+            plane = outline.mesh(num_points=num_nodes, refine=refine)
     return layer(plane, height, heights=heights)
 
 
 def _distinct_positions(planes: Float[np.ndarray, " k"], low: float, high: float) -> Float[np.ndarray, " s"]:
     """Distinct positions of the planes between `low` and `high`, with these two ends included."""
-    within = np.sort(planes[(planes > low) & (planes < high)])
-    kept, least = [low], _MERGE_DISTANCE * (high - low)
-    for one in within:
-        if one - kept[-1] > least and high - one > least:
-            kept.append(float(one))
-    return np.array([*kept, high])
+    inner_positions = np.sort(planes[(planes > low) & (planes < high)])
+    distinct, min_gap = [low], _MERGE_DISTANCE * (high - low)
+    for position in inner_positions:
+        if position - distinct[-1] > min_gap and high - position > min_gap:
+            distinct.append(float(position))
+    return np.array([*distinct, high])
 
 
 def _divide_axis(stops: Float[np.ndarray, " s"], max_size: float) -> Float[np.ndarray, " n"]:
     """Positions of nodes along an axis: the planes `stops`, and nodes between them at distances that grow away from
     these planes up to `max_size`, metres."""
-    places = [stops[:1]]
+    node_positions = [stops[:1]]
     for low, high in pairwise(stops):
         # Number of cells before each of many positions.
-        fine = np.linspace(low, high, 400)
-        middle = (fine[1:] + fine[:-1]) / 2
-        width = np.minimum(max_size, _SMALLEST_CELL * max_size + _CELL_GROWTH * np.minimum(middle - low, high - middle))
-        count = np.concatenate([[0.0], np.cumsum(np.diff(fine) / width)])
-        number = max(1, round(count[-1]))
-        places.append(np.interp(np.arange(1, number + 1) * (count[-1] / number), count, fine))
-        places[-1][-1] = high
-    return np.concatenate(places)
+        samples = np.linspace(low, high, 400)
+        midpoints = (samples[1:] + samples[:-1]) / 2
+        widths = np.minimum(
+            max_size, _SMALLEST_CELL * max_size + _CELL_GROWTH * np.minimum(midpoints - low, high - midpoints)
+        )
+        cumulative_count = np.concatenate([[0.0], np.cumsum(np.diff(samples) / widths)])
+        num_cells = max(1, round(cumulative_count[-1]))
+        node_positions.append(
+            np.interp(np.arange(1, num_cells + 1) * (cumulative_count[-1] / num_cells), cumulative_count, samples)
+        )
+        node_positions[-1][-1] = high
+    return np.concatenate(node_positions)
 
 
-def _largest_cell_size(count: Callable[[float], float], num_points: int, max_size: float) -> float:
+def _largest_cell_size(count_nodes: Callable[[float], float], num_points: int, max_size: float) -> float:
     """Maximum cell size for which the number of nodes is about `num_points`; `max_size` if even that size gives more
     nodes."""
-    if count(max_size) >= num_points:
+    if count_nodes(max_size) >= num_points:
         return max_size
-    found: Any = brentq(lambda size: count(size) - num_points - 0.5, 1e-4 * max_size, max_size, xtol=1e-5 * max_size)
-    return float(found)
+    cell_size: Any = brentq(
+        lambda size: count_nodes(size) - num_points - 0.5, 1e-4 * max_size, max_size, xtol=1e-5 * max_size
+    )
+    return float(cell_size)
 
 
 def _grid_triangles(rows: int, columns: int) -> Int[np.ndarray, "t 3"]:
@@ -115,7 +123,7 @@ def _grid_triangles(rows: int, columns: int) -> Int[np.ndarray, "t 3"]:
     i, j = (index.ravel() for index in np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij"))
     a = i * columns + j
     b, c, d = a + columns, a + columns + 1, a + 1
-    even = ((i + j) % 2 == 0)[:, None]
-    first = np.where(even, np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1))
-    second = np.where(even, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1))
+    is_even = ((i + j) % 2 == 0)[:, None]
+    first = np.where(is_even, np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1))
+    second = np.where(is_even, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1))
     return np.concatenate([first, second])

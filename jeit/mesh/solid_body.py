@@ -103,8 +103,9 @@ class OwnMesh(Body):
         if self.given.space_dimension == 3:
             return ()
         points, facets = np.asarray(self.given.points), np.asarray(self.given.facets)
-        begins = np.flatnonzero(facets[1:, 0] != facets[:-1, 1]) + 1  # facets are ordered head to tail, loop by loop
-        return tuple(as_array(points[loop[:, 0]]) for loop in np.split(facets, begins))
+        # Facets are ordered head to tail, loop by loop.
+        loop_starts = np.flatnonzero(facets[1:, 0] != facets[:-1, 1]) + 1
+        return tuple(as_array(points[loop[:, 0]]) for loop in np.split(facets, loop_starts))
 
     def describe(self) -> dict[str, Any]:
         """Dimensions, and numbers of nodes and cells."""

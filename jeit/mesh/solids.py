@@ -142,31 +142,31 @@ def polygon(
     )
 
 
-def stacked_cells(cells: np.ndarray, count: int, num_layers: int) -> np.ndarray:
+def stacked_cells(cells: np.ndarray, num_nodes: int, num_layers: int) -> np.ndarray:
     """Tetrahedra (3 m num_layers, 4) of the prisms above triangles (m, 3); node k · count + i is node i after k layers.
 
     Every prism is divided along the diagonals that rise from its lower-numbered to its higher-numbered node, so that
     the tetrahedra of neighbouring prisms match.
     """
     a, b, c = np.sort(cells.astype(np.int64), axis=1).T
-    up = count
+    num_nodes_up = num_nodes
     prism = np.stack(
         [
-            np.stack([a, b, c, c + up], axis=1),
-            np.stack([a, b, b + up, c + up], axis=1),
-            np.stack([a, a + up, b + up, c + up], axis=1),
+            np.stack([a, b, c, c + num_nodes_up], axis=1),
+            np.stack([a, b, b + num_nodes_up, c + num_nodes_up], axis=1),
+            np.stack([a, a + num_nodes_up, b + num_nodes_up, c + num_nodes_up], axis=1),
         ],
         axis=1,
     ).reshape(-1, 4)
-    return np.concatenate([prism + k * count for k in range(num_layers)])
+    return np.concatenate([prism + k * num_nodes for k in range(num_layers)])
 
 
-def stacked_wall(edges: np.ndarray, count: int, num_layers: int) -> np.ndarray:
+def stacked_wall(edges: np.ndarray, num_nodes: int, num_layers: int) -> np.ndarray:
     """Triangles (2 e num_layers, 3) of the wall above edges (e, 2), divided like the prisms in `stacked_cells`."""
     low, high = np.sort(edges.astype(np.int64), axis=1).T
-    lower = np.stack([low, high, high + count], axis=1)
-    upper = np.stack([low, low + count, high + count], axis=1)
-    return np.concatenate([face + k * count for k in range(num_layers) for face in (lower, upper)])
+    lower = np.stack([low, high, high + num_nodes], axis=1)
+    upper = np.stack([low, low + num_nodes, high + num_nodes], axis=1)
+    return np.concatenate([face + k * num_nodes for k in range(num_layers) for face in (lower, upper)])
 
 
 # In a solid, 'bottom' and 'top' are the horizontal faces, so the sides of a rectangle with these names are renamed.
@@ -209,21 +209,23 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
     levels = _check_heights(thickness, num_layers, heights)
     num_layers = len(levels) - 1
     plane, cells, facets = np.asarray(mesh.points), np.asarray(mesh.cells), np.asarray(mesh.facets)
-    count = len(plane)
-    unstructured.check_total(count * (num_layers + 1), "num_layers")
-    points = np.column_stack([np.tile(plane, (num_layers + 1, 1)), np.repeat(levels, count)])
+    num_nodes = len(plane)
+    unstructured.check_total(num_nodes * (num_layers + 1), "num_layers")
+    points = np.column_stack([np.tile(plane, (num_layers + 1, 1)), np.repeat(levels, num_nodes)])
 
-    solid = stacked_cells(cells, count, num_layers)
+    solid = stacked_cells(cells, num_nodes, num_layers)
 
-    def side(edges: np.ndarray) -> np.ndarray:
-        return stacked_wall(edges, count, num_layers)
+    def wall(edges: np.ndarray) -> np.ndarray:
+        return stacked_wall(edges, num_nodes, num_layers)
 
-    tags: dict[str, ArrayLike] = {"bottom": cells, "top": cells + num_layers * count, "side": side(facets)}
+    tags: dict[str, ArrayLike] = {"bottom": cells, "top": cells + num_layers * num_nodes, "side": wall(facets)}
     for name, index in mesh.tags.items():
-        new = _RENAMED_TAGS.get(name, name)
-        if new in tags:
-            raise ValueError(f"mesh: its tag {name!r} would be called {new!r} in the layer, which is taken. Rename it.")
-        tags[new] = side(facets[np.asarray(index)])
+        new_name = _RENAMED_TAGS.get(name, name)
+        if new_name in tags:
+            raise ValueError(
+                f"mesh: its tag {name!r} would be called {new_name!r} in the layer, which is taken. Rename it."
+            )
+        tags[new_name] = wall(facets[np.asarray(index)])
     with size_checked():
         return Mesh.create(points, solid, tags=tags)
 
@@ -329,7 +331,7 @@ def cylinder(
 
 def in_plane(area: float, height: float, num_layers: int | None) -> Callable[[int], int]:
     """Function that returns how many nodes the base of a solid has, given the number of nodes of the solid."""
-    return lambda number: choose_layers(area, height, number, None, num_layers)[0] or number
+    return lambda num_points: choose_layers(area, height, num_points, None, num_layers)[0] or num_points
 
 
 def choose_layers(
@@ -342,11 +344,11 @@ def choose_layers(
         num_layers = unstructured.check_count("num_layers", num_layers, 1)
     if target.cell_size is not None:
         return None, num_layers or max(1, round(height / target.cell_size))
-    number = target.num_points if target.asked else 4000
+    num_nodes = target.num_points if target.is_requested else 4000
     # With spacing h in the plane and along z, the number of nodes is n = (1.1 A / h²) (H / h + 1).
     if num_layers is None:
-        spacing = np.cbrt(1.1 * area * height / number)
+        spacing = np.cbrt(1.1 * area * height / num_nodes)
         for _ in range(20):
-            spacing = np.sqrt(1.1 * area * (height / spacing + 1) / number)
+            spacing = np.sqrt(1.1 * area * (height / spacing + 1) / num_nodes)
         num_layers = max(1, round(height / spacing))
-    return max(4, round(number / (num_layers + 1))), num_layers
+    return max(4, round(num_nodes / (num_layers + 1))), num_layers

@@ -42,11 +42,11 @@ def match_facets(facets: np.ndarray, num_points: int) -> tuple[np.ndarray, np.nd
     key = facet_keys(facets, num_points)
     order = np.argsort(key, kind="stable")
     ordered = key[order]
-    same = ordered[1:] == ordered[:-1]
-    triple = np.flatnonzero(same[1:] & same[:-1])
-    if triple.size:
-        return order[:0], order[:0], order[triple[0] : triple[0] + 3]
-    position = np.flatnonzero(same)
+    is_same = ordered[1:] == ordered[:-1]
+    triple_positions = np.flatnonzero(is_same[1:] & is_same[:-1])
+    if triple_positions.size:
+        return order[:0], order[:0], order[triple_positions[0] : triple_positions[0] + 3]
+    position = np.flatnonzero(is_same)
     return order[position], order[position + 1], order[:0]
 
 
@@ -64,18 +64,18 @@ def pair_facets(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             f"cells: the facet with nodes {np.sort(facets[crowded[0]]).tolist()} belongs to more than two cells "
             f"(among them {(crowded // width).tolist()}), so the mesh is not manifold. Remove the surplus cells."
         )
-    odd = odd_permutation(facets)
-    folded = np.flatnonzero(odd[first] == odd[second])
-    if folded.size:
-        pair = np.sort([first[folded[0]] // width, second[folded[0]] // width]).tolist()
+    is_odd = odd_permutation(facets)
+    overlapping = np.flatnonzero(is_odd[first] == is_odd[second])
+    if overlapping.size:
+        pair = np.sort([first[overlapping[0]] // width, second[overlapping[0]] // width]).tolist()
         raise ValueError(
-            f"cells: {folded.size} pair(s) of neighbouring cells overlap, first {pair}: both lie on the same side of "
-            "the facet they share. A node has been moved across a facet (an inverted cell), or the cells "
+            f"cells: {overlapping.size} pair(s) of neighbouring cells overlap, first {pair}: both lie on the same side "
+            "of the facet they share. A node has been moved across a facet (an inverted cell), or the cells "
             "come from two meshes laid over each other. Rebuild the mesh or move the node back."
         )
-    paired = np.zeros(len(facets), bool)
-    paired[first] = paired[second] = True
-    return first, second, np.flatnonzero(~paired)
+    is_paired = np.zeros(len(facets), bool)
+    is_paired[first] = is_paired[second] = True
+    return first, second, np.flatnonzero(~is_paired)
 
 
 def order_loops(facets: np.ndarray, points: np.ndarray | None) -> np.ndarray:
@@ -90,14 +90,14 @@ def order_loops(facets: np.ndarray, points: np.ndarray | None) -> np.ndarray:
             f"cells: the boundary touches itself at node {start[counts > 1][0]}: parts of the mesh hang together "
             "by a single node. Join them along an edge, or separate them and keep one."
         )
-    following = dict(zip(facets[:, 0].tolist(), facets[:, 1].tolist(), strict=True))
+    next_nodes = dict(zip(facets[:, 0].tolist(), facets[:, 1].tolist(), strict=True))
     loops = []
     for node in start.tolist():
-        if node not in following:
+        if node not in next_nodes:
             continue
         loop = [node]
-        while (nxt := following.pop(loop[-1])) != node:
-            loop.append(nxt)
+        while (next_node := next_nodes.pop(loop[-1])) != node:
+            loop.append(next_node)
         loops.append(np.array(loop))
     if points is None:
         loops.sort(key=len, reverse=True)
@@ -128,8 +128,11 @@ def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray
     if loop.ndim != 2 or loop.shape[1] != 2 or len(loop) < 3:
         raise ValueError(f"{name}: expected at least three vertices, shape (k, 2), got {loop.shape}.")
     if not np.isfinite(loop).all():
-        bad = int(np.flatnonzero(~np.isfinite(loop).all(axis=1))[0])
-        raise ValueError(f"{name}: vertex {bad} is {loop[bad].tolist()}. Every coordinate must be a finite number.")
+        invalid_vertex = int(np.flatnonzero(~np.isfinite(loop).all(axis=1))[0])
+        raise ValueError(
+            f"{name}: vertex {invalid_vertex} is {loop[invalid_vertex].tolist()}. Every coordinate must be a finite "
+            "number."
+        )
     extent = np.ptp(loop, axis=0).max()
     length = np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1)
     if length.min() <= 1e-9 * extent:
@@ -152,8 +155,8 @@ def check_apart(outer: np.ndarray, holes: Sequence[np.ndarray]) -> None:
     for k, hole in enumerate(holes):
         if not inside(hole, [outer]).all() or _touches(hole, outer):
             raise ValueError(f"holes[{k}]: does not lie strictly inside the outline. Move or shrink it.")
-        for j, other in enumerate(holes[:k]):
-            if _touches(hole, other) or inside(hole[:1], [other])[0] or inside(other[:1], [hole])[0]:
+        for j, other_hole in enumerate(holes[:k]):
+            if _touches(hole, other_hole) or inside(hole[:1], [other_hole])[0] or inside(other_hole[:1], [hole])[0]:
                 raise ValueError(f"holes[{k}]: overlaps or touches holes[{j}]. Merge them into one hole.")
 
 
@@ -182,10 +185,10 @@ def along(points: np.ndarray, loop: np.ndarray) -> np.ndarray:
 
 def distance(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Distances (p, s) of points (p, 2) from segments with end points `start` and `end` (s, 2)."""
-    along = end - start
+    direction = end - start
     offset = points[:, None] - start
-    fraction = np.clip((offset * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
-    return np.linalg.norm(offset - fraction[..., None] * along, axis=-1)
+    fraction = np.clip((offset * direction).sum(-1) / (direction**2).sum(-1), 0.0, 1.0)
+    return np.linalg.norm(offset - fraction[..., None] * direction, axis=-1)
 
 
 def _signed_area_of_corner(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
@@ -196,48 +199,54 @@ def _intersecting_sides(first: np.ndarray, second: np.ndarray, tolerance: float)
     """Yield, in order and in batches, pairs (p, 2) of a side of the first loop and a side of the second that cross or
     come within `tolerance` of each other. Only sides whose bounding boxes overlap are tested."""
     a, b, c, d = first, np.roll(first, -1, axis=0), second, np.roll(second, -1, axis=0)
-    low, high = np.minimum(a, b) - tolerance, np.maximum(a, b) + tolerance
-    other_low, other_high = np.minimum(c, d), np.maximum(c, d)
-    rows = max(1, _PAIRS_PER_BATCH // len(second))
-    for start in range(0, len(first), rows):
-        block = slice(start, start + rows)
-        near = ((low[block, None] <= other_high) & (other_low <= high[block, None])).all(axis=-1)
-        one, other = np.nonzero(near)
-        one += start
-        yield np.column_stack([one, other])[_intersects(a[one], b[one], c[other], d[other], tolerance)]
+    lower_corners, upper_corners = np.minimum(a, b) - tolerance, np.maximum(a, b) + tolerance
+    other_lower_corners, other_upper_corners = np.minimum(c, d), np.maximum(c, d)
+    batch_size = max(1, _PAIRS_PER_BATCH // len(second))
+    for start in range(0, len(first), batch_size):
+        block = slice(start, start + batch_size)
+        boxes_overlap = (
+            (lower_corners[block, None] <= other_upper_corners) & (other_lower_corners <= upper_corners[block, None])
+        ).all(axis=-1)
+        first_side, second_side = np.nonzero(boxes_overlap)
+        first_side += start
+        yield np.column_stack([first_side, second_side])[
+            _intersects(a[first_side], b[first_side], c[second_side], d[second_side], tolerance)
+        ]
 
 
 def _intersects(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, tolerance: float) -> np.ndarray:
     """Whether each segment from a to b crosses the segment from c to d or comes within `tolerance` of it; all (p,
     2)."""
-    crosses = (_signed_area_of_corner(a, b, c) * _signed_area_of_corner(a, b, d) < 0) & (
+    is_crossing = (_signed_area_of_corner(a, b, c) * _signed_area_of_corner(a, b, d) < 0) & (
         _signed_area_of_corner(c, d, a) * _signed_area_of_corner(c, d, b) < 0
     )
-    near = (_segment_distance(a, c, d) <= tolerance) | (_segment_distance(b, c, d) <= tolerance)
-    return crosses | near | (_segment_distance(c, a, b) <= tolerance) | (_segment_distance(d, a, b) <= tolerance)
+    is_near = (_segment_distance(a, c, d) <= tolerance) | (_segment_distance(b, c, d) <= tolerance)
+    return is_crossing | is_near | (_segment_distance(c, a, b) <= tolerance) | (_segment_distance(d, a, b) <= tolerance)
 
 
 def _segment_distance(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Distance (p,) of each of points (p, 2) from the segment of the same index."""
-    along, offset = end - start, points - start
-    fraction = np.clip((offset * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
-    return np.linalg.norm(offset - fraction[:, None] * along, axis=-1)
+    direction, offset = end - start, points - start
+    fraction = np.clip((offset * direction).sum(-1) / (direction**2).sum(-1), 0.0, 1.0)
+    return np.linalg.norm(offset - fraction[:, None] * direction, axis=-1)
 
 
 def _first_crossing(loop: np.ndarray) -> tuple[int, int] | None:
-    count = len(loop)
+    num_sides = len(loop)
     for pairs in _intersecting_sides(loop, loop, 1e-9 * np.ptp(loop, axis=0).max()):
-        apart = np.abs(pairs[:, 0] - pairs[:, 1])
-        others = pairs[(apart > 1) & (apart < count - 1)]
-        if len(others):
-            return int(others[0].min()), int(others[0].max())
+        index_distance = np.abs(pairs[:, 0] - pairs[:, 1])
+        nonadjacent_pairs = pairs[(index_distance > 1) & (index_distance < num_sides - 1)]
+        if len(nonadjacent_pairs):
+            return int(nonadjacent_pairs[0].min()), int(nonadjacent_pairs[0].max())
     # Neighbouring sides share a vertex, and can overlap elsewhere only by folding back onto each other.
-    before, after = np.roll(loop, 1, axis=0) - loop, np.roll(loop, -1, axis=0) - loop
-    cosine = (before * after).sum(1) / (np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1))
-    folded = np.flatnonzero(cosine > 1 - 1e-12)
-    if folded.size:
-        vertex = int(folded[0])
-        return (vertex - 1) % count, vertex
+    previous_sides, next_sides = np.roll(loop, 1, axis=0) - loop, np.roll(loop, -1, axis=0) - loop
+    cosine = (previous_sides * next_sides).sum(1) / (
+        np.linalg.norm(previous_sides, axis=1) * np.linalg.norm(next_sides, axis=1)
+    )
+    folded_vertices = np.flatnonzero(cosine > 1 - 1e-12)
+    if folded_vertices.size:
+        vertex = int(folded_vertices[0])
+        return (vertex - 1) % num_sides, vertex
     return None
 
 

@@ -35,7 +35,7 @@ def axes_or_new(ax: Axes | None, size: tuple[float, float] = (6.4, 5.6)) -> Axes
 
 
 # Distance of numbers from a body, and width of a digit in a small picture, divided by the size of the body.
-_BAR_DISTANCE, _LETTER = 0.04, 0.021
+_TEXT_DISTANCE, _LETTER_WIDTH = 0.04, 0.021
 
 
 def hide_axes(ax: Axes, extent: tuple[float, float, float, float], *, numbered: bool = True) -> None:
@@ -43,23 +43,25 @@ def hide_axes(ax: Axes, extent: tuple[float, float, float, float], *, numbered: 
     electrodes are `numbered`, for their numbers, as much as the longest text beside the body needs."""
     x_min, x_max, y_min, y_max = extent
     size = max(x_max - x_min, y_max - y_min)
-    room = (0.12 if numbered else 0.06) * size
-    begun = [
-        one
-        for one in ax.texts
-        if one.get_horizontalalignment() != "center" and not x_min <= one.get_position()[0] <= x_max
+    margin = (0.12 if numbered else 0.06) * size
+    outer_texts = [
+        text
+        for text in ax.texts
+        if text.get_horizontalalignment() != "center" and not x_min <= text.get_position()[0] <= x_max
     ]
-    across = max([room, *((_BAR_DISTANCE + _LETTER * len(one.get_text())) * size for one in begun)])
+    horizontal_margin = max(
+        [margin, *((_TEXT_DISTANCE + _LETTER_WIDTH * len(text.get_text())) * size for text in outer_texts)]
+    )
     ax.set_aspect("equal")
-    ax.set_xlim(x_min - across, x_max + across)
-    ax.set_ylim(y_min - 0.18 * size, y_max + (room if numbered else 0.03 * size))
+    ax.set_xlim(x_min - horizontal_margin, x_max + horizontal_margin)
+    ax.set_ylim(y_min - 0.18 * size, y_max + (margin if numbered else 0.03 * size))
     ax.set_axis_off()
 
 
 def extent_of(points: np.ndarray) -> tuple[float, float, float, float]:
     """Extent (x_min, x_max, y_min, y_max) of points (n, 2) or (n, 3)."""
-    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
-    return (low[0], high[0], low[1], high[1])
+    lower_corner, upper_corner = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    return (lower_corner[0], upper_corner[0], lower_corner[1], upper_corner[1])
 
 
 def soften_axes(ax: Axes) -> None:
@@ -77,9 +79,9 @@ def draw_horizontal_grid(ax: Axes) -> None:
 
 def draw_legend_above(ax: Axes) -> None:
     """Draw a legend above the curves; the y axis begins at zero, and its upper limit is raised to make room."""
-    entries = len(ax.get_legend_handles_labels()[1])
+    num_entries = len(ax.get_legend_handles_labels()[1])
     ax.autoscale_view()
-    ax.set_ylim(0, ax.get_ylim()[1] * (1.02 + 0.08 * entries))
+    ax.set_ylim(0, ax.get_ylim()[1] * (1.02 + 0.08 * num_entries))
     ax.legend(loc="upper right", frameon=False, labelcolor=INK, borderaxespad=0)
 
 
@@ -91,8 +93,8 @@ def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
     x, y = x_min - 0.06 * size, y_min - 0.125 * size
     ax.plot([x, x + length], [y, y], color=INK, linewidth=2.5, solid_capstyle="butt")
     millimetres = 1e3 * length
-    below = ax.transData + ScaledTranslation(0, -3 / 72, ax.figure.dpi_scale_trans)
-    ax.text(x, y, f"{millimetres:g} mm", transform=below, ha="left", va="top", color=INK, fontsize=9)
+    text_transform = ax.transData + ScaledTranslation(0, -3 / 72, ax.figure.dpi_scale_trans)
+    ax.text(x, y, f"{millimetres:g} mm", transform=text_transform, ha="left", va="top", color=INK, fontsize=9)
 
 
 def draw_colour_bar(
@@ -100,10 +102,10 @@ def draw_colour_bar(
 ) -> None:
     """Draw a slim colour bar at the right of `ax`, or on the axes `position`; `signed`: whether tick labels have a
     sign, for differences."""
-    where: dict[str, Any] = (
+    placement: dict[str, Any] = (
         {"ax": ax, "shrink": 0.72, "aspect": 28, "pad": 0.02} if position is None else {"cax": position}
     )
-    bar = ax.figure.colorbar(mappable, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]), **where)
+    bar = ax.figure.colorbar(mappable, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]), **placement)
     if signed:
         bar.ax.yaxis.set_major_formatter(
             lambda value, _: "0" if abs(value) < 1e-12 else f"{value:+g}".replace("-", "−")
@@ -172,18 +174,23 @@ class ColourScale(Module):
         if not np.isfinite(largest):
             raise ValueError("values must be finite to be drawn.")
         factor, with_prefix = with_si_prefix(largest, unit)
-        high = factor * largest or 1.0
+        upper_limit = factor * largest or 1.0
         if self.difference:
-            low = -high
+            lower_limit = -upper_limit
         else:
-            low = factor * float(values.min())
-            if low >= high:  # a constant image
-                low, high = low - 0.05 * abs(low) - 1e-12, high + 0.05 * abs(high) + 1e-12
-        sheet = "sheet conductivity" if unit == "S" else "conductivity"
-        what = self.quantity or (f"Change of {sheet}" if self.difference else sheet.capitalize())
-        label = f"{what} ({with_prefix})" if with_prefix else what
-        colours = self.colour_map or (DIVERGING if self.difference else SEQUENTIAL)
-        return FittedScale(factor, label, {"cmap": colours, "vmin": low, "vmax": high}, self)
+            lower_limit = factor * float(values.min())
+            if lower_limit >= upper_limit:  # a constant image
+                lower_limit, upper_limit = (
+                    lower_limit - 0.05 * abs(lower_limit) - 1e-12,
+                    upper_limit + 0.05 * abs(upper_limit) + 1e-12,
+                )
+        conductivity_name = "sheet conductivity" if unit == "S" else "conductivity"
+        quantity = self.quantity or (
+            f"Change of {conductivity_name}" if self.difference else conductivity_name.capitalize()
+        )
+        label = f"{quantity} ({with_prefix})" if with_prefix else quantity
+        colour_map = self.colour_map or (DIVERGING if self.difference else SEQUENTIAL)
+        return FittedScale(factor, label, {"cmap": colour_map, "vmin": lower_limit, "vmax": upper_limit}, self)
 
 
 class FittedScale(Module):
@@ -195,10 +202,10 @@ class FittedScale(Module):
     keywords: dict
     scale: ColourScale
 
-    def draw_bar(self, ax: Axes, drawn: ScalarMappable) -> None:
-        """Draw the colour bar of the mappable `drawn` beside `ax`, unless the scale has none."""
+    def draw_bar(self, ax: Axes, mappable: ScalarMappable) -> None:
+        """Draw the colour bar of `mappable` beside `ax`, unless the scale has none."""
         if self.scale.bar:
-            draw_colour_bar(ax, drawn, self.label, signed=self.scale.difference)
+            draw_colour_bar(ax, mappable, self.label, signed=self.scale.difference)
 
 
 def check_scale(scale: ColourScale) -> None:

@@ -59,12 +59,12 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
         "reciprocity_error": reciprocity_error(measurement),
         "noise": None if noise is None else {"standard_deviation": noise.standard_deviation, "method": noise.method},
         "impossible_signs": None if signs is None else float(signs.max()),
-        "wiring": _wiring(measurement),
+        "wiring": _describe_wiring(measurement),
     }
     return as_plain_values(content)
 
 
-def _wiring(measurement: Measurement) -> str | None:
+def _describe_wiring(measurement: Measurement) -> str | None:
     """Description of the estimated wiring, in words, from the frame named "reference", or else the first frame; None if
     the body or the places of the electrodes are not known."""
     domain, electrodes = measurement.domain, measurement.electrodes
@@ -74,16 +74,16 @@ def _wiring(measurement: Measurement) -> str | None:
     model = ForwardModel(
         imaging_mesh(domain, electrodes, None, usual=_MAX_MESH_NODES), electrodes, measurement.protocol
     )
-    found, broken = find_wiring(model, reference), reciprocity_error(reference)
-    if broken is not None and broken > MOST_DIFFERENCE_RECIPROCITY_ERROR and not found.explanation:
+    wiring, error = find_wiring(model, reference), reciprocity_error(reference)
+    if error is not None and error > MOST_DIFFERENCE_RECIPROCITY_ERROR and not wiring.explanation:
         return (
-            f"reciprocity broken by {percent(broken)}, and nothing that was tried mends it: channels or drives in "
+            f"reciprocity broken by {percent(error)}, and nothing that was tried mends it: channels or drives in "
             "another order than described, or nothing but noise"
         )
-    if found.fault:
-        return found.fault
-    if found.described > MOST_MISFIT:
-        return f"nothing that was tried speaks against the description, but it misses {percent(found.described)}"
+    if wiring.fault:
+        return wiring.fault
+    if wiring.described > MOST_MISFIT:
+        return f"nothing that was tried speaks against the description, but it misses {percent(wiring.described)}"
     return "nothing speaks against the description"
 
 
@@ -107,9 +107,9 @@ def write_choice(result: ComparedRules, folder: str | Path) -> None:
     write_choice(compared, "out")
     ```
     """
-    with results(folder, ("choice.png", "choice.json")) as made:
-        draw_choice(result).savefig(made / "choice.png", dpi=120)
-        write_json(report_choice(result), made / "choice.json")
+    with results(folder, ("choice.png", "choice.json")) as temporary_folder:
+        draw_choice(result).savefig(temporary_folder / "choice.png", dpi=120)
+        write_json(report_choice(result), temporary_folder / "choice.json")
 
 
 def draw_choice(result: ComparedRules):
@@ -148,11 +148,11 @@ def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
     from jeit.plot.axes import INK
     from jeit.plot.imaging.hyperparameter import COLOURS
 
-    number = len(outcome.inclusions)
-    marked = outcome.inclusions if number <= _MAX_MARKED else ()
-    plot_image(mesh, outcome.change, inclusions=marked, scale=ColourScale(bar=False), ax=ax)
+    num_inclusions = len(outcome.inclusions)
+    marked_inclusions = outcome.inclusions if num_inclusions <= _MAX_MARKED else ()
+    plot_image(mesh, outcome.change, inclusions=marked_inclusions, scale=ColourScale(bar=False), ax=ax)
     _draw_scale(ax, float(jnp.abs(outcome.change).max()), "S" if mesh.dimension == 2 else "S/m")
-    ax.set_title(f"{name}\n{counted(number, 'inclusion')}", color=COLOURS.get(name, INK), fontsize=11, pad=0)
+    ax.set_title(f"{name}\n{counted(num_inclusions, 'inclusion')}", color=COLOURS.get(name, INK), fontsize=11, pad=0)
 
 
 def _draw_scale(ax, largest: float, unit: str) -> None:
@@ -160,10 +160,10 @@ def _draw_scale(ax, largest: float, unit: str) -> None:
     from jeit.plot.axes import INK, SOFT, with_si_prefix
 
     factor, unit = with_si_prefix(largest, unit)
-    end = factor * largest
-    drawn = next(one for one in (*ax.images, *ax.collections) if one.get_array() is not None)
-    bar = ax.figure.colorbar(drawn, ax=ax, orientation="horizontal", shrink=0.62, aspect=18, pad=0.01)
-    bar.set_ticks([-end, 0, end], labels=[f"−{end:.3g}", "0", f"+{end:.3g} {unit}"])
+    limit = factor * largest
+    mappable = next(artist for artist in (*ax.images, *ax.collections) if artist.get_array() is not None)
+    bar = ax.figure.colorbar(mappable, ax=ax, orientation="horizontal", shrink=0.62, aspect=18, pad=0.01)
+    bar.set_ticks([-limit, 0, limit], labels=[f"−{limit:.3g}", "0", f"+{limit:.3g} {unit}"])
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
     bar.ax.tick_params(length=2, color=SOFT, labelcolor=INK, labelsize=8)
 
@@ -195,8 +195,13 @@ def report_choice(result: ComparedRules) -> dict[str, Any]:
                 "relative_residual": outcome.residual,
                 "noise_figure": outcome.noise_figure,
                 "inclusions": [
-                    {"sign": found.sign, "kind": found.kind, "centroid": list(found.centroid), "peak": found.peak}
-                    for found in outcome.inclusions
+                    {
+                        "sign": inclusion.sign,
+                        "kind": inclusion.kind,
+                        "centroid": list(inclusion.centroid),
+                        "peak": inclusion.peak,
+                    }
+                    for inclusion in outcome.inclusions
                 ],
                 "target": choice.target,
                 "candidates": choice.candidates,

@@ -27,8 +27,8 @@ _ENCODING_ERRORS = "backslashreplace"
 def results(folder: str | Path, names: tuple[str, ...]) -> Iterator[Path]:
     """Context manager with a temporary folder for files of the given `names`. They are moved to `folder` together once
     all are written; it is created if needed. Raises `ValueError` if the path cannot be a folder."""
-    with whole_files(results_folder(folder, names)) as beside:
-        yield beside
+    with whole_files(results_folder(folder, names)) as temporary_folder:
+        yield temporary_folder
 
 
 def write_json(report: dict[str, Any], path: Path) -> None:
@@ -55,12 +55,12 @@ def results_folder(folder: str | Path, names: tuple[str, ...]) -> Path:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             pass
-        taken = [name for name in names if (path / name).is_dir()]
+        folder_names = [name for name in names if (path / name).is_dir()]
     except OSError as error:
         reason = error.strerror or error
         raise ValueError(f"folder {path} cannot be written to ({reason}); give another folder.") from None
-    if taken:
-        raise ValueError(f"folder {path}: there is a folder named {taken[0]} in it; give another.")
+    if folder_names:
+        raise ValueError(f"folder {path}: there is a folder named {folder_names[0]} in it; give another.")
     return path
 
 

@@ -39,12 +39,12 @@ class GrowingTable:
         text = io.StringIO()
         csv.writer(text).writerow(row)
         line = text.getvalue().encode("utf-8", "backslashreplace")
-        good, written = self._file.tell(), 0
+        line_start, num_written = self._file.tell(), 0
         try:
-            while written < len(line):
-                written += self._file.write(line[written:])
+            while num_written < len(line):
+                num_written += self._file.write(line[num_written:])
         except OSError:
-            self._file.truncate(good)
+            self._file.truncate(line_start)
             raise
 
     def __enter__(self) -> "GrowingTable":
@@ -67,11 +67,11 @@ class GrowingRows:
         self._file.write(np.asarray(row, np.float32).tobytes())
         self.number += 1
 
-    def read(self, numbers: Iterable[int]) -> Float[np.ndarray, "k *shape"]:
-        """Read the rows of the given `numbers`; call it only after the last `append`."""
+    def read(self, row_indices: Iterable[int]) -> Float[np.ndarray, "k *shape"]:
+        """Read the rows of the given `row_indices`; call it only after the last `append`."""
         size, rows = 4 * int(np.prod(self.shape)), []
-        for number in numbers:
-            self._file.seek(size * number)
+        for row_index in row_indices:
+            self._file.seek(size * row_index)
             rows.append(np.frombuffer(self._file.read(size), np.float32).reshape(self.shape))
         return np.stack(rows)
 
@@ -84,12 +84,12 @@ class GrowingRows:
         with written_whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array_header_1_0(member, header)
-                for done, block in self._blocks():
+                for share_done, block in self._blocks():
                     if progress is not None and self._file.tell() > _BLOCK_BYTES:
-                        progress(f"{100 * done:.0f} %")
+                        progress(f"{100 * share_done:.0f} %")
                     member.write(block)
-            for other, values in others.items():
-                with archive.open(f"{other}.npy", "w", force_zip64=True) as member:
+            for other_name, values in others.items():
+                with archive.open(f"{other_name}.npy", "w", force_zip64=True) as member:
                     np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
 
     def _blocks(self) -> Iterator[tuple[float, bytes]]:
@@ -114,9 +114,9 @@ def reporting_partial_results(rows: GrowingRows) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        left = f"frames.csv has the {counted(rows.number, 'frame')} until then"
-        said = f"{error.strerror or error}: what came of the stream could not all be written; {left}"
-        raise OSError(error.errno, said, str(rows.folder)) from error
+        remaining_text = f"frames.csv has the {counted(rows.number, 'frame')} until then"
+        message = f"{error.strerror or error}: what came of the stream could not all be written; {remaining_text}"
+        raise OSError(error.errno, message, str(rows.folder)) from error
 
 
 class Sample:

@@ -61,16 +61,16 @@ def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[fl
     write_image(imaged, "out")
     ```
     """
-    with results(folder, IMAGE_FILES) as made:
-        draw_image(result, truth=truth).savefig(made / "image.png", dpi=150)
-        np.savez_compressed(made / "image.npz", **_arrays(result))
-        write_json(report_image(result), made / "report.json")
+    with results(folder, IMAGE_FILES) as temporary_folder:
+        draw_image(result, truth=truth).savefig(temporary_folder / "image.png", dpi=150)
+        np.savez_compressed(temporary_folder / "image.npz", **_arrays(result))
+        write_json(report_image(result), temporary_folder / "report.json")
         if result.mesh.dimension == 3:
             background, change = np.asarray(result.calibration.conductivity), np.asarray(result.change)
             values = {"change of conductivity": change, "conductivity": background + change}
             from jeit.report.volume_files import draft_vtu
 
-            draft_vtu(made / "image.vtu", result.mesh, values, electrodes=result.electrodes)
+            draft_vtu(temporary_folder / "image.vtu", result.mesh, values, electrodes=result.electrodes)
 
 
 def _arrays(result: ImagedDifference) -> dict[str, Any]:
@@ -86,11 +86,11 @@ def _arrays(result: ImagedDifference) -> dict[str, Any]:
     if result.labels is not None:
         arrays["labels"] = result.labels
     if result.iterative and not result.is_complex:
-        arrays["departure"] = _draw_views(result)
+        arrays["departure"] = _drawn_values(result)
     return {**arrays, **saved_extras(result.mesh, result.electrodes, result.inclusions)}
 
 
-def _draw_views(result: ImagedDifference) -> np.ndarray:
+def _drawn_values(result: ImagedDifference) -> np.ndarray:
     """Values per cell for the picture: the change of conductivity, or, for iterative images, which range from 0.01 to
     100 times the background, the change of its logarithm to base 10."""
     return np.asarray(result.departure) / (math.log(10) if result.iterative else 1)
@@ -130,13 +130,13 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     if result.mesh.dimension == 3:
         from jeit.plot.solid.overview import plot_solid
 
-        figure = plot_solid(result.mesh, _draw_views(result), electrodes, inclusions=result.inclusions, scale=scale)
+        figure = plot_solid(result.mesh, _drawn_values(result), electrodes, inclusions=result.inclusions, scale=scale)
         figure.suptitle(result.measurement.name)
         return figure
     figure = Figure(figsize=(6.4, 5.6), layout="constrained")
     ax = plot_image(
         result.mesh,
-        _draw_views(result),
+        _drawn_values(result),
         electrodes,
         inclusions=result.inclusions if result.labels is None and result.shapes is None else (),
         title=result.measurement.name,
@@ -149,7 +149,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     if result.labels is not None:
         draw_labels(result.labels, result.extent, ax=ax)
     elif result.shapes is not None:
-        draw_outlines([one for one in result.shapes.bodies if isinstance(one, Star)], ax=ax)
+        draw_outlines([body for body in result.shapes.bodies if isinstance(body, Star)], ax=ax)
     elif result.inclusions:
         ax.plot([], [], color="black", linewidth=1, linestyle=(0, (4, 3)), label="found: sign and area")
     if ax.get_legend_handles_labels()[1]:
@@ -174,16 +174,16 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
     reconstruction, quality, settings = result.reconstruction, result.quality, result.settings
     noise = quality.difference_noise
     content = {
-        "data": {**describe_measurement(result.measurement), **_frame(result)},
+        "data": {**describe_measurement(result.measurement), **_frame_report(result)},
         "reference": describe_measurement(result.reference),
         "geometry": {
             **describe_domain(result.measurement.domain or result.reference.domain),
             "electrodes": describe_electrodes(result.calibration.model.electrodes),
             "mesh": {"points": result.mesh.num_points, "cells": result.mesh.num_cells},
         },
-        "protocol": _protocol(result.measurement.protocol),
+        "protocol": _protocol_report(result.measurement.protocol),
         "uncertainty": _uncertainty_report(result.reference.uncertainty or Uncertainty()),
-        "calibration": _calibration(result),
+        "calibration": _calibration_report(result),
         "noise": None
         if noise is None
         else {
@@ -206,8 +206,8 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "method": settings.method,
             "why": result.why or None,
             "least_change_relative_to_background": result.lowest,
-            "prior": _prior(settings, result.mesh.dimension),
-            **_iteration(result),
+            "prior": _prior_name(settings, result.mesh.dimension),
+            **_iteration_report(result),
         },
         "hyperparameter": {
             "value": float(reconstruction.hyperparameter),
@@ -215,7 +215,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "note": (reconstruction.choice.note or None) if reconstruction.choice is not None else None,
         },
         "doubts": list(result.doubts),
-        "inclusions": [_inclusion(result, one) for one in result.inclusions],
+        "inclusions": [_inclusion_report(result, inclusion) for inclusion in result.inclusions],
         "shapes": _shapes_report(result),
         "inclusion_settings": {"level": result.level, "least_peak": settings.least_peak},
         "timings": {**result.timings, "unit": "s"},
@@ -224,19 +224,19 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
     return as_plain_values(content)
 
 
-def _uncertainty_report(known: Uncertainty) -> dict[str, Any]:
-    """The uncertainty of the description, which intervals are based on; the position is None by default, for 0.0175 of
-    the width of the body."""
+def _uncertainty_report(uncertainty: Uncertainty) -> dict[str, Any]:
+    """Report of the uncertainty of the description, on which intervals are based. The position None stands for the
+    default, 0.0175 of the width of the body."""
     return {
-        "position": known.position,
+        "position": uncertainty.position,
         "position_unit": "m",
-        "contact_drift": known.drift,
-        "size": known.size,
-        "other": known.other,
+        "contact_drift": uncertainty.drift,
+        "size": uncertainty.size,
+        "other": uncertainty.other,
     }
 
 
-def _frame(result: ImagedDifference) -> dict[str, Any]:
+def _frame_report(result: ImagedDifference) -> dict[str, Any]:
     """Name of the imaged frame, or else its number from 0; and number of frames in the file."""
     names = result.measurement.frame_names
     return {"frame": names[0] if names else result.frame, "frames": result.num_frames}
@@ -246,7 +246,7 @@ def _unit(result: ImagedDifference) -> str:
     return "S" if result.mesh.dimension == 2 else "S/m"
 
 
-def _protocol(protocol: Protocol) -> dict[str, Any]:
+def _protocol_report(protocol: Protocol) -> dict[str, Any]:
     return {
         "name": protocol.name,
         "electrodes": protocol.num_electrodes,
@@ -257,7 +257,7 @@ def _protocol(protocol: Protocol) -> dict[str, Any]:
     }
 
 
-def _calibration(result: ImagedDifference) -> dict[str, Any]:
+def _calibration_report(result: ImagedDifference) -> dict[str, Any]:
     """Report of the fit of the model to the reference."""
     calibration = result.calibration
     electrodes = calibration.model.electrodes
@@ -275,7 +275,7 @@ def _calibration(result: ImagedDifference) -> dict[str, Any]:
     }
 
 
-def _inclusion(result: ImagedDifference, inclusion: Inclusion) -> dict[str, Any]:
+def _inclusion_report(result: ImagedDifference, inclusion: Inclusion) -> dict[str, Any]:
     return {
         "sign": inclusion.sign,
         "kind": inclusion.kind,
@@ -290,7 +290,7 @@ def _inclusion(result: ImagedDifference, inclusion: Inclusion) -> dict[str, Any]
 
 
 def _interval_report(inclusion: Inclusion) -> dict[str, Any]:
-    """68 % intervals of what was estimated of a body, None at an open end; nothing where none were estimated."""
+    """68 % intervals of the estimated properties of a body, None at an open end; empty if none were estimated."""
     if inclusion.contrast_interval is None:
         return {}
     return {
@@ -314,29 +314,29 @@ def _shapes_report(result: ImagedDifference) -> dict[str, Any] | None:
     """Report of fitted bodies with their outlines, and of bodies left out as artefacts; None if none were fitted."""
     if result.shapes is None:
         return None
-    kept, left = (
+    body_reports, left_out_reports = (
         [
             {
-                "sign": one.sign,
-                "centroid": one.centroid,
-                **_form_report(one),
-                "conductivity_over_background": math.exp(one.sign * one.contrast),
-                "conductivity_is": _evidence_text(one),
-                "rise": one.rise,
+                "sign": body.sign,
+                "centroid": body.centroid,
+                **_form_report(body),
+                "conductivity_over_background": math.exp(body.sign * body.contrast),
+                "conductivity_is": _evidence_text(body),
+                "rise": body.rise,
             }
-            for one in bodies
+            for body in bodies
         ]
         for bodies in (result.shapes.bodies, result.shapes.doubtful)
     )
-    others = zip(result.shapes.alternatives, result.shapes.alternative_deviations, strict=True)
-    for one, (other, its) in zip(kept, others, strict=True):
-        if other is not None:
-            ratio = math.exp(other.sign * other.contrast)
-            said = {"conductivity_over_background": ratio, "deviation_of_logarithm": its}
-            one["or"] = {"centroid": other.centroid, **_form_report(other), **said}
+    alternatives = zip(result.shapes.alternatives, result.shapes.alternative_deviations, strict=True)
+    for body_report, (alternative, deviation) in zip(body_reports, alternatives, strict=True):
+        if alternative is not None:
+            ratio = math.exp(alternative.sign * alternative.contrast)
+            evidence = {"conductivity_over_background": ratio, "deviation_of_logarithm": deviation}
+            body_report["or"] = {"centroid": alternative.centroid, **_form_report(alternative), **evidence}
     return {
-        "bodies": kept,
-        "left_out": left,
+        "bodies": body_reports,
+        "left_out": left_out_reports,
         "length_unit": "m",
         "rise": "how many times the objective rises if the body is left out",
         "misfit": float(result.shapes.misfit),
@@ -362,7 +362,7 @@ def _evidence_text(body: Star | Ellipsoid) -> str:
     return "estimated from the data"
 
 
-def _prior(settings: ImagingSettings, dimension: int) -> str | None:
+def _prior_name(settings: ImagingSettings, dimension: int) -> str | None:
     """Name of the prior of the settings or of the method; None for methods without a prior."""
     method = METHODS[settings.method]
     if settings.method == "shapes" and dimension == 3:
@@ -372,16 +372,16 @@ def _prior(settings: ImagingSettings, dimension: int) -> str | None:
     return settings.prior if isinstance(settings.prior, str) else type(settings.prior).__name__
 
 
-def _iteration(result: ImagedDifference) -> dict[str, Any]:
+def _iteration_report(result: ImagedDifference) -> dict[str, Any]:
     """Report of the iteration; empty for images without one."""
-    found = result.reconstruction
-    if not isinstance(found, Reconstruction):
+    reconstruction = result.reconstruction
+    if not isinstance(reconstruction, Reconstruction):
         return {}
     return {
-        "status": str(found.status),
-        "reason": found.reason,
-        "iterations": found.iterations,
-        "misfit": float(found.misfit),
+        "status": str(reconstruction.status),
+        "reason": reconstruction.reason,
+        "iterations": reconstruction.iterations,
+        "misfit": float(reconstruction.misfit),
         "misfit_unit": "standard deviations",
-        "objective_per_iteration": np.asarray(found.costs),
+        "objective_per_iteration": np.asarray(reconstruction.costs),
     }

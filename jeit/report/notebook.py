@@ -16,12 +16,12 @@ from jeit.report.image import draw_image
 from jeit_solvers.engines import has_values
 
 # Dots per inch, and frames of a measurement that are drawn.
-_DPI, _FRAMES = 90, 12
+_DPI, _MAX_FRAMES = 90, 12
 
 
 def picture(value: Any) -> bytes | None:
     """PNG of an object; None for one of another kind, and inside `jax.jit` or a derivative."""
-    draw = _DRAWN.get(type(value).__name__)
+    draw = _DRAW_FUNCTIONS.get(type(value).__name__)
     if draw is None or not has_values(value):
         return None
     file = io.BytesIO()
@@ -29,16 +29,16 @@ def picture(value: Any) -> bytes | None:
     return file.getvalue()
 
 
-def page(one: Any) -> str | None:
+def page(value: Any) -> str | None:
     """HTML of an object: its text above its picture, without scripts; None if it has no picture."""
-    drawn = picture(one)
-    if drawn is None:
+    png = picture(value)
+    if png is None:
         return None
-    data = base64.b64encode(drawn).decode("ascii")
-    return f'<pre>{html.escape(repr(one))}</pre><img alt="{type(one).__name__}" src="data:image/png;base64,{data}">'
+    data = base64.b64encode(png).decode("ascii")
+    return f'<pre>{html.escape(repr(value))}</pre><img alt="{type(value).__name__}" src="data:image/png;base64,{data}">'
 
 
-def _mesh(mesh: Any) -> Figure:
+def _draw_mesh(mesh: Any) -> Figure:
     if mesh.is_surface:
         from jeit.plot.solid.shaded_surface import plot_surface
 
@@ -53,7 +53,7 @@ def _mesh(mesh: Any) -> Figure:
     return figure
 
 
-def _layout(layout: Any) -> Figure:
+def _draw_layout(layout: Any) -> Figure:
     from matplotlib.patches import Circle
 
     from jeit.plot.axes import INK, SOFT, draw_scale_bar, hide_axes
@@ -75,43 +75,43 @@ def _layout(layout: Any) -> Figure:
     return figure
 
 
-def _measurement(measurement: Any) -> Figure:
+def _draw_measurement(measurement: Any) -> Figure:
     from jeit.plot.axes import with_si_prefix
 
     figure = Figure(figsize=(7.0, 3.2), layout="constrained")
     ax = figure.subplots()
-    shown = np.unique(np.linspace(0, measurement.num_frames - 1, _FRAMES).round().astype(int))
-    values = np.where(measurement.mask, np.real(np.asarray(measurement.voltages)), np.nan)[shown]
+    frame_indices = np.unique(np.linspace(0, measurement.num_frames - 1, _MAX_FRAMES).round().astype(int))
+    values = np.where(measurement.mask, np.real(np.asarray(measurement.voltages)), np.nan)[frame_indices]
     factor, unit = with_si_prefix(float(np.abs(values[np.isfinite(values)]).max(initial=0)) or 1.0, "V")
     ax.plot(factor * values.T, linewidth=0.8)
     ax.set(xlabel="Channel", ylabel=f"Voltage ({unit})")
-    few = "" if len(shown) == measurement.num_frames else f"{len(shown)} of "
-    ax.set_title(f"{measurement.name}: {few}{measurement.num_frames} frames", fontsize=10)
+    count_text = "" if len(frame_indices) == measurement.num_frames else f"{len(frame_indices)} of "
+    ax.set_title(f"{measurement.name}: {count_text}{measurement.num_frames} frames", fontsize=10)
     ax.spines[["top", "right"]].set_visible(False)
     return figure
 
 
-def _series(series: Any) -> Figure:
+def _draw_series(series: Any) -> Figure:
     from jeit.plot.imaging.series import plot_frames
 
     return plot_frames(series.mesh, series.changes, titles=series.titles)
 
 
-def _figures_of_merit(figures: Any) -> Figure:
+def _draw_figures_of_merit(figures: Any) -> Figure:
     from jeit.plot.imaging.hyperparameter import plot_figures_of_merit
 
     figure = Figure(figsize=(10.6, 5.6), layout="constrained")
-    several = jax.tree.map(np.atleast_1d, figures)
-    plot_figures_of_merit({"targets": several}, ax=figure.subplots())
+    target_figures = jax.tree.map(np.atleast_1d, figures)
+    plot_figures_of_merit({"targets": target_figures}, ax=figure.subplots())
     return figure
 
 
-_DRAWN: dict[str, Callable[[Any], Figure]] = {
+_DRAW_FUNCTIONS: dict[str, Callable[[Any], Figure]] = {
     "ImagedDifference": draw_image,
-    "Mesh": _mesh,
-    "Layout": _layout,
-    "Measurement": _measurement,
-    "ImageSeries": _series,
-    "FiguresOfMerit": _figures_of_merit,
-    "Skin": lambda skin: _layout(skin.layout),
+    "Mesh": _draw_mesh,
+    "Layout": _draw_layout,
+    "Measurement": _draw_measurement,
+    "ImageSeries": _draw_series,
+    "FiguresOfMerit": _draw_figures_of_merit,
+    "Skin": lambda skin: _draw_layout(skin.layout),
 }

@@ -104,16 +104,16 @@ def saved_extras(
         "electrode_corners": shapes.corners,
         "electrode_sizes": shapes.sizes,
         "electrode_numbers": shapes.electrode,
-        "inclusion_centroids": np.array([one.centroid for one in inclusions]).reshape(-1, dimension),
-        "inclusion_sizes": np.array([one.area for one in inclusions], float),
-        "inclusion_peaks": np.array([one.peak for one in inclusions], float),
+        "inclusion_centroids": np.array([inclusion.centroid for inclusion in inclusions]).reshape(-1, dimension),
+        "inclusion_sizes": np.array([inclusion.area for inclusion in inclusions], float),
+        "inclusion_peaks": np.array([inclusion.peak for inclusion in inclusions], float),
     }
-    forms = [one.form for one in inclusions if one.form is not None]
+    forms = [inclusion.form for inclusion in inclusions if inclusion.form is not None]
     if forms and len(forms) == len(inclusions):
         extras |= {
-            "inclusion_centres": np.array([one.centre for one in forms]),
-            "inclusion_axes": np.array([one.axes for one in forms]),
-            "inclusion_columns": np.array([one.column for one in forms]),
+            "inclusion_centres": np.array([form.centre for form in forms]),
+            "inclusion_axes": np.array([form.axes for form in forms]),
+            "inclusion_columns": np.array([form.column for form in forms]),
         }
     return extras
 
@@ -150,19 +150,19 @@ def read_image(path: str | Path) -> SavedImage:
             raise ValueError(f"'points' is {describe(arrays['points'])}; real numbers are wanted, metres.")
         with size_checked():  # the size of the mesh was checked by the command that wrote it
             mesh = Mesh.create(arrays["points"], arrays["cells"])
-        return _image(mesh, arrays)
+        return _to_saved_image(mesh, arrays)
     except ValueError as error:
         raise ValueError(f"{name}: {error}"[:400]) from None
 
 
 def _check_kind(arrays: dict[str, np.ndarray]) -> None:
     """Raise `ValueError` for NPZ files that are not an image: series of frames, and files without an image."""
-    held = set(arrays[""].tolist())
-    if held & {"images", "depth", "functional"}:
+    array_names = set(arrays[""].tolist())
+    if array_names & {"images", "depth", "functional"}:
         raise ValueError("it holds many frames; give the image.npz of one, of jeit reconstruct.")
-    if not held & {*_REQUIRED_ARRAYS}:
-        few = ", ".join(name[:40] for name in sorted(held)[:6])
-        raise ValueError(f"it holds {few or 'nothing'}, and no image; {_REMEDY}.")
+    if not array_names & {*_REQUIRED_ARRAYS}:
+        first_names = ", ".join(name[:40] for name in sorted(array_names)[:6])
+        raise ValueError(f"it holds {first_names or 'nothing'}, and no image; {_REMEDY}.")
 
 
 def _other_file_hint(path: Path) -> str:
@@ -170,7 +170,7 @@ def _other_file_hint(path: Path) -> str:
     return "" if kind is None else f", but {kind}"
 
 
-def _image(mesh: Mesh, arrays: dict[str, np.ndarray]) -> SavedImage:
+def _to_saved_image(mesh: Mesh, arrays: dict[str, np.ndarray]) -> SavedImage:
     def per_cell(name: str, kinds: str) -> np.ndarray | None:
         if name not in arrays:
             return None
@@ -191,12 +191,12 @@ def _image(mesh: Mesh, arrays: dict[str, np.ndarray]) -> SavedImage:
         change=change,
         background=None if background is None else background.item(),
         departure=per_cell("departure", "f"),
-        electrodes=_electrodes(mesh, arrays),
-        inclusions=_inclusions(mesh, arrays),
+        electrodes=_read_electrodes(mesh, arrays),
+        inclusions=_read_inclusions(mesh, arrays),
     )
 
 
-def _electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShapes | None:
+def _read_electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShapes | None:
     if "electrode_corners" not in arrays:
         return None
     need(arrays, "electrode_sizes", "electrode_numbers")
@@ -205,8 +205,8 @@ def _electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShapes | 
         raise ValueError("'electrode_corners' are no places in the mesh's space; write it again.")
     if not np.isfinite(corners).all():
         raise ValueError("'electrode_corners' are no places: some are not finite; write it again.")
-    whole = all(one.dtype.kind in "iu" and one.ndim == 1 for one in (sizes, numbers))
-    if not (whole and len(sizes) == len(numbers) > 0 and sizes.min() > 0 and sizes.sum() == len(corners)):
+    are_integers = all(array.dtype.kind in "iu" and array.ndim == 1 for array in (sizes, numbers))
+    if not (are_integers and len(sizes) == len(numbers) > 0 and sizes.min() > 0 and sizes.sum() == len(corners)):
         raise ValueError("'electrode_sizes' does not say whose corners 'electrode_corners' are; write it again.")
     # Every electrode needs a polygon, as otherwise its place is unknown.
     if not np.array_equal(np.unique(numbers), np.arange(numbers.max() + 1)):
@@ -214,35 +214,39 @@ def _electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShapes | 
     return ElectrodeShapes(corners.astype(float), sizes, numbers)
 
 
-def _inclusions(mesh: Mesh, arrays: dict[str, np.ndarray]) -> tuple[Inclusion, ...]:
+def _read_inclusions(mesh: Mesh, arrays: dict[str, np.ndarray]) -> tuple[Inclusion, ...]:
     if "inclusion_centroids" not in arrays:
         return ()
     need(arrays, "inclusion_sizes", "inclusion_peaks")
     centroids, sizes, peaks = (arrays[f"inclusion_{name}"] for name in ("centroids", "sizes", "peaks"))
-    number = peaks.size
-    if centroids.shape != (number, mesh.points.shape[1]) or not sizes.shape == peaks.shape == (number,):
+    num_inclusions = peaks.size
+    if centroids.shape != (num_inclusions, mesh.points.shape[1]) or not sizes.shape == peaks.shape == (num_inclusions,):
         raise ValueError("'inclusion_centroids', '_sizes' and '_peaks' do not belong together; write it again.")
-    if not all(one.dtype.kind == "f" and np.isfinite(one).all() for one in (centroids, sizes, peaks)):
+    if not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in (centroids, sizes, peaks)):
         raise ValueError("inclusions have values that are not finite; write it again.")
-    listed = zip(centroids.tolist(), sizes.tolist(), peaks.tolist(), _read_forms(arrays, number), strict=True)
+    records = zip(centroids.tolist(), sizes.tolist(), peaks.tolist(), _read_forms(arrays, num_inclusions), strict=True)
     return tuple(
         Inclusion(1 if peak > 0 else -1, tuple(centroid), size, peak, mesh.is_surface, form)
-        for centroid, size, peak, form in listed
+        for centroid, size, peak, form in records
     )
 
 
-def _read_forms(arrays: dict[str, np.ndarray], number: int) -> list[SolidForm | None]:
+def _read_forms(arrays: dict[str, np.ndarray], num_inclusions: int) -> list[SolidForm | None]:
     if "inclusion_axes" not in arrays:
-        return [None] * number
+        return [None] * num_inclusions
     need(arrays, "inclusion_centres", "inclusion_columns")
     centres, axes, columns = (arrays[f"inclusion_{name}"] for name in ("centres", "axes", "columns"))
-    if not (centres.shape == (number, 3) and axes.shape == (number, 3, 3) and columns.shape == (number,)):
+    if not (
+        centres.shape == (num_inclusions, 3)
+        and axes.shape == (num_inclusions, 3, 3)
+        and columns.shape == (num_inclusions,)
+    ):
         raise ValueError("'inclusion_centres', '_axes' and '_columns' are not of every inclusion; write it again.")
-    if not all(one.dtype.kind == "f" and np.isfinite(one).all() for one in (centres, axes)):
+    if not all(array.dtype.kind == "f" and np.isfinite(array).all() for array in (centres, axes)):
         raise ValueError("inclusions have places that are not finite; write it again.")
     return [
-        SolidForm(tuple(centre), tuple(map(tuple, three)), bool(column))
-        for centre, three, column in zip(centres.tolist(), axes.tolist(), columns.tolist(), strict=True)
+        SolidForm(tuple(centre), tuple(map(tuple, half_axes)), bool(column))
+        for centre, half_axes, column in zip(centres.tolist(), axes.tolist(), columns.tolist(), strict=True)
     ]
 
 
@@ -291,11 +295,11 @@ def write_views(
     """
     if image.mesh.dimension != 3 and planes:
         raise ValueError("planes cut solids; this image is of a sheet. Leave them out.")
-    drawn = _figures(image, camera, levels, planes, axis, slices)
-    with results(folder, tuple(drawn)) as made:
-        for name, figure in drawn.items():
-            figure.savefig(made / name, dpi=_DPI)
-    return tuple(drawn)
+    figures = _draw_figures(image, camera, levels, planes, axis, slices)
+    with results(folder, tuple(figures)) as temporary_folder:
+        for name, figure in figures.items():
+            figure.savefig(temporary_folder / name, dpi=_DPI)
+    return tuple(figures)
 
 
 def drawn_values(image: SavedImage) -> tuple[np.ndarray, "ColourScale"]:
@@ -310,23 +314,28 @@ def drawn_values(image: SavedImage) -> tuple[np.ndarray, "ColourScale"]:
     return np.asarray(image.change), CHANGE
 
 
-def _figures(image: SavedImage, camera, levels, planes, axis: str, slices: int) -> dict[str, "Figure"]:
+def _draw_figures(image: SavedImage, camera, levels, planes, axis: str, slices: int) -> dict[str, "Figure"]:
     from jeit.plot.solid.isosurfaces import plot_isosurfaces
     from jeit.plot.solid.overview import plot_solid
-    from jeit.plot.solid.scene import FROM_THE_CORNER, Camera
+    from jeit.plot.solid.scene import CORNER_VIEW, Camera
     from jeit.plot.solid.shaded_surface import plot_surface
     from jeit.plot.solid.slices import plot_slice, plot_slices
 
-    first = FROM_THE_CORNER if camera is None else camera
+    first_camera = CORNER_VIEW if camera is None else camera
     values, scale = drawn_values(image)
     mesh, electrodes = image.mesh, image.electrodes
     if mesh.dimension == 2 and not mesh.is_surface:
         return {"image.png": _draw_sheet(image, values, scale)}
-    other = Camera(first.azimuth + 180, first.elevation)
-    sides = {"": first, "from the other side": other, "from the front": Camera(-90, 0), "from above": Camera(-90, 90)}
+    opposite_camera = Camera(first_camera.azimuth + 180, first_camera.elevation)
+    cameras = {
+        "": first_camera,
+        "from the other side": opposite_camera,
+        "from the front": Camera(-90, 0),
+        "from above": Camera(-90, 90),
+    }
 
-    def each(draw, names, width: float, height: float):
-        figure = _figure(width, height)
+    def draw_panels(draw, names, width: float, height: float):
+        figure = _new_figure(width, height)
         panels = figure.subplots(math.ceil(len(names) / 2), min(2, len(names)), squeeze=False).ravel()
         for name, panel in zip(names, panels, strict=False):
             draw(name, panel)
@@ -336,38 +345,40 @@ def _figures(image: SavedImage, camera, levels, planes, axis: str, slices: int) 
 
     if mesh.is_surface:
 
-        def side_of_surface(name, panel):
+        def draw_surface_side(name, panel):
             cells = np.asarray(mesh.cells)
-            plot_surface(mesh.points, cells, values, electrodes, camera=sides[name], scale=scale, title=name, ax=panel)
+            plot_surface(
+                mesh.points, cells, values, electrodes, camera=cameras[name], scale=scale, title=name, ax=panel
+            )
 
-        return {"surface.png": each(side_of_surface, list(sides), 11, 9.5)}
+        return {"surface.png": draw_panels(draw_surface_side, list(cameras), 11, 9.5)}
 
-    marked: dict[str, Any] = {"inclusions": image.inclusions, "scale": scale}
+    options: dict[str, Any] = {"inclusions": image.inclusions, "scale": scale}
 
-    def side(name, panel):
-        plot_isosurfaces(mesh, values, electrodes, levels=levels, camera=sides[name], ax=panel, **marked)
-        panel.set_title(name or _angles(first), fontsize=10)
+    def draw_side(name, panel):
+        plot_isosurfaces(mesh, values, electrodes, levels=levels, camera=cameras[name], ax=panel, **options)
+        panel.set_title(name or _angle_text(first_camera), fontsize=10)
 
-    found = {
-        "overview.png": plot_solid(mesh, values, electrodes, levels=levels, camera=first, **marked),
-        "isosurfaces.png": each(side, list(sides), 12, 10),
-        "slices.png": plot_slices(mesh, values, electrodes, axis=axis, at=slices, **marked),
+    figures = {
+        "overview.png": plot_solid(mesh, values, electrodes, levels=levels, camera=first_camera, **options),
+        "isosurfaces.png": draw_panels(draw_side, list(cameras), 12, 10),
+        "slices.png": plot_slices(mesh, values, electrodes, axis=axis, at=slices, **options),
     }
     if planes:
 
-        def cut(plane, panel):
-            plot_slice(mesh, values, plane, electrodes, ax=panel, **marked)
+        def draw_section(plane, panel):
+            plot_slice(mesh, values, plane, electrodes, ax=panel, **options)
 
-        rows = math.ceil(len(planes) / 2)
-        found["planes.png"] = each(cut, list(planes), 5.6 * min(2, len(planes)), 5 * rows)
-    return found
+        num_rows = math.ceil(len(planes) / 2)
+        figures["planes.png"] = draw_panels(draw_section, list(planes), 5.6 * min(2, len(planes)), 5 * num_rows)
+    return figures
 
 
-def _angles(camera: "Camera") -> str:
+def _angle_text(camera: "Camera") -> str:
     return f"azimuth {camera.azimuth:g}°, elevation {camera.elevation:g}°".replace("-", "−")
 
 
-def _figure(width: float, height: float) -> "Figure":
+def _new_figure(width: float, height: float) -> "Figure":
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
@@ -378,7 +389,7 @@ def _draw_sheet(image: SavedImage, values, scale) -> "Figure":
     from jeit.plot.imaging.electrodes import draw_shapes
     from jeit.plot.imaging.image import plot_image
 
-    figure = _figure(6.4, 5.6)
+    figure = _new_figure(6.4, 5.6)
     ax = plot_image(image.mesh, values, inclusions=image.inclusions, scale=scale, ax=figure.subplots())
     if image.electrodes is not None:
         draw_shapes(image.mesh, image.electrodes, ax=ax)

@@ -72,28 +72,28 @@ def write_film(
 
     from jeit.plot.axes import SOFT, ColourScale
     from jeit.plot.imaging.image import slice_text
-    from jeit.plot.imaging.series import FramePicture, chosen_frames, fit_scale
+    from jeit.plot.imaging.series import FramePicture, fit_scale, select_frames
 
     path, values = Path(path), np.asarray(changes)
     check_film(path.name)
-    said = [f"frame {number}" for number in range(len(values))] if titles is None else list(titles)
+    frame_titles = [f"frame {number}" for number in range(len(values))] if titles is None else list(titles)
     figure = Figure(figsize=(5.0, 4.4), layout="constrained")
-    fitted, chosen = fit_scale(values, mesh, ColourScale(limit=limit)), chosen_frames(len(values), FILM_FRAMES)
-    picture = FramePicture(figure.subplots(), mesh, electrodes, fitted)
-    fitted.draw_bar(picture.ax, picture.drawn)
-    picture.show(values[chosen[0]], said[chosen[0]])
+    fitted_scale, selected = fit_scale(values, mesh, ColourScale(limit=limit)), select_frames(len(values), FILM_FRAMES)
+    picture = FramePicture(figure.subplots(), mesh, electrodes, fitted_scale)
+    fitted_scale.draw_bar(picture.ax, picture.mappable)
+    picture.show(values[selected[0]], frame_titles[selected[0]])
     if text := slice_text(mesh):
         figure.supxlabel(text, fontsize=9, color=SOFT)
     figure.canvas.draw()
     figure.set_layout_engine("none")  # prevents a different layout in each frame
-    pace = min(_DEFAULT_RATE if rate is None else rate * len(chosen) / len(values), _MAX_RATE)
-    writer = (PillowWriter if path.suffix.lower() == ".gif" else FFMpegWriter)(fps=max(pace, 0.1))  # pyright: ignore
+    frame_rate = min(_DEFAULT_RATE if rate is None else rate * len(selected) / len(values), _MAX_RATE)
+    writer = (PillowWriter if path.suffix.lower() == ".gif" else FFMpegWriter)(fps=max(frame_rate, 0.1))  # pyright: ignore
     with writer.saving(figure, str(path), 80):
-        for done, frame in enumerate(chosen):
-            picture.show(values[frame], said[frame])
+        for index, frame in enumerate(selected):
+            picture.show(values[frame], frame_titles[frame])
             writer.grab_frame()
             if progress is not None:
-                progress(f"{done + 1} of {len(chosen)}")
+                progress(f"{index + 1} of {len(selected)}")
 
 
 SERIES_FILES = ("series.png", "series.npz", "regions.csv", "report.json")
@@ -130,60 +130,75 @@ def write_series(
     ```
     """
     series, model = series_result.series, series_result.prepared.model
-    chosen = {"whole body": np.ones(series.mesh.num_cells, bool)} if not regions else dict(regions)
+    region_masks = {"whole body": np.ones(series.mesh.num_cells, bool)} if not regions else dict(regions)
     films = () if film is None else (check_film(film),)
-    curves = {name: series.mean_change(region) for name, region in chosen.items()}
+    curves = {name: series.mean_change(region) for name, region in region_masks.items()}
     report = _report(series_result, curves, oscillations)
     from jeit.plot.imaging.series import plot_series
 
-    with results(folder, (*SERIES_FILES, *films)) as made:
-        plot_series(series, chosen, oscillations, model.electrodes).savefig(made / "series.png", dpi=130)
+    with results(folder, (*SERIES_FILES, *films)) as temporary_folder:
+        plot_series(series, region_masks, oscillations, model.electrodes).savefig(
+            temporary_folder / "series.png", dpi=130
+        )
         np.savez_compressed(
-            made / "series.npz",
+            temporary_folder / "series.npz",
             changes=series.changes,
             times=series.times,
             background=series.background,
             points=np.asarray(series.mesh.points),
             cells=np.asarray(series.mesh.cells),
             functional=series.functional(),
-            frequency=np.array([one.frequency for one in oscillations], float),
-            amplitude=np.array([one.amplitude for one in oscillations], float).reshape(-1, series.mesh.num_cells),
-            phase=np.array([one.phase for one in oscillations], float).reshape(-1, series.mesh.num_cells),
+            frequency=np.array([fitted_oscillation.frequency for fitted_oscillation in oscillations], float),
+            amplitude=np.array([fitted_oscillation.amplitude for fitted_oscillation in oscillations], float).reshape(
+                -1, series.mesh.num_cells
+            ),
+            phase=np.array([fitted_oscillation.phase for fitted_oscillation in oscillations], float).reshape(
+                -1, series.mesh.num_cells
+            ),
         )
         rows = zip(series.times, *curves.values(), strict=True)
-        cells = ([f"{time:.9g}", *("" if np.isnan(one) else f"{one:.6g}" for one in row)] for time, *row in rows)
-        write_rows(made / "regions.csv", ("time_s" if series.timed else "frame", *curves), cells)
-        write_json(report, made / "report.json")
+        cells = ([f"{time:.9g}", *("" if np.isnan(value) else f"{value:.6g}" for value in row)] for time, *row in rows)
+        write_rows(temporary_folder / "regions.csv", ("time_s" if series.timed else "frame", *curves), cells)
+        write_json(report, temporary_folder / "report.json")
         if film is not None:
             titles, rate = series.titles, series.frame_rate
-            write_film(made / film, series.mesh, series.changes, model.electrodes, titles=titles, rate=rate)
+            write_film(temporary_folder / film, series.mesh, series.changes, model.electrodes, titles=titles, rate=rate)
     return report
 
 
-def _report(found: ImagedSequence, curves: Mapping[str, np.ndarray], oscillations: Sequence[Oscillation]) -> dict:
-    series = found.series
+def _report(sequence: ImagedSequence, curves: Mapping[str, np.ndarray], oscillations: Sequence[Oscillation]) -> dict:
+    series = sequence.series
     reported = []
-    for one in oscillations:
-        at = {name: oscillation(curve, series.times, one.frequency) for name, curve in curves.items()}
-        parts = {
-            name: {
-                "amplitude": float(part.amplitude),
-                "noise": float(part.noise),
-                "phase_degrees": float(np.degrees(part.phase)),
-            }
-            for name, part in at.items()
+    for fitted_oscillation in oscillations:
+        region_oscillations = {
+            name: oscillation(curve, series.times, fitted_oscillation.frequency) for name, curve in curves.items()
         }
-        reported.append({"frequency": one.frequency, "resolution": one.resolution, "unit": "Hz", "regions": parts})
+        region_reports = {
+            name: {
+                "amplitude": float(component.amplitude),
+                "noise": float(component.noise),
+                "phase_degrees": float(np.degrees(component.phase)),
+            }
+            for name, component in region_oscillations.items()
+        }
+        reported.append(
+            {
+                "frequency": fitted_oscillation.frequency,
+                "resolution": fitted_oscillation.resolution,
+                "unit": "Hz",
+                "regions": region_reports,
+            }
+        )
     return as_plain_values(
         {
-            "measurement": describe_measurement(found.prepared.measurement),
+            "measurement": describe_measurement(sequence.prepared.measurement),
             "frames": len(series.times),
-            "refused": int(found.refused.sum()),
+            "refused": int(sequence.refused.sum()),
             "frame_rate": series.frame_rate,
             "frame_rate_unit": "Hz",
             "background": series.background,
             "unit": series.unit,
-            "hyperparameter": float(found.reconstruction.hyperparameter),
+            "hyperparameter": float(sequence.reconstruction.hyperparameter),
             "oscillations": reported,
         }
     )

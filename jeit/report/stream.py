@@ -89,32 +89,34 @@ def write_stream(
         check_film(film)
     if rate is not None and not (is_number(rate) and rate > 0):
         raise ValueError(f"rate must be positive, frames in a second; it is {describe(rate)}.")
-    made = ("frames.csv", "images.npz", "frames.png", *([] if film is None else [film]))
-    folder = results_folder(folder, made)
-    for earlier in made[1:]:
+    file_names = ("frames.csv", "images.npz", "frames.png", *([] if film is None else [film]))
+    folder = results_folder(folder, file_names)
+    for earlier in file_names[1:]:
         (folder / earlier).unlink(missing_ok=True)  # it belongs to an earlier stream
     clear_unfinished(folder)
-    report = drawing or (lambda said: None)
-    mesh, seen = calibration.model.mesh, _StreamSummary(calibration)
+    report = drawing or (lambda task: None)
+    mesh, summary = calibration.model.mesh, _StreamSummary(calibration)
     with GrowingRows(folder, (mesh.num_cells,)) as rows:
         with GrowingTable(folder / "frames.csv", _COLUMNS) as table:
-            for one in images:
-                row, image = seen.take(one)
+            for frame_image in images:
+                row, image = summary.take(frame_image)
                 with reporting_partial_results(rows):
                     table.write(row)
                     rows.append(image)
                 if progress is not None:
-                    progress(one)
+                    progress(frame_image)
         if not rows.number:
             raise ValueError(f"'{name}': there was no frame in it.")
-        others = {"background": calibration.conductivity, "points": mesh.points, "cells": mesh.cells}
+        arrays = {"background": calibration.conductivity, "points": mesh.points, "cells": mesh.cells}
         report("images")
         with reporting_partial_results(rows):
-            rows.write_npz(folder / "images.npz", "conductivity", others, lambda far: report(f"images: {far}"))
-        latency = seen.latency.values()
+            rows.write_npz(
+                folder / "images.npz", "conductivity", arrays, lambda progress_text: report(f"images: {progress_text}")
+            )
+        latency = summary.latency.values()
         if latency.size:
-            _StreamPictures(folder, film, rate, report).draw(rows, seen)
-        return WrittenStream(rows.number, seen.counts, latency, seen.first_reason)
+            _StreamPictures(folder, film, rate, report).draw(rows, summary)
+        return WrittenStream(rows.number, summary.counts, latency, summary.first_reason)
 
 
 class _StreamSummary:
@@ -124,22 +126,22 @@ class _StreamSummary:
         self.calibration = calibration
         mesh, self.background = calibration.model.mesh, float(calibration.conductivity)
         self._strongest = StrongestRegion(mesh)
-        self._nothing = np.full(mesh.num_cells, np.nan, np.float32)
+        self._empty_image = np.full(mesh.num_cells, np.nan, np.float32)
         self.latency, self.counts, self.first_reason = Sample(), {}, ""
         self.refused, self.first_imaged, self.largest = [], -1, 0.0
 
-    def take(self, one: FrameImage) -> tuple[list[object], Float[np.ndarray, " m"]]:
+    def take(self, frame_image: FrameImage) -> tuple[list[object], Float[np.ndarray, " m"]]:
         """Add a frame to the statistics; return its line of the table, and its image."""
-        self.counts[str(one.status)] = self.counts.get(str(one.status), 0) + 1
-        if one.conductivity is None:
-            self.first_reason = self.first_reason or one.reason
-            self.refused += [one.number] if len(self.refused) < _MAX_NAMED else []
-            return _table_row(one, self._strongest, self.background), self._nothing
-        self.first_imaged = one.number if self.first_imaged < 0 else self.first_imaged
-        self.latency.append(one.latency)
-        image = one.conductivity.astype(np.float32)
+        self.counts[str(frame_image.status)] = self.counts.get(str(frame_image.status), 0) + 1
+        if frame_image.conductivity is None:
+            self.first_reason = self.first_reason or frame_image.reason
+            self.refused += [frame_image.number] if len(self.refused) < _MAX_NAMED else []
+            return _table_row(frame_image, self._strongest, self.background), self._empty_image
+        self.first_imaged = frame_image.number if self.first_imaged < 0 else self.first_imaged
+        self.latency.append(frame_image.latency)
+        image = frame_image.conductivity.astype(np.float32)
         self.largest = max(self.largest, float(np.abs(image - np.float32(self.background)).max()))
-        return _table_row(one, self._strongest, self.background), image
+        return _table_row(frame_image, self._strongest, self.background), image
 
     @property
     def limit(self) -> float:
@@ -159,52 +161,54 @@ class _StreamPictures:
     rate: float | None
     report: Callable[[str], None]
 
-    def draw(self, rows: GrowingRows, seen: _StreamSummary) -> None:
+    def draw(self, rows: GrowingRows, summary: _StreamSummary) -> None:
         """Draw the contact sheet and the film from evenly spaced rows."""
         from jeit.plot import ColourScale, plot_frames
         from jeit.plot.imaging.series import SHEET_FRAMES, FrameCount
 
-        model, limit = seen.calibration.model, seen.limit
+        model, limit = summary.calibration.model, summary.limit
         self.report(PICTURES[0])
-        changes, titles = self._some(rows, seen, SHEET_FRAMES)
-        count = FrameCount(rows.number, seen.counts.get("refused", 0), self._titles(seen.refused))
+        changes, titles = self._selected_changes(rows, summary, SHEET_FRAMES)
+        count = FrameCount(rows.number, summary.counts.get("refused", 0), self._titles(summary.refused))
         scale = ColourScale(limit=limit)
         sheet = plot_frames(model.mesh, changes, model.electrodes, titles=titles, scale=scale, count=count)
         with written_whole(self.folder / "frames.png") as file:
             sheet.savefig(file, dpi=120)
         if self.film is None:
             return
-        changes, titles = self._some(rows, seen, FILM_FRAMES)
-        pace = None if self.rate is None else self.rate * len(changes) / rows.number
-        with whole_files(self.folder) as made:
+        changes, titles = self._selected_changes(rows, summary, FILM_FRAMES)
+        film_rate = None if self.rate is None else self.rate * len(changes) / rows.number
+        with whole_files(self.folder) as temporary_folder:
             write_film(
-                made / self.film,
+                temporary_folder / self.film,
                 model.mesh,
                 changes,
                 model.electrodes,
                 titles=titles,
-                rate=pace,
+                rate=film_rate,
                 limit=limit,
-                progress=lambda far: self.report(f"{PICTURES[1]}: {far}"),
+                progress=lambda progress_text: self.report(f"{PICTURES[1]}: {progress_text}"),
             )
 
-    def _some(self, rows: GrowingRows, seen: _StreamSummary, most: int) -> tuple[Float[np.ndarray, "k m"], list[str]]:
-        from jeit.plot.imaging.series import chosen_frames
+    def _selected_changes(
+        self, rows: GrowingRows, summary: _StreamSummary, max_frames: int
+    ) -> tuple[Float[np.ndarray, "k m"], list[str]]:
+        from jeit.plot.imaging.series import select_frames
 
-        chosen = chosen_frames(rows.number, most)
-        images = rows.read(chosen)
+        selected = select_frames(rows.number, max_frames)
+        images = rows.read(selected)
         if not np.isfinite(images).any():  # include a frame that was imaged
-            chosen = sorted({seen.first_imaged, *chosen[1:]})
-            images = rows.read(chosen)
-        return images - np.float32(seen.background), self._titles(chosen)
+            selected = sorted({summary.first_imaged, *selected[1:]})
+            images = rows.read(selected)
+        return images - np.float32(summary.background), self._titles(selected)
 
     def _titles(self, numbers: Iterable[int]) -> list[str]:
-        return [f"frame {one}" if self.rate is None else f"{one / self.rate:.2f} s" for one in numbers]
+        return [f"frame {number}" if self.rate is None else f"{number / self.rate:.2f} s" for number in numbers]
 
 
 def _table_row(frame_image: FrameImage, strongest: StrongestRegion, background: float) -> list[object]:
     """Values of a frame for the table."""
-    spent = f"{1e3 * frame_image.latency:.3f}"
+    latency_text = f"{1e3 * frame_image.latency:.3f}"
     if frame_image.conductivity is None:
         return [
             frame_image.number,
@@ -212,22 +216,22 @@ def _table_row(frame_image: FrameImage, strongest: StrongestRegion, background: 
             int(frame_image.usable.sum()),
             "",
             frame_image.iterations,
-            spent,
+            latency_text,
             "",
             "",
             "",
             frame_image.reason,
         ]
     misfit = "" if np.isnan(frame_image.misfit) else f"{frame_image.misfit:.4g}"
-    head = [
+    first_values = [
         frame_image.number,
         frame_image.status,
         int(frame_image.usable.sum()),
         misfit,
         frame_image.iterations,
-        spent,
+        latency_text,
     ]
     if frame_image.status == FrameStatus.UNCHANGED:
-        return [*head, "", "", "", frame_image.reason]
+        return [*first_values, "", "", "", frame_image.reason]
     centroid, peak = strongest(frame_image.conductivity - background)
-    return [*head, *(f"{value:.5f}" for value in centroid[:2]), f"{peak:.5g}", frame_image.reason]
+    return [*first_values, *(f"{value:.5f}" for value in centroid[:2]), f"{peak:.5g}", frame_image.reason]

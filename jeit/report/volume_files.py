@@ -19,7 +19,7 @@ from jeit.mesh.geometry import facet_measures
 from jeit.report.folder import results_folder
 
 # Minimum share of the surface around a node that an electrode must cover for the node to count as under it.
-_NODE_TOLERANCE = 0.1
+_MIN_COVERED_SHARE = 0.1
 
 
 def write_vtu(
@@ -52,8 +52,8 @@ def write_vtu(
     path = Path(path)
     if path.suffix.lower() != ".vtu":
         raise ValueError(f"path: {path.name[:80]} must end in .vtu.")
-    with whole_files(results_folder(path.parent, (path.name,))) as made:
-        draft_vtu(made / path.name, mesh, cell_data, point_data=point_data, electrodes=electrodes)
+    with whole_files(results_folder(path.parent, (path.name,))) as temporary_folder:
+        draft_vtu(temporary_folder / path.name, mesh, cell_data, point_data=point_data, electrodes=electrodes)
 
 
 def draft_vtu(
@@ -65,10 +65,10 @@ def draft_vtu(
     electrodes: AbstractElectrodes | None = None,
 ) -> None:
     """Write a VTU file as `write_vtu`, but directly to `path`, such as in the temporary folder of `results`."""
-    at_nodes = dict(point_data or {})
+    node_data = dict(point_data or {})
     if electrodes is not None:
-        at_nodes["electrode"] = electrode_of_nodes(mesh, electrodes)
-    write(mesh, path, cell_data=_real(cell_data), point_data=_real(at_nodes))
+        node_data["electrode"] = electrode_of_nodes(mesh, electrodes)
+    write(mesh, path, cell_data=_real_arrays(cell_data), point_data=_real_arrays(node_data))
 
 
 def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> None:
@@ -94,7 +94,7 @@ def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: 
     path = Path(path)
     if path.suffix.lower() != ".pvd":
         raise ValueError(f"path: {path.name[:80]} must end in .pvd.")
-    seconds, values = _frames(mesh, times, cell_data)
+    seconds, values = _checked_frames(mesh, times, cell_data)
     names = [f"{path.stem}_{k:04d}.vtu" for k in range(len(seconds))]
     entries = [
         f'    <DataSet timestep="{time:.17g}" part="0" file={quoteattr(name)}/>'
@@ -108,10 +108,10 @@ def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: 
         "  </Collection>",
         "</VTKFile>",
     ]
-    with whole_files(results_folder(path.parent, (path.name, *names))) as made:
+    with whole_files(results_folder(path.parent, (path.name, *names))) as temporary_folder:
         for k, name in enumerate(names):
-            draft_vtu(made / name, mesh, {key: one[k] for key, one in values.items()})
-        (made / path.name).write_text("\n".join(lines) + "\n", "utf-8")
+            draft_vtu(temporary_folder / name, mesh, {key: array[k] for key, array in values.items()})
+        (temporary_folder / path.name).write_text("\n".join(lines) + "\n", "utf-8")
 
 
 def write_xdmf(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> None:
@@ -135,16 +135,19 @@ def write_xdmf(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mappin
     path = Path(path)
     if path.suffix.lower() != ".xdmf":
         raise ValueError(f"path: {path.name[:80]} must end in .xdmf.")
-    seconds, values = _frames(mesh, times, cell_data)
+    seconds, values = _checked_frames(mesh, times, cell_data)
     points = np.asarray(mesh.points, float)
     if points.shape[1] == 2:
         points = np.column_stack([points, np.zeros(len(points))])
     kind = {3: "triangle", 4: "tetra"}[mesh.cells.shape[1]]
     folder = results_folder(path.parent, (path.name,))
-    with whole_files(folder) as made, TimeSeriesWriter(str(made / path.name), data_format="XML") as file:
+    with (
+        whole_files(folder) as temporary_folder,
+        TimeSeriesWriter(str(temporary_folder / path.name), data_format="XML") as file,
+    ):
         file.write_points_cells(points, [(kind, np.asarray(mesh.cells))])
         for k, time in enumerate(seconds):
-            file.write_data(float(time), cell_data={key: [one[k]] for key, one in values.items()})
+            file.write_data(float(time), cell_data={key: [array[k]] for key, array in values.items()})
 
 
 def electrode_of_nodes(mesh: Mesh, electrodes: AbstractElectrodes) -> Int[np.ndarray, " n"]:
@@ -153,42 +156,44 @@ def electrode_of_nodes(mesh: Mesh, electrodes: AbstractElectrodes) -> Int[np.nda
     load = np.asarray(contact.load)
     if not electrodes.is_point:
         load = load * np.asarray(electrodes.contact_impedance)
-        onto = np.asarray(contact.nodes[0])
-        if len(contact.nodes) == 1 and onto.shape == np.shape(mesh.facets):
-            share = np.repeat(np.asarray(facet_measures(mesh)) / onto.shape[1], onto.shape[1])
-            round_it = np.bincount(onto.ravel(), share, mesh.num_points)
-            load = load / np.where(round_it > 0, round_it, np.inf)[:, None]
+        facets = np.asarray(contact.nodes[0])
+        if len(contact.nodes) == 1 and facets.shape == np.shape(mesh.facets):
+            share = np.repeat(np.asarray(facet_measures(mesh)) / facets.shape[1], facets.shape[1])
+            node_measures = np.bincount(facets.ravel(), share, mesh.num_points)
+            load = load / np.where(node_measures > 0, node_measures, np.inf)[:, None]
         else:
             load = load / load.max(axis=0)
-    return np.where(load.max(axis=1) > _NODE_TOLERANCE, load.argmax(axis=1) + 1, 0)
+    return np.where(load.max(axis=1) > _MIN_COVERED_SHARE, load.argmax(axis=1) + 1, 0)
 
 
-def _real(data: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
+def _real_arrays(data: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
     """Replace complex arrays by two arrays, their real and imaginary part."""
-    found = {}
+    arrays = {}
     for name, values in data.items():
         array: Any = np.asarray(values)
         if np.iscomplexobj(array):
-            found[f"{name}, real"], found[f"{name}, imaginary"] = array.real, array.imag
+            arrays[f"{name}, real"], arrays[f"{name}, imaginary"] = array.real, array.imag
         else:
-            found[name] = array
-    return found
+            arrays[name] = array
+    return arrays
 
 
-def _frames(mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> tuple[np.ndarray, dict[str, Any]]:
+def _checked_frames(
+    mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]
+) -> tuple[np.ndarray, dict[str, Any]]:
     """Check the times and values of a series, and return them as arrays. Raises `ValueError` if they do not fit."""
     check_kind("mesh", mesh, Mesh, "a Mesh, such as Disk(0.05).mesh()")
     seconds: Sequence | np.ndarray = np.atleast_1d(np.asarray(times, dtype=object))
-    if len(seconds) == 0 or not all(is_number(one) for one in seconds):
+    if len(seconds) == 0 or not all(is_number(number) for number in seconds):
         raise ValueError(f"times must be a time for each frame, seconds; they are {describe(times)}.")
     seconds = np.asarray(seconds, float)
     if not (np.diff(seconds) > 0).all():
         raise ValueError("times must rise from frame to frame.")
-    values = _real(cell_data)
-    for name, one in values.items():
-        if one.shape != (len(seconds), mesh.num_cells):
+    values = _real_arrays(cell_data)
+    for name, array in values.items():
+        if array.shape != (len(seconds), mesh.num_cells):
             raise ValueError(
-                f"cell_data: {str(name)[:40]!r} has shape {one.shape}; give one value for each of the {len(seconds)} "
+                f"cell_data: {str(name)[:40]!r} has shape {array.shape}; give one value for each of the {len(seconds)} "
                 f"times and {mesh.num_cells} cells."
             )
     if not values:

@@ -50,7 +50,7 @@ def quick_compilation() -> str:
     return f"--xla_backend_optimization_level=0{fusion}"
 
 
-_refusing = False
+_refuses_compilation = False
 
 
 def refuse_compiled_code_in_forks() -> None:
@@ -62,12 +62,12 @@ def refuse_compiled_code_in_forks() -> None:
 
 
 def _refuse_in_child() -> None:
-    global _refusing
-    if _refusing or not _has_started():
+    global _refuses_compilation
+    if _refuses_compilation or not _has_started():
         return
-    _refusing = True
+    _refuses_compilation = True
     jax.clear_caches()  # programs compiled before the fork are dropped, and new ones are refused
-    jax.monitoring.register_event_duration_secs_listener(_refuse)
+    jax.monitoring.register_event_duration_secs_listener(_raise_at_compilation)
 
 
 def _has_started() -> bool:
@@ -76,7 +76,7 @@ def _has_started() -> bool:
     return xla_bridge.backends_are_initialized()
 
 
-def _refuse(event: str, duration_secs: float, **_: str | int) -> None:
+def _raise_at_compilation(event: str, duration_secs: float, **_: str | int) -> None:
     """Listener to JAX's monitoring events that raises after tracing, before a program is compiled."""
     del duration_secs
     if event.startswith("/jax/core/compile"):
@@ -87,7 +87,7 @@ def _refuse(event: str, duration_secs: float, **_: str | int) -> None:
         )
 
 
-_MOST_BYTES, _MOST_FILES = 256 * 2**20, 5000
+_MAX_BYTES, _MAX_FILES = 256 * 2**20, 5000
 
 
 def keep_compiled_code() -> None:
@@ -99,15 +99,15 @@ def keep_compiled_code() -> None:
     identifies programs by their text and by the versions of JAX and of the compiler. The least recently used programs
     are deleted when there are more than 5,000 files or 256 MiB.
     """
-    given = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    asked = os.environ.get("JEIT_COMPILATION_CACHE", "").strip().lower()
-    if given is not None or asked in ("off", "0", "no", "none", "false", "disabled"):
+    user_folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    setting = os.environ.get("JEIT_COMPILATION_CACHE", "").strip().lower()
+    if user_folder is not None or setting in ("off", "0", "no", "none", "false", "disabled"):
         return
     try:
-        every = _cache_folder() / "jeit" / "jax"
-        folder = every / _processor()
+        cache_folder = _cache_folder() / "jeit" / "jax"
+        folder = cache_folder / _processor()
         folder.mkdir(parents=True, exist_ok=True)
-        _discard_oldest(every)
+        _discard_oldest(cache_folder)
     except (OSError, RuntimeError):
         return
     if os.access(folder, os.W_OK):
@@ -123,11 +123,11 @@ def discarded_damaged(warning: str) -> bool:
     Otherwise JAX, which does not overwrite cached files, would compile the program again and repeat the warning in
     every later process.
     """
-    given = re.match(r"Error reading persistent compilation cache entry for '([\w<>.-]+)'", warning)
+    match = re.match(r"Error reading persistent compilation cache entry for '([\w<>.-]+)'", warning)
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if given is None or not folder or not Path(folder).is_relative_to(_cache_folder() / "jeit"):
+    if match is None or not folder or not Path(folder).is_relative_to(_cache_folder() / "jeit"):
         return False
-    for path in Path(folder).glob(f"{glob.escape(given[1])}-*"):
+    for path in Path(folder).glob(f"{glob.escape(match[1])}-*"):
         with contextlib.suppress(OSError):
             path.unlink()
     return True
@@ -136,20 +136,20 @@ def discarded_damaged(warning: str) -> bool:
 def _processor() -> str:
     """Identifier of the type of processor, because code compiled for one type must not run on another where home
     folders are shared."""
-    described = platform.machine() + platform.processor()
+    description = platform.machine() + platform.processor()
     with contextlib.suppress(OSError), open("/proc/cpuinfo") as lines:
-        described += next((line for line in lines if line.startswith(("flags", "Features"))), "")
-    return hashlib.sha256(described.encode()).hexdigest()[:12]
+        description += next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    return hashlib.sha256(description.encode()).hexdigest()[:12]
 
 
 def _discard_oldest(folder: Path) -> None:
     """Delete the least recently used files beyond the limits, and empty files, which a full disk leaves and JAX cannot
     read."""
-    kept = sorted(_file_usage(folder), reverse=True)
-    size = 0
-    for number, (_, bytes_taken, path) in enumerate(kept):
-        size += bytes_taken
-        if number >= _MOST_FILES or size > _MOST_BYTES or not bytes_taken:
+    files = sorted(_file_usage(folder), reverse=True)
+    total_bytes = 0
+    for file_index, (_, num_bytes, path) in enumerate(files):
+        total_bytes += num_bytes
+        if file_index >= _MAX_FILES or total_bytes > _MAX_BYTES or not num_bytes:
             path.unlink(missing_ok=True)
 
 
@@ -157,13 +157,13 @@ def _file_usage(folder: Path) -> Iterator[tuple[float, int, Path]]:
     """Time of last use, size in bytes, and path of each file."""
     for path in folder.glob("*/*"):
         with contextlib.suppress(FileNotFoundError):  # another process may delete the file
-            given = path.stat()
-            yield max(given.st_atime, given.st_mtime), given.st_size, path
+            status = path.stat()
+            yield max(status.st_atime, status.st_mtime), status.st_size, path
 
 
 def _cache_folder() -> Path:
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches"
     variable = "LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME"
-    given = Path(os.environ.get(variable, ""))
-    return given if given.is_absolute() else Path.home() / ".cache"
+    folder = Path(os.environ.get(variable, ""))
+    return folder if folder.is_absolute() else Path.home() / ".cache"

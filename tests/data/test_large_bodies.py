@@ -79,7 +79,7 @@ def test_the_command_prints_a_warning_once(capsys):
     from jeit.cli import app
 
     with warnings.catch_warnings():
-        show = app._shown_once()
+        show = app._create_warning_printer()
         for line in (1, 2):
             show(UserWarning("large"), UserWarning, "a.py", line)
         show(UserWarning("small"), UserWarning, "a.py", 1)

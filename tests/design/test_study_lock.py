@@ -103,9 +103,9 @@ def test_abandoned_locks_are_taken_over(store_path, lock_file, left):
     if left == "before this machine started":
         signed(lock_file, host=lock_module.platform.node())
     elif left == "another name of this machine":
-        if not lock_module.boot():
+        if not lock_module.boot_identifier():
             pytest.skip("this system does not distinguish its boots")
-        signed(lock_file, boot=lock_module.boot())
+        signed(lock_file, boot=lock_module.boot_identifier())
     else:
         lock_file.write_text({"nothing": "", "no JSON": "{" * 5000, "a list": "[1]"}[left])
     with locked(store_path, "study"):

@@ -375,7 +375,7 @@ class One(Table):
 class Small(Table):
     """A table of tables."""
 
-    what = "a list"
+    subject = "a list"
     microphones: list[One]
     strengths: list[float]
 
@@ -383,7 +383,7 @@ class Small(Table):
 class Named(Table):
     """A table of one word."""
 
-    what = "a name"
+    subject = "a name"
     word: Word
 
 

@@ -46,7 +46,7 @@ def test_the_frame_is_reported_and_written(name, tmp_path, capsys):
     result = image_difference(measured, base, SETTINGS, frame=frame)
     np.testing.assert_array_equal(np.asarray(result.measurement.voltages)[0], FULL)
     assert (result.frame, result.num_frames) == (number, measured.num_frames)
-    show(plain_console(), result, asked=frame is not None)
+    show(plain_console(), result, frame_given=frame is not None)
     assert f"frame {label} background " in " ".join(capsys.readouterr().out.split())
     write_image(result, tmp_path)
     data = json.loads((tmp_path / "report.json").read_text())["data"]

@@ -233,16 +233,16 @@ def test_electrodes_that_hide_a_body_are_transparent(tank, image, ax):
 
 
 def test_each_sign_has_its_own_surface(tank, image):
-    found = level_surfaces(tank, image, (0.5,), both=True)
+    found = level_surfaces(tank, image, (0.5,), is_signed=True)
     assert [np.sign(value) for value, _, _ in found] == [1, -1]
     for (_, _, surface), middle in zip(found, MIDDLES, strict=True):
         # A Gaussian falls to half at 0.83 of its length.
         assert surface.enclosed == pytest.approx(4 / 3 * np.pi * (0.8326 * 0.03) ** 3, rel=0.3)
         assert np.linalg.norm(surface.points.mean(axis=0) - middle) < 0.008
     weak = np.where(image < 0, 0.1 * image, image)
-    assert len(level_surfaces(tank, weak, (0.3, 0.6), both=True)) == 2
-    assert level_surfaces(tank, np.zeros(tank.num_cells), (0.5,), both=True) == []
-    ((value, _, _),) = level_surfaces(tank, image + 5e-3, (0.5,), both=False)
+    assert len(level_surfaces(tank, weak, (0.3, 0.6), is_signed=True)) == 2
+    assert level_surfaces(tank, np.zeros(tank.num_cells), (0.5,), is_signed=True) == []
+    ((value, _, _),) = level_surfaces(tank, image + 5e-3, (0.5,), is_signed=False)
     assert 5e-3 < value < 6.5e-3
 
 

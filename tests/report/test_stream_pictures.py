@@ -8,7 +8,7 @@ from jeit.electrodes import BoundaryElectrodes
 from jeit.layout import ring
 from jeit.mesh import Disk, Solid, centroids
 from jeit.plot import plot_frames
-from jeit.plot.imaging.series import chosen_frames
+from jeit.plot.imaging.series import select_frames
 from jeit.report import series, write_film
 
 RADIUS = 0.05
@@ -33,15 +33,15 @@ def pictures(figure):
 
 
 def test_chosen_frames_are_evenly_spaced_with_both_ends():
-    assert chosen_frames(5, 12) == [0, 1, 2, 3, 4]
-    assert chosen_frames(100, 4) == [0, 33, 66, 99]
+    assert select_frames(5, 12) == [0, 1, 2, 3, 4]
+    assert select_frames(100, 4) == [0, 33, 66, 99]
 
 
 def test_a_contact_sheet_has_one_scale_times_and_refusals():
     titles = [f"{0.1 * k:.1f} s" for k in range(30)]
     figure = plot_frames(MESH, changes(30, (0, 4)), ELECTRODES, titles=titles)
     shown = pictures(figure)
-    assert [ax.get_title() for ax in shown] == [titles[k] for k in chosen_frames(30, 12)]
+    assert [ax.get_title() for ax in shown] == [titles[k] for k in select_frames(30, 12)]
     assert {ax.images[1].get_clim() for ax in shown} == {shown[0].images[1].get_clim()}
     assert shown[0].images[1].get_clim()[1] == pytest.approx(2, rel=0.1)  # mS: of all frames, the last is strongest
     assert [ax.images[1].get_visible() for ax in shown] == [False] + 11 * [True]

@@ -94,7 +94,7 @@ class Calibration(Module):
 
         name = Path(path).name
         try:
-            content = read_json(path, most=_LARGEST)
+            content = read_json(path, max_bytes=_LARGEST)
         except ValueError:
             content = None
         if not isinstance(content, dict) or content.get("format") != FORMAT:

@@ -22,7 +22,7 @@ Loop = Annotated[np.ndarray, Numbers(((3, _MOST_VERTICES), (2, 2)), -1e6, 1e6, "
 class UnitsTable(Table):
     """Units of the values in the file."""
 
-    what = "units"
+    subject = "units"
     length: Literal["m"]
     intensity: Literal["square of the samples' unit"]
 
@@ -30,7 +30,7 @@ class UnitsTable(Table):
 class CurveTable(Table):
     """Parameters of a curved surface; see `CurvedSurface`."""
 
-    what = "a curve"
+    subject = "a curve"
     origin: Vector
     axes: Annotated[np.ndarray, Numbers(((3, 3), (2, 2)))]
     normal: Vector
@@ -42,7 +42,7 @@ class CurveTable(Table):
 class SurfaceTable(Table):
     """Surface of the skin: its outline, holes and curvature, in metres."""
 
-    what = "a surface"
+    subject = "a surface"
     outline: Loop
     holes: Annotated[list[Loop], FailFast()] = Field(max_length=_MOST_HOLES)
     curve: CurveTable | None = None
@@ -51,7 +51,7 @@ class SurfaceTable(Table):
 class IntensityTable(Table):
     """Band and windows with which samples are analysed; see `IntensitySettings`."""
 
-    what = "intensity"
+    subject = "intensity"
     low: Annotated[float, Number(0, 1e9, "Hz")] = 50.0
     high: Annotated[float, Number(0, 1e9, "Hz")] = 1000.0
     window: Annotated[float, Number(1e-9, 10, "s")] = 0.05
@@ -61,7 +61,7 @@ class IntensityTable(Table):
 class ErrorsTable(Table):
     """Relative standard error of each parameter of the decay model; null where unknown."""
 
-    what = "relative standard errors"
+    subject = "relative standard errors"
     a: NotNegative | None = None
     b: NotNegative | None = None
     length: NotNegative | None = None
@@ -70,7 +70,7 @@ class ErrorsTable(Table):
 class MicrophoneTable(Table):
     """Position, decay model and noise of one microphone."""
 
-    what = "a microphone"
+    subject = "a microphone"
     position: Annotated[np.ndarray, Numbers(((2, 3),), -1e6, 1e6, "m")]
     a: Positive | None = None
     b: Positive | None = None
@@ -87,7 +87,7 @@ class MicrophoneTable(Table):
 class CalibrationTable(Table):
     """Content of a calibration file."""
 
-    what = "a calibration"
+    subject = "a calibration"
     format: Literal["jeit microphone calibration"]
     version: Literal[1]
     units: UnitsTable

@@ -59,16 +59,18 @@ def choose(
     from jeit.imaging import ImagingSettings, compare_on_data
     from jeit.report import write_choice
 
-    given = {"prior": prior, "contact": contact, "num_points": num_points, "as_is": as_is}
-    settings = ImagingSettings(**{name: value for name, value in given.items() if value is not None})
+    setting_values = {"prior": prior, "contact": contact, "num_points": num_points, "as_is": as_is}
+    settings = ImagingSettings(**{name: value for name, value in setting_values.items() if value is not None})
     make_folder(output, ("choice.png", "choice.json"))
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
         measurement, base = read_pair(data, reference, reference_frames, format, description, (key, reference_key))
-        chosen = None if frame is None else number_or_name(frame, int)
+        frame_selector = None if frame is None else number_or_name(frame, int)
         with naming_options({"rules": "--rule"}):
-            result = compare_on_data(measurement, base, settings, rules=rule or None, frame=chosen, progress=step)
+            result = compare_on_data(
+                measurement, base, settings, rules=rule or None, frame=frame_selector, progress=step
+            )
         step("write")
         write_choice(result, output)
     if not quiet:

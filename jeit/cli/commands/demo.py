@@ -35,19 +35,19 @@ def demo(
     with Steps(console, quiet=quiet) as step:
         step("simulate a press")
         with naming_options({"position": "--x and --y"}):
-            pressed, rest = simulate_press(skin, jax.random.key(seed), (x, y), noise=noise)
-        result = image_difference(pressed, rest, progress=step)
+            pressed, reference = simulate_press(skin, jax.random.key(seed), (x, y), noise=noise)
+        result = image_difference(pressed, reference, progress=step)
         step("write")
         write_image(result, output, truth=(x, y))
     if not result.inclusions:
         raise ValueError("the press was not found in the image; try less --noise.")
     if quiet:
         return
-    found = result.inclusions[0].centroid
-    error = float(np.hypot(found[0] - x, found[1] - y))
+    centroid = result.inclusions[0].centroid
+    error = float(np.hypot(centroid[0] - x, centroid[1] - y))
     rows = [
         ("pressed at", f"({1e3 * x:6.1f}, {1e3 * y:6.1f}) mm"),
-        ("found at", f"({1e3 * found[0]:6.1f}, {1e3 * found[1]:6.1f}) mm"),
+        ("found at", f"({1e3 * centroid[0]:6.1f}, {1e3 * centroid[1]:6.1f}) mm"),
         ("error", f"{1e3 * error:.1f} mm, {100 * error / (2 * skin.radius):.1f} % of the diameter"),
     ]
     console.print()

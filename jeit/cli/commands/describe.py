@@ -23,10 +23,10 @@ _SHAPES = {
     "cylinder": (("radius", "height"), "ring"),
     "box": (("width", "depth", "height"), "perimeter"),
 }
-_FILE = "description.toml"
-_WRITTEN = (_FILE, "image.png", "image.npz", "report.json", "image.vtu")
+_DESCRIPTION_FILE = "description.toml"
+_WRITTEN_FILES = (_DESCRIPTION_FILE, "image.png", "image.npz", "report.json", "image.vtu")
 # Explanations that are listed.
-_LISTED = 5
+_MAX_LISTED = 5
 
 
 def describe(
@@ -52,9 +52,9 @@ def describe(
     ] = None,
     order: Annotated[str | None, typer.Option(help="Of measurements: rotating or fixed, if it is known.")] = None,
     current: Annotated[float, typer.Option(help="Amplitude, amperes; scales conductivities alone.")] = 1e-3,
-    output: Annotated[Path, typer.Option("--output", "-o", help=f"Folder for {_FILE} and the first image.")] = Path(
-        "."
-    ),
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help=f"Folder for {_DESCRIPTION_FILE} and the first image.")
+    ] = Path("."),
     quiet: Quiet = False,
 ) -> None:
     """Find out what a file that nobody has described may be: electrodes, protocol, order of channels, signs, frames.
@@ -73,66 +73,68 @@ def describe(
     from jeit.imaging.describe import find_description
     from jeit.report import write_image
 
-    known: dict[str, Any] = {"number": electrodes, "order": order}
+    known_values: dict[str, Any] = {"number": electrodes, "order": order}
     if protocol is not None:
-        known["kind"] = protocol.replace("-", "_")
-        check_name("--protocol", known["kind"], ("adjacent", "skip", "opposite", "two_terminal"))
+        known_values["kind"] = protocol.replace("-", "_")
+        check_name("--protocol", known_values["kind"], ("adjacent", "skip", "opposite", "two_terminal"))
     if order is not None:
         check_name("--order", order, ("rotating", "fixed"))
-    geometry, places = _body(
-        _asked("--shape", shape, "The body in metres, such as disk:0.1", "disk:0.1"), width, height
+    geometry, electrode_table = _body_tables(
+        _value_or_prompt("--shape", shape, "The body in metres, such as disk:0.1", "disk:0.1"), width, height
     )
-    make_folder(output, _WRITTEN)
-    target = output / _FILE
+    make_folder(output, _WRITTEN_FILES)
+    target = output / _DESCRIPTION_FILE
     if target.exists():
         raise ValueError(f"--output: {target} exists already; move it, or give another folder.")
     console = plain_console()
-    given = {name: value for name, value in known.items() if value is not None}
-    named = {"key": "--key", "number": "--electrodes", "width": "--width", "height": "--height"}
-    with Steps(console, quiet=quiet) as step, naming_options(named), _naming_sizes():
-        found = find_description(
+    stated_values = {name: value for name, value in known_values.items() if value is not None}
+    option_names = {"key": "--key", "number": "--electrodes", "width": "--width", "height": "--height"}
+    with Steps(console, quiet=quiet) as step, naming_options(option_names), _naming_sizes():
+        findings = find_description(
             data,
             geometry,
-            places,
+            electrode_table,
             reference=reference,
             keys=(key, reference_key),
-            known=given,
+            known=stated_values,
             current=current,
             progress=step,
         )
     if not quiet:
-        _show(console, data, found)
-    if found.fault:
-        raise ValueError(found.fault)
-    if found.undecided:
-        others = "; ".join(one.name for one in found.undecided)
+        _print_findings(console, data, findings)
+    if findings.fault:
+        raise ValueError(findings.fault)
+    if findings.undecided:
+        other_names = "; ".join(candidate.name for candidate in findings.undecided)
         raise ValueError(
-            f"undecided: {found.candidates[0].name}, or {others} explain the voltages as well. Decide by --electrodes, "
-            "--protocol or --order."
+            f"undecided: {findings.candidates[0].name}, or {other_names} explain the voltages as well. Decide by "
+            "--electrodes, --protocol or --order."
         )
     with written_whole(target) as file:
-        file.write(found.text.encode())
+        file.write(findings.text.encode())
     if reference is None and reference_key is None:
-        frames = found.candidates[0].frames
-        several = (
+        frames = findings.candidates[0].frames
+        hint = (
             f"; or say which of its {frames} frames are of the empty body, and which to image: jeit reconstruct {data} "
             f"--description {target} --reference-frames 0-1 --frame {frames - 1}"
         )
         console.print(
-            f"Written: {target}. Give --reference, a file of the empty body, to image it{several * (frames > 1)}.",
+            f"Written: {target}. Give --reference, a file of the empty body, to image it{hint * (frames > 1)}.",
             soft_wrap=True,
         )
         return
     with Steps(console, quiet=quiet) as step:
         base = read(data if reference is None else reference, description=target, key=reference_key)
         measured = read(data, description=target, like=base, key=key)
-        sound = [k for k, one in enumerate(assess(measured, base.mean_frame())) if one.imageable]
-        result = image_difference(measured, base, frame=sound[0] if sound else None, progress=step)
+        imageable_frames = [k for k, quality in enumerate(assess(measured, base.mean_frame())) if quality.imageable]
+        result = image_difference(
+            measured, base, frame=imageable_frames[0] if imageable_frames else None, progress=step
+        )
         step("write the first image")
         write_image(result, output)
     if not quiet:
         show(console, result)
-        say_written(console, target, *_WRITTEN[1 : 4 + (result.mesh.dimension == 3)])
+        say_written(console, target, *_WRITTEN_FILES[1 : 4 + (result.mesh.dimension == 3)])
 
 
 @contextmanager
@@ -141,64 +143,69 @@ def _naming_sizes() -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        said = str(error).removeprefix("the description: ")
-        if " overlap;" in said:
-            said = f"--width: {said[0].lower()}{said[1:]}"
-        said = re.sub(r"^geometry(\.\w+)?", "--shape", re.sub(r"^electrodes\.(width|height)", r"--\1", said))
-        if not said.startswith("--"):
+        message = str(error).removeprefix("the description: ")
+        if " overlap;" in message:
+            message = f"--width: {message[0].lower()}{message[1:]}"
+        message = re.sub(r"^geometry(\.\w+)?", "--shape", re.sub(r"^electrodes\.(width|height)", r"--\1", message))
+        if not message.startswith("--"):
             raise
-        raise ValueError(re.sub(r"^(--\w+): \1: ", r"\1: ", said)) from error
+        raise ValueError(re.sub(r"^(--\w+): \1: ", r"\1: ", message)) from error
 
 
-def _asked(option: str, given: Any, question: str, example: str) -> Any:
+def _value_or_prompt(option: str, value: Any, question: str, example: str) -> Any:
     """The value of an option, asked for on a terminal. Raises `ValueError` if there is none."""
-    if given is not None:
-        return given
+    if value is not None:
+        return value
     if not sys.stdin.isatty():
         raise ValueError(f"{option}: no file says it; give {option} {example}, in metres.")
     return typer.prompt(question)
 
 
-def _body(shape: str, width: float | None, height: float | None) -> tuple[dict[str, Any], dict[str, Any]]:
+def _body_tables(shape: str, width: float | None, height: float | None) -> tuple[dict[str, Any], dict[str, Any]]:
     """Tables `[geometry]` and `[electrodes]` of a description. Raises `ValueError`."""
-    name, _, rest = shape.partition(":")
+    name, _, sizes_text = shape.partition(":")
     try:
-        numbers = [float(one) for one in rest.split(",")]
+        numbers = [float(number) for number in sizes_text.split(",")]
     except ValueError:
         numbers = []
-    names, layout = _SHAPES.get(name, ((), ""))
-    if not numbers or len(numbers) != len(names):
-        options = ", ".join(f"{one}:{','.join(sizes).upper()}" for one, (sizes, _) in _SHAPES.items())
+    size_names, layout = _SHAPES.get(name, ((), ""))
+    if not numbers or len(numbers) != len(size_names):
+        options = ", ".join(f"{shape_name}:{','.join(sizes).upper()}" for shape_name, (sizes, _) in _SHAPES.items())
         raise ValueError(f"--shape: give one of {options}, in metres; it is {shape[:40]!r}.")
-    geometry = {"shape": name, **dict(zip(names, numbers, strict=True))}
-    wide = float(_asked("--width", width, "Width of an electrode in metres, such as 0.01", "0.01"))
-    places: dict[str, Any] = {"layout": layout, "width": wide}
+    geometry = {"shape": name, **dict(zip(size_names, numbers, strict=True))}
+    electrode_width = float(_value_or_prompt("--width", width, "Width of an electrode in metres, such as 0.01", "0.01"))
+    electrode_table: dict[str, Any] = {"layout": layout, "width": electrode_width}
     if name in ("cylinder", "box"):
-        tall = geometry["height"] if height is None else height
-        places = {"kind": "patch", **places, "height": tall, "levels": geometry["height"] / 2}
+        electrode_height = geometry["height"] if height is None else height
+        electrode_table = {
+            "kind": "patch",
+            **electrode_table,
+            "height": electrode_height,
+            "levels": geometry["height"] / 2,
+        }
     elif height is not None:
         raise ValueError(f"--height: a {name} is a sheet; leave it out.")
-    return geometry, places
+    return geometry, electrode_table
 
 
-def _show(console, data: Path, found: "Findings") -> None:
+def _print_findings(console, data: Path, findings: "Findings") -> None:
     """Print the explanations that were found."""
     from jeit.arguments import counted, percent
     from jeit.cli.console import pairs
 
     rows = []
-    for one in found.candidates[:_LISTED]:
-        evidence = [counted(one.frames, "frame")]
-        evidence += [] if one.reciprocity is None else [f"reciprocity broken by {percent(one.reciprocity)}"]
-        evidence += [f"frames of the empty body differ by {percent(one.spread)}"] if one.spread else []
-        misfit = "not compared" if one.wiring is None else f"misfit {percent(one.misfit)}"
-        rows.append((misfit, f"{one.name}: {', '.join(evidence)}"))
-    best = found.candidates[0]
-    rows += [("note", note) for note in best.measurement.notes]
-    if best.gains is not None:
+    for candidate in findings.candidates[:_MAX_LISTED]:
+        evidence = [counted(candidate.frames, "frame")]
+        evidence += [] if candidate.reciprocity is None else [f"reciprocity broken by {percent(candidate.reciprocity)}"]
+        evidence += [f"frames of the empty body differ by {percent(candidate.spread)}"] if candidate.spread else []
+        misfit = "not compared" if candidate.wiring is None else f"misfit {percent(candidate.misfit)}"
+        rows.append((misfit, f"{candidate.name}: {', '.join(evidence)}"))
+    best_candidate = findings.candidates[0]
+    rows += [("note", note) for note in best_candidate.measurement.notes]
+    if best_candidate.gains is not None:
         rows.append(("gains", "those of the measurements differ, and are corrected: [data] gains of the description"))
-    if best.wiring is not None and best.wiring.explanation and not best.reversed_signs:
-        rows.append(("wiring", best.wiring.explanation))
+    if best_candidate.wiring is not None and best_candidate.wiring.explanation and not best_candidate.reversed_signs:
+        rows.append(("wiring", best_candidate.wiring.explanation))
     console.print()
     console.print(pairs(f"{data.name} may be", rows))
     console.print()

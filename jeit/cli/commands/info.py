@@ -29,28 +29,28 @@ def info(
     from jeit.report import report_measurement
 
     measurement = read_file("DATA", data, format, description, key=key)
-    found = report_measurement(measurement)
-    body, noise = found["body"], found["noise"]
-    names = f" ({', '.join(found['frame_names'])})" if found["frame_names"] else ""
-    rate = f", {found['frame_rate']:.4g} a second" if found["frame_rate"] else ""
-    known = noise and f"{scaled(noise['standard_deviation'], 'V')}, from {noise['method']}"
+    content = report_measurement(measurement)
+    body, noise = content["body"], content["noise"]
+    names = f" ({', '.join(content['frame_names'])})" if content["frame_names"] else ""
+    rate = f", {content['frame_rate']:.4g} a second" if content["frame_rate"] else ""
+    noise_text = noise and f"{scaled(noise['standard_deviation'], 'V')}, from {noise['method']}"
     rows = [
-        ("frames", f"{found['frames']}{names}{rate}"),
-        ("protocol", found["protocol"]),
-        ("channels", f"{found['channels']}, of {counted(found['drives'], 'drive')}"),
-        ("masked", f"{found['masked']} of {found['voltages']} voltages"),
-        ("largest current", scaled(found["largest_current"], "A")),
-        ("largest voltage", scaled(found["largest_voltage"], "V")),
+        ("frames", f"{content['frames']}{names}{rate}"),
+        ("protocol", content["protocol"]),
+        ("channels", f"{content['channels']}, of {counted(content['drives'], 'drive')}"),
+        ("masked", f"{content['masked']} of {content['voltages']} voltages"),
+        ("largest current", scaled(content["largest_current"], "A")),
+        ("largest voltage", scaled(content["largest_voltage"], "V")),
         ("body", _body_text(body)),
-        ("electrodes", f"{found['electrodes']['number']}, {found['electrodes']['kind']}"),
-        ("reciprocity error", percent(found["reciprocity_error"])),
-        ("noise", known or "not known"),
-        ("impossible signs", percent(found["impossible_signs"])),
+        ("electrodes", f"{content['electrodes']['number']}, {content['electrodes']['kind']}"),
+        ("reciprocity error", percent(content["reciprocity_error"])),
+        ("noise", noise_text or "not known"),
+        ("impossible signs", percent(content["impossible_signs"])),
     ]
-    if (found["impossible_signs"] or 0) > MOST_IMPOSSIBLE_SIGNS:
+    if (content["impossible_signs"] or 0) > MOST_IMPOSSIBLE_SIGNS:
         rows.append(("doubt", "so many impossible signs are those of noise: frames with them are not imaged"))
-    rows.append(("wiring", found["wiring"] or "not known: the file does not say where electrodes are"))
-    rows += [("note", note) for note in found["notes"]]
+    rows.append(("wiring", content["wiring"] or "not known: the file does not say where electrodes are"))
+    rows += [("note", note) for note in content["notes"]]
     plain_console().print(pairs(measurement.name, rows))
 
 
@@ -63,6 +63,6 @@ def _body_text(body: dict[str, Any]) -> str:
     names = {key: key for key in ("radius", "width", "height", "thickness")}
     shape = body["shape"]
     if "thickness" in body and shape in _SOLIDS:
-        shape, renamed = _SOLIDS[shape]
-        names |= renamed
+        shape, renamed_keys = _SOLIDS[shape]
+        names |= renamed_keys
     return ", ".join([shape, *(f"{name} {1e3 * body[key]:g} mm" for key, name in names.items() if key in body)])

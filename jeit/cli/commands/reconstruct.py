@@ -115,13 +115,13 @@ def reconstruct(
             "key": key,
             "reference-key": reference_key,
         }
-        which = None if frame is None else number_or_name(frame, int)
+        frame_selector = None if frame is None else number_or_name(frame, int)
         image_by_network(
             model,
             (data, reference, format, description),
             output,
             method=method,
-            frame=which,
+            frame=frame_selector,
             unused_options=unused,
             quiet=quiet,
         )
@@ -132,7 +132,7 @@ def reconstruct(
     from jeit.report import write_image
 
     check_method(method, (AUTO, *METHODS))
-    given = {
+    setting_values = {
         "segment": segment,
         "method": method,
         "prior": prior,
@@ -142,7 +142,7 @@ def reconstruct(
         "num_points": num_points,
         "as_is": as_is,
     }
-    settings = ImagingSettings(**{name: value for name, value in given.items() if value is not None})
+    settings = ImagingSettings(**{name: value for name, value in setting_values.items() if value is not None})
     chosen_method = METHODS.get(settings.method, METHODS["one-step"])
     if prior is not None and not chosen_method.takes_prior:
         raise ValueError(f"--prior does not go with --method {method}; leave it out, or choose another method.")
@@ -153,22 +153,22 @@ def reconstruct(
     with Steps(console, quiet=quiet) as step:
         step("read")
         measurement, base = read_pair(data, reference, reference_frames, format, description, (key, reference_key))
-        chosen = None if frame is None else number_or_name(frame, int)
-        result = image_difference(measurement, base, settings, frame=chosen, progress=step)
+        frame_number = None if frame is None else number_or_name(frame, int)
+        result = image_difference(measurement, base, settings, frame=frame_number, progress=step)
         step("write")
         write_image(result, output)
     if not quiet:
-        show(console, result, asked=frame is not None)
-        solid = ("image.vtu",) if result.mesh.dimension == 3 else ()
-        say_written(console, output / "image.png", "image.npz", "report.json", *solid)
+        show(console, result, frame_given=frame is not None)
+        solid_files = ("image.vtu",) if result.mesh.dimension == 3 else ()
+        say_written(console, output / "image.png", "image.npz", "report.json", *solid_files)
 
 
 # Share of the difference above which rounding is reported.
-_ROUNDED = 2e-3
+_MIN_ROUNDING = 2e-3
 
 
-def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
-    """Print the result; `asked`: whether the frame was given by the user."""
+def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> None:
+    """Print the result; `frame_given`: whether the frame was given by the user."""
     import numpy as np
 
     from jeit.arguments import counted, percent
@@ -180,18 +180,20 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
     unit = "S" if result.mesh.dimension == 2 else "S/m"
     noise = result.quality.difference_noise
     hyperparameter = float(reconstruction.hyperparameter)
-    chosen = "none" if result.chosen_by == "none" else f"{hyperparameter:.3g} ({result.chosen_by})"
+    choice_text = "none" if result.chosen_by == "none" else f"{hyperparameter:.3g} ({result.chosen_by})"
     background = np.asarray(calibration.conductivity).item()
-    size = scaled(background.real, unit)
-    size += f" and {scaled(background.imag, unit)} of susceptivity" if isinstance(background, complex) else ""
+    background_text = scaled(background.real, unit)
+    background_text += (
+        f" and {scaled(background.imag, unit)} of susceptivity" if isinstance(background, complex) else ""
+    )
     rows = [
-        ("background", f"{size}, misfit {percent(float(calibration.misfit))}"),
+        ("background", f"{background_text}, misfit {percent(float(calibration.misfit))}"),
         ("difference", f"{percent(result.quality.difference)} of the reference"),
         ("noise in it", "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"),
-        ("method", f"{result.settings.method}, hyperparameter {chosen}"),
+        ("method", f"{result.settings.method}, hyperparameter {choice_text}"),
         ("mesh", f"{counted(result.mesh.num_points, 'node')}, {counted(result.mesh.num_cells, 'cell')}"),
     ]
-    if result.quality.rounding > _ROUNDED:
+    if result.quality.rounding > _MIN_ROUNDING:
         rows.insert(3, ("rounding", f"{percent(result.quality.rounding)} of the difference: voltages have few digits"))
     if calibration.note:
         rows.insert(1, ("note", calibration.note))
@@ -204,28 +206,28 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
         iterations = counted(int(reconstruction.iterations), "iteration")
         rows.append(("iteration", f"{reconstruction.status}, {iterations}, {misfit}"))
     elif result.lowest < -1:
-        fall = (
+        explanation = (
             f"falls to {percent(result.lowest)} of the background, below -100 %: bodies may be out of place, missing, "
             "or shown where none are; leave out --method, or take gauss-newton"
         )
-        rows.append(("linear image", fall))
+        rows.append(("linear image", explanation))
     rows += [("doubt", doubt) for doubt in result.doubts]
     if result.shapes is not None:
         rows.append(("bodies", bodies_text(result.shapes, result.mesh.dimension)))
     if result.why:
         rows.append(("chosen, for", result.why))
-    if unlike := result.unlike_electrodes:
-        numbers = ", ".join(f"{one + 1} ({times:.1f} times)" for one, times in unlike.items())
+    if unlike_electrodes := result.unlike_electrodes:
+        numbers = ", ".join(f"{electrode + 1} ({ratio:.1f} times)" for electrode, ratio in unlike_electrodes.items())
         rows.append(("note", f"more misfit than at other electrodes at {numbers}: what reads them counts less"))
     if result.wiring.fault:
         rows.append(("wiring", result.wiring.fault))
     rows += [("note", note) for note in dict.fromkeys((*result.measurement.notes, *result.reference.notes))]
     console.print()
     if result.num_frames > 1:
-        rows.insert(0, ("frame", _which(result, asked)))
+        rows.insert(0, ("frame", _frame_text(result, frame_given)))
     console.print(pairs(result.measurement.name, rows))
     console.print()
-    if any(one.contrast_interval is not None for one in result.inclusions):
+    if any(inclusion.contrast_interval is not None for inclusion in result.inclusions):
         table, note = quantity_table(result.inclusions, background.real), ""
     else:
         table = inclusion_table(result.inclusions, unit, background=background.real)
@@ -237,29 +239,30 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
 
 
 def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
-    """The bodies fitted as shapes, in half a sentence: outlines in a sheet, surfaces in a solid."""
+    """Text on the bodies fitted as shapes: outlines in a sheet, surfaces in a solid."""
     from jeit.arguments import counted, percent
     from jeit.inverse.shapes import Ellipsoid
 
-    edge = "surface" if dimension == 3 else "outline"
-    left = f"; {counted(len(shapes.doubtful), 'ghost')} left out" if shapes.doubtful else ""
-    strong = sum(not one.contrast_is_determined for one in shapes.bodies)
-    upright = sum(isinstance(one, Ellipsoid) and one.column for one in shapes.bodies)
-    columns = f", {counted(upright, 'column')} through the whole height" if upright else ""
-    assumed = f"; of {strong} the data give a limit of the change only" if strong else ""
-    alike = any(isinstance(one, Ellipsoid) and one.alike for one in shapes.bodies)
-    material = ", as of one material: the data do not contradict it" if alike else ""
-    drift = f"the background has drifted by {percent(shapes.drift)}"
-    return f"{counted(len(shapes.bodies), edge)} fitted{columns}{material}{left}{assumed}; {drift}"
+    noun = "surface" if dimension == 3 else "outline"
+    ghosts_text = f"; {counted(len(shapes.doubtful), 'ghost')} left out" if shapes.doubtful else ""
+    num_strong = sum(not body.contrast_is_determined for body in shapes.bodies)
+    num_columns = sum(isinstance(body, Ellipsoid) and body.column for body in shapes.bodies)
+    columns_text = f", {counted(num_columns, 'column')} through the whole height" if num_columns else ""
+    assumed_text = f"; of {num_strong} the data give a limit of the change only" if num_strong else ""
+    shares_material = any(isinstance(body, Ellipsoid) and body.alike for body in shapes.bodies)
+    material_text = ", as of one material: the data do not contradict it" if shares_material else ""
+    drift_text = f"the background has drifted by {percent(shapes.drift)}"
+    fitted_text = f"{counted(len(shapes.bodies), noun)} fitted{columns_text}"
+    return f"{fitted_text}{material_text}{ghosts_text}{assumed_text}; {drift_text}"
 
 
-def _which(result: "ImagedDifference", asked: bool) -> str:
-    """The frame that was imaged, of how many, and how to image others."""
+def _frame_text(result: "ImagedDifference", frame_given: bool) -> str:
+    """Text that states which frame of how many was imaged, and how to image others."""
     names = result.measurement.frame_names
-    said = f"{names[0]!r}, " if names else ""
-    said += f"{result.frame} of {result.num_frames}"
-    if asked:
-        return said
+    text = f"{names[0]!r}, " if names else ""
+    text += f"{result.frame} of {result.num_frames}"
+    if frame_given:
+        return text
     # Named frames usually show different objects, so that their mean is not useful.
-    mean = "" if names else ', or their mean: frames = "mean" in [data] of the description'
-    return f"{said}, from 0; --frame takes another{mean}"
+    mean_hint = "" if names else ', or their mean: frames = "mean" in [data] of the description'
+    return f"{text}, from 0; --frame takes another{mean_hint}"

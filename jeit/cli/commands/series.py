@@ -95,18 +95,20 @@ def series(
     from jeit.report import write_series
     from jeit.report.series import SERIES_FILES, check_film
 
-    given = {
+    setting_values = {
         "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
         "contact": contact,
         "num_points": num_points,
         "as_is": as_is,
     }
-    settings = ImagingSettings("one-step", **{name: value for name, value in given.items() if value is not None})
-    wanted = None if film == "none" else film
+    settings = ImagingSettings(
+        "one-step", **{name: value for name, value in setting_values.items() if value is not None}
+    )
+    film_name = None if film == "none" else film
     with naming_options({"film": "--film"}):
-        films = () if wanted is None else (check_film(wanted),)
-    bands = [_band(one) for one in frequency or ()]
-    spelled = {one: _spelled(one) for one in region or ()}
+        films = () if film_name is None else (check_film(film_name),)
+    bands = [_parse_band(band_text) for band_text in frequency or ()]
+    parsed_regions = {region_text: _parse_region(region_text) for region_text in region or ()}
     make_folder(output, (*SERIES_FILES, *films))
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
@@ -118,35 +120,35 @@ def series(
             if measured.times is None and bands:
                 raise ValueError(f"frequency: '{measured.name}' says no times; give --rate, in frames a second.")
             if measured.times is not None:
-                for one in bands:
-                    oscillation(np.zeros((measured.num_frames, 1)), measured.times, one)
-        regions = {text: partial(_region, text, one) for text, one in spelled.items()}
-        found = image_sequence(measured, base, settings, regions=regions, progress=step)
+                for band in bands:
+                    oscillation(np.zeros((measured.num_frames, 1)), measured.times, band)
+        regions = {text: partial(_region_mask, text, parsed) for text, parsed in parsed_regions.items()}
+        sequence = image_sequence(measured, base, settings, regions=regions, progress=step)
         with naming_options({"frequency": "--frequency"}):
-            oscillations = [oscillation(found.series.changes, found.series.times, one) for one in bands]
+            oscillations = [oscillation(sequence.series.changes, sequence.series.times, band) for band in bands]
         step("write")
-        report = write_series(found, output, regions=found.regions, oscillations=oscillations, film=wanted)
+        report = write_series(sequence, output, regions=sequence.regions, oscillations=oscillations, film=film_name)
     if quiet:
         return
     frames, unit = counted(report["frames"], "frame"), report["unit"]
     rate_text = "" if report["frame_rate"] is None else f", {report['frame_rate']:.4g} a second"
     untimed = "" if measured.times is not None else "; no times are known (--rate gives them), frames are numbered"
     console.print(f"\n{frames}{rate_text}, {report['refused']} refused{untimed}")
-    for note in dict.fromkeys((*found.prepared.measurement.notes, *(() if base is None else base.notes))):
+    for note in dict.fromkeys((*sequence.prepared.measurement.notes, *(() if base is None else base.notes))):
         console.print(f"  {note}", style="dim")
-    for one in report["oscillations"]:
-        console.print(f"{one['frequency']:.4g} Hz (resolution {one['resolution']:.2g} Hz):")
-        for name, part in one["regions"].items():
-            sizes = f"{scaled(part['amplitude'], unit)} ± {scaled(part['noise'], unit)}"
-            console.print(f"  {name}: amplitude {sizes}, phase {part['phase_degrees']:.0f}°", markup=False)
+    for entry in report["oscillations"]:
+        console.print(f"{entry['frequency']:.4g} Hz (resolution {entry['resolution']:.2g} Hz):")
+        for name, component in entry["regions"].items():
+            sizes = f"{scaled(component['amplitude'], unit)} ± {scaled(component['noise'], unit)}"
+            console.print(f"  {name}: amplitude {sizes}, phase {component['phase_degrees']:.0f}°", markup=False)
     say_written(console, output / "series.png", "series.npz", "regions.csv", "report.json", *films)
 
 
-def _band(text: str) -> "float | tuple[float, float]":
+def _parse_band(text: str) -> "float | tuple[float, float]":
     """A frequency, or a band of them. Raises `ValueError`."""
-    parts = text.split("-")
+    number_texts = text.split("-")
     try:
-        numbers = [float(one) for one in parts]
+        numbers = [float(number_text) for number_text in number_texts]
     except ValueError:
         numbers = []
     if len(numbers) not in (1, 2):
@@ -154,22 +156,22 @@ def _band(text: str) -> "float | tuple[float, float]":
     return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
 
 
-def _spelled(text: str) -> tuple[str, list[float]]:
+def _parse_region(text: str) -> tuple[str, list[float]]:
     """The shape and the numbers of a region. Raises `ValueError`."""
-    name, _, rest = text.partition(":")
+    name, _, numbers_text = text.partition(":")
     try:
-        return name, [float(one) for one in rest.split(",")]
+        return name, [float(number_text) for number_text in numbers_text.split(",")]
     except ValueError:
         raise ValueError(f"--region: {text[:40]!r} is no shape and numbers, such as ball:0.02,0,0.01.") from None
 
 
-def _region(text: str, spelled: tuple[str, list[float]], mesh: "Mesh"):
+def _region_mask(text: str, parsed: tuple[str, list[float]], mesh: "Mesh"):
     """Cells of a region. Raises `ValueError`."""
     from jeit.image import ball_region, box_region, half_region
 
-    (name, numbers), d = spelled, mesh.dimension
-    wanted = {"ball": d + 1, "box": 2 * d, "half": d}
-    if wanted.get(name) != len(numbers):
+    (name, numbers), d = parsed, mesh.dimension
+    num_expected = {"ball": d + 1, "box": 2 * d, "half": d}
+    if num_expected.get(name) != len(numbers):
         example = "ball:0.02,0,0.01" if d == 2 else "ball:0.02,0,0.05,0.01"
         raise ValueError(f"--region: {text[:40]!r} is none of a body of {d} dimensions; give {example}, box: or half:.")
     try:

@@ -109,8 +109,10 @@ def stream(
         }
         if reference is None:
             raise ValueError(f"--reference is needed with --method {NETWORK}.")
-        given = data if data == "-" else Path(data), reference, format, description
-        image_by_network(model, given, output, method=method, unused_options=unused, quiet=quiet, streamed=True)
+        setting_values = data if data == "-" else Path(data), reference, format, description
+        image_by_network(
+            model, setting_values, output, method=method, unused_options=unused, quiet=quiet, streamed=True
+        )
         return
     import numpy as np
 
@@ -119,7 +121,7 @@ def stream(
     from jeit.cli.stopping import FrameCounter, Stopping
     from jeit.data.imageable import mask_spikes
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, parse_frames, prepare_imager
-    from jeit.inverse import stream as images_of
+    from jeit.inverse import stream as stream_images
     from jeit.inverse.nonlinear.solvers import SOLVERS, frame_solvers
     from jeit.report import write_stream
     from jeit.report.series import check_film
@@ -127,7 +129,7 @@ def stream(
 
     if method not in SOLVERS:
         check_method(method, frame_solvers())
-    given = {
+    setting_values = {
         "solver": method,
         "max_steps": steps,
         "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
@@ -137,10 +139,10 @@ def stream(
         "as_is": as_is,
     }
     with naming_options({"solver": "--method", "max_steps": "--steps"}):
-        settings = StreamSettings(**{name: value for name, value in given.items() if value is not None})
-    wanted = None if film == "none" else film
+        settings = StreamSettings(**{name: value for name, value in setting_values.items() if value is not None})
+    film_name = None if film == "none" else film
     with naming_options({"film": "--film"}):
-        films = () if wanted is None else (check_film(wanted),)
+        films = () if film_name is None else (check_film(film_name),)
     if reference is None and (reference_frames is None or data == "-"):
         raise ValueError(
             "--reference is missing: give a measured file of the undisturbed body"
@@ -152,37 +154,45 @@ def stream(
         with Steps(console, quiet=quiet) as step:
             step("read")
             if data == "-":
-                empty = read_file("--reference", Path(reference or ""), format, description, key=reference_key)
-                empty = empty if reference_frames is None else reference_of_frames(empty, reference_frames)
-                measured = empty
+                reference_measurement = read_file(
+                    "--reference", Path(reference or ""), format, description, key=reference_key
+                )
+                reference_measurement = (
+                    reference_measurement
+                    if reference_frames is None
+                    else reference_of_frames(reference_measurement, reference_frames)
+                )
+                measured = reference_measurement
             else:
                 keys = (key, reference_key)
                 measured, base = read_pair(Path(data), reference, reference_frames, format, description, keys)
-                empty = measured if base is None else base
-            imager, calibration = prepare_imager(empty, settings, measurement=measured, progress=step)
+                reference_measurement = measured if base is None else base
+            imager, calibration = prepare_imager(reference_measurement, settings, measurement=measured, progress=step)
         if data == "-":
-            frames, number = parse_frames(sys.stdin), None
+            frames, num_frames = parse_frames(sys.stdin), None
         else:
-            measured = measured if settings.as_is else mask_spikes(measured, empty)
-            frames, number = frames_of(measured), measured.num_frames
+            measured = measured if settings.as_is else mask_spikes(measured, reference_measurement)
+            frames, num_frames = frames_of(measured), measured.num_frames
             rate = measured.frame_rate if rate is None else rate
-        notes = (*measured.notes, *empty.notes, *([calibration.note] if calibration.note else []))
+        notes = (*measured.notes, *reference_measurement.notes, *([calibration.note] if calibration.note else []))
         for note in () if quiet else dict.fromkeys(notes):
             console.print(f"  note: {note}", soft_wrap=True, markup=False)
         with naming_options({"rate": "--rate"}), Steps(console, quiet=quiet) as step:
             step("image")
-            come = FrameCounter(step, number)
+            frame_counter = FrameCounter(step, num_frames)
 
-            def show(one) -> None:
-                come.one_more()
-                if one.reason and not quiet:
-                    console.print(f"  frame {one.number}: {one.status}. {one.reason}", soft_wrap=True)
+            def show(frame_image) -> None:
+                frame_counter.one_more()
+                if frame_image.reason and not quiet:
+                    console.print(
+                        f"  frame {frame_image.number}: {frame_image.status}. {frame_image.reason}", soft_wrap=True
+                    )
 
             drawing = stopping.before(PICTURES, step)
-            images = images_of(imager, stopping.until(frames))
-            with stopping.ending(come, "frames.csv", "images.npz"):
+            images = stream_images(imager, stopping.until(frames))
+            with stopping.ending(frame_counter, "frames.csv", "images.npz"):
                 written = write_stream(
-                    images, calibration, output, name=data, film=wanted, rate=rate, progress=show, drawing=drawing
+                    images, calibration, output, name=data, film=film_name, rate=rate, progress=show, drawing=drawing
                 )
     if not written.latency.size:
         raise ValueError(
@@ -190,9 +200,9 @@ def stream(
         )
     if quiet:
         return
-    said = ", ".join(f"{number} {status}" for status, number in sorted(written.counts.items()))
+    counts_text = ", ".join(f"{count} {status}" for status, count in sorted(written.counts.items()))
     background = scaled(float(calibration.conductivity), "S" if calibration.model.mesh.dimension == 2 else "S/m")
-    console.print(f"\n{counted(written.number, 'frame')}: {said}; background {background}")
-    middle, high = 1e3 * np.quantile(written.latency, (0.5, 0.99))
-    console.print(f"latency: median {middle:.2f} ms, 99 % within {high:.2f} ms")
+    console.print(f"\n{counted(written.number, 'frame')}: {counts_text}; background {background}")
+    median, upper_quantile = 1e3 * np.quantile(written.latency, (0.5, 0.99))
+    console.print(f"latency: median {median:.2f} ms, 99 % within {upper_quantile:.2f} ms")
     say_written(console, output / "frames.csv", "images.npz", "frames.png", *films)

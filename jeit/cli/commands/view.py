@@ -51,13 +51,13 @@ def view(
     planes = [_plane(text) for text in plane_mm or ()]
     console, saved = plain_console(), read_image(image)
     if output is None and saved.mesh.dimension == 3 and not planes:
-        if not (missing := interactive.can_view()):
+        if not (reason := interactive.can_view()):
             values, scale = drawn_values(saved)
-            marked = {"inclusions": saved.inclusions, "levels": levels, "scale": scale}
-            interactive.view_solid(saved.mesh, values, saved.electrodes, **marked).show()
+            options = {"inclusions": saved.inclusions, "levels": levels, "scale": scale}
+            interactive.view_solid(saved.mesh, values, saved.electrodes, **options).show()
             return
         if not quiet:
-            console.print(f"  pictures, not a window: {missing}", highlight=False, markup=False)
+            console.print(f"  pictures, not a window: {reason}", highlight=False, markup=False)
     folder = image.parent / "view" if output is None else output
     make_folder(folder, VIEW_FILES)
     with naming_options({"levels": "--level", "at": "--slices", "plane": "--plane-mm"}):
@@ -75,8 +75,8 @@ def _plane(text: str):
         if "=" in text:
             axis, _, value = text.partition("=")
             return Plane.at(axis.strip(), float(value) / 1e3)
-        point, normal = ([float(one) for one in part.split(",")] for part in text.split("/"))
-        return Plane.through([one / 1e3 for one in point], normal)
+        point, normal = ([float(number) for number in vector.split(",")] for vector in text.split("/"))
+        return Plane.through([coordinate / 1e3 for coordinate in point], normal)
     except ValueError:
         raise ValueError(
             f"--plane-mm must be such as z=20, or a point and a direction, 0,0,85/1,1,0, in millimetres; it is "

@@ -36,10 +36,10 @@ def recognises(path: Path) -> bool:
 def find_description(path: Path) -> Path | None:
     """The description beside a file, or None: a TOML file of the same name, or `description.toml` in the same folder if
     the file holds no patterns of its own."""
-    beside, common = path.with_suffix(".toml"), path.parent / "description.toml"
-    if beside.is_file():
-        return beside
-    return common if common.is_file() and not recognises(path) else None
+    sibling, shared = path.with_suffix(".toml"), path.parent / "description.toml"
+    if sibling.is_file():
+        return sibling
+    return shared if shared.is_file() and not recognises(path) else None
 
 
 def read(
@@ -53,24 +53,36 @@ def read(
 
     Raises `ValueError` if neither the file nor a description defines the protocol, or if no vector is found.
     """
-    which = description if description is not None else find_description(path)
-    if which is None and like is not None and not recognises(path):
-        described = description_like(like)
+    description_source = description if description is not None else find_description(path)
+    if description_source is None and like is not None and not recognises(path):
+        sensor_description = description_like(like)
     else:
-        described = parse_description({}, path.name) if which is None else load_description(which)
-    described = described if key is None else replace(described, layout=replace(described.layout, keys=(key,)))
-    own = {} if described.protocol_section is not None or (which is None and like) else matlab.load(path, *PATTERN)
-    protocols = described.protocols(path) or ([(_own_protocol(own, path), "")] if own else [])
+        sensor_description = (
+            parse_description({}, path.name) if description_source is None else load_description(description_source)
+        )
+    sensor_description = (
+        sensor_description
+        if key is None
+        else replace(sensor_description, layout=replace(sensor_description.layout, keys=(key,)))
+    )
+    stored_patterns = (
+        {}
+        if sensor_description.protocol_section is not None or (description_source is None and like)
+        else matlab.load(path, *PATTERN)
+    )
+    protocols = sensor_description.protocols(path) or (
+        [(_stored_protocol(stored_patterns, path), "")] if stored_patterns else []
+    )
     if not protocols and like is not None:
         protocols = [(like.protocol, "")]
-    keys, names, said = _keys(matlab.shapes(path), described, channel_counts(protocols), path)
+    keys, frame_names, key_notes = _keys(matlab.shapes(path), sensor_description, channel_counts(protocols), path)
     content = matlab.load(path, *keys)
     vectors = [matlab.numbers(content, key, path) for key in keys]
-    if vectors[0].ndim == 3 or described.patterns_measured:
+    if vectors[0].ndim == 3 or sensor_description.patterns_measured:
         if len(vectors) > 1:
             raise ValueError(f"{path.name}: [data] keys names {len(vectors)} arrays; give one, of all frames.")
-        table = frames_of(vectors[0], described.layout.axes, path.name)
-        described = replace(described, layout=replace(described.layout, frames_in="rows"))
+        table = frames_of(vectors[0], sensor_description.layout.axes, path.name)
+        sensor_description = replace(sensor_description, layout=replace(sensor_description.layout, frames_in="rows"))
     elif len(vectors) == 1:
         table = vectors[0]
         if 1 in table.shape and table.size in channel_counts(protocols):  # a vector is one frame
@@ -81,47 +93,53 @@ def read(
             raise ValueError(f"{path.name}: variables {', '.join(keys)} differ in length ({sorted(lengths)}).")
         table = np.stack([vector.ravel() for vector in vectors], axis=1)
     # A matrix holds one frame per column, as in EIDORS, unless the numbers say otherwise.
-    found = frames_in_table(table, channel_counts(protocols), described.layout, usual="columns")
-    found = found._replace(notes=(*said, *found.notes))
-    measurement = measurement_in(path, described, found, protocols, like=like)
-    return measurement if measurement.frame_names or not names else replace(measurement, frame_names=names)
+    frames = frames_in_table(table, channel_counts(protocols), sensor_description.layout, default_axis="columns")
+    frames = frames._replace(notes=(*key_notes, *frames.notes))
+    measurement = measurement_in(path, sensor_description, frames, protocols, like=like)
+    return measurement if measurement.frame_names or not frame_names else replace(measurement, frame_names=frame_names)
 
 
 def _keys(
-    held: dict[str, tuple[int, ...]], described: Description, counts: list[int], path: Path
+    shapes: dict[str, tuple[int, ...]], sensor_description: Description, counts: list[int], path: Path
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
     """Names of the arrays to read, names of their frames, and a note if an array was chosen for its shape."""
-    if described.layout.keys:
-        return described.layout.keys, (), ()
-    reference = [name for name in REFERENCE_NAMES if name in held]
-    objects = [name for name in OBJECT_NAMES if name in held]
-    if reference and objects:
-        return (reference[0], objects[0]), ("reference", "object"), ()
-    if reference or objects:
-        return ((reference + objects)[0],), (), ()
-    held = {name: shape for name, shape in held.items() if name not in PATTERN}
-    fitting = {name: shape for name, shape in held.items() if set(shape) & set(counts) or math.prod(shape) in counts}
-    if len(fitting) == 1:
-        (name,) = fitting
+    if sensor_description.layout.keys:
+        return sensor_description.layout.keys, (), ()
+    reference_names = [name for name in REFERENCE_NAMES if name in shapes]
+    object_names = [name for name in OBJECT_NAMES if name in shapes]
+    if reference_names and object_names:
+        return (reference_names[0], object_names[0]), ("reference", "object"), ()
+    if reference_names or object_names:
+        return ((reference_names + object_names)[0],), (), ()
+    shapes = {name: shape for name, shape in shapes.items() if name not in PATTERN}
+    fitting_shapes = {
+        name: shape for name, shape in shapes.items() if set(shape) & set(counts) or math.prod(shape) in counts
+    }
+    if len(fitting_shapes) == 1:
+        (name,) = fitting_shapes
         return (name,), (), (f"the frames are those of {name!r}.",)
-    there = "as many numbers as a frame's are in" if fitting else "there are"
-    usual = ", ".join(REFERENCE_NAMES + OBJECT_NAMES)
+    preamble = "as many numbers as a frame's are in" if fitting_shapes else "there are"
+    usual_names = ", ".join(REFERENCE_NAMES + OBJECT_NAMES)
     raise ValueError(
-        f"{path.name}: none of {usual} is there; {there} {_shaped(fitting or held)}. "
+        f"{path.name}: none of {usual_names} is there; {preamble} {_list_shapes(fitting_shapes or shapes)}. "
         "Name the array of frames by key=, or by [data] keys in the description; --reference-key names that of the "
         "reference."
     )
 
 
-def _shaped(held: dict[str, tuple[int, ...]]) -> str:
-    return listed([f"{name} ({' × '.join(map(str, shape))})" for name, shape in held.items()]) if held else "no numbers"
+def _list_shapes(shapes: dict[str, tuple[int, ...]]) -> str:
+    return (
+        listed([f"{name} ({' × '.join(map(str, shape))})" for name, shape in shapes.items()])
+        if shapes
+        else "no numbers"
+    )
 
 
-def _own_protocol(content: dict, path: Path) -> Protocol:
-    missing = [key for key in PATTERN if key not in content]
-    if missing:
+def _stored_protocol(content: dict, path: Path) -> Protocol:
+    missing_keys = [key for key in PATTERN if key not in content]
+    if missing_keys:
         raise ValueError(
-            f"{path.name} does not say what was driven and measured: '{missing[0]}' is missing, and no "
+            f"{path.name} does not say what was driven and measured: '{missing_keys[0]}' is missing, and no "
             "description gives a [protocol]. Save stim (L, S), meas (M, L) and meas_stim (M) with the data, "
             "or write a description."
         )

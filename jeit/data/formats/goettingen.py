@@ -19,20 +19,20 @@ from jeit.data.formats.recording import (
     CHANNELS,
     adjacent_recording,
     content_of,
-    cut_off,
+    count_frames,
     description_of,
-    frame_at,
     measurement_of,
+    truncation_notes,
 )
 from jeit.data.measurement import Measurement
 
 DESCRIPTION = "Göttingen MCEIT (.get): 208 adjacent voltages a frame"
 # Bytes per frame; the beginning and the end of Dräger's text, and its maximum length in bytes.
-_FRAME, _MARK, _END, _LONGEST = 1024, b"---Draeger EIT-Software", b"\r\n\r\n\r\n", 65536
-# Bytes of text; share of numbers that are finite, and the largest of a frame.
-_READABLE, _MOST, _LARGEST = frozenset(b"\t\r\n" + bytes(range(32, 127))), 0.9, 1e9
-_NOTE = "neither unit nor gain of the voltages is known: trust relative changes, not volts."
-_NO_RATE = "the file says no rate, nor a record beside it (.prl); give it by [data] frame_rate."
+_FRAME_BYTES, _HEADER_MARK, _HEADER_END, _MAX_TEXT_BYTES = 1024, b"---Draeger EIT-Software", b"\r\n\r\n\r\n", 65536
+# Bytes that occur in text; minimum share of finite numbers in a frame, and their maximum magnitude.
+_TEXT_BYTES, _MIN_FINITE_SHARE, _MAX_VALUE = frozenset(b"\t\r\n" + bytes(range(32, 127))), 0.9, 1e9
+_SCALE_NOTE = "neither unit nor gain of the voltages is known: trust relative changes, not volts."
+_NO_RATE_NOTE = "the file says no rate, nor a record beside it (.prl); give it by [data] frame_rate."
 _RATE = re.compile(rb"Framerate\s*=\s*(\d+(?:\.\d+)?)\s*per second", re.IGNORECASE)
 
 
@@ -42,39 +42,47 @@ def recognises(path: Path) -> bool:
     if path.suffix.lower() != ".get":
         return False
     with path.open("rb") as file:
-        head = file.read(_FRAME)
-    if head.startswith(_MARK) or len(head) < _FRAME:
+        head = file.read(_FRAME_BYTES)
+    if head.startswith(_HEADER_MARK) or len(head) < _FRAME_BYTES:
         return True
-    if all(byte in _READABLE for byte in head):
+    if all(byte in _TEXT_BYTES for byte in head):
         return False
-    first = np.frombuffer(head, "<f4")
-    known = first[np.isfinite(first)]
-    return len(known) > _MOST * len(first) and bool((np.abs(known) < _LARGEST).all())
+    first_frame = np.frombuffer(head, "<f4")
+    finite_values = first_frame[np.isfinite(first_frame)]
+    return len(finite_values) > _MIN_FINITE_SHARE * len(first_frame) and bool(
+        (np.abs(finite_values) < _MAX_VALUE).all()
+    )
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
     """Read all frames. Raises `ValueError` for a file without a complete frame or without any voltage."""
-    content, start = content_of(path), 0
-    if content.startswith(_MARK):
-        end = content.find(_END, 0, _LONGEST)
-        if end < 0:
+    content, frames_start = content_of(path), 0
+    if content.startswith(_HEADER_MARK):
+        header_end = content.find(_HEADER_END, 0, _MAX_TEXT_BYTES)
+        if header_end < 0:
             raise ValueError(f"{path.name}: its text does not end with two empty lines before the frames; is it whole?")
-        start = end + len(_END)
-    number, left = frame_at(content, start, _FRAME, path)
-    values = np.frombuffer(content, "<f4", number * _FRAME // 4, start).reshape(number, -1)[:, :CHANNELS]
-    described, rate = description_of(path, description), _recorded_rate(path)
-    no_rate = (_NO_RATE,) if rate is None and described.layout.frame_rate is None else ()
-    times = None if rate is None else np.arange(number) / rate
-    return measurement_of(path, adjacent_recording(values, times, (_NOTE, *no_rate, *cut_off(left))), described)
+        frames_start = header_end + len(_HEADER_END)
+    num_frames, num_leftover_bytes = count_frames(content, frames_start, _FRAME_BYTES, path)
+    values = np.frombuffer(content, "<f4", num_frames * _FRAME_BYTES // 4, frames_start).reshape(num_frames, -1)[
+        :, :CHANNELS
+    ]
+    sensor_description, rate = description_of(path, description), _recorded_rate(path)
+    rate_notes = (_NO_RATE_NOTE,) if rate is None and sensor_description.layout.frame_rate is None else ()
+    times = None if rate is None else np.arange(num_frames) / rate
+    return measurement_of(
+        path,
+        adjacent_recording(values, times, (_SCALE_NOTE, *rate_notes, *truncation_notes(num_leftover_bytes))),
+        sensor_description,
+    )
 
 
 def _recorded_rate(path: Path) -> float | None:
     """Frame rate in frames per second from the record beside a file; None if there is no record, or no rate in it."""
-    for ending in (".prl", ".PRL"):
-        record = path.with_suffix(ending)
+    for suffix in (".prl", ".PRL"):
+        record = path.with_suffix(suffix)
         if record.is_file():
             with record.open("rb") as file:
-                said = _RATE.search(file.read(_LONGEST))
-            if said and float(said[1]) > 0:
-                return float(said[1])
+                match = _RATE.search(file.read(_MAX_TEXT_BYTES))
+            if match and float(match[1]) > 0:
+                return float(match[1])
     return None

@@ -37,23 +37,23 @@ def read(path: Path) -> Measurement:
     """
     keys = "Uel", "CurrentPattern", "MeasPattern"
     content = matlab.load(path, *keys)
-    voltages, current, difference = (matlab.numbers(content, key, path) for key in keys)
-    electrodes, drives = current.shape
-    if difference.shape[0] != electrodes or voltages.shape != (difference.shape[1], drives):
+    voltages, currents, differences = (matlab.numbers(content, key, path) for key in keys)
+    num_electrodes, num_drives = currents.shape
+    if differences.shape[0] != num_electrodes or voltages.shape != (differences.shape[1], num_drives):
         raise ValueError(
-            f"{path.name}: Uel {voltages.shape} should be (measurements, drives) = ({difference.shape[1]}, "
-            f"{drives}), as MeasPattern {difference.shape} and CurrentPattern {current.shape} say. Is the "
+            f"{path.name}: Uel {voltages.shape} should be (measurements, drives) = ({differences.shape[1]}, "
+            f"{num_drives}), as MeasPattern {differences.shape} and CurrentPattern {currents.shape} say. Is the "
             "file damaged?"
         )
     protocol = from_matrices(
-        1e-3 * current.T,
-        difference.T.astype(float),
-        name=f"KIT4, {drives} drives, {difference.shape[1]} adjacent differences",
+        1e-3 * currents.T,
+        differences.T.astype(float),
+        name=f"KIT4, {num_drives} drives, {differences.shape[1]} adjacent differences",
     )
     return screen(
         voltages.T.ravel(),
         protocol,
-        electrodes=BoundaryElectrodes(ring(RADIUS, electrodes, clockwise=True), ELECTRODE_WIDTH, CONTACT_IMPEDANCE),
+        electrodes=BoundaryElectrodes(ring(RADIUS, num_electrodes, clockwise=True), ELECTRODE_WIDTH, CONTACT_IMPEDANCE),
         domain=Disk(RADIUS),
         name=path.stem,
         source=str(path),

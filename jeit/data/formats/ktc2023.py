@@ -28,7 +28,7 @@ def recognises(path: Path) -> bool:
     if path.suffix.lower() != ".mat":
         return False
     names = matlab.variable_names(path)
-    return any(one <= names for one in VARIABLES)
+    return any(variables <= names for variables in VARIABLES)
 
 
 def read(path: Path) -> Measurement:
@@ -43,23 +43,23 @@ def read(path: Path) -> Measurement:
     suffix = "" if "Inj" in matlab.variable_names(path) else "ref"
     keys = f"Inj{suffix}", f"Uel{suffix}", "Mpat"
     content = matlab.load(path, *keys)
-    current, voltages, difference = (matlab.numbers(content, key, path) for key in keys)
-    electrodes, drives = current.shape
-    channels = drives * difference.shape[1]
-    if difference.shape[0] != electrodes or voltages.size != channels:
+    currents, voltages, differences = (matlab.numbers(content, key, path) for key in keys)
+    num_electrodes, num_drives = currents.shape
+    num_channels = num_drives * differences.shape[1]
+    if differences.shape[0] != num_electrodes or voltages.size != num_channels:
         raise ValueError(
-            f"{path.name}: {voltages.size} voltages, but {drives} drives and {difference.shape[1]} "
-            f"measurement patterns make {channels}. Is the file damaged?"
+            f"{path.name}: {voltages.size} voltages, but {num_drives} drives and {differences.shape[1]} "
+            f"measurement patterns make {num_channels}. Is the file damaged?"
         )
     protocol = from_matrices(
-        1e-3 * current.T,
-        difference.T.astype(float),
-        name=f"KTC 2023, {drives} drives, {difference.shape[1]} adjacent differences",
+        1e-3 * currents.T,
+        differences.T.astype(float),
+        name=f"KTC 2023, {num_drives} drives, {differences.shape[1]} adjacent differences",
     )
     return screen(
         voltages.ravel(),
         protocol,
-        electrodes=BoundaryElectrodes(ring(RADIUS, electrodes), RADIUS * ELECTRODE_ANGLE, CONTACT_IMPEDANCE),
+        electrodes=BoundaryElectrodes(ring(RADIUS, num_electrodes), RADIUS * ELECTRODE_ANGLE, CONTACT_IMPEDANCE),
         domain=Disk(RADIUS),
         name=path.stem,
         source=str(path),

@@ -32,19 +32,19 @@ from jeit.files import check_electrodes, read_toml
 from jeit.protocol import from_channels
 
 DESCRIPTION = "text with a line for each measurement: electrodes a, b, m, n and the voltage or resistance"
-_HEAD, _MOST_HEADING = 65536, 400
-# Names of the four electrodes, of which letters and digits count: current enters, leaves; voltage of the one less the
-# other.
-_ELECTRODES = (
+_HEAD_BYTES, _MAX_HEADING_LINES = 65536, 400
+# Names, in letters and digits, of the four electrodes: current enters at the first and leaves at the second; the
+# voltage is that of the third minus that of the fourth.
+_ELECTRODE_NAMES = (
     ("a", "b", "m", "n"),
     ("c1", "c2", "p1", "p2"),
     *(
-        tuple(f"{who}{sign}" for who in pair for sign in ("plus", "minus"))
+        tuple(f"{quantity}{sign}" for quantity in pair for sign in ("plus", "minus"))
         for pair in (("f", "s"), ("i", "v"), ("drive", "sense"), ("drive", "measure"), ("force", "sense"))
     ),
 )
-# Names of what was read, and of other columns that matter.
-_NAMES = {
+# Names of the measured quantities, and of other columns that are read.
+_COLUMN_NAMES = {
     "real": ("real", "re", "realraw", "vreal", "ureal"),
     "imag": ("imag", "im", "imagraw", "vimag", "uimag"),
     "u": ("u", "v", "voltage", "volt", "volts"),
@@ -55,33 +55,33 @@ _NAMES = {
     "frame": ("frame", "frameid", "frameno", "framenumber", "scan", "cycle"),
     "time": ("t", "time", "seconds"),
 }
-_UNITS = {"v": 1.0, "mv": 1e-3, "uv": 1e-6, "µv": 1e-6, "a": 1.0, "ma": 1e-3, "ua": 1e-6, "µa": 1e-6,
+_UNIT_VALUES = {"v": 1.0, "mv": 1e-3, "uv": 1e-6, "µv": 1e-6, "a": 1.0, "ma": 1e-3, "ua": 1e-6, "µa": 1e-6,
           "ohm": 1.0, "ω": 1.0, "kohm": 1e3, "kω": 1e3, "ohmm": 1.0, "m": 1.0, "s": 1.0, "ms": 1e-3}  # fmt: skip
-_UNIT = re.compile(r"^(.+?)\s*(?:/\s*([A-Za-zµΩ*]+)|[(\[]\s*([A-Za-zµΩ*]+)\s*[)\]])$")
-_CURRENT = 1e-3
+_UNIT_PATTERN = re.compile(r"^(.+?)\s*(?:/\s*([A-Za-zµΩ*]+)|[(\[]\s*([A-Za-zµΩ*]+)\s*[)\]])$")
+_ASSUMED_CURRENT = 1e-3
 
 
-class _Lines(NamedTuple):
-    """Content of a file: names of the columns, `scale` of each, the numbers in rows, coordinates of the electrodes, if
+class _QuadrupoleTable(NamedTuple):
+    """Content of a file: names of the columns, `scales` of each, the numbers in rows, coordinates of the electrodes, if
     it has them, whether it is of the unified data format, and notes."""
 
     names: list[str]
-    scale: list[float]
+    scales: list[float]
     rows: Float[np.ndarray, "R C"]
-    places: np.ndarray | None
-    unified: bool
+    positions: np.ndarray | None
+    is_unified: bool
     notes: tuple[str, ...]
 
     def column(self, name: str) -> Float[np.ndarray, " R"] | None:
-        """The column of a name in `_NAMES`, in SI units, or None."""
-        index = next((k for k, one in enumerate(self.names) if one in _NAMES[name]), None)
-        return None if index is None else self.scale[index] * self.rows[:, index]
+        """The column of a name in `_COLUMN_NAMES`, in SI units, or None."""
+        column_index = next((k for k, column_name in enumerate(self.names) if column_name in _COLUMN_NAMES[name]), None)
+        return None if column_index is None else self.scales[column_index] * self.rows[:, column_index]
 
 
 def recognises(path: Path) -> bool:
     """True for text whose heading names four electrodes and a voltage or resistance."""
     with path.open("rb") as file:
-        head = file.read(_HEAD)
+        head = file.read(_HEAD_BYTES)
     try:
         text = head.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -95,106 +95,110 @@ def read(
     path: Path, description: str | Path | None = None, like: Measurement | None = None, key: str | None = None
 ) -> Measurement:
     """Read all frames. A description, given or beside the file, states the body; its `[electrodes]` may leave out
-    positions that the file has. `[protocol]` states the current, where the file does not.
+        positions that the file has. `[protocol]` states the current, where the file does not.
 
-    Raises `ValueError`, with the line, for lines that are not as the heading says, and for a `key`, for there are no
-    arrays.
+    Raises `ValueError`, with the line, for lines that are not as the heading says, and for a `key`, because there are
+    no arrays.
     """
     if key is not None:
         raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
-    lines = _lines(path)
+    table = _read_table(path)
     if like is not None and description is None and find_description(path) is None:
-        described = description_like(like)
+        sensor_description = description_like(like)
     else:
-        described = _described(path, description, lines.places)
-    placed = None if described.electrodes is None else described.electrodes.num_electrodes
-    electrodes, notes = _numbered(path, lines, placed)
-    number = placed or max(int(electrodes.max()) + 1, 0 if lines.places is None else len(lines.places))
-    check_electrodes(path.name, number)
-    amplitude, assumed = _current(path, described, lines, like)
-    values = _values(lines, amplitude)
-    channels, frames, times, said = _arranged(path, lines, electrodes, values, like)
-    drives, index = np.unique(channels[:, :2], axis=0, return_inverse=True)
-    protocol = from_channels(
-        amplitude * _pairs(drives, number),
-        _pairs(channels[:, 2:], number),
-        index.ravel(),
-        name=f"{len(drives)} drives, {len(channels)} channels, {number} electrodes",
+        sensor_description = _describe_body(path, description, table.positions)
+    num_described = None if sensor_description.electrodes is None else sensor_description.electrodes.num_electrodes
+    electrodes, notes = _electrode_indices(path, table, num_described)
+    num_electrodes = num_described or max(
+        int(electrodes.max()) + 1, 0 if table.positions is None else len(table.positions)
     )
-    recording = Recording(frames, protocol, times=times, notes=(*lines.notes, *notes, *assumed, *said))
-    return with_signs(measurement_of(path, recording, replace(described, protocol_section=None)), like)
+    check_electrodes(path.name, num_electrodes)
+    amplitude, current_notes = _current_amplitude(path, sensor_description, table, like)
+    values = _channel_voltages(table, amplitude)
+    channels, frames, times, channel_notes = _arrange_frames(path, table, electrodes, values, like)
+    drives, drive_index = np.unique(channels[:, :2], axis=0, return_inverse=True)
+    protocol = from_channels(
+        amplitude * _pairs(drives, num_electrodes),
+        _pairs(channels[:, 2:], num_electrodes),
+        drive_index.ravel(),
+        name=f"{len(drives)} drives, {len(channels)} channels, {num_electrodes} electrodes",
+    )
+    recording = Recording(frames, protocol, times=times, notes=(*table.notes, *notes, *current_notes, *channel_notes))
+    return with_signs(measurement_of(path, recording, replace(sensor_description, protocol_section=None)), like)
 
 
-def places(path: Path) -> Float[np.ndarray, "L d"] | None:
+def electrode_positions(path: Path) -> Float[np.ndarray, "L d"] | None:
     """Positions of the electrodes (L, d), metres, that a file states; or None. Raises `ValueError` as `read`."""
-    return _lines(path).places
+    return _read_table(path).positions
 
 
 def _heading(lines: Sequence[str]) -> tuple[int, list[str], list[float]] | None:
     """Index of the line that names the columns, names and scales of these; None if there is none."""
-    for number, line in enumerate(lines[:_MOST_HEADING]):
-        cells = _cells(re.sub(r"\s+([(\[])", r"\1", line.lstrip("#% \t")))
+    for line_index, line in enumerate(lines[:_MAX_HEADING_LINES]):
+        cells = _split_cells(re.sub(r"\s+([(\[])", r"\1", line.lstrip("#% \t")))
         if not 5 <= len(cells) <= 60:
             continue
-        names, scales = zip(*map(_name, cells), strict=True)
-        if _electrodes(names) is None:
+        names, scales = zip(*map(_parse_column_name, cells), strict=True)
+        if _electrode_columns(names) is None:
             continue
-        held = {name for name, known in _NAMES.items() if set(known) & set(names)}
-        if held & {"real", "u", "r"} or {"rhoa", "k"} <= held:
-            return number, list(names), list(scales)
+        found_names = {name for name, spellings in _COLUMN_NAMES.items() if set(spellings) & set(names)}
+        if found_names & {"real", "u", "r"} or {"rhoa", "k"} <= found_names:
+            return line_index, list(names), list(scales)
     return None
 
 
-def _cells(line: str) -> list[str]:
+def _split_cells(line: str) -> list[str]:
     """Cells of a line, separated by commas, semicolons or tabs, or else by spaces."""
-    separator = next((one for one in ";\t," if one in line), None)
+    separator = next((character for character in ";\t," if character in line), None)
     return [cell.strip(' \t"') for cell in line.strip(" \r\n").split(separator)]
 
 
-def _name(cell: str) -> tuple[str, float]:
+def _parse_column_name(cell: str) -> tuple[str, float]:
     """The letters and digits of a column's name, and the value of its unit in SI units."""
-    united = _UNIT.match(cell)
-    unit = "" if united is None else (united[2] or united[3]).lower()
-    text = (united[1] if united is not None and unit in _UNITS else cell).lower()
+    unit_match = _UNIT_PATTERN.match(cell)
+    unit = "" if unit_match is None else (unit_match[2] or unit_match[3]).lower()
+    text = (unit_match[1] if unit_match is not None and unit in _UNIT_VALUES else cell).lower()
     text = re.sub(r"\+$", "plus", re.sub(r"-$", "minus", text))
     text = re.sub(r"[^0-9a-z]", "", text)
-    return re.sub(r"(?<=plus|inus)(index|electrode|el)$", "", text), _UNITS.get(unit, 1.0)
+    return re.sub(r"(?<=plus|inus)(index|electrode|el)$", "", text), _UNIT_VALUES.get(unit, 1.0)
 
 
-def _electrodes(names: Sequence[str]) -> list[int] | None:
+def _electrode_columns(names: Sequence[str]) -> list[int] | None:
     """Indices of the columns with the four electrodes, or None."""
-    return next(([names.index(one) for one in four] for four in _ELECTRODES if set(four) <= set(names)), None)
+    return next(([names.index(name) for name in four] for four in _ELECTRODE_NAMES if set(four) <= set(names)), None)
 
 
-def _lines(path: Path) -> _Lines:
+def _read_table(path: Path) -> _QuadrupoleTable:
     """The numbers of a file. Raises `ValueError`, with the line, for a line that is not as the heading says."""
     try:
         text = content_of(path).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise ValueError(f"{path.name} is not text; is it damaged?") from None
-    found = _heading(text)
-    if found is None:
+    heading = _heading(text)
+    if heading is None:
         raise ValueError(
             f"{path.name}: no line names the columns of four electrodes, such as a, b, m, n, and of a voltage u or a "
             "resistance r."
         )
-    start, names, scale = found
-    before = [(number, line.split("#")[0].split()) for number, line in enumerate(text[:start], 1)]
-    before = [(number, cells) for number, cells in before if cells]
-    unified = len(before) > 1 and before[-1][1][0].isdecimal() and before[0][1][0].isdecimal()
-    places, stated = _places(path, before) if unified else (None, None)
-    four = _electrodes(names)
-    known = set().union(*_NAMES.values())
-    used = [k for k, one in enumerate(names) if one in known or k in (four or ())]
+    heading_index, names, scales = heading
+    preceding_lines = [(number, line.split("#")[0].split()) for number, line in enumerate(text[:heading_index], 1)]
+    preceding_lines = [(number, cells) for number, cells in preceding_lines if cells]
+    is_unified = (
+        len(preceding_lines) > 1 and preceding_lines[-1][1][0].isdecimal() and preceding_lines[0][1][0].isdecimal()
+    )
+    positions, num_stated = _header_positions(path, preceding_lines) if is_unified else (None, None)
+    electrode_columns = _electrode_columns(names)
+    known_names = set().union(*_COLUMN_NAMES.values())
+    used_columns = [k for k, name in enumerate(names) if name in known_names or k in (electrode_columns or ())]
     rows: list[list[float]] = []
     notes: tuple[str, ...] = ()
-    for number, line in enumerate(text[start + 1 :], start + 2):
-        if not (line.split("#")[0].strip() and (stated is None or len(rows) < stated)):
+    for number, line in enumerate(text[heading_index + 1 :], heading_index + 2):
+        if not (line.split("#")[0].strip() and (num_stated is None or len(rows) < num_stated)):
             continue
-        cells = _cells(line.split("#")[0])
+        cells = _split_cells(line.split("#")[0])
         try:
-            numbers = np.full(len(names), np.nan)
-            numbers[used] = [float(cells[k].replace(",", ".") or "nan") for k in used]
+            row = np.full(len(names), np.nan)
+            row[used_columns] = [float(cells[k].replace(",", ".") or "nan") for k in used_columns]
         except (ValueError, IndexError):
             if number == len(text) and rows:
                 notes = (f"line {number}, the last, is cut off, and left out.",)
@@ -203,164 +207,187 @@ def _lines(path: Path) -> _Lines:
                 f"{path.name}, line {number}: {line.strip()[:40]!r} is not {counted(len(names), 'column')} of numbers, "
                 "as the heading says; where a value is missing write nan."
             ) from None
-        rows.append(numbers.tolist())
+        rows.append(row.tolist())
     if not rows:
         raise ValueError(f"{path.name} holds no measurement.")
-    if stated is not None and len(rows) < stated:
-        notes = (*notes, f"it states {counted(stated, 'measurement')}, and holds {len(rows)}: is it cut off?")
-    return _Lines(names, scale, np.array(rows), places, unified, notes)
+    if num_stated is not None and len(rows) < num_stated:
+        notes = (*notes, f"it states {counted(num_stated, 'measurement')}, and holds {len(rows)}: is it cut off?")
+    return _QuadrupoleTable(names, scales, np.array(rows), positions, is_unified, notes)
 
 
-def _places(path: Path, before: Sequence[tuple[int, list[str]]]) -> tuple[np.ndarray, int]:
+def _header_positions(path: Path, preceding_lines: Sequence[tuple[int, list[str]]]) -> tuple[np.ndarray, int]:
     """Coordinates of the electrodes, and the number of measurements, that precede the names of the columns."""
-    number, stated = int(before[0][1][0]), int(before[-1][1][0])
+    num_electrodes, num_stated = int(preceding_lines[0][1][0]), int(preceding_lines[-1][1][0])
     try:
-        places = np.array([[float(cell) for cell in cells] for _, cells in before[1:-1]])
-        assert places.shape[0] == number
-        assert places.shape[1] in (2, 3)
+        positions = np.array([[float(cell) for cell in cells] for _, cells in preceding_lines[1:-1]])
+        assert positions.shape[0] == num_electrodes
+        assert positions.shape[1] in (2, 3)
     except (ValueError, IndexError, AssertionError):
         raise ValueError(
-            f"{path.name}: line {before[0][0]} states {counted(number, 'electrode')}; as many lines of two or three "
-            "coordinates must follow it, and then the number of measurements."
+            f"{path.name}: line {preceding_lines[0][0]} states {counted(num_electrodes, 'electrode')}; as many lines "
+            "of two or three coordinates must follow it, and then the number of measurements."
         ) from None
-    flat = np.ptp(places, axis=0) == 0
-    return (places[:, ~flat] if places.shape[1] == 3 and flat.sum() == 1 else places), stated
+    is_constant = np.ptp(positions, axis=0) == 0
+    return (positions[:, ~is_constant] if positions.shape[1] == 3 and is_constant.sum() == 1 else positions), num_stated
 
 
-def _described(path: Path, description: str | Path | None, places: np.ndarray | None) -> Description:
-    """The description given, or that beside the file, or an empty one; with the places of electrodes in the file where
-    it states none."""
-    which = find_description(path) if description is None else description
-    if which is None:
+def _describe_body(path: Path, description: str | Path | None, positions: np.ndarray | None) -> Description:
+    """Return the given description, else the one beside the file, else an empty one. If it states no positions of
+    electrodes, they are those in the file."""
+    description_source = find_description(path) if description is None else description
+    if description_source is None:
         return parse_description({}, path.name)
-    if places is None or not Path(which).is_file():
-        return load_description(which)
-    tables: dict[str, Any] = read_toml(which)
-    own = tables.get("electrodes")
-    if isinstance(own, dict) and "positions" not in own:
-        more = {"positions": places.tolist()} if "layout" not in own else {"number": len(places)}
-        tables = {**tables, "electrodes": {**more, **own}}
-    return parse_description(tables, Path(which).name, Path(which).parent)
+    if positions is None or not Path(description_source).is_file():
+        return load_description(description_source)
+    tables: dict[str, Any] = read_toml(description_source)
+    electrode_section = tables.get("electrodes")
+    if isinstance(electrode_section, dict) and "positions" not in electrode_section:
+        added_keys = (
+            {"positions": positions.tolist()} if "layout" not in electrode_section else {"number": len(positions)}
+        )
+        tables = {**tables, "electrodes": {**added_keys, **electrode_section}}
+    return parse_description(tables, Path(description_source).name, Path(description_source).parent)
 
 
-def _numbered(path: Path, lines: _Lines, placed: int | None) -> tuple[Int[np.ndarray, "R 4"], tuple[str, ...]]:
+def _electrode_indices(
+    path: Path, table: _QuadrupoleTable, num_described: int | None
+) -> tuple[Int[np.ndarray, "R 4"], tuple[str, ...]]:
     """Electrodes of each line, counted from 0, and notes. Raises `ValueError` for what is no electrode."""
-    given = lines.rows[:, _electrodes(lines.names) or []]
-    if not (np.isfinite(given).all() and (given == given.round()).all() and np.abs(given).max() < 1e6):
+    numbers = table.rows[:, _electrode_columns(table.names) or []]
+    if not (np.isfinite(numbers).all() and (numbers == numbers.round()).all() and np.abs(numbers).max() < 1e6):
         raise ValueError(f"{path.name}: electrodes must be whole numbers.")
-    electrodes, notes = given.astype(int), ()
-    number = placed if lines.places is None else len(lines.places)
-    if not lines.unified and electrodes.min() == 0:
+    electrodes, notes = numbers.astype(int), ()
+    num_electrodes = num_described if table.positions is None else len(table.positions)
+    if not table.is_unified and electrodes.min() == 0:
         notes = ("electrodes are counted from 0.",)
     else:
         electrodes = electrodes - 1
     if electrodes.min() < 0:
         raise ValueError(
-            f"{path.name}: {_at(electrodes.min(axis=1).argmin())} has electrode {given.min():g}, which stands for one "
-            "far away, and a body has none. Leave such lines out."
+            f"{path.name}: {_measurement_name(electrodes.min(axis=1).argmin())} has electrode {numbers.min():g}, which "
+            "stands for one far away, and a body has none. Leave such lines out."
         )
-    if number is not None and electrodes.max() >= number:
+    if num_electrodes is not None and electrodes.max() >= num_electrodes:
         raise ValueError(
-            f"{path.name}: {_at(electrodes.max(axis=1).argmax())} has electrode {given.max():g}, and there are "
-            f"{number}."
+            f"{path.name}: {_measurement_name(electrodes.max(axis=1).argmax())} has electrode {numbers.max():g}, and "
+            f"there are {num_electrodes}."
         )
-    alike = (electrodes[:, 0] == electrodes[:, 1]) | (electrodes[:, 2] == electrodes[:, 3])
-    if alike.any():
+    has_repeated_electrode = (electrodes[:, 0] == electrodes[:, 1]) | (electrodes[:, 2] == electrodes[:, 3])
+    if has_repeated_electrode.any():
         raise ValueError(
-            f"{path.name}: {_at(alike.argmax())} has an electrode twice in a pair; a pair has two different ones."
+            f"{path.name}: {_measurement_name(has_repeated_electrode.argmax())} has an electrode twice in a pair; a "
+            "pair has two different ones."
         )
     return electrodes, notes
 
 
-def _at(row: int | np.integer) -> str:
+def _measurement_name(row: int | np.integer) -> str:
     return f"measurement {int(row) + 1}"
 
 
-def _current(
-    path: Path, described: Description, lines: _Lines, like: Measurement | None
+def _current_amplitude(
+    path: Path, sensor_description: Description, table: _QuadrupoleTable, like: Measurement | None
 ) -> tuple[float, tuple[str, ...]]:
     """Amplitude of the current, amperes, and a note if it is assumed."""
     if like is not None:
         return float(np.abs(np.asarray(like.protocol.drive)).max()), ()
-    protocol = described.protocol(path)
+    protocol = sensor_description.protocol(path)
     if protocol is not None:
         return float(np.abs(np.asarray(protocol.drive)).max()), ()
-    current = lines.column("i")
-    known = np.zeros(0) if current is None else np.abs(current[np.isfinite(current) & (current != 0)])
-    if known.size:
-        return float(np.median(known)), ()
-    voltages = lines.column("u") is not None or lines.column("real") is not None
-    taken = "is assumed" if voltages else "multiplies the resistances"
-    return _CURRENT, (f"the file states no current: {1e3 * _CURRENT:g} mA {taken}.",)
+    current = table.column("i")
+    known_currents = np.zeros(0) if current is None else np.abs(current[np.isfinite(current) & (current != 0)])
+    if known_currents.size:
+        return float(np.median(known_currents)), ()
+    has_voltages = table.column("u") is not None or table.column("real") is not None
+    assumption = "is assumed" if has_voltages else "multiplies the resistances"
+    return _ASSUMED_CURRENT, (f"the file states no current: {1e3 * _ASSUMED_CURRENT:g} mA {assumption}.",)
 
 
-def _values(lines: _Lines, amplitude: float) -> Inexact[np.ndarray, " R"]:
+def _channel_voltages(table: _QuadrupoleTable, amplitude: float) -> Inexact[np.ndarray, " R"]:
     """Voltages of the lines at one amplitude of the current; NaN where a current is zero."""
-    r, current, rhoa, k = (lines.column(one) for one in ("r", "i", "rhoa", "k"))
-    real, imag = (lines.column(one) for one in ("real", "imag"))
-    u = lines.column("u")
-    u = real if u is None else u
+    resistances, currents, apparent_resistivities, geometric_factors = (
+        table.column(name) for name in ("r", "i", "rhoa", "k")
+    )
+    real, imag = (table.column(name) for name in ("real", "imag"))
+    voltages = table.column("u")
+    voltages = real if voltages is None else voltages
     with np.errstate(divide="ignore", invalid="ignore"):
-        if u is not None:
-            whole = u if imag is None else u + 1j * imag
-            return whole if current is None else np.where(current == 0, np.nan, amplitude * whole / current)
-        if r is None:
-            assert rhoa is not None
-            assert k is not None
-            r = np.where(k == 0, np.nan, rhoa / k)
-        return amplitude * r
+        if voltages is not None:
+            complex_voltages = voltages if imag is None else voltages + 1j * imag
+            return (
+                complex_voltages
+                if currents is None
+                else np.where(currents == 0, np.nan, amplitude * complex_voltages / currents)
+            )
+        if resistances is None:
+            assert apparent_resistivities is not None
+            assert geometric_factors is not None
+            resistances = np.where(geometric_factors == 0, np.nan, apparent_resistivities / geometric_factors)
+        return amplitude * resistances
 
 
-def _arranged(
+def _arrange_frames(
     path: Path,
-    lines: _Lines,
+    table: _QuadrupoleTable,
     electrodes: Int[np.ndarray, "R 4"],
     values: Inexact[np.ndarray, " R"],
     like: Measurement | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...]]:
     """Electrodes (M, 4) of the channels, frames (F, M), their times, and notes. NaN where a frame has no line."""
-    channels, channel = np.unique(electrodes, axis=0, return_inverse=True)
-    channel, notes = channel.ravel(), ()
-    frame, said = _frame_of_lines(path, lines.column("frame"), channel, len(channels))
-    frames = np.full((frame.max() + 1, len(channels)), np.nan, values.dtype)
-    if len(np.unique(frame * len(channels) + channel)) < len(frame):
+    channels, channel_of_line = np.unique(electrodes, axis=0, return_inverse=True)
+    channel_of_line, notes = channel_of_line.ravel(), ()
+    frame_of_line, frame_notes = _frame_of_lines(path, table.column("frame"), channel_of_line, len(channels))
+    frames = np.full((frame_of_line.max() + 1, len(channels)), np.nan, values.dtype)
+    if len(np.unique(frame_of_line * len(channels) + channel_of_line)) < len(frame_of_line):
         raise ValueError(
             f"{path.name}: a frame measures the same electrodes twice; number its frames, or average them."
         )
-    frames[frame, channel] = values
-    first = np.unique(frame, return_index=True)[1]
-    times = lines.column("time")
-    times = None if times is None or len(first) < 2 or not np.isfinite(times[first]).all() else times[first]
+    frames[frame_of_line, channel_of_line] = values
+    first_lines = np.unique(frame_of_line, return_index=True)[1]
+    times = table.column("time")
+    times = (
+        None
+        if times is None or len(first_lines) < 2 or not np.isfinite(times[first_lines]).all()
+        else times[first_lines]
+    )
     if like is not None:
-        drive, read = (np.asarray(one) for one in (like.protocol.channel_drive, like.protocol.channel_measurement))
-        theirs = np.stack([one(each, axis=1) for each in (drive, read) for one in (np.argmax, np.argmin)], axis=1)
-        place = {tuple(one): k for k, one in enumerate(channels.tolist())}
-        index = np.array([place.get(tuple(one), -1) for one in theirs.tolist()])
+        drives, measurements = (
+            np.asarray(patterns) for patterns in (like.protocol.channel_drive, like.protocol.channel_measurement)
+        )
+        like_channels = np.stack(
+            [find(patterns, axis=1) for patterns in (drives, measurements) for find in (np.argmax, np.argmin)], axis=1
+        )
+        channel_numbers = {tuple(channel): k for k, channel in enumerate(channels.tolist())}
+        index = np.array([channel_numbers.get(tuple(channel), -1) for channel in like_channels.tolist()])
         if 2 * (index >= 0).sum() > len(index):
-            left = len(channels) - int((index >= 0).sum())
-            notes = (f"{counted(left, 'channel')} that '{like.name}' lacks are left out.",) if left else ()
-            channels, frames = theirs, np.where(index >= 0, frames[:, index], np.nan)
-    return channels, frames, times, (*said, *notes)
+            num_left_out = len(channels) - int((index >= 0).sum())
+            notes = (
+                (f"{counted(num_left_out, 'channel')} that '{like.name}' lacks are left out.",) if num_left_out else ()
+            )
+            channels, frames = like_channels, np.where(index >= 0, frames[:, index], np.nan)
+    return channels, frames, times, (*frame_notes, *notes)
 
 
 def _frame_of_lines(
-    path: Path, stated: np.ndarray | None, channel: Int[np.ndarray, " R"], count: int
+    path: Path, stated_frames: np.ndarray | None, channel_of_line: Int[np.ndarray, " R"], num_channels: int
 ) -> tuple[Int[np.ndarray, " R"], tuple[str, ...]]:
     """Number of the frame of each line, from 0, and notes. Raises `ValueError` if nothing separates frames."""
-    if stated is not None and np.isfinite(stated).all():
-        return np.unique(stated, return_inverse=True)[1].ravel(), ()
-    rows = np.arange(len(channel))
-    if (channel == channel[rows % count]).all():
-        number = -(-len(channel) // count)
-        return rows // count, (f"its lines repeat: {counted(number, 'frame')}.",) if number > 1 else ()
-    twice = listed([str(one + 1) for one in rows[1:][np.isin(channel[1:], channel[:1])][:3]])
+    if stated_frames is not None and np.isfinite(stated_frames).all():
+        return np.unique(stated_frames, return_inverse=True)[1].ravel(), ()
+    rows = np.arange(len(channel_of_line))
+    if (channel_of_line == channel_of_line[rows % num_channels]).all():
+        num_frames = -(-len(channel_of_line) // num_channels)
+        return rows // num_channels, (f"its lines repeat: {counted(num_frames, 'frame')}.",) if num_frames > 1 else ()
+    repeated_measurements = listed(
+        [str(row + 1) for row in rows[1:][np.isin(channel_of_line[1:], channel_of_line[:1])][:3]]
+    )
     raise ValueError(
         f"{path.name}: some electrodes are measured twice, and no column numbers frames; add one named frame"
-        f"{twice and f' (those of line 1 also in measurement {twice})'}."
+        f"{repeated_measurements and f' (those of line 1 also in measurement {repeated_measurements})'}."
     )
 
 
-def _pairs(pairs: Int[np.ndarray, "n 2"], number: int) -> Float[np.ndarray, "n L"]:
+def _pairs(pairs: Int[np.ndarray, "n 2"], num_electrodes: int) -> Float[np.ndarray, "n L"]:
     """Patterns of +1 and -1 at two electrodes."""
-    every = np.eye(number)
-    return every[pairs[:, 0]] - every[pairs[:, 1]]
+    identity = np.eye(num_electrodes)
+    return identity[pairs[:, 0]] - identity[pairs[:, 1]]

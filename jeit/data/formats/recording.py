@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Inexact
 
 from jeit.data.description import Description, load_description, parse_description
-from jeit.data.formats.table import find_description, frames_from, measurement_from, part_of
+from jeit.data.formats.table import component_notes, find_description, frames_from, measurement_from
 from jeit.data.measurement import Measurement
 from jeit.files import check_memory
 from jeit.protocol import Protocol, adjacent
 
 # Maximum bytes of memory per byte of the file: two copies, with numbers twice as long as in the file.
-_IN_MEMORY = 4
+_MEMORY_FACTOR = 4
 
 
 @dataclass(frozen=True)
@@ -42,34 +42,36 @@ class Recording:
 
 def content_of(path: Path) -> bytes:
     """Content of a file. Raises `TooLarge` if it would not fit in memory."""
-    check_memory(path.name, _IN_MEMORY * path.stat().st_size)
+    check_memory(path.name, _MEMORY_FACTOR * path.stat().st_size)
     return path.read_bytes()
 
 
 def description_of(path: Path, description: str | Path | None) -> Description:
     """The description given, else the one beside the file, else an empty one. Raises `ValueError` if it is not
     valid."""
-    which = find_description(path) if description is None else description
-    return parse_description({}, path.name) if which is None else load_description(which)
+    description_source = find_description(path) if description is None else description
+    return parse_description({}, path.name) if description_source is None else load_description(description_source)
 
 
-def measurement_of(path: Path, recording: Recording, described: Description) -> Measurement:
+def measurement_of(path: Path, recording: Recording, sensor_description: Description) -> Measurement:
     """Convert a recording to a measurement of the body described. Protocol, times and frame names of the description
     take precedence over those of the recording.
 
     Raises `ValueError` if protocol and channels, or names and frames, do not match.
     """
-    layout = described.layout
-    notes = (*recording.notes, *part_of(recording.voltages, layout))
+    layout = sensor_description.layout
+    notes = (*recording.notes, *component_notes(recording.voltages, layout))
     layout = replace(layout, frames_in="rows", complex_pairs=False)
     if recording.frame_names and not layout.frame_names:
         layout = replace(layout, frame_names=recording.frame_names)
-    described = replace(described, layout=layout, notes=(*described.notes, *notes))
+    sensor_description = replace(sensor_description, layout=layout, notes=(*sensor_description.notes, *notes))
     # Current patterns in the file have already been read as part of the recording.
-    own = described.protocol_section is None or described.patterns_measured
+    uses_own_protocol = sensor_description.protocol_section is None or sensor_description.patterns_measured
     frames = frames_from(recording.voltages, layout, path.name)
-    mask = None if recording.usable is None or not own else recording.usable
-    measurement = measurement_from(path, described, frames, recording.protocol if own else None, mask)
+    mask = None if recording.usable is None or not uses_own_protocol else recording.usable
+    measurement = measurement_from(
+        path, sensor_description, frames, recording.protocol if uses_own_protocol else None, mask
+    )
     if recording.times is None or layout.averaged or layout.frame_rate is not None:
         return measurement
     if (np.diff(recording.times) <= 0).any():
@@ -78,27 +80,27 @@ def measurement_of(path: Path, recording: Recording, described: Description) -> 
     return replace(measurement, times=recording.times)
 
 
-def frame_at(content: bytes, start: int, size: int, path: Path) -> tuple[int, int]:
-    """Number of complete frames of `size` bytes after byte `start`, and number of bytes left over.
+def count_frames(content: bytes, frames_start: int, frame_size: int, path: Path) -> tuple[int, int]:
+    """Number of complete frames of `frame_size` bytes after byte `frames_start`, and number of bytes left over.
 
     Raises `ValueError` if there is no complete frame.
     """
-    if not 0 <= start <= len(content):
-        raise ValueError(f"{path.name}: its header says that frames begin at byte {start}, beyond its end.")
-    number, left = divmod(len(content) - start, size)
-    if not number:
+    if not 0 <= frames_start <= len(content):
+        raise ValueError(f"{path.name}: its header says that frames begin at byte {frames_start}, beyond its end.")
+    num_frames, num_leftover_bytes = divmod(len(content) - frames_start, frame_size)
+    if not num_frames:
         raise ValueError(f"{path.name} holds no whole frame; is it cut off?")
-    return number, left
+    return num_frames, num_leftover_bytes
 
 
-def cut_off(left: int) -> tuple[str, ...]:
-    """A note about `left` bytes after the last complete frame; empty for none."""
-    return (f"the last frame is cut off, and left out ({left} bytes).",) if left else ()
+def truncation_notes(num_bytes: int) -> tuple[str, ...]:
+    """A note about `num_bytes` bytes after the last complete frame; empty for none."""
+    return (f"the last frame is cut off, and left out ({num_bytes} bytes).",) if num_bytes else ()
 
 
 CHANNELS = 208
 # Amperes: the maximum drive current stated for all of these systems.
-_CURRENT = 5e-3
+_ASSUMED_CURRENT = 5e-3
 _CURRENT_NOTE = "a current of 5 mA is assumed; the file does not say it."
 
 
@@ -112,4 +114,4 @@ def adjacent_recording(
         notes = (*notes, f"{int((~usable).sum())} of {CHANNELS} channels were not measured (zero in every frame).")
     with np.errstate(invalid="ignore"):  # a signalling NaN of single precision would warn
         voltages = -values.astype(float)
-    return Recording(voltages, adjacent(16, current=_CURRENT), usable, times, notes=(*notes, _CURRENT_NOTE))
+    return Recording(voltages, adjacent(16, current=_ASSUMED_CURRENT), usable, times, notes=(*notes, _CURRENT_NOTE))

@@ -27,14 +27,16 @@ from jeit.files import check_electrodes
 from jeit.protocol import from_matrices, measurement_patterns
 
 DESCRIPTION = "Sciospec EIT (.eit, text): potentials of all channels, for every injection and frequency"
-_FEWEST, _MOST = 9, 64
-_LISTS = ("MeasurementChannelsIndependentFromInjectionPattern:", "MeasurementChannels:")
-_NOTES = ("the current in the file is taken as it stands; whether it is peak or root mean square it does not say.",)
+_MIN_HEADER_LINES, _MAX_HEADER_LINES = 9, 64
+_CHANNEL_LISTS = ("MeasurementChannelsIndependentFromInjectionPattern:", "MeasurementChannels:")
+_CURRENT_NOTES = (
+    "the current in the file is taken as it stands; whether it is peak or root mean square it does not say.",
+)
 
 
 @dataclass(frozen=True)
 class _Header:
-    lines: int
+    num_lines: int
     date: str
     frequencies: np.ndarray
     current: float
@@ -46,8 +48,8 @@ def recognises(path: Path) -> bool:
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:
-        first = file.read(24).removeprefix(b"\xef\xbb\xbf").split(b"\n")[0].strip()
-    return first.isdigit() and _FEWEST <= int(first) <= _MOST
+        first_line = file.read(24).removeprefix(b"\xef\xbb\xbf").split(b"\n")[0].strip()
+    return first_line.isdigit() and _MIN_HEADER_LINES <= int(first_line) <= _MAX_HEADER_LINES
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
@@ -64,11 +66,11 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
         raise ValueError(f"{path.name} is not text, as Sciospec's files are; is it damaged?") from None
     header = _header(lines, path)
     pairs, potentials = _injections(lines, header, path)
-    numbers, columns = _channels(header, potentials.shape[2], path)
-    check_electrodes(path.name, len(numbers))
-    described = description_of(path, description)
-    recording = _recording(header, pairs, potentials[:, :, columns], numbers, described, path)
-    return measurement_of(path, recording, described)
+    electrode_numbers, column_indices = _channels(header, potentials.shape[2], path)
+    check_electrodes(path.name, len(electrode_numbers))
+    sensor_description = description_of(path, description)
+    recording = _recording(header, pairs, potentials[:, :, column_indices], electrode_numbers, sensor_description, path)
+    return measurement_of(path, recording, sensor_description)
 
 
 def read_all(paths: Sequence[Path], description: str | Path | None = None) -> Measurement:
@@ -83,118 +85,146 @@ def read_all(paths: Sequence[Path], description: str | Path | None = None) -> Me
 
 
 def _header(lines: list[str], path: Path) -> _Header:
-    count = int(_number(lines, 0, path, whole=True))
-    if not _FEWEST <= count <= _MOST or count >= len(lines):
-        raise ValueError(f"{path.name}, line 1: a header of {count} lines, and the file has {len(lines)}.")
-    at = 1 if count < 11 else 2  # line of the name of the setup
-    low, high = (_number(lines, at + one, path) for one in (2, 3))
-    number = int(_number(lines, at + 5, path, whole=True))
-    if not (0 < low <= high and 1 <= number <= len(lines)):
-        raise ValueError(f"{path.name}, line {at + 3}: {number} frequencies from {low:g} to {high:g} Hz are none.")
-    spaced = np.geomspace if _number(lines, at + 4, path) == 1 else np.linspace
-    channels = {name: _list(line, name) for line in lines[:count] for name in _LISTS if line.startswith(name)}
-    return _Header(count, lines[at + 1], spaced(low, high, number), _number(lines, at + 6, path), channels)
-
-
-def _number(lines: list[str], at: int, path: Path, *, whole: bool = False) -> float:
-    text = lines[at].strip() if at < len(lines) else ""
-    with suppress(ValueError):
-        value = float(text)
-        if np.isfinite(value) and (not whole or (value == int(value) and abs(value) < 1e9)):
-            return value
-    raise ValueError(
-        f"{path.name}, line {at + 1}: must be a {'whole ' if whole else ''}number; it is {describe(text)}."
+    num_lines = int(_number(lines, 0, path, is_integer=True))
+    if not _MIN_HEADER_LINES <= num_lines <= _MAX_HEADER_LINES or num_lines >= len(lines):
+        raise ValueError(f"{path.name}, line 1: a header of {num_lines} lines, and the file has {len(lines)}.")
+    name_line = 1 if num_lines < 11 else 2  # line of the name of the setup
+    min_frequency, max_frequency = (_number(lines, name_line + offset, path) for offset in (2, 3))
+    num_frequencies = int(_number(lines, name_line + 5, path, is_integer=True))
+    if not (0 < min_frequency <= max_frequency and 1 <= num_frequencies <= len(lines)):
+        raise ValueError(
+            f"{path.name}, line {name_line + 3}: {num_frequencies} frequencies from {min_frequency:g} to "
+            f"{max_frequency:g} Hz are none."
+        )
+    spacing = np.geomspace if _number(lines, name_line + 4, path) == 1 else np.linspace
+    channels = {
+        name: _channel_list(line, name)
+        for line in lines[:num_lines]
+        for name in _CHANNEL_LISTS
+        if line.startswith(name)
+    }
+    return _Header(
+        num_lines,
+        lines[name_line + 1],
+        spacing(min_frequency, max_frequency, num_frequencies),
+        _number(lines, name_line + 6, path),
+        channels,
     )
 
 
-def _list(line: str, name: str) -> list[int]:
+def _number(lines: list[str], line_index: int, path: Path, *, is_integer: bool = False) -> float:
+    text = lines[line_index].strip() if line_index < len(lines) else ""
+    with suppress(ValueError):
+        value = float(text)
+        if np.isfinite(value) and (not is_integer or (value == int(value) and abs(value) < 1e9)):
+            return value
+    raise ValueError(
+        f"{path.name}, line {line_index + 1}: must be a {'whole ' if is_integer else ''}number; it is {describe(text)}."
+    )
+
+
+def _channel_list(line: str, name: str) -> list[int]:
     """Channel numbers, counted from 1."""
-    parts = line.removeprefix(name).replace(",", " ").split()
-    return [int(one) for one in parts if one.isdecimal() and len(one) < 6]
+    words = line.removeprefix(name).replace(",", " ").split()
+    return [int(word) for word in words if word.isdecimal() and len(word) < 6]
 
 
 def _injections(lines: list[str], header: _Header, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Electrode pairs (S, 2), counted from 1, and complex potentials (S, frequencies, columns) as stored in the
     file."""
-    pairs, rows, frequencies = [], [], len(header.frequencies)
-    for at, line in _nonempty_lines(lines, header.lines):
-        values = _values(line, at, path)
-        if len(rows) == frequencies * len(pairs):
+    pairs, rows, num_frequencies = [], [], len(header.frequencies)
+    for line_index, line in _nonempty_lines(lines, header.num_lines):
+        values = _values(line, line_index, path)
+        if len(rows) == num_frequencies * len(pairs):
             if len(values) != 2 or (values != values.round()).any() or not (values > 0).all() or values.max() > 1e5:
-                raise ValueError(f"{path.name}, line {at + 1}: must be the two electrodes of an injection.")
+                raise ValueError(f"{path.name}, line {line_index + 1}: must be the two electrodes of an injection.")
             if values[0] == values[1]:
                 raise ValueError(
-                    f"{path.name}, line {at + 1}: current enters and leaves at electrode {values[0]:g}; an injection "
-                    "has two different electrodes."
+                    f"{path.name}, line {line_index + 1}: current enters and leaves at electrode {values[0]:g}; an "
+                    "injection has two different electrodes."
                 )
             pairs.append(values.astype(int))
             continue
         if len(values) < 4 or len(values) % 2 or (rows and len(values) != 2 * len(rows[0])):
             raise ValueError(
-                f"{path.name}, line {at + 1}: has {len(values)} numbers; give a real and an imaginary part for each "
-                "channel, as many as before. Is the file cut off?"
+                f"{path.name}, line {line_index + 1}: has {len(values)} numbers; give a real and an imaginary part for "
+                "each channel, as many as before. Is the file cut off?"
             )
         rows.append(values[0::2] + 1j * values[1::2])
-    if not pairs or len(rows) != frequencies * len(pairs):
+    if not pairs or len(rows) != num_frequencies * len(pairs):
         raise ValueError(f"{path.name}: {len(pairs)} injections have {len(rows)} lines of potentials; is it cut off?")
-    return np.array(pairs), np.array(rows).reshape(len(pairs), frequencies, -1)
+    return np.array(pairs), np.array(rows).reshape(len(pairs), num_frequencies, -1)
 
 
 def _nonempty_lines(lines: list[str], start: int) -> Iterator[tuple[int, str]]:
-    return ((at, lines[at]) for at in range(start, len(lines)) if lines[at].strip())
+    return ((line_index, lines[line_index]) for line_index in range(start, len(lines)) if lines[line_index].strip())
 
 
-def _values(line: str, at: int, path: Path) -> np.ndarray:
+def _values(line: str, line_index: int, path: Path) -> np.ndarray:
     try:
-        return np.array([float(one) for one in line.split()])
+        return np.array([float(number) for number in line.split()])
     except ValueError:
-        raise ValueError(f"{path.name}, line {at + 1}: {describe(line.strip())} is not numbers.") from None
+        raise ValueError(f"{path.name}, line {line_index + 1}: {describe(line.strip())} is not numbers.") from None
 
 
-def _channels(header: _Header, columns: int, path: Path) -> tuple[list[int], list[int]]:
-    """Numbers of the electrodes, and indices of the columns that hold their potentials."""
-    wide, measured = (header.channels.get(name, []) for name in _LISTS)
-    held = next((one for one in (measured, wide) if len(one) == columns), list(range(1, columns + 1)))
-    numbers = measured if set(measured) <= set(held) and len(measured) > 1 else held
-    if len(set(numbers)) < len(numbers):
+def _channels(header: _Header, num_columns: int, path: Path) -> tuple[list[int], list[int]]:
+    """Return the numbers of the electrodes, and the indices of the columns that hold their potentials."""
+    all_channels, measured_channels = (header.channels.get(name, []) for name in _CHANNEL_LISTS)
+    column_channels = next(
+        (channels for channels in (measured_channels, all_channels) if len(channels) == num_columns),
+        list(range(1, num_columns + 1)),
+    )
+    electrode_numbers = (
+        measured_channels
+        if set(measured_channels) <= set(column_channels) and len(measured_channels) > 1
+        else column_channels
+    )
+    if len(set(electrode_numbers)) < len(electrode_numbers):
         raise ValueError(f"{path.name}: its header lists a channel twice.")
-    return numbers, [held.index(one) for one in numbers]
+    return electrode_numbers, [column_channels.index(number) for number in electrode_numbers]
 
 
 def _recording(
-    header: _Header, pairs: np.ndarray, potentials: np.ndarray, numbers: list[int], described: Description, path: Path
+    header: _Header,
+    pairs: np.ndarray,
+    potentials: np.ndarray,
+    electrode_numbers: list[int],
+    sensor_description: Description,
+    path: Path,
 ) -> Recording:
-    missing = sorted({*pairs.ravel().tolist()} - {*numbers})
-    if missing:
-        raise ValueError(f"{path.name}: current flows at electrode {missing[0]}, which is not among those measured.")
-    index = np.array([[numbers.index(one) for one in pair] for pair in pairs.tolist()])
+    missing_electrodes = sorted({*pairs.ravel().tolist()} - {*electrode_numbers})
+    if missing_electrodes:
+        raise ValueError(
+            f"{path.name}: current flows at electrode {missing_electrodes[0]}, which is not among those measured."
+        )
+    index = np.array([[electrode_numbers.index(electrode) for electrode in pair] for pair in pairs.tolist()])
     if not 0 < header.current <= 1:
         raise ValueError(f"{path.name}: its current is {header.current:g} A; it must be positive, and at most 1.")
-    drive, every = np.zeros((len(index), len(numbers))), np.arange(len(index))
-    drive[every, index[:, 0]], drive[every, index[:, 1]] = header.current, -header.current
+    drive, drive_indices = np.zeros((len(index), len(electrode_numbers))), np.arange(len(index))
+    drive[drive_indices, index[:, 0]], drive[drive_indices, index[:, 1]] = header.current, -header.current
     # The sign of the power, which the body dissipates, shows at which electrode of a pair the current enters.
-    notes: list[str] = [*_NOTES]
+    notes: list[str] = [*_CURRENT_NOTES]
     if np.median(np.einsum("sl,sfl->sf", drive, np.nan_to_num(np.real(potentials)))) < 0:
         drive = -drive
         notes.append("current is taken to enter at the second electrode of a pair, whose potential is the higher.")
-    reading, reference = described.reading
-    rows = measurement_patterns(len(numbers), reading, reference)
+    reading, reference = sensor_description.reading
+    rows = measurement_patterns(len(electrode_numbers), reading, reference)
     with np.errstate(invalid="ignore", over="ignore"):
         voltages = np.einsum("kl,sfl->fsk", rows, potentials).reshape(len(header.frequencies), -1)
-    name = f"{len(index)} injections, {reading}, {len(numbers)} electrodes"
-    single = len(header.frequencies) == 1
+    name = f"{len(index)} injections, {reading}, {len(electrode_numbers)} electrodes"
+    is_single = len(header.frequencies) == 1
     return Recording(
         voltages,
         from_matrices(drive, rows, name=name),
-        times=_times(header.date) if single else None,
-        frame_names=() if single else tuple(f"{one:.6g} Hz" for one in header.frequencies),
+        times=_times(header.date) if is_single else None,
+        frame_names=() if is_single else tuple(f"{frequency:.6g} Hz" for frequency in header.frequencies),
         notes=tuple(notes),
     )
 
 
 def _times(date: str) -> np.ndarray | None:
     """Time of the measurement in seconds since 1970, taking the date as UTC; None if the date has another form."""
-    for form in ("%Y.%m.%d. %H:%M:%S.%f", "%Y.%m.%d. %H:%M:%S"):
+    for date_format in ("%Y.%m.%d. %H:%M:%S.%f", "%Y.%m.%d. %H:%M:%S"):
         with suppress(ValueError):
-            return np.array([datetime.strptime(date.strip(), form).replace(tzinfo=UTC).timestamp()])
+            return np.array([datetime.strptime(date.strip(), date_format).replace(tzinfo=UTC).timestamp()])
     return None

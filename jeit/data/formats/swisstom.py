@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jeit.data.formats.recording import Recording, content_of, cut_off, description_of, measurement_of
+from jeit.data.formats.recording import Recording, content_of, description_of, measurement_of, truncation_notes
 from jeit.data.measurement import Measurement
 from jeit.protocol import skip
 
@@ -21,12 +21,12 @@ DESCRIPTION = "Swisstom BB2, Pioneer (.eit, format 4): 32 electrodes, skip 4, co
 _ELECTRODES, _SKIPPED, _FORMAT = 32, 4, 4
 # Bytes before the content of a frame, and in the content before the voltages; number of integers of the voltages;
 # offset of the time in the content.
-_HEAD, _BEFORE, _NUMBERS, _TIME = 16, 60 + 12 + 256, 2 * _ELECTRODES**2, 16
+_HEADER_BYTES, _VOLTAGE_OFFSET, _NUM_INTEGERS, _TIME_OFFSET = 16, 60 + 12 + 256, 2 * _ELECTRODES**2, 16
 # Range of the four-byte counter of microseconds.
-_ROUND = 2**32
+_COUNTER_PERIOD = 2**32
 # Volts per unit of the stored numbers: an estimate by users of these files.
 _SCALE = 2.048 / (2**20 * 360 * 1000)
-_NOTES = (
+_SCALE_NOTES = (
     "neither the scale of the voltages nor the current is published (5 mA is assumed): trust relative changes alone.",
     "electrode pairs are assumed to have the polarity that makes voltages positive.",
     "voltages of driven electrodes are left out: they were not measured with care.",
@@ -38,8 +38,8 @@ def recognises(path: Path) -> bool:
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:
-        begin = file.read(4)
-    return begin in (bytes([_FORMAT, 0, 0, 0]), *(bytes([0, 0, 0, number]) for number in (1, 2, 3, _FORMAT)))
+        first_bytes = file.read(4)
+    return first_bytes in (bytes([_FORMAT, 0, 0, 0]), *(bytes([0, 0, 0, number]) for number in (1, 2, 3, _FORMAT)))
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
@@ -48,10 +48,10 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
     content = content_of(path)
     if content[:4] != bytes([_FORMAT, 0, 0, 0]):
         raise ValueError(f"{path.name} is of a Swisstom format that is not known; format 4 is. Export it as a table.")
-    start = int.from_bytes(content[4:8], "little", signed=True)
-    if not 8 <= start <= len(content):
-        raise ValueError(f"{path.name}: its header says that frames begin at byte {start}, beyond its end.")
-    values, times, left = _frames(content, start, path)
+    frames_start = int.from_bytes(content[4:8], "little", signed=True)
+    if not 8 <= frames_start <= len(content):
+        raise ValueError(f"{path.name}: its header says that frames begin at byte {frames_start}, beyond its end.")
+    values, times, num_leftover_bytes = _frames(content, frames_start, path)
     if not values:
         raise ValueError(f"{path.name} holds no whole frame; is it cut off?")
     pairs = np.stack(values).astype(float) * _SCALE
@@ -60,25 +60,27 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
         -(pairs[:, 0::2] + 1j * pairs[:, 1::2]),
         protocol,
         ~protocol.channels_on_driven_electrodes(),
-        np.unwrap(times, period=_ROUND) * 1e-6,
-        notes=(*_NOTES, *cut_off(left)),
+        np.unwrap(times, period=_COUNTER_PERIOD) * 1e-6,
+        notes=(*_SCALE_NOTES, *truncation_notes(num_leftover_bytes)),
     )
     return measurement_of(path, recording, description_of(path, description))
 
 
-def _frames(content: bytes, start: int, path: Path) -> tuple[list[np.ndarray], np.ndarray, int]:
+def _frames(content: bytes, frames_start: int, path: Path) -> tuple[list[np.ndarray], np.ndarray, int]:
     """Stored numbers and times (microseconds) of every complete frame, and number of bytes left over by a truncated
     last frame."""
-    values, times, place = [], [], start
-    while place + _HEAD <= len(content):
-        kind, length = (int(one) for one in np.frombuffer(content, "<i4", 2, place + 8))
-        begin = place + _HEAD
-        if length < 0 or (kind == 0 and length < _BEFORE + 4 * _NUMBERS):
-            raise ValueError(f"{path.name}: the frame at byte {place} says a length of {length}; it is damaged.")
-        if begin + length > len(content):
+    values, times, offset = [], [], frames_start
+    while offset + _HEADER_BYTES <= len(content):
+        kind, length = (int(number) for number in np.frombuffer(content, "<i4", 2, offset + 8))
+        content_start = offset + _HEADER_BYTES
+        if length < 0 or (kind == 0 and length < _VOLTAGE_OFFSET + 4 * _NUM_INTEGERS):
+            raise ValueError(f"{path.name}: the frame at byte {offset} says a length of {length}; it is damaged.")
+        if content_start + length > len(content):
             break
         if kind == 0:
-            values.append(np.frombuffer(content, "<i4", _NUMBERS, begin + _BEFORE))
-            times.append(int.from_bytes(content[begin + _TIME : begin + _TIME + 4], "little"))
-        place = begin + length
-    return values, np.array(times, float), len(content) - place
+            values.append(np.frombuffer(content, "<i4", _NUM_INTEGERS, content_start + _VOLTAGE_OFFSET))
+            times.append(
+                int.from_bytes(content[content_start + _TIME_OFFSET : content_start + _TIME_OFFSET + 4], "little")
+            )
+        offset = content_start + length
+    return values, np.array(times, float), len(content) - offset

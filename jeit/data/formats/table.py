@@ -30,12 +30,12 @@ from jeit.protocol import Protocol
 DESCRIPTION = "table (.csv, .txt, .npy, .npz) with a TOML description beside it"
 SUFFIXES = (".csv", ".txt", ".dat", ".npy", ".npz")
 # Arrays that `write_table` stores in addition to the voltages and the protocol.
-_WORDS = ("mask", "protocol_name", "frame_names", "notes", "times")
+_TEXT_ARRAYS = ("mask", "protocol_name", "frame_names", "notes", "times")
 
 AXES = ("electrodes", "patterns", "frames")
 """Names of the axes of an array of voltages, in their default order; a description can state another order."""
 # Maximum mean of the potentials of a pattern that counts as removed, relative to the largest potential.
-_MOST_MEAN = 0.01
+_MAX_RESIDUAL_MEAN = 0.01
 
 
 def recognises(path: Path) -> bool:
@@ -67,11 +67,11 @@ def read(
     are used, and, if it was read from a table, the units and columns in its description. Raises `ValueError` if there
     is no description, or if file and description disagree.
     """
-    which = find_description(path) if description is None else description
-    if which is not None:
-        described = load_description(which)
+    description_source = find_description(path) if description is None else description
+    if description_source is not None:
+        sensor_description = load_description(description_source)
     elif like is not None:
-        described = description_like(like)
+        sensor_description = description_like(like)
     else:
         # A damaged file is named as such: no description helps it.
         _ = _from_numpy(path, ()) if path.suffix.lower() in (".npz", ".npy") else read_text(path)
@@ -83,25 +83,25 @@ def read(
     if key is not None and path.suffix.lower() != ".npz":
         raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
     if key is not None:
-        described = replace(described, layout=replace(described.layout, keys=(key,)))
-    protocols = described.protocols(path) or ([] if like is None else [(like.protocol, "")])
-    mask = own = times = None
+        sensor_description = replace(sensor_description, layout=replace(sensor_description.layout, keys=(key,)))
+    protocols = sensor_description.protocols(path) or ([] if like is None else [(like.protocol, "")])
+    mask = stored_protocol = times = None
     if path.suffix.lower() in (".npz", ".npy"):
-        arrays = _from_numpy(path, described.layout.keys)
-        table, mask = _voltages(arrays, described.layout, path), arrays.get("mask")
-        if table.ndim == 3 or described.patterns_measured:
-            table = frames_of(table, described.layout.axes, path.name)
-        if described.protocol_section is None:
-            own = _own_protocol(arrays)
-        protocols = protocols if own is None else [(own, "")]
-        found = frames_in_table(np.atleast_2d(table), channel_counts(protocols), described.layout)
-        described, times = _with_words(described, arrays), _times(arrays, path.name)
+        arrays = _from_numpy(path, sensor_description.layout.keys)
+        table, mask = _voltages(arrays, sensor_description.layout, path), arrays.get("mask")
+        if table.ndim == 3 or sensor_description.patterns_measured:
+            table = frames_of(table, sensor_description.layout.axes, path.name)
+        if sensor_description.protocol_section is None:
+            stored_protocol = _stored_protocol(arrays)
+        protocols = protocols if stored_protocol is None else [(stored_protocol, "")]
+        file_frames = frames_in_table(np.atleast_2d(table), channel_counts(protocols), sensor_description.layout)
+        sensor_description, times = _with_stored_texts(sensor_description, arrays), _times(arrays, path.name)
     else:
-        layout = described.layout
+        layout = sensor_description.layout
         text = read_text(path, layout.delimiter, layout.skip_rows)
-        found = frames_in_text(text, channel_counts(protocols), layout, path.name)
-    measurement = measurement_in(path, described, found, protocols, mask, like)
-    if times is None or described.layout.averaged or described.layout.frame_rate is not None:
+        file_frames = frames_in_text(text, channel_counts(protocols), layout, path.name)
+    measurement = measurement_in(path, sensor_description, file_frames, protocols, mask, like)
+    if times is None or sensor_description.layout.averaged or sensor_description.layout.frame_rate is not None:
         return measurement
     return replace(measurement, times=times)
 
@@ -112,48 +112,48 @@ Protocols = Sequence[tuple[Protocol, str]]
 
 def channel_counts(protocols: Protocols) -> list[int]:
     """Numbers of channels of the protocols, the described one's first."""
-    return [*dict.fromkeys(one.num_measurements for one, _ in protocols)]
+    return [*dict.fromkeys(protocol.num_measurements for protocol, _ in protocols)]
 
 
 def measurement_in(
     path: Path,
-    described: Description,
-    found: Frames,
+    sensor_description: Description,
+    file_frames: Frames,
     protocols: Protocols,
     mask: np.ndarray | None = None,
     like: Measurement | None = None,
 ) -> Measurement:
     """The measurement of frames that were found in a file, with notes on what was found out; arguments as for
     `measurement_from` and `read`."""
-    layout = replace(described.layout, frames_in="rows")
-    frames = frames_from(found.table, layout, path.name)
-    notes = (*described.notes, *found.notes, *part_of(found.table, layout))
-    protocol, said = fitting_protocol(frames, protocols, like)
-    described = replace(described, layout=layout, notes=(*notes, *said))
+    layout = replace(sensor_description.layout, frames_in="rows")
+    frames = frames_from(file_frames.table, layout, path.name)
+    notes = (*sensor_description.notes, *file_frames.notes, *component_notes(file_frames.table, layout))
+    protocol, protocol_notes = fitting_protocol(frames, protocols, like)
+    sensor_description = replace(sensor_description, layout=layout, notes=(*notes, *protocol_notes))
     reason = ""
     if protocol is not None and frames.shape[-1] == protocol.num_measurements:
-        unread = driven_zeros(frames, protocol)
-        if unread.any():
-            mask = ~unread if mask is None else np.asarray(mask) & ~unread
+        unread_channels = driven_zeros(frames, protocol)
+        if unread_channels.any():
+            mask = ~unread_channels if mask is None else np.asarray(mask) & ~unread_channels
             reason = "they read driven electrodes, and are zero in every frame."
-    measurement = measurement_from(path, described, frames, protocol, mask)
+    measurement = measurement_from(path, sensor_description, frames, protocol, mask)
     if reason:
         notes = [note.replace("excluded by the mask given.", reason) for note in measurement.notes]
         measurement = replace(measurement, notes=tuple(notes))
     if layout.polarity is None:
         measurement = with_signs(measurement, like)
-    if found.times is None or layout.averaged or layout.frame_rate is not None:
+    if file_frames.times is None or layout.averaged or layout.frame_rate is not None:
         return measurement
-    return replace(measurement, times=found.times[:: 2 if layout.complex_pairs else 1])
+    return replace(measurement, times=file_frames.times[:: 2 if layout.complex_pairs else 1])
 
 
-def _without_gains(frames: np.ndarray, protocol: Protocol, described: Description) -> np.ndarray:
+def _without_gains(frames: np.ndarray, protocol: Protocol, sensor_description: Description) -> np.ndarray:
     """Frames divided by the gains of their measurement patterns. Raises `ValueError` for another number of these."""
-    gains, number = np.array(described.layout.gains), len(protocol.measurement)
-    if gains.size not in (0, number):
+    gains, num_patterns = np.array(sensor_description.layout.gains), len(protocol.measurement)
+    if gains.size not in (0, num_patterns):
         raise ValueError(
-            f"{described.origin}: [data] gains must be one for each of the {number} measurement patterns of "
-            f"'{protocol.name}'; they are {gains.size}."
+            f"{sensor_description.origin}: [data] gains must be one for each of the {num_patterns} measurement "
+            f"patterns of '{protocol.name}'; they are {gains.size}."
         )
     if not gains.size or frames.shape[-1] != protocol.num_measurements:
         return frames
@@ -164,8 +164,14 @@ def description_like(like: Measurement) -> Description:
     """Description that consists of the properties of another measurement of the same sensor, without its protocol and
     frame names."""
     source = Path(like.source)
-    beside = find_description(source) if like.source and (recognises(source) or source.suffix == ".mat") else None
-    layout = TableLayout() if beside is None else replace(load_description(beside).layout, frame_names=(), keys=())
+    description_path = (
+        find_description(source) if like.source and (recognises(source) or source.suffix == ".mat") else None
+    )
+    layout = (
+        TableLayout()
+        if description_path is None
+        else replace(load_description(description_path).layout, frame_names=(), keys=())
+    )
     return Description(
         origin=f"the description of '{like.name}'",
         title="",
@@ -179,7 +185,7 @@ def description_like(like: Measurement) -> Description:
 
 
 def measurement_from(
-    path: Path, described: Description, frames: np.ndarray, protocol: Protocol | None, mask: np.ndarray | None
+    path: Path, sensor_description: Description, frames: np.ndarray, protocol: Protocol | None, mask: np.ndarray | None
 ) -> Measurement:
     """Screen frames (F, M), in the unit of the file, and scale them as the description states. `protocol`: the one
     stored in the file, or None.
@@ -187,39 +193,39 @@ def measurement_from(
     Raises `ValueError` if there is no protocol, if the number of frame names differs from that of the frames, and as
     `screen`.
     """
-    protocol = protocol or described.protocol(path)
+    protocol = protocol or sensor_description.protocol(path)
     if protocol is None:
         raise ValueError(
-            f'{described.origin}: no protocol: add a [protocol] section with kind = "adjacent" or another.'
+            f'{sensor_description.origin}: no protocol: add a [protocol] section with kind = "adjacent" or another.'
         )
-    notes, frames = described.notes, _without_gains(frames, protocol, described)
-    if described.mean_removed and frames.shape[-1] == protocol.num_measurements:
-        frames, mean = less_their_mean(np.atleast_2d(frames), protocol.num_electrodes)
-        said = f"the potentials had a mean, {mean * described.layout.scale:.3g} V at most; it is subtracted."
+    notes, frames = sensor_description.notes, _without_gains(frames, protocol, sensor_description)
+    if sensor_description.mean_removed and frames.shape[-1] == protocol.num_measurements:
+        frames, mean = subtract_mean(np.atleast_2d(frames), protocol.num_electrodes)
+        said = f"the potentials had a mean, {mean * sensor_description.layout.scale:.3g} V at most; it is subtracted."
         notes = (*notes, said) if mean else notes
-    names, number = described.layout.frame_names, len(np.atleast_2d(frames))
-    if names and len(names) != number:
+    frame_names, num_frames = sensor_description.layout.frame_names, len(np.atleast_2d(frames))
+    if frame_names and len(frame_names) != num_frames:
         raise ValueError(
-            f"{described.origin}: [data] frame_names must be as many as the frames of {path.name}, {number}; they are "
-            f"{len(names)}."
+            f"{sensor_description.origin}: [data] frame_names must be as many as the frames of {path.name}, "
+            f"{num_frames}; they are {len(frame_names)}."
         )
     measurement = screen(
-        frames * described.layout.scale,
+        frames * sensor_description.layout.scale,
         protocol,
-        electrodes=described.electrodes,
-        domain=described.domain,
+        electrodes=sensor_description.electrodes,
+        domain=sensor_description.domain,
         mask=mask,
-        saturation=described.layout.saturation,
+        saturation=sensor_description.layout.saturation,
         name=path.stem,
         source=str(path),
-        frame_names=names,
+        frame_names=frame_names,
         notes=notes,
     )
-    measurement = replace(measurement, uncertainty=described.uncertainty)
-    if described.layout.averaged:
+    measurement = replace(measurement, uncertainty=sensor_description.uncertainty)
+    if sensor_description.layout.averaged:
         note = f"the mean of {measurement.num_frames} frames."
         return replace(measurement.mean_frame(), notes=(*measurement.notes, note))
-    rate = described.layout.frame_rate
+    rate = sensor_description.layout.frame_rate
     return measurement if rate is None else measurement.at_rate(rate)
 
 
@@ -256,7 +262,7 @@ def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray
     return frames if layout.component == "complex" else np.real(frames)
 
 
-def part_of(values: np.ndarray, layout: TableLayout) -> tuple[str, ...]:
+def component_notes(values: np.ndarray, layout: TableLayout) -> tuple[str, ...]:
     """A note that states which part of complex voltages is read."""
     if not np.iscomplexobj(values) or layout.component == "complex":
         return ()
@@ -268,19 +274,19 @@ def _from_numpy(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
     try:
         if path.suffix.lower() == ".npy":
             return {"voltages": npy_array(path)}
-        return npz_arrays(path, *(keys or ("voltages",)), *PROTOCOL_ARRAYS, *_WORDS)
+        return npz_arrays(path, *(keys or ("voltages",)), *PROTOCOL_ARRAYS, *_TEXT_ARRAYS)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
 
 
 def _voltages(arrays: dict[str, np.ndarray], layout: TableLayout, path: Path) -> np.ndarray:
     keys = layout.keys if layout.keys and path.suffix.lower() == ".npz" else ("voltages",)
-    missing = [key for key in keys if key not in arrays]
-    if missing:
-        held = listed(sorted(arrays.get("", arrays)))
+    missing_keys = [key for key in keys if key not in arrays]
+    if missing_keys:
+        array_names = listed(sorted(arrays.get("", arrays)))
         raise ValueError(
-            f"{path.name}: there is no array '{missing[0]}'; the file has {held}. Name the voltages with [data] keys "
-            "in the description."
+            f"{path.name}: there is no array '{missing_keys[0]}'; the file has {array_names}. Name the voltages with "
+            "[data] keys in the description."
         )
     for key in keys:
         if arrays[key].dtype.kind not in "biufc":
@@ -288,19 +294,19 @@ def _voltages(arrays: dict[str, np.ndarray], layout: TableLayout, path: Path) ->
     return arrays[keys[0]] if len(keys) == 1 else np.stack([arrays[key].ravel() for key in keys])
 
 
-def _own_protocol(arrays: dict[str, np.ndarray]) -> Protocol | None:
+def _stored_protocol(arrays: dict[str, np.ndarray]) -> Protocol | None:
     """The protocol in a file written by `write_table`; None if the file holds no protocol."""
-    if not all(part in arrays for part in PROTOCOL_ARRAYS):
+    if not all(array in arrays for array in PROTOCOL_ARRAYS):
         return None
     name = str(arrays.get("protocol_name", "custom"))
-    return Protocol(**{part: arrays[part] for part in PROTOCOL_ARRAYS}, name=name)
+    return Protocol(**{array: arrays[array] for array in PROTOCOL_ARRAYS}, name=name)
 
 
-def _with_words(described: Description, arrays: dict[str, np.ndarray]) -> Description:
+def _with_stored_texts(description: Description, arrays: dict[str, np.ndarray]) -> Description:
     """The description, completed by frame names (if it has none) and notes from a file written by `write_table`."""
-    names = described.layout.frame_names or _texts(arrays, "frame_names")
-    notes = (*described.notes, *_texts(arrays, "notes"))
-    return replace(described, layout=replace(described.layout, frame_names=names), notes=notes)
+    frame_names = description.layout.frame_names or _texts(arrays, "frame_names")
+    notes = (*description.notes, *_texts(arrays, "notes"))
+    return replace(description, layout=replace(description.layout, frame_names=frame_names), notes=notes)
 
 
 def _times(arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
@@ -312,7 +318,7 @@ def _times(arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
 
 
 def _texts(arrays: dict[str, np.ndarray], name: str) -> tuple[str, ...]:
-    return tuple(str(one) for one in np.ravel(arrays.get(name, np.zeros(0))))
+    return tuple(str(text) for text in np.ravel(arrays.get(name, np.zeros(0))))
 
 
 def frames_of(values: np.ndarray, axes: tuple[str, ...], name: str) -> Inexact[np.ndarray, "F M"]:
@@ -321,23 +327,25 @@ def frames_of(values: np.ndarray, axes: tuple[str, ...], name: str) -> Inexact[n
 
     Raises `ValueError` for another number of axes.
     """
-    named = tuple(axes or AXES)
-    if values.ndim == len(named) - 1:
-        values = np.expand_dims(values, named.index("frames"))  # MATLAB drops a last axis of length one
-    if values.ndim != len(named):
-        raise ValueError(f"{name}: the voltages have shape {values.shape}; {', '.join(named)} are {len(named)} axes.")
-    ordered = np.transpose(values, [named.index(one) for one in ("frames", "patterns", "electrodes")])
+    axis_names = tuple(axes or AXES)
+    if values.ndim == len(axis_names) - 1:
+        values = np.expand_dims(values, axis_names.index("frames"))  # MATLAB drops a last axis of length one
+    if values.ndim != len(axis_names):
+        raise ValueError(
+            f"{name}: the voltages have shape {values.shape}; {', '.join(axis_names)} are {len(axis_names)} axes."
+        )
+    ordered = np.transpose(values, [axis_names.index(axis) for axis in ("frames", "patterns", "electrodes")])
     return ordered.reshape(len(ordered), -1)
 
 
-def less_their_mean(frames: Inexact[np.ndarray, "F M"], count: int) -> tuple[Inexact[np.ndarray, "F M"], float]:
-    """Subtract from the potentials of `count` electrodes the mean of each pattern, if any mean exceeds noise: the
-    potentials were then measured against ground or an electrode. Returns the frames and the largest mean, 0 if nothing
-    is subtracted. Patterns with NaN are not changed."""
-    potentials = frames.reshape(len(frames), -1, count)
-    mean = potentials.mean(axis=2, keepdims=True)
-    mean = np.where(np.isfinite(mean), mean, 0)
-    rest = potentials - mean
-    if not (np.abs(mean) > _MOST_MEAN * np.abs(rest).max(axis=2, keepdims=True)).any():
+def subtract_mean(frames: Inexact[np.ndarray, "F M"], num_electrodes: int) -> tuple[Inexact[np.ndarray, "F M"], float]:
+    """Subtract from the potentials of `num_electrodes` electrodes the mean of each pattern, if any mean exceeds noise:
+    the potentials were then measured against ground or an electrode. Returns the frames and the largest mean, 0 if
+    nothing is subtracted. Patterns with NaN are not changed."""
+    potentials = frames.reshape(len(frames), -1, num_electrodes)
+    means = potentials.mean(axis=2, keepdims=True)
+    means = np.where(np.isfinite(means), means, 0)
+    centred_potentials = potentials - means
+    if not (np.abs(means) > _MAX_RESIDUAL_MEAN * np.abs(centred_potentials).max(axis=2, keepdims=True)).any():
         return frames, 0.0
-    return rest.reshape(frames.shape), float(np.abs(mean).max())
+    return centred_potentials.reshape(frames.shape), float(np.abs(means).max())

@@ -32,7 +32,7 @@ LAYERS = Number(1, 50)
 class MaterialTable(Table):
     """Table "skin": model, size and material of the skin."""
 
-    what = "a skin"
+    subject = "a skin"
     model: Literal["sheet", "layer"] = "sheet"
     width_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
     height_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
@@ -43,7 +43,7 @@ class MaterialTable(Table):
 class LayoutTable(Table):
     """Table "electrodes": layout, diameter and contact impedance. NaN stands for the value of the layout."""
 
-    what = "a skin"
+    subject = "a skin"
     layout: Word
     diameter_mm: Annotated[float, DIAMETER] = math.nan
     contact_impedance_ohm_m2: Annotated[float, IMPEDANCE] = math.nan
@@ -52,7 +52,7 @@ class LayoutTable(Table):
 class MeasurementTable(Table):
     """Table "measurement": the measurement protocol."""
 
-    what = "a skin"
+    subject = "a skin"
     protocol: ProtocolName = defaults.PROTOCOL
     pairs: Annotated[int, PAIRS] | None = None
     current_mA: Annotated[float, CURRENT] = 1e3 * defaults.CURRENT
@@ -61,7 +61,7 @@ class MeasurementTable(Table):
 class CellsTable(Table):
     """Table "mesh": cell size and number of layers."""
 
-    what = "a skin"
+    subject = "a skin"
     cell_mm: Annotated[float, CELL] = 1e3 * defaults.CELL_SIZE
     layers: Annotated[int, LAYERS] = defaults.NUM_LAYERS
 
@@ -69,7 +69,7 @@ class CellsTable(Table):
 class SkinTable(Table):
     """All tables of a skin file."""
 
-    what = "a skin"
+    subject = "a skin"
     skin: MaterialTable = MaterialTable()
     surface: Annotated[SurfaceTable | None, SURFACE] = None
     electrodes: LayoutTable = Field(default_factory=dict, validate_default=True)

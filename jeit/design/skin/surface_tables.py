@@ -15,7 +15,7 @@ _SECTION = Numbers(((2, 2),), 2, 5000, "mm", single=True)
 class TubeTable(Table):
     """The lateral surface of a cylinder."""
 
-    what = "a tube"
+    subject = "a tube"
     kind: Literal["tube"]
     radius_mm: Annotated[float, _RADIUS]
     height_mm: Annotated[float, _LENGTH]
@@ -25,7 +25,7 @@ class TubeTable(Table):
 class ForearmTable(Table):
     """A tapered sleeve: each end is given by a radius, or by the two half widths of an oval."""
 
-    what = "a forearm"
+    subject = "a forearm"
     kind: Literal["forearm"]
     length_mm: Annotated[float, _LENGTH]
     wrist_mm: Annotated[Any, _SECTION]
@@ -36,7 +36,7 @@ class ForearmTable(Table):
 class SphereTable(Table):
     """A sphere."""
 
-    what = "a sphere"
+    subject = "a sphere"
     kind: Literal["sphere"]
     radius_mm: Annotated[float, _RADIUS]
     outward: bool = True
@@ -45,7 +45,7 @@ class SphereTable(Table):
 class CapTable(Table):
     """The cap of a sphere about its pole."""
 
-    what = "a cap"
+    subject = "a cap"
     kind: Literal["cap"]
     radius_mm: Annotated[float, _RADIUS]
     angle_degrees: Annotated[float, Number(5, 170, "degrees")]
@@ -55,7 +55,7 @@ class CapTable(Table):
 class BentSheetTable(Table):
     """A flat sheet bent around a cylinder along `axis`."""
 
-    what = "a bent sheet"
+    subject = "a bent sheet"
     kind: Literal["bent sheet"]
     width_mm: Annotated[float, _LENGTH]
     height_mm: Annotated[float, _LENGTH]
@@ -67,7 +67,7 @@ class BentSheetTable(Table):
 class ScanTable(Table):
     """A surface from a file of triangles or a CAD file, with the unit of length."""
 
-    what = "a surface's file"
+    subject = "a surface's file"
     file: Word
     unit: Literal["mm", "cm", "m", "inch"]
     outward: bool = True
@@ -79,7 +79,16 @@ class ScanTable(Table):
 
 
 SurfaceTable = TubeTable | ForearmTable | SphereTable | CapTable | BentSheetTable | ScanTable
-SURFACE = OneOf("kind", TubeTable, ForearmTable, SphereTable, CapTable, BentSheetTable, mark="file", other=ScanTable)
+SURFACE = OneOf(
+    "kind",
+    TubeTable,
+    ForearmTable,
+    SphereTable,
+    CapTable,
+    BentSheetTable,
+    alternative_key="file",
+    alternative_table=ScanTable,
+)
 
 
 def check_keys_of_surface(surface: SurfaceTable | None, skin: Table, mesh: Table) -> None:

@@ -12,7 +12,7 @@ from datetime import datetime
 from pathlib import Path
 
 from jeit.arguments import describe
-from jeit.files.whole import boot, is_alive
+from jeit.files.whole import boot_identifier, is_alive
 
 try:
     import fcntl
@@ -99,7 +99,7 @@ def _is_file_at(descriptor: int, lock_path: Path) -> bool:
 
 def _write_owner(descriptor: int) -> None:
     """Write the process, the machine and the time into the lock file as JSON, so that others can name its owner."""
-    owner = {"pid": os.getpid(), "host": platform.node(), "boot": boot()}
+    owner = {"pid": os.getpid(), "host": platform.node(), "boot": boot_identifier()}
     owner["since"] = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, json.dumps(owner).encode(), 0)
@@ -123,7 +123,7 @@ def _has_ended(owner: dict, *, certain: bool) -> bool:
 
 def _is_on_this_machine(owner: dict) -> bool:
     """Whether the owner runs, or ran, on this machine, by its name or its boot identifier."""
-    return owner.get("host") == platform.node() or (bool(boot()) and owner.get("boot") == boot())
+    return owner.get("host") == platform.node() or (bool(boot_identifier()) and owner.get("boot") == boot_identifier())
 
 
 def _refusal_message(owner: dict, lock_path: Path, store_path: Path, contents: str) -> str:

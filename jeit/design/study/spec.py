@@ -237,7 +237,7 @@ def read_study(path: str | Path) -> Study:
     from jeit.files.limits import faults_message
     from jeit.files.schema import validated
 
-    text = read_text(path, most=_MAX_FILE_BYTES)
+    text = read_text(path, max_bytes=_MAX_FILE_BYTES)
     table = validated(StudyTable, parsed_toml(text, path.name), path.name)
     try:
         return _study_from_table(text, table, path.parent)

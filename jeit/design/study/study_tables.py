@@ -32,7 +32,7 @@ _MAX_LAYOUTS, _MAX_POINTS = 2000, 100_000
 class MaterialSweep(Table):
     """Table "skin": model, size and material of the skins."""
 
-    what = "a study"
+    subject = "a study"
     model: Literal["sheet", "layer"] = "sheet"
     width_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
     height_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
@@ -43,7 +43,7 @@ class MaterialSweep(Table):
 class LayoutSweep(Table):
     """Table "electrodes": layouts, diameters and contact impedances. NaN stands for the values of the layout."""
 
-    what = "a study"
+    subject = "a study"
     layouts: Several[Word]
     diameter_mm: Annotated[list[float], DIAMETER] = Field(default=[math.nan])
     contact_impedance_ohm_m2: Annotated[list[float], IMPEDANCE] = Field(default=[math.nan])
@@ -53,7 +53,7 @@ class LayoutSweep(Table):
 class MeasurementSweep(Table):
     """Table "measurement": measurement protocols, current and noise."""
 
-    what = "a study"
+    subject = "a study"
     protocol: Several[ProtocolName] = Field(default=[defaults.PROTOCOL])
     pairs: Annotated[list[int], PAIRS] | None = None
     current_mA: Annotated[float, CURRENT] = 1e3 * defaults.CURRENT
@@ -63,7 +63,7 @@ class MeasurementSweep(Table):
 class TouchTable(Table):
     """Table "touch": shape of the touches, and grid of the touched positions."""
 
-    what = "a study"
+    subject = "a study"
     indentation: Literal["bell", "hemisphere"] = "bell"
     depth_mm: Annotated[float, Number(0.01, 100, "mm")] = 1e3 * defaults.DEPTH
     deviation_mm: Annotated[float, Number(0.1, 200, "mm")] = 1e3 * defaults.DEVIATION
@@ -77,7 +77,7 @@ class TouchTable(Table):
 class CellsSweep(Table):
     """Table "mesh": cell sizes and number of layers."""
 
-    what = "a study"
+    subject = "a study"
     cell_mm: Annotated[list[float], CELL] = Field(default=[1e3 * defaults.CELL_SIZE])
     layers: Annotated[int, LAYERS] = defaults.NUM_LAYERS
 
@@ -85,7 +85,7 @@ class CellsSweep(Table):
 class ScoresTable(Table):
     """Table "scores": scores to be computed, and their parameters."""
 
-    what = "a study"
+    subject = "a study"
     wanted: Several[ScoreName] = Field(default=["minimum", "mean", "uniformity"])
     num_taxels: Annotated[int, Number(1, 10_000)] = defaults.NUM_TAXELS
     threshold: Annotated[float, Number(0.01, 0.99)] = defaults.THRESHOLD
@@ -96,7 +96,7 @@ class ScoresTable(Table):
 class StudyTable(Table):
     """All tables of a study file."""
 
-    what = "a study"
+    subject = "a study"
     name: Word = "study"
     chunk_points: Annotated[int, Number(1, 4096)] = 16
     skin: MaterialSweep = MaterialSweep()

@@ -18,7 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.spatial import Delaunay, KDTree
 
-from jeit.mesh.generate.curve import Curve, Size, divide, within
+from jeit.mesh.generate.curve import Curve, Size, divide, is_within
 
 
 @dataclass
@@ -60,16 +60,21 @@ class Front:
 
     def guarded(self) -> np.ndarray:
         """Whether each node on the outline is a sharp corner (num_outline,)."""
-        return np.concatenate([np.isin(s, g) for s, g in zip(self.stops, self.guards, strict=True)])
+        return np.concatenate(
+            [
+                np.isin(arc_lengths, guarded_lengths)
+                for arc_lengths, guarded_lengths in zip(self.stops, self.guards, strict=True)
+            ]
+        )
 
-    def divide(self, chosen: np.ndarray) -> None:
-        """Insert a node in the middle of each of the `chosen` outline segments (indices)."""
+    def divide(self, segments: np.ndarray) -> None:
+        """Insert a node in the middle of each of the outline segments with the indices `segments`."""
         offset = 0
         for k, stops in enumerate(self.stops):
-            mine = chosen[(chosen >= offset) & (chosen < offset + len(stops))] - offset
+            own_segments = segments[(segments >= offset) & (segments < offset + len(stops))] - offset
             length = self.curves[k].length
-            following = np.append(stops[1:], stops[0] + length)
-            self.stops[k] = np.sort(np.concatenate([stops, (0.5 * (stops + following))[mine] % length]))
+            next_stops = np.append(stops[1:], stops[0] + length)
+            self.stops[k] = np.sort(np.concatenate([stops, (0.5 * (stops + next_stops))[own_segments] % length]))
             offset += len(stops)
 
 
@@ -77,18 +82,18 @@ def triangulate(front: Front, points: np.ndarray) -> np.ndarray:
     """Delaunay triangles (m, 3) inside the outline, counter-clockwise."""
     outline = points[: front.num_outline]
     # Distant auxiliary nodes keep the outline off the convex hull, where collinear nodes would produce slivers.
-    reach = np.ptp(outline, axis=0).max()
+    extent = np.ptp(outline, axis=0).max()
     angle = 2 * np.pi * (np.arange(16) + 0.37) / 16
-    far = outline.mean(axis=0) + 4 * reach * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    cells = Delaunay(np.concatenate([points, far])).simplices
+    auxiliary_nodes = outline.mean(axis=0) + 4 * extent * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    cells = Delaunay(np.concatenate([points, auxiliary_nodes])).simplices
     cells = cells[(cells < len(points)).all(axis=1)]
     # A cell with a node in the interior lies inside; only cells whose nodes are all on the outline need a test.
-    doubtful = np.flatnonzero((cells < front.num_outline).all(axis=1))
-    keep = np.ones(len(cells), bool)
-    keep[doubtful] = within(front.curves, points[cells[doubtful]].mean(axis=1))
-    cells = cells[keep]
-    clockwise = doubled_areas(points, cells) < 0
-    cells[clockwise] = cells[clockwise][:, [0, 2, 1]]
+    outline_cells = np.flatnonzero((cells < front.num_outline).all(axis=1))
+    is_inside = np.ones(len(cells), bool)
+    is_inside[outline_cells] = is_within(front.curves, points[cells[outline_cells]].mean(axis=1))
+    cells = cells[is_inside]
+    is_clockwise = doubled_areas(points, cells) < 0
+    cells[is_clockwise] = cells[is_clockwise][:, [0, 2, 1]]
     return cells
 
 
@@ -128,14 +133,14 @@ def select_apart(points: np.ndarray, radius: np.ndarray, priority: np.ndarray) -
     """Select points greedily in order of decreasing `priority`, skipping points within `radius` of a selected one.
     Returns their indices."""
     order = np.argsort(-priority, kind="stable")
-    near = KDTree(points[order]).query_ball_point(points[order], radius[order], return_sorted=False)
-    taken = np.zeros(len(points), bool)
-    blocked = np.zeros(len(points), bool)
-    for index, others in enumerate(near):
-        if not blocked[index]:
-            taken[index] = True
-            blocked[others] = True
-    return order[taken]
+    neighbours = KDTree(points[order]).query_ball_point(points[order], radius[order], return_sorted=False)
+    is_selected = np.zeros(len(points), bool)
+    is_blocked = np.zeros(len(points), bool)
+    for index, others in enumerate(neighbours):
+        if not is_blocked[index]:
+            is_selected[index] = True
+            is_blocked[others] = True
+    return order[is_selected]
 
 
 def clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap: np.ndarray) -> np.ndarray:
@@ -147,14 +152,14 @@ def clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap: n
     start, end = nodes[segments[:, 0]], nodes[segments[:, 1]]
     tree = KDTree(0.5 * (start + end))
     _, nearest = tree.query(points, k=min(3, len(segments)))
-    apart = np.full(len(points), np.inf)
+    distances = np.full(len(points), np.inf)
     for column in nearest.reshape(len(points), -1).T:
-        along, offset = end[column] - start[column], points - start[column]
-        fraction = np.clip((offset * along).sum(1) / (along**2).sum(1), 0.0, 1.0)
-        apart = np.minimum(apart, np.linalg.norm(offset - fraction[:, None] * along, axis=1))
-    clear = apart > gap
-    clear[clear] = within(front.curves, points[clear])
-    return clear
+        direction, offset = end[column] - start[column], points - start[column]
+        fraction = np.clip((offset * direction).sum(1) / (direction**2).sum(1), 0.0, 1.0)
+        distances = np.minimum(distances, np.linalg.norm(offset - fraction[:, None] * direction, axis=1))
+    is_clear = distances > gap
+    is_clear[is_clear] = is_within(front.curves, points[is_clear])
+    return is_clear
 
 
 # Angles in degrees: the guaranteed minimum angle; the minimum that `repair` aims at, which is slightly larger; and the
@@ -171,9 +176,9 @@ _TRIAL_STEPS = np.concatenate([length * _STEP_DIRECTIONS for length in (0.02, 0.
 
 def improvable(front: Front, cells: np.ndarray) -> np.ndarray:
     """Whether each cell can be improved: no cell at a sharp corner can, since the outline determines its shape."""
-    sharp = np.zeros(cells.max() + 1, bool)
-    sharp[: front.num_outline] = front.guarded()
-    return np.logical_not(sharp[cells].any(axis=1))
+    is_sharp = np.zeros(cells.max() + 1, bool)
+    is_sharp[: front.num_outline] = front.guarded()
+    return np.logical_not(is_sharp[cells].any(axis=1))
 
 
 def missing_segments(front: Front, cells: np.ndarray, num_points: int) -> np.ndarray:
@@ -190,43 +195,43 @@ def polish(front: Front, passes: int = 4) -> None:
     Steps in eight directions are tried for each node, because the smallest angle is not differentiable where two cells
     tie.
     """
-    held = front.num_held
+    num_held = front.num_held
     for _ in range(passes):
         points = front.points()
         cells = triangulate(front, points)
         angle = smallest_angles(points[cells])
-        bad = np.flatnonzero((angle < _POLISH_ANGLE) & improvable(front, cells))
-        movable = np.unique(cells[bad])
-        movable = movable[movable >= held]
+        bad_cells = np.flatnonzero((angle < _POLISH_ANGLE) & improvable(front, cells))
+        movable = np.unique(cells[bad_cells])
+        movable = movable[movable >= num_held]
         if not movable.size:
             return
         order = np.argsort(cells.ravel(), kind="stable")
         bounds = np.searchsorted(cells.ravel()[order], np.arange(len(points) + 1))
-        moved = False
+        has_moved = False
         for node in movable.tolist():
-            star = order[bounds[node] : bounds[node + 1]]
-            corner = star % 3
-            around = cells[star // 3]
-            second = points[around[np.arange(len(star)), (corner + 1) % 3]]
-            third = points[around[np.arange(len(star)), (corner + 2) % 3]]
-            reach = np.linalg.norm(second - points[node], axis=1).mean()
-            places = points[node] + np.concatenate([np.zeros((1, 2)), reach * _TRIAL_STEPS])
-            shape = (len(places), len(star), 2)
+            star_corners = order[bounds[node] : bounds[node + 1]]
+            corner = star_corners % 3
+            star_cells = cells[star_corners // 3]
+            second = points[star_cells[np.arange(len(star_corners)), (corner + 1) % 3]]
+            third = points[star_cells[np.arange(len(star_corners)), (corner + 2) % 3]]
+            mean_length = np.linalg.norm(second - points[node], axis=1).mean()
+            trial_points = points[node] + np.concatenate([np.zeros((1, 2)), mean_length * _TRIAL_STEPS])
+            shape = (len(trial_points), len(star_corners), 2)
             corners = np.stack(
                 [
-                    np.broadcast_to(places[:, None], shape),
+                    np.broadcast_to(trial_points[:, None], shape),
                     np.broadcast_to(second, shape),
                     np.broadcast_to(third, shape),
                 ],
                 axis=2,
             )
-            worst = smallest_angles(corners).min(axis=1)
-            best = int(np.argmax(worst))
-            if worst[best] > worst[0] + 1e-3:
-                points[node] = places[best]
-                moved = True
-        front.free = points[held:]
-        if not moved:
+            min_angles = smallest_angles(corners).min(axis=1)
+            best_index = int(np.argmax(min_angles))
+            if min_angles[best_index] > min_angles[0] + 1e-3:
+                points[node] = trial_points[best_index]
+                has_moved = True
+        front.free = points[num_held:]
+        if not has_moved:
             return
 
 
@@ -240,15 +245,15 @@ def repair(front: Front) -> bool:
     for round_number in range(_MAX_REPAIR_ROUNDS):
         points = front.points()
         cells = triangulate(front, points)
-        missing = missing_segments(front, cells, len(points))
-        if missing.size:
-            _recover(front, points, missing, remove=round_number < 10)
+        missing_indices = missing_segments(front, cells, len(points))
+        if missing_indices.size:
+            _recover(front, points, missing_indices, remove=round_number < 10)
             continue
         angle = smallest_angles(points[cells])
-        bad = np.flatnonzero((angle < _REPAIR_ANGLE) & improvable(front, cells))
-        if not bad.size:
+        bad_cells = np.flatnonzero((angle < _REPAIR_ANGLE) & improvable(front, cells))
+        if not bad_cells.size:
             return True
-        _insert_circumcentres(front, points, cells[bad], angle[bad])
+        _insert_circumcentres(front, points, cells[bad_cells], angle[bad_cells])
         if round_number % 3 == 2:
             polish(front, passes=2)
     return False
@@ -264,42 +269,42 @@ def _is_divisible(front: Front) -> np.ndarray:
     return np.logical_not(front.guarded()[front.segments()].any(axis=1))
 
 
-def _recover(front: Front, points: np.ndarray, missing: np.ndarray, *, remove: bool) -> None:
+def _recover(front: Front, points: np.ndarray, missing_indices: np.ndarray, *, remove: bool) -> None:
     """Make missing outline segments appear: remove the free nodes close to them or, if there are none, halve the
     segments."""
-    middle, half = _diametral_circles(front, points)
+    centres, radii = _diametral_circles(front, points)
     if remove and len(front.free):
-        near = KDTree(front.free).query_ball_point(middle[missing], half[missing])
-        doomed = np.unique(np.concatenate([np.asarray(n, dtype=int) for n in near]))
-        if doomed.size:
-            front.free = np.delete(front.free, doomed, axis=0)
+        neighbours = KDTree(front.free).query_ball_point(centres[missing_indices], radii[missing_indices])
+        removed_nodes = np.unique(np.concatenate([np.asarray(indices, dtype=int) for indices in neighbours]))
+        if removed_nodes.size:
+            front.free = np.delete(front.free, removed_nodes, axis=0)
             return
-    divisible = _is_divisible(front)[missing]
-    front.divide(missing[divisible])
+    is_divisible = _is_divisible(front)[missing_indices]
+    front.divide(missing_indices[is_divisible])
 
 
-def _insert_circumcentres(front: Front, points: np.ndarray, bad: np.ndarray, angle: np.ndarray) -> None:
-    centre, radius = circumcircles(points, bad)
-    chosen = select_apart(centre, radius, -angle)
-    centre = centre[chosen]
-    middle, half = _diametral_circles(front, points)
-    divisible = _is_divisible(front)
+def _insert_circumcentres(front: Front, points: np.ndarray, bad_cells: np.ndarray, angle: np.ndarray) -> None:
+    centre, radius = circumcircles(points, bad_cells)
+    selected = select_apart(centre, radius, -angle)
+    centre = centre[selected]
+    centres, radii = _diametral_circles(front, points)
+    is_divisible = _is_divisible(front)
     # A segment is encroached upon if a new node lies in the circle whose diameter is the segment.
-    near = KDTree(centre).query_ball_point(middle, half * (1 - 1e-9))
-    encroached = np.array([len(n) > 0 for n in near])
-    affected = np.zeros(len(centre), bool)
-    for index in np.flatnonzero(encroached):
-        affected[near[index]] = True
-    outside = ~within(front.curves, centre)
-    lost = np.flatnonzero(outside & ~affected)
-    if lost.size:
-        encroached[KDTree(middle).query(centre[lost])[1]] = True
-    accepted = centre[~affected & ~outside]
+    neighbours = KDTree(centre).query_ball_point(centres, radii * (1 - 1e-9))
+    is_encroached = np.array([len(indices) > 0 for indices in neighbours])
+    is_affected = np.zeros(len(centre), bool)
+    for index in np.flatnonzero(is_encroached):
+        is_affected[neighbours[index]] = True
+    is_outside = ~is_within(front.curves, centre)
+    lost_centres = np.flatnonzero(is_outside & ~is_affected)
+    if lost_centres.size:
+        is_encroached[KDTree(centres).query(centre[lost_centres])[1]] = True
+    accepted = centre[~is_affected & ~is_outside]
     if len(accepted):
         accepted = accepted[clear_of_outline(front, points, accepted, np.zeros(len(accepted)))]
-    halved = np.flatnonzero(encroached & divisible)
+    halved_segments = np.flatnonzero(is_encroached & is_divisible)
     front.free = np.concatenate([front.free, accepted])
-    front.divide(halved)
+    front.divide(halved_segments)
 
 
 # Maximum ratio of circumradius to cell size, chosen so that the mean edge equals the cell size (the ratio of an
@@ -313,18 +318,20 @@ _SHARP_CORNER = np.radians(75.0)
 def outline_nodes(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size, guard: float) -> Front:
     """Place nodes on the outline and cut off sharp corners at a distance of `guard` times the local cell size."""
     all_stops, guards = [], []
-    for curve, own in zip(curves, stops, strict=True):
-        stop = np.unique(np.concatenate([curve.corners, own % curve.length]))
-        sharp = np.flatnonzero(curve.angles < _SHARP_CORNER)
-        extra = []
-        for corner in sharp:
-            place = curve.corners[corner]
-            ahead = np.min((stop - place - 1e-12 * curve.length) % curve.length)
-            behind = np.min((place - stop - 1e-12 * curve.length) % curve.length)
-            cut = min(guard * float(size(curve.at(np.array([place])))[0]), 0.45 * ahead, 0.45 * behind)
-            extra += [(place + cut) % curve.length, (place - cut) % curve.length]
-        all_stops.append(divide(curve, np.concatenate([stop, extra]), size))
-        guards.append(curve.corners[sharp])
+    for curve, required_stops in zip(curves, stops, strict=True):
+        stop_lengths = np.unique(np.concatenate([curve.corners, required_stops % curve.length]))
+        sharp_corners = np.flatnonzero(curve.angles < _SHARP_CORNER)
+        added_stops = []
+        for corner in sharp_corners:
+            corner_length = curve.corners[corner]
+            gap_ahead = np.min((stop_lengths - corner_length - 1e-12 * curve.length) % curve.length)
+            gap_behind = np.min((corner_length - stop_lengths - 1e-12 * curve.length) % curve.length)
+            cut_length = min(
+                guard * float(size(curve.at(np.array([corner_length])))[0]), 0.45 * gap_ahead, 0.45 * gap_behind
+            )
+            added_stops += [(corner_length + cut_length) % curve.length, (corner_length - cut_length) % curve.length]
+        all_stops.append(divide(curve, np.concatenate([stop_lengths, added_stops]), size))
+        guards.append(curve.corners[sharp_corners])
     return Front(curves, all_stops, guards, fixed, np.zeros((0, 2)))
 
 
@@ -334,39 +341,45 @@ def fill(front: Front, size: Size) -> None:
         points = front.points()
         cells = triangulate(front, points)
         centre, radius = circumcircles(points, cells)
-        wanted = size(centre)
-        large = radius > _RADIUS_PER_SIZE * wanted
-        centre, ratio, wanted = centre[large], (radius / wanted)[large], wanted[large]
-        good = clear_of_outline(front, points, centre, 0.5 * wanted)
-        if not good.any():
+        sizes = size(centre)
+        is_large = radius > _RADIUS_PER_SIZE * sizes
+        centre, ratio, sizes = centre[is_large], (radius / sizes)[is_large], sizes[is_large]
+        is_clear = clear_of_outline(front, points, centre, 0.5 * sizes)
+        if not is_clear.any():
             return
-        centre, ratio, wanted = centre[good], ratio[good], wanted[good]
-        front.free = np.concatenate([front.free, centre[select_apart(centre, 0.95 * wanted, ratio)]])
+        centre, ratio, sizes = centre[is_clear], ratio[is_clear], sizes[is_clear]
+        front.free = np.concatenate([front.free, centre[select_apart(centre, 0.95 * sizes, ratio)]])
 
 
 def smooth(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
     """Move the free nodes towards the optimal Delaunay triangulation for the requested cell sizes."""
-    held = front.num_held
+    num_held = front.num_held
     if not len(front.free):
         return
     for _ in range(steps):
         points = front.points()
         cells = triangulate(front, points)
         corners = points[cells]
-        middle = corners.mean(axis=1)
-        offset = circumcircles(points, cells)[0] - middle
+        centroids = corners.mean(axis=1)
+        offset = circumcircles(points, cells)[0] - centroids
         # The circumcentre of an obtuse cell lies far outside it and would displace nodes too far.
-        reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
-        offset *= np.minimum(1.0, reach / np.maximum(np.linalg.norm(offset, axis=1), 1e-300))[:, None]
-        weight = doubled_areas(points, cells) / size(middle) ** 3
-        weighted = weight[:, None] * np.concatenate([middle + offset, np.ones((len(cells), 1))], axis=1)
+        radii = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
+        offset *= np.minimum(1.0, radii / np.maximum(np.linalg.norm(offset, axis=1), 1e-300))[:, None]
+        weight = doubled_areas(points, cells) / size(centroids) ** 3
+        weighted = weight[:, None] * np.concatenate([centroids + offset, np.ones((len(cells), 1))], axis=1)
         summed = np.stack(
-            [np.bincount(cells.ravel(), np.repeat(w, 3), minlength=len(points)) for w in weighted.T], axis=1
-        )[held:]
-        known = summed[:, 2] > 0
-        target = np.where(known[:, None], summed[:, :2] / np.where(known, summed[:, 2], 1.0)[:, None], front.free)
-        good = clear_of_outline(front, points, target, 0.45 * size(target))
-        front.free = np.where(good[:, None], target, front.free)
+            [
+                np.bincount(cells.ravel(), np.repeat(weight_column, 3), minlength=len(points))
+                for weight_column in weighted.T
+            ],
+            axis=1,
+        )[num_held:]
+        has_cells = summed[:, 2] > 0
+        target = np.where(
+            has_cells[:, None], summed[:, :2] / np.where(has_cells, summed[:, 2], 1.0)[:, None], front.free
+        )
+        is_clear = clear_of_outline(front, points, target, 0.45 * size(target))
+        front.free = np.where(is_clear[:, None], target, front.free)
 
 
 def generate(
@@ -385,12 +398,12 @@ def generate(
             fill(front, size)
         smooth(front, size)
         polish(front)
-        done = repair(front)
+        is_repaired = repair(front)
         polish(front, passes=1)
         points = front.points()
         cells = triangulate(front, points)
         angle = smallest_angles(points[cells])
-        if done and angle[improvable(front, cells)].min(initial=90.0) >= PROMISED_ANGLE:
+        if is_repaired and angle[improvable(front, cells)].min(initial=90.0) >= PROMISED_ANGLE:
             return order_nodes(points, cells)
         front = None
     raise ValueError(
@@ -402,10 +415,10 @@ def generate(
 def order_nodes(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Renumber nodes and cells so that neighbours have close indices; node 0 stays first, and unused nodes are
     removed."""
-    used = np.unique(cells)
-    number = np.full(len(points), -1)
-    number[used] = np.arange(len(used))
-    points, cells = points[used], number[cells]
+    used_nodes = np.unique(cells)
+    new_index = np.full(len(points), -1)
+    new_index[used_nodes] = np.arange(len(used_nodes))
+    points, cells = points[used_nodes], new_index[cells]
     edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
     graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(points),) * 2)
     order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)

@@ -90,7 +90,7 @@ def closed_line(vertices: np.ndarray) -> Curve:
     )
 
 
-def within(curves: list[Curve], points: np.ndarray) -> np.ndarray:
+def is_within(curves: list[Curve], points: np.ndarray) -> np.ndarray:
     """Whether points lie inside the first curve and outside the others, which are holes."""
     result = np.zeros(len(points), bool)
     for curve in curves:
@@ -103,20 +103,22 @@ def divide(curve: Curve, stops: np.ndarray, size: Size) -> np.ndarray:
     stops = np.unique(stops)
     if not len(stops):
         stops = np.zeros(1)
-    fine = np.append(stops, stops[0] + curve.length)
+    samples = np.append(stops, stops[0] + curve.length)
     while True:
-        middle, width = 0.5 * (fine[1:] + fine[:-1]), np.diff(fine)
-        long = width > 0.5 * size(curve.at(middle % curve.length))
-        if not long.any():
+        midpoints, widths = 0.5 * (samples[1:] + samples[:-1]), np.diff(samples)
+        is_long = widths > 0.5 * size(curve.at(midpoints % curve.length))
+        if not is_long.any():
             break
-        fine = np.sort(np.concatenate([fine, middle[long]]))
-    density = 1.0 / size(curve.at(0.5 * (fine[1:] + fine[:-1]) % curve.length))
-    count = np.concatenate([[0.0], np.cumsum(np.diff(fine) * density)])
-    at_ends = np.interp(np.append(stops, stops[0] + curve.length), fine, count)
-    fewest = max(1, -(-3 // len(stops)))
+        samples = np.sort(np.concatenate([samples, midpoints[is_long]]))
+    density = 1.0 / size(curve.at(0.5 * (samples[1:] + samples[:-1]) % curve.length))
+    cumulative_count = np.concatenate([[0.0], np.cumsum(np.diff(samples) * density)])
+    stop_counts = np.interp(np.append(stops, stops[0] + curve.length), samples, cumulative_count)
+    min_pieces = max(1, -(-3 // len(stops)))
     pieces = []
-    for start, low, high in zip(stops, at_ends[:-1], at_ends[1:], strict=True):
-        number = max(fewest, round(high - low))
-        inner = np.interp(low + (high - low) * np.arange(1, number) / number, count, fine)
-        pieces.append(np.append(start, inner))
+    for start, start_count, end_count in zip(stops, stop_counts[:-1], stop_counts[1:], strict=True):
+        num_pieces = max(min_pieces, round(end_count - start_count))
+        inner_stops = np.interp(
+            start_count + (end_count - start_count) * np.arange(1, num_pieces) / num_pieces, cumulative_count, samples
+        )
+        pieces.append(np.append(start, inner_stops))
     return np.sort(np.concatenate(pieces) % curve.length)

@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
-from jeit.mesh.generate.curve import Curve, Size, within
+from jeit.mesh.generate.curve import Curve, Size, is_within
 from jeit_solvers.module import Module
 
 # Factor between successive trial numbers of nodes, and maximum number of nodes tried.
@@ -21,34 +21,34 @@ _TRIAL_FACTOR, _MAX_TRIAL_NODES = 1.1, 2e6
 
 
 class TooFewNodes(ValueError):
-    """Raised if a plane mesh needs about `least` nodes, more than requested.
+    """Raised if a plane mesh needs about `min_points` nodes, more than requested.
 
     `solid` is the message for a plane mesh that is the base of a solid, without the leading "num_points: "; {asked} and
     {least} in it are replaced by numbers of nodes of the solid.
     """
 
-    def __init__(self, message: str, least: int, solid: str):
+    def __init__(self, message: str, min_points: int, solid: str):
         super().__init__(message)
-        self.least, self.solid = least, solid
+        self.min_points, self.solid = min_points, solid
 
 
 @contextmanager
-def nodes_of_solid(asked: int | None, in_plane: Callable[[int], int]) -> Iterator[None]:
+def nodes_of_solid(num_requested: int | None, in_plane: Callable[[int], int]) -> Iterator[None]:
     """Convert a `TooFewNodes` error raised within into a `ValueError` about the number of nodes of a solid.
 
-    `asked`: number of nodes requested for the solid; `in_plane`: function that returns how many of a solid's nodes lie
-    in its base.
+    `num_requested`: number of nodes requested for the solid; `in_plane`: function that returns how many of a solid's
+    nodes lie in its base.
     """
     try:
         yield
     except TooFewNodes as error:
-        if asked is None:
+        if num_requested is None:
             raise
-        number = float(asked)
-        while in_plane(round(number)) < error.least and number < _MAX_TRIAL_NODES:
-            number *= _TRIAL_FACTOR
-        least = float(f"{number:.2g}")
-        raise ValueError(f"num_points: {error.solid.format(asked=asked, least=f'{least:.0f}')}") from None
+        num_points = float(num_requested)
+        while in_plane(round(num_points)) < error.min_points and num_points < _MAX_TRIAL_NODES:
+            num_points *= _TRIAL_FACTOR
+        min_points = float(f"{num_points:.2g}")
+        raise ValueError(f"num_points: {error.solid.format(asked=num_requested, least=f'{min_points:.0f}')}") from None
 
 
 # Growth of the edge length per length away from nodes that lie close together, and in a size function given by the
@@ -71,8 +71,8 @@ class Refine(Module):
 
     **Fields**: `points` (k, 2): coordinates in metres, or None for the whole outline; `cell_size`: in metres; `factor`:
     ratio of the background cell size to that at the points, at least 1; `growth`: increase of the edge length per
-    length, at most 1 (default 0.35; above 0.7 cells are visibly stretched); `distance`: distance in metres within which
-    cells keep their smallest size.
+    length, at most 1 (default 0.35; above 0.7 cells are visibly stretched); `distance`: distance in metres within
+    which cells keep their smallest size.
 
     **Example:**
 
@@ -143,9 +143,9 @@ class SizeField:
         Raises `ValueError` if `refine` contains anything but `Refine` objects.
         """
         self._terms: list[tuple[Callable[[np.ndarray], np.ndarray], Refine]] = []
-        self._own: Size | None = None
+        self._user_size: Size | None = None
         if callable(refine):
-            self._own = limited(curves, refine)
+            self._user_size = limited(curves, refine)
         elif refine is not None:
             for term in (refine,) if isinstance(refine, Refine) else tuple(refine):
                 if not isinstance(term, Refine):
@@ -154,36 +154,36 @@ class SizeField:
                     )
                 self._terms.append((_distance_function(curves, term.points), term))
         self._required_size = _size_at_close_nodes(required_nodes, spacing)
-        self._least_room = float(spacing.min()) if len(spacing) else np.inf
+        self._min_spacing = float(spacing.min()) if len(spacing) else np.inf
 
     @property
-    def is_own(self) -> bool:
+    def is_user_function(self) -> bool:
         """Whether `refine` is a function given by the user."""
-        return self._own is not None
+        return self._user_size is not None
 
     def at(self, points: np.ndarray) -> Callable[[float], np.ndarray]:
         """Edge lengths (p,) at points (p, 2), as a function of the background cell size in metres. If the user gave a
         size function, the argument is instead the factor by which its sizes are multiplied."""
-        if self._own is not None:
-            own, required = self._own(points), self._required_size(points)
-            return lambda factor: np.minimum(factor * own, required)
-        apart = [np.maximum(distance(points) - term.distance, 0.0) for distance, term in self._terms]
+        if self._user_size is not None:
+            user_sizes, required_sizes = self._user_size(points), self._required_size(points)
+            return lambda factor: np.minimum(factor * user_sizes, required_sizes)
+        distances = [np.maximum(distance(points) - term.distance, 0.0) for distance, term in self._terms]
 
         def size(background: float) -> np.ndarray:
             result = np.full(len(points), background)
-            for beyond, (_, term) in zip(apart, self._terms, strict=True):
-                result = np.minimum(result, term.smallest(background) + term.growth * beyond)
+            for distance_beyond, (_, term) in zip(distances, self._terms, strict=True):
+                result = np.minimum(result, term.smallest(background) + term.growth * distance_beyond)
             # Required nodes that are farther apart than the background cell size need no refinement.
-            return result if background <= self._least_room else np.minimum(result, self._required_size(points))
+            return result if background <= self._min_spacing else np.minimum(result, self._required_size(points))
 
         return size
 
 
 def _distance_function(curves: list[Curve], points: np.ndarray | None) -> Callable[[np.ndarray], np.ndarray]:
     if points is None:
-        return lambda where: np.min([curve.distance(where) for curve in curves], axis=0)
+        return lambda positions: np.min([curve.distance(positions) for curve in curves], axis=0)
     tree = KDTree(points)
-    return lambda where: tree.query(where)[0]
+    return lambda positions: tree.query(positions)[0]
 
 
 def _size_at_close_nodes(required_nodes: np.ndarray, spacing: np.ndarray) -> Size:
@@ -191,17 +191,20 @@ def _size_at_close_nodes(required_nodes: np.ndarray, spacing: np.ndarray) -> Siz
     if not len(required_nodes):
         return lambda points: np.full(len(points), np.inf)
     tree = KDTree(required_nodes)
-    count = min(8, len(required_nodes))
-    if count > 1:
+    num_neighbours = min(8, len(required_nodes))
+    if num_neighbours > 1:
         # Propagate the spacing of distant nodes, so that the nearest few nodes suffice to evaluate the size.
         for _ in range(4):
-            apart, other = tree.query(required_nodes, k=count)
-            spacing = np.min(spacing[other] + _USER_SIZE_GROWTH * apart, axis=1)
+            distances, neighbours = tree.query(required_nodes, k=num_neighbours)
+            spacing = np.min(spacing[neighbours] + _USER_SIZE_GROWTH * distances, axis=1)
 
     def size(points: np.ndarray) -> np.ndarray:
-        apart, other = tree.query(points, k=count)
-        apart, other = apart.reshape(len(points), count), other.reshape(len(points), count)
-        return np.min(spacing[other] + _USER_SIZE_GROWTH * apart, axis=1)
+        distances, neighbours = tree.query(points, k=num_neighbours)
+        distances, neighbours = (
+            distances.reshape(len(points), num_neighbours),
+            neighbours.reshape(len(points), num_neighbours),
+        )
+        return np.min(spacing[neighbours] + _USER_SIZE_GROWTH * distances, axis=1)
 
     return size
 
@@ -213,44 +216,44 @@ def limited(curves: list[Curve], function: Callable[[np.ndarray], Any], resoluti
     Raises `ValueError` if the function does not return one positive, finite size per point.
     """
     outline = curves[0].at(np.linspace(0, curves[0].length, 721))
-    low, high = outline.min(axis=0), outline.max(axis=0)
-    step = float((high - low).max()) / resolution
-    axes = [np.arange(low[k] - step, high[k] + 2 * step, step) for k in (0, 1)]
+    lower, upper = outline.min(axis=0), outline.max(axis=0)
+    step = float((upper - lower).max()) / resolution
+    axes = [np.arange(lower[k] - step, upper[k] + 2 * step, step) for k in (0, 1)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    shape, flat = grid.shape[:2], grid.reshape(-1, 2)
-    inside = np.flatnonzero(within(curves, flat))
-    values = np.asarray(function(flat[inside]), dtype=float)
-    if values.shape != (len(inside),):
+    shape, grid_points = grid.shape[:2], grid.reshape(-1, 2)
+    inside_nodes = np.flatnonzero(is_within(curves, grid_points))
+    values = np.asarray(function(grid_points[inside_nodes]), dtype=float)
+    if values.shape != (len(inside_nodes),):
         raise ValueError(
-            f"refine: the size function must return one size per point: for points of shape ({len(inside)}, 2) it "
-            f"returned shape {values.shape}."
+            f"refine: the size function must return one size per point: for points of shape ({len(inside_nodes)}, 2) "
+            f"it returned shape {values.shape}."
         )
     if not (np.isfinite(values).all() and (values > 0).all()):
-        bad = inside[int(np.flatnonzero(~(np.isfinite(values) & (values > 0)))[0])]
+        invalid_node = inside_nodes[int(np.flatnonzero(~(np.isfinite(values) & (values > 0)))[0])]
         raise ValueError(
             f"refine: the size function must be positive and finite inside the domain; "
-            f"at {flat[bad].tolist()} it is not."
+            f"at {grid_points[invalid_node].tolist()} it is not."
         )
-    number = np.arange(len(flat)).reshape(shape)
-    links = [
-        (number[1:], number[:-1], step),
-        (number[:, 1:], number[:, :-1], step),
-        (number[1:, 1:], number[:-1, :-1], step * np.sqrt(2)),
-        (number[1:, :-1], number[:-1, 1:], step * np.sqrt(2)),
+    node_index = np.arange(len(grid_points)).reshape(shape)
+    grid_links = [
+        (node_index[1:], node_index[:-1], step),
+        (node_index[:, 1:], node_index[:, :-1], step),
+        (node_index[1:, 1:], node_index[:-1, :-1], step * np.sqrt(2)),
+        (node_index[1:, :-1], node_index[:-1, 1:], step * np.sqrt(2)),
     ]
-    start = np.concatenate([a.ravel() for a, _, _ in links] + [np.full(len(inside), len(flat))])
-    end = np.concatenate([b.ravel() for _, b, _ in links] + [inside])
-    weight = np.concatenate([np.full(a.size, _USER_SIZE_GROWTH * length) for a, _, length in links] + [values])
-    graph = coo_array((weight, (start, end)), shape=(len(flat) + 1,) * 2).tocsr()
-    field = dijkstra(graph, directed=False, indices=len(flat))[:-1].reshape(shape)
+    start = np.concatenate([a.ravel() for a, _, _ in grid_links] + [np.full(len(inside_nodes), len(grid_points))])
+    end = np.concatenate([b.ravel() for _, b, _ in grid_links] + [inside_nodes])
+    weight = np.concatenate([np.full(a.size, _USER_SIZE_GROWTH * length) for a, _, length in grid_links] + [values])
+    graph = coo_array((weight, (start, end)), shape=(len(grid_points) + 1,) * 2).tocsr()
+    field = dijkstra(graph, directed=False, indices=len(grid_points))[:-1].reshape(shape)
     interpolate = scipy.interpolate.RegularGridInterpolator(axes, field)
-    first, last = grid[0, 0], grid[-1, -1]
+    lower_corner, upper_corner = grid[0, 0], grid[-1, -1]
 
     def size(points: np.ndarray) -> np.ndarray:
         # Trial nodes may lie outside the domain, where the user's function may be invalid.
         with np.errstate(all="ignore"):
-            own = np.asarray(function(points), dtype=float)
-        own = np.where(np.isfinite(own) & (own > 0), own, np.inf)
-        return np.minimum(own, interpolate(np.clip(points, first, last)))
+            user_sizes = np.asarray(function(points), dtype=float)
+        user_sizes = np.where(np.isfinite(user_sizes) & (user_sizes > 0), user_sizes, np.inf)
+        return np.minimum(user_sizes, interpolate(np.clip(points, lower_corner, upper_corner)))
 
     return size

@@ -44,19 +44,24 @@ def ring_counts(num_rings: int, num_boundary: int) -> np.ndarray:
 
 def choose_rings(num_points: int) -> tuple[int, int]:
     """Number of rings and number of boundary nodes such that the disk has close to `num_points` nodes."""
-    guess = np.sqrt(num_points / 3.0)
-    best = None
-    for num_rings in range(max(1, int(guess) - 1), int(guess) + 3):
+    guessed_rings = np.sqrt(num_points / 3.0)
+    best_choice = None
+    for num_rings in range(max(1, int(guessed_rings) - 1), int(guessed_rings) + 3):
         for num_boundary in range(max(5, int(4.9 * num_rings)), int(7.3 * num_rings) + 2):
-            total = 1 + int(ring_counts(num_rings, num_boundary).sum())
+            num_nodes = 1 + int(ring_counts(num_rings, num_boundary).sum())
             # The most regular triangles have six times as many boundary nodes as rings; deviate only to meet the number
             # of nodes.
-            miss = abs(total / num_points - 1.0)
-            cost = (miss > 0.03, miss if miss > 0.03 else 0.0, abs(num_boundary / num_rings - 6.0), miss)
-            if best is None or cost < best[0]:
-                best = (cost, num_rings, num_boundary)
-    assert best is not None
-    return best[1], best[2]
+            deviation = abs(num_nodes / num_points - 1.0)
+            cost = (
+                deviation > 0.03,
+                deviation if deviation > 0.03 else 0.0,
+                abs(num_boundary / num_rings - 6.0),
+                deviation,
+            )
+            if best_choice is None or cost < best_choice[0]:
+                best_choice = (cost, num_rings, num_boundary)
+    assert best_choice is not None
+    return best_choice[1], best_choice[2]
 
 
 def ring_disk(num_rings: int, num_boundary: int) -> tuple[np.ndarray, np.ndarray]:
@@ -69,8 +74,8 @@ def ring_disk(num_rings: int, num_boundary: int) -> tuple[np.ndarray, np.ndarray
     points = np.concatenate([radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1), np.zeros((1, 2))])
     rings = [np.arange(offsets[k], offsets[k + 1]) for k in range(num_rings)]
     cells = [zip_chains(a, b, closed=True) for a, b in pairwise(rings)]
-    last = rings[-1]
-    cells.append(np.stack([last, np.roll(last, -1), np.full(len(last), offsets[-1])], axis=1))
+    innermost = rings[-1]
+    cells.append(np.stack([innermost, np.roll(innermost, -1), np.full(len(innermost), offsets[-1])], axis=1))
     return points, np.concatenate(cells)
 
 
@@ -84,31 +89,34 @@ def choose_rows(width: float, height: float, num_points: int, cell_size: float |
         cell_size = min(cell_size, width, height) / 1.036
         return max(1, round(width / cell_size - 0.5)), max(1, round(height / (_ROW_HEIGHT * cell_size)))
     edge = np.sqrt(width * height / (_ROW_HEIGHT * num_points))
-    guess = height / (_ROW_HEIGHT * edge)
+    guessed_rows = height / (_ROW_HEIGHT * edge)
     # With few nodes, accept a larger deviation from their number rather than stretched cells.
-    enough = 0.03 if num_points > 200 else 0.1
-    best = None
-    for num_rows in range(max(1, int(0.6 * guess)), int(1.5 * guess) + 3):
-        odd = (num_rows + 1) // 2
-        for num_columns in {int(c) for c in np.rint((num_points - odd) / (num_rows + 1) - 1 + np.arange(-1, 2))}:
+    max_deviation = 0.03 if num_points > 200 else 0.1
+    best_choice = None
+    for num_rows in range(max(1, int(0.6 * guessed_rows)), int(1.5 * guessed_rows) + 3):
+        num_wide_rows = (num_rows + 1) // 2
+        for num_columns in {
+            int(column_count)
+            for column_count in np.rint((num_points - num_wide_rows) / (num_rows + 1) - 1 + np.arange(-1, 2))
+        }:
             if num_columns < 1:
                 continue
-            total = (num_rows + 1) * (num_columns + 1) + odd
-            miss = abs(total / num_points - 1.0)
+            num_nodes = (num_rows + 1) * (num_columns + 1) + num_wide_rows
+            deviation = abs(num_nodes / num_points - 1.0)
             stretch = abs(np.log(height / num_rows / (_ROW_HEIGHT * width / (num_columns + 0.5))))
-            cost = (stretch > 0.6, max(0.0, miss - enough), stretch)
-            if best is None or cost < best[0]:
-                best = (cost, num_columns, num_rows)
-    if best is None or best[0][0]:
-        least = 2 * max(width / height, height / width) + 3
+            cost = (stretch > 0.6, max(0.0, deviation - max_deviation), stretch)
+            if best_choice is None or cost < best_choice[0]:
+                best_choice = (cost, num_columns, num_rows)
+    if best_choice is None or best_choice[0][0]:
+        min_points = 2 * max(width / height, height / width) + 3
         raise TooFewNodes(
             f"num_points: {num_points} nodes in a rectangle of {width:g} by {height:g} m make flat cells. Ask for at "
-            f"least about {least:.0f}.",
-            round(least),
+            f"least about {min_points:.0f}.",
+            round(min_points),
             f"{{asked}} nodes in a solid on {width:g} by {height:g} m make flat cells. Ask for at least about "
             "{least}.",
         )
-    return best[1], best[2]
+    return best_choice[1], best_choice[2]
 
 
 def row_rectangle(width: float, height: float, num_columns: int, num_rows: int) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from jeit.arguments import check_metres
 from jeit.mesh import topology
 from jeit.mesh.generate import _triangulate
 from jeit.mesh.generate._triangulate import Front, doubled_areas, triangulate
-from jeit.mesh.generate.curve import Curve, Size, within
+from jeit.mesh.generate.curve import Curve, Size, is_within
 from jeit.mesh.generate.refine import Refinement, SizeField, TooFewNodes
 from jeit.mesh.mesh import Mesh
 
@@ -34,13 +34,13 @@ _NODE_COUNT_TOLERANCE = 0.02
 class Target:
     """Target size of a mesh.
 
-    **Fields**: `num_points`: number of nodes; `cell_size`: cell size in metres, or None to use `num_points`; `asked`:
-    whether the number of nodes was given rather than a default.
+    **Fields**: `num_points`: number of nodes; `cell_size`: cell size in metres, or None to use `num_points`;
+    `is_requested`: whether the number of nodes was given rather than a default.
     """
 
     num_points: int
     cell_size: float | None
-    asked: bool
+    is_requested: bool
 
     @staticmethod
     def create(num_points: int | None, cell_size: float | None) -> Target:
@@ -49,23 +49,23 @@ class Target:
             raise ValueError("num_points, cell_size: give one of the two, not both.")
         if cell_size is not None:
             check_metres("cell_size", cell_size)
-        number = DEFAULT_NUM_POINTS if num_points is None else check_count("num_points", num_points, 4)
-        check_total(number, "num_points")
-        return Target(number, cell_size, num_points is not None)
+        num_nodes = DEFAULT_NUM_POINTS if num_points is None else check_count("num_points", num_points, 4)
+        check_total(num_nodes, "num_points")
+        return Target(num_nodes, cell_size, num_points is not None)
 
 
-def check_count(name: str, value: int, least: int) -> int:
-    """Convert to an integer. Raises `ValueError` unless it is a whole number of at least `least`."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
-        raise ValueError(f"{name}: expected a whole number of at least {least}, got {value!r}.")
+def check_count(name: str, value: int, minimum: int) -> int:
+    """Convert to an integer. Raises `ValueError` unless it is a whole number of at least `minimum`."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < minimum:
+        raise ValueError(f"{name}: expected a whole number of at least {minimum}, got {value!r}.")
     return int(value)
 
 
-def check_total(number: float, name: str) -> None:
+def check_total(num_points: float, name: str) -> None:
     """Raise `ValueError` if the mesh would have more than the maximum number of nodes."""
-    if number > MOST_POINTS:
+    if num_points > MOST_POINTS:
         raise ValueError(
-            f"{name}: this would make about {number:.2g} nodes; the limit is {MOST_POINTS:.0e}. Lengths are in "
+            f"{name}: this would make about {num_points:.2g} nodes; the limit is {MOST_POINTS:.0e}. Lengths are in "
             "metres: check the units, or ask for larger cells."
         )
 
@@ -95,16 +95,16 @@ def mesh_within(
     2) in metres. Raises `ValueError` for invalid or contradictory arguments.
     """
     stops = [
-        _merge_with_corners(curve, own)
-        for curve, own in zip(curves, _required_positions(curves, boundary_points), strict=True)
+        _merge_with_corners(curve, required_stops)
+        for curve, required_stops in zip(curves, _required_positions(curves, boundary_points), strict=True)
     ]
     fixed = _check_interior(interior_points, curves)
     field = SizeField(curves, refine, *_required_spacing(curves, stops, fixed))
     front = None
     if target.cell_size is not None:
-        size = partial(_capped_size_at if field.is_own else _size_at, field, target.cell_size)
+        size = partial(_capped_size_at if field.is_user_function else _size_at, field, target.cell_size)
         check_total(_estimate_num_nodes(curves, size, area), "cell_size")
-    elif field.is_own and not target.asked:
+    elif field.is_user_function and not target.is_requested:
         size = partial(_size_at, field, 1.0)
         check_total(_estimate_num_nodes(curves, size, area), "refine")
     else:
@@ -136,22 +136,24 @@ def _merge_with_corners(curve: Curve, positions: np.ndarray) -> np.ndarray:
     if len(stops) < 2:
         return stops
     gaps = np.diff(np.append(stops, stops[0] + curve.length)) / curve.length
-    close = (gaps > 1e-9) & (gaps < _MIN_NODE_DISTANCE)
-    if close.any():
-        first = int(np.flatnonzero(close)[0])
+    is_too_close = (gaps > 1e-9) & (gaps < _MIN_NODE_DISTANCE)
+    if is_too_close.any():
+        first = int(np.flatnonzero(is_too_close)[0])
         raise ValueError(
             f"boundary_points: two nodes at arc lengths {stops[first]:g} and {stops[(first + 1) % len(stops)]:g} m are "
             "closer than a millionth of the outline (a corner counts). Make them equal or move one."
         )
-    keep = gaps > 1e-9
+    is_distinct = gaps > 1e-9
     # Of coinciding positions, keep the corner's, so that corners are not moved.
-    kept = stops[keep]
+    distinct_stops = stops[is_distinct]
     if len(curve.corners):
-        apart = np.abs(kept[:, None] - curve.corners)
-        apart = np.minimum(apart, curve.length - apart)
-        nearest = apart.argmin(axis=1)
-        kept = np.where(apart.min(axis=1) < 2e-9 * curve.length, curve.corners[nearest], kept)
-    return np.unique(kept)
+        corner_distances = np.abs(distinct_stops[:, None] - curve.corners)
+        corner_distances = np.minimum(corner_distances, curve.length - corner_distances)
+        nearest_corner = corner_distances.argmin(axis=1)
+        distinct_stops = np.where(
+            corner_distances.min(axis=1) < 2e-9 * curve.length, curve.corners[nearest_corner], distinct_stops
+        )
+    return np.unique(distinct_stops)
 
 
 def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> np.ndarray:
@@ -160,12 +162,12 @@ def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> n
     fixed = np.atleast_2d(np.asarray(interior_points, dtype=float))
     if fixed.ndim != 2 or fixed.shape[1] != 2 or not np.isfinite(fixed).all():
         raise ValueError(f"interior_points: expected finite coordinates of shape (k, 2), got shape {fixed.shape}.")
-    apart = np.min([curve.distance(fixed) for curve in curves], axis=0)
-    bad = np.flatnonzero(~within(curves, fixed) | (apart < _MIN_NODE_DISTANCE * curves[0].length))
-    if bad.size:
+    distances = np.min([curve.distance(fixed) for curve in curves], axis=0)
+    outside_points = np.flatnonzero(~is_within(curves, fixed) | (distances < _MIN_NODE_DISTANCE * curves[0].length))
+    if outside_points.size:
         raise ValueError(
-            f"interior_points: point {bad[0]} at {fixed[bad[0]].tolist()} does not lie inside the outline. Use "
-            "boundary_points for nodes on it."
+            f"interior_points: point {outside_points[0]} at {fixed[outside_points[0]].tolist()} does not lie inside "
+            "the outline. Use boundary_points for nodes on it."
         )
     if len(fixed) > 1 and KDTree(fixed).query(fixed, k=2)[0][:, 1].min() < _MIN_NODE_DISTANCE * curves[0].length:
         raise ValueError("interior_points: two points coincide or nearly so. Keep one of them.")
@@ -176,25 +178,25 @@ def _required_spacing(curves: list[Curve], stops: list[np.ndarray], fixed: np.nd
     """Positions (k, 2) of required nodes, and the distance (k,) of each to the nearest other one or to the nearest side
     that it does not lie on."""
     chains = [curve.at(stop) for curve, stop in zip(curves, stops, strict=True)]
-    held = np.concatenate([*chains, fixed])
-    if len(held) < 2:
-        apart = np.array([curves[0].distance(point[None])[0] for point in fixed])
-        return (held, apart) if len(fixed) else (np.zeros((0, 2)), np.zeros(0))
-    spacing = KDTree(held).query(held, k=2)[0][:, 1]
+    required_nodes = np.concatenate([*chains, fixed])
+    if len(required_nodes) < 2:
+        distances = np.array([curves[0].distance(point[None])[0] for point in fixed])
+        return (required_nodes, distances) if len(fixed) else (np.zeros((0, 2)), np.zeros(0))
+    spacing = KDTree(required_nodes).query(required_nodes, k=2)[0][:, 1]
     offset = 0
     for chain in chains:
-        count = len(chain)
+        num_nodes = len(chain)
         for k, (start, end) in enumerate(pairwise(np.concatenate([chain, chain[:1]]))):
-            if count < 2 or (start == end).all():
+            if num_nodes < 2 or (start == end).all():
                 continue
-            apart = topology.distance(held, start[None], end[None])[:, 0]
-            apart[[offset + k, offset + (k + 1) % count]] = np.inf
-            spacing = np.minimum(spacing, np.where(apart > 0, apart, np.inf))
-        offset += count
+            distances = topology.distance(required_nodes, start[None], end[None])[:, 0]
+            distances[[offset + k, offset + (k + 1) % num_nodes]] = np.inf
+            spacing = np.minimum(spacing, np.where(distances > 0, distances, np.inf))
+        offset += num_nodes
     for curve in curves:
         if len(fixed):
             spacing[offset:] = np.minimum(spacing[offset:], curve.distance(fixed))
-    return held, spacing
+    return required_nodes, spacing
 
 
 def _interior_samples(curves: list[Curve]) -> np.ndarray:
@@ -202,7 +204,7 @@ def _interior_samples(curves: list[Curve]) -> np.ndarray:
     outline = curves[0].at(np.linspace(0, curves[0].length, 400))
     axes = [np.linspace(outline[:, k].min(), outline[:, k].max(), 60) for k in (0, 1)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    return grid[within(curves, grid)]
+    return grid[is_within(curves, grid)]
 
 
 def _estimate_num_nodes(curves: list[Curve], size: Size, area: float) -> float:
@@ -228,51 +230,53 @@ def _fit_cell_size(
     The number of nodes is about ∫ c/h² over the domain, h being the cell size: a first mesh determines the constant c
     and the sample points, further meshes correct the rest.
     """
-    first = num_points / 4 if num_points > 4000 else num_points
-    value = float(np.sqrt(1.1 * area / first))
-    if field.is_own:
-        value *= float(np.sqrt(np.mean(1.0 / field.at(_interior_samples(curves))(1.0) ** 2)))
-    best: tuple[float, Size, Front] | None = None
+    first_num_points = num_points / 4 if num_points > 4000 else num_points
+    background = float(np.sqrt(1.1 * area / first_num_points))
+    if field.is_user_function:
+        background *= float(np.sqrt(np.mean(1.0 / field.at(_interior_samples(curves))(1.0) ** 2)))
+    best_fit: tuple[float, Size, Front] | None = None
     for _ in range(6):
-        size = partial(_size_at, field, value)
+        size = partial(_size_at, field, background)
         front = _triangulate.outline_nodes(curves, stops, fixed, size, 1.0)
         _triangulate.fill(front, size)
         points = front.points()
-        miss = len(points) / num_points - 1.0
-        if best is None or abs(miss) < best[0]:
-            best = (abs(miss), size, front)
-        if abs(miss) < _NODE_COUNT_TOLERANCE:
+        surplus = len(points) / num_points - 1.0
+        if best_fit is None or abs(surplus) < best_fit[0]:
+            best_fit = (abs(surplus), size, front)
+        if abs(surplus) < _NODE_COUNT_TOLERANCE:
             break
         cells = triangulate(front, points)
-        value = _correct_background(
-            field.at(points[cells].mean(axis=1)), doubled_areas(points, cells), value, miss, num_points
+        background = _correct_background(
+            field.at(points[cells].mean(axis=1)), doubled_areas(points, cells), background, surplus, num_points
         )
-    assert best is not None
-    return best[1], best[2]
+    assert best_fit is not None
+    return best_fit[1], best_fit[2]
 
 
 def _correct_background(
-    size: Callable[[float], np.ndarray], weight: np.ndarray, value: float, surplus: float, num_points: int
+    size: Callable[[float], np.ndarray], weight: np.ndarray, background: float, surplus: float, num_points: int
 ) -> float:
-    """Background size for which ∫ 1/h² is its value for the background size `value` divided by 1 + `surplus`, where
-    `surplus` is the relative surplus of nodes."""
+    """Background size for which ∫ 1/h² is its value for the background size `background` divided by 1 + `surplus`,
+    where `surplus` is the relative surplus of nodes."""
 
-    def total(trial: float) -> float:
+    def density_integral(trial: float) -> float:
         return float(np.sum(weight / size(trial) ** 2))
 
-    wanted = total(value) / (1.0 + surplus)
-    if total(1e3 * value) > 1.1 * wanted:
-        least = round(num_points * total(1e3 * value) / wanted)
+    target_total = density_integral(background) / (1.0 + surplus)
+    if density_integral(1e3 * background) > 1.1 * target_total:
+        min_points = round(num_points * density_integral(1e3 * background) / target_total)
         raise TooFewNodes(
-            f"num_points: the outline and refinement alone need about {least} nodes, more than the {num_points} asked. "
-            "Ask for more nodes, less refinement (larger cell_size, smaller factor) or faster growth.",
-            least,
+            f"num_points: the outline and refinement alone need about {min_points} nodes, more than the {num_points} "
+            "asked. Ask for more nodes, less refinement (larger cell_size, smaller factor) or faster growth.",
+            min_points,
             "the surface alone, as fine as electrodes or refine want it, needs about {least} nodes, more than the "
             "{asked} asked. Ask for more.",
         )
-    # Search for a factor of `value`, so that the mesh of a body twice as large is exactly twice as large.
-    low, high = -np.log(1e3), np.log(1e3)
+    # Search for a factor of `background`, so that the mesh of a body twice as large is exactly twice as large.
+    lower, upper = -np.log(1e3), np.log(1e3)
     for _ in range(30):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if total(value * float(np.exp(middle))) > wanted else (low, middle)
-    return value * float(np.exp(0.5 * (low + high)))
+        middle = 0.5 * (lower + upper)
+        lower, upper = (
+            (middle, upper) if density_integral(background * float(np.exp(middle))) > target_total else (lower, middle)
+        )
+    return background * float(np.exp(0.5 * (lower + upper)))

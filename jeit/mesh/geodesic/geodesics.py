@@ -76,7 +76,7 @@ class Geodesics(Module):
         `Triangles.of` does."""
         triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
         cells, points = triangles.cells, triangles.points
-        node, start, end = (np.roll(cells, -turn, axis=1).ravel() for turn in range(3))
+        node, start, end = (np.roll(cells, -shift, axis=1).ravel() for shift in range(3))
         local = _triangle_coordinates(points[start], points[end], points[node])
         ends = np.concatenate([start, end])
         order = np.argsort(ends, kind="stable")
@@ -97,33 +97,42 @@ class Geodesics(Module):
         Distances beyond `limit`, metres, and between disconnected parts are infinite. Raises `ValueError` for points
         farther from the surface than a quarter of its extent.
         """
-        begun = sources if isinstance(sources, SurfacePlaces) else self._project("sources", sources)
+        source_places = sources if isinstance(sources, SurfacePlaces) else self._project("sources", sources)
         if isinstance(targets, SurfacePlaces) or targets is None:
-            reached = targets
+            target_places = targets
         else:
-            reached = self._project("targets", targets)
-        found = []
-        for low in range(0, len(begun.triangle), _SOURCES_PER_BATCH):
-            some = SurfacePlaces(*(getattr(begun, one)[low : low + _SOURCES_PER_BATCH] for one in _PLACE_FIELDS))
-            lengths, bent = self._distances_to_nodes(some, limit)
-            found.append(lengths if reached is None else self._distances_in_triangles(some, lengths, bent, reached))
-        found = np.concatenate(found) if found else np.zeros((0, 0))
-        found[found > limit] = np.inf
-        return found
+            target_places = self._project("targets", targets)
+        batches = []
+        for batch_start in range(0, len(source_places.triangle), _SOURCES_PER_BATCH):
+            batch = SurfacePlaces(
+                *(
+                    getattr(source_places, name)[batch_start : batch_start + _SOURCES_PER_BATCH]
+                    for name in _PLACE_FIELDS
+                )
+            )
+            lengths, curvatures = self._distances_to_nodes(batch, limit)
+            batches.append(
+                lengths
+                if target_places is None
+                else self._distances_in_triangles(batch, lengths, curvatures, target_places)
+            )
+        batches = np.concatenate(batches) if batches else np.zeros((0, 0))
+        batches[batches > limit] = np.inf
+        return batches
 
     def _project(self, name: str, places: ArrayLike) -> SurfacePlaces:
         """Nearest points on the surface. Raises `ValueError` with the argument's `name` for points that are too far
         from it."""
-        at = self.surface.nearest(places)
+        projected = self.surface.nearest(places)
         extent = float(np.ptp(self.surface.points, axis=0).max())
-        lost = np.flatnonzero(~(at.away <= _MAX_OFF_SURFACE * extent))
-        if lost.size:
+        off_surface = np.flatnonzero(~(projected.away <= _MAX_OFF_SURFACE * extent))
+        if off_surface.size:
             raise ValueError(
-                f"{name}: {lost.size} of {len(at.away)} lie off the surface, the first, at "
-                f"{np.asarray(places, float)[lost[0]].tolist()} m, by {1e3 * at.away[lost[0]]:.3g} mm; give places on "
-                "it, in metres."
+                f"{name}: {off_surface.size} of {len(projected.away)} lie off the surface, the first, at "
+                f"{np.asarray(places, float)[off_surface[0]].tolist()} m, by "
+                f"{1e3 * projected.away[off_surface[0]]:.3g} mm; give places on it, in metres."
             )
-        return at
+        return projected
 
     def between(self, places: ArrayLike) -> Float[np.ndarray, "p p"]:
         """Geodesic distances (p, p) between all pairs of points (p, 3), metres: symmetric, with a zero diagonal."""
@@ -135,101 +144,116 @@ class Geodesics(Module):
 
     def owners(self, sources: ArrayLike | SurfacePlaces) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """For each node, the index of the nearest of the `sources` (s, 3) and the geodesic distance to it, metres."""
-        at = sources if isinstance(sources, SurfacePlaces) else self.surface.nearest(sources)
-        nodes = self.surface.cells[at.triangle]
-        length = np.linalg.norm(self.surface.points[nodes] - at.points[:, None], axis=-1)
+        source_places = sources if isinstance(sources, SurfacePlaces) else self.surface.nearest(sources)
+        nodes = self.surface.cells[source_places.triangle]
+        length = np.linalg.norm(self.surface.points[nodes] - source_places.points[:, None], axis=-1)
         lengths, owner = np.full(len(self.surface.points), np.inf), np.full(len(self.surface.points), -1)
-        number = np.repeat(np.arange(len(nodes)), 3)
-        changed = _lower_distances(lengths, owner, nodes.ravel(), length.ravel(), number)
+        source_index = np.repeat(np.arange(len(nodes)), 3)
+        changed = _lower_distances(lengths, owner, nodes.ravel(), length.ravel(), source_index)
         while changed.size:
             _, corner = self._opposite_corners(changed, np.zeros_like(changed))
             start, end, node = self.corners.start[corner], self.corners.end[corner], self.corners.node[corner]
-            local = (part[corner] for part in self.corners[3:])
-            through, along = _distances_across(
+            local = (coordinates[corner] for coordinates in self.corners[3:])
+            new_lengths, by_start = _distances_across(
                 lengths[start], lengths[end], *local, same_source=owner[start] == owner[end]
             )
-            changed = _lower_distances(lengths, owner, node, through, np.where(along, owner[start], owner[end]))
+            changed = _lower_distances(lengths, owner, node, new_lengths, np.where(by_start, owner[start], owner[end]))
         return owner, lengths
 
     def _distances_to_nodes(self, sources: SurfacePlaces, limit: float):
         """Distances (s, n) from the sources to all nodes, and mean curvatures (s, n) along the paths."""
-        count = len(self.surface.points)
-        lengths = np.full(len(sources.triangle) * count, np.inf)
-        bent = np.tile(self.curvature, len(sources.triangle))
+        num_nodes = len(self.surface.points)
+        lengths = np.full(len(sources.triangle) * num_nodes, np.inf)
+        curvatures = np.tile(self.curvature, len(sources.triangle))
         nodes = self.surface.cells[sources.triangle]
-        place = (np.arange(len(nodes))[:, None] * count + nodes).ravel()
-        lengths[place] = np.linalg.norm(self.surface.points[nodes] - sources.points[:, None], axis=-1).ravel()
-        changed = place
+        entries = (np.arange(len(nodes))[:, None] * num_nodes + nodes).ravel()
+        lengths[entries] = np.linalg.norm(self.surface.points[nodes] - sources.points[:, None], axis=-1).ravel()
+        changed = entries
         while changed.size:
-            source, corner = self._opposite_corners(changed % count, changed - changed % count)
+            source, corner = self._opposite_corners(changed % num_nodes, changed - changed % num_nodes)
             start, end = source + self.corners.start[corner], source + self.corners.end[corner]
-            local = (part[corner] for part in self.corners[3:])
-            mean = (bent[start] + bent[end]) / 2
-            through, by_start = _distances_across(lengths[start], lengths[end], *local, curvature=mean)
+            local = (coordinates[corner] for coordinates in self.corners[3:])
+            mean_curvature = (curvatures[start] + curvatures[end]) / 2
+            new_lengths, by_start = _distances_across(lengths[start], lengths[end], *local, curvature=mean_curvature)
             node = self.corners.node[corner]
-            place = source + node
-            lower = (through < (1 - _MIN_DECREASE) * lengths[place]) & (through <= 2 * limit)
-            place, through, node = place[lower], through[lower], node[lower]
-            before = np.where(by_start, lengths[start], lengths[end])[lower]
-            np.minimum.at(lengths, place, through)
+            entries = source + node
+            is_lower = (new_lengths < (1 - _MIN_DECREASE) * lengths[entries]) & (new_lengths <= 2 * limit)
+            entries, new_lengths, node = entries[is_lower], new_lengths[is_lower], node[is_lower]
+            previous_lengths = np.where(by_start, lengths[start], lengths[end])[is_lower]
+            np.minimum.at(lengths, entries, new_lengths)
             with np.errstate(invalid="ignore"):
-                share = np.where(through > 0, np.clip(before / through, 0, 1), 0.0)
-            least = through == lengths[place]
-            bent[place[least]] = (share * mean[lower] + (1 - share) * self.curvature[node])[least]
+                fraction = np.where(new_lengths > 0, np.clip(previous_lengths / new_lengths, 0, 1), 0.0)
+            is_smallest = new_lengths == lengths[entries]
+            curvatures[entries[is_smallest]] = (
+                fraction * mean_curvature[is_lower] + (1 - fraction) * self.curvature[node]
+            )[is_smallest]
             # Nodes beyond the limit are not propagated.
-            changed = np.unique(place[lengths[place] <= limit])
-        return lengths.reshape(-1, count), bent.reshape(-1, count)
+            changed = np.unique(entries[lengths[entries] <= limit])
+        return lengths.reshape(-1, num_nodes), curvatures.reshape(-1, num_nodes)
 
-    def _opposite_corners(self, nodes, carried):
-        """The corners opposite to the sides at the `nodes`, and for each of these corners the value `carried` by its
-        node."""
-        number = self.first[nodes + 1] - self.first[nodes]
-        total = np.cumsum(number)
-        inside = np.arange(total[-1]) - np.repeat(total - number, number)
-        return np.repeat(carried, number), self.touching[np.repeat(self.first[nodes], number) + inside]
+    def _opposite_corners(self, nodes, values):
+        """Return the corners opposite to the sides at the `nodes`, and for each of these corners the entry of `values`
+        that belongs to its node."""
+        num_corners = self.first[nodes + 1] - self.first[nodes]
+        ends = np.cumsum(num_corners)
+        offset = np.arange(ends[-1]) - np.repeat(ends - num_corners, num_corners)
+        return np.repeat(values, num_corners), self.touching[np.repeat(self.first[nodes], num_corners) + offset]
 
     def near(self, sources: ArrayLike, targets: SurfacePlaces, limit: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """For each of the `sources` (s, 3), the indices of the targets within a geodesic distance of `limit` metres,
         and their distances. Only targets within `limit` in a straight line are considered."""
-        begun = self.surface.nearest(sources)
-        tree, found = KDTree(targets.points), []
-        for low in range(0, len(begun.triangle), _SOURCES_PER_BATCH):
-            some = SurfacePlaces(*(getattr(begun, one)[low : low + _SOURCES_PER_BATCH] for one in _PLACE_FIELDS))
-            lengths, bent = self._distances_to_nodes(some, limit)
-            close = [np.asarray(one, int) for one in tree.query_ball_point(some.points, limit, return_sorted=True)]
-            source = np.repeat(np.arange(len(close)), [len(one) for one in close])
-            every = np.concatenate(close) if close else np.zeros(0, int)
-            at = SurfacePlaces(*(getattr(targets, one)[every] for one in _PLACE_FIELDS))
-            length = self._distances_in_triangles(some, lengths, bent, at, source)
-            ends = np.cumsum([len(one) for one in close])[:-1]
-            for index, own in zip(np.split(every, ends), np.split(length, ends), strict=True):
-                found.append((index[own < limit], own[own < limit]))
-        return found
+        source_places = self.surface.nearest(sources)
+        tree, neighbours = KDTree(targets.points), []
+        for batch_start in range(0, len(source_places.triangle), _SOURCES_PER_BATCH):
+            batch = SurfacePlaces(
+                *(
+                    getattr(source_places, name)[batch_start : batch_start + _SOURCES_PER_BATCH]
+                    for name in _PLACE_FIELDS
+                )
+            )
+            lengths, curvatures = self._distances_to_nodes(batch, limit)
+            close_targets = [
+                np.asarray(indices, int) for indices in tree.query_ball_point(batch.points, limit, return_sorted=True)
+            ]
+            source = np.repeat(np.arange(len(close_targets)), [len(indices) for indices in close_targets])
+            target_indices = np.concatenate(close_targets) if close_targets else np.zeros(0, int)
+            target_places = SurfacePlaces(*(getattr(targets, name)[target_indices] for name in _PLACE_FIELDS))
+            target_lengths = self._distances_in_triangles(batch, lengths, curvatures, target_places, source)
+            ends = np.cumsum([len(indices) for indices in close_targets])[:-1]
+            for index, is_target in zip(np.split(target_indices, ends), np.split(target_lengths, ends), strict=True):
+                neighbours.append((index[is_target < limit], is_target[is_target < limit]))
+        return neighbours
 
     def _distances_in_triangles(
-        self, sources: SurfacePlaces, lengths: Float[np.ndarray, "s n"], bent, targets: SurfacePlaces, source=None
+        self, sources: SurfacePlaces, lengths: Float[np.ndarray, "s n"], curvatures, targets: SurfacePlaces, source=None
     ):
         """Distances (s, p) at points inside triangles; or (p,), if `source` gives the index of the source for each
         target."""
         cells = self.surface.cells[targets.triangle]
         corners = self.surface.points[cells]
-        of = np.arange(len(lengths))[:, None] if source is None else source
-        found = np.inf
+        source_rows = np.arange(len(lengths))[:, None] if source is None else source
+        shortest = np.inf
         for first, second, third in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            ends = (of, cells[:, first]), (of, cells[:, second])
-            start, end = (lengths[one] for one in ends)
+            ends = (source_rows, cells[:, first]), (source_rows, cells[:, second])
+            start, end = (lengths[end_index] for end_index in ends)
             side, x, y = _triangle_coordinates(corners[:, first], corners[:, second], targets.points)
-            through, _ = _distances_across(start, end, side, x, y, curvature=(bent[ends[0]] + bent[ends[1]]) / 2)
+            across_side, _ = _distances_across(
+                start, end, side, x, y, curvature=(curvatures[ends[0]] + curvatures[ends[1]]) / 2
+            )
             # Where paths from two directions meet, the distances at the ends of a side belong to different waves, and
             # contradict the distance at the third corner. The path is then taken through a corner.
             with np.errstate(invalid="ignore", over="ignore"):
-                seen, behind, _ = _virtual_source(start, end, side)
-                _, across, off = _triangle_coordinates(corners[:, first], corners[:, second], corners[:, third])
-                apart = np.hypot(across - seen, off + behind) - lengths[of, cells[:, third]]
-            by_corner = start + np.sqrt(x**2 + y**2)
-            found = np.minimum(found, np.where(np.abs(apart) < _WAVE_TOLERANCE * side, through, by_corner))
-        straight = np.linalg.norm(sources.points[of] - targets.points, axis=-1)
-        return np.where(sources.triangle[of] == targets.triangle, straight, found)
+                source_x, source_depth, _ = _virtual_source(start, end, side)
+                _, corner_x, corner_y = _triangle_coordinates(corners[:, first], corners[:, second], corners[:, third])
+                mismatch = (
+                    np.hypot(corner_x - source_x, corner_y + source_depth) - lengths[source_rows, cells[:, third]]
+                )
+            through_corner = start + np.sqrt(x**2 + y**2)
+            shortest = np.minimum(
+                shortest, np.where(np.abs(mismatch) < _WAVE_TOLERANCE * side, across_side, through_corner)
+            )
+        straight_lengths = np.linalg.norm(sources.points[source_rows] - targets.points, axis=-1)
+        return np.where(sources.triangle[source_rows] == targets.triangle, straight_lengths, shortest)
 
 
 _PLACE_FIELDS = "triangle", "weights", "points", "away"
@@ -249,25 +273,31 @@ def _distances_across(start, end, side, x, y, *, same_source: Any = True, curvat
     `same_source` is True, i.e. where the distances at both of its ends are from the same source. `curvature`: mean
     Gaussian curvature along the path, 1/m²."""
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        along = np.sqrt(x**2 + y**2) + start
-        back = np.sqrt((side - x) ** 2 + y**2) + end
-        seen, behind, off = _virtual_source(start, end, side)
-        crossing = (seen * y + x * behind) / np.where(behind + y > 0, behind + y, 1.0)
-        straight = (off >= 0) & (crossing >= 0) & (crossing <= side) & same_source & (behind + y > 0)
-        length = np.sqrt((x - seen) ** 2 + (y + behind) ** 2)
+        through_start = np.sqrt(x**2 + y**2) + start
+        through_end = np.sqrt((side - x) ** 2 + y**2) + end
+        source_x, source_depth, squared_depth = _virtual_source(start, end, side)
+        crossing = (source_x * y + x * source_depth) / np.where(source_depth + y > 0, source_depth + y, 1.0)
+        crosses_side = (
+            (squared_depth >= 0) & (crossing >= 0) & (crossing <= side) & same_source & (source_depth + y > 0)
+        )
+        length = np.sqrt((x - source_x) ** 2 + (y + source_depth) ** 2)
         # Difference between the sagitta of the wave front at the crossing and that of a front in the plane.
-        square = (crossing - seen) ** 2 + off
-        across = np.where(square > 0, off / np.where(square > 0, square, 1.0), 0.0)
-        length += 0.5 * _front_flattening(curvature, np.sqrt(square)) * across * crossing * (side - crossing)
-    return np.where(straight, length, np.minimum(along, back)), along <= back
+        squared_length = (crossing - source_x) ** 2 + squared_depth
+        front_curvature = np.where(
+            squared_length > 0, squared_depth / np.where(squared_length > 0, squared_length, 1.0), 0.0
+        )
+        length += (
+            0.5 * _front_flattening(curvature, np.sqrt(squared_length)) * front_curvature * crossing * (side - crossing)
+        )
+    return np.where(crosses_side, length, np.minimum(through_start, through_end)), through_start <= through_end
 
 
 def _virtual_source(start, end, side):
     """Virtual source of a wave with given distances at the start and the end of a side: its coordinate along the side,
     its distance behind the side, and the square of this distance, which is negative for incompatible distances."""
-    seen = (start**2 - end**2 + side**2) / (2 * side)
-    off = start**2 - seen**2
-    return seen, np.sqrt(np.maximum(off, 0.0)), off
+    source_x = (start**2 - end**2 + side**2) / (2 * side)
+    squared_depth = start**2 - source_x**2
+    return source_x, np.sqrt(np.maximum(squared_depth, 0.0)), squared_depth
 
 
 def _front_flattening(curvature, length):
@@ -275,37 +305,43 @@ def _front_flattening(curvature, length):
     surface of Gaussian curvature K = `curvature`, 1/m²: κ = √K cot(√K length), with the hyperbolic cotangent for
     negative K."""
     angle = np.sqrt(np.abs(curvature)) * length
-    small, round_, saddle = angle < 1e-3, np.clip(angle, 1e-3, _MAX_SPHERE_ANGLE), np.clip(angle, 1e-3, 10.0)
-    share = np.where(curvature > 0, 1 - round_ / np.tan(round_), 1 - saddle / np.tanh(saddle))
-    return np.where(small, curvature * length / 3, share / np.where(small, 1.0, length))
+    is_small, spherical_angle, hyperbolic_angle = (
+        angle < 1e-3,
+        np.clip(angle, 1e-3, _MAX_SPHERE_ANGLE),
+        np.clip(angle, 1e-3, 10.0),
+    )
+    relative_flattening = np.where(
+        curvature > 0, 1 - spherical_angle / np.tan(spherical_angle), 1 - hyperbolic_angle / np.tanh(hyperbolic_angle)
+    )
+    return np.where(is_small, curvature * length / 3, relative_flattening / np.where(is_small, 1.0, length))
 
 
 def _gaussian_curvature(surface: Triangles, corners: _Corners) -> Float[np.ndarray, " n"]:
     """Gaussian curvature (n,) at the nodes, 1/m²: angle defect, i.e. 2π minus the sum of the angles at the node,
     divided by a third of the area of its triangles; both are averaged over two rings of neighbours. Nodes on the border
     do not contribute."""
-    count, node = len(surface.points), corners.node
+    num_nodes, node = len(surface.points), corners.node
     angle = np.arctan2(corners.y, corners.x), np.arctan2(corners.y, corners.side - corners.x)
-    lacking = 2 * np.pi - np.bincount(node, np.pi - angle[0] - angle[1], count)
-    area = surface.node_areas
-    border = np.unique(surface.border)
-    lacking[border], area[border] = 0.0, 0.0
+    angle_defect = 2 * np.pi - np.bincount(node, np.pi - angle[0] - angle[1], num_nodes)
+    areas = surface.node_areas
+    border_nodes = np.unique(surface.border)
+    angle_defect[border_nodes], areas[border_nodes] = 0.0, 0.0
     for _ in range(2):
-        lacking, area = (
-            one
-            + np.bincount(corners.start, one[corners.end], count)
-            + np.bincount(corners.end, one[corners.start], count)
-            for one in (lacking, area)
+        angle_defect, areas = (
+            values
+            + np.bincount(corners.start, values[corners.end], num_nodes)
+            + np.bincount(corners.end, values[corners.start], num_nodes)
+            for values in (angle_defect, areas)
         )
-    return np.where(area > 0, lacking / np.where(area > 0, area, 1.0), 0.0)
+    return np.where(areas > 0, angle_defect / np.where(areas > 0, areas, 1.0), 0.0)
 
 
-def _lower_distances(lengths, owner, nodes, through, number) -> np.ndarray:
-    """Lower the distances of `nodes` to the minimum of the new distances `through`, and store the owner's index.
+def _lower_distances(lengths, owner, nodes, new_lengths, owner_index) -> np.ndarray:
+    """Lower the distances of `nodes` to the minimum of the new distances `new_lengths`, and store the owner's index.
     Returns the nodes whose distance has decreased."""
-    lower = through < (1 - _MIN_DECREASE) * lengths[nodes]
-    nodes, through, number = nodes[lower], through[lower], number[lower]
-    order = np.lexsort((through, nodes))
-    changed, first = np.unique(nodes[order], return_index=True)
-    lengths[changed], owner[changed] = through[order][first], number[order][first]
+    is_lower = new_lengths < (1 - _MIN_DECREASE) * lengths[nodes]
+    nodes, new_lengths, owner_index = nodes[is_lower], new_lengths[is_lower], owner_index[is_lower]
+    order = np.lexsort((new_lengths, nodes))
+    changed, first_entries = np.unique(nodes[order], return_index=True)
+    lengths[changed], owner[changed] = new_lengths[order][first_entries], owner_index[order][first_entries]
     return changed

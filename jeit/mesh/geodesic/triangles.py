@@ -115,59 +115,69 @@ class Triangles(Module):
 
     def nearest(self, places: ArrayLike) -> SurfacePlaces:
         """Points on the surface nearest to `places` (p, 3), metres."""
-        asked = np.asarray(places, float)
-        number = min(_CANDIDATES, len(self.cells))
+        positions = np.asarray(places, float)
+        num_candidates = min(_CANDIDATES, len(self.cells))
         corners = self.corners
-        near = KDTree(corners.mean(axis=1)).query(asked, number)[1].reshape(len(asked), number)
-        weights = _nearest_in_triangles(corners[near], asked[:, None])
-        points = np.einsum("pqk,pqkd->pqd", weights, corners[near])
-        away = np.linalg.norm(points - asked[:, None], axis=-1)
-        best = away.argmin(axis=1)
-        row = np.arange(len(asked))
-        return SurfacePlaces(near[row, best], weights[row, best], points[row, best], away[row, best])
+        candidates = (
+            KDTree(corners.mean(axis=1)).query(positions, num_candidates)[1].reshape(len(positions), num_candidates)
+        )
+        weights = _nearest_in_triangles(corners[candidates], positions[:, None])
+        points = np.einsum("pqk,pqkd->pqd", weights, corners[candidates])
+        distances = np.linalg.norm(points - positions[:, None], axis=-1)
+        nearest_index = distances.argmin(axis=1)
+        row = np.arange(len(positions))
+        return SurfacePlaces(
+            candidates[row, nearest_index],
+            weights[row, nearest_index],
+            points[row, nearest_index],
+            distances[row, nearest_index],
+        )
 
     def normals_at(self, places: SurfacePlaces) -> Float[np.ndarray, "p 3"]:
         """Outward unit normals at points on the surface, interpolated from those at the nodes."""
-        between = places.of_nodes(self, self.node_normals)
-        return between / np.linalg.norm(between, axis=1, keepdims=True)
+        interpolated = places.of_nodes(self, self.node_normals)
+        return interpolated / np.linalg.norm(interpolated, axis=1, keepdims=True)
 
     def distance_to_border(self, places: ArrayLike) -> Float[np.ndarray, " p"]:
         """Straight distances (p,) of points (p, 3) from the border, metres; infinite for a closed surface."""
-        border, asked = self.border, np.asarray(places, float)
+        border, positions = self.border, np.asarray(places, float)
         if not len(border):
-            return np.full(len(asked), np.inf)
+            return np.full(len(positions), np.inf)
         start, end = self.points[border[:, 0]], self.points[border[:, 1]]
-        part = (np.arange(16) / 16)[:, None, None]
-        along = ((1 - part) * start + part * end).reshape(-1, 3)
-        return KDTree(along).query(asked)[0]
+        fractions = (np.arange(16) / 16)[:, None, None]
+        border_points = ((1 - fractions) * start + fractions * end).reshape(-1, 3)
+        return KDTree(border_points).query(positions)[0]
 
     def finer(self) -> "Triangles":
         """Divide each triangle into four at the midpoints of its sides."""
         edges = np.sort(self.cells[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
-        distinct, number = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
+        distinct_edges, edge_index = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
         a, b, c = self.cells.T
-        p, q, r = (number.reshape(-1, 3) + len(self.points)).T
-        cells = np.concatenate([np.stack(one, axis=1) for one in ((a, r, q), (r, b, p), (q, p, c), (p, q, r))])
-        return Triangles(np.concatenate([self.points, self.points[distinct].mean(axis=1)]), cells)
+        p, q, r = (edge_index.reshape(-1, 3) + len(self.points)).T
+        cells = np.concatenate([np.stack(nodes, axis=1) for nodes in ((a, r, q), (r, b, p), (q, p, c), (p, q, r))])
+        return Triangles(np.concatenate([self.points, self.points[distinct_edges].mean(axis=1)]), cells)
 
 
-def _nearest_in_triangles(corners: Float[np.ndarray, "... 3 3"], place: Float[np.ndarray, "... 3"]) -> np.ndarray:
-    """Barycentric coordinates (…, 3) of the point of each triangle that is nearest to `place`."""
+def _nearest_in_triangles(corners: Float[np.ndarray, "... 3 3"], points: Float[np.ndarray, "... 3"]) -> np.ndarray:
+    """Barycentric coordinates (…, 3) of the point of each triangle that is nearest to `points`."""
     first, second = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
-    offset = place - corners[..., 0, :]
+    offset = points - corners[..., 0, :]
     aa, bb, ab = (first**2).sum(-1), (second**2).sum(-1), (first * second).sum(-1)
     a, b = (offset * first).sum(-1), (offset * second).sum(-1)
     area = aa * bb - ab**2
     u, v = (bb * a - ab * b) / area, (aa * b - ab * a) / area
     inside = np.stack([1 - u - v, u, v], axis=-1)
-    found = np.where((inside >= 0).all(axis=-1, keepdims=True), inside, np.nan)
-    least = np.where(np.isnan(found[..., 0]), np.inf, 0.0)
+    nearest_weights = np.where((inside >= 0).all(axis=-1, keepdims=True), inside, np.nan)
+    min_distance = np.where(np.isnan(nearest_weights[..., 0]), np.inf, 0.0)
     for start, end in ((0, 1), (1, 2), (2, 0)):
         side = corners[..., end, :] - corners[..., start, :]
-        reached = np.clip(((place - corners[..., start, :]) * side).sum(-1) / (side**2).sum(-1), 0, 1)
-        left = np.linalg.norm(corners[..., start, :] + reached[..., None] * side - place, axis=-1)
+        fraction = np.clip(((points - corners[..., start, :]) * side).sum(-1) / (side**2).sum(-1), 0, 1)
+        distance = np.linalg.norm(corners[..., start, :] + fraction[..., None] * side - points, axis=-1)
         weights = np.zeros_like(inside)
-        weights[..., start], weights[..., end] = 1 - reached, reached
-        better = left < least
-        least, found = np.where(better, left, least), np.where(better[..., None], weights, found)
-    return found
+        weights[..., start], weights[..., end] = 1 - fraction, fraction
+        is_nearer = distance < min_distance
+        min_distance, nearest_weights = (
+            np.where(is_nearer, distance, min_distance),
+            np.where(is_nearer[..., None], weights, nearest_weights),
+        )
+    return nearest_weights

@@ -54,11 +54,11 @@ class Unfolding(NamedTuple):
         """Squared distances (m, k, p), m², from k points to positions in each triangle. `which` (m, k): indices of the
         points for each triangle; `weights` (p, 3): barycentric coordinates of the positions."""
         xp = namespace(self.corners, self.turn)
-        number = xp.arange(len(self.corners))[:, None]
+        cell_index = xp.arange(len(self.corners))[:, None]
         points = xp.einsum("pi,mid->mpd", weights, self.corners)[:, None]
-        turn, shift = self.turn[which, number][:, :, None], (self.shift - self.place[:, None])[which, number]
-        laid = _rotate(turn, points) + shift[:, :, None]
-        return (laid**2).sum(axis=-1)
+        turn, shift = self.turn[which, cell_index][:, :, None], (self.shift - self.place[:, None])[which, cell_index]
+        unfolded_points = _rotate(turn, points) + shift[:, :, None]
+        return (unfolded_points**2).sum(axis=-1)
 
 
 def unfold(mesh: Mesh, places: Float[Array, "L 3"], max_distance: Float[Array, "L m"]) -> Unfolding:
@@ -80,10 +80,10 @@ def unfold(mesh: Mesh, places: Float[Array, "L 3"], max_distance: Float[Array, "
     xp = namespace(mesh, places)
     corners = xp.asarray(mesh.points[mesh.cells])
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    along = first / xp.sqrt((first**2).sum(axis=1, keepdims=True))
+    first_axis = first / xp.sqrt((first**2).sum(axis=1, keepdims=True))
     normal = xp.cross(first, second)
     normal = normal / xp.sqrt((normal**2).sum(axis=1, keepdims=True))
-    axes = xp.stack([along, xp.cross(normal, along)], axis=1)
+    axes = xp.stack([first_axis, xp.cross(normal, first_axis)], axis=1)
     local = xp.einsum("mid,mad->mia", corners - corners[:, :1], axes)
     frames = corners[:, 0], axes, normal
     root = _containing_triangles(undifferentiated(places), *undifferentiated((frames, local)))
@@ -96,11 +96,11 @@ def unfold(mesh: Mesh, places: Float[Array, "L 3"], max_distance: Float[Array, "
     turn, shift = (transform[side_index] for transform in _transforms_across_sides(local, opposite))
     has_previous = (side >= 0)[..., None]
     turn, shift = xp.where(has_previous, turn, xp.array([1.0, 0.0])), xp.where(has_previous, shift, 0.0)
-    turn, shift, last = _compose_transforms(previous, turn, shift)
+    turn, shift, end_triangle = _compose_transforms(previous, turn, shift)
     place = xp.einsum("ld,lad->la", places - corners[root, 0], axes[root])
-    curved = _is_curved(undifferentiated(local), mesh.cells, opposite, mesh.num_points)
-    lost = reached & (curved | (last != root[:, None]))
-    return Unfolding(local, turn, shift, place, reached, ~lost.any(axis=1))
+    is_curved = _is_curved(undifferentiated(local), mesh.cells, opposite, mesh.num_points)
+    is_invalid = reached & (is_curved | (end_triangle != root[:, None]))
+    return Unfolding(local, turn, shift, place, reached, ~is_invalid.any(axis=1))
 
 
 def _rotate(turn, points):
@@ -128,32 +128,34 @@ def _opposite_sides(cells) -> Int[Array, " h"]:
     side's own index. The index of side k (0, 1, 2) of triangle c is 3 c + k."""
     xp = namespace(cells)
     start, end = cells.reshape(-1), xp.roll(cells, -1, axis=1).reshape(-1)
-    low, high = xp.minimum(start, end), xp.maximum(start, end)
-    order = xp.lexsort((high, low))
-    same = (xp.diff(low[order]) == 0) & (xp.diff(high[order]) == 0)
-    no = xp.zeros(1, bool)
-    step = xp.where(xp.concatenate([same, no]), 1, 0) - xp.where(xp.concatenate([no, same]), 1, 0)
-    other = order[xp.arange(len(order)) + step]
-    return other[xp.argsort(order)]
+    lower_nodes, upper_nodes = xp.minimum(start, end), xp.maximum(start, end)
+    order = xp.lexsort((upper_nodes, lower_nodes))
+    is_same_as_next = (xp.diff(lower_nodes[order]) == 0) & (xp.diff(upper_nodes[order]) == 0)
+    false_entry = xp.zeros(1, bool)
+    step = xp.where(xp.concatenate([is_same_as_next, false_entry]), 1, 0) - xp.where(
+        xp.concatenate([false_entry, is_same_as_next]), 1, 0
+    )
+    opposite = order[xp.arange(len(order)) + step]
+    return opposite[xp.argsort(order)]
 
 
-def _connect(neighbour, near: Bool[Array, "L m"], root):
-    """Find the triangles `near` each point that are connected to the triangle `root` (L,) across sides. Returns whether
-    each triangle (L, m) is connected, and the number of its side (L, m) that leads towards the root; −1 for the root
-    itself and for triangles that are not connected."""
-    xp = namespace(neighbour, near)
-    cell = xp.arange(near.shape[1])
+def _connect(neighbour, is_near: Bool[Array, "L m"], root):
+    """Find the triangles near each point (`is_near`) that are connected to the triangle `root` (L,) across sides.
+    Returns whether each triangle (L, m) is connected, and the number of its side (L, m) that leads towards the root;
+    −1 for the root itself and for triangles that are not connected."""
+    xp = namespace(neighbour, is_near)
+    cell = xp.arange(is_near.shape[1])
     neighbour = neighbour.reshape(-1, 3)
-    begun = cell == root[:, None]
+    is_root = cell == root[:, None]
 
     def grow(state):
         reached, side, _ = state
-        there = reached[:, neighbour]
-        new = near & ~reached & there.any(axis=-1)
-        return reached | new, xp.where(new, there.argmax(axis=-1).astype(int), side), new.any()
+        is_reached_across = reached[:, neighbour]
+        is_new = is_near & ~reached & is_reached_across.any(axis=-1)
+        return reached | is_new, xp.where(is_new, is_reached_across.argmax(axis=-1).astype(int), side), is_new.any()
 
-    some = xp.ones((), bool)
-    reached, side, _ = while_loop(lambda state: state[2], grow, (begun, xp.full(near.shape, -1, int), some))
+    has_changed = xp.ones((), bool)
+    reached, side, _ = while_loop(lambda state: state[2], grow, (is_root, xp.full(is_near.shape, -1, int), has_changed))
     return reached, side
 
 
@@ -162,8 +164,11 @@ def _transforms_across_sides(local, opposite):
     plane of its triangle into that of the triangle on the other side."""
     xp = namespace(local)
     start, end = local.reshape(-1, 2), xp.roll(local, -1, axis=1).reshape(-1, 2)
-    own, other = end - start, start[opposite] - end[opposite]
-    turn = xp.stack([(own * other).sum(axis=1), own[:, 0] * other[:, 1] - own[:, 1] * other[:, 0]], axis=1)
+    side, opposite_side = end - start, start[opposite] - end[opposite]
+    turn = xp.stack(
+        [(side * opposite_side).sum(axis=1), side[:, 0] * opposite_side[:, 1] - side[:, 1] * opposite_side[:, 0]],
+        axis=1,
+    )
     turn = turn / xp.sqrt((turn**2).sum(axis=1, keepdims=True))
     return turn, end[opposite] - _rotate(turn, start)
 
@@ -174,8 +179,8 @@ def _compose_transforms(previous, turn, shift):
     xp = namespace(previous, turn)
     row = xp.arange(len(previous))[:, None]
     for _ in range(_MAX_DOUBLINGS):
-        then, moved = turn[row, previous], shift[row, previous]
-        turn, shift = _rotate(then, turn), _rotate(then, shift) + moved
+        next_turn, next_shift = turn[row, previous], shift[row, previous]
+        turn, shift = _rotate(next_turn, turn), _rotate(next_turn, shift) + next_shift
         previous = previous[row, previous]
         if has_values(previous) and (previous[row, previous] == previous).all():
             break
@@ -185,10 +190,13 @@ def _compose_transforms(previous, turn, shift):
 def _is_curved(local, cells, opposite, num_nodes: int) -> Bool[Array, " m"]:
     """For each triangle, whether the angles around one of its corners inside the surface do not sum to a full turn."""
     xp = namespace(local, cells)
-    ahead, back = xp.roll(local, -1, axis=1) - local, xp.roll(local, 1, axis=1) - local
-    angle = xp.arctan2(ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0], (ahead * back).sum(axis=-1))
-    round_node = sum_into((num_nodes,), (cells,), angle)
-    edge = (opposite == xp.arange(len(opposite))).reshape(-1, 3)
-    ends = sum_into((num_nodes,), (cells,), 1.0 * (edge | xp.roll(edge, 1, axis=1)))
-    bent = (abs(round_node - 2 * np.pi) > _ANGLE_TOLERANCE) & (ends == 0)
-    return bent[cells].any(axis=1)
+    next_edges, previous_edges = xp.roll(local, -1, axis=1) - local, xp.roll(local, 1, axis=1) - local
+    angle = xp.arctan2(
+        next_edges[..., 0] * previous_edges[..., 1] - next_edges[..., 1] * previous_edges[..., 0],
+        (next_edges * previous_edges).sum(axis=-1),
+    )
+    angle_sums = sum_into((num_nodes,), (cells,), angle)
+    is_border_side = (opposite == xp.arange(len(opposite))).reshape(-1, 3)
+    num_border_sides = sum_into((num_nodes,), (cells,), 1.0 * (is_border_side | xp.roll(is_border_side, 1, axis=1)))
+    is_curved_node = (abs(angle_sums - 2 * np.pi) > _ANGLE_TOLERANCE) & (num_border_sides == 0)
+    return is_curved_node[cells].any(axis=1)

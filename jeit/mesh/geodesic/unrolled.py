@@ -61,14 +61,14 @@ class Unrolled(Module):
     @property
     def seam(self) -> Float[np.ndarray, "s 2 2"]:
         """Segments (s, 2, 2) of the flat outline that arose from the cut; there are none for an open sheet."""
-        ends, cut = self._edges
-        return self.points[ends[cut]]
+        ends, is_cut = self._edges
+        return self.points[ends[is_cut]]
 
     @property
     def edge(self) -> Float[np.ndarray, "s 2 2"]:
         """Segments (s, 2, 2) of the flat outline that are edges of the original surface."""
-        ends, cut = self._edges
-        return self.points[ends[~cut]]
+        ends, is_cut = self._edges
+        return self.points[ends[~is_cut]]
 
     @property
     def _edges(self):
@@ -77,8 +77,8 @@ class Unrolled(Module):
 
     def flat(self, places: ArrayLike | SurfacePlaces) -> Float[np.ndarray, "p 2"]:
         """Positions (p, 2) on the flat surface, metres, of points (p, 3) on the surface, metres."""
-        at = places if isinstance(places, SurfacePlaces) else self.surface.nearest(places)
-        return np.einsum("pk,pkd->pd", at.weights, self.points[self.cells[at.triangle]])
+        surface_places = places if isinstance(places, SurfacePlaces) else self.surface.nearest(places)
+        return np.einsum("pk,pkd->pd", surface_places.weights, self.points[self.cells[surface_places.triangle]])
 
 
 def unroll(surface: Triangles | Mesh, face: str | None = None, *, cut: ArrayLike | None = None) -> Unrolled:
@@ -106,50 +106,52 @@ def unroll(surface: Triangles | Mesh, face: str | None = None, *, cut: ArrayLike
     points = _conformal_map(cells, local, len(nodes))
     points = _flatten_rigidly(cells, local, points)
     points = _turn_upright(points, triangles.points[nodes])
-    flat = _edges(points[cells]) @ np.linalg.inv(_edges(local))
-    return Unrolled(triangles, cells, points, nodes, np.linalg.svd(flat, compute_uv=False)[:, ::-1])
+    deformation = _edges(points[cells]) @ np.linalg.inv(_edges(local))
+    return Unrolled(triangles, cells, points, nodes, np.linalg.svd(deformation, compute_uv=False)[:, ::-1])
 
 
 def _plane_corners(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3 2"]:
     """Corners of each triangle in its own plane."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     length = np.linalg.norm(a, axis=1)
-    along = (a * b).sum(axis=1) / length
-    up = np.linalg.norm(np.cross(a, b), axis=1) / length
+    third_x = (a * b).sum(axis=1) / length
+    third_y = np.linalg.norm(np.cross(a, b), axis=1) / length
     zero = np.zeros_like(length)
-    return np.stack([np.stack([zero, zero], 1), np.stack([length, zero], 1), np.stack([along, up], 1)], axis=1)
+    return np.stack([np.stack([zero, zero], 1), np.stack([length, zero], 1), np.stack([third_x, third_y], 1)], axis=1)
 
 
 def _edges(triangles: Float[np.ndarray, "m 3 2"]) -> Float[np.ndarray, "m 2 2"]:
     return np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=2)
 
 
-def _conformal_map(cells, local, count: int) -> np.ndarray:
+def _conformal_map(cells, local, num_nodes: int) -> np.ndarray:
     """Least-squares conformal map, which preserves angles as well as possible; the two farthest nodes are fixed."""
-    held = _farthest_nodes(cells, local, count)
-    w = np.stack([local[:, 2] - local[:, 1], local[:, 0] - local[:, 2], local[:, 1] - local[:, 0]], axis=1)
-    w = w / np.sqrt(np.abs(np.linalg.det(_edges(local))))[:, None, None]
+    held_nodes = _farthest_nodes(cells, local, num_nodes)
+    side_vectors = np.stack([local[:, 2] - local[:, 1], local[:, 0] - local[:, 2], local[:, 1] - local[:, 0]], axis=1)
+    side_vectors = side_vectors / np.sqrt(np.abs(np.linalg.det(_edges(local))))[:, None, None]
     row = np.repeat(np.arange(len(cells)), 3)
     real, imaginary = (
-        scipy.sparse.csr_array((part.ravel(), (row, cells.ravel())), shape=(len(cells), count))
-        for part in (w[..., 0], w[..., 1])
+        scipy.sparse.csr_array((component.ravel(), (row, cells.ravel())), shape=(len(cells), num_nodes))
+        for component in (side_vectors[..., 0], side_vectors[..., 1])
     )
     matrix = scipy.sparse.block_array([[real, -imaginary], [imaginary, real]]).tocsc()
-    fixed = np.array([held[0], held[1], held[0] + count, held[1] + count])
-    values = np.array([0.0, held[2], 0.0, 0.0])
-    free = np.setdiff1d(np.arange(2 * count), fixed)
-    left, right = matrix[:, free], -(matrix[:, fixed] @ values)
-    found = np.zeros(2 * count)
-    found[fixed] = values
-    found[free] = scipy.sparse.linalg.spsolve((left.T @ left).tocsc(), left.T @ right)
-    return found.reshape(2, -1).T
+    fixed = np.array([held_nodes[0], held_nodes[1], held_nodes[0] + num_nodes, held_nodes[1] + num_nodes])
+    values = np.array([0.0, held_nodes[2], 0.0, 0.0])
+    free = np.setdiff1d(np.arange(2 * num_nodes), fixed)
+    free_columns, right_side = matrix[:, free], -(matrix[:, fixed] @ values)
+    coordinates = np.zeros(2 * num_nodes)
+    coordinates[fixed] = values
+    coordinates[free] = scipy.sparse.linalg.spsolve(
+        (free_columns.T @ free_columns).tocsc(), free_columns.T @ right_side
+    )
+    return coordinates.reshape(2, -1).T
 
 
-def _farthest_nodes(cells, local, count: int):
+def _farthest_nodes(cells, local, num_nodes: int):
     """Two nodes far from each other, and their distance along edges."""
     length = np.linalg.norm(local[:, [1, 2, 0]] - local, axis=2)
     start, end = cells.ravel(), cells[:, [1, 2, 0]].ravel()
-    graph = scipy.sparse.csr_array((length.ravel(), (start, end)), shape=(count, count))
+    graph = scipy.sparse.csr_array((length.ravel(), (start, end)), shape=(num_nodes, num_nodes))
     first = int(np.argmax(dijkstra(graph, directed=False, indices=0)))
     lengths = dijkstra(graph, directed=False, indices=first)
     return first, int(np.argmax(lengths)), float(lengths.max())
@@ -158,32 +160,35 @@ def _farthest_nodes(cells, local, count: int):
 def _flatten_rigidly(cells, local, points: np.ndarray) -> np.ndarray:
     """Flatten as rigidly as possible: alternately fit a rotation of each triangle to the map, and the nodes to the
     rotated triangles."""
-    count = len(points)
-    next_, after = [1, 2, 0], [2, 0, 1]
-    edge = local[:, next_] - local  # side k runs from corner k to the next
-    one, other = local - local[:, after], local[:, next_] - local[:, after]
-    cross = one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]
-    weight = (one * other).sum(-1) / cross / 2  # half the cotangent of the angle opposite to side k
-    start, end = cells, cells[:, next_]
+    num_nodes = len(points)
+    next_corner, previous_corner = [1, 2, 0], [2, 0, 1]
+    edge = local[:, next_corner] - local  # side k runs from corner k to the next
+    first_leg, second_leg = local - local[:, previous_corner], local[:, next_corner] - local[:, previous_corner]
+    cross = first_leg[..., 0] * second_leg[..., 1] - first_leg[..., 1] * second_leg[..., 0]
+    weight = (first_leg * second_leg).sum(-1) / cross / 2  # half the cotangent of the angle opposite to side k
+    start, end = cells, cells[:, next_corner]
     rows = np.concatenate([start.ravel(), end.ravel(), start.ravel(), end.ravel()])
     columns = np.concatenate([start.ravel(), end.ravel(), end.ravel(), start.ravel()])
-    w = weight.ravel()
-    matrix = scipy.sparse.csc_array((np.concatenate([w, w, -w, -w]), (rows, columns)), shape=(count, count))
+    side_weights = weight.ravel()
+    matrix = scipy.sparse.csc_array(
+        (np.concatenate([side_weights, side_weights, -side_weights, -side_weights]), (rows, columns)),
+        shape=(num_nodes, num_nodes),
+    )
     solve = factorized(matrix[1:, 1:].tocsc())
     for _ in range(_RIGID_ITERATIONS):
-        drawn = points[end] - points[start]
-        moment = np.einsum("mk,mki,mkj->mij", weight, drawn, edge)
+        flat_edges = points[end] - points[start]
+        moment = np.einsum("mk,mki,mkj->mij", weight, flat_edges, edge)
         u, _, v = np.linalg.svd(moment)
         u[:, :, 1] *= np.sign(np.linalg.det(u @ v))[:, None]
-        turned = weight[..., None] * np.einsum("mij,mkj->mki", u @ v, edge)
-        right = np.zeros_like(points)
-        np.add.at(right, end, turned)
-        np.subtract.at(right, start, turned)
-        moved = np.zeros_like(points)
-        moved[1:] = np.column_stack([solve(right[1:, axis]) for axis in range(2)])
-        settled = np.abs((moved - points) - (moved - points).mean(axis=0)).max() < 1e-7 * np.ptp(points)
-        points = moved
-        if settled:
+        rotated_edges = weight[..., None] * np.einsum("mij,mkj->mki", u @ v, edge)
+        right_side = np.zeros_like(points)
+        np.add.at(right_side, end, rotated_edges)
+        np.subtract.at(right_side, start, rotated_edges)
+        new_points = np.zeros_like(points)
+        new_points[1:] = np.column_stack([solve(right_side[1:, axis]) for axis in range(2)])
+        has_converged = np.abs((new_points - points) - (new_points - points).mean(axis=0)).max() < 1e-7 * np.ptp(points)
+        points = new_points
+        if has_converged:
             break
     return points
 
@@ -196,8 +201,8 @@ def _turn_upright(points: np.ndarray, space: np.ndarray) -> np.ndarray:
         height = space[:, axis] - space[:, axis].mean()
         (a, b), *_ = np.linalg.lstsq(points, height, rcond=None)
         if np.hypot(a, b) > _MIN_UPWARD_SLOPE:
-            c, s = np.array([b, a]) / np.hypot(a, b)
-            return points @ np.array([[c, s], [-s, c]])
+            cosine, sine = np.array([b, a]) / np.hypot(a, b)
+            return points @ np.array([[cosine, sine], [-sine, cosine]])
     return points
 
 
@@ -207,115 +212,115 @@ def _border_edges(cells) -> np.ndarray:
     return edges[first[counts == 1]]
 
 
-def _is_among(edges, others) -> np.ndarray:
-    size = 1 + max(edges.max(initial=0), others.max(initial=0))
-    return np.isin(edges[:, 0] * size + edges[:, 1], others[:, 0] * size + others[:, 1])
+def _is_among(edges, reference_edges) -> np.ndarray:
+    size = 1 + max(edges.max(initial=0), reference_edges.max(initial=0))
+    return np.isin(edges[:, 0] * size + edges[:, 1], reference_edges[:, 0] * size + reference_edges[:, 1])
 
 
 def _cut_to_disk(surface: Triangles, cut) -> tuple[np.ndarray, np.ndarray]:
     """Cut a surface so that it becomes a disk. Returns its triangles, and for each new node the original node."""
-    cells, count = surface.cells, len(surface.points)
+    cells, num_nodes = surface.cells, len(surface.points)
     border = surface.border
-    loops, label = _border_loops(border, count)
+    num_loops, label = _border_loops(border, num_nodes)
     edges = np.unique(np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
-    euler = count - len(edges) + len(cells)
-    graph = scipy.sparse.csr_array((np.ones(len(edges)), edges.T), shape=(count, count))
+    euler_characteristic = num_nodes - len(edges) + len(cells)
+    graph = scipy.sparse.csr_array((np.ones(len(edges)), edges.T), shape=(num_nodes, num_nodes))
     if connected_components(graph, directed=False)[0] > 1:
         raise ValueError("surface: parts of it do not hang together; unroll each on its own.")
-    if loops == 1 and euler == 1:
-        return cells, np.arange(count)
-    if (loops, euler) not in ((2, 0), (0, 2)):
+    if num_loops == 1 and euler_characteristic == 1:
+        return cells, np.arange(num_nodes)
+    if (num_loops, euler_characteristic) not in ((2, 0), (0, 2)):
         raise ValueError(
-            f"surface: it has {loops} edges and Euler characteristic {euler}; what can be unrolled is a sheet, a "
-            "sleeve of two open ends, or closed without handles."
+            f"surface: it has {num_loops} edges and Euler characteristic {euler_characteristic}; what can be unrolled "
+            "is a sheet, a sleeve of two open ends, or closed without handles."
         )
     points = surface.points
-    if loops == 2:
+    if num_loops == 2:
         ends = np.unique(border[label == 0]), np.unique(border[label == 1])
     else:
         axis = int(np.argmax(np.ptp(points, axis=0)))
         ends = np.array([points[:, axis].argmin()]), np.array([points[:, axis].argmax()])
     path = _path_along_edges(points, edges, ends, cut, border)
-    return _split_along_path(cells, path, count, closed=loops == 0)
+    return _split_along_path(cells, path, num_nodes, closed=num_loops == 0)
 
 
-def _border_loops(border, count: int):
+def _border_loops(border, num_nodes: int):
     """Number of loops of the border, and the index of the loop of each border edge."""
     if not len(border):
         return 0, np.zeros(0, int)
-    graph = scipy.sparse.csr_array((np.ones(len(border)), border.T), shape=(count, count))
+    graph = scipy.sparse.csr_array((np.ones(len(border)), border.T), shape=(num_nodes, num_nodes))
     label = connected_components(graph, directed=False)[1][border[:, 0]]
-    kinds, label = np.unique(label, return_inverse=True)
-    return len(kinds), label
+    distinct_labels, label = np.unique(label, return_inverse=True)
+    return len(distinct_labels), label
 
 
 def _path_along_edges(points, edges, ends, cut, border) -> list[int]:
     """Nodes of a path along edges from one end to the other, near the requested side and off the border."""
-    middle = points.mean(axis=0)
+    centre = points.mean(axis=0)
     goal = np.asarray(cut, float) if cut is not None else None
     spread = np.ptp(points, axis=0).max()
-    between = points[edges].mean(axis=1)
+    midpoints = points[edges].mean(axis=1)
     if goal is None:
         # Edges away from the side of the smallest x cost more, which yields a straight line along that side.
-        off = (between[:, 0] - points[:, 0].min()) / spread
-        aside = np.abs(between[:, 1] - middle[1]) / spread
-        cost = 1 + 20 * (off + aside)
+        x_offsets = (midpoints[:, 0] - points[:, 0].min()) / spread
+        y_offsets = np.abs(midpoints[:, 1] - centre[1]) / spread
+        cost = 1 + 20 * (x_offsets + y_offsets)
     else:
-        way = points[ends[1]].mean(axis=0) - points[ends[0]].mean(axis=0)
-        way = way / np.linalg.norm(way)
-        away = between - goal
-        cost = 1 + 20 * np.linalg.norm(away - (away @ way)[:, None] * way, axis=1) / spread
+        axis = points[ends[1]].mean(axis=0) - points[ends[0]].mean(axis=0)
+        axis = axis / np.linalg.norm(axis)
+        offsets = midpoints - goal
+        cost = 1 + 20 * np.linalg.norm(offsets - (offsets @ axis)[:, None] * axis, axis=1) / spread
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) * cost
     if len(border):
         length = np.where(_is_among(edges, np.sort(border, axis=1)), 1e3 * length, length)
     graph = scipy.sparse.csr_array((length, edges.T), shape=(len(points), len(points)))
-    lengths, before, _ = dijkstra(graph, directed=False, indices=ends[0], return_predecessors=True, min_only=True)
+    lengths, predecessors, _ = dijkstra(graph, directed=False, indices=ends[0], return_predecessors=True, min_only=True)
     path = [int(ends[1][np.argmin(lengths[ends[1]])])]
-    while before[path[-1]] >= 0:
-        path.append(int(before[path[-1]]))
+    while predecessors[path[-1]] >= 0:
+        path.append(int(predecessors[path[-1]]))
     return path
 
 
-def _split_along_path(cells, path: list[int], count: int, *, closed: bool):
+def _split_along_path(cells, path: list[int], num_nodes: int, *, closed: bool):
     """Duplicate the nodes along a path for the triangles on one side of it. On a closed surface, the ends of the path
     are not duplicated."""
-    doubled = path[1:-1] if closed else path
-    ahead = set(itertools.pairwise(path))
-    onto = set(path)
-    new = {node: count + k for k, node in enumerate(doubled)}
-    touching: dict[int, list[int]] = {node: [] for node in doubled}
-    for number in np.flatnonzero(np.isin(cells, doubled).any(axis=1)):
-        for node in cells[number]:
-            if node in touching:
-                touching[int(node)].append(int(number))
+    doubled_nodes = path[1:-1] if closed else path
+    path_edges = set(itertools.pairwise(path))
+    path_nodes = set(path)
+    new_nodes = {node: num_nodes + k for k, node in enumerate(doubled_nodes)}
+    triangles_at: dict[int, list[int]] = {node: [] for node in doubled_nodes}
+    for triangle in np.flatnonzero(np.isin(cells, doubled_nodes).any(axis=1)):
+        for node in cells[triangle]:
+            if node in triangles_at:
+                triangles_at[int(node)].append(int(triangle))
     cells = cells.copy()
     original = cells.copy()
-    for node in doubled:
+    for node in doubled_nodes:
         # The triangles around the node, joined across edges that are not on the path, form two parts; one side is the
         # part that contains a triangle traversing the path forwards.
-        around = touching[node]
-        side = set()
-        for number in around:
-            corners = original[number].tolist()
+        star = triangles_at[node]
+        side_triangles = set()
+        for triangle in star:
+            corners = original[triangle].tolist()
             sides = zip(corners, corners[1:] + corners[:1], strict=True)
-            if any(one in ahead and node in one for one in sides):
-                side.add(number)
-        grown = True
-        while grown:
-            grown = False
-            for number in around:
-                if number in side:
+            if any(edge in path_edges and node in edge for edge in sides):
+                side_triangles.add(triangle)
+        has_grown = True
+        while has_grown:
+            has_grown = False
+            for triangle in star:
+                if triangle in side_triangles:
                     continue
-                for other in tuple(side):
-                    shared = set(original[number].tolist()) & set(original[other].tolist()) - {node}
-                    if any(not _is_on_path(node, far, onto, ahead) for far in shared):
-                        side.add(number)
-                        grown = True
+                for side_triangle in tuple(side_triangles):
+                    shared_nodes = set(original[triangle].tolist()) & set(original[side_triangle].tolist()) - {node}
+                    if any(not _is_on_path(node, other_node, path_nodes, path_edges) for other_node in shared_nodes):
+                        side_triangles.add(triangle)
+                        has_grown = True
                         break
-        for number in side:
-            cells[number][original[number] == node] = new[node]
-    return cells, np.concatenate([np.arange(count), np.array(doubled, int)])
+        for triangle in side_triangles:
+            cells[triangle][original[triangle] == node] = new_nodes[node]
+    return cells, np.concatenate([np.arange(num_nodes), np.array(doubled_nodes, int)])
 
 
-def _is_on_path(node: int, far: int, onto: set, ahead: set) -> bool:
-    return far in onto and ((node, far) in ahead or (far, node) in ahead)
+def _is_on_path(node: int, other_node: int, path_nodes: set, path_edges: set) -> bool:
+    return other_node in path_nodes and ((node, other_node) in path_edges or (other_node, node) in path_edges)

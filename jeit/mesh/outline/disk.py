@@ -113,19 +113,19 @@ class Disk(Domain):
         interior_points: ArrayLike | None = None,
     ) -> Mesh:
         """Mesh the disk. The arguments and the errors raised are those of `jeit.mesh.disk`."""
-        middle = np.asarray(self.centre)
+        centre = np.asarray(self.centre)
         if num_boundary is not None:
             refine = self._refine_rim(num_boundary, refine)
         if refine is None and boundary_points is None and interior_points is None:
             points, cells = structured.ring_disk(*self._choose_rings(num_points, cell_size))
-            return Mesh.create(middle + self.radius * points, cells)
+            return Mesh.create(centre + self.radius * points, cells)
         arcs = None
         if boundary_points is not None:
             arcs = self.radius * np.mod(check_positions("boundary_points", boundary_points), 2 * np.pi)
         target = Target.create(num_points, cell_size)
-        mesh = mesh_within([circle(self.radius, middle)], self.area, target, refine, arcs, interior_points)
-        most = 0 if num_boundary is None else 0.1 * num_boundary + (1 if arcs is None else len(arcs))
-        if num_boundary is not None and abs(mesh.num_facets - num_boundary) > most:
+        mesh = mesh_within([circle(self.radius, centre)], self.area, target, refine, arcs, interior_points)
+        max_deviation = 0 if num_boundary is None else 0.1 * num_boundary + (1 if arcs is None else len(arcs))
+        if num_boundary is not None and abs(mesh.num_facets - num_boundary) > max_deviation:
             raise ValueError(
                 f"num_boundary: cells of the size asked give {mesh.num_facets} nodes on the circle, not "
                 f"{num_boundary}. Ask for fewer nodes inside (num_points), larger cells, or more nodes on the circle."
@@ -136,8 +136,8 @@ class Disk(Domain):
         num_boundary = check_count("num_boundary", num_boundary, 3)
         if callable(refine):
             raise ValueError("num_boundary: cannot be combined with a size function; let the function give the size.")
-        along = Refine(cell_size=self.perimeter / num_boundary)
-        return (along, *(() if refine is None else (refine,) if isinstance(refine, Refine) else tuple(refine)))
+        rim_refinement = Refine(cell_size=self.perimeter / num_boundary)
+        return (rim_refinement, *(() if refine is None else (refine,) if isinstance(refine, Refine) else tuple(refine)))
 
     def _choose_rings(self, num_points: int | None, cell_size: float | None) -> tuple[int, int]:
         target = Target.create(num_points, cell_size)

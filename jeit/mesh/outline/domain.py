@@ -149,9 +149,10 @@ def numerics(*values: Any) -> Any:
     return np if has_values(*values) else jnp
 
 
-def check_length(name: str, value: Any, across: float = 1.0) -> Any:
+def check_length(name: str, value: Any, size_factor: float = 1.0) -> Any:
     """Check a length in metres and convert it to a float; traced values are returned unchanged. Raises `ValueError`
-    unless it is positive, and warns if the object is large: `across` is the object's size divided by this length."""
+    unless it is positive, and warns if the object is large: `size_factor` is the object's size divided by this
+    length."""
     if not has_values(value):
         return value
     try:
@@ -160,18 +161,20 @@ def check_length(name: str, value: Any, across: float = 1.0) -> Any:
         raise ValueError(f"{name}: expected one length in metres, got {value!r}.") from None
     if not np.isfinite(number) or number <= 0:
         raise ValueError(f"{name}: expected a positive length in metres, got {describe(value)}.")
-    warn_large(number, name, across)
+    warn_large(number, name, size_factor)
     return number
 
 
-def check_near_origin(name: str, far: Any, size: Any) -> None:
-    """Raise `ValueError` with the argument's `name` if an outline of `size` metres is so `far` from the origin, metres,
-    that its coordinates lose accuracy. Traced values are not checked."""
-    if has_values(far, size) and float(np.max(np.abs(np.asarray(far)))) > _MAX_DISTANCE_FROM_ORIGIN * float(size):
-        away = float(np.max(np.abs(np.asarray(far))))
+def check_near_origin(name: str, coordinates: Any, size: Any) -> None:
+    """Raise `ValueError` with the argument's `name` if an outline of `size` metres, whose position is given by
+    `coordinates` in metres, is so far from the origin that it loses accuracy. Traced values are not checked."""
+    if not has_values(coordinates, size):
+        return
+    distance = float(np.max(np.abs(np.asarray(coordinates))))
+    if distance > _MAX_DISTANCE_FROM_ORIGIN * float(size):
         raise ValueError(
-            f"{name}: {away:.3g} m from the origin, and only {float(size):.3g} m across; give its coordinates about a "
-            "point of its own."
+            f"{name}: {distance:.3g} m from the origin, and only {float(size):.3g} m across; give its coordinates "
+            "about a point of its own."
         )
 
 

@@ -49,8 +49,8 @@ def along(loop: Loop, arc_length: ArrayLike) -> Float[Array, "... 2"]:
 def contains(loops: Sequence[Loop], points: ArrayLike) -> Bool[Array, "..."]:
     """Whether each of `points` (…, 2) lies inside the first loop and outside the holes (even-odd rule)."""
     if namespace(loops, points) is np:
-        at = np.asarray(points)
-        return enclosed(at.reshape(-1, 2), loops).reshape(at.shape[:-1])  # pyright: ignore
+        point_array = np.asarray(points)
+        return enclosed(point_array.reshape(-1, 2), loops).reshape(point_array.shape[:-1])  # pyright: ignore
     points = jnp.asarray(points)
     inside = jnp.zeros(points.shape[:-1], bool)
     for loop in loops:
@@ -61,31 +61,31 @@ def contains(loops: Sequence[Loop], points: ArrayLike) -> Bool[Array, "..."]:
 def signed_distance(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, " p"]:
     """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
     xp = numerics(loops, points)
-    at, inside, place = _project_onto_loops(xp, loops, points)
-    apart = xp.sqrt(((at - place) ** 2).sum(axis=1) + 1e-24)  # differentiable at zero, too
-    return jnp.asarray(xp.where(inside, apart, -apart))
+    point_array, is_inside, nearest_points = _project_onto_loops(xp, loops, points)
+    distances = xp.sqrt(((point_array - nearest_points) ** 2).sum(axis=1) + 1e-24)  # differentiable at zero, too
+    return jnp.asarray(xp.where(is_inside, distances, -distances))
 
 
 def nearest(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "p 2"]:
     """Move those of `points` (p, 2) that lie outside to the nearest point on a side; others are returned unchanged."""
     xp = numerics(loops, points)
-    at, inside, place = _project_onto_loops(xp, loops, points)
-    return jnp.asarray(xp.where(inside[:, None], at, place))
+    point_array, is_inside, nearest_points = _project_onto_loops(xp, loops, points)
+    return jnp.asarray(xp.where(is_inside[:, None], point_array, nearest_points))
 
 
 def _project_onto_loops(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tuple[Any, Any, Any]:
     """Convert `points` (p, 2) to an array; also returns whether each lies inside (p,), and the nearest point on a side
     (p, 2)."""
-    chains, at = [xp.asarray(loop) for loop in loops], xp.asarray(points, float)
+    chains, point_array = [xp.asarray(loop) for loop in loops], xp.asarray(points, float)
     start = xp.concatenate(chains)
     sides = xp.concatenate([xp.roll(loop, -1, axis=0) for loop in chains]) - start
-    offset = at[:, None] - start
+    offset = point_array[:, None] - start
     fraction = xp.clip((offset * sides).sum(axis=-1) / (sides**2).sum(axis=-1), 0, 1)
     on_sides = start + fraction[..., None] * sides  # (p, s, 2)
-    closest = xp.argmin(((at[:, None] - on_sides) ** 2).sum(axis=-1), axis=1)
-    place = xp.take_along_axis(on_sides, closest[:, None, None], axis=1)[:, 0]
-    inside = enclosed(at, chains) if xp is np else jax.lax.stop_gradient(contains(chains, at))
-    return at, inside, place
+    closest_side = xp.argmin(((point_array[:, None] - on_sides) ** 2).sum(axis=-1), axis=1)
+    nearest_points = xp.take_along_axis(on_sides, closest_side[:, None, None], axis=1)[:, 0]
+    is_inside = enclosed(point_array, chains) if xp is np else jax.lax.stop_gradient(contains(chains, point_array))
+    return point_array, is_inside, nearest_points
 
 
 def _side_lengths(loop: Loop) -> Float[Array, " k"]:

@@ -40,9 +40,9 @@ def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
     if tag is not None:
         check_name("tag", tag, mesh.tags)
         facets = facets[np.asarray(mesh.tags[tag])]
-    used, cells = np.unique(facets, return_inverse=True)
+    used_nodes, cells = np.unique(facets, return_inverse=True)
     with size_checked():
-        return Mesh.create(np.asarray(mesh.points)[used], cells.reshape(facets.shape))
+        return Mesh.create(np.asarray(mesh.points)[used_nodes], cells.reshape(facets.shape))
 
 
 # Minimum cosine of the angle between the mean normal at a node and those of its triangles: below it, the node lies on a
@@ -72,52 +72,57 @@ def node_normals(mesh: Mesh) -> np.ndarray:
     ```
     """
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
-    facing = np.asarray(normals(mesh))
+    cell_normals = np.asarray(normals(mesh))
     if not mesh.is_surface:
-        return np.broadcast_to(facing[:1], (mesh.num_points, 3)).copy()
+        return np.broadcast_to(cell_normals[:1], (mesh.num_points, 3)).copy()
     corners = points[cells]
-    before, after = np.roll(corners, 1, axis=1) - corners, np.roll(corners, -1, axis=1) - corners
-    lengths = np.linalg.norm(before, axis=2) * np.linalg.norm(after, axis=2)
-    angle = np.arccos(np.clip((before * after).sum(axis=2) / lengths, -1, 1))
-    mean = np.zeros_like(points)
-    np.add.at(mean, cells, angle[..., None] * facing[:, None])
-    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
-    least = np.ones(len(points))
-    np.minimum.at(least, cells, (mean[cells] * facing[:, None]).sum(axis=2))
-    slope, determined = _fit_slopes(points, cells, mean)
-    smooth = (least > _MIN_CREASE_COSINE) & determined
-    fitted = mean - np.where(smooth[:, None], slope, 0)
-    return fitted / np.linalg.norm(fitted, axis=1, keepdims=True)
+    previous_edges, next_edges = np.roll(corners, 1, axis=1) - corners, np.roll(corners, -1, axis=1) - corners
+    lengths = np.linalg.norm(previous_edges, axis=2) * np.linalg.norm(next_edges, axis=2)
+    angle = np.arccos(np.clip((previous_edges * next_edges).sum(axis=2) / lengths, -1, 1))
+    mean_normals = np.zeros_like(points)
+    np.add.at(mean_normals, cells, angle[..., None] * cell_normals[:, None])
+    mean_normals /= np.linalg.norm(mean_normals, axis=1, keepdims=True)
+    min_cosine = np.ones(len(points))
+    np.minimum.at(min_cosine, cells, (mean_normals[cells] * cell_normals[:, None]).sum(axis=2))
+    slopes, is_determined = _fit_slopes(points, cells, mean_normals)
+    is_smooth = (min_cosine > _MIN_CREASE_COSINE) & is_determined
+    fitted_normals = mean_normals - np.where(is_smooth[:, None], slopes, 0)
+    return fitted_normals / np.linalg.norm(fitted_normals, axis=1, keepdims=True)
 
 
 def _fit_slopes(points: np.ndarray, cells: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit a quadratic surface to the first and second neighbours of each node, as a height above the plane
     perpendicular to `normal`. Returns its slopes (n, 3) at the nodes, and whether the neighbours determine it."""
-    count = len(points)
+    num_nodes = len(points)
     pairs = np.concatenate([cells[:, [a, b]] for a in range(3) for b in range(3)])
-    near = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)).tocsr()
-    within_two = coo_array(near @ near)
-    one, other = within_two.row, within_two.col
-    apart = one != other
-    one, other = one[apart], other[apart]
-    helper = np.eye(3)[np.abs(normal).argmin(axis=1)]
-    across = np.cross(normal, helper)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    axes = np.stack([across, np.cross(normal, across), normal], axis=1)  # (n, 3, 3)
-    offset = np.einsum("pij,pj->pi", axes[one], points[other] - points[one])
-    scale = np.sqrt(np.bincount(one, (offset**2).sum(axis=1), count) / np.bincount(one, minlength=count))
-    u, v, height = (offset / scale[one][:, None]).T
+    adjacency = coo_array((np.ones(len(pairs)), pairs.T), shape=(num_nodes, num_nodes)).tocsr()
+    two_ring = coo_array(adjacency @ adjacency)
+    centre_node, neighbour = two_ring.row, two_ring.col
+    is_distinct = centre_node != neighbour
+    centre_node, neighbour = centre_node[is_distinct], neighbour[is_distinct]
+    auxiliary_axis = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    first_axis = np.cross(normal, auxiliary_axis)
+    first_axis /= np.linalg.norm(first_axis, axis=1, keepdims=True)
+    axes = np.stack([first_axis, np.cross(normal, first_axis), normal], axis=1)  # (n, 3, 3)
+    offset = np.einsum("pij,pj->pi", axes[centre_node], points[neighbour] - points[centre_node])
+    scale = np.sqrt(
+        np.bincount(centre_node, (offset**2).sum(axis=1), num_nodes) / np.bincount(centre_node, minlength=num_nodes)
+    )
+    u, v, height = (offset / scale[centre_node][:, None]).T
     terms = np.stack([u, v, u * u / 2, u * v, v * v / 2], axis=1)
-    matrix, right = np.zeros((count, _NUM_COEFFICIENTS, _NUM_COEFFICIENTS)), np.zeros((count, _NUM_COEFFICIENTS))
+    matrix, right_side = (
+        np.zeros((num_nodes, _NUM_COEFFICIENTS, _NUM_COEFFICIENTS)),
+        np.zeros((num_nodes, _NUM_COEFFICIENTS)),
+    )
     for k in range(_NUM_COEFFICIENTS):
-        right[:, k] = np.bincount(one, terms[:, k] * height, count)
+        right_side[:, k] = np.bincount(centre_node, terms[:, k] * height, num_nodes)
         for j in range(_NUM_COEFFICIENTS):
-            matrix[:, k, j] = np.bincount(one, terms[:, k] * terms[:, j], count)
-    values = np.linalg.eigvalsh(matrix)
-    determined = values[:, 0] > _MIN_EIGENVALUE_RATIO * values[:, -1]
-    matrix[~determined] = np.eye(_NUM_COEFFICIENTS)
-    found = np.linalg.solve(matrix, right[..., None])[:, :2, 0]
-    return np.einsum("ni,nij->nj", found, axes[:, :2]), determined
+            matrix[:, k, j] = np.bincount(centre_node, terms[:, k] * terms[:, j], num_nodes)
+    eigenvalues = np.linalg.eigvalsh(matrix)
+    is_determined = eigenvalues[:, 0] > _MIN_EIGENVALUE_RATIO * eigenvalues[:, -1]
+    matrix[~is_determined] = np.eye(_NUM_COEFFICIENTS)
+    slopes = np.linalg.solve(matrix, right_side[..., None])[:, :2, 0]
+    return np.einsum("ni,nij->nj", slopes, axes[:, :2]), is_determined
 
 
 # Distance from a fold to a node, divided by the distance between folds, below which the fold is moved onto the node, to
@@ -161,31 +166,34 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
         raise ValueError(f"radius: expected a length in metres that is not zero, got {describe(radius)}.")
     if num_folds is not None and (isinstance(num_folds, bool) or not isinstance(num_folds, int) or num_folds < 1):
         raise ValueError(f"num_folds: expected a whole number of at least 1, got {describe(num_folds)}.")
-    across = 0 if axis == "y" else 1
+    bent_axis = 0 if axis == "y" else 1
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
-    folds = _fold_positions(points[:, across], points[cells], across, num_folds)
+    folds = _fold_positions(points[:, bent_axis], points[cells], bent_axis, num_folds)
     edges = {name: np.asarray(mesh.facets)[np.asarray(index)] for name, index in mesh.tags.items()}
     for line in folds[1:-1]:
-        points, cells, edges = _cut_cells(points, cells, edges, points[:, across] - line)
-    out, up = _roll_coordinates(points[:, across], folds, float(radius))
-    columns = [out, points[:, 1], up] if across == 0 else [points[:, 0], out, up]
+        points, cells, edges = _cut_cells(points, cells, edges, points[:, bent_axis] - line)
+    horizontal, vertical = _roll_coordinates(points[:, bent_axis], folds, float(radius))
+    columns = [horizontal, points[:, 1], vertical] if bent_axis == 0 else [points[:, 0], horizontal, vertical]
     return Mesh.create(np.stack(columns, axis=1), cells, tags=edges)
 
 
-def _fold_positions(places: np.ndarray, corners: np.ndarray, across: int, num_folds: int | None) -> np.ndarray:
+def _fold_positions(positions: np.ndarray, corners: np.ndarray, bent_axis: int, num_folds: int | None) -> np.ndarray:
     """Coordinates in metres, across the sheet, of the lines along which it is bent, its two borders included."""
-    width = np.ptp(places)
-    ordered = np.sort(places)
+    width = np.ptp(positions)
+    ordered = np.sort(positions)
     rows = ordered[np.concatenate([[True], np.diff(ordered) > _LINE_TOLERANCE * width])]
-    own = corners[..., across]
-    low, high = (np.searchsorted(rows, side - _LINE_TOLERANCE * width) for side in (own.min(axis=1), own.max(axis=1)))
-    if num_folds is None and (high - low <= 1).all():
+    coordinates = corners[..., bent_axis]
+    first_row, last_row = (
+        np.searchsorted(rows, side - _LINE_TOLERANCE * width)
+        for side in (coordinates.min(axis=1), coordinates.max(axis=1))
+    )
+    if num_folds is None and (last_row - first_row <= 1).all():
         return rows
-    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
-    lines = np.linspace(rows[0], rows[-1], 1 + (num_folds or max(1, round(width / edge))))
+    mean_edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
+    lines = np.linspace(rows[0], rows[-1], 1 + (num_folds or max(1, round(width / mean_edge))))
     nearest = ordered[np.abs(ordered - lines[:, None]).argmin(axis=1)]
-    near = np.abs(nearest - lines) < _FOLD_SNAP_DISTANCE * (lines[1] - lines[0])
-    return np.where(near, nearest, lines)
+    is_near = np.abs(nearest - lines) < _FOLD_SNAP_DISTANCE * (lines[1] - lines[0])
+    return np.where(is_near, nearest, lines)
 
 
 def _cut_cells(
@@ -194,62 +202,66 @@ def _cut_cells(
     """Cut cells and named edges along a line; `height` (n,) are the signed distances of the nodes from it."""
     side = np.where(np.abs(height) <= _LINE_TOLERANCE * np.ptp(height), 0, np.sign(height)).astype(int)
     sides = side[cells]
-    crossed = (sides.min(axis=1) < 0) & (sides.max(axis=1) > 0)
-    if not crossed.any():
+    is_crossed = (sides.min(axis=1) < 0) & (sides.max(axis=1) > 0)
+    if not is_crossed.any():
         return points, cells, edges
-    pairs = np.sort(cells[crossed][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    pairs = np.sort(cells[is_crossed][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     pairs = np.unique(pairs[side[pairs].prod(axis=1) < 0], axis=0)
-    share = (height[pairs[:, 0]] / (height[pairs[:, 0]] - height[pairs[:, 1]]))[:, None]
+    fraction = (height[pairs[:, 0]] / (height[pairs[:, 0]] - height[pairs[:, 1]]))[:, None]
     middles = {(a, b): len(points) + k for k, (a, b) in enumerate(map(tuple, pairs.tolist()))}
-    points = np.concatenate([points, (1 - share) * points[pairs[:, 0]] + share * points[pairs[:, 1]]])
+    points = np.concatenate([points, (1 - fraction) * points[pairs[:, 0]] + fraction * points[pairs[:, 1]]])
 
     def middle(a: int, b: int) -> int:
         return middles[min(a, b), max(a, b)]
 
-    pieces = []
-    for corners in cells[crossed].tolist():
+    new_cells = []
+    for corners in cells[is_crossed].tolist():
         signs = side[corners].tolist()
         if 0 in signs:
             k = signs.index(0)
             a, b, c = corners[k:] + corners[:k]
-            d = middle(b, c)
-            pieces += [(a, b, d), (a, d, c)]
+            first_new = middle(b, c)
+            new_cells += [(a, b, first_new), (a, first_new, c)]
         else:
             k = signs.index(-sum(signs))
             a, b, c = corners[k:] + corners[:k]
-            d, e = middle(a, b), middle(a, c)
-            pieces.append((a, d, e))
-            shorter = np.linalg.norm(points[d] - points[c]) < np.linalg.norm(points[b] - points[e])
-            pieces += [(d, b, c), (d, c, e)] if shorter else [(d, b, e), (b, c, e)]
-    named = {}
+            first_new, second_new = middle(a, b), middle(a, c)
+            new_cells.append((a, first_new, second_new))
+            shorter = np.linalg.norm(points[first_new] - points[c]) < np.linalg.norm(points[b] - points[second_new])
+            new_cells += (
+                [(first_new, b, c), (first_new, c, second_new)]
+                if shorter
+                else [(first_new, b, second_new), (b, c, second_new)]
+            )
+    named_edges = {}
     for name, ends in edges.items():
-        through = side[ends].prod(axis=1) < 0
-        halves = [[(a, middle(a, b)), (middle(a, b), b)] for a, b in ends[through].tolist()]
-        named[name] = np.concatenate([ends[~through], np.array(halves, int).reshape(-1, 2)])
-    return points, np.concatenate([cells[~crossed], np.array(pieces)]), named
+        is_crossed_edge = side[ends].prod(axis=1) < 0
+        halves = [[(a, middle(a, b)), (middle(a, b), b)] for a, b in ends[is_crossed_edge].tolist()]
+        named_edges[name] = np.concatenate([ends[~is_crossed_edge], np.array(halves, int).reshape(-1, 2)])
+    return points, np.concatenate([cells[~is_crossed], np.array(new_cells)]), named_edges
 
 
-def _roll_coordinates(places: np.ndarray, folds: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+def _roll_coordinates(positions: np.ndarray, folds: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
     """Horizontal and vertical coordinates of positions (n,) on the sheet after bending. The `folds` lie on a circle;
     the middle of the sheet stays at 0."""
     middle = (folds[0] + folds[-1]) / 2
     if np.isinf(radius):
-        return places - middle, np.zeros_like(places)
-    strips = np.diff(folds)
+        return positions - middle, np.zeros_like(positions)
+    strip_widths = np.diff(folds)
     size = abs(radius)
-    too_wide = strips.max() > 2 * size
-    turned = 2 * np.arcsin(np.minimum(strips / (2 * size), 1))
-    if too_wide or turned.sum() >= 2 * np.pi:
+    too_wide = strip_widths.max() > 2 * size
+    fold_angles = 2 * np.arcsin(np.minimum(strip_widths / (2 * size), 1))
+    if too_wide or fold_angles.sum() >= 2 * np.pi:
         width = folds[-1] - folds[0]
         raise ValueError(
             f"radius: a sheet {width:.4g} m wide would overlap itself on a cylinder of radius {size:.4g} m. It needs "
             f"more than {width / (2 * np.pi):.4g} m, and finer cells where these are large; a closed sleeve is a "
             "jeit.mesh.tube."
         )
-    angle = np.concatenate([[0.0], np.cumsum(turned)])
+    angle = np.concatenate([[0.0], np.cumsum(fold_angles)])
     angle -= np.interp(middle, folds, angle)
-    out, up = size * np.sin(angle), size * (np.cos(angle) - 1) * np.sign(radius)
-    return np.interp(places, folds, out), np.interp(places, folds, up)
+    horizontal, vertical = size * np.sin(angle), size * (np.cos(angle) - 1) * np.sign(radius)
+    return np.interp(positions, folds, horizontal), np.interp(positions, folds, vertical)
 
 
 _SHELL_TAGS = ("inner", "outer", "side")
@@ -295,76 +307,80 @@ def shell(
     thickness = check_length("thickness", thickness)
     num_layers = unstructured.check_count("num_layers", num_layers, 1)
     points, cells, facets = (np.asarray(array) for array in (surface.points, surface.cells, surface.facets))
-    count = len(points)
-    unstructured.check_total(count * (num_layers + 1), "num_layers")
-    away = node_normals(surface) if normals is None else _check_normals(normals, count)
-    away = away if outward else -away
-    solid = stacked_cells(cells, count, num_layers)
+    num_nodes = len(points)
+    unstructured.check_total(num_nodes * (num_layers + 1), "num_layers")
+    directions = node_normals(surface) if normals is None else _check_normals(normals, num_nodes)
+    directions = directions if outward else -directions
+    solid = stacked_cells(cells, num_nodes, num_layers)
     # Sorting the corners inverted some prisms, and the second of the three tetrahedra has the opposite orientation.
-    upright = np.where(odd_permutation(cells) ^ (not outward), -1.0, 1.0)
-    turned = np.tile(np.outer(upright, (1, -1, 1)).ravel(), num_layers)
+    orientation = np.where(odd_permutation(cells) ^ (not outward), -1.0, 1.0)
+    tetrahedron_signs = np.tile(np.outer(orientation, (1, -1, 1)).ravel(), num_layers)
 
-    def stacked(height: float) -> np.ndarray:
-        return np.concatenate([points + k * height / num_layers * away for k in range(num_layers + 1)])
+    def layer_points(height: float) -> np.ndarray:
+        return np.concatenate([points + k * height / num_layers * directions for k in range(num_layers + 1)])
 
-    _check_upright(stacked, solid, turned, thickness, len(cells))
-    tags: dict[str, ArrayLike] = {"inner": cells, "outer": cells + num_layers * count}
+    _check_upright(layer_points, solid, tetrahedron_signs, thickness, len(cells))
+    tags: dict[str, ArrayLike] = {"inner": cells, "outer": cells + num_layers * num_nodes}
     if not outward:
         tags = {"outer": tags["inner"], "inner": tags["outer"]}
     if len(facets):
-        tags["side"] = stacked_wall(facets, count, num_layers)
+        tags["side"] = stacked_wall(facets, num_nodes, num_layers)
     for name, index in surface.tags.items():
         if name in _SHELL_TAGS:
             raise ValueError(f"surface: its tag {name!r} is taken in a shell. Rename it.")
-        tags[name] = stacked_wall(facets[np.asarray(index)], count, num_layers)
-    mesh = Mesh.create(stacked(thickness), solid, tags=tags)
+        tags[name] = stacked_wall(facets[np.asarray(index)], num_nodes, num_layers)
+    mesh = Mesh.create(layer_points(thickness), solid, tags=tags)
     _check_apart(mesh, thickness)
     return mesh
 
 
-def _check_normals(normals: ArrayLike, count: int) -> np.ndarray:
-    away = np.asarray(normals, dtype=float)
-    if away.shape != (count, 3) or not np.allclose(np.linalg.norm(away, axis=1), 1, atol=1e-6):
-        raise ValueError(f"normals: expected unit vectors at the nodes, shape ({count}, 3), got shape {away.shape}.")
-    return away
+def _check_normals(normals: ArrayLike, num_nodes: int) -> np.ndarray:
+    directions = np.asarray(normals, dtype=float)
+    if directions.shape != (num_nodes, 3) or not np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-6):
+        raise ValueError(
+            f"normals: expected unit vectors at the nodes, shape ({num_nodes}, 3), got shape {directions.shape}."
+        )
+    return directions
 
 
-def _volumes(points: np.ndarray, solid: np.ndarray, turned: np.ndarray) -> np.ndarray:
+def _volumes(points: np.ndarray, solid: np.ndarray, tetrahedron_signs: np.ndarray) -> np.ndarray:
     edges = points[solid[:, 1:]] - points[solid[:, :1]]
-    return turned * np.linalg.det(edges) / 6
+    return tetrahedron_signs * np.linalg.det(edges) / 6
 
 
-def _check_upright(stacked, solid: np.ndarray, turned: np.ndarray, thickness: float, count: int) -> None:
-    volume = _volumes(stacked(thickness), solid, turned)
+def _check_upright(
+    layer_points, solid: np.ndarray, tetrahedron_signs: np.ndarray, thickness: float, num_triangles: int
+) -> None:
+    volume = _volumes(layer_points(thickness), solid, tetrahedron_signs)
     if volume.min() > 0:
         return
-    if thickness > (size := float(np.ptp(stacked(0.0), axis=0).max())):
+    if thickness > (size := float(np.ptp(layer_points(0.0), axis=0).max())):
         raise ValueError(
             f"thickness: {thickness:.4g} m is more than the surface is large, {size:.4g} m. Are both in metres? If the "
             f"thickness is millimetres, give {1e-3 * thickness:.4g}; if the surface came from a file of another unit, "
             "read it with that: jeit.mesh.read(..., scale=1e-3) for millimetres, 0.0254 for inches, 1 for metres."
         )
-    low, high = 0.0, thickness
+    lower, upper = 0.0, thickness
     for _ in range(_BISECTION_STEPS):
-        middle = (low + high) / 2
-        upright = _volumes(stacked(middle), solid, turned).min() > 0
-        low, high = (middle, high) if upright else (low, middle)
-    worst = int(np.argmin(_volumes(stacked(high), solid, turned)))
-    triangle = worst // 3 % count
-    place = stacked(0.0)[solid[worst, 0]].round(6).tolist()
-    most = (1 - 5e-4) * low  # does not exceed `low` after rounding to four digits
+        middle = (lower + upper) / 2
+        is_upright = _volumes(layer_points(middle), solid, tetrahedron_signs).min() > 0
+        lower, upper = (middle, upper) if is_upright else (lower, middle)
+    worst_tetrahedron = int(np.argmin(_volumes(layer_points(upper), solid, tetrahedron_signs)))
+    triangle = worst_tetrahedron // 3 % num_triangles
+    position = layer_points(0.0)[solid[worst_tetrahedron, 0]].round(6).tolist()
+    max_thickness = (1 - 5e-4) * lower  # does not exceed `lower` after rounding to four digits
     raise ValueError(
         f"thickness: {thickness:.4g} m is more than the radius of curvature of the surface at triangle {triangle}, "
-        f"near {place} m: the skin turns inside out there. It can be {most:.4g} m thick at most; or let it grow to the "
-        "other side, or smooth the surface."
+        f"near {position} m: the skin turns inside out there. It can be {max_thickness:.4g} m thick at most; or let it "
+        "grow to the other side, or smooth the surface."
     )
 
 
 def _check_apart(mesh: Mesh, thickness: float) -> None:
     points, boundary = np.asarray(mesh.points), np.asarray(mesh.facets)
     if (pair := first_crossing(points, boundary)) is not None:
-        place = points[boundary[pair[0]]].mean(axis=0).round(6).tolist()
+        position = points[boundary[pair[0]]].mean(axis=0).round(6).tolist()
         raise ValueError(
-            f"thickness: a skin {thickness:.4g} m thick grows into itself near {place} m, where parts of the surface "
-            "lie closer together than that. Make it thinner."
+            f"thickness: a skin {thickness:.4g} m thick grows into itself near {position} m, where parts of the "
+            "surface lie closer together than that. Make it thinner."
         )

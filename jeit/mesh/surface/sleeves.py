@@ -51,8 +51,8 @@ def tube(
     ```
     """
     radius, height = check_length("radius", radius), check_length("height", height)
-    around, rows = _node_counts(2 * np.pi * radius, height, num_points, cell_size, num_around)
-    return _sleeve_mesh(height, np.full((rows + 1, 2), radius), around)
+    num_per_ring, rows = _node_counts(2 * np.pi * radius, height, num_points, cell_size, num_around)
+    return _sleeve_mesh(height, np.full((rows + 1, 2), radius), num_per_ring)
 
 
 def forearm(
@@ -87,19 +87,19 @@ def forearm(
     ends = np.stack([_semi_axes("wrist", wrist), _semi_axes("elbow", elbow)])
     girth = float(np.mean([_arc_lengths(*end)[-1] for end in ends]))
     slant = float(np.hypot(length, np.abs(ends[1] - ends[0]).mean()))
-    around, rows = _node_counts(girth, slant, num_points, cell_size, num_around)
+    num_per_ring, rows = _node_counts(girth, slant, num_points, cell_size, num_around)
     share = np.linspace(0, 1, rows + 1)[:, None]
-    return _sleeve_mesh(length, (1 - share) * ends[0] + share * ends[1], around)
+    return _sleeve_mesh(length, (1 - share) * ends[0] + share * ends[1], num_per_ring)
 
 
-def _semi_axes(name: str, given: float | Sequence[float]) -> np.ndarray:
+def _semi_axes(name: str, radii: float | Sequence[float]) -> np.ndarray:
     try:
-        half = np.asarray(given, dtype=float)
+        semi_axes = np.asarray(radii, dtype=float)
     except (TypeError, ValueError):
-        half = np.zeros(3)
-    if half.shape not in ((), (2,)):
+        semi_axes = np.zeros(3)
+    if semi_axes.shape not in ((), (2,)):
         raise ValueError(f"{name}: give a radius in metres, or two, along x and along y.")
-    return np.array([check_length(name, float(value)) for value in np.broadcast_to(half, 2)])
+    return np.array([check_length(name, float(value)) for value in np.broadcast_to(semi_axes, 2)])
 
 
 def _node_counts(
@@ -109,22 +109,22 @@ def _node_counts(
     if num_around is not None:
         if num_points is not None or cell_size is not None:
             raise ValueError("num_around: give it, num_points or cell_size, not two of them.")
-        around = unstructured.check_count("num_around", num_around, _MIN_AROUND)
-        return around, max(1, round(height / (_ROW_HEIGHT * girth / around)))
+        num_per_ring = unstructured.check_count("num_around", num_around, _MIN_AROUND)
+        return num_per_ring, max(1, round(height / (_ROW_HEIGHT * girth / num_per_ring)))
     target = unstructured.Target.create(num_points, cell_size)
     if target.cell_size is None:
         # n = (g / h) (H / (0.87 h) + 1)
-        number = target.num_points
-        edge = np.sqrt(girth * height / (_ROW_HEIGHT * number))
+        num_nodes = target.num_points
+        edge = np.sqrt(girth * height / (_ROW_HEIGHT * num_nodes))
         for _ in range(30):
-            edge = np.sqrt(girth * (height / _ROW_HEIGHT + edge) / number)
+            edge = np.sqrt(girth * (height / _ROW_HEIGHT + edge) / num_nodes)
         rows = max(1, round(height / (_ROW_HEIGHT * edge)))
-        around = max(_MIN_AROUND, round(number / (rows + 1)))
+        num_per_ring = max(_MIN_AROUND, round(num_nodes / (rows + 1)))
     else:
-        around = max(_MIN_AROUND, round(girth / target.cell_size))
-        rows = max(1, round(height / (_ROW_HEIGHT * girth / around)))
-    unstructured.check_total(around * (rows + 1), "num_points" if target.cell_size is None else "cell_size")
-    return around, rows
+        num_per_ring = max(_MIN_AROUND, round(girth / target.cell_size))
+        rows = max(1, round(height / (_ROW_HEIGHT * girth / num_per_ring)))
+    unstructured.check_total(num_per_ring * (rows + 1), "num_points" if target.cell_size is None else "cell_size")
+    return num_per_ring, rows
 
 
 def _arc_lengths(a: float, b: float) -> np.ndarray:
@@ -134,34 +134,34 @@ def _arc_lengths(a: float, b: float) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
 
 
-def _sleeve_mesh(height: float, halves: np.ndarray, around: int) -> Mesh:
-    """Mesh a sleeve from rows of nodes on ellipses with semi-axes `halves` (r + 1, 2), evenly spaced along each."""
+def _sleeve_mesh(height: float, semi_axes: np.ndarray, num_per_ring: int) -> Mesh:
+    """Mesh a sleeve from rows of nodes on ellipses with `semi_axes` (r + 1, 2), evenly spaced along each."""
     rings = []
-    for row, (a, b) in enumerate(halves):
-        turn = (np.arange(around) + row % 2 / 2) / around
-        angle = 2 * np.pi * turn
+    for row, (a, b) in enumerate(semi_axes):
+        turns = (np.arange(num_per_ring) + row % 2 / 2) / num_per_ring
+        angle = 2 * np.pi * turns
         if a != b:
             length = _arc_lengths(a, b)
-            angle = np.interp(turn * length[-1], length, np.linspace(0, 2 * np.pi, _ELLIPSE_SAMPLES + 1))
-        rings.append(np.stack([a * np.cos(angle), b * np.sin(angle), np.full(around, height * row)], axis=1))
+            angle = np.interp(turns * length[-1], length, np.linspace(0, 2 * np.pi, _ELLIPSE_SAMPLES + 1))
+        rings.append(np.stack([a * np.cos(angle), b * np.sin(angle), np.full(num_per_ring, height * row)], axis=1))
     points = np.concatenate(rings)
-    points[:, 2] /= len(halves) - 1
-    numbers = np.arange(len(points)).reshape(len(halves), around)
-    cells = [_triangles_between_rings(low, high, row % 2) for row, (low, high) in enumerate(pairwise(numbers))]
+    points[:, 2] /= len(semi_axes) - 1
+    node_index = np.arange(len(points)).reshape(len(semi_axes), num_per_ring)
+    cells = [_triangles_between_rings(low, high, row % 2) for row, (low, high) in enumerate(pairwise(node_index))]
 
     def loop(ring: np.ndarray) -> np.ndarray:
         return np.stack([ring, np.roll(ring, -1)], axis=1)
 
-    return Mesh.create(points, np.concatenate(cells), tags={"bottom": loop(numbers[0]), "top": loop(numbers[-1])})
+    return Mesh.create(points, np.concatenate(cells), tags={"bottom": loop(node_index[0]), "top": loop(node_index[-1])})
 
 
-def _triangles_between_rings(low: np.ndarray, high: np.ndarray, ahead: int) -> np.ndarray:
-    """Triangles between two rings with equal numbers of nodes, offset by half the node spacing; `ahead`: whether the
-    lower ring is ahead."""
-    after_low, after_high = np.roll(low, -1), np.roll(high, -1)
-    if ahead:
-        return np.concatenate([np.stack([low, after_low, after_high], 1), np.stack([low, after_high, high], 1)])
-    return np.concatenate([np.stack([low, after_low, high], 1), np.stack([after_low, after_high, high], 1)])
+def _triangles_between_rings(low: np.ndarray, high: np.ndarray, lower_is_ahead: int) -> np.ndarray:
+    """Triangles between two rings with equal numbers of nodes, offset by half the node spacing; `lower_is_ahead`:
+    whether the lower ring is ahead."""
+    next_low, next_high = np.roll(low, -1), np.roll(high, -1)
+    if lower_is_ahead:
+        return np.concatenate([np.stack([low, next_low, next_high], 1), np.stack([low, next_high, high], 1)])
+    return np.concatenate([np.stack([low, next_low, high], 1), np.stack([next_low, next_high, high], 1)])
 
 
 def sphere(radius: float, *, num_points: int | None = None, cell_size: float | None = None) -> Mesh:
@@ -186,27 +186,27 @@ def sphere(radius: float, *, num_points: int | None = None, cell_size: float | N
     radius = check_length("radius", radius)
     target = unstructured.Target.create(num_points, cell_size)
     if target.cell_size is None:
-        parts = max(1, round(np.sqrt((target.num_points - 2) / 10)))
+        num_divisions = max(1, round(np.sqrt((target.num_points - 2) / 10)))
     else:
         # The area of the sphere is divided into 20 k² triangles of area (√3 / 4) h².
-        parts = max(1, round(np.sqrt(4 * np.pi / 20 / (np.sqrt(3) / 4)) * radius / target.cell_size))
-    unstructured.check_total(10 * parts**2 + 2, "cell_size")
+        num_divisions = max(1, round(np.sqrt(4 * np.pi / 20 / (np.sqrt(3) / 4)) * radius / target.cell_size))
+    unstructured.check_total(10 * num_divisions**2 + 2, "cell_size")
     corners = _icosahedron()
     faces = corners[ConvexHull(corners).simplices]
-    i, j = np.meshgrid(np.arange(parts + 1), np.arange(parts + 1), indexing="ij")
-    inside = i + j <= parts
-    share = np.stack([parts - i - j, i, j], axis=-1)[inside] / parts
-    number = np.full(inside.shape, -1)
-    number[inside] = np.arange(inside.sum())
-    up = np.stack([number[:-1, :-1], number[1:, :-1], number[:-1, 1:]], axis=-1)
-    down = np.stack([number[1:, 1:], number[:-1, 1:], number[1:, :-1]], axis=-1)
-    own = np.concatenate([up.reshape(-1, 3), down.reshape(-1, 3)])
-    own = own[(own >= 0).all(axis=1)]
-    points = np.concatenate([share @ face for face in faces])
-    cells = np.concatenate([own + k * len(share) for k in range(len(faces))])
+    i, j = np.meshgrid(np.arange(num_divisions + 1), np.arange(num_divisions + 1), indexing="ij")
+    is_inside = i + j <= num_divisions
+    weights = np.stack([num_divisions - i - j, i, j], axis=-1)[is_inside] / num_divisions
+    node_index = np.full(is_inside.shape, -1)
+    node_index[is_inside] = np.arange(is_inside.sum())
+    upward_triangles = np.stack([node_index[:-1, :-1], node_index[1:, :-1], node_index[:-1, 1:]], axis=-1)
+    downward_triangles = np.stack([node_index[1:, 1:], node_index[:-1, 1:], node_index[1:, :-1]], axis=-1)
+    face_cells = np.concatenate([upward_triangles.reshape(-1, 3), downward_triangles.reshape(-1, 3)])
+    face_cells = face_cells[(face_cells >= 0).all(axis=1)]
+    points = np.concatenate([weights @ face for face in faces])
+    cells = np.concatenate([face_cells + k * len(weights) for k in range(len(faces))])
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     # Nodes on the edges of the icosahedron were created once for each of the two faces.
-    points, cells = merge_points(points, cells, 1e-6 / parts)
+    points, cells = merge_points(points, cells, 1e-6 / num_divisions)
     return Mesh.create(radius * points, _orient_outward(points, cells))
 
 
@@ -246,15 +246,15 @@ def cap(
     flat = disk(radius * float(angle), num_points=num_points, cell_size=cell_size, refine=refine)
     x, y = np.asarray(flat.points).T
     distance = np.hypot(x, y)
-    across = np.sinc(distance / radius / np.pi)  # sin(d / R) / (d / R)
-    points = np.stack([x * across, y * across, radius * np.cos(distance / radius)], axis=1)
+    radial_factor = np.sinc(distance / radius / np.pi)  # sin(d / R) / (d / R)
+    points = np.stack([x * radial_factor, y * radial_factor, radius * np.cos(distance / radius)], axis=1)
     return Mesh.create(points, flat.cells, tags={"edge": np.arange(flat.num_facets)})
 
 
 def _orient_outward(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Orient triangles (m, 3) so that they face away from the origin."""
-    facing = np.linalg.det(points[cells]) > 0
-    return np.where(facing[:, None], cells, cells[:, [0, 2, 1]])
+    is_outward = np.linalg.det(points[cells]) > 0
+    return np.where(is_outward[:, None], cells, cells[:, [0, 2, 1]])
 
 
 def _icosahedron() -> np.ndarray:

@@ -51,10 +51,10 @@ def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
     bodies are dashed. Beside each stands the 68 % interval of its change of conductivity, if it is known."""
     ax = axes_or_new(ax)
     for sign, _, style, name in _STYLES:
-        for number, one in enumerate(one for one in stars if one.sign == sign):
-            closed = np.concatenate([one.outline, one.outline[:1]])
+        for number, star in enumerate(star for star in stars if star.sign == sign):
+            closed = np.concatenate([star.outline, star.outline[:1]])
             ax.plot(*closed.T, color=INK, linewidth=1.4, linestyle=style, label=None if number else name)
-    _label_intervals(ax, [one for one in stars if one.quantities is not None])
+    _label_intervals(ax, [star for star in stars if star.quantities is not None])
     return ax
 
 
@@ -62,21 +62,26 @@ def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
     """Write the interval of each body on the side of its outline that faces the middle of the axes, where no electrodes
     are; on the other side if another label is there."""
     (x_min, y_min), (x_max, y_max) = ax.dataLim.get_points()
-    near, taken = 0.3 * np.array([x_max - x_min, 0.2 * (y_max - y_min)]), []
-    for one in stars:
-        sides = (1, -1) if one.centroid[1] < (y_min + y_max) / 2 else (-1, 1)
-        places = [(one.centroid[0], side * (side * one.outline[:, 1]).max()) for side in sides]
-        free = [all((np.abs(np.subtract(place, other)) > near).any() for other in taken) for place in places]
-        which = free.index(True) if any(free) else 0
-        taken.append(places[which])
-        assert one.quantities is not None
+    min_distances, used_positions = 0.3 * np.array([x_max - x_min, 0.2 * (y_max - y_min)]), []
+    for star in stars:
+        sides = (1, -1) if star.centroid[1] < (y_min + y_max) / 2 else (-1, 1)
+        positions = [(star.centroid[0], side * (side * star.outline[:, 1]).max()) for side in sides]
+        is_free = [
+            all(
+                (np.abs(np.subtract(position, used_position)) > min_distances).any() for used_position in used_positions
+            )
+            for position in positions
+        ]
+        position_index = is_free.index(True) if any(is_free) else 0
+        used_positions.append(positions[position_index])
+        assert star.quantities is not None
         ax.annotate(
-            interval_text(one.quantities.change_interval, signed_percent),
-            places[which],
-            xytext=(0, 3 * sides[which]),
+            interval_text(star.quantities.change_interval, signed_percent),
+            positions[position_index],
+            xytext=(0, 3 * sides[position_index]),
             textcoords="offset points",
             ha="center",
-            va="bottom" if sides[which] > 0 else "top",
+            va="bottom" if sides[position_index] > 0 else "top",
             fontsize=8,
             color=INK,
             zorder=4,
@@ -183,31 +188,31 @@ _MIN_FREE_DISTANCE = 1.6
 
 
 def draw_numbers(
-    ax: Axes, mesh: Mesh, places: Float[np.ndarray, "L 2"], beside: Bool[np.ndarray, " L"], first: int
+    ax: Axes, mesh: Mesh, positions: Float[np.ndarray, "L 2"], beside: Bool[np.ndarray, " L"], first: int
 ) -> None:
-    """Draw the numbers of electrodes at `places`, beginning with `first`: on the electrode, or `beside` it.
+    """Draw the numbers of electrodes at `positions`, beginning with `first`: on the electrode, or `beside` it.
 
     Beside means, for an electrode on the edge of a sheet, outside along the normal, or inside if a notch is too narrow;
     for an electrode within a sheet, above it; and for a solid seen from above, away from the middle. Electrodes above
     each other share one text.
     """
     corners = np.asarray(mesh.points)[:, :2]
-    away = _NUMBER_DISTANCE * np.ptp(corners, axis=0).max()
+    number_distance = _NUMBER_DISTANCE * np.ptp(corners, axis=0).max()
     if mesh.dimension == 2:
-        shift, inside = _away_from_edge(mesh, places, away)
+        shifts, is_inside = _shifts_from_edge(mesh, positions, number_distance)
     else:
-        shift, inside = _away_from_middle(corners, places, away), np.zeros(len(places), bool)
-    shift[~beside] = 0
-    fontsize = 9 if len(places) <= 20 else 7
-    rim = [withStroke(linewidth=2, foreground="white")]
-    for one in at_one_place(places, 0.1 * away):
-        k = one[0]
-        effects = rim if inside[k] or not beside[k] else None  # a white rim where the text is on the image
+        shifts, is_inside = _shifts_from_centre(corners, positions, number_distance), np.zeros(len(positions), bool)
+    shifts[~beside] = 0
+    fontsize = 9 if len(positions) <= 20 else 7
+    white_rim = [withStroke(linewidth=2, foreground="white")]
+    for group in group_coincident(positions, 0.1 * number_distance):
+        k = group[0]
+        effects = white_rim if is_inside[k] or not beside[k] else None  # a white rim where the text is on the image
         style = {"ha": "center", "va": "center", "fontsize": fontsize, "color": INK, "zorder": 4}
-        text = ", ".join(str(k + first) for k in one)
-        if len(one) > 1:
-            style["ha"] = _alignment(shift[k])
-        x, y = places[k] + (1.0 if style["ha"] == "center" else _ALIGNED_FACTOR) * shift[k]
+        text = ", ".join(str(k + first) for k in group)
+        if len(group) > 1:
+            style["ha"] = _alignment(shifts[k])
+        x, y = positions[k] + (1.0 if style["ha"] == "center" else _ALIGNED_FACTOR) * shifts[k]
         ax.text(x, y, text, path_effects=effects, **style)
 
 
@@ -219,63 +224,72 @@ def _alignment(shift: Float[np.ndarray, " 2"]) -> str:
     return "left" if shift[0] > 0 else "right"
 
 
-def at_one_place(places: Float[np.ndarray, "L 2"], tolerance: float) -> list[list[int]]:
+def group_coincident(positions: Float[np.ndarray, "L 2"], tolerance: float) -> list[list[int]]:
     """Group electrodes within a distance `tolerance` of each other, such as those of several rings of a tank seen from
     above."""
-    together: list[list[int]] = []
-    for k, place in enumerate(places):
-        for one in together:
-            if np.linalg.norm(places[one[0]] - place) < tolerance:
-                one.append(k)
+    groups: list[list[int]] = []
+    for k, position in enumerate(positions):
+        for group in groups:
+            if np.linalg.norm(positions[group[0]] - position) < tolerance:
+                group.append(k)
                 break
         else:
-            together.append([k])
-    return together
+            groups.append([k])
+    return groups
 
 
-def _away_from_edge(mesh: Mesh, places, away: float) -> tuple[Float[np.ndarray, "L 2"], Bool[np.ndarray, " L"]]:
+def _shifts_from_edge(
+    mesh: Mesh, positions, number_distance: float
+) -> tuple[Float[np.ndarray, "L 2"], Bool[np.ndarray, " L"]]:
     """Shifts (L, 2) of numbers from their electrodes on a sheet, and whether each number is inside the sheet."""
     start, end = np.asarray(mesh.points)[np.asarray(mesh.facets)].swapaxes(0, 1)
-    shift, inside = np.tile([0.0, 0.7 * away], (len(places), 1)), np.ones(len(places), bool)
-    for k, place in enumerate(places):
-        distance = _distances(place, start, end)
-        if distance.min() > _EDGE_TOLERANCE / _NUMBER_DISTANCE * away:
+    shifts, is_inside = np.tile([0.0, 0.7 * number_distance], (len(positions), 1)), np.ones(len(positions), bool)
+    for k, position in enumerate(positions):
+        distance = _distances(position, start, end)
+        if distance.min() > _EDGE_TOLERANCE / _NUMBER_DISTANCE * number_distance:
             continue
         # At a corner two edges are nearest, and the number is placed along the bisector.
-        nearest = distance <= distance.min() + 1e-6 * away
-        outward = _normals(start[nearest], end[nearest]).sum(axis=0)
-        outward /= max(np.linalg.norm(outward), 1e-12)
-        inside[k] = _is_free(place, outward, start, end, 0.01 * away) < _MIN_FREE_DISTANCE * away
-        shift[k] = (-away if inside[k] else away) * outward
-    return shift, inside
+        nearest = distance <= distance.min() + 1e-6 * number_distance
+        outward_normal = _normals(start[nearest], end[nearest]).sum(axis=0)
+        outward_normal /= max(np.linalg.norm(outward_normal), 1e-12)
+        is_inside[k] = (
+            _free_distance(position, outward_normal, start, end, 0.01 * number_distance)
+            < _MIN_FREE_DISTANCE * number_distance
+        )
+        shifts[k] = (-number_distance if is_inside[k] else number_distance) * outward_normal
+    return shifts, is_inside
 
 
-def _away_from_middle(corners, places, away: float) -> Float[np.ndarray, "L 2"]:
+def _shifts_from_centre(corners, positions, number_distance: float) -> Float[np.ndarray, "L 2"]:
     """Shifts (L, 2) of numbers away from the middle of a body; zero for electrodes near the middle."""
-    offset = places - (corners.min(axis=0) + corners.max(axis=0)) / 2
+    offset = positions - (corners.min(axis=0) + corners.max(axis=0)) / 2
     distance = np.linalg.norm(offset, axis=1, keepdims=True)
-    reach = distance > 0.3 * np.ptp(corners, axis=0).max()
-    return np.where(reach, away * offset / np.maximum(distance, 1e-12), 0)
+    is_outer = distance > 0.3 * np.ptp(corners, axis=0).max()
+    return np.where(is_outer, number_distance * offset / np.maximum(distance, 1e-12), 0)
 
 
 def _normals(start, end) -> Float[np.ndarray, "b 2"]:
     """Outward unit normals of edges that have the body on their left."""
-    along = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
-    return np.stack([along[:, 1], -along[:, 0]], axis=1)
+    directions = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
+    return np.stack([directions[:, 1], -directions[:, 0]], axis=1)
 
 
-def _distances(place, start, end) -> Float[np.ndarray, " b"]:
-    """Distance of a place from every edge."""
-    along = end - start
-    fraction = np.clip(np.sum((place - start) * along, axis=1) / np.sum(along**2, axis=1), 0, 1)
-    return np.linalg.norm(start + fraction[:, None] * along - place, axis=1)
+def _distances(position, start, end) -> Float[np.ndarray, " b"]:
+    """Distance of a position from every edge."""
+    sides = end - start
+    fraction = np.clip(np.sum((position - start) * sides, axis=1) / np.sum(sides**2, axis=1), 0, 1)
+    return np.linalg.norm(start + fraction[:, None] * sides - position, axis=1)
 
 
-def _is_free(position, direction, start, end, min_distance: float) -> float:
-    """Distance from a place along a unit direction to the first edge that is farther away than `min_distance`."""
-    along, offset = end - start, start - position
-    across = direction[0] * along[:, 1] - direction[1] * along[:, 0]
+def _free_distance(position, direction, start, end, min_distance: float) -> float:
+    """Distance from a position along a unit direction to the first edge that is farther away than `min_distance`."""
+    sides, offset = end - start, start - position
+    cross_products = direction[0] * sides[:, 1] - direction[1] * sides[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):  # edges parallel to the direction give infinity or NaN
-        far = (offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]) / across
-        where = (offset[:, 0] * direction[1] - offset[:, 1] * direction[0]) / across
-    return float(np.min(far[(far > min_distance) & (where >= 0) & (where <= 1)], initial=np.inf))
+        ray_distance = (offset[:, 0] * sides[:, 1] - offset[:, 1] * sides[:, 0]) / cross_products
+        side_fraction = (offset[:, 0] * direction[1] - offset[:, 1] * direction[0]) / cross_products
+    return float(
+        np.min(
+            ray_distance[(ray_distance > min_distance) & (side_fraction >= 0) & (side_fraction <= 1)], initial=np.inf
+        )
+    )

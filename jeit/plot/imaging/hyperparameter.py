@@ -58,9 +58,9 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
     plot_choice(compare_rules(model, 1.0, difference=change, noise=1e-6))
     ```
     """
-    several = list(choices.values()) if isinstance(choices, Mapping) else [choices]
-    for one in several:
-        check_kind("choices", one, Choice, "a Choice, or several, {name: choice}, as of compare_rules")
+    all_choices = list(choices.values()) if isinstance(choices, Mapping) else [choices]
+    for item in all_choices:
+        check_kind("choices", item, Choice, "a Choice, or several, {name: choice}, as of compare_rules")
     if isinstance(choices, Choice):
         if choices.criterion.size == 0:
             raise ValueError("choices: a hyperparameter that was given has no curve; draw one that a rule chose.")
@@ -73,27 +73,33 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
             ax.set_title(title or _choice_title(choices), color=_rule_colour(choices), fontsize=11, loc="left")
             ax.set_xlabel("Hyperparameter λ")
         return ax
-    rules = [choice for choice in several if choice.criterion.size]
+    rules = [choice for choice in all_choices if choice.criterion.size]
     if not rules:
         raise ValueError("choices: there is no choice of a rule among them, so there is no curve to draw.")
     ax = axes_or_new(ax, (9.6, 5.4))
     ax.set_axis_off()
     ax.set_title(title or "", loc="left")
     with_data = [choice for choice in rules if choice.residual.size]
-    left = 0.0
+    left_edge = 0.0
     if with_data:
-        left = 0.54
+        left_edge = 0.54
         # Every choice has the whole curve; the one with the most candidates has the finest.
-        longest = max(with_data, key=lambda choice: choice.candidates.size)
-        _draw_l_curve(ax.inset_axes((0, 0, 0.46, 1)), longest, several)
+        most_detailed = max(with_data, key=lambda choice: choice.candidates.size)
+        _draw_l_curve(ax.inset_axes((0, 0, 0.46, 1)), most_detailed, all_choices)
     height = 1 / len(rules)
     panel = None
     for row, choice in enumerate(rules):
-        place = (left, 1 - (row + 1) * height, 1 - left, (0.62 if len(rules) > 1 else 0.95) * height)
-        panel = ax.inset_axes(place, sharex=panel)
-        for other in several:
-            panel.axvline(float(other.hyperparameter), color=_rule_colour(other), linewidth=0.6, alpha=0.45, zorder=0)
-        _draw_criterion(panel, choice, small=len(rules) > 1)
+        panel_bounds = (left_edge, 1 - (row + 1) * height, 1 - left_edge, (0.62 if len(rules) > 1 else 0.95) * height)
+        panel = ax.inset_axes(panel_bounds, sharex=panel)
+        for other_choice in all_choices:
+            panel.axvline(
+                float(other_choice.hyperparameter),
+                color=_rule_colour(other_choice),
+                linewidth=0.6,
+                alpha=0.45,
+                zorder=0,
+            )
+        _draw_criterion(panel, choice, is_small=len(rules) > 1)
         panel.tick_params(labelbottom=row == len(rules) - 1)
     if panel is not None:
         panel.set_xlabel("Hyperparameter λ")
@@ -106,38 +112,38 @@ def _draw_l_curve(ax: Axes, curve: Choice, choices: list[Choice]) -> None:
     ax.loglog(residual, penalty, color=SOFT, linewidth=1.8, zorder=1)
     exponents = np.arange(np.ceil(np.log10(values[0])), np.floor(np.log10(values[-1])) + 1, dtype=int)
     extent = np.log10([residual.max() / residual.min(), penalty.max() / penalty.min()])
-    named = np.full((1, 2), np.inf)
+    labelled_positions = np.full((1, 2), np.inf)
     for exponent in exponents[::-1]:
-        place = curve.read(residual, 10.0**exponent), curve.read(penalty, 10.0**exponent)
-        where = np.log10(place) / extent
-        if np.linalg.norm(named - where, axis=1).min() < _MIN_LABEL_DISTANCE:
+        point = curve.read(residual, 10.0**exponent), curve.read(penalty, 10.0**exponent)
+        relative_position = np.log10(point) / extent
+        if np.linalg.norm(labelled_positions - relative_position, axis=1).min() < _MIN_LABEL_DISTANCE:
             continue
-        named = np.vstack([named, where])
+        labelled_positions = np.vstack([labelled_positions, relative_position])
         name = "λ = " if exponent == exponents[-1] else ""
         label = {"textcoords": "offset points", "ha": "right", "va": "top", "color": SOFT, "fontsize": 7.5}
-        ax.plot(*place, "o", color=SOFT, markersize=3, zorder=1)
-        ax.annotate(f"{name}$10^{{{exponent}}}$", place, (-4, -3), **label)
-    ordered = sorted(choices, key=lambda choice: float(choice.hyperparameter))
-    for number, choice in enumerate(ordered):
-        place = curve.read(residual, choice.hyperparameter), curve.read(penalty, choice.hyperparameter)
+        ax.plot(*point, "o", color=SOFT, markersize=3, zorder=1)
+        ax.annotate(f"{name}$10^{{{exponent}}}$", point, (-4, -3), **label)
+    sorted_choices = sorted(choices, key=lambda choice: float(choice.hyperparameter))
+    for rank, choice in enumerate(sorted_choices):
+        point = curve.read(residual, choice.hyperparameter), curve.read(penalty, choice.hyperparameter)
         ax.annotate(
             _choice_title(choice),
-            place,
-            (0.36, 0.97 - 0.065 * number),
+            point,
+            (0.36, 0.97 - 0.065 * rank),
             textcoords="axes fraction",
             color=_rule_colour(choice),
             va="center",
             fontsize=9,
             arrowprops={"arrowstyle": "-", "color": _rule_colour(choice), "linewidth": 0.7, "relpos": (0, 0.5)},
         )
-        ax.plot(*place, zorder=3, **_marker_style(choice, 8))
+        ax.plot(*point, zorder=3, **_marker_style(choice, 8))
     ax.margins(0.09, 0.05)
     ax.set_xlabel("Residual ‖w (v − Jx)‖ (standard deviations)")
     ax.set_ylabel("Penalty √(xᵀQx)")
     _style_axes(ax)
 
 
-def _draw_criterion(ax: Axes, choice: Choice, *, small: bool = False) -> None:
+def _draw_criterion(ax: Axes, choice: Choice, *, is_small: bool = False) -> None:
     label, scale, aim = _CRITERIA.get(choice.rule, ("criterion", "linear", ""))
     value = float(choice.hyperparameter)
     ax.set_xscale("log")
@@ -145,15 +151,17 @@ def _draw_criterion(ax: Axes, choice: Choice, *, small: bool = False) -> None:
     ax.plot(np.asarray(choice.candidates), np.asarray(choice.criterion), color=_rule_colour(choice), linewidth=1.6)
     if choice.target is not None:
         ax.axhline(choice.target, color=INK, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
-    ax.plot(value, choice.read(choice.criterion), clip_on=False, zorder=3, **_marker_style(choice, 6 if small else 8))
+    ax.plot(
+        value, choice.read(choice.criterion), clip_on=False, zorder=3, **_marker_style(choice, 6 if is_small else 8)
+    )
     text = f"{label}, {aim}" if aim else label
-    if small:
+    if is_small:
         ax.set_title(f"{choice.rule}: {text}", fontsize=8.5, loc="left", pad=3, color=_rule_colour(choice))
         ax.tick_params(labelsize=7.5)
     else:
         ax.axvline(value, color=_rule_colour(choice), linewidth=0.6, alpha=0.45, zorder=0)
         ax.set_ylabel(text[0].upper() + text[1:])
-    _style_axes(ax, ticks=3 if small else 6)
+    _style_axes(ax, ticks=3 if is_small else 6)
 
 
 def _marker_style(choice: Choice, size: float) -> dict:
@@ -174,14 +182,14 @@ def _rule_colour(choice: Choice) -> str:
 
 def _style_axes(ax: Axes, ticks: int = 6) -> None:
     soften_axes(ax)
-    for axis, number in ((ax.xaxis, 8), (ax.yaxis, ticks)):
+    for axis, max_ticks in ((ax.xaxis, 8), (ax.yaxis, ticks)):
         if axis.get_scale() == "log":
-            axis.set_major_locator(LogLocator(numticks=number))
+            axis.set_major_locator(LogLocator(numticks=max_ticks))
             axis.set_minor_formatter(NullFormatter())
-            if number < 6:
+            if max_ticks < 6:
                 axis.set_minor_locator(NullLocator())
         else:
-            axis.set_major_locator(MaxNLocator(number))
+            axis.set_major_locator(MaxNLocator(max_ticks))
 
 
 # For each figure of merit: field, title, unit on the axis, factor to that unit, and value for a perfect image, or None.
@@ -231,20 +239,20 @@ def plot_figures_of_merit(
     ax = axes_or_new(ax, (10.6, 5.6))
     ax.set_axis_off()
     ax.set_title(title or "")
-    reach = max(1e3 * float(np.max(merit.body_radius)) for merit in figures.values())
-    for number, (field, heading, unit, factor, perfect) in enumerate(_PANELS):
-        column, row = number % 3, number // 3
+    max_radius = max(1e3 * float(np.max(merit.body_radius)) for merit in figures.values())
+    for panel_index, (field, heading, unit, factor, perfect_value) in enumerate(_PANELS):
+        column, row = panel_index % 3, panel_index // 3
         panel = ax.inset_axes((0.36 * column, 0.55 * (1 - row), 0.28, 0.43))
-        if perfect is not None:
-            panel.axhline(factor * perfect, color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), zorder=1)
+        if perfect_value is not None:
+            panel.axhline(factor * perfect_value, color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), zorder=1)
         for merit, colour, marker in zip(figures.values(), SERIES_COLOURS, SERIES_MARKERS, strict=False):
             distance, value = 1e3 * np.asarray(merit.distance), factor * np.asarray(getattr(merit, field))
-            shown = np.isfinite(value)
-            place, mean = _binned_means(distance[shown], value[shown], 1e-3 * reach)
-            panel.plot(place, mean, color=colour, linewidth=1.6, zorder=3)
-            panel.plot(distance[shown], value[shown], marker, color=colour, markersize=3.2, zorder=3)
-        _style_panel(panel, heading, unit, reach)
-        if number >= 2:  # the lowest plot of its column
+            is_finite = np.isfinite(value)
+            mean_distances, mean_values = _binned_means(distance[is_finite], value[is_finite], 1e-3 * max_radius)
+            panel.plot(mean_distances, mean_values, color=colour, linewidth=1.6, zorder=3)
+            panel.plot(distance[is_finite], value[is_finite], marker, color=colour, markersize=3.2, zorder=3)
+        _style_panel(panel, heading, unit, max_radius)
+        if panel_index >= 2:  # the lowest plot of its column
             panel.set_xlabel("Target's distance from the centre (mm)", fontsize=9, color=INK)
     styles = zip(figures, SERIES_COLOURS, SERIES_MARKERS, strict=False)
     lines = [Line2D([], [], color=colour, marker=marker, markersize=5, label=name) for name, colour, marker in styles]
@@ -263,8 +271,8 @@ def _style_panel(panel: Axes, heading: str, unit: str, max_distance: float) -> N
     panel.set_title(heading, loc="left", fontsize=11, color=INK)
     panel.set_ylabel(unit, fontsize=9, color=INK)
     panel.set_xlim(0, max_distance)
-    low, high = panel.get_ylim()
-    panel.set_ylim(min(low, 0), high)  # from zero, so that small variations look small
+    lower_limit, upper_limit = panel.get_ylim()
+    panel.set_ylim(min(lower_limit, 0), upper_limit)  # from zero, so that small variations look small
     soften_axes(panel)
     panel.tick_params(length=3, labelsize=9)
     draw_horizontal_grid(panel)

@@ -89,10 +89,10 @@ def draw_slice_outline(
 ) -> None:
     """Draw the edge of a slice through a solid, given by `pixels` that are NaN outside it; `extent` in metres."""
     # Pad by one pixel, so that the edge is closed where it touches the border of the picture.
-    shown = np.pad(np.isfinite(pixels).astype(float), 1)
+    is_inside = np.pad(np.isfinite(pixels).astype(float), 1)
     width, height = (extent[1] - extent[0]) / pixels.shape[1], (extent[3] - extent[2]) / pixels.shape[0]
-    wider = (extent[0] - width, extent[1] + width, extent[2] - height, extent[3] + height)
-    ax.contour(shown, [0.5], extent=wider, origin="upper", colors=INK, linewidths=0.9, zorder=2)
+    padded_extent = (extent[0] - width, extent[1] + width, extent[2] - height, extent[3] + height)
+    ax.contour(is_inside, [0.5], extent=padded_extent, origin="upper", colors=INK, linewidths=0.9, zorder=2)
 
 
 def slice_text(mesh: Mesh, height: float | None = None, subject: str = "slice") -> str:
@@ -150,25 +150,27 @@ def plot_image(
         raise ValueError("values are complex; draw their real or imaginary part.")
     ax = axes_or_new(ax)
     if mesh.dimension == 3:
-        per_cell = image if image.shape == (mesh.num_cells,) else image[np.asarray(mesh.cells)].mean(axis=1)
+        cell_image = image if image.shape == (mesh.num_cells,) else image[np.asarray(mesh.cells)].mean(axis=1)
         raster = Raster.create(mesh, height=height)
-        pixels, extent = np.asarray(raster.sample(jnp.asarray(per_cell))), raster.extent
+        pixels, extent = np.asarray(raster.sample(jnp.asarray(cell_image))), raster.extent
         if not np.isfinite(pixels).any():
             raise ValueError(f"height: there is no mesh at z = {height} m to cut through.")
-        colours = scale.of(pixels[np.isfinite(pixels)], "S/m")
-        drawn = ax.imshow(colours.factor * pixels, extent=extent, interpolation="nearest", **colours.keywords)
+        fitted_scale = scale.of(pixels[np.isfinite(pixels)], "S/m")
+        mappable = ax.imshow(
+            fitted_scale.factor * pixels, extent=extent, interpolation="nearest", **fitted_scale.keywords
+        )
         draw_slice_outline(pixels, extent, ax)
     else:
         points = np.asarray(mesh.points)
         extent = extent_of(points)
         triangles = Triangulation(points[:, 0], points[:, 1], np.asarray(mesh.cells))
-        colours = scale.of(image, "S")
+        fitted_scale = scale.of(image, "S")
         # Edges in the colour of their cell prevent gaps between cells, through which the background would be visible.
-        flat = {"shading": "flat", "edgecolors": "face", "linewidth": 0.5}
-        style = flat if image.shape == (mesh.num_cells,) else {"shading": "gouraud"}
-        drawn = ax.tripcolor(triangles, colours.factor * image, **style, **colours.keywords)
+        flat_style = {"shading": "flat", "edgecolors": "face", "linewidth": 0.5}
+        style = flat_style if image.shape == (mesh.num_cells,) else {"shading": "gouraud"}
+        mappable = ax.tripcolor(triangles, fitted_scale.factor * image, **style, **fitted_scale.keywords)
     _finish_axes(ax, mesh, electrodes, inclusions, extent, title)
-    colours.draw_bar(ax, drawn)
+    fitted_scale.draw_bar(ax, mappable)
     return ax
 
 
@@ -193,16 +195,16 @@ def plot_raster(
     if mesh is not None:
         check_body(mesh, electrodes)
     pixels = np.asarray(raster)
-    shown = pixels[np.isfinite(pixels)]
-    if pixels.ndim != 2 or shown.size == 0:
+    finite_values = pixels[np.isfinite(pixels)]
+    if pixels.ndim != 2 or finite_values.size == 0:
         raise ValueError(f"raster has shape {pixels.shape}; give (rows, columns) with at least one finite value.")
     if electrodes is not None and mesh is None:
         raise ValueError("electrodes are drawn along the boundary of a mesh: give mesh, the one the raster is of.")
-    colours = scale.of(shown, "S")
+    fitted_scale = scale.of(finite_values, "S")
     ax = axes_or_new(ax)
-    drawn = ax.imshow(colours.factor * pixels, extent=extent, interpolation="nearest", **colours.keywords)
+    mappable = ax.imshow(fitted_scale.factor * pixels, extent=extent, interpolation="nearest", **fitted_scale.keywords)
     _finish_axes(ax, mesh, electrodes, inclusions, extent, title)
-    colours.draw_bar(ax, drawn)
+    fitted_scale.draw_bar(ax, mappable)
     return ax
 
 
@@ -259,14 +261,14 @@ def plot_admittivity(
     first, second = (
         plot_image(
             mesh,
-            part,
+            component,
             electrodes,
             scale=ColourScale(difference=difference, quantity=name[0].upper() + name[1:], limit=limit),
             title=title,
             ax=ax,
             **options,
         )
-        for ax, part, name, limit, title in zip(
+        for ax, component, name, limit, title in zip(
             figure.subplots(1, 2), (image.real, image.imag), names, limits, titles, strict=True
         )
     )

@@ -35,7 +35,7 @@ from jeit.plot.imaging.image import check_body, draw_outline, draw_slice_outline
 from jeit_solvers.engines import as_array
 
 # Number of pixels along a side of an image, and colour of a body without an image.
-_PIXELS, _GREY = 160, "#dfe2e6"
+_NUM_PIXELS, _BODY_COLOUR = 160, "#dfe2e6"
 SHEET_FRAMES = 12
 """Default of the maximum number of frames of a contact sheet."""
 SERIES_FRAMES, _FRAMES_PER_ROW = 12, 6
@@ -53,9 +53,9 @@ class FrameCount(NamedTuple):
     names: Sequence[str]
 
 
-def chosen_frames(num_frames: int, max_frames: int) -> list[int]:
+def select_frames(num_frames: int, max_frames: int) -> list[int]:
     """Numbers of at most `max_frames` evenly spaced frames out of `num_frames`, including the first and the last."""
-    return [int(one) for one in np.unique(np.linspace(0, num_frames - 1, min(num_frames, max_frames)).round())]
+    return [int(frame) for frame in np.unique(np.linspace(0, num_frames - 1, min(num_frames, max_frames)).round())]
 
 
 class FramePicture:
@@ -77,11 +77,11 @@ class FramePicture:
         height: float | None = None,
     ):
         self.ax, self.fitted = ax, fitted
-        self.raster = Raster.create(mesh, shape=(_PIXELS, _PIXELS), height=height)
-        extent, inside = self.raster.extent, np.asarray(self.raster.cell) >= 0
-        body = np.where(inside, 0.0, np.nan)
-        ax.imshow(body, extent=extent, cmap=ListedColormap([_GREY]), interpolation="nearest", zorder=0)
-        self.drawn = ax.imshow(body, extent=extent, interpolation="nearest", zorder=1, **fitted.keywords)
+        self.raster = Raster.create(mesh, shape=(_NUM_PIXELS, _NUM_PIXELS), height=height)
+        extent, is_inside = self.raster.extent, np.asarray(self.raster.cell) >= 0
+        body = np.where(is_inside, 0.0, np.nan)
+        ax.imshow(body, extent=extent, cmap=ListedColormap([_BODY_COLOUR]), interpolation="nearest", zorder=0)
+        self.mappable = ax.imshow(body, extent=extent, interpolation="nearest", zorder=1, **fitted.keywords)
         if mesh.dimension == 2:
             draw_outline(mesh, ax)
         else:
@@ -91,17 +91,17 @@ class FramePicture:
         hide_axes(ax, extent, numbered=number and electrodes is not None)
         if bar:
             draw_scale_bar(ax, extent)
-        middle = (extent[0] + extent[1]) / 2, (extent[2] + extent[3]) / 2
+        centre = (extent[0] + extent[1]) / 2, (extent[2] + extent[3]) / 2
         style = {"ha": "center", "va": "center", "color": INK, "fontsize": 10, "zorder": 5}
-        self.refused = ax.text(*middle, "refused", **style)  # pyright: ignore[reportArgumentType]
+        self.refused = ax.text(*centre, "refused", **style)  # pyright: ignore[reportArgumentType]
 
     def show(self, change: Float[np.ndarray, " m"], title: str) -> None:
         """Show a frame. `change`: change of conductivity per cell (m,), NaN for a refused frame."""
-        imaged = bool(np.isfinite(change).all())
-        if imaged:
-            self.drawn.set_data(self.fitted.factor * np.asarray(self.raster.sample(as_array(change))))
-        self.drawn.set_visible(imaged)
-        self.refused.set_visible(not imaged)
+        has_image = bool(np.isfinite(change).all())
+        if has_image:
+            self.mappable.set_data(self.fitted.factor * np.asarray(self.raster.sample(as_array(change))))
+        self.mappable.set_visible(has_image)
+        self.refused.set_visible(not has_image)
         self.ax.set_title(title, fontsize=10)
 
 
@@ -148,38 +148,40 @@ def plot_frames(
     values = np.asarray(changes)
     if values.ndim != 2 or values.shape[1] != mesh.num_cells or not len(values):
         raise ValueError(f"changes has shape {values.shape}; give (frames, {mesh.num_cells}), one value for each cell.")
-    said = [f"frame {number}" for number in range(len(values))] if titles is None else list(titles)
-    if len(said) != len(values):
-        raise ValueError(f"titles are {len(said)}, and the frames {len(values)}; give one each.")
-    fitted, chosen = fit_scale(values, mesh, scale), chosen_frames(len(values), most)
-    columns = min(len(chosen), 4)
-    rows = -(-len(chosen) // columns)
+    frame_titles = [f"frame {number}" for number in range(len(values))] if titles is None else list(titles)
+    if len(frame_titles) != len(values):
+        raise ValueError(f"titles are {len(frame_titles)}, and the frames {len(values)}; give one each.")
+    fitted_scale, selected = fit_scale(values, mesh, scale), select_frames(len(values), most)
+    columns = min(len(selected), 4)
+    rows = -(-len(selected) // columns)
     figure = Figure(figsize=(2.3 * columns + 1.1, 2.5 * rows + 0.3), layout="constrained")
-    places = figure.add_gridspec(rows, columns + 1, width_ratios=[1] * columns + [0.05])
+    grid = figure.add_gridspec(rows, columns + 1, width_ratios=[1] * columns + [0.05])
     pictures = []
-    for place, frame in enumerate(chosen):
-        ax = figure.add_subplot(places[place // columns, place % columns])
-        pictures.append(FramePicture(ax, mesh, electrodes, fitted, number=False, bar=place == 0))
-        pictures[-1].show(values[frame], said[frame])
+    for panel_index, frame in enumerate(selected):
+        ax = figure.add_subplot(grid[panel_index // columns, panel_index % columns])
+        pictures.append(FramePicture(ax, mesh, electrodes, fitted_scale, number=False, bar=panel_index == 0))
+        pictures[-1].show(values[frame], frame_titles[frame])
     if scale.bar:
-        where = figure.add_subplot(places[:, -1])
-        draw_colour_bar(where, pictures[0].drawn, fitted.label, signed=scale.difference, position=where)
+        colour_bar_axes = figure.add_subplot(grid[:, -1])
+        draw_colour_bar(
+            colour_bar_axes, pictures[0].mappable, fitted_scale.label, signed=scale.difference, position=colour_bar_axes
+        )
     if count is None:
-        refused = [title for title, row in zip(said, values, strict=True) if not np.isfinite(row).all()]
+        refused = [title for title, row in zip(frame_titles, values, strict=True) if not np.isfinite(row).all()]
         count = FrameCount(len(values), len(refused), refused)
-    text = _count_text(count, len(chosen), mesh)
+    text = _count_text(count, len(selected), mesh)
     if text:
         figure.supxlabel(text, fontsize=9, color=SOFT)
     return figure
 
 
-def _count_text(count: FrameCount, chosen: int, mesh: Mesh) -> str:
+def _count_text(count: FrameCount, num_drawn: int, mesh: Mesh) -> str:
     """Text on the number of frames drawn and on refused frames."""
-    parts = [] if chosen == count.number else [f"{chosen} of {count.number} frames"]
+    sentences = [] if num_drawn == count.number else [f"{num_drawn} of {count.number} frames"]
     if count.refused:
-        some = ", ".join(count.names[:_MAX_NAMED]) + (" …" if count.refused > _MAX_NAMED else "")
-        parts.append(f"{count.refused} of {count.number} refused: {some}")
-    return "; ".join([*parts, *filter(None, [slice_text(mesh, subject="slices")])])
+        names = ", ".join(count.names[:_MAX_NAMED]) + (" …" if count.refused > _MAX_NAMED else "")
+        sentences.append(f"{count.refused} of {count.number} refused: {names}")
+    return "; ".join([*sentences, *filter(None, [slice_text(mesh, subject="slices")])])
 
 
 # Minimum amplitude for the phase to be drawn: as a share of the maximum amplitude, and as a multiple of its noise.
@@ -204,50 +206,58 @@ def plot_series(
     booleans by name. `height`: z in metres of the slice through a 3-D mesh; default: half the height.
     """
     check_body(series.mesh, electrodes)
-    rows = len(oscillations)
-    lines = -(-min(len(series.times), SERIES_FRAMES) // _FRAMES_PER_ROW)
-    figure = Figure(figsize=(11.0, 2.2 * lines + 3.4 * rows + 3.4), layout="constrained")
-    parts: Any = figure.subfigures(2, 1, height_ratios=[2.2 * lines, 3.4 * rows + 3.4])
-    sheet, others = parts
-    _draw_frames(sheet, series, electrodes, lines, height)
-    grid = others.add_gridspec(rows + 1, 3, height_ratios=[1.0] * (rows + 1))
+    num_rows = len(oscillations)
+    num_lines = -(-min(len(series.times), SERIES_FRAMES) // _FRAMES_PER_ROW)
+    figure = Figure(figsize=(11.0, 2.2 * num_lines + 3.4 * num_rows + 3.4), layout="constrained")
+    subfigures: Any = figure.subfigures(2, 1, height_ratios=[2.2 * num_lines, 3.4 * num_rows + 3.4])
+    frames_figure, maps_figure = subfigures
+    _draw_frames(frames_figure, series, electrodes, num_lines, height)
+    grid = maps_figure.add_gridspec(num_rows + 1, 3, height_ratios=[1.0] * (num_rows + 1))
     maps = _RegionMaps(series, electrodes, height)
-    functional = ", ".join(filter(None, ["functional image", slice_text(series.mesh, height)]))
-    deviation = ColourScale(difference=False, quantity="Standard deviation over time")
-    maps.draw(others.add_subplot(grid[0, 0]), series.functional(), deviation, functional)
-    for row, one in enumerate(oscillations):
-        amplitude = ColourScale(difference=False, quantity=f"Amplitude at {one.frequency:.3g} Hz")
-        said = f"{one.frequency:.4g} Hz (resolution {one.resolution:.2g} Hz)"
-        maps.draw(others.add_subplot(grid[row, 1]), one.amplitude, amplitude, said)
-        clear = (one.amplitude > _MIN_PHASE_SHARE * one.amplitude.max()) & (one.amplitude > _MIN_PHASE_SNR * one.noise)
-        maps.draw_phase(others.add_subplot(grid[row, 2]), np.where(clear, np.degrees(one.phase), np.nan))
+    functional_title = ", ".join(filter(None, ["functional image", slice_text(series.mesh, height)]))
+    deviation_scale = ColourScale(difference=False, quantity="Standard deviation over time")
+    maps.draw(maps_figure.add_subplot(grid[0, 0]), series.functional(), deviation_scale, functional_title)
+    for row, oscillation in enumerate(oscillations):
+        amplitude_scale = ColourScale(difference=False, quantity=f"Amplitude at {oscillation.frequency:.3g} Hz")
+        title = f"{oscillation.frequency:.4g} Hz (resolution {oscillation.resolution:.2g} Hz)"
+        maps.draw(maps_figure.add_subplot(grid[row, 1]), oscillation.amplitude, amplitude_scale, title)
+        has_phase = (oscillation.amplitude > _MIN_PHASE_SHARE * oscillation.amplitude.max()) & (
+            oscillation.amplitude > _MIN_PHASE_SNR * oscillation.noise
+        )
+        maps.draw_phase(
+            maps_figure.add_subplot(grid[row, 2]), np.where(has_phase, np.degrees(oscillation.phase), np.nan)
+        )
     means = {name: series.mean_change(region) for name, region in regions.items()}
-    largest = max((float(np.nanmax(np.abs(one))) for one in means.values()), default=0.0)
+    largest = max((float(np.nanmax(np.abs(mean))) for mean in means.values()), default=0.0)
     factor, unit = with_si_prefix(largest or 1.0, series.unit)
     spectra = {name: _spectrum(factor * mean, series.times) for name, mean in means.items()} if series.timed else {}
-    drawn = {name: one for name, one in spectra.items() if one is not None}
+    drawn_spectra = {name: spectrum for name, spectrum in spectra.items() if spectrum is not None}
     # Without oscillations, curves stand beside the functional image.
-    below = (grid[rows, :] if rows else grid[0, 1:]).subgridspec(1, 2, width_ratios=[1.6, 1.0])
-    place = below[0] if drawn else below[:]
-    _draw_curves(others.add_subplot(place), means, series, factor, unit)
-    if drawn:
-        _draw_spectra(others.add_subplot(below[1]), drawn, oscillations, unit)
+    curves_grid = (grid[num_rows, :] if num_rows else grid[0, 1:]).subgridspec(1, 2, width_ratios=[1.6, 1.0])
+    curves_position = curves_grid[0] if drawn_spectra else curves_grid[:]
+    _draw_curves(maps_figure.add_subplot(curves_position), means, series, factor, unit)
+    if drawn_spectra:
+        _draw_spectra(maps_figure.add_subplot(curves_grid[1]), drawn_spectra, oscillations, unit)
     return figure
 
 
 def _draw_frames(
-    figure, series: ImageSeries, electrodes: AbstractElectrodes | None, lines: int, height: float | None
+    figure, series: ImageSeries, electrodes: AbstractElectrodes | None, num_lines: int, height: float | None
 ) -> None:
-    """Draw evenly spaced frames in so many lines, on one colour scale."""
-    chosen, fitted = chosen_frames(len(series.times), SERIES_FRAMES), fit_scale(series.changes, series.mesh)
-    places = figure.add_gridspec(lines, _FRAMES_PER_ROW + 1, width_ratios=[1] * _FRAMES_PER_ROW + [0.05])
-    for place, frame in enumerate(chosen):
-        ax = figure.add_subplot(places[place // _FRAMES_PER_ROW, place % _FRAMES_PER_ROW])
-        picture = FramePicture(ax, series.mesh, electrodes, fitted, number=False, bar=place == 0, height=height)
+    """Draw evenly spaced frames in `num_lines` lines, on one colour scale."""
+    selected, fitted_scale = select_frames(len(series.times), SERIES_FRAMES), fit_scale(series.changes, series.mesh)
+    grid = figure.add_gridspec(num_lines, _FRAMES_PER_ROW + 1, width_ratios=[1] * _FRAMES_PER_ROW + [0.05])
+    for panel_index, frame in enumerate(selected):
+        ax = figure.add_subplot(grid[panel_index // _FRAMES_PER_ROW, panel_index % _FRAMES_PER_ROW])
+        picture = FramePicture(
+            ax, series.mesh, electrodes, fitted_scale, number=False, bar=panel_index == 0, height=height
+        )
         picture.show(series.changes[frame], series.titles[frame])
-        if place == 0:
-            where = figure.add_subplot(places[:, -1])
-            draw_colour_bar(where, picture.drawn, fitted.label, signed=True, position=where)
+        if panel_index == 0:
+            colour_bar_axes = figure.add_subplot(grid[:, -1])
+            draw_colour_bar(
+                colour_bar_axes, picture.mappable, fitted_scale.label, signed=True, position=colour_bar_axes
+            )
 
 
 class _RegionMaps:
@@ -255,21 +265,21 @@ class _RegionMaps:
 
     def __init__(self, series: ImageSeries, electrodes: AbstractElectrodes | None, height: float | None):
         self.mesh, self.unit, self.electrodes = series.mesh, series.unit, electrodes
-        self.raster = Raster.create(self.mesh, shape=(_PIXELS, _PIXELS), height=height)
+        self.raster = Raster.create(self.mesh, shape=(_NUM_PIXELS, _NUM_PIXELS), height=height)
 
     def draw(self, ax: Axes, values: np.ndarray, scale: ColourScale, title: str) -> None:
         pixels = np.asarray(self.raster.sample(as_array(values)))
-        fitted: FittedScale = scale.of(pixels[np.isfinite(pixels)], self.unit)
-        fitted.draw_bar(ax, self._show(ax, fitted.factor * pixels, title, **fitted.keywords))
+        fitted_scale: FittedScale = scale.of(pixels[np.isfinite(pixels)], self.unit)
+        fitted_scale.draw_bar(ax, self._show(ax, fitted_scale.factor * pixels, title, **fitted_scale.keywords))
 
     def draw_phase(self, ax: Axes, degrees: np.ndarray) -> None:
         pixels = np.asarray(self.raster.sample(as_array(degrees)))
-        drawn = self._show(ax, pixels, "phase", cmap="hsv", vmin=-180, vmax=180)
-        ax.figure.colorbar(drawn, ax=ax, ticks=[-180, -90, 0, 90, 180], label="Phase (degrees)")
+        mappable = self._show(ax, pixels, "phase", cmap="hsv", vmin=-180, vmax=180)
+        ax.figure.colorbar(mappable, ax=ax, ticks=[-180, -90, 0, 90, 180], label="Phase (degrees)")
 
     def _show(self, ax: Axes, pixels: np.ndarray, title: str, **keywords):
         extent = self.raster.extent
-        drawn = ax.imshow(pixels, extent=extent, interpolation="nearest", **keywords)
+        mappable = ax.imshow(pixels, extent=extent, interpolation="nearest", **keywords)
         if self.mesh.dimension == 2:
             draw_outline(self.mesh, ax)
         else:
@@ -279,7 +289,7 @@ class _RegionMaps:
         hide_axes(ax, extent, numbered=False)
         draw_scale_bar(ax, extent)
         ax.set_title(title, fontsize=10)
-        return drawn
+        return mappable
 
 
 def _spectrum(mean: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -297,19 +307,19 @@ def _draw_curves(ax: Axes, means: Mapping[str, np.ndarray], series: ImageSeries,
     ax.set(xlabel="Time (s)" if series.timed else "Frame", ylabel=f"Mean change ({unit})", title="regions over time")
     if means:
         ax.legend(fontsize=8, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.25), ncols=3)
-    _soften(ax)
+    _style_graph(ax)
 
 
 def _draw_spectra(ax: Axes, spectra: Mapping, oscillations: Sequence[Oscillation], unit: str) -> None:
     """Draw the spectra of the regions, in the same order of colours as their curves."""
     for frequencies, amplitude in spectra.values():
         ax.plot(frequencies, amplitude, linewidth=1.2)
-    for one in oscillations:
-        ax.axvline(one.frequency, color=INK, linewidth=0.8, linestyle=":")
+    for oscillation in oscillations:
+        ax.axvline(oscillation.frequency, color=INK, linewidth=0.8, linestyle=":")
     ax.set(xlabel="Frequency (Hz)", ylabel=f"Amplitude ({unit})", title="their spectra")
-    _soften(ax)
+    _style_graph(ax)
 
 
-def _soften(ax: Axes) -> None:
+def _style_graph(ax: Axes) -> None:
     ax.title.set_fontsize(10)
     ax.spines[["top", "right"]].set_visible(False)

@@ -30,41 +30,42 @@ def plot_voltages(
     of different lengths, and for drawn voltages that are not finite.
     """
     measured, modelled = np.asarray(measured), np.asarray(modelled)
-    used = np.ones(measured.shape, bool) if mask is None else np.asarray(mask, bool)
-    if measured.ndim != 1 or modelled.shape != measured.shape or used.shape != measured.shape:
+    is_drawn = np.ones(measured.shape, bool) if mask is None else np.asarray(mask, bool)
+    if measured.ndim != 1 or modelled.shape != measured.shape or is_drawn.shape != measured.shape:
         raise ValueError(
-            f"measured {measured.shape}, modelled {modelled.shape} and mask {used.shape} must be one frame (M,) each."
+            f"measured {measured.shape}, modelled {modelled.shape} and mask {is_drawn.shape} must be one frame (M,) "
+            "each."
         )
     if protocol is not None and protocol.num_measurements != measured.size:
         raise ValueError(f"measured has {measured.size} channels, and '{protocol.name}' {protocol.num_measurements}.")
-    if not used.any() or not np.isfinite(measured[used]).all() or not np.isfinite(modelled[used]).all():
+    if not is_drawn.any() or not np.isfinite(measured[is_drawn]).all() or not np.isfinite(modelled[is_drawn]).all():
         raise ValueError("there must be channels to draw, and their voltages finite; mask those that are not.")
-    channel = np.flatnonzero(used)
-    level = np.sqrt(np.mean(measured[used] ** 2))
-    factor, unit = with_si_prefix(float(np.abs(measured[used]).max()), "V")
-    misfit = np.linalg.norm((modelled - measured)[used]) / np.linalg.norm(measured[used])
+    channel = np.flatnonzero(is_drawn)
+    rms_voltage = np.sqrt(np.mean(measured[is_drawn] ** 2))
+    factor, unit = with_si_prefix(float(np.abs(measured[is_drawn]).max()), "V")
+    misfit = np.linalg.norm((modelled - measured)[is_drawn]) / np.linalg.norm(measured[is_drawn])
     ax = axes_or_new(ax, (8.4, 5.0))
     ax.set_axis_off()
     upper = ax.inset_axes((0, 0.42, 1, 0.58))
     lower = ax.inset_axes((0, 0, 1, 0.36), sharex=upper)
-    size = float(np.clip(500 / channel.size, 0.8, 3))
-    upper.plot(channel, factor * measured[used], "o", color=MEASURED, markersize=2 * size, label="measured")
-    upper.plot(channel, factor * modelled[used], "o", color=MODELLED, markersize=size, label="modelled")
+    marker_size = float(np.clip(500 / channel.size, 0.8, 3))
+    upper.plot(channel, factor * measured[is_drawn], "o", color=MEASURED, markersize=2 * marker_size, label="measured")
+    upper.plot(channel, factor * modelled[is_drawn], "o", color=MODELLED, markersize=marker_size, label="modelled")
     upper.set_ylabel(f"Voltage ({unit})")
     upper.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.1, markerscale=2)
     upper.set_title(title or f"Relative misfit {100 * misfit:.2g} %", loc="left", fontsize=11)
     upper.tick_params(labelbottom=False)
-    residual = 100 * (modelled - measured)[used] / level
+    residual = 100 * (modelled - measured)[is_drawn] / rms_voltage
     lower.axhline(0, color=SOFT, linewidth=0.8)
     lower.vlines(channel, 0, residual, color=INK, linewidth=0.6)
-    lower.plot(channel, residual, "o", color=INK, markersize=size)
+    lower.plot(channel, residual, "o", color=INK, markersize=marker_size)
     lower.set_ylabel("Difference\n(% of rms)")
     lower.set_xlabel("Channel")
     if protocol is not None:
-        starts = np.flatnonzero(np.diff(np.asarray(protocol.drive_index)) != 0) + 1
+        drive_starts = np.flatnonzero(np.diff(np.asarray(protocol.drive_index)) != 0) + 1
         for axes in (upper, lower):
             axes.vlines(
-                starts - 0.5, 0, 1, transform=axes.get_xaxis_transform(), color="#e6e8eb", linewidth=0.6, zorder=0
+                drive_starts - 0.5, 0, 1, transform=axes.get_xaxis_transform(), color="#e6e8eb", linewidth=0.6, zorder=0
             )
     for axes in (upper, lower):
         axes.spines[["top", "right"]].set_visible(False)

@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgba
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, ProjectionSurface, surface_triangles
 from jeit.mesh import Mesh
 from jeit.plot.axes import SOFT
-from jeit.plot.imaging.electrodes import METAL, at_one_place
+from jeit.plot.imaging.electrodes import METAL, group_coincident
 from jeit.plot.solid.scene import BODY, Scene, draw_number
 
 _HULL_OPACITY = 0.1
@@ -47,18 +47,20 @@ def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarr
     )
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    of = np.repeat(np.arange(len(triangles)), 3)
+    triangle_index = np.repeat(np.arange(len(triangles)), 3)
     order = np.lexsort(edges.T)
-    edges, of = edges[order], of[order]
-    pair = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
-    first, second = normal[of[pair]], normal[of[pair + 1]]
+    edges, triangle_index = edges[order], triangle_index[order]
+    shared_rows = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
+    first_normals, second_normals = normal[triangle_index[shared_rows]], normal[triangle_index[shared_rows + 1]]
     # Facets parallel to the line of sight, within rounding errors, face neither to the viewer nor away.
-    side = np.stack([first @ toward, second @ toward])
-    side = np.where(np.abs(side) < 1e-9, 0, side)
-    drawn = (np.sum(first * second, axis=1) < _EDGE_COSINE) | ((side > 0).any(axis=0) & (side <= 0).any(axis=0))
-    alone = np.ones(len(edges), bool)
-    alone[pair] = alone[pair + 1] = False
-    return np.concatenate([edges[pair[drawn]], edges[alone]])
+    facing = np.stack([first_normals @ toward, second_normals @ toward])
+    facing = np.where(np.abs(facing) < 1e-9, 0, facing)
+    is_drawn = (np.sum(first_normals * second_normals, axis=1) < _EDGE_COSINE) | (
+        (facing > 0).any(axis=0) & (facing <= 0).any(axis=0)
+    )
+    is_boundary = np.ones(len(edges), bool)
+    is_boundary[shared_rows] = is_boundary[shared_rows + 1] = False
+    return np.concatenate([edges[shared_rows[is_drawn]], edges[is_boundary]])
 
 
 def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes, *, through: bool = False) -> None:
@@ -71,40 +73,44 @@ def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes, *, 
     polygons = shapes.polygons()
     normals = surface.normals(np.array([corners.mean(axis=0) for corners in polygons]))
     rims = _rims(polygons, shapes.electrode, 1e-6 * size)
-    front = [one for one, outward in zip(polygons, normals, strict=True) if outward @ scene.camera.toward > 0]
-    hides = (
+    front_polygons = [
+        polygon for polygon, outward in zip(polygons, normals, strict=True) if outward @ scene.camera.toward > 0
+    ]
+    hides_body = (
         through
-        and sum(_visible_area(scene, one) for one in front)
+        and sum(_visible_area(scene, polygon) for polygon in front_polygons)
         > _MAX_COVERED_SHARE * _visible_area(scene, points[triangles]) / 2
     )
     for corners, outward, rim in zip(polygons, normals, rims, strict=True):
         if len(corners) == 1:
             angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
-            _, across, up = surface.frames(corners)[0]
-            corners = corners + 0.012 * size * (np.outer(np.cos(angle), across) + np.outer(np.sin(angle), up))
+            _, first_axis, second_axis = surface.frames(corners)[0]
+            corners = corners + 0.012 * size * (
+                np.outer(np.cos(angle), first_axis) + np.outer(np.sin(angle), second_axis)
+            )
             rim = np.ones(12, bool)
-        side = float(np.sign(outward @ scene.camera.toward))
-        colour = to_rgba(METAL, _TRANSLUCENT_OPACITY if hides and side > 0 else 1.0)
-        scene.add_polygon(corners, colour, before=_ELECTRODE_OFFSET * size * side, rim=rim)
+        facing = float(np.sign(outward @ scene.camera.toward))
+        colour = to_rgba(METAL, _TRANSLUCENT_OPACITY if hides_body and facing > 0 else 1.0)
+        scene.add_polygon(corners, colour, before=_ELECTRODE_OFFSET * size * facing, rim=rim)
 
 
 def _visible_area(scene: Scene, corners: Float[np.ndarray, "*m k 3"]) -> float:
     """Total area of polygons as projected onto the page, m²."""
     x, y = np.moveaxis(scene.camera.on_page(corners.reshape(-1, 3)).reshape(*corners.shape[:-1], 2), -1, 0)
-    twice = (x * np.roll(y, -1, axis=-1) - np.roll(x, -1, axis=-1) * y).sum(axis=-1)
-    return float(np.abs(twice).sum() / 2)
+    doubled_areas = (x * np.roll(y, -1, axis=-1) - np.roll(x, -1, axis=-1) * y).sum(axis=-1)
+    return float(np.abs(doubled_areas).sum() / 2)
 
 
 def _rims(polygons, electrode, offset: float) -> list[np.ndarray]:
     """Whether each edge of each polygon is on the rim of its electrode: no other polygon of the electrode shares it.
     Corners closer than `offset` are taken as equal."""
     keys = []
-    for corners, number in zip(polygons, electrode.tolist(), strict=True):
-        places = [tuple(place) for place in np.round(corners / offset).astype(np.int64).tolist()]
-        others = [*places[1:], places[0]]
-        keys.append([(number, *sorted(pair)) for pair in zip(places, others, strict=True)])
-    count = Counter(key for one in keys for key in one)
-    return [np.array([count[key] == 1 for key in one]) for one in keys]
+    for corners, electrode_index in zip(polygons, electrode.tolist(), strict=True):
+        rounded_corners = [tuple(corner) for corner in np.round(corners / offset).astype(np.int64).tolist()]
+        next_corners = [*rounded_corners[1:], rounded_corners[0]]
+        keys.append([(electrode_index, *sorted(pair)) for pair in zip(rounded_corners, next_corners, strict=True)])
+    num_occurrences = Counter(key for polygon_keys in keys for key in polygon_keys)
+    return [np.array([num_occurrences[key] == 1 for key in polygon_keys]) for polygon_keys in keys]
 
 
 def number_electrodes(
@@ -117,22 +123,33 @@ def number_electrodes(
     """
     middles = shapes.middles()
     normals = ProjectionSurface(points, triangles).normals(middles)
-    places = scene.camera.on_page(middles + _NUMBER_DISTANCE * float(np.ptp(points, axis=0).max()) * normals)
-    fontsize = 8 if len(places) <= 20 else 6.5
-    faint = normals @ scene.camera.toward < -0.05
-    near, clear = places[~faint], _MIN_NUMBER_DISTANCE * float(np.ptp(points, axis=0).max())
-    seen = scene.camera.on_page(points)[:, 0]
-    left, right = seen.min() + clear, seen.max() - clear
-    for side in (False, True) if behind else (False,):
-        some = np.flatnonzero(faint == side)
-        for one in at_one_place(places[some], clear):
-            place = places[some[one]].mean(axis=0)
+    positions = scene.camera.on_page(middles + _NUMBER_DISTANCE * float(np.ptp(points, axis=0).max()) * normals)
+    fontsize = 8 if len(positions) <= 20 else 6.5
+    is_faint = normals @ scene.camera.toward < -0.05
+    front_positions, min_distance = positions[~is_faint], _MIN_NUMBER_DISTANCE * float(np.ptp(points, axis=0).max())
+    horizontal = scene.camera.on_page(points)[:, 0]
+    left_limit, right_limit = horizontal.min() + min_distance, horizontal.max() - min_distance
+    for draws_faint in (False, True) if behind else (False,):
+        electrode_indices = np.flatnonzero(is_faint == draws_faint)
+        for group in group_coincident(positions[electrode_indices], min_distance):
+            position = positions[electrode_indices[group]].mean(axis=0)
             # Numbers of electrodes behind are left out where they would overlap a number in front.
-            if side and len(near) and np.linalg.norm(near - place, axis=1).min() <= clear:
+            if (
+                draws_faint
+                and len(front_positions)
+                and np.linalg.norm(front_positions - position, axis=1).min() <= min_distance
+            ):
                 continue
-            outward = "right" if place[0] < left else "left" if place[0] > right else "center"
-            align = outward if len(one) > 1 else "center"
-            draw_number(ax, place, _number_text((some[one] + 1).tolist()), fontsize=fontsize, faint=side, align=align)
+            outward = "right" if position[0] < left_limit else "left" if position[0] > right_limit else "center"
+            alignment = outward if len(group) > 1 else "center"
+            draw_number(
+                ax,
+                position,
+                _number_text((electrode_indices[group] + 1).tolist()),
+                fontsize=fontsize,
+                faint=draws_faint,
+                align=alignment,
+            )
 
 
 def _number_text(numbers: list[int]) -> str:

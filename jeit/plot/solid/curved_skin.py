@@ -17,7 +17,7 @@ from jeit.mesh.geodesic import Triangles
 from jeit.plot.axes import CHANGE, INK, SERIES_COLOURS, ColourScale, axes_or_new, check_scale
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import size_of
-from jeit.plot.solid.scene import FROM_THE_CORNER, Camera, Scene, bare_in_space
+from jeit.plot.solid.scene import CORNER_VIEW, Camera, Scene, hide_axes_in_space
 from jeit.plot.solid.shaded_surface import BODY, checked_values, colours_of, mappable
 
 # Tolerance for marks being hidden by the surface on which they lie: distance divided by the size of the skin.
@@ -29,7 +29,7 @@ def plot_curved_skin(
     values: ArrayLike | None = None,
     *,
     marks: Mapping[str, ArrayLike] | None = None,
-    camera: Camera = FROM_THE_CORNER,
+    camera: Camera = CORNER_VIEW,
     scale: ColourScale = CHANGE,
     title: str | None = None,
     ax: Axes | None = None,
@@ -62,27 +62,35 @@ def plot_curved_skin(
     mesh = layout.surface
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     ax = axes_or_new(ax)
-    scene, fitted, colours = Scene(camera), None, np.array(to_rgba(BODY))
+    scene, fitted_scale, colours = Scene(camera), None, np.array(to_rgba(BODY))
     if values is not None:
         image = checked_values(values, len(points), len(cells))
-        fitted = scale.of(image, "S")
-        colours = colours_of(fitted, image if len(image) == len(cells) else image[cells].mean(axis=1))
+        fitted_scale = scale.of(image, "S")
+        colours = colours_of(fitted_scale, image if len(image) == len(cells) else image[cells].mean(axis=1))
     scene.add_triangles(points, cells, colours, smooth=True)
     surface = ProjectionSurface(points, cells)
     # Pieces are sorted by the depth of their centres, so discs are moved in front of the triangles on which they lie.
-    before = float(np.sqrt(np.asarray(measures(mesh)).max()))
+    depth_offset = float(np.sqrt(np.asarray(measures(mesh)).max()))
     for corners in shapes_of(mesh, layout.discs(1.0)).polygons():
         (outward,) = surface.normals(corners.mean(axis=0)[None])
-        facing = abs(float(outward @ camera.toward))
+        cosine = abs(float(outward @ camera.toward))
         rim = np.ones(len(corners), bool)
-        scene.add_polygon(corners, METAL, before=before / max(facing, 0.1), rim=rim)
+        scene.add_polygon(corners, METAL, before=depth_offset / max(cosine, 0.1), rim=rim)
     scene.draw(ax)
     triangles = Triangles.of(mesh)
-    for (name, places), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
-        on_it = triangles.nearest(np.atleast_2d(np.asarray(places, float))).points
-        seen = _faces_viewer(mesh, on_it, camera)
-        ax.plot(*camera.on_page(seen).T, "o", color=colour, markersize=5, markeredgecolor="white", label=name, zorder=5)
-    bare_in_space(ax, camera, points, numbered=False)
+    for (name, mark_points), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
+        surface_points = triangles.nearest(np.atleast_2d(np.asarray(mark_points, float))).points
+        visible_points = _visible_points(mesh, surface_points, camera)
+        ax.plot(
+            *camera.on_page(visible_points).T,
+            "o",
+            color=colour,
+            markersize=5,
+            markeredgecolor="white",
+            label=name,
+            zorder=5,
+        )
+    hide_axes_in_space(ax, camera, points, numbered=False)
     if marks:
         # The legend is below the axes, since the arrows of x, y and z are inside.
         ax.legend(
@@ -95,25 +103,25 @@ def plot_curved_skin(
         )
     if title is not None:
         ax.set_title(title)
-    if fitted is not None:
-        fitted.draw_bar(ax, mappable(fitted))
+    if fitted_scale is not None:
+        fitted_scale.draw_bar(ax, mappable(fitted_scale))
     return ax
 
 
-def _faces_viewer(mesh, places, camera: Camera):
+def _visible_points(mesh, points, camera: Camera):
     """Select the points that the surface does not hide: no part of it is nearer to the viewer on the same ray."""
     corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
-    flat, deep = camera.on_page(corners), camera.nearness(corners)
-    seen = []
-    for place in places:
-        at, depth = camera.on_page(place[None])[0], float(camera.nearness(place[None])[0])
-        a, b, c = (flat[:, k] - at for k in range(3))
+    page_corners, depths = camera.on_page(corners), camera.nearness(corners)
+    visible = []
+    for point in points:
+        page_position, depth = camera.on_page(point[None])[0], float(camera.nearness(point[None])[0])
+        a, b, c = (page_corners[:, k] - page_position for k in range(3))
         areas = np.stack([b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0], c[:, 0] * a[:, 1] - c[:, 1] * a[:, 0],
                           a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]], axis=1)  # fmt: skip
-        total = areas.sum(axis=1)
-        share = areas / np.where(total == 0, 1.0, total)[:, None]
-        over = (share >= 0).all(axis=1) & (total != 0)
-        nearer = (share * deep).sum(axis=1)[over]
-        if not (nearer > depth + _MARK_OFFSET * size_of(mesh)).any():
-            seen.append(place)
-    return np.array(seen).reshape(-1, 3)
+        doubled_area = areas.sum(axis=1)
+        weights = areas / np.where(doubled_area == 0, 1.0, doubled_area)[:, None]
+        is_covering = (weights >= 0).all(axis=1) & (doubled_area != 0)
+        covering_depths = (weights * depths).sum(axis=1)[is_covering]
+        if not (covering_depths > depth + _MARK_OFFSET * size_of(mesh)).any():
+            visible.append(point)
+    return np.array(visible).reshape(-1, 3)

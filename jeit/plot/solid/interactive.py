@@ -58,10 +58,10 @@ def view_solid(
     ```
     """
     check_drawn(mesh, electrodes, scale)
-    surfaces = level_surfaces(mesh, values, levels, both=scale.difference)
+    surfaces = level_surfaces(mesh, values, levels, is_signed=scale.difference)
     pv: Any = optional("pyvista", "the interactive view", "Pictures without it: jeit.plot.plot_solid.")
     fitted = scale.of(np.asarray(values), "S/m")
-    look: dict[str, Any] = {
+    colour_options: dict[str, Any] = {
         "cmap": fitted.keywords["cmap"],
         "clim": (fitted.keywords["vmin"], fitted.keywords["vmax"]),
     }
@@ -80,22 +80,28 @@ def view_solid(
         shell["value"] = np.full(shell.n_points, fitted.factor * value)
         opacity = 1.0 if share == max(levels) else OUTER
         options = {"smooth_shading": True, "show_scalar_bar": False, "name": f"isosurface {k}"}
-        plotter.add_mesh(shell, scalars="value", opacity=opacity, **options, **look)
+        plotter.add_mesh(shell, scalars="value", opacity=opacity, **options, **colour_options)
     grid = pv.UnstructuredGrid({pv.CellType.TETRA: np.asarray(mesh.cells)}, points)
     grid.cell_data["value"] = fitted.factor * cell_values(mesh, values)
     # The label has two lines, since VTK cuts off text wider than the bar, such as the unit.
-    what, bracket, unit = fitted.label.rpartition(" (")
-    bar = {"title": f"{what}\n{bracket.strip()}{unit}", "color": INK, "vertical": True, "n_labels": 5, "fmt": "%.3g"}
+    quantity, bracket, unit = fitted.label.rpartition(" (")
+    bar = {
+        "title": f"{quantity}\n{bracket.strip()}{unit}",
+        "color": INK,
+        "vertical": True,
+        "n_labels": 5,
+        "fmt": "%.3g",
+    }
     bar |= {"title_font_size": 16, "label_font_size": 14, "position_x": 0.86, "position_y": 0.25, "height": 0.5}
-    plotter.add_mesh_slice(grid, normal="z", scalars="value", scalar_bar_args=bar, name="plane", **look)
+    plotter.add_mesh_slice(grid, normal="z", scalars="value", scalar_bar_args=bar, name="plane", **colour_options)
     if electrodes is not None:
         shapes = shapes_of(mesh, electrodes) if isinstance(electrodes, AbstractElectrodes) else electrodes
         _add_electrodes(plotter, pv, shapes)
-    for k, one in enumerate(inclusions):
-        if one.form is None:
-            form = pv.Sphere(radius=1e3 * one.radius, center=1e3 * np.array(one.centroid))
+    for k, inclusion in enumerate(inclusions):
+        if inclusion.form is None:
+            form = pv.Sphere(radius=1e3 * inclusion.radius, center=1e3 * np.array(inclusion.centroid))
         else:
-            surface = one.form.surface()
+            surface = inclusion.form.surface()
             form = pv.PolyData.from_regular_faces(1e3 * surface.points, surface.triangles)
         plotter.add_mesh(form, style="wireframe", color=INK, opacity=0.15, name=f"inclusion {k}")
     plotter.add_axes()  # pyright: ignore[reportCallIssue]
@@ -118,17 +124,19 @@ def can_view() -> str:
 def _display_responds(display: str) -> bool:
     """Whether an X server listens at a display of this machine; True for displays of other machines and for other
     texts."""
-    host, _, rest = display.rpartition(":")
-    number = rest.partition(".")[0]
-    if host not in ("", "unix", "localhost") or not number.isdecimal() or len(number) > 4:
+    host, _, display_number = display.rpartition(":")
+    server_number = display_number.partition(".")[0]
+    if host not in ("", "unix", "localhost") or not server_number.isdecimal() or len(server_number) > 4:
         return True
     # Standard addresses of X11 servers (Xtrans). PyVista's own check calls a program that may not be installed.
-    path = f"/tmp/.X11-unix/X{number}"
-    local = [(socket.AF_UNIX, path), (socket.AF_UNIX, "\0" + path)]
-    for family, address in [(socket.AF_INET, (host, 6000 + int(number)))] if host == "localhost" else local:
-        with socket.socket(family, socket.SOCK_STREAM) as door, suppress(OSError):
-            door.settimeout(1)
-            door.connect(address)
+    path = f"/tmp/.X11-unix/X{server_number}"
+    local_addresses = [(socket.AF_UNIX, path), (socket.AF_UNIX, "\0" + path)]
+    for family, address in (
+        [(socket.AF_INET, (host, 6000 + int(server_number)))] if host == "localhost" else local_addresses
+    ):
+        with socket.socket(family, socket.SOCK_STREAM) as connection, suppress(OSError):
+            connection.settimeout(1)
+            connection.connect(address)
             return True
     return False
 

@@ -19,7 +19,7 @@ from jeit.image.plane import check_solid, crossed_edges
 from jeit.mesh import Mesh
 from jeit.plot.axes import CHANGE, INK, ColourScale, FittedScale, axes_or_new, check_scale
 from jeit.plot.solid.body import add_electrodes, add_hull, number_electrodes
-from jeit.plot.solid.scene import FROM_THE_CORNER, Camera, Scene, bare_in_space, mark_sign
+from jeit.plot.solid.scene import CORNER_VIEW, Camera, Scene, hide_axes_in_space, mark_sign
 from jeit.plot.solid.shaded_surface import colours_of, mappable
 
 _DASH_PATTERN = {"fill": False, "edgecolor": INK, "linewidth": 1, "linestyle": (0, (4, 3)), "zorder": 3}
@@ -39,17 +39,17 @@ def draw_body_in_plane(ax: Axes, plane: Plane, inclusion: Inclusion) -> None:
     """Draw the outline of the section of an inclusion by a plane, and its sign in the middle."""
     if inclusion.form is not None:
         surface = inclusion.form.surface()
-        cut = crossed_edges(surface.triangles, plane.distance(surface.points)).at_corners(surface.points)
-        if len(cut):
-            corners = _draw_round(ax, plane.on_page(cut.reshape(-1, 3)))
+        segments = crossed_edges(surface.triangles, plane.distance(surface.points)).at_corners(surface.points)
+        if len(segments):
+            corners = _draw_round(ax, plane.on_page(segments.reshape(-1, 3)))
             x, y = (corners.min(axis=0) + corners.max(axis=0)) / 2
             mark_sign(ax, x, y, inclusion.sign)
         return
     centre = np.array(inclusion.centroid)
-    squared = inclusion.radius**2 - float(plane.distance(centre)) ** 2
-    if squared > 0:
+    squared_radius = inclusion.radius**2 - float(plane.distance(centre)) ** 2
+    if squared_radius > 0:
         x, y = plane.on_page(centre)
-        ax.add_patch(Circle((x, y), float(np.sqrt(squared)), **_DASH_PATTERN))
+        ax.add_patch(Circle((x, y), float(np.sqrt(squared_radius)), **_DASH_PATTERN))
         mark_sign(ax, x, y, inclusion.sign)
 
 
@@ -73,7 +73,7 @@ def plot_isosurfaces(
     *,
     levels: Sequence[float] = HALF,
     inclusions: Sequence[Inclusion] = (),
-    camera: Camera = FROM_THE_CORNER,
+    camera: Camera = CORNER_VIEW,
     scale: ColourScale = CHANGE,
     ax: Axes | None = None,
 ) -> Axes:
@@ -127,59 +127,59 @@ def draw_in_space(
     check_kind("camera", camera, Camera, "a Camera, such as Camera(azimuth=-60, elevation=25)")
     scene = Scene(camera)
     add_hull(scene, mesh)
-    surfaces = level_surfaces(mesh, values, levels, both=fitted.scale.difference)
+    surfaces = level_surfaces(mesh, values, levels, is_signed=fitted.scale.difference)
     for value, share, surface in surfaces:
         colour = np.array(colours_of(fitted, np.array([value]))[0])
         colour[3] = 1.0 if share == max(levels) else OUTER
         scene.add_triangles(surface.points, surface.triangles, colour, smooth=True)
     for plane in planes:
         outline = cut_by_plane(mesh, plane).outline
-        places = (
+        end_points = (
             outline[..., :1] * plane.right + outline[..., 1:] * plane.up + (plane.point @ plane.toward) * plane.toward
         )
-        scene.add_lines(places, INK, 0.6)
+        scene.add_lines(end_points, INK, 0.6)
     shapes = shapes_of(mesh, electrodes) if isinstance(electrodes, AbstractElectrodes) else electrodes
-    points, wall = np.asarray(mesh.points), np.asarray(mesh.facets)
+    points, facets = np.asarray(mesh.points), np.asarray(mesh.facets)
     if shapes is not None:
-        add_electrodes(scene, points, wall, shapes, through=bool(surfaces))
+        add_electrodes(scene, points, facets, shapes, through=bool(surfaces))
     scene.draw(ax)
-    bare_in_space(ax, camera, points, numbered=shapes is not None)
+    hide_axes_in_space(ax, camera, points, numbered=shapes is not None)
     if shapes is not None:
-        number_electrodes(ax, scene, points, wall, shapes)
-    for one in inclusions:
-        draw_visible_body(ax, camera, one)
+        number_electrodes(ax, scene, points, facets, shapes)
+    for inclusion in inclusions:
+        draw_visible_body(ax, camera, inclusion)
     return ax
 
 
 def level_surfaces(
-    mesh: Mesh, values: ArrayLike, levels: Sequence[float], *, both: bool
+    mesh: Mesh, values: ArrayLike, levels: Sequence[float], *, is_signed: bool
 ) -> list[tuple[float, float, TriangleSurface]]:
     """Compute isosurfaces; return the value, the level and the surface of each.
 
-    `levels`: shares of the maximum change of each sign if `both`, otherwise fractions of the range from minimum to
+    `levels`: shares of the maximum change of each sign if `is_signed`, otherwise fractions of the range from minimum to
     maximum. Raises `ValueError` for levels that are not between 0 and 1.
     """
     shares = check_levels(levels)
     image = node_values(mesh, np.asarray(values))
-    base = 0.0 if both else float(image.min())
-    least = _MIN_PEAK * float(np.abs(image - base).max())
-    found = []
-    for sign in (1.0, -1.0) if both else (1.0,):
-        peak = float((sign * (image - base)).max())
-        if peak > 0 and peak >= least:
+    reference = 0.0 if is_signed else float(image.min())
+    min_peak = _MIN_PEAK * float(np.abs(image - reference).max())
+    surfaces = []
+    for sign in (1.0, -1.0) if is_signed else (1.0,):
+        peak_change = float((sign * (image - reference)).max())
+        if peak_change > 0 and peak_change >= min_peak:
             for share in shares:
-                level = sign * share * peak
-                found.append((base + level, share, isosurface_of(mesh, image - base, level)))
-    return found
+                level = sign * share * peak_change
+                surfaces.append((reference + level, share, isosurface_of(mesh, image - reference, level)))
+    return surfaces
 
 
 def check_levels(levels: Sequence[float]) -> list[float]:
     """Check levels, and return them as a list. Raises `ValueError` unless they are between 0 and 1."""
     shares: Float[np.ndarray, " k"] | Sequence = np.atleast_1d(np.asarray(levels, dtype=object))
-    if len(shares) == 0 or not all(is_number(one) and 0 < one < 1 for one in shares):
-        given = ", ".join(describe(one) for one in shares[:4]) or "none"
-        raise ValueError(f"levels must be shares of the strongest change, from 0 to 1; given were {given}.")
-    return [float(one) for one in shares]
+    if len(shares) == 0 or not all(is_number(level) and 0 < level < 1 for level in shares):
+        level_texts = ", ".join(describe(level) for level in shares[:4]) or "none"
+        raise ValueError(f"levels must be shares of the strongest change, from 0 to 1; given were {level_texts}.")
+    return [float(level) for level in shares]
 
 
 def check_drawn(mesh: Mesh, electrodes, scale: ColourScale) -> None:

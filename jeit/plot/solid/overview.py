@@ -18,7 +18,7 @@ from jeit.mesh import Mesh, centroids
 from jeit.plot.axes import CHANGE, INK, ColourScale, draw_colour_bar
 from jeit.plot.solid.body import size_of
 from jeit.plot.solid.isosurfaces import HALF, check_drawn, draw_in_space
-from jeit.plot.solid.scene import FROM_THE_CORNER, Camera
+from jeit.plot.solid.scene import CORNER_VIEW, Camera
 from jeit.plot.solid.shaded_surface import mappable
 from jeit.plot.solid.slices import cell_values, draw_slice, finish_slice
 
@@ -33,7 +33,7 @@ def plot_solid(
     *,
     levels: Sequence[float] = HALF,
     inclusions: Sequence[Inclusion] = (),
-    camera: Camera = FROM_THE_CORNER,
+    camera: Camera = CORNER_VIEW,
     scale: ColourScale = CHANGE,
     figure: Figure | None = None,
 ) -> Figure:
@@ -60,23 +60,23 @@ def plot_solid(
     shapes = electrodes
     if isinstance(electrodes, AbstractElectrodes):
         shapes = shapes_of(mesh, electrodes)
-    place = strongest_place(mesh, image, inclusions)
-    planes = [Plane.at(axis, float(place[AXES.index(axis)])) for axis in ("z", "x", "y")]
+    common_point = strongest_place(mesh, image, inclusions)
+    planes = [Plane.at(axis, float(common_point[AXES.index(axis)])) for axis in ("z", "x", "y")]
     figure = Figure(figsize=(12.6, 6.4), layout="constrained") if figure is None else figure
     grid = figure.add_gridspec(2, 4, width_ratios=(1.75, 1, 1, 0.045))
     space = figure.add_subplot(grid[:, 0])
     draw_in_space(
         space, mesh, values, shapes, levels=levels, inclusions=inclusions, camera=camera, fitted=fitted, planes=planes
     )
-    half = size_of(mesh) / 2
-    for plane, cell in zip(planes, (grid[0, 1], grid[0, 2], grid[1, 1]), strict=True):
-        panel = figure.add_subplot(cell)
+    half_size = size_of(mesh) / 2
+    for plane, grid_cell in zip(planes, (grid[0, 1], grid[0, 2], grid[1, 1]), strict=True):
+        panel = figure.add_subplot(grid_cell)
         draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted)
-        seen = plane.on_page(np.asarray(mesh.points))
-        x, y = (seen.min(axis=0) + seen.max(axis=0)) / 2
+        page_points = plane.on_page(np.asarray(mesh.points))
+        x, y = (page_points.min(axis=0) + page_points.max(axis=0)) / 2
         # All slices have the same scale of lengths.
-        finish_slice(panel, plane, (x - half, x + half, y - half, y + half), cross=True)
-    _caption(figure.add_subplot(grid[1, 2]), place, levels, inclusions, difference=scale.difference)
+        finish_slice(panel, plane, (x - half_size, x + half_size, y - half_size, y + half_size), cross=True)
+    _caption(figure.add_subplot(grid[1, 2]), common_point, levels, inclusions, difference=scale.difference)
     if scale.bar:
         bar = figure.add_subplot(grid[:, 3])
         draw_colour_bar(space, mappable(fitted), fitted.label, signed=scale.difference, position=bar)
@@ -91,21 +91,21 @@ def strongest_place(mesh: Mesh, image: np.ndarray, inclusions: Sequence[Inclusio
     return np.asarray(centroids(mesh))[np.abs(image - (np.median(image))).argmax()]
 
 
-def _caption(ax: Axes, place, levels, inclusions: Sequence[Inclusion], *, difference: bool) -> None:
+def _caption(ax: Axes, common_point, levels, inclusions: Sequence[Inclusion], *, difference: bool) -> None:
     """Draw a caption that describes the slices, the isosurfaces and the inclusions."""
     ax.set_axis_off()
     shares = ", ".join(f"{100 * share:g}" for share in sorted(levels))
-    of = "of the strongest change" if difference else "of the way from least to greatest"
-    lines = [f"slices through ({_position_text(place)}) mm", f"surfaces at {shares} % {of}"]
+    scale_text = "of the strongest change" if difference else "of the way from least to greatest"
+    lines = [f"slices through ({_position_text(common_point)}) mm", f"surfaces at {shares} % {scale_text}"]
     if inclusions:
-        balls = "" if all(one.form for one in inclusions) else ", drawn as balls of their volume"
-        lines += ["", f"found, dashed{balls}:"]
-    for one in inclusions[:_MAX_LISTED]:
-        sign = "+" if one.sign > 0 else "−"
-        column = "column of " if one.is_column else ""
-        lines.append(f"{sign}  {column}{1e6 * one.area:.3g} cm³ at ({_position_text(one.centroid)}) mm")
-        if one.contrast_interval is not None:
-            lines.append(f"    {interval_text(one.contrast_interval, signed_percent)}")
+        ball_text = "" if all(inclusion.form for inclusion in inclusions) else ", drawn as balls of their volume"
+        lines += ["", f"found, dashed{ball_text}:"]
+    for inclusion in inclusions[:_MAX_LISTED]:
+        sign = "+" if inclusion.sign > 0 else "−"
+        column = "column of " if inclusion.is_column else ""
+        lines.append(f"{sign}  {column}{1e6 * inclusion.area:.3g} cm³ at ({_position_text(inclusion.centroid)}) mm")
+        if inclusion.contrast_interval is not None:
+            lines.append(f"    {interval_text(inclusion.contrast_interval, signed_percent)}")
     if len(inclusions) > _MAX_LISTED:
         lines.append(f"and {len(inclusions) - _MAX_LISTED} more")
     ax.text(0, 0.9, "\n".join(lines), transform=ax.transAxes, va="top", fontsize=8.5, color=INK, linespacing=1.6)

@@ -54,14 +54,14 @@ class Camera:
     @property
     def toward(self) -> Float[np.ndarray, "3"]:
         """Unit vector towards the viewer."""
-        round_z, above = np.radians(self.azimuth), np.radians(self.elevation)
-        return np.array([np.cos(above) * np.cos(round_z), np.cos(above) * np.sin(round_z), np.sin(above)])
+        azimuth, elevation = np.radians(self.azimuth), np.radians(self.elevation)
+        return np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
 
     @property
     def right(self) -> Float[np.ndarray, "3"]:
         """Unit vector to the right on the page."""
-        round_z = np.radians(self.azimuth)
-        return np.array([-np.sin(round_z), np.cos(round_z), 0.0])
+        azimuth = np.radians(self.azimuth)
+        return np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
 
     @property
     def up(self) -> Float[np.ndarray, "3"]:
@@ -82,11 +82,15 @@ class Camera:
         length = np.maximum(np.linalg.norm(normals, axis=-1), 1e-300)
         direction = normals / length[:, None]
         direction = direction * np.where(direction @ self.toward < 0, -1.0, 1.0)[:, None]
-        lamp = _LIGHT_DIRECTION[0] * self.right + _LIGHT_DIRECTION[1] * self.up + _LIGHT_DIRECTION[2] * self.toward
-        return _MIN_BRIGHTNESS + (1 - _MIN_BRIGHTNESS) * np.clip(direction @ lamp / np.linalg.norm(lamp), 0, 1)
+        light_direction = (
+            _LIGHT_DIRECTION[0] * self.right + _LIGHT_DIRECTION[1] * self.up + _LIGHT_DIRECTION[2] * self.toward
+        )
+        return _MIN_BRIGHTNESS + (1 - _MIN_BRIGHTNESS) * np.clip(
+            direction @ light_direction / np.linalg.norm(light_direction), 0, 1
+        )
 
 
-FROM_THE_CORNER = Camera()
+CORNER_VIEW = Camera()
 
 
 _RIM = [withStroke(linewidth=2.2, foreground="white")]
@@ -123,33 +127,44 @@ class Scene:
         corners = points[triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         if smooth:
-            at_nodes = np.stack(
-                [np.bincount(triangles.ravel(), np.repeat(one, 3), len(points)) for one in normals.T], axis=1
+            node_normals = np.stack(
+                [np.bincount(triangles.ravel(), np.repeat(component, 3), len(points)) for component in normals.T],
+                axis=1,
             )
-            normals = at_nodes[triangles].sum(axis=1)
-        face = np.array(np.broadcast_to(colours, (len(triangles), 4)), dtype=float)
+            normals = node_normals[triangles].sum(axis=1)
+        face_colours = np.array(np.broadcast_to(colours, (len(triangles), 4)), dtype=float)
         if lit:
-            face[:, :3] *= self.camera.light(normals)[:, None]
+            face_colours[:, :3] *= self.camera.light(normals)[:, None]
         nearness = self.camera.nearness(corners.mean(axis=1)) + before
         # Edges in the colour of their face close gaps. Translucent triangles have none, as they would be visible as a
         # net.
-        solid = face[:, 3] > 0.99
-        self._add(corners[:, [0, 1, 2, 2]], nearness, face, np.where(solid[:, None], face, 0), 0.7 * solid)
+        is_opaque = face_colours[:, 3] > 0.99
+        self._add(
+            corners[:, [0, 1, 2, 2]],
+            nearness,
+            face_colours,
+            np.where(is_opaque[:, None], face_colours, 0),
+            0.7 * is_opaque,
+        )
 
     def add_polygon(
         self, corners: Float[np.ndarray, "k 3"], colour, *, before: float, rim: Bool[np.ndarray, " k"]
     ) -> None:
         """Add a convex polygon on a surface, divided into pieces that are sorted separately; `before` as in
         `add_triangles`. Edges on the `rim` are drawn as lines."""
-        middle = corners.mean(axis=0)
-        ring = np.arange(len(corners))
-        points = np.concatenate([corners, (corners + middle) / 2, middle[None]])
-        inner, other, count = ring + len(corners), (ring + 1) % len(corners), len(corners)
+        centre = corners.mean(axis=0)
+        corner_index = np.arange(len(corners))
+        points = np.concatenate([corners, (corners + centre) / 2, centre[None]])
+        inner_nodes, next_corner, num_corners = (
+            corner_index + len(corners),
+            (corner_index + 1) % len(corners),
+            len(corners),
+        )
         triangles = np.concatenate(
             [
-                np.stack([ring, other, other + count], axis=1),
-                np.stack([ring, other + count, inner], axis=1),
-                np.stack([inner, other + count, np.full(count, 2 * count)], axis=1),
+                np.stack([corner_index, next_corner, next_corner + num_corners], axis=1),
+                np.stack([corner_index, next_corner + num_corners, inner_nodes], axis=1),
+                np.stack([inner_nodes, next_corner + num_corners, np.full(num_corners, 2 * num_corners)], axis=1),
             ]
         )
         self.add_triangles(points, triangles, np.array(to_rgba(colour)), before=before)
@@ -175,7 +190,7 @@ class Scene:
             return
         order = np.argsort(np.concatenate(self._nearness), kind="stable")
         corners, face, edge, width = (
-            np.concatenate(parts)[order] for parts in (self._corners, self._face, self._edge, self._width)
+            np.concatenate(arrays)[order] for arrays in (self._corners, self._face, self._edge, self._width)
         )
         ax.add_collection(
             PolyCollection(
@@ -191,24 +206,24 @@ class Scene:
         )
 
 
-def bare_in_space(ax: Axes, camera: Camera, points: Float[np.ndarray, "n 3"], *, numbered: bool) -> None:
+def hide_axes_in_space(ax: Axes, camera: Camera, points: Float[np.ndarray, "n 3"], *, numbered: bool) -> None:
     """Set equal scales and limits around the projected `points`, remove the frame, and draw a scale bar and arrows of
     the axes below. `numbered`: whether to leave space for numbers of electrodes."""
-    seen = camera.on_page(points)
-    (left, low), (right, high) = seen.min(axis=0), seen.max(axis=0)
+    page_points = camera.on_page(points)
+    (left, low), (right, high) = page_points.min(axis=0), page_points.max(axis=0)
     size = max(right - left, high - low)
-    room = (0.09 if numbered else 0.03) * size
+    margin = (0.09 if numbered else 0.03) * size
     ax.set_aspect("equal")
-    ax.set_xlim(left - max(room, 0.07 * size), right + max(room, 0.07 * size))
-    ax.set_ylim(low - 0.24 * size - 0.4 * room, high + room)
+    ax.set_xlim(left - max(margin, 0.07 * size), right + max(margin, 0.07 * size))
+    ax.set_ylim(low - 0.24 * size - 0.4 * margin, high + margin)
     ax.set_axis_off()
-    draw_scale_bar(ax, (left, right, low - 0.4 * room, high))
-    place = (right - 0.05 * size, low - 0.4 * room - 0.14 * size)
-    draw_axes_cross(ax, camera.on_page(np.eye(3)), place, 0.09 * size)
+    draw_scale_bar(ax, (left, right, low - 0.4 * margin, high))
+    cross_position = (right - 0.05 * size, low - 0.4 * margin - 0.14 * size)
+    draw_axes_cross(ax, camera.on_page(np.eye(3)), cross_position, 0.09 * size)
 
 
-def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], place: tuple[float, float], length: float) -> None:
-    """Draw arrows with letters for the x, y and z axes at `place` on the page, in metres; axes that point towards the
+def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], origin: tuple[float, float], length: float) -> None:
+    """Draw arrows with letters for the x, y and z axes at `origin` on the page, in metres; axes that point towards the
     viewer are left out.
 
     `directions`: (3, 2), projected unit vectors; `length`: length of an arrow that is not shortened by projection.
@@ -216,7 +231,7 @@ def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], place: tuple
     for letter, direction in zip(_AXIS_NAMES, directions, strict=True):
         if np.hypot(*direction) < 0.15:
             continue
-        tip = np.array(place) + length * direction
+        tip = np.array(origin) + length * direction
         style = {
             "arrowstyle": "-|>,head_width=0.14,head_length=0.28",
             "color": INK,
@@ -224,17 +239,17 @@ def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], place: tuple
             "shrinkA": 0,
             "shrinkB": 0,
         }
-        ax.annotate("", xy=tuple(tip), xytext=place, arrowprops=style, annotation_clip=False)
+        ax.annotate("", xy=tuple(tip), xytext=origin, arrowprops=style, annotation_clip=False)
         # The distance of the letter from the tip does not depend on the length of the arrow.
         x, y = tip + 0.3 * length * direction / np.hypot(*direction)
         ax.text(x, y, letter, ha="center", va="center", fontsize=8, color=INK)
 
 
 def draw_number(
-    ax: Axes, place: Float[np.ndarray, "2"], text: str, *, fontsize: float, faint: bool, align: str = "center"
+    ax: Axes, position: Float[np.ndarray, "2"], text: str, *, fontsize: float, faint: bool, align: str = "center"
 ) -> None:
-    """Draw a number on the page with a white rim; `align`: horizontal alignment relative to `place`."""
-    x, y = place
+    """Draw a number on the page with a white rim; `align`: horizontal alignment relative to `position`."""
+    x, y = position
     ax.text(
         x, y, text, ha=align, va="center", fontsize=fontsize, color=INK, alpha=0.45 if faint else 1.0,
         path_effects=_RIM, zorder=4,

@@ -14,7 +14,7 @@ from jeit.arguments import check_kind
 from jeit.electrodes.electrode_shapes import ElectrodeShapes
 from jeit.plot.axes import CHANGE, ColourScale, FittedScale, axes_or_new, check_scale
 from jeit.plot.solid.body import add_electrodes, number_electrodes
-from jeit.plot.solid.scene import BODY, FROM_THE_CORNER, Camera, Scene, bare_in_space
+from jeit.plot.solid.scene import BODY, CORNER_VIEW, Camera, Scene, hide_axes_in_space
 
 
 def plot_surface(
@@ -23,7 +23,7 @@ def plot_surface(
     values: ArrayLike | None = None,
     electrodes: ElectrodeShapes | None = None,
     *,
-    camera: Camera = FROM_THE_CORNER,
+    camera: Camera = CORNER_VIEW,
     scale: ColourScale = CHANGE,
     title: str | None = None,
     ax: Axes | None = None,
@@ -51,46 +51,58 @@ def plot_surface(
     plot_surface(ball.points, ball.cells, ball.points[:, 2], scale=ColourScale(quantity="height", unit="m"))
     ```
     """
-    places, faces = checked_surface(points, triangles)
+    point_array, triangle_array = checked_surface(points, triangles)
     check_kind("camera", camera, Camera, "a Camera, such as Camera(azimuth=-60, elevation=25)")
     check_scale(scale)
     if electrodes is not None:
         check_kind("electrodes", electrodes, ElectrodeShapes, "ElectrodeShapes, of shapes_of(mesh, electrodes)")
     ax = axes_or_new(ax)
-    scene, fitted = Scene(camera), None
+    scene, fitted_scale = Scene(camera), None
     if values is None:
         colours = np.array(to_rgba(BODY))
     else:
-        image = checked_values(values, len(places), len(faces))
-        fitted = scale.of(image, "S")
-        colours = colours_of(fitted, image if len(image) == len(faces) else image[faces].mean(axis=1))
-    scene.add_triangles(places, faces, colours, smooth=True)
+        image = checked_values(values, len(point_array), len(triangle_array))
+        fitted_scale = scale.of(image, "S")
+        colours = colours_of(
+            fitted_scale, image if len(image) == len(triangle_array) else image[triangle_array].mean(axis=1)
+        )
+    scene.add_triangles(point_array, triangle_array, colours, smooth=True)
     if electrodes is not None:
-        add_electrodes(scene, places, faces, electrodes)
+        add_electrodes(scene, point_array, triangle_array, electrodes)
     scene.draw(ax)
-    bare_in_space(ax, camera, places, numbered=electrodes is not None)
+    hide_axes_in_space(ax, camera, point_array, numbered=electrodes is not None)
     if electrodes is not None:
-        number_electrodes(ax, scene, places, faces, electrodes, behind=False)
+        number_electrodes(ax, scene, point_array, triangle_array, electrodes, behind=False)
     if title is not None:
         ax.set_title(title)
-    if fitted is not None:
-        fitted.draw_bar(ax, mappable(fitted))
+    if fitted_scale is not None:
+        fitted_scale.draw_bar(ax, mappable(fitted_scale))
     return ax
 
 
 def checked_surface(points: ArrayLike, triangles: ArrayLike) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
     """Check the points and triangles of a surface, and return them as arrays. Raises `ValueError` for other shapes,
     points that are not finite, and indices out of range."""
-    places, faces = np.asarray(points), np.asarray(triangles)
-    if places.ndim != 2 or places.shape[1] != 3 or not np.issubdtype(places.dtype, np.number):
-        raise ValueError(f"points has shape {places.shape}; give (n, 3), metres.")
-    if not np.isfinite(places).all():
+    point_array, triangle_array = np.asarray(points), np.asarray(triangles)
+    if point_array.ndim != 2 or point_array.shape[1] != 3 or not np.issubdtype(point_array.dtype, np.number):
+        raise ValueError(f"points has shape {point_array.shape}; give (n, 3), metres.")
+    if not np.isfinite(point_array).all():
         raise ValueError("points must be finite, in metres.")
-    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or not np.issubdtype(faces.dtype, np.integer):
-        raise ValueError(f"triangles has shape {faces.shape} of {faces.dtype}; give (m, 3) whole numbers of points.")
-    if faces.min() < 0 or faces.max() >= len(places):
-        raise ValueError(f"triangles names point {int(faces.max())}; there are {len(places)}, counted from 0.")
-    return places.astype(float), faces
+    if (
+        triangle_array.ndim != 2
+        or triangle_array.shape[1] != 3
+        or len(triangle_array) == 0
+        or not np.issubdtype(triangle_array.dtype, np.integer)
+    ):
+        raise ValueError(
+            f"triangles has shape {triangle_array.shape} of {triangle_array.dtype}; give (m, 3) whole numbers of "
+            "points."
+        )
+    if triangle_array.min() < 0 or triangle_array.max() >= len(point_array):
+        raise ValueError(
+            f"triangles names point {int(triangle_array.max())}; there are {len(point_array)}, counted from 0."
+        )
+    return point_array.astype(float), triangle_array
 
 
 def checked_values(values: ArrayLike, num_points: int, num_triangles: int) -> Float[np.ndarray, " k"]:

@@ -23,7 +23,7 @@ from jeit.plot.solid.body import size_of
 from jeit.plot.solid.isosurfaces import check_drawn, draw_body_in_plane
 from jeit.plot.solid.scene import draw_axes_cross, draw_number
 
-MOST_SLICES = 64
+MAX_SLICES = 64
 
 
 def plot_slice(
@@ -61,9 +61,9 @@ def plot_slice(
     image = cell_values(mesh, values)
     fitted = scale.of(image, "S/m")
     ax = axes_or_new(ax)
-    drawn = draw_slice(ax, mesh, image, plane, electrodes, inclusions=inclusions, fitted=fitted)
+    mappable = draw_slice(ax, mesh, image, plane, electrodes, inclusions=inclusions, fitted=fitted)
     finish_slice(ax, plane, window_of(ax), cross=True)
-    fitted.draw_bar(ax, drawn)
+    fitted.draw_bar(ax, mappable)
     return ax
 
 
@@ -114,11 +114,11 @@ def plot_slices(
     grid = figure.add_gridspec(rows, columns + 1, width_ratios=[1] * columns + [0.05])
     panels = [figure.add_subplot(grid[divmod(k, columns)]) for k in range(len(planes))]
     for panel, plane in zip(panels, planes, strict=True):
-        drawn = draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted)
+        mappable = draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted)
         finish_slice(panel, plane, (left, right, low, high), cross=panel is panels[0])
         if scale.bar and panel is panels[-1]:
             bar = figure.add_subplot(grid[:, columns])
-            draw_colour_bar(panel, drawn, fitted.label, signed=scale.difference, position=bar)
+            draw_colour_bar(panel, mappable, fitted.label, signed=scale.difference, position=bar)
     return figure
 
 
@@ -127,16 +127,18 @@ def planes_along(mesh: Mesh, axis: str, at: Sequence[float] | int) -> list[Plane
     coordinates in metres. Raises `ValueError` for an unknown axis, and for too many or no planes."""
     if axis not in AXES:
         raise ValueError(f"axis must be 'x', 'y' or 'z'; it is {describe(axis)}.")
-    along = np.asarray(mesh.points)[:, AXES.index(axis)]
+    coordinates = np.asarray(mesh.points)[:, AXES.index(axis)]
     if isinstance(at, int | np.integer) and not isinstance(at, bool):
-        if not 1 <= at <= MOST_SLICES:
-            raise ValueError(f"at must be a number of slices from 1 to {MOST_SLICES}, or their places; it is {at}.")
-        places = along.min() + (np.arange(at) + 0.5) / at * np.ptp(along)
+        if not 1 <= at <= MAX_SLICES:
+            raise ValueError(f"at must be a number of slices from 1 to {MAX_SLICES}, or their places; it is {at}.")
+        plane_positions = coordinates.min() + (np.arange(at) + 0.5) / at * np.ptp(coordinates)
     else:
-        places = np.atleast_1d(np.asarray(at, dtype=object))
-        if not 1 <= len(places) <= MOST_SLICES:
-            raise ValueError(f"at must be the places of 1 to {MOST_SLICES} slices, in metres; they are {len(places)}.")
-    return [Plane.at(axis, one) for one in places]
+        plane_positions = np.atleast_1d(np.asarray(at, dtype=object))
+        if not 1 <= len(plane_positions) <= MAX_SLICES:
+            raise ValueError(
+                f"at must be the places of 1 to {MAX_SLICES} slices, in metres; they are {len(plane_positions)}."
+            )
+    return [Plane.at(axis, position) for position in plane_positions]
 
 
 def draw_slice(
@@ -151,18 +153,18 @@ def draw_slice(
 ) -> ScalarMappable:
     """Draw a section with its outline, electrodes and inclusions in a fitted colour scale; return the mappable for a
     colour bar."""
-    cut = cut_by_plane(mesh, plane)
-    cells = PolyCollection(cut.polygons, edgecolors="face", linewidths=0.4)  # pyright: ignore[reportArgumentType]
-    cells.set_array(fitted.factor * image[cut.cell])
+    section = cut_by_plane(mesh, plane)
+    cells = PolyCollection(section.polygons, edgecolors="face", linewidths=0.4)  # pyright: ignore[reportArgumentType]
+    cells.set_array(fitted.factor * image[section.cell])
     cells.set_cmap(fitted.keywords["cmap"])
     cells.set_clim(fitted.keywords["vmin"], fitted.keywords["vmax"])
     ax.add_collection(cells)
-    ax.add_collection(LineCollection(list(cut.outline), colors=INK, linewidths=0.9, capstyle="round", zorder=2))
+    ax.add_collection(LineCollection(list(section.outline), colors=INK, linewidths=0.9, capstyle="round", zorder=2))
     shapes = _electrode_shapes(mesh, electrodes)
     if shapes is not None:
-        _draw_cut_electrodes(ax, plane, shapes, 0.05 * size_of(mesh), cut.polygons.reshape(-1, 2).mean(axis=0))
-    for one in inclusions:
-        draw_body_in_plane(ax, plane, one)
+        _draw_cut_electrodes(ax, plane, shapes, 0.05 * size_of(mesh), section.polygons.reshape(-1, 2).mean(axis=0))
+    for inclusion in inclusions:
+        draw_body_in_plane(ax, plane, inclusion)
     return cells
 
 
@@ -171,10 +173,10 @@ def finish_slice(ax: Axes, plane: Plane, window: tuple[float, float, float, floa
     arrows of the axes."""
     left, right, low, high = window
     size = max(right - left, high - low)
-    room = 0.08 * size
+    margin = 0.08 * size
     ax.set_aspect("equal")
-    ax.set_xlim(left - room, right + room)
-    ax.set_ylim(low - 0.2 * size, high + room)
+    ax.set_xlim(left - margin, right + margin)
+    ax.set_ylim(low - 0.2 * size, high + margin)
     ax.set_axis_off()
     if cross:
         draw_scale_bar(ax, (left, right, low, high))
@@ -211,32 +213,32 @@ def _electrode_shapes(mesh: Mesh, electrodes) -> ElectrodeShapes | None:
 
 def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, distance: float, middle) -> None:
     """Draw a thick line where a plane intersects an electrode, and the number of the electrode outwards of it."""
-    found: dict[int, list[np.ndarray]] = {}
-    for corners, number in zip(shapes.polygons(), shapes.electrode, strict=True):
-        height = plane.distance(corners)
-        if len(corners) < 3 or height.min() > 0 or height.max() < 0:
+    lines_by_electrode: dict[int, list[np.ndarray]] = {}
+    for corners, electrode_index in zip(shapes.polygons(), shapes.electrode, strict=True):
+        distances = plane.distance(corners)
+        if len(corners) < 3 or distances.min() > 0 or distances.max() < 0:
             continue
         ring = np.arange(1, len(corners) - 1)
         fan = np.stack([np.zeros_like(ring), ring, ring + 1], axis=1)
-        lines = plane.on_page(crossed_edges(fan, height).at_corners(corners))
+        lines = plane.on_page(crossed_edges(fan, distances).at_corners(corners))
         if len(lines):
-            found.setdefault(int(number), []).extend(lines)
-    for number, lines in found.items():
+            lines_by_electrode.setdefault(int(electrode_index), []).extend(lines)
+    for electrode_index, lines in lines_by_electrode.items():
         ax.add_collection(LineCollection(lines, colors=METAL, linewidths=4, capstyle="butt", zorder=3))
         ends = np.concatenate(lines)
-        place = ends.mean(axis=0)
+        position = ends.mean(axis=0)
         if np.ptp(ends, axis=0).max() < 0.1 * distance:
             continue  # only a corner of the electrode is cut
         # The number is placed perpendicular to the line, away from the middle of the section.
-        outward = np.linalg.svd(ends - place)[2][1]
-        place = place + distance * outward * np.sign(outward @ (place - middle))
-        draw_number(ax, place, str(number + 1), fontsize=7, faint=False)
+        outward = np.linalg.svd(ends - position)[2][1]
+        position = position + distance * outward * np.sign(outward @ (position - middle))
+        draw_number(ax, position, str(electrode_index + 1), fontsize=7, faint=False)
 
 
-def _num_columns(number: int, tall: float) -> int:
-    """Number of columns of a grid of `number` panels on a landscape page; `tall`: ratio of height to width of a
-    panel."""
-    best = max(1, round(float(np.sqrt(1.6 * number * tall))))
+def _num_columns(num_panels: int, aspect_ratio: float) -> int:
+    """Number of columns of a grid of `num_panels` panels on a landscape page; `aspect_ratio`: ratio of height to width
+    of a panel."""
+    preferred = max(1, round(float(np.sqrt(1.6 * num_panels * aspect_ratio))))
     # Among similar numbers of columns, the one with the fewest empty places is chosen.
-    near = range(max(1, best - 1), best + 2)
-    return min(number, min(near, key=lambda columns: (-number % columns, abs(columns - best))))
+    candidates = range(max(1, preferred - 1), preferred + 2)
+    return min(num_panels, min(candidates, key=lambda columns: (-num_panels % columns, abs(columns - preferred))))

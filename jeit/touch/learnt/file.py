@@ -179,7 +179,7 @@ def read_plain(path: Path, kind: str, version: int, description: str, make: Call
         check_archive(path)
         untrusted_types = sorted(get_untrusted_types(file=path))
         if untrusted_types:
-            raise ValueError(f"it holds {listed(untrusted_types, most=3)}, which no {description} does")
+            raise ValueError(f"it holds {listed(untrusted_types, max_names=3)}, which no {description} does")
         content = load(path, trusted=[])
         if not isinstance(content, dict) or content.get("kind") != kind:
             raise ValueError("it is of another kind")
