@@ -18,7 +18,7 @@ from jeit_solvers.engines import host, namespace
 from jeit_solvers.module import Module
 
 # Constant in m² added to r², since r = √r² has no derivative at r = 0: the square of a hundredth of a micrometre.
-_TIP = 1e-16
+_DISTANCE_SMOOTHING = 1e-16
 
 
 class AbstractDecay(Module):
@@ -95,8 +95,8 @@ class InverseSquare(AbstractDecay):
     @classmethod
     def start(cls, spacing, num_microphones):
         """Initial model with a = b = spacing²."""
-        same = host.full(num_microphones, float(spacing) ** 2)
-        return cls(same, same)
+        squared_spacing = host.full(num_microphones, float(spacing) ** 2)
+        return cls(squared_spacing, squared_spacing)
 
     @classmethod
     def bounds(cls, extent):
@@ -115,13 +115,13 @@ class Exponential(AbstractDecay):
     def log_response(self, squared_distance):
         """Logarithm of the response: log a − r / l."""
         xp = namespace(self, squared_distance)
-        distance = xp.sqrt(squared_distance + _TIP)
+        distance = xp.sqrt(squared_distance + _DISTANCE_SMOOTHING)
         return column(xp.log(self.a), squared_distance) - distance / column(self.length, squared_distance)
 
     def response(self, squared_distance):
         """Response a exp(−r / l)."""
         xp = namespace(self, squared_distance)
-        distance = xp.sqrt(squared_distance + _TIP)
+        distance = xp.sqrt(squared_distance + _DISTANCE_SMOOTHING)
         return column(self.a, squared_distance) * xp.exp(-distance / column(self.length, squared_distance))
 
     @property
@@ -162,7 +162,7 @@ class AttenuatedInverseSquare(AbstractDecay):
     def log_response(self, squared_distance):
         """Logarithm of the response: log a − log(r² + b) − r / l."""
         xp = namespace(self, squared_distance)
-        distance = xp.sqrt(squared_distance + _TIP)
+        distance = xp.sqrt(squared_distance + _DISTANCE_SMOOTHING)
         spreading = xp.log(squared_distance + column(self.b, squared_distance))
         attenuation = distance / column(self.length, squared_distance)
         return column(xp.log(self.a), squared_distance) - spreading - attenuation
@@ -170,9 +170,9 @@ class AttenuatedInverseSquare(AbstractDecay):
     def response(self, squared_distance):
         """Response a exp(−r / l) / (r² + b)."""
         xp = namespace(self, squared_distance)
-        distance = xp.sqrt(squared_distance + _TIP)
-        left = column(self.a, squared_distance) * xp.exp(-distance / column(self.length, squared_distance))
-        return left / (squared_distance + column(self.b, squared_distance))
+        distance = xp.sqrt(squared_distance + _DISTANCE_SMOOTHING)
+        attenuated_gain = column(self.a, squared_distance) * xp.exp(-distance / column(self.length, squared_distance))
+        return attenuated_gain / (squared_distance + column(self.b, squared_distance))
 
     @property
     def gain(self):
@@ -191,8 +191,8 @@ class AttenuatedInverseSquare(AbstractDecay):
     @classmethod
     def start(cls, spacing, num_microphones):
         """Initial model with a = b = spacing² and l = 3 spacing."""
-        same = host.full(num_microphones, float(spacing) ** 2)
-        return cls(same, same, host.full(num_microphones, 3.0 * spacing))
+        squared_spacing = host.full(num_microphones, float(spacing) ** 2)
+        return cls(squared_spacing, squared_spacing, host.full(num_microphones, 3.0 * spacing))
 
     @classmethod
     def bounds(cls, extent):

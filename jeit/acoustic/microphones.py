@@ -36,22 +36,22 @@ class MicrophoneArray(Module):
 
     def response(self, chart: Float[Array, "2 ..."]) -> Float[Array, "M ..."]:
         """Responses f_i of the microphones to sources at chart coordinates (2, …)."""
-        place = self.surface.place(chart)
-        mine = self.microphones.reshape(self.microphones.shape + (1,) * (place.ndim - 1))
-        squares = [(place[k] - mine[:, k]) ** 2 for k in range(place.shape[0])]
+        position = self.surface.place(chart)
+        microphones = self.microphones.reshape(self.microphones.shape + (1,) * (position.ndim - 1))
+        squares = [(position[k] - microphones[:, k]) ** 2 for k in range(position.shape[0])]
         return self.decay.response(sum(squares[1:], squares[0]))
 
     def expected(self, unknowns: Float[Array, "n F"]) -> tuple[Float[Array, "M F"], Float[Array, "M F"]]:
         """Expected levels m (M, F) and their variances v (M, F). `unknowns` (n, F): chart coordinates and logarithm of
         the strength of one or more sources."""
-        each = [unknowns[k : k + 3] for k in range(0, len(unknowns), 3)]
+        sources = [unknowns[k : k + 3] for k in range(0, len(unknowns), 3)]
         xp = namespace(self, unknowns)
-        sent = [xp.exp(one[2]) * self.response(one[:2]) for one in each]
-        received = functools.reduce(operator.add, sent)
+        powers = [xp.exp(source[2]) * self.response(source[:2]) for source in sources]
+        received = functools.reduce(operator.add, powers)
         return xp.log(received + self.noise.floor[:, None]), self.noise.level_variance(received)
 
 
 def check_array(microphone_array: MicrophoneArray) -> None:
     """Raises `ValueError` if `microphone_array` is not a `MicrophoneArray`."""
-    wanted = "a MicrophoneArray, such as calibration.microphone_array"
-    check_kind("microphone_array", microphone_array, MicrophoneArray, wanted)
+    description = "a MicrophoneArray, such as calibration.microphone_array"
+    check_kind("microphone_array", microphone_array, MicrophoneArray, description)

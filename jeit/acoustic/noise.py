@@ -22,7 +22,7 @@ from jeit_solvers.engines import as_array, namespace
 from jeit_solvers.module import Module
 
 # Minimum relative error of a decay model.
-LEAST_RELATIVE = 1e-3
+MIN_RELATIVE_ERROR = 1e-3
 # Minimum floor in standard deviations of the noise, which keeps the argument of the logarithm positive if no floor is
 # known.
 _FLOOR_DEVIATIONS = 4.0
@@ -48,18 +48,21 @@ class IntensityNoise(Module):
         floor: ArrayLike = 0.0,
         freedom: ArrayLike = np.inf,
         deviation: ArrayLike | None = None,
-        relative: ArrayLike = LEAST_RELATIVE,
+        relative: ArrayLike = MIN_RELATIVE_ERROR,
     ) -> "IntensityNoise":
         """Create the noise parameters from the subtracted `floor` and the degrees of freedom ν of a window (`freedom`),
         or from the standard deviation s of the intensity without a source (`deviation`). `relative`: relative error τ.
         All are numbers or (M,)."""
-        wide = [np.broadcast_to(np.asarray(value, float), (num_microphones,)) for value in (floor, freedom, relative)]
-        base, degrees, scatter = wide
-        rest = base * np.sqrt(2 / degrees)
+        arrays = [np.broadcast_to(np.asarray(value, float), (num_microphones,)) for value in (floor, freedom, relative)]
+        floors, degrees, errors = arrays
+        deviations = floors * np.sqrt(2 / degrees)
         if deviation is not None:
-            rest = np.maximum(rest, np.broadcast_to(np.asarray(deviation, float), (num_microphones,)))
-        floor, least = np.maximum(base, _FLOOR_DEVIATIONS * rest), np.maximum(scatter, LEAST_RELATIVE)
-        return cls(*(as_array(values) for values in (floor, rest, 4 * base / degrees, least)))
+            deviations = np.maximum(deviations, np.broadcast_to(np.asarray(deviation, float), (num_microphones,)))
+        floor, bounded_errors = (
+            np.maximum(floors, _FLOOR_DEVIATIONS * deviations),
+            np.maximum(errors, MIN_RELATIVE_ERROR),
+        )
+        return cls(*(as_array(values) for values in (floor, deviations, 4 * floors / degrees, bounded_errors)))
 
     def variance(self, received: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
         """Variance of the power minus the floor, for the expected power `received` (M, …)."""
@@ -84,6 +87,6 @@ def column(values: Float[Array, " M"], broadcast_to: Array) -> Array:
 def noise_from_negative_powers(power: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Standard deviation (M,) of the noise, estimated from the negative values among the intensities `power` (F, M).
     Only noise can make intensities negative."""
-    below = np.where(usable & (power < 0), power, 0.0)
-    number = (below < 0).sum(axis=0)
-    return np.sqrt((below**2).sum(axis=0) / np.maximum(number, 1))
+    negative_power = np.where(usable & (power < 0), power, 0.0)
+    num_negative = (negative_power < 0).sum(axis=0)
+    return np.sqrt((negative_power**2).sum(axis=0) / np.maximum(num_negative, 1))

@@ -12,7 +12,7 @@ from jeit.acoustic import Localiser, LocatedTouches
 from jeit.acoustic.calibration.calibrate import CalibrationFit
 from jeit.acoustic.localisation.locate import microphones_in_use
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
-from jeit.acoustic.localisation.pixels import fade, map_brightness
+from jeit.acoustic.localisation.pixels import last_overlay_image, map_brightness
 from jeit.acoustic.tracking import Track
 from jeit.report.folder import as_plain_values, results, version_of, write_json, write_rows
 
@@ -35,9 +35,9 @@ def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
     ```
     """
     path, picture = calibration_files(path)
-    with results(path.parent, (path.name, picture.name)) as made:
-        fit.calibration.save(made / path.name)
-        draw_calibration(fit).savefig(made / picture.name, dpi=130)
+    with results(path.parent, (path.name, picture.name)) as output_folder:
+        fit.calibration.save(output_folder / path.name)
+        draw_calibration(fit).savefig(output_folder / picture.name, dpi=130)
 
 
 def calibration_files(path: str | Path) -> tuple[Path, Path]:
@@ -91,22 +91,22 @@ def write_track(found: LocatedTouches, folder: str | Path) -> None:
     write_track(located, "out")
     ```
     """
-    with results(folder, ("track.csv", "report.json", "track.png")) as made:
+    with results(folder, ("track.csv", "report.json", "track.png")) as output_folder:
         columns = _column_names(found.locations.position.shape[1])
-        write_rows(made / "track.csv", columns, _track_rows(found.locations, found.track))
-        write_json(report_track(found), made / "report.json")
-        draw_track(found).savefig(made / "track.png", dpi=150)
+        write_rows(output_folder / "track.csv", columns, _track_rows(found.locations, found.track))
+        write_json(report_track(found), output_folder / "report.json")
+        draw_track(found).savefig(output_folder / "track.png", dpi=150)
 
 
-def report_track(found: LocatedTouches) -> dict[str, Any]:
+def report_track(located_touches: LocatedTouches) -> dict[str, Any]:
     """Summarise the result of `locate_touches` in a dictionary of numbers, strings, lists and dictionaries, with None
     for unknown values."""
-    locations, track, calibration = found.locations, found.track, found.calibration
+    locations, track, calibration = located_touches.locations, located_touches.track, located_touches.calibration
     touches = []
     for number, touch in enumerate(track.touches, 1):
         frames = slice(touch.first, touch.last + 1)
         strength = locations.strength[frames]
-        kinds = [str(kind) for kind in locations.status[frames] if kind != LocationStatus.NO_TOUCH]
+        statuses = [str(status) for status in locations.status[frames] if status != LocationStatus.NO_TOUCH]
         touches.append(
             {
                 "touch": number,
@@ -114,7 +114,7 @@ def report_track(found: LocatedTouches) -> dict[str, Any]:
                 "offset_s": touch.offset,
                 "path_length_m": touch.length,
                 "mean_position_m": np.nanmean(track.position[frames], axis=0),
-                "status": {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)},
+                "status": {status: statuses.count(status) for status in dict.fromkeys(statuses)},
                 "greatest_strength": np.nanmax(strength),
             }
         )
@@ -127,7 +127,7 @@ def report_track(found: LocatedTouches) -> dict[str, Any]:
         {
             "recording": locations.name,
             "calibration": calibration.name,
-            "method": found.method,
+            "method": located_touches.method,
             "decay": calibration.microphone_array.decay.name,
             "frames": len(locations.times),
             "duration_s": locations.times[-1] - locations.times[0],
@@ -155,16 +155,21 @@ def report_track(found: LocatedTouches) -> dict[str, Any]:
     )
 
 
-def draw_track(found: LocatedTouches):
+def draw_track(located_touches: LocatedTouches):
     """Plot the track of a recording. Returns a matplotlib `Figure`; no display is needed."""
     from matplotlib.figure import Figure
 
     from jeit.acoustic.plots import plot_track
 
     figure = Figure(figsize=(6.6, 5.8), layout="constrained")
-    title = found.locations.name
+    title = located_touches.locations.name
     plot_track(
-        found.track, found.locations, found.calibration, overlay=_overlay_maps(found), title=title, ax=figure.subplots()
+        located_touches.track,
+        located_touches.locations,
+        located_touches.calibration,
+        overlay=_overlay_maps(located_touches),
+        title=title,
+        ax=figure.subplots(),
     )
     return figure
 
@@ -173,18 +178,20 @@ def _overlay_maps(touches: LocatedTouches) -> np.ndarray | None:
     """Overlay (rows, columns) of the maps of all located frames, in which older frames are fainter; None if no frame is
     located."""
     locations, intensities = touches.locations, touches.intensities
-    located = np.flatnonzero(locations.has_position & (locations.status != LocationStatus.TWO_TOUCHES))
-    if not located.size:
+    located_frames = np.flatnonzero(locations.has_position & (locations.status != LocationStatus.TWO_TOUCHES))
+    if not located_frames.size:
         return None
     microphone_array, use, _ = microphones_in_use(intensities, touches.calibration)
     localiser = Localiser.create(microphone_array, method=touches.method, map_shape=(_PIXELS, _PIXELS), compiled=False)
-    times = locations.times[located]
+    times = locations.times[located_frames]
     time_constant = max(0.3, 0.5 * float(times[-1] - times[0]))
     image = np.zeros((_PIXELS, _PIXELS))
-    for start in range(0, located.size, _FRAMES):
-        some = located[start : start + _FRAMES]
-        bright = map_brightness(localiser.maps(intensities.power[some], use[some]), method=touches.method)
-        image = np.maximum(image, fade(bright, locations.times[some], at=times[-1], time_constant=time_constant))
+    for start in range(0, located_frames.size, _FRAMES):
+        chunk = located_frames[start : start + _FRAMES]
+        brightness = map_brightness(localiser.maps(intensities.power[chunk], use[chunk]), method=touches.method)
+        image = np.maximum(
+            image, last_overlay_image(brightness, locations.times[chunk], time=times[-1], time_constant=time_constant)
+        )
     return image
 
 
@@ -197,34 +204,36 @@ def _column_names(dimension: int) -> list[str]:
 
 
 def _track_rows(locations: Locations, track: Track):
-    d = locations.position.shape[1]
-    number = np.zeros(len(locations.times), int)
+    dimension = locations.position.shape[1]
+    touch_numbers = np.zeros(len(locations.times), int)
     for index, touch in enumerate(track.touches, 1):
-        number[touch.first : touch.last + 1] = index
-    raw, smooth = (np.sqrt(np.diagonal(each.covariance, axis1=1, axis2=2)) for each in (locations, track))
+        touch_numbers[touch.first : touch.last + 1] = index
+    frame_deviations, track_deviations = (
+        np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2)) for estimate in (locations, track)
+    )
     for k, time in enumerate(locations.times):
-        place, spread = locations.position[k], locations.covariance[k]
+        position, covariance = locations.position[k], locations.covariance[k]
         row = [
             f"{time:.6f}",
-            *_format_numbers(place[:2]),
-            *_format_numbers(raw[k, :2]),
-            _format_number(spread[0, 1]),
+            *_format_numbers(position[:2]),
+            *_format_numbers(frame_deviations[k, :2]),
+            _format_number(covariance[0, 1]),
             _format_number(locations.strength[k]),
         ]
         row += [
             locations.status[k],
             *_format_numbers(track.position[k, :2]),
-            *_format_numbers(smooth[k, :2]),
-            number[k] or "",
+            *_format_numbers(track_deviations[k, :2]),
+            touch_numbers[k] or "",
         ]
-        if d == 3:
+        if dimension == 3:
             row += [
-                _format_number(place[2]),
-                _format_number(raw[k, 2]),
-                _format_number(spread[0, 2]),
-                _format_number(spread[1, 2]),
+                _format_number(position[2]),
+                _format_number(frame_deviations[k, 2]),
+                _format_number(covariance[0, 2]),
+                _format_number(covariance[1, 2]),
             ]
-            row += [_format_number(track.position[k, 2]), _format_number(smooth[k, 2])]
+            row += [_format_number(track.position[k, 2]), _format_number(track_deviations[k, 2])]
         yield row
 
 

@@ -18,7 +18,7 @@ from jeit_solvers.engines import as_array, namespace, on_host, slopes
 from jeit_solvers.module import Module
 
 # Maximum number of spline knots: more would slow down evaluation without making the surface smoother.
-_MOST_KNOTS = 300
+_MAX_KNOTS = 300
 
 
 class AbstractSurface(Module):
@@ -105,16 +105,16 @@ def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -
     try:
         vertices = np.asarray(outline, float)
     except (TypeError, ValueError):
-        wanted = "an outline, such as Disk(0.1), or vertices (K, 2) or (K, 3) in metres"
-        raise ValueError(f"outline must be {wanted}; it is {describe(outline)}.") from None
+        expected = "an outline, such as Disk(0.1), or vertices (K, 2) or (K, 3) in metres"
+        raise ValueError(f"outline must be {expected}; it is {describe(outline)}.") from None
     if vertices.ndim != 2 or vertices.shape[1] not in (2, 3) or len(vertices) < 3:
         raise ValueError(f"outline: give at least three vertices (K, 2) or (K, 3) in metres; got {vertices.shape}.")
     if vertices.shape[1] == 2:
         return Plane(Polygon(vertices))
-    known = vertices if points is None else np.vstack([vertices, np.asarray(points, float)])
-    if not np.isfinite(known).all():
+    surface_points = vertices if points is None else np.vstack([vertices, np.asarray(points, float)])
+    if not np.isfinite(surface_points).all():
         raise ValueError("outline: every coordinate of the outline and of the points on it must be finite.")
-    return _curved_surface(vertices, np.unique(known, axis=0))
+    return _curved_surface(vertices, np.unique(surface_points, axis=0))
 
 
 def bounding_box(surface: AbstractSurface) -> tuple[Float[Array, " 2"], Float[Array, " 2"]]:
@@ -128,10 +128,10 @@ def to_space(
 ) -> tuple[Float[Array, "F d"], Float[Array, "F d d"]]:
     """Transform positions (2, F) and covariances (2, 2, F) in the chart to positions (F, d) and covariances (F, d, d)
     in space."""
-    place, along = slopes(surface.place, chart)
-    xp = namespace(place, covariance)
-    along = xp.stack(along)
-    return place.T, xp.einsum("kaf,klf,lbf->fab", along, covariance, along)
+    position, derivatives = slopes(surface.place, chart)
+    xp = namespace(position, covariance)
+    derivatives = xp.stack(derivatives)
+    return position.T, xp.einsum("kaf,klf,lbf->fab", derivatives, covariance, derivatives)
 
 
 def longer_side(surface: AbstractSurface) -> Float[Array, ""]:
@@ -143,12 +143,12 @@ def longer_side(surface: AbstractSurface) -> Float[Array, ""]:
 def chart_grid(surface: AbstractSurface, columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the centres (2, rows, columns) of the pixels of a raster over the outline's bounding box, bottom row
     first, and the mask (rows, columns) of the pixels inside the outline."""
-    at_hand: AbstractSurface = on_host(surface)
-    (left, bottom), (right, top) = bounding_box(at_hand)
+    host_surface: AbstractSurface = on_host(surface)
+    (left, bottom), (right, top) = bounding_box(host_surface)
     x = left + (right - left) * (np.arange(columns) + 0.5) / columns
     y = bottom + (top - bottom) * (np.arange(rows) + 0.5) / rows
-    grid = np.stack(np.meshgrid(x, y))
-    return grid, np.asarray(at_hand.outline.contains(np.moveaxis(grid, 0, -1)))
+    centres = np.stack(np.meshgrid(x, y))
+    return centres, np.asarray(host_surface.outline.contains(np.moveaxis(centres, 0, -1)))
 
 
 def outline_sides(surface: AbstractSurface) -> tuple[Float[Array, "2 K"], Float[Array, "2 K"]]:
@@ -162,29 +162,29 @@ def outline_sides(surface: AbstractSurface) -> tuple[Float[Array, "2 K"], Float[
 def _thin_plate(squared):
     """Thin-plate kernel ρ² log ρ as a function of ρ²; 0 for ρ = 0."""
     xp = namespace(squared)
-    positive = squared.real > 0
-    safe = xp.where(positive, squared, 1.0)
-    return xp.where(positive, 0.5 * safe * xp.log(safe), 0.0)
+    is_positive = squared.real > 0
+    positive_squared = xp.where(is_positive, squared, 1.0)
+    return xp.where(is_positive, 0.5 * positive_squared * xp.log(positive_squared), 0.0)
 
 
 def _curved_surface(vertices: np.ndarray, points_on_surface: np.ndarray) -> CurvedSurface:
     origin = points_on_surface.mean(axis=0)
-    _, spread, directions = np.linalg.svd(points_on_surface - origin, full_matrices=False)
-    if spread[1] <= 1e-6 * spread[0]:
+    _, singular_values, directions = np.linalg.svd(points_on_surface - origin, full_matrices=False)
+    if singular_values[1] <= 1e-6 * singular_values[0]:
         raise ValueError("outline: its vertices lie on one line; give the outline of a surface, in metres.")
     normal = directions[2] * (1.0 if directions[2][np.argmax(np.abs(directions[2]))] > 0 else -1.0)
     # The first axis of the chart is the projection of the coordinate axis that is most nearly parallel to the plane.
-    leading = np.eye(3)[np.argmin(np.abs(normal) + np.array([0.0, 1e-3, 2e-3]))]
-    first = leading - normal * (normal @ leading)
-    first /= np.linalg.norm(first)
-    axes = np.stack([first, np.cross(normal, first)], axis=1)
+    leading_axis = np.eye(3)[np.argmin(np.abs(normal) + np.array([0.0, 1e-3, 2e-3]))]
+    first_axis = leading_axis - normal * (normal @ leading_axis)
+    first_axis /= np.linalg.norm(first_axis)
+    axes = np.stack([first_axis, np.cross(normal, first_axis)], axis=1)
     chart, height = (points_on_surface - origin) @ axes, (points_on_surface - origin) @ normal
     scale = np.ptp(chart, axis=0).max()
-    keep = _farthest_points(chart, _MOST_KNOTS)
-    chart, height = chart[keep], height[keep]
-    apart = np.linalg.norm(chart[:, None] - chart, axis=-1) + 2 * scale * np.eye(len(chart))
-    first_of, second_of = np.unravel_index(apart.argmin(), apart.shape)
-    if apart.min() < 1e-3 * scale and abs(height[first_of] - height[second_of]) > 10 * apart.min():
+    knot_indices = _farthest_points(chart, _MAX_KNOTS)
+    chart, height = chart[knot_indices], height[knot_indices]
+    distances = np.linalg.norm(chart[:, None] - chart, axis=-1) + 2 * scale * np.eye(len(chart))
+    first_index, second_index = np.unravel_index(distances.argmin(), distances.shape)
+    if distances.min() < 1e-3 * scale and abs(height[first_index] - height[second_index]) > 10 * distances.min():
         raise ValueError(
             "positions: the surface folds over its best plane (two points lie above each other), which jeit cannot "
             "chart; calibrate its parts one by one."
@@ -203,8 +203,8 @@ def _farthest_points(points: np.ndarray, max_points: int) -> np.ndarray:
     """Indices of at most `max_points` points that are far from each other (farthest-point sampling)."""
     if len(points) <= max_points:
         return np.arange(len(points))
-    chosen, distance = [0], np.full(len(points), np.inf)
-    while len(chosen) < max_points:
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
-        chosen.append(int(distance.argmax()))
-    return np.array(chosen)
+    indices, distance = [0], np.full(len(points), np.inf)
+    while len(indices) < max_points:
+        distance = np.minimum(distance, np.linalg.norm(points - points[indices[-1]], axis=1))
+        indices.append(int(distance.argmax()))
+    return np.array(indices)

@@ -17,7 +17,7 @@ from jeit.acoustic.tracking import Track, track
 from jeit_solvers.module import Module
 
 # Rows and columns of the map on which the consistency loss is minimised, as in Park 2022.
-_PAPERS_MAP = (200, 200)
+_MAP_SHAPE = (200, 200)
 
 
 class LocatedTouches(Module):
@@ -77,20 +77,20 @@ def locate_touches(
     write_track(located, "out")
     ```
     """
-    said = progress or (lambda step: None)
+    report_step = progress or (lambda step: None)
     if intensity is not None and isinstance(recording, Intensities):
         raise ValueError("intensity: band and window are for samples; this recording holds intensities.")
     if not (np.isfinite(gap) and gap > 0):
         raise ValueError(f"gap must be positive, in seconds; it is {gap}.")
-    said("measure intensities")
+    report_step("measure intensities")
     result = calibrated_intensities(recording, calibration, intensity, silence=silence)
     if len(result.times) > 1 and np.median(np.diff(result.times)) > gap:
         raise ValueError(
             f"gap: frames are {np.median(np.diff(result.times)):g} s apart, more than the {gap:g} s that end a touch: "
             "give times in seconds, or a longer gap."
         )
-    said("locate")
-    map_shape = _PAPERS_MAP if method == "consistency" else None
+    report_step("locate")
+    map_shape = _MAP_SHAPE if method == "consistency" else None
     locations = locate(result, calibration, method=method, map_shape=map_shape, gain_drift=gain_drift)
-    said("track")
+    report_step("track")
     return LocatedTouches(result, locations, track(locations, gap=gap), calibration, method)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.special import chdtri
 
-from jeit.acoustic.localisation.locations import FEW_FRAMES, Locations
+from jeit.acoustic.localisation.locations import MAX_NUMPY_FRAMES, Locations
 from jeit.arguments import check_kind
 from jeit_solvers.engines import at_once, namespace, scan
 from jeit_solvers.module import Module
@@ -23,7 +23,7 @@ _DENSITIES = np.geomspace(1e-5, 10.0, 13)
 # Probability that a correct position is rejected as too far from its prediction.
 _FALSE_REJECTION = 1e-4
 # Standard deviation of each component of the initial velocity of a touch, in m/s.
-_FIRST_SPEED = 0.5
+_INITIAL_SPEED = 0.5
 
 
 class Touch(Module):
@@ -81,119 +81,143 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
         raise ValueError(f"gap must be positive, in seconds; it is {gap}.")
     if acceleration is not None and not (np.isfinite(acceleration) and acceleration > 0):
         raise ValueError(f"acceleration must be positive, in m²/s³; it is {acceleration}.")
-    frames, d = locations.position.shape
-    times, located = locations.times, locations.has_position
-    position, velocity = np.full((frames, d), np.nan), np.full((frames, d), np.nan)
-    covariance, rejected = np.full((frames, d, d), np.nan), np.zeros(frames, bool)
-    runs = _touch_intervals(times, located, gap)
+    num_frames, dimension = locations.position.shape
+    times, has_position = locations.times, locations.has_position
+    position, velocity = np.full((num_frames, dimension), np.nan), np.full((num_frames, dimension), np.nan)
+    covariance, rejected = np.full((num_frames, dimension, dimension), np.nan), np.zeros(num_frames, bool)
+    intervals = _touch_intervals(times, has_position, gap)
     densities = _DENSITIES if acceleration is None else np.array([acceleration])
     touches = []
-    for first, last in runs:
-        part = slice(first, last + 1)
-        measured = np.where(located[part, None], locations.position[part], 0.0)
-        spread = np.where(located[part, None, None], locations.covariance[part], np.eye(d)) * locations.overlap
+    for first, last in intervals:
+        touch_frames = slice(first, last + 1)
+        measured = np.where(has_position[touch_frames, None], locations.position[touch_frames], 0.0)
+        measured_covariance = (
+            np.where(has_position[touch_frames, None, None], locations.covariance[touch_frames], np.eye(dimension))
+            * locations.overlap
+        )
         # A minimum standard deviation of a tenth of a micrometre is added, since covariances on a curved surface are
         # singular.
-        spread = spread + 1e-14 * np.eye(d)
-        step = np.diff(times[part], prepend=times[first])
-        state, error, believed = _smooth_touch(step, measured, spread, located[part], densities)
-        position[part], velocity[part] = state[:, :d], state[:, d:]
-        covariance[part] = error[:, :d, :d]
-        rejected[part] = located[part] & ~believed
-        length = float(np.linalg.norm(np.diff(position[part], axis=0), axis=1).sum())
+        measured_covariance = measured_covariance + 1e-14 * np.eye(dimension)
+        time_steps = np.diff(times[touch_frames], prepend=times[first])
+        states, errors, is_accepted = _smooth_touch(
+            time_steps, measured, measured_covariance, has_position[touch_frames], densities
+        )
+        position[touch_frames], velocity[touch_frames] = states[:, :dimension], states[:, dimension:]
+        covariance[touch_frames] = errors[:, :dimension, :dimension]
+        rejected[touch_frames] = has_position[touch_frames] & ~is_accepted
+        length = float(np.linalg.norm(np.diff(position[touch_frames], axis=0), axis=1).sum())
         touches.append(Touch(float(times[first]), float(times[last]), int(first), int(last), length))
     return Track(np.asarray(times), position, covariance, velocity, tuple(touches), rejected)
 
 
-def _touch_intervals(times, located, gap: float) -> list[tuple[int, int]]:
+def _touch_intervals(times, has_position, gap: float) -> list[tuple[int, int]]:
     """Indices of the first and last located frame of each touch."""
-    index = np.flatnonzero(located)
+    index = np.flatnonzero(has_position)
     if not index.size:
         return []
     breaks = np.flatnonzero(np.diff(times[index]) > gap)
     firsts, lasts = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [index.size - 1]])
-    return [(int(index[a]), int(index[b])) for a, b in zip(firsts, lasts, strict=True)]
+    return [(int(index[first]), int(index[last])) for first, last in zip(firsts, lasts, strict=True)]
 
 
-def _smooth_touch(step, measured, spread, located, densities) -> tuple[np.ndarray, ...]:
+def _smooth_touch(time_steps, measured, covariances, has_position, densities) -> tuple[np.ndarray, ...]:
     """Call `_smooth`: with NumPy for a touch with few frames; otherwise compiled, with frames padded to a power of
     two."""
-    frames, d = measured.shape
-    if frames <= FEW_FRAMES:
-        return at_once(_smooth, step, measured, spread, located, densities)
-    pad = (1 << (frames - 1).bit_length()) - frames
+    num_frames, dimension = measured.shape
+    if num_frames <= MAX_NUMPY_FRAMES:
+        return at_once(_smooth, time_steps, measured, covariances, has_position, densities)
+    padding = (1 << (num_frames - 1).bit_length()) - num_frames
     arrays = (
-        np.pad(step, (0, pad)),
-        np.pad(measured, ((0, pad), (0, 0))),
-        np.concatenate([spread, np.broadcast_to(np.eye(d), (pad, d, d))]),
-        np.pad(located, (0, pad)),
+        np.pad(time_steps, (0, padding)),
+        np.pad(measured, ((0, padding), (0, 0))),
+        np.concatenate([covariances, np.broadcast_to(np.eye(dimension), (padding, dimension, dimension))]),
+        np.pad(has_position, (0, padding)),
     )
-    return tuple(np.asarray(array)[:frames] for array in jax.jit(_smooth)(*arrays, densities))
+    return tuple(np.asarray(array)[:num_frames] for array in jax.jit(_smooth)(*arrays, densities))
 
 
-def _smooth(step, measured, spread, located, densities):
+def _smooth(time_steps, measured, measured_covariance, has_position, densities):
     """Smooth the positions of one touch with n frames, for the most likely of the densities.
 
     Returns the states (n, 2 d), position and velocity; their covariances (n, 2 d, 2 d); and the mask (n,) of accepted
     positions.
     """
-    xp, d = namespace(measured), measured.shape[1]
-    score, filtered = _filter(step, measured, spread, located, densities)
-    best = xp.argmax(score)
-    mean, error, predicted_mean, predicted_error, believed = (array[:, best] for array in filtered)
+    xp, dimension = namespace(measured), measured.shape[1]
+    score, filtered = _filter(time_steps, measured, measured_covariance, has_position, densities)
+    best_index = xp.argmax(score)
+    mean, covariance, predicted_mean, predicted_covariance, is_accepted = (array[:, best_index] for array in filtered)
 
-    def smooth_step(later, now):
-        later_mean, later_error = later
-        mean, error, next_mean, next_error, next_step = now
-        move = _transition_matrix(next_step, d)
-        gain = xp.linalg.solve(next_error, move @ error).T
-        mean = mean + gain @ (later_mean - next_mean)
-        error = error + gain @ (later_error - next_error) @ gain.T
-        return (mean, error), (mean, error)
+    def smooth_step(next_state, frame_data):
+        smoothed_mean, smoothed_covariance = next_state
+        mean, covariance, next_mean, next_covariance, next_step = frame_data
+        transition = _transition_matrix(next_step, dimension)
+        gain = xp.linalg.solve(next_covariance, transition @ covariance).T
+        mean = mean + gain @ (smoothed_mean - next_mean)
+        covariance = covariance + gain @ (smoothed_covariance - next_covariance) @ gain.T
+        return (mean, covariance), (mean, covariance)
 
     # The recursion starts behind the last frame with a state equal to its prediction, so that the last frame is
     # unchanged.
-    beyond = predicted_mean[-1], predicted_error[-1]
-    later = (xp.concatenate([array[1:], array[-1:]]) for array in (predicted_mean, predicted_error, step))
-    _, (means, errors) = scan(smooth_step, beyond, (mean, error, *later), reverse=True)
-    return means, errors, believed
+    last_prediction = predicted_mean[-1], predicted_covariance[-1]
+    next_arrays = (
+        xp.concatenate([array[1:], array[-1:]]) for array in (predicted_mean, predicted_covariance, time_steps)
+    )
+    _, (means, covariances) = scan(smooth_step, last_prediction, (mean, covariance, *next_arrays), reverse=True)
+    return means, covariances, is_accepted
 
 
-def _filter(step, measured, spread, located, densities):
+def _filter(step, measured, measured_covariance, has_position, densities):
     """Run the Kalman filter for Q spectral densities at once.
 
     Returns the log-likelihood (Q,) of each density; and for every frame and density the filtered mean and covariance of
     the state, the predicted mean and covariance, and whether the position was accepted.
     """
-    xp, d = namespace(measured), measured.shape[1]
-    limit = float(chdtri(d, _FALSE_REJECTION))
+    xp, dimension = namespace(measured), measured.shape[1]
+    max_distance = float(chdtri(dimension, _FALSE_REJECTION))
 
-    def filter_step(state, now):
-        mean, error = state
-        step, place, spread, there = now
-        move = _transition_matrix(step, d)
-        mean, error = mean @ move.T, move @ error @ move.T + densities[:, None, None] * _process_noise(step, d)
-        off, inner = place - mean[:, :d], error[:, :d, :d] + spread
-        gain = xp.swapaxes(xp.linalg.solve(inner, error[:, :d]), 1, 2)
-        square = xp.sum(off * xp.linalg.solve(inner, off[:, :, None])[:, :, 0], axis=1)
-        believed = there & (square < limit)
-        logarithm = xp.log(xp.linalg.det(inner))
+    def filter_step(state, frame_data):
+        mean, covariance = state
+        step, position, measured_covariance, is_measured = frame_data
+        transition = _transition_matrix(step, dimension)
+        mean, covariance = (
+            mean @ transition.T,
+            transition @ covariance @ transition.T + densities[:, None, None] * _process_noise(step, dimension),
+        )
+        innovation, innovation_covariance = (
+            position - mean[:, :dimension],
+            covariance[:, :dimension, :dimension] + measured_covariance,
+        )
+        gain = xp.swapaxes(xp.linalg.solve(innovation_covariance, covariance[:, :dimension]), 1, 2)
+        squared_distance = xp.sum(
+            innovation * xp.linalg.solve(innovation_covariance, innovation[:, :, None])[:, :, 0], axis=1
+        )
+        is_accepted = is_measured & (squared_distance < max_distance)
+        log_determinant = xp.log(xp.linalg.det(innovation_covariance))
         # A rejected position lowers the likelihood of a density as much as a position at the limit of acceptance.
-        score = xp.where(there, -0.5 * (xp.minimum(square, limit) + logarithm), 0.0)
-        new_mean = xp.where(believed[:, None], mean + xp.einsum("qij,qj->qi", gain, off), mean)
+        score = xp.where(is_measured, -0.5 * (xp.minimum(squared_distance, max_distance) + log_determinant), 0.0)
+        new_mean = xp.where(is_accepted[:, None], mean + xp.einsum("qij,qj->qi", gain, innovation), mean)
         # The Joseph form of the update is accurate also for nearly exact positions, where the difference in the usual
         # form is lost to rounding.
-        keep = xp.eye(2 * d) - xp.concatenate([gain, xp.zeros_like(gain)], axis=2)
-        updated = keep @ error @ xp.swapaxes(keep, 1, 2) + gain @ spread @ xp.swapaxes(gain, 1, 2)
-        new_error = xp.where(believed[:, None, None], (updated + xp.swapaxes(updated, 1, 2)) / 2, error)
-        return (new_mean, new_error), (score, new_mean, new_error, mean, error, believed)
+        update_matrix = xp.eye(2 * dimension) - xp.concatenate([gain, xp.zeros_like(gain)], axis=2)
+        updated_covariance = update_matrix @ covariance @ xp.swapaxes(
+            update_matrix, 1, 2
+        ) + gain @ measured_covariance @ xp.swapaxes(gain, 1, 2)
+        new_covariance = xp.where(
+            is_accepted[:, None, None], (updated_covariance + xp.swapaxes(updated_covariance, 1, 2)) / 2, covariance
+        )
+        return (new_mean, new_covariance), (score, new_mean, new_covariance, mean, covariance, is_accepted)
 
-    begin = xp.concatenate([measured[0], xp.zeros(d)])
-    wide = xp.concatenate([1e4 * xp.trace(spread[0]) * xp.ones(d), xp.full(d, _FIRST_SPEED**2)])
-    many = len(densities)
-    first = xp.tile(begin, (many, 1)), xp.tile(xp.diag(wide), (many, 1, 1))
-    _, (score, *rest) = scan(filter_step, first, (step, measured, spread, located))
-    return xp.sum(score, axis=0), rest
+    initial_mean = xp.concatenate([measured[0], xp.zeros(dimension)])
+    initial_variances = xp.concatenate(
+        [1e4 * xp.trace(measured_covariance[0]) * xp.ones(dimension), xp.full(dimension, _INITIAL_SPEED**2)]
+    )
+    num_densities = len(densities)
+    initial_state = (
+        xp.tile(initial_mean, (num_densities, 1)),
+        xp.tile(xp.diag(initial_variances), (num_densities, 1, 1)),
+    )
+    _, (score, *filtered) = scan(filter_step, initial_state, (step, measured, measured_covariance, has_position))
+    return xp.sum(score, axis=0), filtered
 
 
 def _transition_matrix(step, dimension: int) -> Float[Array, "s s"]:

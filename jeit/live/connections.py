@@ -1,4 +1,5 @@
-"""Connections that deliver bytes: standard input, a serial device, and a server; the last two may be lost and found."""
+"""Connections that deliver bytes: standard input, a serial device, and a server. The last two are made again when they
+are lost."""
 
 from __future__ import annotations
 
@@ -13,25 +14,25 @@ from typing import Any
 
 from jeit.arguments.extras import optional
 
-_PIECE = 65536
-_NUMBER = re.compile(r"^\[Errno \d+\] ")
-# Seconds for which a server may take to answer.
-_ANSWER = 5.0
-_BAUD, _MOST_BAUD = 115_200, 20_000_000
+_MAX_READ_BYTES = 65536
+_ERRNO_PREFIX = re.compile(r"^\[Errno \d+\] ")
+# Maximum time in seconds until a server answers.
+_CONNECT_TIMEOUT = 5.0
+_DEFAULT_BAUD, _MAX_BAUD = 115_200, 20_000_000
 
 
 class AbstractConnection(abc.ABC):
-    """Bytes of a device. **Attribute** `lasting`: whether to connect again once the connection is lost."""
+    """Base class of connections. **Attribute** `reconnects`: whether to connect again when the connection is lost."""
 
-    lasting: bool = True
+    reconnects: bool = True
 
     @abc.abstractmethod
     def open(self) -> None:
-        """Connect. Raises `OSError` if that fails now."""
+        """Connect. Raises `OSError` if the device does not answer."""
 
     @abc.abstractmethod
     def read(self, timeout: float) -> bytes | None:
-        """Bytes as soon as some are there; empty if none come within `timeout` seconds; None at the end.
+        """Wait for bytes, and return them. Returns b"" if none arrive within `timeout` seconds, and None at the end.
 
         Raises `OSError` if the connection is lost.
         """
@@ -44,7 +45,7 @@ class AbstractConnection(abc.ABC):
 class StandardInput(AbstractConnection):
     """Bytes of standard input, or of another open file."""
 
-    lasting = False
+    reconnects = False
 
     def __init__(self, descriptor: int | None = None):
         self.descriptor = descriptor
@@ -57,13 +58,13 @@ class StandardInput(AbstractConnection):
     def read(self, timeout: float) -> bytes | None:
         """Wait for bytes; see `AbstractConnection.read`."""
         assert self.descriptor is not None, "open first"
-        # Elsewhere only sockets can be waited for: reading waits for bytes.
+        # On other systems `select` accepts only sockets, so the read itself waits for bytes.
         if os.name == "posix" and not select.select([self.descriptor], [], [], timeout)[0]:
             return b""
-        return os.read(self.descriptor, _PIECE) or None
+        return os.read(self.descriptor, _MAX_READ_BYTES) or None
 
     def close(self) -> None:
-        """Leave it open: it is not ours."""
+        """Do nothing: the file is closed by the program that opened it."""
 
 
 class SerialPort(AbstractConnection):
@@ -72,7 +73,7 @@ class SerialPort(AbstractConnection):
     Raises `ImportError` without pyserial.
     """
 
-    def __init__(self, port: str, baud: int = _BAUD):
+    def __init__(self, port: str, baud: int = _DEFAULT_BAUD):
         self.port, self.baud = port, baud
         self.serial = optional("serial", "a serial device")
         self.device: Any = None
@@ -84,9 +85,9 @@ class SerialPort(AbstractConnection):
         except ValueError as error:  # a rate that the driver does not know
             raise OSError(str(error)) from None
         except OSError as error:
-            others = ", ".join(self._others()) or "none"
-            said = _NUMBER.sub("", str(error).split(": [Errno")[0])
-            raise OSError(f"{said} (serial devices here: {others})") from None
+            port_names = ", ".join(self._list_ports()) or "none"
+            message = _ERRNO_PREFIX.sub("", str(error).split(": [Errno")[0])
+            raise OSError(f"{message} (serial devices here: {port_names})") from None
 
     def read(self, timeout: float) -> bytes | None:
         """Wait for bytes; see `AbstractConnection.read`."""
@@ -94,7 +95,7 @@ class SerialPort(AbstractConnection):
         try:
             device.timeout = timeout
             first = device.read(1)
-            return first + device.read(min(device.in_waiting, _PIECE)) if first else b""
+            return first + device.read(min(device.in_waiting, _MAX_READ_BYTES)) if first else b""
         except TypeError:  # closed by another thread
             raise OSError("the port was closed") from None
 
@@ -105,16 +106,16 @@ class SerialPort(AbstractConnection):
             with suppress(OSError):
                 device.close()
 
-    def _others(self) -> list[str]:
+    def _list_ports(self) -> list[str]:
         with suppress(Exception):  # a system whose devices cannot be listed
             from serial.tools import list_ports
 
-            return sorted(one.device for one in list_ports.comports())[:8]
+            return sorted(port_info.device for port_info in list_ports.comports())[:8]
         return []
 
 
 class Server(AbstractConnection):
-    """A TCP server that sends frames to whoever connects."""
+    """A TCP server that sends frames to all connected clients."""
 
     def __init__(self, host: str, port: int):
         self.host, self.port = host, port
@@ -122,7 +123,7 @@ class Server(AbstractConnection):
 
     def open(self) -> None:
         """Connect; see `AbstractConnection.open`."""
-        self.socket = socket.create_connection((self.host, self.port), timeout=_ANSWER)
+        self.socket = socket.create_connection((self.host, self.port), timeout=_CONNECT_TIMEOUT)
         # A server whose cable is unplugged sends nothing, not even an end.
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
 
@@ -131,7 +132,7 @@ class Server(AbstractConnection):
         assert self.socket is not None, "open first"
         self.socket.settimeout(timeout)
         try:
-            return self.socket.recv(_PIECE) or None
+            return self.socket.recv(_MAX_READ_BYTES) or None
         except TimeoutError:
             return b""
 
@@ -143,21 +144,22 @@ class Server(AbstractConnection):
 
 
 def connection_to(text: str) -> AbstractConnection:
-    """The connection that "-", "serial:PORT@BAUD" or "tcp:HOST:PORT" names; without "@BAUD", 115,200.
+    """Create the connection that "-", "serial:PORT@BAUD" or "tcp:HOST:PORT" names. Without "@BAUD", the baud rate is
+    115,200.
 
     Raises `ValueError` for other texts, and `ImportError` for a serial device without pyserial.
     """
-    kind, _, rest = text.partition(":")
+    kind, _, address = text.partition(":")
     if text == "-":
         return StandardInput()
     if kind == "serial":
-        port, _, baud = (rest if "@" in rest else f"{rest}@{_BAUD}").rpartition("@")
-        if not port or not (baud.isascii() and baud.isdigit() and 0 < len(baud) < 9 and 0 < int(baud) <= _MOST_BAUD):
+        port, _, baud = (address if "@" in address else f"{address}@{_DEFAULT_BAUD}").rpartition("@")
+        if not port or not (baud.isascii() and baud.isdigit() and 0 < len(baud) < 9 and 0 < int(baud) <= _MAX_BAUD):
             raise ValueError(
                 f"source '{text[:80]}': give serial:PORT@BAUD, such as serial:/dev/ttyACM0@115200 or serial:COM3@9600."
             )
         return SerialPort(port, int(baud))
-    host, _, port = rest.rpartition(":")
+    host, _, port = address.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if not host or not (port.isascii() and port.isdigit() and len(port) < 6 and 0 < int(port) < 65536):
         raise ValueError(f"source '{text[:80]}': give tcp:HOST:PORT, such as tcp:192.168.4.1:5000.")

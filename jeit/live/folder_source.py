@@ -13,17 +13,19 @@ from jeit.imaging.stream_preparation import frames_of
 from jeit.live.pictures import LiveFrame
 from jeit.live.sources import CONNECTED, ENDED, AbstractSource
 
-# Seconds from one look into the folder to the next; as a multiple of what a look takes, in folders of many files; and
-# after which a file that cannot be read is refused: the instrument may still be writing.
-_LOOK, _MULTIPLE, _PATIENCE = 0.02, 4.0, 2.0
+# Minimum pause in seconds between two listings of the folder; minimum ratio of the pause to the duration of a listing,
+# for folders of many files; and time in seconds after which a file that cannot be read is refused, since the instrument
+# may still be writing it.
+_MIN_PAUSE, _PAUSE_FACTOR, _READ_TIMEOUT = 0.02, 4.0, 2.0
 
 
 class WatchedFolder(AbstractSource):
-    """The frames in files that appear in a folder, in the order of their names; files that were there before are left
-    out, unless a `rate`, frames/s, is given.
+    """Source of the frames in files that appear in a folder, in the order of their names. Files that exist already are
+    left out, unless a `rate` in frames/s is given.
 
-    A file is read once it has kept its size from one look to the next. `description`, `reference`: as `description`
-    and `like` of `jeit.data.read`. A file that cannot be read is delivered as text, to be refused.
+    A file is read when its size is the same in two successive listings. `description`, `reference`: as `description`
+    and `like` of `jeit.data.read`. For a file that cannot be read, the error message is delivered as text, which a view
+    refuses.
     """
 
     def __init__(
@@ -35,59 +37,61 @@ class WatchedFolder(AbstractSource):
     ):
         super().__init__(str(folder))
         self.folder, self.description, self.reference, self.rate = folder, description, reference, rate
-        self._seen = set() if rate is not None else set(self._sizes())
-        self._pending: dict[str, tuple[int, float]] = {}
-        if self._seen:
+        self._known_names = set() if rate is not None else set(self._list_sizes())
+        self._pending_files: dict[str, tuple[int, float]] = {}
+        if self._known_names:
             self.say(
-                f"Left out: {counted(len(self._seen), 'file')} that were in the folder before; --rate plays them, too."
+                f"Left out: {counted(len(self._known_names), 'file')} that were in the folder before; --rate plays "
+                "them, too."
             )
 
     def __iter__(self) -> Iterator[LiveFrame]:
         self.begun = time.monotonic()
-        pause = _LOOK
+        pause = _MIN_PAUSE
         while not self.closing.wait(pause):
             start = time.monotonic()
             try:
-                sizes = self._sizes()
+                sizes = self._list_sizes()
             except OSError as error:
                 if self.connection == CONNECTED:
                     self.connection = f"waiting: {error}"[:300]
                     self.say(f"The folder cannot be read: {error}.")
                 continue
-            pause = max(_LOOK, _MULTIPLE * (time.monotonic() - start))
+            pause = max(_MIN_PAUSE, _PAUSE_FACTOR * (time.monotonic() - start))
             if self.connection != CONNECTED:
                 self.connection = CONNECTED
                 self.say("The folder can be read again.")
-            self._seen &= sizes.keys()
-            for name in [one for one in self._pending if one not in sizes]:
-                del self._pending[name]
-            for name in sorted(sizes.keys() - self._seen):
-                yield from self._file(name, sizes[name])
+            self._known_names &= sizes.keys()
+            for name in [name for name in self._pending_files if name not in sizes]:
+                del self._pending_files[name]
+            for name in sorted(sizes.keys() - self._known_names):
+                yield from self._read_file(name, sizes[name])
         self.connection = ENDED
 
-    def _sizes(self) -> dict[str, int]:
-        """Sizes of the files in the folder; hidden ones, which programs write before they rename them, are left out."""
+    def _list_sizes(self) -> dict[str, int]:
+        """Return the sizes of the files in the folder by name. Hidden and temporary files are left out, since programs
+        write them before they rename them."""
         with os.scandir(self.folder) as entries:
             sizes = {}
-            for one in entries:
+            for entry in entries:
                 try:
                     if (
-                        not one.name.startswith(".")
-                        and not one.name.endswith((".toml", ".part", ".tmp"))
-                        and one.is_file()
+                        not entry.name.startswith(".")
+                        and not entry.name.endswith((".toml", ".part", ".tmp"))
+                        and entry.is_file()
                     ):
-                        sizes[one.name] = one.stat().st_size
+                        sizes[entry.name] = entry.stat().st_size
                 except OSError:  # removed meanwhile
                     continue
             return sizes
 
-    def _file(self, name: str, size: int) -> Iterator[LiveFrame]:
-        """Frames of a file, if it is complete."""
-        before, since = self._pending.get(name, (-1, time.monotonic()))
-        if size != before:
-            since = time.monotonic()
-        self._pending[name] = size, since
-        if size != before or not size:
+    def _read_file(self, name: str, size: int) -> Iterator[LiveFrame]:
+        """Yield the frames of a file if it is complete."""
+        previous_size, size_time = self._pending_files.get(name, (-1, time.monotonic()))
+        if size != previous_size:
+            size_time = time.monotonic()
+        self._pending_files[name] = size, size_time
+        if size != previous_size or not size:
             return
         try:
             measured = read(self.folder / name, description=self.description, like=self.reference)
@@ -95,19 +99,19 @@ class WatchedFolder(AbstractSource):
             if frames.dtype.kind == "c":
                 raise ValueError(f"{name}: the voltages are complex; choose a part with [data] component.")
         except (ValueError, OSError) as error:
-            if time.monotonic() - since < _PATIENCE:
+            if time.monotonic() - size_time < _READ_TIMEOUT:
                 return
-            self._done(name)
+            self._mark_as_read(name)
             yield self.frame(f"{error}"[:400])
             return
-        self._done(name)
+        self._mark_as_read(name)
         for values in frames:
             if self.rate is not None:
-                due = self.begun + self._number / self.rate
-                if self.closing.wait(max(0.0, due - time.monotonic())):
+                due_time = self.begun + self._num_frames / self.rate
+                if self.closing.wait(max(0.0, due_time - time.monotonic())):
                     return
             yield self.frame(values)
 
-    def _done(self, name: str) -> None:
-        self._pending.pop(name, None)
-        self._seen.add(name)
+    def _mark_as_read(self, name: str) -> None:
+        self._pending_files.pop(name, None)
+        self._known_names.add(name)

@@ -1,4 +1,4 @@
-"""What passes between the parts of a live session: frames of a source, and the picture that a view makes of each."""
+"""Data exchanged by the parts of a live session: frames of a source, and the picture that a view computes from each."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class LiveFrame:
 
 @dataclass(frozen=True)
 class Marker:
-    """A place that a view estimates: a contact, a touch, a sound.
+    """A position that a view estimates, such as that of a contact, a touch or a sound.
 
     **Fields**: `x`, `y`: metres; `label`: text beside it, such as "2.1 N" or "stroke 93 %"; `radius`: radius of the
-    region that holds the place with a probability of 68 %, metres, NaN if unknown; `track`: number of the contact that
-    it belongs to, so that its path can be drawn, or None.
+    region that contains the position with a probability of 68 %, metres, NaN if unknown; `track`: number of the contact
+    to which it belongs, so that the path of the contact can be drawn, or None.
 
     **Example:**
 
@@ -59,7 +59,7 @@ class Marker:
 
 @dataclass(frozen=True)
 class Picture:
-    """What a view makes of one frame.
+    """Picture that a view computes from one frame.
 
     **Fields**: `pixels` (H, W): float32 image in the scene's unit, row 0 at the largest y, NaN outside the body; None
     for a refused frame or a view without an image; `markers`: estimated places; `status`, `reason`: as in
@@ -82,7 +82,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a page needs to know of a view once, before the first picture.
+    """Description of a view, which a page receives once, before the first picture.
 
     **Fields**: `title`; `quantity`, `unit`: what pixels are, such as "conductivity change", "S/m"; `diverging`: whether
     colours are centred on zero; `extent`: x of left and right edge, y of lower and upper edge of the image, metres;
@@ -112,7 +112,7 @@ class Scene:
 class AbstractView(abc.ABC):
     """Base class of views, which turn frames into pictures, one after another, in the order of their numbers.
 
-    **Attributes**: `scene`: what a page needs to know of the view before the first picture.
+    **Attributes**: `scene`: description of the view, which a page receives before the first picture.
 
     **Example:**
 
@@ -126,11 +126,11 @@ class AbstractView(abc.ABC):
 
     @abc.abstractmethod
     def picture(self, frame: LiveFrame) -> Picture:
-        """The picture of a frame; a refused frame gives a picture without pixels, with the reason."""
+        """Compute the picture of a frame. The picture of a refused frame has no pixels, and states the reason."""
 
     @abc.abstractmethod
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
         """Take the mean of frames (N, M) of the undisturbed sensor, volts, as the new reference.
 
-        Raises `ValueError` for frames that cannot be a reference; the old one stays.
+        Raises `ValueError` for frames that cannot be a reference; the old reference is then kept.
         """

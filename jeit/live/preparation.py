@@ -1,4 +1,4 @@
-"""A source and a view of what is known of the sensor, for the command and for programs."""
+"""Preparation of a source and the view of its sensor, for the command and for programs."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from jeit.live.quality import change_during
 from jeit.live.sources import CONNECTED, AbstractSource, PlayedRecording, open_source
 from jeit.live.views.conductivity import ConductivityView
 
-# Files that a folder of a learnt model holds, by kind.
-_NETWORK, _SKIN, _GESTURES = "network.jeit", "skin.skops", "gestures.skops"
-# Fewest frames of an undisturbed sensor, and most of which a reference is made.
-_FEWEST, _MOST = 3, 10_000
-# Seconds between looks at the connection of a source; seconds in which lines that were sent before arrive.
-_LOOK, _BURST = 0.3, 0.05
+# Names of the files of learnt models in a folder.
+_NETWORK_FILE, _SKIN_FILE, _GESTURES_FILE = "network.jeit", "skin.skops", "gestures.skops"
+# Minimum and maximum number of frames of an undisturbed sensor from which a reference is computed.
+_MIN_FRAMES, _MAX_FRAMES = 3, 10_000
+# Period in seconds in which the connection of a source is checked; time in seconds within which the lines arrive that
+# were sent before they could be read.
+_POLL_PERIOD, _BURST_TIME = 0.3, 0.05
 
 
 class Prepared(NamedTuple):
@@ -61,7 +62,7 @@ def prepare(
     untouched: float = 1.0,
     progress: Callable[[str], None] | None = None,
 ) -> Prepared:
-    """Open a source, and prepare the view of its sensor, by what is known of it.
+    """Open a source, and prepare the view of its sensor.
 
     Without `model` and `calibration`, the view is the change of conductivity (`ConductivityView`).
 
@@ -69,8 +70,8 @@ def prepare(
 
     - `source`: as in `open_source`; with a `model`, a recording is read as by `jeit touch predict`, and with a
       `calibration` as by `jeit locate`.
-    - `reference`: measured file of the undisturbed sensor, which says protocol and electrodes.
-    - `description`: a TOML file or the name of a bundled one, which says what the frames are without a `reference`.
+    - `reference`: measured file of the undisturbed sensor, which states the protocol and the electrodes.
+    - `description`: a TOML file or the name of a bundled one, which describes the frames without a `reference`.
     - `model`: file or folder of `jeit touch fit`, `jeit touch gestures` or `jeit learn image`: places and forces
       (`LearntSkinView`), gestures (`GestureView`, which needs a description) or depth (`DepthView`).
     - `calibration`: file of `jeit calibrate-microphones`: loss maps and places of sounds (`SoundView`).
@@ -78,9 +79,9 @@ def prepare(
     - `settings`: how changes of conductivity are imaged.
     - `rate`: frames/s of a recording, and for gestures.
     - `untouched`: time from the beginning, seconds, whose frames are the reference if none is given.
-    - `progress`: called with each step as it begins.
+    - `progress`: called with the name of each step when it begins.
 
-    Raises `ValueError` where something is missing or does not fit, and as the views and readers.
+    Raises `ValueError` if an argument is missing or does not match the others, and as the views and readers do.
 
     **Example:**
 
@@ -89,33 +90,35 @@ def prepare(
     print(next(frames(source, view)).picture.markers)
     ```
     """
-    report = progress or (lambda step: None)
+    report_step = progress or (lambda step: None)
     if calibration is not None:
         if model is not None:
             raise ValueError("calibration= and model= are of different sensors; give one of them.")
-        return Prepared(*_with_sound(source, calibration, rate), None)
-    described = None if description is None else load_description(description)
+        return Prepared(*_prepare_sound(source, calibration, rate), None)
+    loaded_description = None if description is None else load_description(description)
     if model is not None:
-        return _with_model(source, reference, description, described, Path(model), rate, untouched, report)
+        return _prepare_model(
+            source, reference, description, loaded_description, Path(model), rate, untouched, report_step
+        )
     measured = reference if isinstance(reference, Measurement | None) else read(reference, None, description)
-    opened = open_source(source, rate=rate, description=description, reference=measured)
-    measured = getattr(opened, "reference", None) if measured is None else measured
+    opened_source = open_source(source, rate=rate, description=description, reference=measured)
+    measured = getattr(opened_source, "reference", None) if measured is None else measured
     if measured is None:
-        if described is None:
+        if loaded_description is None:
             raise ValueError(
                 "reference is missing: give a measured file of the undisturbed sensor, or a description, and the first "
                 "frames are the reference."
             )
-        still, opened = first_frames(opened, untouched, report, rate=rate)
-        measured = described_reference(described, still)
+        reference_frames, opened_source = first_frames(opened_source, untouched, report_step, rate=rate)
+        measured = described_reference(loaded_description, reference_frames)
     else:
-        still = frames_of(measured)
-    images = ConductivityView.prepare(measured, settings, progress=progress)
+        reference_frames = frames_of(measured)
+    conductivity_view = ConductivityView.prepare(measured, settings, progress=progress)
     if not contacts:
-        return Prepared(opened, images, measured)
+        return Prepared(opened_source, conductivity_view, measured)
     from jeit.live.views.contacts import ContactsView
 
-    return Prepared(opened, ContactsView(images, still), measured)
+    return Prepared(opened_source, ContactsView(conductivity_view, reference_frames), measured)
 
 
 def first_frames(
@@ -129,96 +132,104 @@ def first_frames(
 
     Lines that were sent before the program could read them arrive all at once. The number of frames is therefore
     `seconds` times the frame rate: `rate`, frames/s, or else that of the frames that arrive one after the other.
-    Frames that are no numbers, or of another length than most, are left out; a recording is played from its beginning
-    nevertheless. `report` is called with what is done, and with the reason while a device is waited for. Raises
+    Frames that are not numbers, or have another length than most, are left out. A recording is nevertheless played from
+    its beginning. `report` is called with the name of the task, and with the reason of any wait for the device. Raises
     `ValueError` if fewer than three frames remain.
     """
     if isinstance(source, PlayedRecording):
-        return _enough(list(source.frames[source.seconds <= seconds]), seconds), source
-    with _reporting(source, f"undisturbed, {seconds:g} s", report or (lambda said: None)):
-        return _first_frames(source, seconds, rate)
+        return _frames_of_usual_length(list(source.frames[source.seconds <= seconds]), seconds), source
+    with _report_connection(source, f"undisturbed, {seconds:g} s", report or (lambda step: None)):
+        return _read_first_frames(source, seconds, rate)
 
 
 @contextmanager
-def _reporting(source: AbstractSource, task: str, report: Callable[[str], None]) -> Iterator[None]:
-    """Report a task, and whenever the state of the source's connection changes."""
-    done = threading.Event()
+def _report_connection(source: AbstractSource, task: str, report: Callable[[str], None]) -> Iterator[None]:
+    """Report a task, and each change of the state of the source's connection."""
+    done_event = threading.Event()
 
-    def follow() -> None:
-        said = CONNECTED
-        while not done.wait(_LOOK):
-            if source.connection != said:
-                said = source.connection
-                report(task if said == CONNECTED else said)
+    def report_changes() -> None:
+        last_state = CONNECTED
+        while not done_event.wait(_POLL_PERIOD):
+            if source.connection != last_state:
+                last_state = source.connection
+                report(task if last_state == CONNECTED else last_state)
 
     report(task)
-    thread = threading.Thread(target=follow, daemon=True)
+    thread = threading.Thread(target=report_changes, daemon=True)
     thread.start()
     try:
         yield
     finally:
-        done.set()
+        done_event.set()
         thread.join()
 
 
-def _first_frames(
+def _read_first_frames(
     source: AbstractSource, seconds: float, rate: float | None
 ) -> tuple[Float[np.ndarray, "N M"], AbstractSource]:
-    frames, first = iter(source), []
-    number = None if rate is None else max(round(rate * seconds), _FEWEST)
+    frames, initial_frames = iter(source), []
+    num_frames = None if rate is None else max(round(rate * seconds), _MIN_FRAMES)
     for frame in frames:
-        is_late = number is None and frame.second - (first or [frame])[0].second >= seconds
-        if is_late or len(first) >= (number or _MOST):
+        is_late = num_frames is None and frame.second - (initial_frames or [frame])[0].second >= seconds
+        if is_late or len(initial_frames) >= (num_frames or _MAX_FRAMES):
             frames = chain([frame], frames)
             break
-        if number is None or not isinstance(frame.values, str):
-            first.append(frame)
-    if number is None and (measured_rate := _rate_of_arrival(first)) is not None:
-        number = max(round(measured_rate * seconds), _FEWEST)
+        if num_frames is None or not isinstance(frame.values, str):
+            initial_frames.append(frame)
+    if num_frames is None and (measured_rate := _arrival_rate(initial_frames)) is not None:
+        num_frames = max(round(measured_rate * seconds), _MIN_FRAMES)
     try:
-        still = _enough([frame.values for frame in first[:number] if not isinstance(frame.values, str)], seconds)
+        reference_frames = _frames_of_usual_length(
+            [frame.values for frame in initial_frames[:num_frames] if not isinstance(frame.values, str)], seconds
+        )
     except ValueError:
         source.close()
         raise
-    if (change := change_during(still)) is not None:
+    if (relative_change := change_during(reference_frames)) is not None:
         source.say(
-            f"The sensor changed by {100 * change:.2g} % in the first {seconds:g} s, which are the reference: take a "
-            "new one while nothing touches the sensor."
+            f"The sensor changed by {100 * relative_change:.2g} % in the first {seconds:g} s, which are the reference: "
+            "take a new one while nothing touches the sensor."
         )
-    return still, _Continued(source, chain(first[len(first) if number is None else number :], frames))
+    return reference_frames, _ContinuedSource(
+        source, chain(initial_frames[len(initial_frames) if num_frames is None else num_frames :], frames)
+    )
 
 
-def _rate_of_arrival(frames: list[LiveFrame]) -> float | None:
-    """The rate of frames, frames/s, without those at the beginning that arrived all at once; None if all did."""
+def _arrival_rate(frames: list[LiveFrame]) -> float | None:
+    """Frame rate in frames/s, without the first frames that arrived all at once; None if all frames did."""
     arrivals = np.array([frame.arrived for frame in frames])
-    late = arrivals[arrivals > (arrivals[:1] + _BURST)]
-    return (len(late) - 1) / (late[-1] - late[0]) if len(late) > 2 and late[-1] > late[0] else None
+    later_arrivals = arrivals[arrivals > (arrivals[:1] + _BURST_TIME)]
+    return (
+        (len(later_arrivals) - 1) / (later_arrivals[-1] - later_arrivals[0])
+        if len(later_arrivals) > 2 and later_arrivals[-1] > later_arrivals[0]
+        else None
+    )
 
 
-def _enough(rows: list[np.ndarray], seconds: float) -> Float[np.ndarray, "N M"]:
-    """Frames of the usual length as one array; raises `ValueError` if these are fewer than three."""
-    widths = [len(one) for one in rows]
-    usual = max(set(widths), key=widths.count, default=0)
-    rows = [one for one in rows if len(one) == usual]
-    if len(rows) < _FEWEST:
+def _frames_of_usual_length(rows: list[np.ndarray], seconds: float) -> Float[np.ndarray, "N M"]:
+    """Return the frames of the most frequent length as one array. Raises `ValueError` if there are fewer than three."""
+    lengths = [len(row) for row in rows]
+    usual_length = max(set(lengths), key=lengths.count, default=0)
+    rows = [row for row in rows if len(row) == usual_length]
+    if len(rows) < _MIN_FRAMES:
         raise ValueError(
-            f"untouched: the first {seconds:g} s have {counted(len(rows), 'frame')} of numbers; {_FEWEST} are needed. "
-            "Give a longer time, or a reference."
+            f"untouched: the first {seconds:g} s have {counted(len(rows), 'frame')} of numbers; {_MIN_FRAMES} are "
+            "needed. Give a longer time, or a reference."
         )
     return np.array(rows, float)
 
 
-class _Continued(AbstractSource):
-    """A source of which some frames have been read already."""
+class _ContinuedSource(AbstractSource):
+    """A source of which some frames have been read already. `remaining`: iterator over the other frames."""
 
-    def __init__(self, source: AbstractSource, coming: Iterator[LiveFrame]):
-        self._source, self._coming = source, coming
+    def __init__(self, source: AbstractSource, remaining: Iterator[LiveFrame]):
+        self._source, self._remaining = source, remaining
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._source, name)
 
     def __iter__(self) -> Iterator[LiveFrame]:
-        return self._coming
+        return self._remaining
 
     def close(self) -> None:
         """End the iteration soon."""
@@ -229,88 +240,99 @@ class _Continued(AbstractSource):
         self._source.end_when_lost()
 
 
-def _with_sound(source: str, calibration: str | Path, rate: float | None) -> tuple[AbstractSource, AbstractView]:
-    """A source of intensities and the view of a calibrated array of microphones; of a file, samples or intensities."""
+def _prepare_sound(source: str, calibration: str | Path, rate: float | None) -> tuple[AbstractSource, AbstractView]:
+    """Create the source of intensities and the view of a calibrated array of microphones. A file may contain samples or
+    intensities."""
     from jeit.acoustic import Calibration, read_recording
     from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
     from jeit.live.views.sound import SoundView
 
-    known = Calibration.load(calibration)
+    loaded_calibration = Calibration.load(calibration)
     if not Path(source).is_file():
-        return open_source(source, rate=rate), SoundView(known)
-    intensities = calibrated_intensities(read_recording(source), known)
+        return open_source(source, rate=rate), SoundView(loaded_calibration)
+    intensities = calibrated_intensities(read_recording(source), loaded_calibration)
     power = np.where(intensities.usable, intensities.power, np.nan)
-    view = SoundView(known, floor=intensities.floor, freedom=intensities.freedom)
+    view = SoundView(loaded_calibration, floor=intensities.floor, freedom=intensities.freedom)
     return PlayedRecording(source, power, np.asarray(intensities.times), rate), view
 
 
-def _with_model(
+def _prepare_model(
     source: str,
     reference: Measurement | str | Path | None,
     description: str | Path | None,
-    described: Description | None,
+    loaded_description: Description | None,
     path: Path,
     rate: float | None,
     untouched: float,
-    report: Callable[[str], None],
+    report_step: Callable[[str], None],
 ) -> Prepared:
-    """A source of plain frames, and the view of what was learnt."""
+    """Create the source of frames, and the view of a learnt model."""
     from jeit.touch import GestureModel, LearntSkin
 
     model = _read_model(path)
-    if isinstance(model, GestureModel) and described is None:
+    if isinstance(model, GestureModel) and loaded_description is None:
         raise ValueError("description is missing: gestures are named from images of the skin, which it describes.")
     measured = reference if isinstance(reference, Measurement) else None
-    still = None if measured is None else frames_of(measured)
+    reference_frames = None if measured is None else frames_of(measured)
     if reference is not None and not isinstance(reference, Measurement):
-        recorded = read_frame_recording(reference, described)
-        still = recorded.frames if recorded.reference is None else recorded.reference
+        reference_recording = read_frame_recording(reference, loaded_description)
+        reference_frames = (
+            reference_recording.frames if reference_recording.reference is None else reference_recording.reference
+        )
     if Path(source).is_file():
-        played = read_frame_recording(source, described)
-        still = played.reference if still is None else still
-        opened: AbstractSource = PlayedRecording(source, played.frames, played.seconds, rate)
+        recording = read_frame_recording(source, loaded_description)
+        reference_frames = recording.reference if reference_frames is None else reference_frames
+        opened_source: AbstractSource = PlayedRecording(source, recording.frames, recording.seconds, rate)
     else:
-        opened = open_source(source, rate=rate, description=description, reference=measured)
-        measured = getattr(opened, "reference", None) if measured is None else measured
-        still = frames_of(measured) if still is None and measured is not None else still
-    if still is None and not (isinstance(model, LearntSkin) and model.mean_reference is None):
-        still, opened = first_frames(opened, untouched, report, rate=rate)
+        opened_source = open_source(source, rate=rate, description=description, reference=measured)
+        measured = getattr(opened_source, "reference", None) if measured is None else measured
+        reference_frames = (
+            frames_of(measured) if reference_frames is None and measured is not None else reference_frames
+        )
+    if reference_frames is None and not (isinstance(model, LearntSkin) and model.mean_reference is None):
+        reference_frames, opened_source = first_frames(opened_source, untouched, report_step, rate=rate)
     if isinstance(model, LearntSkin):
         from jeit.live.views.learnt import LearntSkinView
 
-        return Prepared(opened, LearntSkinView(model, still, description=described), measured)
-    assert still is not None
+        return Prepared(
+            opened_source, LearntSkinView(model, reference_frames, description=loaded_description), measured
+        )
+    assert reference_frames is not None
     if isinstance(model, GestureModel):
         from jeit.live.views.contacts import GestureView
 
-        assert described is not None
-        view: AbstractView = GestureView(described, model, still, rate=rate, progress=report)
-        return Prepared(opened, view, described_reference(described, still) if measured is None else measured)
+        assert loaded_description is not None
+        view: AbstractView = GestureView(loaded_description, model, reference_frames, rate=rate, progress=report_step)
+        return Prepared(
+            opened_source,
+            view,
+            described_reference(loaded_description, reference_frames) if measured is None else measured,
+        )
     from jeit.live.views.learnt import DepthView
 
-    return Prepared(opened, DepthView(model, still), measured)
+    return Prepared(opened_source, DepthView(model, reference_frames), measured)
 
 
 def _read_model(path: Path):
-    """The learnt skin, gestures or network that a path is, or that its folder holds.
+    """Read the learnt skin, gestures or network from a file, or from the file in a folder.
 
     Raises `ValueError` for a path without any, and for a folder with several.
     """
     if path.is_dir():
-        held = [one for one in (_SKIN, _GESTURES, _NETWORK) if (path / one).is_file()]
-        if len(held) > 1:
-            raise ValueError(f"model: '{path}' holds {' and '.join(held)}; give one of these files.")
-        path = path / held[0] if held else path
+        file_names = [name for name in (_SKIN_FILE, _GESTURES_FILE, _NETWORK_FILE) if (path / name).is_file()]
+        if len(file_names) > 1:
+            raise ValueError(f"model: '{path}' holds {' and '.join(file_names)}; give one of these files.")
+        path = path / file_names[0] if file_names else path
     if not path.is_file() or path.suffix not in (".skops", ".jeit"):
-        made = "'jeit touch fit', 'jeit touch gestures' or 'jeit learn image'"
-        raise ValueError(f"model: '{path}' is neither a folder of {made}, nor a file of such a folder.")
+        commands = "'jeit touch fit', 'jeit touch gestures' or 'jeit learn image'"
+        raise ValueError(f"model: '{path}' is neither a folder of {commands}, nor a file of such a folder.")
     if path.suffix == ".jeit":
         from jeit.touch.networks import read_network
 
         return read_network(path)
     from jeit.touch import GestureModel, read_skin
 
-    if path.name == _GESTURES:
+    if path.name == _GESTURES_FILE:
         return GestureModel.read(path)
     try:
         return read_skin(path)

@@ -13,19 +13,21 @@ from jaxtyping import Bool, Float
 from jeit.data import Measurement, reciprocity_error
 from jeit.live.pictures import LiveFrame
 
-# Latest frames that are judged, and fewest of them.
-_FRAMES, _FEWEST = 32, 8
-# Medians of these that are kept: over as many looks an electrode must drift.
-_LOOKS = 40
-# A reading is lost if there is none, or if its relative difference from the reference exceeds the first number; an
-# electrode is dead if the second share of its readings is lost, those of dead electrodes aside. It drifts if the median
-# relative difference of its readings exceeds the third number, and the fourth times that of all others.
-_LOST, _MOST_LOST, _DRIFTED, _APART = 0.5, 0.7, 0.05, 3.0
-# Parts of the frames of a reference whose means are compared, and fewest frames of a part; ratio of the deviation of
-# these means to what noise explains from which the sensor was disturbed meanwhile.
-_PARTS, _FEWEST_OF_A_PART, _DISTURBED = 4, 2, 4.0
-# Factor by which a frame rate must change to be reported, and looks for which it must last.
-_RATE_CHANGE, _LASTING = 1.4, 3
+# Number of latest frames from which the quality is computed, and minimum number of frames.
+_NUM_FRAMES, _MIN_FRAMES = 32, 8
+# Number of successive medians of these frames that are kept to detect drift.
+_NUM_MEDIANS = 40
+# A reading is lost if it is missing, or if its relative difference from the reference exceeds the first number. An
+# electrode is dead if the second number, a fraction, of its readings is lost, without those of other dead electrodes.
+# It drifts if the median relative difference of its readings exceeds the third number, and also the fourth number times
+# that of all other readings.
+_LOST_DIFFERENCE, _DEAD_SHARE, _DRIFT_DIFFERENCE, _DRIFT_RATIO = 0.5, 0.7, 0.05, 3.0
+# Number of parts of the frames of a reference whose means are compared, and minimum number of frames of a part; ratio
+# of the deviation of these means to that expected from noise above which the sensor is considered disturbed.
+_NUM_PARTS, _MIN_PART_FRAMES, _DISTURBANCE_RATIO = 4, 2, 4.0
+# Factor by which a frame rate must change to be reported, and number of successive calls for which the change must
+# last.
+_MIN_RATE_RATIO, _NUM_RATE_CALLS = 1.4, 3
 
 
 @dataclass(frozen=True)
@@ -42,48 +44,52 @@ class Quality:
 
 @np.errstate(all="ignore")  # readings of faulty frames may overflow
 def change_during(frames: Float[np.ndarray, "N M"]) -> float | None:
-    """Change of a sensor while frames (N, M) were taken, relative to their mean: the largest difference of the mean of
-    a quarter of them from that of all. None if noise, which is estimated from successive frames, explains it or is as
-    large in a frame, and for fewer than eight frames."""
+    """Relative change of a sensor during frames (N, M): the largest difference of the mean of a quarter of the frames
+    from the mean of all frames, divided by the latter. None if the noise, which is estimated from successive frames,
+    explains the change or is as large in a single frame, and for fewer than eight frames."""
     frames = np.asarray(frames, float)[:, np.isfinite(frames).all(axis=0)]
-    if len(frames) < _PARTS * _FEWEST_OF_A_PART or not frames.size:
+    if len(frames) < _NUM_PARTS * _MIN_PART_FRAMES or not frames.size:
         return None
-    away = np.array([part.mean(axis=0) for part in np.array_split(frames, _PARTS)]) - frames.mean(axis=0)
+    part_deviations = np.array([part.mean(axis=0) for part in np.array_split(frames, _NUM_PARTS)]) - frames.mean(axis=0)
     noise = (np.diff(frames, axis=0) ** 2).mean(axis=0).sum() / 2
-    # A change within the noise of a frame, such as a slow drift in thousands of frames, does no harm.
-    if not (away**2).sum() > (_PARTS - 1) * noise * max(_DISTURBED**2 * _PARTS / len(frames), 1.0):
+    # A change smaller than the noise of a frame, such as a slow drift over thousands of frames, is harmless.
+    if not (part_deviations**2).sum() > (_NUM_PARTS - 1) * noise * max(
+        _DISTURBANCE_RATIO**2 * _NUM_PARTS / len(frames), 1.0
+    ):
         return None
-    return float(np.sqrt((away**2).sum(axis=1).max()) / np.linalg.norm(frames.mean(axis=0)))
+    return float(np.sqrt((part_deviations**2).sum(axis=1).max()) / np.linalg.norm(frames.mean(axis=0)))
 
 
 class QualityWatch:
-    """Judges the latest frames of a sensor whenever it is asked, in any thread.
+    """Computes the quality of the latest frames of a sensor. It can be used by several threads.
 
-    `reference`: a measurement of the undisturbed sensor; without it only the noise is estimated.
+    `reference`: a measurement of the undisturbed sensor; without it, only the noise is estimated.
     """
 
     def __init__(self, reference: Measurement | None):
         self.protocol = None if reference is None else reference.protocol
         self.expected = self.touching = None
         self._lock = threading.Lock()
-        self._frames: deque[np.ndarray] = deque(maxlen=_FRAMES)
-        self._slow: deque[np.ndarray] = deque(maxlen=_LOOKS)
+        self._frames: deque[np.ndarray] = deque(maxlen=_NUM_FRAMES)
+        self._medians: deque[np.ndarray] = deque(maxlen=_NUM_MEDIANS)
         if reference is not None:
             self.renew(np.where(reference.mask, np.real(np.asarray(reference.voltages)), np.nan))
-            count = reference.protocol.num_electrodes
-            self.touching = np.array([reference.protocol.channels_touching(one) for one in range(count)])
+            num_electrodes = reference.protocol.num_electrodes
+            self.touching = np.array(
+                [reference.protocol.channels_touching(electrode) for electrode in range(num_electrodes)]
+            )
 
     def renew(self, frames: Float[np.ndarray, "N M"]) -> None:
-        """Compare with the mean of these frames from now on."""
-        known = np.isfinite(frames)
-        total = np.where(known, frames, 0.0).sum(axis=0)
-        mean = np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
+        """Replace the reference by the mean of these frames."""
+        is_finite = np.isfinite(frames)
+        total = np.where(is_finite, frames, 0.0).sum(axis=0)
+        mean = np.where(is_finite.any(axis=0), total / np.maximum(is_finite.sum(axis=0), 1), np.nan)
         with self._lock:
             self.expected = mean
-            self._slow.clear()
+            self._medians.clear()
 
     def add(self, frame: LiveFrame) -> None:
-        """Take a frame into account; frames of other sensors and text are left out."""
+        """Add a frame. Text and frames of another number of channels are left out."""
         values = frame.values
         if isinstance(values, str) or values.ndim != 1 or values.dtype.kind not in "iuf":
             return
@@ -95,99 +101,112 @@ class QualityWatch:
             self._frames.append(values)
 
     @np.errstate(all="ignore")  # squares of numbers that are no voltages may overflow
-    def look(self) -> Quality:
-        """The quality of the latest frames; call it every half a second or so."""
+    def assess(self) -> Quality:
+        """Compute the quality of the latest frames. To be called about every half second."""
         with self._lock:
-            if len(self._frames) < _FEWEST:
+            if len(self._frames) < _MIN_FRAMES:
                 return Quality()
             frames = np.array(self._frames, float)
             expected = self.expected
         frames[~np.isfinite(frames)] = np.nan
-        noise = _noise(frames)
+        noise = _relative_noise(frames)
         if expected is None or self.protocol is None or self.touching is None:
             return Quality(noise)
-        known = np.isfinite(frames).sum(axis=0) > len(frames) // 2
-        middle = np.full(frames.shape[1], np.nan)
-        middle[known] = np.nanmedian(frames[:, known], axis=0)
+        is_known = np.isfinite(frames).sum(axis=0) > len(frames) // 2
+        medians = np.full(frames.shape[1], np.nan)
+        medians[is_known] = np.nanmedian(frames[:, is_known], axis=0)
         reciprocity = None
-        if known.any():
-            measured = Measurement(np.where(known, middle, 0.0)[None], known[None], self.protocol)
+        if is_known.any():
+            measured = Measurement(np.where(is_known, medians, 0.0)[None], is_known[None], self.protocol)
             reciprocity = reciprocity_error(measured)
         with self._lock:
-            self._slow.append(middle)
-            slow = np.array(self._slow)
+            self._medians.append(medians)
+            past_medians = np.array(self._medians)
         readable = np.isfinite(expected) & (expected != 0)
-        change = np.abs(middle - expected) / np.abs(np.where(readable, expected, 1.0))
-        dead = _dead(~known | (change > _LOST), readable, self.touching)
-        if len(slow) < _LOOKS // 2:
+        change = np.abs(medians - expected) / np.abs(np.where(readable, expected, 1.0))
+        dead = _find_dead(~is_known | (change > _LOST_DIFFERENCE), readable, self.touching)
+        if len(past_medians) < _NUM_MEDIANS // 2:
             return Quality(noise, reciprocity, dead)
-        lasting = np.isfinite(slow).all(axis=0) & readable & ~self.touching[dead].any(axis=0)
+        has_drift_data = np.isfinite(past_medians).all(axis=0) & readable & ~self.touching[dead].any(axis=0)
         drift = np.zeros(len(expected))
-        drift[lasting] = np.median(np.abs(slow[:, lasting] / expected[lasting] - 1), axis=0)
-        return Quality(noise, reciprocity, dead, _drifting(drift, lasting, self.touching))
+        drift[has_drift_data] = np.median(
+            np.abs(past_medians[:, has_drift_data] / expected[has_drift_data] - 1), axis=0
+        )
+        return Quality(noise, reciprocity, dead, _find_drifting(drift, has_drift_data, self.touching))
 
 
 class RateWatch:
-    """Notices when a frame rate changes and stays changed."""
+    """Detects lasting changes of a frame rate."""
 
     def __init__(self):
-        self.usual: float | None = None
-        self._other = 0
+        self.usual_rate: float | None = None
+        self._num_changed = 0
 
     def __call__(self, rate: float) -> str:
-        """A sentence if the rate, frames/s, has changed; empty if it has not."""
+        """Return a sentence if the `rate` in frames/s has changed, otherwise an empty string."""
         if rate <= 0:
             return ""
-        if self.usual is not None and max(rate / self.usual, self.usual / rate) < _RATE_CHANGE:
-            self._other = 0
+        if self.usual_rate is not None and max(rate / self.usual_rate, self.usual_rate / rate) < _MIN_RATE_RATIO:
+            self._num_changed = 0
             return ""
-        self._other += 1
-        if self._other < _LASTING:
+        self._num_changed += 1
+        if self._num_changed < _NUM_RATE_CALLS:
             return ""
-        before, self.usual, self._other = self.usual, rate, 0
-        return "" if before is None else f"The frame rate has changed from {before:.3g} to {rate:.3g} frames a second."
+        previous_rate, self.usual_rate, self._num_changed = self.usual_rate, rate, 0
+        return (
+            ""
+            if previous_rate is None
+            else f"The frame rate has changed from {previous_rate:.3g} to {rate:.3g} frames a second."
+        )
 
 
-def _noise(frames: Float[np.ndarray, "F M"]) -> float | None:
-    """Relative noise from second differences in time, which a steady motion does not change."""
-    size = np.sqrt(np.nanmean(frames**2)) if np.isfinite(frames).any() else 0.0
-    bent = frames[:-2] - 2 * frames[1:-1] + frames[2:]
-    bent = bent[np.isfinite(bent)]
-    if not size > 0 or not bent.size or not np.isfinite(size):
+def _relative_noise(frames: Float[np.ndarray, "F M"]) -> float | None:
+    """Estimate the relative noise from second differences in time, which a steady change does not affect."""
+    rms = np.sqrt(np.nanmean(frames**2)) if np.isfinite(frames).any() else 0.0
+    second_differences = frames[:-2] - 2 * frames[1:-1] + frames[2:]
+    second_differences = second_differences[np.isfinite(second_differences)]
+    if not rms > 0 or not second_differences.size or not np.isfinite(rms):
         return None
-    return float(1.4826 * np.median(np.abs(bent)) / np.sqrt(6) / size)
+    return float(1.4826 * np.median(np.abs(second_differences)) / np.sqrt(6) / rms)
 
 
-def _dead(
-    lost: Bool[np.ndarray, " M"], readable: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
+def _find_dead(
+    is_lost: Bool[np.ndarray, " M"], readable: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
 ) -> list[int]:
-    """Electrodes most of whose readings are lost: the worst first, then others without its channels."""
+    """Find the electrodes most of whose readings are lost. The worst electrode is found first, and its channels are
+    left out in the search for the next."""
     dead: list[int] = []
-    left = readable.copy()
-    while left.any():
-        own = touching & left
-        count = own.sum(axis=1)
-        share = np.where(count > 0, (own & lost).sum(axis=1) / np.maximum(count, 1), 0.0)
-        worst = int(share.argmax())
-        if share[worst] < _MOST_LOST:
+    is_remaining = readable.copy()
+    while is_remaining.any():
+        own_channels = touching & is_remaining
+        num_channels = own_channels.sum(axis=1)
+        lost_shares = np.where(
+            num_channels > 0, (own_channels & is_lost).sum(axis=1) / np.maximum(num_channels, 1), 0.0
+        )
+        worst_electrode = int(lost_shares.argmax())
+        if lost_shares[worst_electrode] < _DEAD_SHARE:
             break
-        dead.append(worst)
-        left &= ~touching[worst]
+        dead.append(worst_electrode)
+        is_remaining &= ~touching[worst_electrode]
     return sorted(dead)
 
 
-def _drifting(
-    drift: Float[np.ndarray, " M"], lasting: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
+def _find_drifting(
+    drift: Float[np.ndarray, " M"], has_drift_data: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
 ) -> list[int]:
-    """Electrodes whose readings have changed for long, and much more than those of the others."""
+    """Find the electrodes whose readings have changed for a long time, and much more than those of the others."""
     drifting: list[int] = []
-    left = lasting.copy()
+    is_remaining = has_drift_data.copy()
     while True:
-        own = [touching[one] & left for one in range(len(touching))]
-        middle = np.array([np.median(drift[one]) if one.any() else 0.0 for one in own])
-        worst = int(middle.argmax())
-        rest = left & ~touching[worst]
-        if middle[worst] < _DRIFTED or not rest.any() or middle[worst] < _APART * np.median(drift[rest]):
+        own_channels = [touching[mask] & is_remaining for mask in range(len(touching))]
+        median_drifts = np.array([np.median(drift[mask]) if mask.any() else 0.0 for mask in own_channels])
+        worst_electrode = int(median_drifts.argmax())
+        other_channels = is_remaining & ~touching[worst_electrode]
+        if (
+            median_drifts[worst_electrode] < _DRIFT_DIFFERENCE
+            or not other_channels.any()
+            or median_drifts[worst_electrode] < _DRIFT_RATIO * np.median(drift[other_channels])
+        ):
             return sorted(drifting)
-        drifting.append(worst)
-        left = rest
+        drifting.append(worst_electrode)
+        is_remaining = other_channels

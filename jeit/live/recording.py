@@ -1,8 +1,8 @@
-"""Recordings of live sessions: frames are written one by one, so that a recording is complete to its last whole frame
-whatever ends it.
+"""Recordings of live sessions. Frames are written one by one, so that the file ends with a complete frame even if the
+program is interrupted.
 
-A recording is a folder with frames.csv (a line a frame: seconds, then volts; nan without a reading), refused.csv (lines
-that were no frames), events.csv, description.toml (of the sensor) and reference.npz (frames of the
+A recording is a folder with frames.csv (one line per frame: time in seconds, then volts; nan for missing readings),
+refused.csv (lines that were not frames), events.csv, description.toml (of the sensor) and reference.npz (frames of the
 undisturbed sensor, with its protocol). `jeit stream`, `jeit series` and `jeit touch watch` read frames.csv.
 """
 
@@ -28,21 +28,22 @@ from jeit.live.pictures import LiveFrame
 
 FRAMES, REFUSED, EVENTS = "frames.csv", "refused.csv", "events.csv"
 REFERENCE, DESCRIPTION = "reference.npz", "description.toml"
-# Memory of frames that wait for a disk that is slow or full, bytes; seconds between trials to write to a full disk,
-# between the moments at which everything written is on the disk itself, and for which the end of a recording waits.
-_MOST_WAITING, _RETRY, _SYNCHRONISE, _LONGEST_END = 64_000_000, 1.0, 2.0, 10.0
-# Size of a part of a recording, bytes: a reader needs eight times that, and may have a gigabyte.
-_PART = 100_000_000
-# How names of files of frames begin; frames of another number of channels, one after another, that begin a new part.
-_STEM, _OTHERS = "frames", 3
-_BINARY = getattr(os, "O_BINARY", 0)  # of Windows, which else changes line ends
+# Maximum memory in bytes of frames that wait for a slow or full disk. Times in seconds: between attempts to write to a
+# full disk, between synchronisations of the files with the disk, and maximum time that the end of a recording takes.
+_MAX_WAITING_BYTES, _RETRY_PERIOD, _SYNC_PERIOD, _END_TIMEOUT = 64_000_000, 1.0, 2.0, 10.0
+# Maximum size in bytes of a file of frames. A reader needs eight times as much memory, and may use a gigabyte.
+_MAX_FILE_SIZE = 100_000_000
+# Prefix of the names of files of frames; number of successive frames with another number of channels after which a new
+# file is begun.
+_FRAMES_PREFIX, _NUM_OTHER_LENGTHS = "frames", 3
+_BINARY = getattr(os, "O_BINARY", 0)  # prevents Windows from changing line ends
 
 
 class Recorder:
     """Writes recordings, each into a new folder named by date and time.
 
-    Frames are written by a thread of their own. If the disk is full, frames wait in memory, 64 MB of them, and are
-    written once there is room again; the file ends with a whole frame at any time.
+    Frames are written in a separate thread. If the disk is full, frames wait in memory, up to 64 MB, and are written
+    when there is room again. The file always ends with a complete frame.
 
     **Arguments:**
 
@@ -63,208 +64,210 @@ class Recorder:
         self.folder, self.reference = Path(folder), reference
         self._changed = threading.Condition()
         self._lines: deque[tuple[str, bytes]] = deque()
-        self._waiting = self._lost = 0
+        self._waiting_bytes = self._num_lost = 0
         self._problem = ""
-        self._into: _Files | None = None
+        self._files: _RecordingFiles | None = None
         self._thread: threading.Thread | None = None
         self._ending = False
-        self._last = -1
-        self._channels = self._width = None if reference is None else reference.num_channels
-        self._others = self._part = self._size = 0
+        self._last_microsecond = -1
+        self._num_channels = self._frame_length = None if reference is None else reference.num_channels
+        self._num_other_lengths = self._file_number = self._file_size = 0
 
     def start(self) -> Path:
-        """Begin a recording, unless one is under way, and return its folder. Raises `OSError` if that cannot be
-        made."""
-        if self._into is not None:
-            return self._into.folder
+        """Begin a recording, unless one is in progress, and return its folder. Raises `OSError` if the folder cannot be
+        created."""
+        if self._files is not None:
+            return self._files.folder
         folder = _new_folder(self.folder)
         if self.reference is not None:
             _write_reference(self.reference, folder)
         with self._changed:
-            self._into, self._ending, self._problem = _Files(folder), False, ""
-            self._lost = 0
-            self._last, self._width = -1, self._channels
-            self._others, self._part, self._size = 0, 1, 0
+            self._files, self._ending, self._problem = _RecordingFiles(folder), False, ""
+            self._num_lost = 0
+            self._last_microsecond, self._frame_length = -1, self._num_channels
+            self._num_other_lengths, self._file_number, self._file_size = 0, 1, 0
             self._lines.clear()
-            self._waiting = 0
+            self._waiting_bytes = 0
             self._thread = threading.Thread(
-                target=self._writing, args=(self._into,), name="jeit live recorder", daemon=True
+                target=self._write_lines, args=(self._files,), name="jeit live recorder", daemon=True
             )
             self._thread.start()
         return folder
 
     def stop(self) -> str:
-        """End the recording, wait until all is written, ten seconds at most, and return a sentence about it; an empty
-        one if no recording was under way."""
+        """End the recording, and wait until all frames are written, for at most ten seconds. Returns a sentence for the
+        user; an empty string if no recording was in progress."""
         with self._changed:
-            thread, into, self._ending = self._thread, self._into, True
+            thread, files, self._ending = self._thread, self._files, True
             self._changed.notify_all()
-        if thread is None or into is None:
+        if thread is None or files is None:
             return ""
-        thread.join(_LONGEST_END)
+        thread.join(_END_TIMEOUT)
         with self._changed:
-            self._into = self._thread = None
-            lost = self._lost + len(self._lines)
+            self._files = self._thread = None
+            num_lost = self._num_lost + len(self._lines)
             self._lines.clear()
-            self._waiting = 0
-        said = f"Recorded: {counted(into.frames, 'frame')} in {into.folder}."
-        return f"{said} Not recorded, for there was no room: {counted(lost, 'line')}." if lost else said
+            self._waiting_bytes = 0
+        sentence = f"Recorded: {counted(files.frames, 'frame')} in {files.folder}."
+        return f"{sentence} Not recorded, for there was no room: {counted(num_lost, 'line')}." if num_lost else sentence
 
     def add(self, frame: LiveFrame) -> None:
-        """Record a frame; does nothing while no recording is under way."""
-        if self._into is None:
+        """Record a frame. Does nothing if no recording is in progress."""
+        if self._files is None:
             return
         values = frame.values
         if isinstance(values, str) or values.ndim != 1:
-            self._put(REFUSED, _row(frame.second, str(values)))
+            self._queue_line(REFUSED, _format_row(frame.second, str(values)))
             return
-        if not self._fits(values):
-            self._put(REFUSED, _row(frame.second, " ".join(map(repr, values.tolist()))))
+        if not self._has_usual_length(values):
+            self._queue_line(REFUSED, _format_row(frame.second, " ".join(map(repr, values.tolist()))))
             return
-        # A column of times is recognised by its rising, here by a microsecond at least.
-        self._last = max(round(1e6 * frame.second), self._last + 1)
-        line = f"{self._last / 1e6:.6f},{','.join(map(repr, values.astype(float).tolist()))}\n".encode()
-        if self._size + len(line) > _PART:
-            self._part, self._size = self._part + 1, 0
-        self._size += len(line)
-        self._put(FRAMES if self._part == 1 else f"frames-{self._part}.csv", line)
+        # Readers recognise a column of times by its increase, so each time is at least a microsecond later.
+        self._last_microsecond = max(round(1e6 * frame.second), self._last_microsecond + 1)
+        line = f"{self._last_microsecond / 1e6:.6f},{','.join(map(repr, values.astype(float).tolist()))}\n".encode()
+        if self._file_size + len(line) > _MAX_FILE_SIZE:
+            self._file_number, self._file_size = self._file_number + 1, 0
+        self._file_size += len(line)
+        self._queue_line(FRAMES if self._file_number == 1 else f"frames-{self._file_number}.csv", line)
 
-    def _fits(self, values: np.ndarray) -> bool:
-        """Whether a frame has as many channels as the others. If the sensor is not known, three frames of another
-        number begin a new part."""
+    def _has_usual_length(self, values: np.ndarray) -> bool:
+        """Whether a frame has as many channels as the others. If the sensor is unknown, a new file is begun after three
+        frames with another number of channels."""
         if values.dtype.kind not in "iuf":
             return False
-        if self._width is None:
-            self._width = len(values)
-        if len(values) == self._width:
-            self._others = 0
+        if self._frame_length is None:
+            self._frame_length = len(values)
+        if len(values) == self._frame_length:
+            self._num_other_lengths = 0
             return True
-        self._others += 1
-        if self._channels is not None or self._others < _OTHERS:
+        self._num_other_lengths += 1
+        if self._num_channels is not None or self._num_other_lengths < _NUM_OTHER_LENGTHS:
             return False
-        if self._size:
-            self._part, self._size = self._part + 1, 0
-        self._width, self._others = len(values), 0
+        if self._file_size:
+            self._file_number, self._file_size = self._file_number + 1, 0
+        self._frame_length, self._num_other_lengths = len(values), 0
         return True
 
     def mark(self, second: float, label: str) -> None:
         """Record an event."""
-        if self._into is not None:
-            self._put(EVENTS, _row(second, label))
+        if self._files is not None:
+            self._queue_line(EVENTS, _format_row(second, label))
 
     def renew(self, second: float, frames: np.ndarray) -> None:
-        """Record frames (N, M) of a new reference, beside the first one, and when it was taken."""
-        if self._into is None:
+        """Write frames (N, M) of a new reference to the folder of the recording, and record the time as an event."""
+        if self._files is None:
             return
         name = f"reference-{second:.3f}s.npy"
         try:
-            np.save(self._into.folder / name, frames)
+            np.save(self._files.folder / name, frames)
         except OSError as error:
             self._problem = f"The new reference is not recorded: {error.strerror}."
             return
         self.mark(second, f"new reference, {name}")
 
     def state(self) -> dict[str, Any] | None:
-        """Folder, number of frames and bytes written, and what is wrong, of the recording under way; None without."""
+        """Folder, number of frames and bytes written, and problem of the recording in progress; None without one."""
         with self._changed:
-            into = self._into
-            if into is None:
+            files = self._files
+            if files is None:
                 return None
             return {
-                "folder": str(into.folder),
-                "frames": into.frames,
-                "bytes": into.bytes,
+                "folder": str(files.folder),
+                "frames": files.frames,
+                "bytes": files.bytes,
                 "problem": self._problem or None,
             }
 
-    def _put(self, name: str, line: bytes) -> None:
+    def _queue_line(self, name: str, line: bytes) -> None:
         with self._changed:
-            if self._waiting + len(line) > _MOST_WAITING:
-                self._lost += 1
-                self._problem = f"The disk is full or too slow: {counted(self._lost, 'line')} could not be recorded."
+            if self._waiting_bytes + len(line) > _MAX_WAITING_BYTES:
+                self._num_lost += 1
+                self._problem = (
+                    f"The disk is full or too slow: {counted(self._num_lost, 'line')} could not be recorded."
+                )
                 return
             self._lines.append((name, line))
-            self._waiting += len(line)
+            self._waiting_bytes += len(line)
             self._changed.notify_all()
 
-    def _writing(self, into: _Files) -> None:
-        synchronised = time.monotonic()
-        while (waiting := self._next(into)) is not None:
+    def _write_lines(self, files: _RecordingFiles) -> None:
+        sync_time = time.monotonic()
+        while (queued_line := self._next_line(files)) is not None:
             try:
-                into.write(*waiting)
+                files.write(*queued_line)
             except OSError as error:
                 with self._changed:
-                    if self._ends(into):
+                    if self._is_ending(files):
                         break
-                    self._problem = _described(error)
-                    self._changed.wait_for(lambda: self._ends(into), _RETRY)
+                    self._problem = _describe_error(error)
+                    self._changed.wait_for(lambda: self._is_ending(files), _RETRY_PERIOD)
                 continue
             with self._changed:
-                if self._into is not into:  # it took so long that the recording was given up
+                if self._files is not files:  # the recording was ended before the line was written
                     break
                 self._lines.popleft()
-                self._waiting -= len(waiting[1])
-                if not self._lost:
+                self._waiting_bytes -= len(queued_line[1])
+                if not self._num_lost:
                     self._problem = ""
-            if time.monotonic() - synchronised > _SYNCHRONISE:
-                into.synchronise()
-                synchronised = time.monotonic()
-        into.close()
+            if time.monotonic() - sync_time > _SYNC_PERIOD:
+                files.synchronise()
+                sync_time = time.monotonic()
+        files.close()
 
-    def _next(self, into: _Files) -> tuple[str, bytes] | None:
-        """Wait for a line to write, which stays the first in the queue; None once the recording ends."""
+    def _next_line(self, files: _RecordingFiles) -> tuple[str, bytes] | None:
+        """Wait for a line to write, and return it without removing it from the queue; None when the recording ends."""
         with self._changed:
-            while not self._lines or self._into is not into:
-                if self._ends(into):
+            while not self._lines or self._files is not files:
+                if self._is_ending(files):
                     return None
-                self._changed.wait(_SYNCHRONISE)
+                self._changed.wait(_SYNC_PERIOD)
             return self._lines[0]
 
-    def _ends(self, into: _Files) -> bool:
-        return self._ending or self._into is not into
+    def _is_ending(self, files: _RecordingFiles) -> bool:
+        return self._ending or self._files is not files
 
 
-class _Files:
-    """The files of a recording, each of which ends with a whole line at any time."""
+class _RecordingFiles:
+    """The files of a recording, each of which always ends with a complete line."""
 
     def __init__(self, folder: Path):
         self.folder = folder
         self.frames = self.bytes = 0
-        self._open: dict[str, int] = {}
+        self._descriptors: dict[str, int] = {}
         self._sizes: dict[str, int] = {}
 
     def write(self, name: str, line: bytes) -> None:
-        """Write a line whole, or nothing of it. Raises `OSError` if it cannot be written."""
-        if name not in self._open:
-            self._begin(name, line)
-        self._append(self._open[name], self._sizes[name], line)
+        """Write a complete line. Raises `OSError` if it cannot be written; the file is then unchanged."""
+        if name not in self._descriptors:
+            self._create_file(name, line)
+        self._append(self._descriptors[name], self._sizes[name], line)
         self._sizes[name] += len(line)
         self.bytes += len(line)
-        self.frames += name.startswith(_STEM)
+        self.frames += name.startswith(_FRAMES_PREFIX)
 
-    def _begin(self, name: str, line: bytes) -> None:
-        """Make a file, with its heading."""
+    def _create_file(self, name: str, line: bytes) -> None:
+        """Create a file with its header line, and close the previous file of frames."""
         heading = b"second,text\n"
-        if name.startswith(_STEM):
-            heading = ("second," + ",".join(f"v{one + 1}" for one in range(line.count(b","))) + "\n").encode()
+        if name.startswith(_FRAMES_PREFIX):
+            heading = ("second," + ",".join(f"v{index + 1}" for index in range(line.count(b","))) + "\n").encode()
         descriptor = os.open(self.folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _BINARY, 0o644)
         try:
             self._append(descriptor, 0, heading)
         except OSError:
             os.close(descriptor)
             raise
-        if name.startswith(_STEM):
-            for part in [one for one in self._open if one.startswith(_STEM)]:
-                os.close(self._open.pop(part))
-        self._open[name], self._sizes[name] = descriptor, len(heading)
+        if name.startswith(_FRAMES_PREFIX):
+            for open_name in [open_name for open_name in self._descriptors if open_name.startswith(_FRAMES_PREFIX)]:
+                os.close(self._descriptors.pop(open_name))
+        self._descriptors[name], self._sizes[name] = descriptor, len(heading)
 
     @staticmethod
     def _append(descriptor: int, size: int, line: bytes) -> None:
-        """Write a line at the end of a file of that size; if that fails, the file keeps its size."""
+        """Append a line to a file of the given `size`. If that fails, the file is truncated to this size."""
         try:
-            done = os.write(descriptor, line)
-            while done < len(line):
-                done += os.write(descriptor, line[done:])
+            num_written = os.write(descriptor, line)
+            while num_written < len(line):
+                num_written += os.write(descriptor, line[num_written:])
         except OSError:
             with suppress(OSError):
                 os.ftruncate(descriptor, size)
@@ -272,28 +275,28 @@ class _Files:
             raise
 
     def synchronise(self) -> None:
-        """Have all that is written on the disk itself."""
-        for descriptor in self._open.values():
+        """Flush all files to the disk."""
+        for descriptor in self._descriptors.values():
             with suppress(OSError):
                 os.fsync(descriptor)
 
     def close(self) -> None:
         self.synchronise()
-        for descriptor in self._open.values():
+        for descriptor in self._descriptors.values():
             with suppress(OSError):
                 os.close(descriptor)
-        self._open.clear()
+        self._descriptors.clear()
 
 
 def _new_folder(folder: Path) -> Path:
-    """A new folder below `folder`, named by date and time."""
+    """Create a new folder below `folder`, named by date and time, and return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     name = datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
     for number in range(1, 1000):
-        made = folder / (name if number == 1 else f"{name}_{number}")
+        new_folder = folder / (name if number == 1 else f"{name}_{number}")
         with suppress(FileExistsError):
-            made.mkdir()
-            return made
+            new_folder.mkdir()
+            return new_folder
     raise FileExistsError(errno.EEXIST, "there are a thousand recordings of this second", str(folder))
 
 
@@ -302,20 +305,20 @@ def _write_reference(reference: Measurement, folder: Path) -> None:
     try:
         _, description = write_table(reference, folder / REFERENCE)
     except ValueError:  # a body that a description cannot express
-        plain = Measurement(reference.voltages, reference.mask, reference.protocol, name=reference.name)
-        _, description = write_table(plain, folder / REFERENCE)
+        bare_reference = Measurement(reference.voltages, reference.mask, reference.protocol, name=reference.name)
+        _, description = write_table(bare_reference, folder / REFERENCE)
     text = description.read_text("utf-8")
     (folder / DESCRIPTION).write_text(text, "utf-8")
 
 
-def _row(second: float, text: str) -> bytes:
-    """A line of a table of times and texts."""
-    written = io.StringIO()
-    csv.writer(written, lineterminator="\n").writerow([f"{second:.6f}", " ".join(text.split())])
-    return written.getvalue().encode("utf-8", "replace")
+def _format_row(second: float, text: str) -> bytes:
+    """Format a line of a table of times and texts."""
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerow([f"{second:.6f}", " ".join(text.split())])
+    return buffer.getvalue().encode("utf-8", "replace")
 
 
-def _described(error: OSError) -> str:
+def _describe_error(error: OSError) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return "The disk is full: frames wait in memory until there is room."
     return f"Frames cannot be written, and wait in memory: {error.strerror or error}."

@@ -1,4 +1,4 @@
-"""Serve the page of a live session: on this machine alone, unless another host is asked for, and then with a token."""
+"""Server of the page of a live session. By default, only this machine can connect; other hosts require a token."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def serve(
     **Arguments:**
 
     - `session`: the session.
-    - `host`, `port`: where to listen; port 0 takes a free one.
-    - `token`: what the address must hold; one is made for a host that other machines reach.
+    - `host`, `port`: address at which to listen; port 0 selects a free one.
+    - `token`: token that the address must contain; by default a random one for a host that other machines can reach.
     - `opened`: called with the page's address once it can be opened.
     - `stay`: whether to stay until Ctrl-C when the session has ended, so that its last minute can be looked at.
 
@@ -48,19 +48,19 @@ def serve(
 
     from jeit.live.page.application import make_application
     from jeit.live.page.guard import is_loopback
-    from jeit.live.page.wire import LONGEST_COMMAND
+    from jeit.live.page.wire import MAX_COMMAND_LENGTH
 
     if token is None and not is_loopback(host):
         token = secrets.token_urlsafe(24)
     hub = Hub(session)
-    listening = _listen(host, port)
-    with listening:
+    server_socket = _listen(host, port)
+    with server_socket:
         config = uvicorn.Config(
             make_application(hub, host=host, token=token),
             log_level="error",
-            access_log=False,  # it would hold the token
+            access_log=False,  # it would contain the token
             ws="websockets-sansio",
-            ws_max_size=LONGEST_COMMAND,
+            ws_max_size=MAX_COMMAND_LENGTH,
             ws_max_queue=64,
             ws_per_message_deflate=False,  # costs more time than it saves bytes
             server_header=False,
@@ -72,13 +72,13 @@ def serve(
         if not stay:
             threading.Thread(target=_stop_at_end, args=(hub, server), daemon=True).start()
         if opened is not None:
-            opened(_address(host, listening.getsockname()[1], token))
+            opened(_address(host, server_socket.getsockname()[1], token))
         with contextlib.suppress(KeyboardInterrupt):
-            server.run(sockets=[listening])
+            server.run(sockets=[server_socket])
 
 
 def check_port(host: str, port: int) -> None:
-    """Raise `OSError` if a page cannot be served at `host` and `port`, with what to do."""
+    """Raise `OSError` with a remedy if a page cannot be served at `host` and `port`."""
     _listen(host, port).close()
 
 
@@ -88,41 +88,41 @@ def _stop_at_end(hub: Hub, server: object) -> None:
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    """Listen at a host and port, with an error that says what to do."""
+    """Return a socket that listens at a host and port. Raises `OSError` with a remedy if that fails."""
     if not 0 <= port <= 65535:
         raise OSError(f"port: {port} is none; they go from 1 to 65535, and 0 takes a free one")
     try:
-        family, kind, number, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        family, socket_type, protocol_number, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     except (socket.gaierror, UnicodeError) as error:
         raise OSError(f"cannot listen on {host!r}, port {port}: {error}") from error
-    listening = socket.socket(family, kind, number)
+    server_socket = socket.socket(family, socket_type, protocol_number)
     try:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind(address)
-        listening.listen(128)
+        server_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        server_socket.bind(address)
+        server_socket.listen(128)
     except OSError as error:
-        listening.close()
+        server_socket.close()
         remedy = f"port {port} is taken or not allowed: choose another, or 0 for any free one"
         raise OSError(error.errno, f"cannot listen on {host}, port {port} ({error.strerror}); {remedy}") from error
-    return listening
+    return server_socket
 
 
 def _address(host: str, port: int, token: str | None) -> str:
-    """The address to open; of a host that stands for all addresses, the one that other machines reach."""
-    shown = host
+    """Address of the page. If the host is unspecified (0.0.0.0), the address is the one that other machines reach."""
+    displayed_host = host
     try:
         if ip_address(host).is_unspecified:
-            shown = _own_address()
-        if ip_address(shown).version == 6:
-            shown = f"[{shown}]"
+            displayed_host = _own_address()
+        if ip_address(displayed_host).version == 6:
+            displayed_host = f"[{displayed_host}]"
     except ValueError:
         pass
     query = f"?token={quote(token, safe='')}" if token else ""
-    return f"http://{shown}:{port}/{query}"
+    return f"http://{displayed_host}:{port}/{query}"
 
 
 def _own_address() -> str:
-    """This machine's address in its network; nothing is sent."""
+    """Address of this machine in its network. No data are sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))

@@ -1,4 +1,4 @@
-"""A live session: frames are read, recorded and imaged in threads of their own, and the results are published."""
+"""Live session: frames are read, recorded and imaged in separate threads, and the results are published."""
 
 from __future__ import annotations
 
@@ -18,28 +18,31 @@ from jeit.inverse.streaming.stream import FrameStatus
 from jeit.live.pictures import AbstractView, LiveFrame, Picture, Scene
 from jeit.live.quality import Quality, QualityWatch, RateWatch, change_during
 from jeit.live.recording import Recorder
-from jeit.live.sources import ENDED, MESSAGES, AbstractSource
+from jeit.live.sources import ENDED, MAX_MESSAGES, AbstractSource
 
-# Seconds for which frames wait for the imaging: older ones are left out of the view.
-_PATIENCE = 0.05
-# Memory of the pictures that are kept, bytes, frames that wait at most, and kinds of reasons that are counted.
-_MOST_BYTES, _MOST_WAITING, _MOST_REASONS = 128_000_000, 256, 30
+# Maximum time in seconds for which frames wait to be imaged. Older frames are left out of the view.
+_MAX_WAIT = 0.05
+# Maximum memory in bytes of the pictures that are kept; maximum number of waiting frames; maximum number of different
+# reasons that are counted.
+_MAX_BYTES, _MAX_WAITING, _MAX_REASONS = 128_000_000, 256, 30
 _NUMBER = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
-# Frames over which latency is summarised; seconds over which the rate is measured, and from one look at the quality of
-# the frames to the next.
-_LATENCIES, _RATE_SPAN, _LOOK = 600, 2.0, 0.5
-# Frames of another number of channels, one after another, that are reported; most frames of a reference.
-_OTHERS, _MOST_REFERENCE = 3, 10_000
-# Longest name of an event; seconds for which events of skipped frames are kept for a program that is busy.
-_LABEL, _SKIPPED = 200, 30.0
+# Number of frames over which the latency is computed; time in seconds over which the rate is measured; period in
+# seconds in which the quality of the frames is computed.
+_NUM_LATENCIES, _RATE_SPAN, _QUALITY_PERIOD = 600, 2.0, 0.5
+# Number of successive frames with another number of channels after which the change is reported; maximum number of
+# frames of a reference.
+_NUM_OTHER_LENGTHS, _MAX_REFERENCE_FRAMES = 3, 10_000
+# Maximum length of the name of an event; time in seconds for which the events of skipped frames are kept for a program
+# that is busy.
+_MAX_LABEL_LENGTH, _EVENT_HISTORY = 200, 30.0
 
 
 @dataclass(frozen=True)
 class Result:
-    """A frame, and what was made of it.
+    """A frame and its picture.
 
-    **Fields**: `frame`: the frame; `picture`: what the view made of it; `latency`: time from the frame's last byte
-    until the picture was made, seconds.
+    **Fields**: `frame`: the frame; `picture`: picture that the view computed from it; `latency`: time from the frame's
+    last byte until the picture was computed, seconds.
 
     **Example:**
 
@@ -57,17 +60,17 @@ class Result:
 class Session:
     """A source whose frames are recorded and turned into pictures by a view, until the source ends or `stop`.
 
-    One thread reads; one images, and leaves frames out of the view, never of the recording, when it falls behind. Use
-    it as a context manager, or call `start` and `stop`.
+    One thread reads the frames, and another images them. If imaging falls behind, frames are left out of the view, but
+    never of the recording. Use the session as a context manager, or call `start` and `stop`.
 
     **Arguments:**
 
     - `source`: the source.
     - `view`: the view of its frames.
-    - `recorder`: where to record once `record(True)` is called.
-    - `history`: seconds for which results are kept; these take 128 MB at most.
-    - `reference`: a measurement of the undisturbed sensor, by which the quality of frames is judged; by default that of
-      the recorder.
+    - `recorder`: recorder that records the frames after `record(True)` is called.
+    - `history`: time in seconds for which results are kept, with at most 128 MB of memory.
+    - `reference`: a measurement of the undisturbed sensor, with which frames are compared to assess their quality; by
+      default that of the recorder.
 
     **Example:**
 
@@ -89,29 +92,29 @@ class Session:
         self.source, self.view, self.recorder, self.history = source, view, recorder, history
         if reference is None and recorder is not None:
             reference = recorder.reference
-        self._watch, self._quality, self._rates = QualityWatch(reference), Quality(), RateWatch()
-        self._channels = None if reference is None else reference.num_channels
-        self._length = self._channels or 0
-        self._others = 0
+        self._quality_watch, self._quality, self._rate_watch = QualityWatch(reference), Quality(), RateWatch()
+        self._num_channels = None if reference is None else reference.num_channels
+        self._frame_length = self._num_channels or 0
+        self._num_other_lengths = 0
         self._changed = threading.Condition()
-        self._waiting: deque[LiveFrame] = deque()
+        self._waiting_frames: deque[LiveFrame] = deque()
         self._results: deque[Result] = deque()
-        self._bytes = 0
+        self._num_bytes = 0
         self._ended = self._finished = False
         self._closed = threading.Event()
-        self._read = self._imaged = self._dropped = self._refused = 0
+        self._num_read = self._num_imaged = self._num_dropped = self._num_refused = 0
         self._reasons: dict[str, list] = {}
         self._statuses: Counter[FrameStatus] = Counter()
-        self._latencies: deque[float] = deque(maxlen=_LATENCIES)
+        self._latencies: deque[float] = deque(maxlen=_NUM_LATENCIES)
         self._arrivals: deque[float] = deque(maxlen=4096)
-        self._messages: deque[tuple[float, str]] = deque(maxlen=MESSAGES)
-        self._wanted, self._collected = 0, []
+        self._messages: deque[tuple[float, str]] = deque(maxlen=MAX_MESSAGES)
+        self._num_requested, self._collected_frames = 0, []
         self._reference: np.ndarray | None = None
         self._threads: list[threading.Thread] = []
 
     @property
     def scene(self) -> Scene:
-        """What is drawn around the pictures of the view."""
+        """Description of the view, which is drawn around its pictures."""
         return self.view.scene
 
     def __enter__(self) -> Session:
@@ -122,12 +125,16 @@ class Session:
         self.stop()
 
     def start(self) -> None:
-        """Begin to read. Raises `RuntimeError` if it has begun before."""
+        """Start the threads. Raises `RuntimeError` if they were started before."""
         if self._threads:
             raise RuntimeError("A session starts once; make another for the same source.")
         self._threads = [
-            threading.Thread(target=work, name=f"jeit live {name}", daemon=True)
-            for name, work in (("reader", self._reading), ("imaging", self._imaging), ("quality", self._judging))
+            threading.Thread(target=target, name=f"jeit live {name}", daemon=True)
+            for name, target in (
+                ("reader", self._read_source),
+                ("imaging", self._image_frames),
+                ("quality", self._assess_quality),
+            )
         ]
         for thread in self._threads:
             thread.start()
@@ -149,58 +156,64 @@ class Session:
                 self._changed.wait(0.5)
 
     def newest(self, after: int, timeout: float) -> Result | None:
-        """The newest result, if the number of its frame is above `after`; else wait for it, `timeout` seconds at most.
-        None if there is none by then, or once the session has ended."""
+        """Return the newest result if the number of its frame is above `after`; otherwise wait for such a result, at
+        most `timeout` seconds. Returns None if there is none by then, or if the session has ended."""
         end = time.monotonic() + timeout
         with self._changed:
             while not (self._results and self._results[-1].frame.number > after):
-                left = end - time.monotonic()
-                if self._finished or left <= 0:
+                remaining_time = end - time.monotonic()
+                if self._finished or remaining_time <= 0:
                     return None
-                self._changed.wait(min(left, 0.5))
+                self._changed.wait(min(remaining_time, 0.5))
             return self._results[-1]
 
     def result(self, number: int) -> Result | None:
-        """The last result at or before the frame of a number, or None if none is kept."""
+        """Return the last kept result whose frame has at most this `number`; None if there is none."""
         with self._changed:
-            for one in reversed(self._results):
-                if one.frame.number <= number:
-                    return one
+            for result in reversed(self._results):
+                if result.frame.number <= number:
+                    return result
         return None
 
     def with_events(self, result: Result, after: int) -> Result:
-        """A result with the events of those kept before it, of frames above `after`, too."""
+        """Add to a result the events of the kept results before it whose frame number is above `after`."""
         with self._changed:
-            skipped = [one for one in self._results if after < one.frame.number < result.frame.number]
-        before = tuple(event for one in skipped for event in one.picture.events)
-        return replace(result, picture=replace(result.picture, events=(*before, *result.picture.events)))
+            skipped_results = [
+                skipped_result
+                for skipped_result in self._results
+                if after < skipped_result.frame.number < result.frame.number
+            ]
+        earlier_events = tuple(event for skipped_result in skipped_results for event in skipped_result.picture.events)
+        return replace(result, picture=replace(result.picture, events=(*earlier_events, *result.picture.events)))
 
     def take_reference(self, count: int) -> None:
         """Take the mean of the next `count` frames, of the undisturbed sensor, as the new reference. Raises
         `ValueError` unless `count` is between 1 and 10,000."""
-        if not 1 <= count <= _MOST_REFERENCE:
-            raise ValueError(f"count must be a number of frames between 1 and {_MOST_REFERENCE:,}; it is {count}.")
+        if not 1 <= count <= _MAX_REFERENCE_FRAMES:
+            raise ValueError(
+                f"count must be a number of frames between 1 and {_MAX_REFERENCE_FRAMES:,}; it is {count}."
+            )
         with self._changed:
-            self._wanted, self._collected = count, []
+            self._num_requested, self._collected_frames = count, []
 
     def mark(self, label: str) -> None:
         """Mark an event now, also in the recording."""
-        label = " ".join(label.split())[:_LABEL] or "event"
+        label = " ".join(label.split())[:_MAX_LABEL_LENGTH] or "event"
         second = time.monotonic() - self.source.begun
         self.say(f"Event: {label}")
         if self.recorder is not None:
             self.recorder.mark(second, label)
 
     def record(self, on: bool) -> None:
-        """Begin a recording in a new folder, or end the one under way. What fails is reported in `state`."""
+        """Begin a recording in a new folder, or end the one in progress. Failures are reported in `state`."""
         if self.recorder is None:
             if on:
                 self.say("There is nowhere to record to.")
             return
         if not on:
-            ended = self.recorder.stop()
-            if ended:
-                self.say(ended)
+            sentence = self.recorder.stop()
+            if sentence:
+                self.say(sentence)
             return
         try:
             folder = self.recorder.start()
@@ -214,32 +227,32 @@ class Session:
         self._messages.append((time.monotonic() - self.source.begun, sentence[:300]))
 
     def state(self) -> dict[str, Any]:
-        """Counters, rate, latency, quality, connection, recording and messages, as JSON can hold them."""
+        """Counters, rate, latency, quality, connection, recording and messages, in types that JSON can represent."""
         with self._changed:
             latencies = np.array(self._latencies)
             counters = {
-                "read": self._read,
-                "imaged": self._imaged,
-                "dropped": self._dropped,
-                "refused": self._refused,
+                "read": self._num_read,
+                "imaged": self._num_imaged,
+                "dropped": self._num_dropped,
+                "refused": self._num_refused,
                 "reasons": dict(self._reasons.values()),
                 "statuses": {str(status): count for status, count in self._statuses.items()},
             }
             quality, ended = self._quality, self._ended
-        median, high = np.quantile(latencies, (0.5, 0.99)).tolist() if latencies.size else (None, None)
-        said = sorted([*self.source.messages.copy(), *self._messages.copy()])[-MESSAGES:]
+        median, latency_99 = np.quantile(latencies, (0.5, 0.99)).tolist() if latencies.size else (None, None)
+        messages = sorted([*self.source.messages.copy(), *self._messages.copy()])[-MAX_MESSAGES:]
         return {
             **counters,
-            "rate": self._rate(),
+            "rate": self._frame_rate(),
             "latency_median": median,
-            "latency_99": high,
+            "latency_99": latency_99,
             "noise": quality.noise,
             "reciprocity": quality.reciprocity,
-            "dead": self._names(quality.dead),
-            "drifting": self._names(quality.drifting),
+            "dead": self._electrode_names(quality.dead),
+            "drifting": self._electrode_names(quality.drifting),
             "connection": ENDED if ended else self.source.connection,
             "recording": None if self.recorder is None else self.recorder.state(),
-            "messages": [{"second": second, "text": text} for second, text in said],
+            "messages": [{"second": second, "text": text} for second, text in messages],
         }
 
     @property
@@ -247,35 +260,35 @@ class Session:
         """Whether the source has ended and its last frame is imaged."""
         return self._finished
 
-    def _rate(self) -> float:
+    def _frame_rate(self) -> float:
         """Frames/s in the last two seconds."""
         now = time.monotonic()
         with self._changed:
-            recent = [one for one in self._arrivals if one > now - _RATE_SPAN]
-        span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
-        return (len(recent) - 1) / span if span > 0 else 0.0
+            recent = [arrival for arrival in self._arrivals if arrival > now - _RATE_SPAN]
+        time_span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
+        return (len(recent) - 1) / time_span if time_span > 0 else 0.0
 
-    def _names(self, electrodes: Sequence[int]) -> list[str]:
+    def _electrode_names(self, electrodes: Sequence[int]) -> list[str]:
         names = self.scene.names
-        return [names[one] if one < len(names) else str(one + 1) for one in electrodes]
+        return [names[electrode] if electrode < len(names) else str(electrode + 1) for electrode in electrodes]
 
-    def _reading(self) -> None:
+    def _read_source(self) -> None:
         try:
             for frame in self.source:
                 if self.recorder is not None:
                     self.recorder.add(frame)
                 with self._changed:
-                    self._read += 1
+                    self._num_read += 1
                     self._arrivals.append(frame.arrived)
-                    self._waiting.append(frame)
-                    if len(self._waiting) > _MOST_WAITING:
-                        self._waiting.popleft()
-                        self._dropped += 1
-                    self._watch.add(frame)
+                    self._waiting_frames.append(frame)
+                    if len(self._waiting_frames) > _MAX_WAITING:
+                        self._waiting_frames.popleft()
+                        self._num_dropped += 1
+                    self._quality_watch.add(frame)
                     self._collect(frame)
                     self._changed.notify_all()
                 self._compare_length(frame)
-        except Exception as error:  # of any device or file: the page reports it
+        except Exception as error:  # devices and files raise exceptions of many types; the page reports them
             self.say(f"The source failed: {error}")
         finally:
             with self._changed:
@@ -283,64 +296,64 @@ class Session:
                 self._changed.notify_all()
 
     def _compare_length(self, frame: LiveFrame) -> None:
-        """Report frames whose number of channels has changed and stays changed."""
+        """Report a lasting change of the number of channels of the frames."""
         if isinstance(frame.values, str):
             return
         length = frame.values.size
-        self._others = self._others + 1 if length != self._length else 0
-        if self._others == _OTHERS:
-            if self._length:
-                self.say(f"Frames now have {counted(length, 'channel')}; they had {self._length}.")
-            self._length, self._others = length, 0
+        self._num_other_lengths = self._num_other_lengths + 1 if length != self._frame_length else 0
+        if self._num_other_lengths == _NUM_OTHER_LENGTHS:
+            if self._frame_length:
+                self.say(f"Frames now have {counted(length, 'channel')}; they had {self._frame_length}.")
+            self._frame_length, self._num_other_lengths = length, 0
 
-    def _judging(self) -> None:
-        while not self._closed.wait(_LOOK):
+    def _assess_quality(self) -> None:
+        while not self._closed.wait(_QUALITY_PERIOD):
             try:
-                quality = self._watch.look()
-            except Exception as error:  # a fault here must not be one of the session
+                quality = self._quality_watch.assess()
+            except Exception as error:  # an error here must not end the session
                 self.say(f"Noise and electrodes are no longer judged: {type(error).__name__}: {error}")
                 return
             with self._changed:
                 self._quality = quality
-            if said := self._rates(self._rate()):
-                self.say(said)
+            if sentence := self._rate_watch(self._frame_rate()):
+                self.say(sentence)
 
     def _collect(self, frame: LiveFrame) -> None:
-        """Keep a frame for the new reference, if one is wanted."""
-        if not self._wanted or isinstance(frame.values, str):
+        """Keep a frame for the new reference, if one was requested."""
+        if not self._num_requested or isinstance(frame.values, str):
             return
-        if self._channels is not None and frame.values.shape != (self._channels,):
+        if self._num_channels is not None and frame.values.shape != (self._num_channels,):
             return
-        if self._collected and self._collected[0].shape != frame.values.shape:
-            self._collected = []
-        self._collected.append(frame.values)
-        if len(self._collected) == self._wanted:
-            self._reference, self._wanted, self._collected = np.array(self._collected), 0, []
+        if self._collected_frames and self._collected_frames[0].shape != frame.values.shape:
+            self._collected_frames = []
+        self._collected_frames.append(frame.values)
+        if len(self._collected_frames) == self._num_requested:
+            self._reference, self._num_requested, self._collected_frames = np.array(self._collected_frames), 0, []
 
-    def _take(self) -> LiveFrame | None:
+    def _next_frame(self) -> LiveFrame | None:
         """Wait for the next frame to image; None at the end."""
         with self._changed:
-            while not self._waiting:
+            while not self._waiting_frames:
                 if self._ended:
                     return None
                 self._changed.wait(0.5)
-            old = time.monotonic() - _PATIENCE
-            while len(self._waiting) > 1 and self._waiting[0].arrived < old:
-                self._waiting.popleft()
-                self._dropped += 1
-            return self._waiting.popleft()
+            oldest_arrival = time.monotonic() - _MAX_WAIT
+            while len(self._waiting_frames) > 1 and self._waiting_frames[0].arrived < oldest_arrival:
+                self._waiting_frames.popleft()
+                self._num_dropped += 1
+            return self._waiting_frames.popleft()
 
-    def _imaging(self) -> None:
-        while (frame := self._take()) is not None:
+    def _image_frames(self) -> None:
+        while (frame := self._next_frame()) is not None:
             self._set_reference()
             try:
                 picture = self.view.picture(frame)
-            except Exception as error:  # a fault of a view must not end the recording
+            except Exception as error:  # an error of a view must not end the recording
                 picture = Picture(None, status=FrameStatus.REFUSED, reason=f"{type(error).__name__}: {error}"[:300])
             self._publish(Result(frame, picture, time.monotonic() - frame.arrived))
         self._closed.set()
         with self._changed:
-            if self._wanted:
+            if self._num_requested:
                 self._messages.append(
                     (time.monotonic() - self.source.begun, "The source ended before a new reference.")
                 )
@@ -352,10 +365,10 @@ class Session:
             frames, self._reference = self._reference, None
         if frames is None:
             return
-        if (change := change_during(frames)) is not None:
+        if (relative_change := change_during(frames)) is not None:
             self.say(
-                f"The old reference stays: the sensor changed by {100 * change:.2g} % while the new one was taken. "
-                "Take it while nothing touches the sensor."
+                f"The old reference stays: the sensor changed by {100 * relative_change:.2g} % while the new one was "
+                "taken. Take it while nothing touches the sensor."
             )
             return
         try:
@@ -363,7 +376,7 @@ class Session:
         except ValueError as error:
             self.say(f"The old reference stays: {error}")
             return
-        self._watch.renew(frames)
+        self._quality_watch.renew(frames)
         if self.recorder is not None:
             self.recorder.renew(time.monotonic() - self.source.begun, frames)
         self.say(f"New reference: mean of {counted(len(frames), 'frame')}.")
@@ -371,29 +384,31 @@ class Session:
     def _publish(self, result: Result) -> None:
         with self._changed:
             self._results.append(result)
-            self._bytes += _size(result)
-            oldest = result.frame.arrived - self.history
-            while len(self._results) > 1 and (self._bytes > _MOST_BYTES or self._results[0].frame.arrived < oldest):
-                self._bytes -= _size(self._results.popleft())
+            self._num_bytes += _result_size(result)
+            oldest_arrival = result.frame.arrived - self.history
+            while len(self._results) > 1 and (
+                self._num_bytes > _MAX_BYTES or self._results[0].frame.arrived < oldest_arrival
+            ):
+                self._num_bytes -= _result_size(self._results.popleft())
             if result.picture.status == FrameStatus.REFUSED:
-                self._refused += 1
+                self._num_refused += 1
             else:
-                self._imaged += 1
+                self._num_imaged += 1
                 self._latencies.append(result.latency)
             if result.picture.status == FrameStatus.REFUSED:
-                self._count(result.picture.reason)
+                self._count_reason(result.picture.reason)
             else:
                 self._statuses[result.picture.status] += 1
             self._changed.notify_all()
         for event in result.picture.events:
             self.say(event)
 
-    def _count(self, reason: str) -> None:
-        """Count a reason; those that differ by numbers only are one kind."""
-        kind = _NUMBER.sub("#", reason)
-        if kind not in self._reasons and len(self._reasons) >= _MOST_REASONS:
-            kind, reason = "", "other reasons"
-        self._reasons.setdefault(kind, [reason, 0])[1] += 1
+    def _count_reason(self, reason: str) -> None:
+        """Count a reason. Reasons that differ only in their numbers are counted together."""
+        pattern = _NUMBER.sub("#", reason)
+        if pattern not in self._reasons and len(self._reasons) >= _MAX_REASONS:
+            pattern, reason = "", "other reasons"
+        self._reasons.setdefault(pattern, [reason, 0])[1] += 1
 
 
 def frames(source: AbstractSource, view: AbstractView, *, recorder: Recorder | None = None) -> Iterator[Result]:
@@ -405,7 +420,7 @@ def frames(source: AbstractSource, view: AbstractView, *, recorder: Recorder | N
 
     - `source`: the source.
     - `view`: the view of its frames.
-    - `recorder`: where all frames are recorded.
+    - `recorder`: recorder that records all frames.
 
     **Example:**
 
@@ -414,20 +429,20 @@ def frames(source: AbstractSource, view: AbstractView, *, recorder: Recorder | N
         print(result.frame.second, result.picture.markers)
     ```
     """
-    session, last = Session(source, view, recorder=recorder, history=_SKIPPED), -1
+    session, last_number = Session(source, view, recorder=recorder, history=_EVENT_HISTORY), -1
     if recorder is not None:
         session.record(True)
     with session:
         while True:
-            result = session.newest(last, 0.5)
+            result = session.newest(last_number, 0.5)
             if result is not None:
-                yield session.with_events(result, last)
-                last = result.frame.number
+                yield session.with_events(result, last_number)
+                last_number = result.frame.number
             elif session.ended:
                 return
 
 
-def _size(result: Result) -> int:
+def _result_size(result: Result) -> int:
     """Memory of a result, bytes."""
     pixels, values = result.picture.pixels, result.frame.values
     return 500 + (0 if pixels is None else pixels.nbytes) + (len(values) if isinstance(values, str) else values.nbytes)

@@ -1,4 +1,5 @@
-"""Sources of frames: what every source has, and the one that a text such as `serial:/dev/ttyACM0@115200` names."""
+"""Sources of frames: their base class, recordings, and the source that a text such as `serial:/dev/ttyACM0@115200`
+names."""
 
 from __future__ import annotations
 
@@ -18,10 +19,10 @@ from jeit.imaging.stream_preparation import frames_of
 from jeit.live.pictures import LiveFrame
 
 ENDED, CONNECTED = "ended", "connected"
-# Number of messages that are kept, and characters of each.
-MESSAGES, _LONGEST = 50, 300
+# Maximum number of messages that are kept, and maximum number of characters of each.
+MAX_MESSAGES, _MAX_MESSAGE_LENGTH = 50, 300
 # Frame rate of a recording without times, in frames/s.
-_USUAL_RATE = 10.0
+_DEFAULT_RATE = 10.0
 
 
 class AbstractSource(abc.ABC):
@@ -29,7 +30,7 @@ class AbstractSource(abc.ABC):
 
     **Arguments:**
 
-    - `name`: what the user gave, for messages.
+    - `name`: name of the source as the user gave it, for messages.
 
     **Attributes**: `name`; `connection`: "connected", "waiting: …" with the reason, or "ended"; `begun`:
     `time.monotonic()` of second 0; `messages`: the last 50 reports about the connection, as pairs of second and
@@ -46,37 +47,37 @@ class AbstractSource(abc.ABC):
     def __init__(self, name: str):
         self.name, self.connection = name, CONNECTED
         self.begun = time.monotonic()
-        self.messages: deque[tuple[float, str]] = deque(maxlen=MESSAGES)
+        self.messages: deque[tuple[float, str]] = deque(maxlen=MAX_MESSAGES)
         self.closing = threading.Event()
-        self._number = 0
+        self._num_frames = 0
 
     @abc.abstractmethod
     def __iter__(self) -> Iterator[LiveFrame]:
-        """Frames as they arrive; ends when the source has ended or is closed."""
+        """Yield frames as they arrive, until the source has ended or is closed."""
 
     def close(self) -> None:
-        """End the iteration soon, also while it waits for a device."""
+        """End the iteration soon, even while it waits for a device."""
         self.closing.set()
 
     def end_when_lost(self) -> None:
-        """End when a connection is lost, instead of waiting for it; sources without connections end anyway."""
+        """End when the connection is lost, instead of reconnecting. Sources without connections end in any case."""
         return
 
     def say(self, sentence: str) -> None:
         """Keep a report about the source, with its time."""
-        self.messages.append((time.monotonic() - self.begun, sentence[:_LONGEST]))
+        self.messages.append((time.monotonic() - self.begun, sentence[:_MAX_MESSAGE_LENGTH]))
 
     def frame(self, values: np.ndarray | str, arrived: float | None = None) -> LiveFrame:
-        """The next frame, numbered. `arrived`: `time.monotonic()` of its last byte, by default now."""
+        """Create the next frame, with its number. `arrived`: `time.monotonic()` of its last byte, by default now."""
         arrived = time.monotonic() if arrived is None else arrived
-        made = LiveFrame(self._number, arrived - self.begun, arrived, values)
-        self._number += 1
-        return made
+        new_frame = LiveFrame(self._num_frames, arrived - self.begun, arrived, values)
+        self._num_frames += 1
+        return new_frame
 
 
 class PlayedRecording(AbstractSource):
-    """Frames (F, M) of a recording, played at their `times` (F,), seconds, at `rate` frames/s, or else at ten
-    frames/s."""
+    """Source that plays the frames (F, M) of a recording: at `rate` frames/s if given, otherwise at their `times` (F,)
+    in seconds if given, otherwise at ten frames/s."""
 
     def __init__(
         self,
@@ -88,10 +89,10 @@ class PlayedRecording(AbstractSource):
         super().__init__(name)
         self.frames = np.asarray(frames)
         if rate is None and times is None:
-            self.say(f"The recording has no times: it is played at {_USUAL_RATE:g} frames a second; see --rate.")
-            rate = _USUAL_RATE
+            self.say(f"The recording has no times: it is played at {_DEFAULT_RATE:g} frames a second; see --rate.")
+            rate = _DEFAULT_RATE
         if rate is not None or times is None:
-            self.seconds = np.arange(len(self.frames)) / (rate or _USUAL_RATE)
+            self.seconds = np.arange(len(self.frames)) / (rate or _DEFAULT_RATE)
         else:
             self.seconds = np.asarray(times) - float(times[0])
 
@@ -111,22 +112,22 @@ def open_source(
     description: str | Path | None = None,
     reference: Measurement | None = None,
 ) -> AbstractSource:
-    """The source that a text names.
+    """Open the source that a text names.
 
     - "-": lines on standard input. "serial:PORT@BAUD": lines of a serial device. "tcp:HOST:PORT": lines of a server.
-    - a folder: files that an instrument writes into it, a frame or more in each; those that are there already are left
+    - a folder: files that an instrument writes into it, each with one or more frames; files that exist already are left
       out, unless a `rate` is given. A file: a recording, played at its own rate.
-    - "demo": a simulated tank in which a rod goes round; "demo:skin": a simulated skin that is stroked.
+    - "demo": a simulated tank in which a rod moves on a circle; "demo:skin": a simulated skin that is stroked.
 
     **Arguments:**
 
     - `text`: the text.
     - `rate`: frames/s of a recording or of lines that have all arrived already.
-    - `description`: what numbers mean, as `description` of `jeit.data.read`.
+    - `description`: description of the frames, as `description` of `jeit.data.read`.
     - `reference`: a measurement of the undisturbed sensor, as `like` of `jeit.data.read`.
 
-    Raises `ValueError` for a text that names no source and for a rate that is not positive, and as `jeit.data.read` for
-    a recording.
+    Raises `ValueError` for a text that does not name a source and for a rate that is not positive, and as
+    `jeit.data.read` does for a recording.
 
     **Example:**
 
@@ -138,11 +139,11 @@ def open_source(
     if rate is not None and not (is_number(rate) and 0 < rate < float("inf")):
         raise ValueError(f"rate must be positive, frames in a second; it is {describe(rate)}.")
     if text == "demo" or text.startswith("demo:"):
-        from jeit.live.simulated import simulated
+        from jeit.live.simulated import open_simulated
 
-        return simulated(text, rate)
-    kind = text.partition(":")[0]
-    if text == "-" or kind in ("serial", "tcp"):
+        return open_simulated(text, rate)
+    scheme = text.partition(":")[0]
+    if text == "-" or scheme in ("serial", "tcp"):
         from jeit.live.connections import connection_to
         from jeit.live.line_source import LineSource, ReadAhead
         from jeit.live.lines import LineReading

@@ -105,7 +105,7 @@ def test_tracks(monkeypatch):
         name="",
     )
     at_once = track(found)
-    monkeypatch.setattr(tracking, "FEW_FRAMES", 0)
+    monkeypatch.setattr(tracking, "MAX_NUMPY_FRAMES", 0)
     compiled = track(found)
     assert_same(
         [at_once.position, at_once.covariance, at_once.velocity, at_once.rejected],

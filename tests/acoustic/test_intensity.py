@@ -122,7 +122,7 @@ def test_times_are_the_middles_of_windows():
 def test_chunks_do_not_matter(monkeypatch):
     recording = Recording(white((3, 30_000)), RATE)
     whole = intensities(recording)
-    monkeypatch.setattr(intensity, "_CHUNK", 20_000)
+    monkeypatch.setattr(intensity, "_MAX_CHUNK_SAMPLES", 20_000)
     np.testing.assert_allclose(intensities(recording).power, whole.power, rtol=1e-12)
     single = intensities(Recording(recording.samples.astype(np.float32), RATE))
     np.testing.assert_allclose(single.power, whole.power, atol=1e-6 * whole.power.max())

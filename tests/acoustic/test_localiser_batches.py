@@ -19,7 +19,7 @@ from microphone_arrays import (
 )
 
 from jeit.acoustic import Localiser
-from jeit.acoustic.localisation.localiser import _CHUNK
+from jeit.acoustic.localisation.localiser import _MAX_CHUNK_FRAMES
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_frames_do_not_depend_on_each_other(method, mixed):
     for key in ("position", "covariance", "strength", "excess", "misfit"):
         np.testing.assert_allclose(shuffled[key], together[key][order], rtol=1e-9, atol=1e-15)
     many = localiser(padded(power)).position
-    assert len(many) > _CHUNK
+    assert len(many) > _MAX_CHUNK_FRAMES
     np.testing.assert_allclose(many, padded(together["position"]), rtol=1e-7, atol=1e-10)
 
 

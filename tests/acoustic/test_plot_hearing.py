@@ -21,7 +21,7 @@ from jeit.acoustic.plots import (
     plot_receptive_fields,
     plot_track,
 )
-from jeit.acoustic.plots.surface_view import FOUND
+from jeit.acoustic.plots.surface_view import ESTIMATE_COLOUR
 from jeit.acoustic.surface import make_surface
 from jeit.acoustic.tracking import Touch, Track
 from jeit.layout import grid
@@ -147,7 +147,7 @@ def test_left_out_taps_are_red_and_unusable_microphones_have_a_reason(ax):
     taps, out = panel.collections
     assert len(taps.get_offsets()) == 28
     assert len(out.get_offsets()) == 2
-    assert to_hex(out.get_edgecolor()[0]) == FOUND
+    assert to_hex(out.get_edgecolor()[0]) == ESTIMATE_COLOUR
     assert "left out" in named(ax)
     assert ax.child_axes[2].texts[1].get_text().replace("\n", " ") == "its intensity does not fall with distance"
     dead = ax.child_axes[4]

@@ -25,8 +25,8 @@ def test_lines_do_not_depend_on_chunk_boundaries(longest):
     buffer = LineBuffer()
     lines = [line for piece in pieces(content, longest) for line in buffer.feed(piece)]
     assert lines == [b"1, 2, 3", b"4;5;6", b"magnitudes : 1,2", b"x\xff\x00y"]
-    assert buffer.rest() == b"last"
-    assert buffer.rest() == b""
+    assert buffer.take_remainder() == b"last"
+    assert buffer.take_remainder() == b""
 
 
 @pytest.mark.parametrize("longest", [1, 5, 1000])
@@ -35,7 +35,7 @@ def test_frames_of_openeit_are_separated_without_line_ends(longest):
     content = b"boot magnitudes : 1, 2,magnitudes : 3, 4\nMagnitudes: 5, 6magnitudes : 7"
     lines = [line for piece in pieces(content, longest) for line in buffer.feed(piece)]
     assert lines == [b"boot ", b"magnitudes : 1, 2,", b"magnitudes : 3, 4", b"Magnitudes: 5, 6"]
-    assert buffer.rest() == b"magnitudes : 7"
+    assert buffer.take_remainder() == b"magnitudes : 7"
 
 
 def test_a_line_without_end_uses_bounded_memory_and_the_next_one_is_complete():
@@ -184,6 +184,6 @@ def test_numbers_without_a_reader_are_volts_with_a_note():
     frame = noisy(1)[0]
     sensor = measured()
     reading = LineReading(None, sensor)
-    reading._read = lambda row, word: (_ for _ in ()).throw(ValueError("no table"))
+    reading._read_volts = lambda row, word: (_ for _ in ()).throw(ValueError("no table"))
     np.testing.assert_array_equal(reading(", ".join(map(repr, frame.tolist())).encode()), frame)
     assert "no table" in reading.note

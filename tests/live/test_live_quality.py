@@ -10,11 +10,11 @@ from jeit.live.quality import Quality, QualityWatch, RateWatch, change_during
 
 def looked(frames, watch=None, times=1):
     watch = QualityWatch(measured()) if watch is None else watch
-    quality = watch.look()
+    quality = watch.assess()
     for _ in range(times):
         for number, values in enumerate(frames):
             watch.add(LiveFrame(number, 0.0, 0.0, values))
-        quality = watch.look()
+        quality = watch.assess()
     return quality
 
 
@@ -76,7 +76,7 @@ def test_few_frames_text_and_other_sensors_give_no_result():
     watch = QualityWatch(measured())
     for values in (*["text"] * 20, *np.zeros((20, 3)), *noisy(3)):
         watch.add(LiveFrame(0, 0.0, 0.0, values))
-    assert watch.look().noise is None
+    assert watch.assess().noise is None
     alone = QualityWatch(None)
     assert looked(noisy(32), alone).noise == pytest.approx(NOISE, rel=0.25)
     assert looked(noisy(32), alone).reciprocity is None

@@ -154,7 +154,7 @@ def test_a_full_disk_leaves_whole_frames_and_the_rest_follows_when_there_is_spac
     folder = recorder.start()
     disk = FullDisk(room)
     monkeypatch.setattr(recording.os, "write", disk)
-    monkeypatch.setattr(recording, "_RETRY", 0.02)
+    monkeypatch.setattr(recording, "_RETRY_PERIOD", 0.02)
     for number, values in enumerate(frames):
         recorder.add(frame(number, values))
     wait_for(lambda: state_of(recorder)["problem"])
@@ -179,7 +179,7 @@ def test_an_abandoned_recording_writes_nothing_into_the_next(tmp_path, monkeypat
         return written(descriptor, content)
 
     monkeypatch.setattr(recording.os, "write", hangs)
-    monkeypatch.setattr(recording, "_LONGEST_END", 0.05)
+    monkeypatch.setattr(recording, "_END_TIMEOUT", 0.05)
     first = recorder.start()
     hung = recorder._thread
     recorder.add(frame(0, frames[0]))
@@ -190,7 +190,7 @@ def test_an_abandoned_recording_writes_nothing_into_the_next(tmp_path, monkeypat
     assert hung is not None
     hung.join(5)
     recorder.add(frame(2, frames[2]))
-    monkeypatch.setattr(recording, "_LONGEST_END", 10.0)
+    monkeypatch.setattr(recording, "_END_TIMEOUT", 10.0)
     assert "2 frames" in recorder.stop()
     rows = np.loadtxt(second / "frames.csv", delimiter=",", skiprows=1)
     np.testing.assert_array_equal(rows[:, 1:], frames[1:])
@@ -201,10 +201,10 @@ def test_frames_without_space_are_counted(tmp_path, monkeypatch):
     recorder = Recorder(tmp_path)
     recorder.start()
     monkeypatch.setattr(recording.os, "write", FullDisk(0))
-    monkeypatch.setattr(recording, "_MOST_WAITING", 5000)
+    monkeypatch.setattr(recording, "_MAX_WAITING_BYTES", 5000)
     for number, values in enumerate(noisy(30)):
         recorder.add(frame(number, values))
-    wait_for(lambda: recorder._lost)
+    wait_for(lambda: recorder._num_lost)
     assert "could not be recorded" in state_of(recorder)["problem"]
     report = recorder.stop()
     assert "0 frames" in report
@@ -212,7 +212,7 @@ def test_frames_without_space_are_counted(tmp_path, monkeypatch):
 
 
 def test_long_recordings_are_in_parts_that_can_be_read_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(recording, "_PART", 5000)
+    monkeypatch.setattr(recording, "_MAX_FILE_SIZE", 5000)
     recorder, frames = Recorder(tmp_path, reference=measured()), noisy(30)
     folder = recorder.start()
     for number, values in enumerate(frames):

@@ -18,7 +18,15 @@ from stand_in import StandIn
 
 from jeit.live.page.guard import host_allowed
 from jeit.live.page.hub import Hub, Viewer
-from jeit.live.page.wire import LONGEST_COMMAND, NO_PIXEL, Mark, picture_message, plain, read_command, to_json
+from jeit.live.page.wire import (
+    MAX_COMMAND_LENGTH,
+    NO_PIXEL,
+    Mark,
+    picture_message,
+    read_command,
+    to_json,
+    to_json_types,
+)
 from jeit.live.pictures import LiveFrame, Marker, Picture
 
 pytest.importorskip("uvicorn", reason="the page needs the extra live")
@@ -151,7 +159,7 @@ def test_json_of_values_that_python_cannot_write():
         "4": True,
         "p": "b'x'",
     }
-    assert plain(np.array([1.0, np.nan])) == [1.0, None]
+    assert to_json_types(np.array([1.0, np.nan])) == [1.0, None]
 
 
 @pytest.mark.parametrize("message", HOSTILE)
@@ -262,7 +270,7 @@ def test_a_flood_is_cut_off(served):
     """A page that sends invalid or overlong messages is disconnected. Another continues."""
     address = served(StandIn(None))
     with page(address) as good:
-        for rubbish, most in (("rubbish", 30), ("x" * (LONGEST_COMMAND + 1), 1)):
+        for rubbish, most in (("rubbish", 30), ("x" * (MAX_COMMAND_LENGTH + 1), 1)):
             with page(address) as bad, pytest.raises(ConnectionClosed):
                 _ask_often(bad, rubbish, most)
         good.send('{"do": "mark", "label": "here"}')
@@ -318,12 +326,12 @@ def test_latency_is_of_displayed_pictures():
         viewer = Viewer()
         now = time.monotonic()
         for number, ago in ((1, 9.0), (2, 0.03)):
-            viewer.sent(number, now - ago)
+            viewer.note_sent(number, now - ago)
         assert not viewer.ready_for(3)
-        viewer.drew(2, hidden=False)
-        viewer.sent(3, now - 60)
-        viewer.drew(3, hidden=True)
-        viewer.drew(77, hidden=False)
+        viewer.note_drawn(2, hidden=False)
+        viewer.note_sent(3, now - 60)
+        viewer.note_drawn(3, hidden=True)
+        viewer.note_drawn(77, hidden=False)
         return viewer.summary()
 
     assert asyncio.run(judged())["latency_99"] == pytest.approx(0.03, abs=0.01)

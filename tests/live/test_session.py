@@ -40,7 +40,7 @@ class Given(AbstractSource):
 @pytest.fixture(autouse=True)
 def _patience(monkeypatch):
     """No frame is late because the machine is busy otherwise."""
-    monkeypatch.setattr(session_module, "_PATIENCE", 5.0)
+    monkeypatch.setattr(session_module, "_MAX_WAIT", 5.0)
 
 
 def wait_for(condition, seconds=5.0):
@@ -72,7 +72,7 @@ def test_all_frames_are_imaged_in_their_order_and_counted():
 
 
 def test_a_slow_view_misses_frames_and_the_recording_none(tmp_path, monkeypatch):
-    monkeypatch.setattr(session_module, "_PATIENCE", 0.05)
+    monkeypatch.setattr(session_module, "_MAX_WAIT", 0.05)
 
     def slow(frame):
         time.sleep(0.03)
@@ -168,11 +168,11 @@ def test_results_are_kept_for_a_time_within_their_memory(monkeypatch):
     assert 10 < len(kept) < 30
     assert kept[-1] == 59
     assert session.result(0) is None
-    monkeypatch.setattr(session_module, "_MOST_BYTES", 12_000)
+    monkeypatch.setattr(session_module, "_MAX_BYTES", 12_000)
     with Session(Given(noisy(60)), Blank(lambda frame: Picture(pixels))) as session:
         session.wait()
         assert 5 < len(session._results) <= 12
-    monkeypatch.setattr(session_module, "_MOST_BYTES", 10)
+    monkeypatch.setattr(session_module, "_MAX_BYTES", 10)
     with Session(Given(noisy(5)), Blank(lambda frame: Picture(pixels))) as session:
         session.wait()
         assert [one.frame.number for one in session._results] == [4]

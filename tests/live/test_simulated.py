@@ -16,7 +16,7 @@ from jeit.live.pictures import LiveFrame
 from jeit.live.quality import QualityWatch
 from jeit.live.recording import Recorder
 from jeit.live.session import Session
-from jeit.live.simulated import simulated, simulated_skin, simulated_tank
+from jeit.live.simulated import open_simulated, simulated_skin, simulated_tank
 from jeit.mesh import centroids
 
 
@@ -49,7 +49,7 @@ def test_none_of_its_electrodes_is_dead_or_drifts(source):
     for second in np.arange(0, 30, 0.5):
         for number in range(32):
             watch.add(LiveFrame(number, 0.0, 0.0, source.states[source._state(second + number / 60)]))
-        quality = watch.look()
+        quality = watch.assess()
         assert not [*quality.dead, *quality.drifting]
 
 
@@ -79,7 +79,7 @@ def test_frames_come_at_their_rate_and_end_at_the_limit():
     late = np.array(seconds) - np.arange(20) / 200
     assert late.min() > -1e-3
     assert np.median(late) < 0.05
-    endless = iter(simulated("demo", 500))
+    endless = iter(open_simulated("demo", 500))
     assert [one.number for one in itertools.islice(endless, 5)] == list(range(5))
 
 

@@ -73,8 +73,8 @@ def are_due(seconds, expected):
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch):
-    monkeypatch.setattr(line_source, "_FIRST_DELAY", 0.02)
-    monkeypatch.setattr(line_source, "_WAIT", 0.02)
+    monkeypatch.setattr(line_source, "_INITIAL_DELAY", 0.02)
+    monkeypatch.setattr(line_source, "_READ_TIMEOUT", 0.02)
 
 
 @posix
@@ -144,7 +144,7 @@ def test_frames_beyond_those_that_can_wait_are_counted(monkeypatch):
     os.write(write, b"".join(map(line, FRAMES)))
     lines = LineSource("-", StandardInput(read), LineReading())
     source = ReadAhead(lines)
-    while lines._number < len(FRAMES):
+    while lines._num_frames < len(FRAMES):
         time.sleep(0.005)
     time.sleep(0.05)
     frames = iter(source)
@@ -247,7 +247,7 @@ def test_a_missing_server_is_awaited_and_can_be_cancelled():
 
 
 def test_a_silent_device_is_reported(monkeypatch):
-    monkeypatch.setattr(line_source, "_SILENT", 0.05)
+    monkeypatch.setattr(line_source, "_SILENCE_TIMEOUT", 0.05)
     listening = socket.create_server(("127.0.0.1", 0))
     source = LineSource("tcp", Server("127.0.0.1", listening.getsockname()[1]), LineReading())
     with Reading(source) as reading:
@@ -260,7 +260,7 @@ def test_a_silent_device_is_reported(monkeypatch):
 
 
 def test_files_that_appear_in_a_folder_are_frames(tmp_path, monkeypatch):
-    monkeypatch.setattr(folder_source, "_PATIENCE", 0.1)
+    monkeypatch.setattr(folder_source, "_READ_TIMEOUT", 0.1)
     reference = measured()
     (tmp_path / "old.csv").write_bytes(line(FRAMES[0]))
     source = open_source(str(tmp_path), reference=reference)
@@ -299,10 +299,10 @@ def test_a_file_is_read_once_its_size_is_constant(tmp_path):
     assert isinstance(source, WatchedFolder)
     path = tmp_path / "frame.csv"
     path.write_bytes(line(FRAMES[0]))
-    assert list(source._file(path.name, path.stat().st_size)) == []
+    assert list(source._read_file(path.name, path.stat().st_size)) == []
     path.write_bytes(line(FRAMES[0]) + line(FRAMES[1]))
-    assert list(source._file(path.name, path.stat().st_size)) == []
-    assert len(list(source._file(path.name, path.stat().st_size))) == 2
+    assert list(source._read_file(path.name, path.stat().st_size)) == []
+    assert len(list(source._read_file(path.name, path.stat().st_size))) == 2
 
 
 def test_a_recording_is_replayed_at_its_own_rate_or_another():

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from jeit.acoustic.calibration.calibration import Calibration
 from jeit.acoustic.calibration.robust_least_squares import TapFit, fit_taps, standard_errors
-from jeit.acoustic.calibration.usable_microphones import LeftOutTaps, check_received, leave_out, locate_left_out
+from jeit.acoustic.calibration.usable_microphones import LeftOutTaps, check_received, exclude_unusable, locate_left_out
 from jeit.acoustic.decay import DECAYS, AbstractDecay, find_decay
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.noise import IntensityNoise, noise_from_negative_powers
@@ -30,13 +30,13 @@ from jeit_solvers.module import Module
 AUTO = "auto"
 # Minimum relative improvement of the localisation error of left-out taps for which a model with more parameters is
 # preferred.
-_LEAST_IMPROVEMENT = 0.05
+_MIN_IMPROVEMENT = 0.05
 # Relative error of the intensities above which a note is given. On simulated skins with uneven coupling and exact
 # positions, the relative error is 18 to 21 %.
 _LARGE_ERROR = 0.23
 # Minimum fraction of the microphones with enough taps that must agree with the model, unless left-out taps are located
 # well. Otherwise the given positions are rejected.
-_LEAST_SHARE = 0.5
+_MIN_USABLE_SHARE = 0.5
 # Default standard deviation of each coordinate of the microphones' given positions, in metres.
 PLACE_ERROR = 2e-3
 
@@ -82,10 +82,12 @@ class CalibrationFit(Module):
         """Text that compares the localisation errors of the decay models for left-out taps; empty if unknown."""
         if not self.left_out:
             return ""
-        mine, *others = (_distance_text(off) for _, off in self.left_out)
+        selected_error, *other_errors = (_distance_text(error) for _, error in self.left_out)
         names = [name for name, _ in self.left_out[1:]]
-        beside = ", ".join(f"{name} {off}" for name, off in zip(names, others, strict=True))
-        return f"locates taps left out of the fit to {mine}, median" + (f" ({beside})" if beside else "")
+        comparison = ", ".join(f"{name} {error}" for name, error in zip(names, other_errors, strict=True))
+        return f"locates taps left out of the fit to {selected_error}, median" + (
+            f" ({comparison})" if comparison else ""
+        )
 
     @property
     def note(self) -> str:
@@ -136,20 +138,22 @@ def calibrate_microphones(
     calibration = fit.calibration
     ```
     """
-    every = isinstance(decay, str) and decay == AUTO
-    kinds = () if every else (find_decay(decay),)
-    fits, refused = fit_each_decay(taps, kinds, place_error=place_error, intensity=intensity, progress=progress)
-    return select_fit(fits, refused)
+    is_auto = isinstance(decay, str) and decay == AUTO
+    decay_classes = () if is_auto else (find_decay(decay),)
+    fits, rejection_reasons = fit_each_decay(
+        taps, decay_classes, place_error=place_error, intensity=intensity, progress=progress
+    )
+    return select_fit(fits, rejection_reasons)
 
 
-def select_fit(fits: dict[str, CalibrationFit], refused: dict[str, str]) -> CalibrationFit:
+def select_fit(fits: dict[str, CalibrationFit], rejection_reasons: dict[str, str]) -> CalibrationFit:
     """Select the fit that locates left-out taps best. Among fits with nearly equal errors, the one with the fewest
-    parameters is selected. Raises `ValueError` if `fits` is empty; its message is the first reason in `refused`."""
+    parameters is selected. Raises `ValueError` with the first of the `rejection_reasons` if `fits` is empty."""
     if not fits:
-        raise ValueError(next(iter(refused.values())))
+        raise ValueError(next(iter(rejection_reasons.values())))
     # The fits are in order of their number of parameters.
-    least = min(fit.left_out[0][1] for fit in fits.values())
-    return next(fit for fit in fits.values() if not fit.left_out[0][1] > (1 + _LEAST_IMPROVEMENT) * least)
+    smallest_error = min(fit.left_out[0][1] for fit in fits.values())
+    return next(fit for fit in fits.values() if not fit.left_out[0][1] > (1 + _MIN_IMPROVEMENT) * smallest_error)
 
 
 @np.errstate(all="ignore")  # models that do not fit are reported with a reason
@@ -162,7 +166,7 @@ def fit_each_decay(
     progress: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, CalibrationFit], dict[str, str]]:
     """Fit each of the given decay models; by default all. Returns a dictionary of the fits by name, and a dictionary of
-    the reasons why the other models could not be fitted.
+    the reasons for which the other models could not be fitted.
 
     `progress` is called with the name of each step when it begins. Raises `ValueError` as `calibrate_microphones` does,
     but not if no model can be fitted.
@@ -173,29 +177,31 @@ def fit_each_decay(
         raise ValueError(f"place_error must be zero or positive, in metres; it is {describe(place_error)}.")
     if intensity is not None and taps.samples is None:
         raise ValueError("intensity: band and window are for taps that come as samples; these are intensities.")
-    report = progress or (lambda step: None)
+    report_step = progress or (lambda step: None)
     if taps.samples is not None:
-        report("measure intensities")
-    readings = _read_taps(taps, intensity, place_error)
-    found, refused = {}, {}
-    for kind in decays or DECAYS.values():
-        report(f"fit {kind.name}")
+        report_step("measure intensities")
+    fit_input = _read_taps(taps, intensity, place_error)
+    fitted_models, rejection_reasons = {}, {}
+    for decay_class in decays or DECAYS.values():
+        report_step(f"fit {decay_class.name}")
         try:
-            found[kind.name] = _fit_decay_model(kind, readings)
+            fitted_models[decay_class.name] = _fit_decay_model(decay_class, fit_input)
         except _NoFitError as error:
-            refused[kind.name] = str(error)
-    left_out = {name: fitted.left.median for name, fitted in found.items()} | dict.fromkeys(refused, np.inf)
+            rejection_reasons[decay_class.name] = str(error)
+    left_out = {name: fitted.left_out_taps.median for name, fitted in fitted_models.items()} | dict.fromkeys(
+        rejection_reasons, np.inf
+    )
     fits = {}
-    for name, fitted in found.items():
-        others = tuple(item for item in left_out.items() if item[0] != name)
-        fits[name] = _calibration_fit(taps, readings, fitted, ((name, left_out[name]), *others))
-    return fits, refused
+    for name, fitted in fitted_models.items():
+        other_errors = tuple(item for item in left_out.items() if item[0] != name)
+        fits[name] = _calibration_fit(taps, fit_input, fitted, ((name, left_out[name]), *other_errors))
+    return fits, rejection_reasons
 
 
 class _FitInput(NamedTuple):
     """Input of a fit: positions and intensities of the taps, and the noise of the microphones.
 
-    **Fields**: `microphones`, `places`: positions of microphones and taps in metres; `surface`: the surface;
+    **Fields**: `microphones`, `positions`: positions of microphones and taps in metres; `surface`: the surface;
     `place_error`: standard deviation of the microphones' coordinates in metres; `power`: intensities minus the floor,
     NaN where unusable; `noise`: noise of the microphones; `known_noise`: whether its floor was measured; `faults`:
     fault of each microphone; `settings`: band and windows, for taps given as samples.
@@ -203,7 +209,7 @@ class _FitInput(NamedTuple):
 
     microphones: Float[np.ndarray, "M d"]
     surface: AbstractSurface
-    places: Float[np.ndarray, "T d"]
+    positions: Float[np.ndarray, "T d"]
     place_error: float
     power: Float[np.ndarray, "M T"]
     noise: IntensityNoise
@@ -215,17 +221,17 @@ class _FitInput(NamedTuple):
 class _FittedModel(NamedTuple):
     """Result of the fit of one decay model.
 
-    **Fields**: `fit`: the fit; `tried`: mask of the readings used in the first fit, of all microphones; `good`: mask of
-    the usable microphones; `reasons`: reasons why microphones are unusable; `explained`: fraction of variance that each
-    model explains; `left`: localisation errors of left-out taps.
+    **Fields**: `fit`: the fit; `initial_use`: mask of the readings used in the first fit, of all microphones; `usable`:
+    mask of the usable microphones; `reasons`: reasons why microphones are unusable; `explained`: fraction of variance
+    that each model explains; `left_out_taps`: localisation errors of left-out taps.
     """
 
     fit: TapFit
-    tried: Bool[np.ndarray, "T M"]
-    good: Bool[np.ndarray, " M"]
+    initial_use: Bool[np.ndarray, "T M"]
+    usable: Bool[np.ndarray, " M"]
     reasons: tuple[str, ...]
     explained: Float[np.ndarray, " M"]
-    left: LeftOutTaps
+    left_out_taps: LeftOutTaps
 
 
 class _NoFitError(Exception):
@@ -243,58 +249,63 @@ def _read_taps(taps: Taps, intensity: IntensitySettings | None, place_error: flo
         settings = intensity if intensity is not None else IntensitySettings()
         power, floor, freedom, usable, faults = tap_intensities(taps, settings)
         noise = IntensityNoise.create(power.shape[1], floor=floor, freedom=np.median(freedom))
-    known = np.where(usable, power, np.nan).T
-    noisy = noise, settings is not None, tuple(faults), settings
-    return _FitInput(taps.microphones, surface, taps.positions, float(place_error), known, *noisy)
+    usable_power = np.where(usable, power, np.nan).T
+    noise_fields = noise, settings is not None, tuple(faults), settings
+    return _FitInput(taps.microphones, surface, taps.positions, float(place_error), usable_power, *noise_fields)
 
 
-def _fit_decay_model(kind: type[AbstractDecay], readings: _FitInput) -> _FittedModel:
+def _fit_decay_model(decay_class: type[AbstractDecay], fit_input: _FitInput) -> _FittedModel:
     """Fit one decay model to all microphones. Raises `_NoFitError` if too few microphones received the taps or agree
     with the model."""
-    distance = np.linalg.norm(readings.microphones[:, None] - readings.places, axis=-1)
-    enough, why = check_received(kind, distance, readings.power, readings.faults)
-    if why:
-        raise _NoFitError(why)
-    noise = readings.noise, readings.known_noise
-    fit = fit_taps(kind, readings.microphones, readings.places, readings.power, *noise, readings.place_error)
-    tried = fit.use.T
-    fit, good, reasons, explained = leave_out(fit, readings.faults)
-    left = locate_left_out(fit, readings.microphones, readings.surface, readings.places)
-    if good.sum() < 3 or (good.sum() < _LEAST_SHARE * enough.sum() and not left.is_better_than_mean):
+    distance = np.linalg.norm(fit_input.microphones[:, None] - fit_input.positions, axis=-1)
+    has_enough_taps, rejection_reason = check_received(decay_class, distance, fit_input.power, fit_input.faults)
+    if rejection_reason:
+        raise _NoFitError(rejection_reason)
+    noise = fit_input.noise, fit_input.known_noise
+    fit = fit_taps(
+        decay_class, fit_input.microphones, fit_input.positions, fit_input.power, *noise, fit_input.place_error
+    )
+    initial_use = fit.use.T
+    fit, is_usable, reasons, explained = exclude_unusable(fit, fit_input.faults)
+    left_out_taps = locate_left_out(fit, fit_input.microphones, fit_input.surface, fit_input.positions)
+    if is_usable.sum() < 3 or (
+        is_usable.sum() < _MIN_USABLE_SHARE * has_enough_taps.sum() and not left_out_taps.is_better_than_mean
+    ):
         raise _NoFitError(
-            f"only {good.sum()} of the {enough.sum()} microphones that received the taps follow a decay model, and "
-            "three are needed, or half: are the rows of positions in the order of the taps, those of microphones in "
-            f"the order of the channels? {describe_faults(reasons)}."
+            f"only {is_usable.sum()} of the {has_enough_taps.sum()} microphones that received the taps follow a decay "
+            "model, and three are needed, or half: are the rows of positions in the order of the taps, those of "
+            f"microphones in the order of the channels? {describe_faults(reasons)}."
         )
-    return _FittedModel(fit, tried, good, reasons, explained, left)
+    return _FittedModel(fit, initial_use, is_usable, reasons, explained, left_out_taps)
 
 
-def _calibration_fit(taps: Taps, readings: _FitInput, fitted: _FittedModel, notes) -> CalibrationFit:
-    fit, good = fitted.fit, fitted.good
+def _calibration_fit(taps: Taps, fit_input: _FitInput, fitted: _FittedModel, left_out) -> CalibrationFit:
+    """Create the `CalibrationFit` of a fitted model. `left_out`: name and localisation error of each model."""
+    fit, is_usable = fitted.fit, fitted.usable
     # Logarithm of the common factor of gains and strengths, according to the convention of `Calibration`.
-    gain = np.log(np.asarray(fit.kind.from_logarithms(host.asarray(fit.logarithms)).gain))[good].mean()
-    strength = np.where(fit.received, np.exp(fit.strength + gain), np.nan)
-    shared, errors = fit.shared & good, standard_errors(fit)[: len(fit.logarithms)]
+    log_gain = np.log(np.asarray(fit.kind.from_logarithms(host.asarray(fit.logarithms)).gain))[is_usable].mean()
+    strength = np.where(fit.received, np.exp(fit.strength + log_gain), np.nan)
+    shared, errors = fit.shared & is_usable, standard_errors(fit)[: len(fit.logarithms)]
     errors[1:, shared] = np.nan
-    decay = on_device(fit.kind.from_logarithms(host.concatenate([fit.logarithms[:1] - gain, fit.logarithms[1:]])))
-    loud = (fit.use & (readings.power > 3 * fit.noise.deviation[:, None])).any(axis=0)
-    microphones = readings.microphones + fit.displacement
+    decay = on_device(fit.kind.from_logarithms(host.concatenate([fit.logarithms[:1] - log_gain, fit.logarithms[1:]])))
+    is_loud = (fit.use & (fit_input.power > 3 * fit.noise.deviation[:, None])).any(axis=0)
+    microphones = fit_input.microphones + fit.displacement
     calibration = Calibration(
-        MicrophoneArray(as_array(microphones), readings.surface, decay, on_device(fit.noise)),
-        good,
+        MicrophoneArray(as_array(microphones), fit_input.surface, decay, on_device(fit.noise)),
+        is_usable,
         fitted.reasons,
         errors,
-        readings.settings,
+        fit_input.settings,
         taps.name,
-        _strength_range(strength[loud]),
-        fitted.left.widening,
+        _strength_range(strength[is_loud]),
+        fitted.left_out_taps.widening,
     )
-    rest = strength, fit.outlier, fitted.explained, shared, fit.displacement, notes
-    distance = np.linalg.norm(readings.places[:, None] - microphones, axis=-1)
-    return CalibrationFit(calibration, distance, readings.power.T, fitted.tried, *rest)
+    remaining_fields = strength, fit.outlier, fitted.explained, shared, fit.displacement, left_out
+    distance = np.linalg.norm(fit_input.positions[:, None] - microphones, axis=-1)
+    return CalibrationFit(calibration, distance, fit_input.power.T, fitted.initial_use, *remaining_fields)
 
 
 def _strength_range(strength: np.ndarray) -> tuple[float, float] | None:
     """Strengths of the weakest and the strongest tap; None if no strength is known."""
-    known = strength[strength > 0]
-    return (float(known.min()), float(known.max())) if known.size else None
+    positive_strengths = strength[strength > 0]
+    return (float(positive_strengths.min()), float(positive_strengths.max())) if positive_strengths.size else None

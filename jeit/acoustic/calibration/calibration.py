@@ -28,11 +28,13 @@ if TYPE_CHECKING:
 
 FORMAT, VERSION = "jeit microphone calibration", 1
 _UNITS = {"length": "m", "intensity": "square of the samples' unit"}
-_SCALE = "strength 1 is the source whose intensity upon a microphone has geometric mean 1 over the usable ones"
+_SCALE_DESCRIPTION = (
+    "strength 1 is the source whose intensity upon a microphone has geometric mean 1 over the usable ones"
+)
 # Fields of `CurvedSurface` that are stored in the file.
-_CURVE = ("origin", "axes", "normal", "knots", "weights", "affine")
+_CURVE_FIELDS = ("origin", "axes", "normal", "knots", "weights", "affine")
 # Maximum size of a calibration file in bytes. A microphone takes several hundred bytes.
-_LARGEST = 2**24
+_MAX_FILE_SIZE = 2**24
 
 
 class Calibration(Module):
@@ -94,7 +96,7 @@ class Calibration(Module):
 
         name = Path(path).name
         try:
-            content = read_json(path, max_bytes=_LARGEST)
+            content = read_json(path, max_bytes=_MAX_FILE_SIZE)
         except ValueError:
             content = None
         if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -119,23 +121,23 @@ class Calibration(Module):
             "holes": [_array_to_lists(hole) for hole in microphone_array.surface.outline.holes],
         }
         if isinstance(microphone_array.surface, CurvedSurface):
-            surface["curve"] = {key: _array_to_lists(getattr(microphone_array.surface, key)) for key in _CURVE}
+            surface["curve"] = {key: _array_to_lists(getattr(microphone_array.surface, key)) for key in _CURVE_FIELDS}
         kind = type(microphone_array.decay)
         microphones = []
-        for number in range(self.num_microphones):
-            parameters = {key: float(getattr(microphone_array.decay, key)[number]) for key in kind.parameters}
-            errors = dict(zip(kind.parameters, self.standard_errors[:, number], strict=True))
+        for index in range(self.num_microphones):
+            parameters = {key: float(getattr(microphone_array.decay, key)[index]) for key in kind.parameters}
+            errors = dict(zip(kind.parameters, self.standard_errors[:, index], strict=True))
             microphones.append(
                 {
-                    "position": _array_to_lists(microphone_array.microphones[number]),
+                    "position": _array_to_lists(microphone_array.microphones[index]),
                     **parameters,
                     "relative_standard_error": {key: _number_or_none(error) for key, error in errors.items()},
-                    "relative_noise": float(microphone_array.noise.relative[number]),
-                    "noise_floor": float(microphone_array.noise.floor[number]),
-                    "noise_deviation": float(microphone_array.noise.deviation[number]),
-                    "noise_cross": float(microphone_array.noise.cross[number]),
-                    "usable": bool(self.usable[number]),
-                    "reason": self.reasons[number],
+                    "relative_noise": float(microphone_array.noise.relative[index]),
+                    "noise_floor": float(microphone_array.noise.floor[index]),
+                    "noise_deviation": float(microphone_array.noise.deviation[index]),
+                    "noise_cross": float(microphone_array.noise.cross[index]),
+                    "usable": bool(self.usable[index]),
+                    "reason": self.reasons[index],
                 }
             )
         settings = self.intensity
@@ -143,7 +145,7 @@ class Calibration(Module):
             "format": FORMAT,
             "version": VERSION,
             "units": _UNITS,
-            "scale": _SCALE,
+            "scale": _SCALE_DESCRIPTION,
             "name": self.name,
             "decay": kind.name,
             "surface": surface,
@@ -157,42 +159,51 @@ class Calibration(Module):
 
     @classmethod
     def _from_table(cls, table: CalibrationTable) -> Calibration:
-        each, kind, surface = table.microphones, DECAYS[table.decay], _surface_from_table(table.surface)
-        for number, one in enumerate(each):
-            if len(one.position) != surface.dimension:
+        microphone_tables, decay_class, surface = (
+            table.microphones,
+            DECAYS[table.decay],
+            _surface_from_table(table.surface),
+        )
+        for index, microphone in enumerate(microphone_tables):
+            if len(microphone.position) != surface.dimension:
                 raise ValueError(
-                    f"microphones[{number}].position must be {surface.dimension} coordinates in metres; it has "
-                    f"{len(one.position)}."
+                    f"microphones[{index}].position must be {surface.dimension} coordinates in metres; it has "
+                    f"{len(microphone.position)}."
                 )
-            missing = [key for key in kind.parameters if getattr(one, key) is None]
-            unknown = [key for key in kind.parameters if key not in one.relative_standard_error.model_fields_set]
-            if missing or unknown:
-                key = missing[0] if missing else f"relative_standard_error.{unknown[0]}"
-                raise ValueError(f"microphones[{number}].{key} is missing; decay is '{kind.name}', which has it.")
+            missing_parameters = [key for key in decay_class.parameters if getattr(microphone, key) is None]
+            missing_errors = [
+                key for key in decay_class.parameters if key not in microphone.relative_standard_error.model_fields_set
+            ]
+            if missing_parameters or missing_errors:
+                key = missing_parameters[0] if missing_parameters else f"relative_standard_error.{missing_errors[0]}"
+                raise ValueError(f"microphones[{index}].{key} is missing; decay is '{decay_class.name}', which has it.")
 
         def column(key: str) -> Array:
-            return as_array(np.array([getattr(one, key) for one in each]))
+            return as_array(np.array([getattr(microphone, key) for microphone in microphone_tables]))
 
-        positions = np.array([one.position for one in each])
-        at_hand = on_host(surface)
-        known: Any = at_hand.outline.vertices
-        if isinstance(at_hand, CurvedSurface):
-            known = np.concatenate([known, at_hand.knots])
-        check_microphones(positions, np.asarray(at_hand.place(known.T)).T)
+        positions = np.array([microphone.position for microphone in microphone_tables])
+        host_surface = on_host(surface)
+        surface_points: Any = host_surface.outline.vertices
+        if isinstance(host_surface, CurvedSurface):
+            surface_points = np.concatenate([surface_points, host_surface.knots])
+        check_microphones(positions, np.asarray(host_surface.place(surface_points.T)).T)
         microphone_array = MicrophoneArray(
             as_array(positions),
             surface,
-            kind(*(column(key) for key in kind.parameters)),
+            decay_class(*(column(key) for key in decay_class.parameters)),
             IntensityNoise(
                 column("noise_floor"), column("noise_deviation"), column("noise_cross"), column("relative_noise")
             ),
         )
-        errors = [[getattr(one.relative_standard_error, key) for one in each] for key in kind.parameters]
+        errors = [
+            [getattr(microphone.relative_standard_error, key) for microphone in microphone_tables]
+            for key in decay_class.parameters
+        ]
         settings = table.intensity
         return cls(
             microphone_array,
-            np.array([one.usable for one in each]),
-            tuple(one.reason for one in each),
+            np.array([microphone.usable for microphone in microphone_tables]),
+            tuple(microphone.reason for microphone in microphone_tables),
             np.array([[math.nan if value is None else value for value in row] for row in errors]),
             None if settings is None else IntensitySettings(**settings.model_dump()),
             table.name,
@@ -210,7 +221,7 @@ def _surface_from_table(table: SurfaceTable) -> AbstractSurface:
         raise ValueError(
             f"surface.curve has {len(curve.knots)} knots and {len(curve.weights)} weights; give a weight for each knot."
         )
-    return CurvedSurface(outline, *(as_array(getattr(curve, key)) for key in _CURVE))
+    return CurvedSurface(outline, *(as_array(getattr(curve, key)) for key in _CURVE_FIELDS))
 
 
 def _check_strengths(strengths: np.ndarray) -> tuple[float, float]:

@@ -10,13 +10,13 @@ from pydantic import FailFast, Field
 
 from jeit.files.schema import Number, Numbers, Table
 
-_MOST_MICROPHONES, _MOST_VERTICES, _MOST_HOLES = 4096, 4096, 64
+_MAX_MICROPHONES, _MAX_VERTICES, _MAX_HOLES = 4096, 4096, 64
 
 Positive = Annotated[float, Number(5e-324, math.inf)]
 NotNegative = Annotated[float, Number(0, math.inf)]
 Text = Annotated[str, Field(max_length=10_000)]
 Vector = Annotated[np.ndarray, Numbers(((3, 3),))]
-Loop = Annotated[np.ndarray, Numbers(((3, _MOST_VERTICES), (2, 2)), -1e6, 1e6, "m")]
+Loop = Annotated[np.ndarray, Numbers(((3, _MAX_VERTICES), (2, 2)), -1e6, 1e6, "m")]
 
 
 class UnitsTable(Table):
@@ -44,7 +44,7 @@ class SurfaceTable(Table):
 
     subject = "a surface"
     outline: Loop
-    holes: Annotated[list[Loop], FailFast()] = Field(max_length=_MOST_HOLES)
+    holes: Annotated[list[Loop], FailFast()] = Field(max_length=_MAX_HOLES)
     curve: CurveTable | None = None
 
 
@@ -98,4 +98,4 @@ class CalibrationTable(Table):
     intensity: IntensityTable | None
     strengths: Annotated[np.ndarray, Numbers(((2, 2),), 5e-324, math.inf)] | None
     widening: Annotated[float, Number(1, math.inf)] = 1.0
-    microphones: Annotated[list[MicrophoneTable], FailFast()] = Field(min_length=1, max_length=_MOST_MICROPHONES)
+    microphones: Annotated[list[MicrophoneTable], FailFast()] = Field(min_length=1, max_length=_MAX_MICROPHONES)

@@ -21,11 +21,11 @@ from jeit_solvers import Descent, minimise_small, solve_definite
 from jeit_solvers.engines import host, slopes
 
 # Maximum number of steps of a minimisation.
-_MOST_STEPS = 100
+_MAX_STEPS = 100
 # Maximum change of the logarithm of a strength in a step.
-_LONGEST_STEP = 3.0
+_MAX_LOG_STEP = 3.0
 # Maximum number of iterations in which parameters are fixed at their bounds or released.
-_MOST_ACTIVE_SET_STEPS = 6
+_MAX_ACTIVE_SET_STEPS = 6
 # The tolerance `atol`, in the unit of the cost, ends the fit once the data are fitted to rounding error.
 _SOLVER = Descent(rtol=1e-10, atol=1e-20, damping=1e-2, history=1)
 
@@ -52,8 +52,8 @@ class DecayProblem(NamedTuple):
 
     def displacement(self, values: Any) -> Float[np.ndarray, "M d"]:
         """Displacements of the microphones from their given positions in metres."""
-        moved = values[len(self.decay.parameters) :].T
-        return self.place_error * moved if moved.size else np.zeros(self.offset.shape[::2])
+        scaled_displacement = values[len(self.decay.parameters) :].T
+        return self.place_error * scaled_displacement if scaled_displacement.size else np.zeros(self.offset.shape[::2])
 
     def log_response(self, values: Any) -> Float[np.ndarray, "M T"]:
         """Logarithm of the responses f (M, T) of the models that have the given `values` (P, M)."""
@@ -81,9 +81,9 @@ class DecayProblem(NamedTuple):
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"], Float[np.ndarray, "P M T"]]:
         """Residuals y − m, the derivatives of m with respect to s, and those with respect to the values. Residuals with
         weight 0 are 0."""
-        log_response, along = slopes(self.log_response, values)
-        mean, share = self.levels(strength + log_response)
-        return self.residual(mean), share, share * np.stack(along)
+        log_response, derivatives = slopes(self.log_response, values)
+        mean, signal_share = self.levels(strength + log_response)
+        return self.residual(mean), signal_share, signal_share * np.stack(derivatives)
 
     def residual(self, mean: Float[np.ndarray, "M T"]) -> Float[np.ndarray, "M T"]:
         """Residuals y − m for the expected levels `mean`; 0 where the weight is 0."""
@@ -95,25 +95,25 @@ def fit_strengths(
 ) -> Float[np.ndarray, " T"]:
     """Fit the logarithms of the strengths of all taps for given decay models."""
 
-    def expand(unknown, taps):
-        level, log_response, weight = taps
-        some = problem._replace(level=level, weight=weight)
-        mean, share = some.levels(unknown[0] + log_response)
-        off = some.residual(mean)
-        value = 0.5 * np.sum(weight * off**2, axis=0)
-        gradient = -np.sum(weight * share * off, axis=0)
-        curvature = np.sum(weight * share**2, axis=0)
+    def expand(unknowns, tap_data):
+        level, log_response, weight = tap_data
+        tap_problem = problem._replace(level=level, weight=weight)
+        mean, signal_share = tap_problem.levels(unknowns[0] + log_response)
+        residual = tap_problem.residual(mean)
+        value = 0.5 * np.sum(weight * residual**2, axis=0)
+        gradient = -np.sum(weight * signal_share * residual, axis=0)
+        curvature = np.sum(weight * signal_share**2, axis=0)
         return value, gradient[None], np.maximum(curvature, 1e-30)[None, None]
 
-    taps = problem.level, problem.log_response(values), problem.weight
-    return _minimise(expand, start[None], taps, (np.full(1, -np.inf), np.full(1, np.inf)))[0]
+    tap_data = problem.level, problem.log_response(values), problem.weight
+    return _minimise(expand, start[None], tap_data, (np.full(1, -np.inf), np.full(1, np.inf)))[0]
 
 
 def _minimise(expand, start, data, bounds) -> np.ndarray:
     lower, upper = (bound[:, None] for bound in bounds)
-    longest = np.full_like(lower, _LONGEST_STEP)
-    found = minimise_small(expand, start, data, lower=lower, upper=upper, largest_step=longest, max_steps=_MOST_STEPS)
-    return np.asarray(found.x)
+    max_step = np.full_like(lower, _MAX_LOG_STEP)
+    minimum = minimise_small(expand, start, data, lower=lower, upper=upper, largest_step=max_step, max_steps=_MAX_STEPS)
+    return np.asarray(minimum.x)
 
 
 def fit_together(
@@ -132,20 +132,20 @@ def fit_together(
         cost, system = _normal_equations(problem, *unpack(unknowns), free)
 
         def solve_step(damping):
-            change, shift = _solve_step(system, damping)
-            slope = np.sum(system.gradient * change) + system.tap_gradient @ shift
-            inner = np.einsum("km,lm,mkl->", change, change, system.matrix)
-            inner += np.einsum("km,kmn,kn->", change, system.penalty, change)
-            across = 2 * np.einsum("km,kmt,t->", change, system.coupling, shift, optimize=True)
+            value_step, strength_step = _solve_step(system, damping)
+            slope = np.sum(system.gradient * value_step) + system.tap_gradient @ strength_step
+            quadratic_term = np.einsum("km,lm,mkl->", value_step, value_step, system.matrix)
+            quadratic_term += np.einsum("km,kmn,kn->", value_step, system.penalty, value_step)
+            cross_term = 2 * np.einsum("km,kmt,t->", value_step, system.coupling, strength_step, optimize=True)
             return (
-                np.concatenate([change.ravel(), shift]),
+                np.concatenate([value_step.ravel(), strength_step]),
                 slope,
-                inner + across + np.sum(system.tap_matrix * shift**2),
+                quadratic_term + cross_term + np.sum(system.tap_matrix * strength_step**2),
             )
 
         return cost, solve_step
 
-    return unpack(_SOLVER.at_once(expand, np.concatenate([start.ravel(), strength]), None, _MOST_STEPS)[0])
+    return unpack(_SOLVER.at_once(expand, np.concatenate([start.ravel(), strength]), None, _MAX_STEPS)[0])
 
 
 def fit_within(
@@ -158,22 +158,22 @@ def fit_within(
     """Fit values and strengths as `fit_together` does, with `bounds` on the values.
 
     `received`: mask of the microphones with usable readings, whose parameters are fitted. Also returns the mask of the
-    parameters that are held at a bound. A held parameter is released if the cost decreases towards the interior.
+    parameters that are fixed at a bound. A fixed parameter is released if the cost decreases towards the interior.
     """
     lower, upper = (bound[:, None] for bound in bounds)
-    held = ((start <= lower) | (start >= upper)) & received
+    is_fixed = ((start <= lower) | (start >= upper)) & received
     values = start
-    for _ in range(_MOST_ACTIVE_SET_STEPS):
-        slope = _normal_equations(problem, values, strength, received & np.ones_like(held))[1].gradient
-        inwards = np.where(values <= lower, slope < 0, slope > 0)
-        held &= ~inwards
-        found, strength = fit_together(problem, values, strength, ~held & received)
-        values = np.clip(np.where(np.isfinite(found), found, values), lower, upper)
-        beyond = (values != found) & ~held & received
-        held |= beyond
-        if not beyond.any():
+    for _ in range(_MAX_ACTIVE_SET_STEPS):
+        slope = _normal_equations(problem, values, strength, received & np.ones_like(is_fixed))[1].gradient
+        descends_inwards = np.where(values <= lower, slope < 0, slope > 0)
+        is_fixed &= ~descends_inwards
+        fitted_values, strength = fit_together(problem, values, strength, ~is_fixed & received)
+        values = np.clip(np.where(np.isfinite(fitted_values), fitted_values, values), lower, upper)
+        is_outside = (values != fitted_values) & ~is_fixed & received
+        is_fixed |= is_outside
+        if not is_outside.any():
             break
-    return values, strength, held
+    return values, strength, is_fixed
 
 
 def log_covariance(
@@ -186,16 +186,18 @@ def log_covariance(
     NaN.
     """
     schur = _schur_complement(_normal_equations(problem, values, strength, free)[1], 0.0)
-    number, count = values.shape
-    kept = np.asarray(free).ravel()
-    shift = np.concatenate([np.ones(count), np.zeros((number - 1) * count)])[kept]
-    normal = np.asarray(scale)[kept]
-    result = np.full((number * count, number * count), np.nan)
+    num_parameters, num_microphones = values.shape
+    is_free = np.asarray(free).ravel()
+    null_direction = np.concatenate([np.ones(num_microphones), np.zeros((num_parameters - 1) * num_microphones)])[
+        is_free
+    ]
+    constraint = np.asarray(scale)[is_free]
+    result = np.full((num_parameters * num_microphones, num_parameters * num_microphones), np.nan)
     # The data do not determine the direction in which all gains increase and all strengths decrease. It is projected
     # out according to the condition.
-    inverse = np.linalg.pinv(schur[np.ix_(kept, kept)], rcond=1e-12, hermitian=True)
-    project = np.eye(len(shift)) - np.outer(shift, normal) / (normal @ shift)
-    result[np.ix_(kept, kept)] = project @ inverse @ project.T
+    inverse = np.linalg.pinv(schur[np.ix_(is_free, is_free)], rcond=1e-12, hermitian=True)
+    projector = np.eye(len(null_direction)) - np.outer(null_direction, constraint) / (constraint @ null_direction)
+    result[np.ix_(is_free, is_free)] = projector @ inverse @ projector.T
     return result
 
 
@@ -218,47 +220,51 @@ class _NormalEquations(NamedTuple):
 
 
 def _normal_equations(problem: DecayProblem, values, strengths, free) -> tuple[np.ndarray, _NormalEquations]:
-    off, share, jacobian = problem.expand(values, strengths)
+    residual, signal_share, jacobian = problem.expand(values, strengths)
     weight = problem.weight
-    ties = _penalty_matrices(problem)
-    pulled = np.einsum("kmn,kn->km", ties, values)
+    penalty = _penalty_matrices(problem)
+    penalty_gradient = np.einsum("kmn,kn->km", penalty, values)
     jacobian = np.where(free[:, :, None], jacobian, 0.0)
     weighted = weight * jacobian
     system = _NormalEquations(
         matrix=np.einsum("kmt,lmt->mkl", weighted, jacobian),
-        penalty=ties * (free[:, :, None] & free[:, None]),
-        coupling=weighted * share,
-        tap_matrix=np.sum(weight * share**2, axis=0),
-        gradient=np.where(free, pulled, 0.0) - np.sum(weighted * off, axis=-1),
-        tap_gradient=-np.sum(weight * share * off, axis=0),
+        penalty=penalty * (free[:, :, None] & free[:, None]),
+        coupling=weighted * signal_share,
+        tap_matrix=np.sum(weight * signal_share**2, axis=0),
+        gradient=np.where(free, penalty_gradient, 0.0) - np.sum(weighted * residual, axis=-1),
+        tap_gradient=-np.sum(weight * signal_share * residual, axis=0),
         free=free,
     )
-    return 0.5 * np.sum(weight * off**2) + 0.5 * np.sum(values * pulled), system
+    return 0.5 * np.sum(weight * residual**2) + 0.5 * np.sum(values * penalty_gradient), system
 
 
 def _penalty_matrices(problem: DecayProblem) -> Float[np.ndarray, "P M M"]:
     """Matrices (P, M, M) of the penalties Σ_m (v_m − v̄)² / spread², where v̄ is the mean over the microphones with at
     least one reading of nonzero weight, or 0 for displacements."""
     received = (problem.weight > 0).any(axis=1).astype(float)
-    mean = np.outer(received, received) / max(received.sum(), 1.0)
-    tied = np.arange(len(problem.spread)) < len(problem.decay.parameters)
-    return (np.diag(received) - tied[:, None, None] * mean) / problem.spread[:, None, None] ** 2
+    mean_matrix = np.outer(received, received) / max(received.sum(), 1.0)
+    has_common_value = np.arange(len(problem.spread)) < len(problem.decay.parameters)
+    return (np.diag(received) - has_common_value[:, None, None] * mean_matrix) / problem.spread[:, None, None] ** 2
 
 
 def _solve_step(system: _NormalEquations, damping):
-    number, count = system.gradient.shape
+    num_parameters, num_microphones = system.gradient.shape
     diagonal = _tap_diagonal(system, damping)
     schur = _schur_complement(system, damping)
-    # Two things are held fixed: the undetermined direction, in which all gains increase and all strengths decrease; and
-    # parameters that are not free.
-    shift = np.concatenate([np.where(system.free[0], 1.0, 0.0), np.zeros((number - 1) * count)])
-    typical = np.trace(schur) / schur.shape[0] + 1e-300
-    held = ~system.free.ravel()
-    schur = schur + typical * (np.outer(shift, shift) / count + np.diag(np.where(held, 1.0, 1e-14)))
-    right = -system.gradient + np.einsum("kmt,t->km", system.coupling, system.tap_gradient / diagonal)
-    change = solve_definite(schur, right.ravel()).reshape(number, count)
-    shifts = -(system.tap_gradient + np.einsum("kmt,km->t", system.coupling, change)) / diagonal
-    return change, shifts
+    # The step has no component along the undetermined direction, in which all gains increase and all strengths
+    # decrease, nor along parameters that are not free.
+    null_direction = np.concatenate(
+        [np.where(system.free[0], 1.0, 0.0), np.zeros((num_parameters - 1) * num_microphones)]
+    )
+    mean_diagonal = np.trace(schur) / schur.shape[0] + 1e-300
+    is_fixed = ~system.free.ravel()
+    schur = schur + mean_diagonal * (
+        np.outer(null_direction, null_direction) / num_microphones + np.diag(np.where(is_fixed, 1.0, 1e-14))
+    )
+    right_hand_side = -system.gradient + np.einsum("kmt,t->km", system.coupling, system.tap_gradient / diagonal)
+    value_step = solve_definite(schur, right_hand_side.ravel()).reshape(num_parameters, num_microphones)
+    strength_step = -(system.tap_gradient + np.einsum("kmt,km->t", system.coupling, value_step)) / diagonal
+    return value_step, strength_step
 
 
 def _tap_diagonal(system: _NormalEquations, damping):
@@ -266,12 +272,15 @@ def _tap_diagonal(system: _NormalEquations, damping):
 
 
 def _schur_complement(system: _NormalEquations, damping):
-    number, count = system.gradient.shape
-    size = number * count
-    blocks = system.matrix * (1 + damping * np.eye(number))
-    index, full = np.arange(count), np.zeros((number, count, number, count))
-    full[:, index, :, index] = blocks
-    parameter = np.arange(number)
-    full[parameter, :, parameter] += system.penalty
+    num_parameters, num_microphones = system.gradient.shape
+    size = num_parameters * num_microphones
+    blocks = system.matrix * (1 + damping * np.eye(num_parameters))
+    microphone_index, full_matrix = (
+        np.arange(num_microphones),
+        np.zeros((num_parameters, num_microphones, num_parameters, num_microphones)),
+    )
+    full_matrix[:, microphone_index, :, microphone_index] = blocks
+    parameter_index = np.arange(num_parameters)
+    full_matrix[parameter_index, :, parameter_index] += system.penalty
     coupling = system.coupling.reshape(size, -1)
-    return full.reshape(size, size) - (coupling / _tap_diagonal(system, damping)) @ coupling.T
+    return full_matrix.reshape(size, size) - (coupling / _tap_diagonal(system, damping)) @ coupling.T

@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 
 from jeit.acoustic.calibration.decay_fit import DecayProblem, fit_strengths, fit_within, log_covariance
 from jeit.acoustic.decay import AbstractDecay
-from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise, noise_from_negative_powers
+from jeit.acoustic.noise import MIN_RELATIVE_ERROR, IntensityNoise, noise_from_negative_powers
 from jeit_solvers.engines import host, on_host, slopes
 from jeit_solvers.module import Module
 
@@ -31,7 +31,7 @@ _OUTLIER_DEVIATIONS = 4.0
 # Weight of the median over all microphones in the noise estimate of one microphone, as a number of taps.
 _MEDIAN_WEIGHT = 20.0
 # Minimum number of taps for an estimate of the additive noise.
-_FEWEST_TAPS = 8
+_MIN_TAPS = 8
 
 
 def relative_errors(
@@ -48,25 +48,29 @@ def relative_errors(
     corrects for the number of fitted parameters. Each estimate is shrunk towards the median over all microphones, which
     has the weight of 20 taps, since the excess may be zero or negative if there are few taps.
     """
-    floor, rest, cross = (np.asarray(x) for x in (noise.floor, noise.deviation, noise.cross))
-    seen, excess = np.zeros(len(received)), np.zeros(len(received))
+    floor, deviation, cross = (np.asarray(x) for x in (noise.floor, noise.deviation, noise.cross))
+    num_inliers, excess = np.zeros(len(received)), np.zeros(len(received))
     for k in range(len(received)):
-        used = use[k] & (received[k] > 3 * rest[k])
-        if used.sum() < 3:
+        is_used = use[k] & (received[k] > 3 * deviation[k])
+        if is_used.sum() < 3:
             continue
-        signal, off = received[k, used], residual[k, used]
-        share = (signal / (signal + floor[k])) ** 2
-        other = (cross[k] * signal + rest[k] ** 2) / (signal + floor[k]) ** 2
-        near = np.abs(off) <= _OUTLIER_DEVIATIONS * max(1.4826 * np.median(np.abs(off)), 1e-15)
+        signal, used_residual = received[k, is_used], residual[k, is_used]
+        squared_share = (signal / (signal + floor[k])) ** 2
+        additive_variance = (cross[k] * signal + deviation[k] ** 2) / (signal + floor[k]) ** 2
+        is_inlier = np.abs(used_residual) <= _OUTLIER_DEVIATIONS * max(1.4826 * np.median(np.abs(used_residual)), 1e-15)
         for _ in range(3):
-            near = np.abs(off) <= _OUTLIER_DEVIATIONS * np.sqrt(np.mean(off[near] ** 2))
-        seen[k] = near.sum()
-        excess[k] = (inflation * np.mean(off[near] ** 2) - np.mean(other[near])) / np.mean(share[near])
-    if not seen.any():
+            is_inlier = np.abs(used_residual) <= _OUTLIER_DEVIATIONS * np.sqrt(np.mean(used_residual[is_inlier] ** 2))
+        num_inliers[k] = is_inlier.sum()
+        excess[k] = (
+            inflation * np.mean(used_residual[is_inlier] ** 2) - np.mean(additive_variance[is_inlier])
+        ) / np.mean(squared_share[is_inlier])
+    if not num_inliers.any():
         return np.full(len(received), 0.5)
-    typical = max(float(np.median(excess[seen > 0])), 0.0)
-    drawn = (seen * np.minimum(excess, 1.0) + _MEDIAN_WEIGHT * typical) / (seen + _MEDIAN_WEIGHT)
-    return np.sqrt(np.maximum(drawn, LEAST_RELATIVE**2))
+    median_excess = max(float(np.median(excess[num_inliers > 0])), 0.0)
+    shrunk_excess = (num_inliers * np.minimum(excess, 1.0) + _MEDIAN_WEIGHT * median_excess) / (
+        num_inliers + _MEDIAN_WEIGHT
+    )
+    return np.sqrt(np.maximum(shrunk_excess, MIN_RELATIVE_ERROR**2))
 
 
 def additive_deviations(
@@ -81,29 +85,31 @@ def additive_deviations(
     underestimated noise causes false detections.
     """
     deviation = np.zeros(len(received))
-    coarse = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 18)])
-    scatter = np.geomspace(LEAST_RELATIVE, 1.0, 30)
+    trial_shares = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 18)])
+    trial_errors = np.geomspace(MIN_RELATIVE_ERROR, 1.0, 30)
     for k in range(len(received)):
-        if use[k].sum() < _FEWEST_TAPS:
+        if use[k].sum() < _MIN_TAPS:
             continue
-        read, signal = power[k, use[k]], received[k, use[k]]
-        top = np.abs(read).max()
-        if top == 0:
+        tap_power, signal = power[k, use[k]], received[k, use[k]]
+        max_power = np.abs(tap_power).max()
+        if max_power == 0:
             continue
 
-        def log_likelihood(shares, read=read, signal=signal, top=top):
-            trial = (scatter[:, None, None] * signal) ** 2 + (top * shares[:, None]) ** 2 + 1e-30 * top**2
-            ratio = np.minimum(inflation * (read - signal) ** 2 / trial, _OUTLIER_DEVIATIONS**2)
-            return np.sum(ratio + np.log(trial), axis=-1).min(axis=0)
+        def log_likelihood(shares, tap_power=tap_power, signal=signal, max_power=max_power):
+            variance = (
+                (trial_errors[:, None, None] * signal) ** 2 + (max_power * shares[:, None]) ** 2 + 1e-30 * max_power**2
+            )
+            ratio = np.minimum(inflation * (tap_power - signal) ** 2 / variance, _OUTLIER_DEVIATIONS**2)
+            return np.sum(ratio + np.log(variance), axis=-1).min(axis=0)
 
-        scores = log_likelihood(coarse)
-        best = int(scores.argmin())
-        if scores[best] < scores[0] - 6:
-            near = coarse[best] * np.geomspace(0.5, 2.0, 9)
-            deviation[k] = top * near[log_likelihood(near).argmin()]
-    judged = use.sum(axis=1) >= _FEWEST_TAPS
-    typical = float(np.median(deviation[judged])) if judged.any() else 0.0
-    return np.where(judged, np.maximum(deviation, 0.5 * typical), deviation)
+        scores = log_likelihood(trial_shares)
+        best_index = int(scores.argmin())
+        if scores[best_index] < scores[0] - 6:
+            fine_shares = trial_shares[best_index] * np.geomspace(0.5, 2.0, 9)
+            deviation[k] = max_power * fine_shares[log_likelihood(fine_shares).argmin()]
+    has_enough_taps = use.sum(axis=1) >= _MIN_TAPS
+    median_deviation = float(np.median(deviation[has_enough_taps])) if has_enough_taps.any() else 0.0
+    return np.where(has_enough_taps, np.maximum(deviation, 0.5 * median_deviation), deviation)
 
 
 # Maximum number of iterations of the fit with a shared shape, and of the fit with individual shapes.
@@ -114,9 +120,9 @@ _T_FREEDOM = 5.0
 _OUTLIER_RATIO = 12.0
 # Standard deviation of the logarithms of the shape parameters over the array: in the fit with a shared shape; initially
 # in the fit with individual shapes; its minimum; its maximum.
-_ALIKE, _FIRST, _LEAST, _MOST = 0.03, 0.5, 0.1, 1.0
+_SHARED_SPREAD, _INITIAL_SPREAD, _MIN_SPREAD, _MAX_SPREAD = 0.03, 0.5, 0.1, 1.0
 # Maximum displacement of a microphone along each coordinate, in units of `place_error`.
-_MOST_DISPLACEMENT = 4.0
+_MAX_DISPLACEMENT = 4.0
 # Relative standard error of the shape at or above which a microphone's own taps are considered not to determine it.
 _UNDETERMINED_ERROR = 0.5
 
@@ -131,7 +137,7 @@ class TapFit(Module):
     - `noise`: noise of the microphones. `known_noise`: whether its floor was measured.
     - `values`: (P, M) logarithms of the K parameters of the decay models, and the coordinates of the displacements of
       the microphones from their given positions, divided by `place_error`, if it is not 0: P is K + d or K.
-    - `held`: (P, M) mask of the parameters that are held at a bound.
+    - `at_bound`: (P, M) mask of the parameters that are fixed at a bound.
     - `spread`: (P,) standard deviation of each logarithm over the array, and of the displacements, used as the prior.
     - `strength`: (T,) logarithms of the strengths of the taps.
     - `weight`: (M, T) inverse variances of the levels, reduced for large residuals.
@@ -146,7 +152,7 @@ class TapFit(Module):
     noise: IntensityNoise
     known_noise: bool
     values: Float[np.ndarray, "P M"]
-    held: Bool[np.ndarray, "P M"]
+    at_bound: Bool[np.ndarray, "P M"]
     spread: Float[np.ndarray, " P"]
     strength: Float[np.ndarray, " T"]
     weight: Float[np.ndarray, "M T"]
@@ -167,8 +173,8 @@ class TapFit(Module):
     @property
     def usable(self) -> Bool[np.ndarray, "M T"]:
         """Mask of the readings with a finite level, of microphones that are not excluded."""
-        above = np.nan_to_num(self.power, nan=-np.inf) + self.noise.floor[:, None] > 0
-        return above & ~self.dropped[:, None]
+        is_positive = np.nan_to_num(self.power, nan=-np.inf) + self.noise.floor[:, None] > 0
+        return is_positive & ~self.dropped[:, None]
 
     @property
     def use(self) -> Bool[np.ndarray, "M T"]:
@@ -182,9 +188,9 @@ class TapFit(Module):
 
     @property
     def free(self) -> Bool[np.ndarray, "P M"]:
-        """Mask of the parameters that are fitted to data: not held at a bound, and of microphones with usable
-        readings."""
-        return ~self.held & self.usable.any(axis=1)
+        """Mask of the parameters that are fitted to data: those of microphones with usable readings that are not fixed
+        at a bound."""
+        return ~self.at_bound & self.usable.any(axis=1)
 
     @property
     def shared(self) -> Bool[np.ndarray, " M"]:
@@ -194,9 +200,9 @@ class TapFit(Module):
         If no tap was near a microphone, the data give only an upper bound of b. Without the prior, b could be very
         small, and estimated positions would be drawn to that microphone.
         """
-        alone = np.where(np.arange(len(self.spread)) == 1, np.inf, self.spread)
-        own = standard_errors(replace(self, spread=alone))[1]
-        return self.usable.any(axis=1) & ~self.held[1] & ~(own < _UNDETERMINED_ERROR)
+        spread_without_prior = np.where(np.arange(len(self.spread)) == 1, np.inf, self.spread)
+        own_errors = standard_errors(replace(self, spread=spread_without_prior))[1]
+        return self.usable.any(axis=1) & ~self.at_bound[1] & ~(own_errors < _UNDETERMINED_ERROR)
 
     @property
     def level(self) -> Float[np.ndarray, "M T"]:
@@ -217,7 +223,7 @@ class TapFit(Module):
 def fit_taps(
     kind: type[AbstractDecay],
     microphones: Float[np.ndarray, "M d"],
-    places: Float[np.ndarray, "T d"],
+    tap_positions: Float[np.ndarray, "T d"],
     power: Float[np.ndarray, "M T"],
     noise: IntensityNoise,
     known_noise: bool,
@@ -225,15 +231,18 @@ def fit_taps(
 ) -> TapFit:
     """Fit the decay model `kind` to all microphones: first with a shared shape, then with individual shapes and
     displacements. The arguments are the fields of `TapFit`; `microphones`: given positions."""
-    offset = microphones[:, None] - places
+    offset = microphones[:, None] - tap_positions
     extent = float(np.linalg.norm(offset, axis=-1).max())
     spacing = float(np.median(KDTree(microphones).query(microphones, k=2)[0][:, 1])) if len(microphones) > 1 else 0.0
-    moves = offset.shape[2] if place_error > 0 else 0
+    num_displacements = offset.shape[2] if place_error > 0 else 0
     low, high = kind.bounds(extent)
-    lower, upper = np.array([*low, *[-_MOST_DISPLACEMENT] * moves]), np.array([*high, *[_MOST_DISPLACEMENT] * moves])
+    lower, upper = (
+        np.array([*low, *[-_MAX_DISPLACEMENT] * num_displacements]),
+        np.array([*high, *[_MAX_DISPLACEMENT] * num_displacements]),
+    )
     start = np.asarray(kind.start(spacing if spacing > 0 else extent / 4, len(microphones)).logarithms())
-    start = np.concatenate([start, np.zeros((moves, len(microphones)))])
-    shapes, taps = len(kind.parameters) - 1, len(places)
+    start = np.concatenate([start, np.zeros((num_displacements, len(microphones)))])
+    num_shapes, num_taps = len(kind.parameters) - 1, len(tap_positions)
     fit = TapFit(
         kind,
         offset,
@@ -242,19 +251,19 @@ def fit_taps(
         on_host(noise),
         known_noise,
         values=np.clip(start, lower[:, None], upper[:, None]),
-        held=np.zeros(start.shape, bool),
-        spread=_prior_spread(np.full(shapes, _ALIKE), np.full(moves, _ALIKE)),
-        strength=np.zeros(taps),
+        at_bound=np.zeros(start.shape, bool),
+        spread=_prior_spread(np.full(num_shapes, _SHARED_SPREAD), np.full(num_displacements, _SHARED_SPREAD)),
+        strength=np.zeros(num_taps),
         weight=np.zeros(power.shape),
-        outlier=np.zeros(taps, bool),
+        outlier=np.zeros(num_taps, bool),
         dropped=np.zeros(len(microphones), bool),
         bounds=(lower, upper),
     )
     # The initial strength of a tap is estimated from the loudest microphone only.
-    seen = np.where(fit.use, power, -np.inf)
-    loudest = seen.argmax(axis=0), np.arange(taps)
+    used_power = np.where(fit.use, power, -np.inf)
+    loudest_index = used_power.argmax(axis=0), np.arange(num_taps)
     response = fit.problem().log_response(fit.values)
-    strength = np.log(np.clip(seen[loudest], 1e-300, 1e300)) - response[loudest]
+    strength = np.log(np.clip(used_power[loudest_index], 1e-300, 1e300)) - response[loudest_index]
     fit = replace(
         fit,
         strength=np.where(fit.received & np.isfinite(strength), strength, 0.0),
@@ -263,7 +272,9 @@ def fit_taps(
     )
     fit = _alternate(fit, _ALTERNATIONS)
     return _alternate(
-        replace(fit, spread=_prior_spread(np.full(shapes, _FIRST), np.ones(moves))), _REWEIGHTINGS, update_spread=True
+        replace(fit, spread=_prior_spread(np.full(num_shapes, _INITIAL_SPREAD), np.ones(num_displacements))),
+        _REWEIGHTINGS,
+        update_spread=True,
     )
 
 
@@ -273,18 +284,18 @@ def refit_without(fit: TapFit, excluded: Bool[np.ndarray, " M"]) -> TapFit:
 
 
 def standard_errors(fit: TapFit) -> Float[np.ndarray, "P M"]:
-    """Standard deviations (P, M) of the values, for gains normalised as in a `Calibration`; NaN for values held at a
+    """Standard deviations (P, M) of the values, for gains normalised as in a `Calibration`; NaN for values fixed at a
     bound."""
     free = fit.free
     if free[0].sum() < 2:
         return np.full(free.shape, np.nan)
-    count = len(fit.kind.parameters)
+    num_parameters = len(fit.kind.parameters)
 
     def scale(values):
-        return np.where(free[0], np.log(fit.kind.from_logarithms(values[:count]).gain), 0.0)
+        return np.where(free[0], np.log(fit.kind.from_logarithms(values[:num_parameters]).gain), 0.0)
 
-    normal = np.ravel(slopes(scale, fit.values)[1])
-    covariance = log_covariance(fit.problem(), fit.values, fit.strength, free, normal)
+    gain_gradient = np.ravel(slopes(scale, fit.values)[1])
+    covariance = log_covariance(fit.problem(), fit.values, fit.strength, free, gain_gradient)
     return np.sqrt(np.maximum(np.diag(covariance), 0)).reshape(free.shape)
 
 
@@ -292,14 +303,14 @@ def _alternate(fit: TapFit, iterations: int, *, update_spread: bool = False) -> 
     """Alternate between the fit of all microphones and the re-estimation of noise and weights, until convergence or for
     `iterations` iterations. If `update_spread`, the `spread` of the parameters is also re-estimated."""
     for _ in range(iterations):
-        before, received = fit.values, np.asarray(fit.usable.any(axis=1))
-        values, strength, held = fit_within(fit.problem(), before, fit.strength, received, fit.bounds)
-        fit = replace(fit, values=values, strength=strength, held=held)
+        previous_values, has_readings = fit.values, np.asarray(fit.usable.any(axis=1))
+        values, strength, at_bound = fit_within(fit.problem(), previous_values, fit.strength, has_readings, fit.bounds)
+        fit = replace(fit, values=values, strength=strength, at_bound=at_bound)
         strength = fit_strengths(fit.problem(with_outliers=True), fit.values, fit.strength)
         fit = _reweight(replace(fit, strength=strength))
         if update_spread:
             fit = replace(fit, spread=_update_spread(fit))
-        if np.abs(fit.values - before)[fit.free].max(initial=0.0) < 1e-9:
+        if np.abs(fit.values - previous_values)[fit.free].max(initial=0.0) < 1e-9:
             break
     return fit
 
@@ -313,18 +324,22 @@ def _prior_spread(shapes, displacements) -> Float[np.ndarray, " P"]:
 def _update_spread(fit: TapFit) -> Float[np.ndarray, " P"]:
     """Update the spread of the shape parameters over the array, and that of the displacements, by one step of
     expectation maximisation, from the estimates and their standard errors."""
-    known = fit.usable.any(axis=1)
-    if known.sum() < 2:
+    has_readings = fit.usable.any(axis=1)
+    if has_readings.sum() < 2:
         return fit.spread
-    count, errors = len(fit.kind.parameters), np.nan_to_num(standard_errors(fit)[:, known])
-    shapes, moves = fit.logarithms[1:, known], fit.values[count:, known]
+    num_parameters, errors = len(fit.kind.parameters), np.nan_to_num(standard_errors(fit)[:, has_readings])
+    shapes, displacements = fit.logarithms[1:, has_readings], fit.values[num_parameters:, has_readings]
     # Deviations are limited, so that an outlying microphone does not dominate.
-    off = np.abs(shapes - np.median(shapes, axis=1, keepdims=True))
-    near = np.minimum(off, 3 * fit.spread[1:count, None])
-    square = (near**2 + errors[1:count] ** 2).sum(axis=1) / (known.sum() - 1)
+    deviations = np.abs(shapes - np.median(shapes, axis=1, keepdims=True))
+    limited_deviations = np.minimum(deviations, 3 * fit.spread[1:num_parameters, None])
+    shape_variance = (limited_deviations**2 + errors[1:num_parameters] ** 2).sum(axis=1) / (has_readings.sum() - 1)
     # The displacements have one spread, which is at most `place_error`.
-    moved = np.full(len(moves), (moves**2 + errors[count:] ** 2).mean() if moves.size else 0.0)
-    return _prior_spread(*(np.clip(np.sqrt(one), _LEAST, _MOST) for one in (square, moved)))
+    displacement_variance = np.full(
+        len(displacements), (displacements**2 + errors[num_parameters:] ** 2).mean() if displacements.size else 0.0
+    )
+    return _prior_spread(
+        *(np.clip(np.sqrt(variance), _MIN_SPREAD, _MAX_SPREAD) for variance in (shape_variance, displacement_variance))
+    )
 
 
 def _reweight(fit: TapFit) -> TapFit:
@@ -332,39 +347,44 @@ def _reweight(fit: TapFit) -> TapFit:
     expected = fit.expected()
     received = np.maximum(np.exp(expected) - fit.noise.floor[:, None], 0.0)
     # The residuals are smaller than the errors, since strengths and parameters were fitted; `inflation` corrects this.
-    count = fit.use.sum()
-    spent = fit.received.sum() + fit.free.sum()
-    inflation = count / max(count - spent, 0.1 * count)
+    num_readings = fit.use.sum()
+    num_fitted = fit.received.sum() + fit.free.sum()
+    inflation = num_readings / max(num_readings - num_fitted, 0.1 * num_readings)
     if not fit.known_noise:
         use = np.isfinite(fit.power) & ~fit.outlier
         deviation = additive_deviations(fit.power, received, use, inflation)
-        betrayed = noise_from_negative_powers(fit.power.T, np.isfinite(fit.power.T))
+        negative_power_deviation = noise_from_negative_powers(fit.power.T, np.isfinite(fit.power.T))
         fit = replace(
-            fit, noise=on_host(IntensityNoise.create(len(received), deviation=np.maximum(deviation, betrayed)))
+            fit,
+            noise=on_host(
+                IntensityNoise.create(len(received), deviation=np.maximum(deviation, negative_power_deviation))
+            ),
         )
-    relative = relative_errors(fit.noise, received, _residual_of_equals(fit, received), fit.use, inflation)
+    relative = relative_errors(fit.noise, received, _residual_for_equal_errors(fit, received), fit.use, inflation)
     fit = replace(fit, noise=replace(fit.noise, relative=relative))
     residual = np.where(fit.usable, fit.level - expected, 0.0)
-    square = residual**2 / np.maximum(_power_variance(fit, np.maximum(received, 1e-150)), LEAST_RELATIVE**2)
+    squared_residual = residual**2 / np.maximum(
+        _power_variance(fit, np.maximum(received, 1e-150)), MIN_RELATIVE_ERROR**2
+    )
     usable = fit.usable
-    level = np.minimum(square, 100.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
-    typical = max(float(np.median(level[usable.any(axis=0)])), 1e-6)
-    fit = replace(fit, outlier=level > _OUTLIER_RATIO * max(typical, 0.2))
+    tap_mean_square = np.minimum(squared_residual, 100.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
+    median_mean_square = max(float(np.median(tap_mean_square[usable.any(axis=0)])), 1e-6)
+    fit = replace(fit, outlier=tap_mean_square > _OUTLIER_RATIO * max(median_mean_square, 0.2))
     variance = _level_variance(fit, received)
     return replace(fit, weight=(_T_FREEDOM + 1) / (_T_FREEDOM + residual**2 / variance) / variance)
 
 
-def _residual_of_equals(fit: TapFit, received: np.ndarray) -> Float[np.ndarray, "M T"]:
+def _residual_for_equal_errors(fit: TapFit, received: np.ndarray) -> Float[np.ndarray, "M T"]:
     """Residuals (M, T) of the levels if the strengths are estimated with the same relative error for all microphones.
 
     With individual relative errors, a single microphone could dominate the strengths: its residuals would become ever
     smaller, and its weight ever larger.
     """
     relative = fit.noise.relative
-    alike = replace(fit, noise=replace(fit.noise, relative=np.full(len(relative), np.median(relative))))
-    alike = replace(alike, weight=1 / _level_variance(alike, received))
-    strength = fit_strengths(alike.problem(with_outliers=True), fit.values, fit.strength)
-    return np.where(fit.usable, fit.level - replace(alike, strength=strength).expected(), 0.0)
+    equal_fit = replace(fit, noise=replace(fit.noise, relative=np.full(len(relative), np.median(relative))))
+    equal_fit = replace(equal_fit, weight=1 / _level_variance(equal_fit, received))
+    strength = fit_strengths(equal_fit.problem(with_outliers=True), fit.values, fit.strength)
+    return np.where(fit.usable, fit.level - replace(equal_fit, strength=strength).expected(), 0.0)
 
 
 def _level_variance(fit: TapFit, received: np.ndarray) -> np.ndarray:

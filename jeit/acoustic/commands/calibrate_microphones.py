@@ -32,13 +32,13 @@ Hop = Annotated[
 
 def intensity_settings(low: float | None, high: float | None, window: float | None, hop: float | None):
     """Create `IntensitySettings` from the options that were given; None if all of them are None."""
-    given = {"low": low, "high": high, "window": window, "hop": hop}
-    given = {name: value for name, value in given.items() if value is not None}
-    if not given:
+    options = {"low": low, "high": high, "window": window, "hop": hop}
+    options = {name: value for name, value in options.items() if value is not None}
+    if not options:
         return None
     from jeit.acoustic import IntensitySettings
 
-    return IntensitySettings(**given)
+    return IntensitySettings(**options)
 
 
 def calibrate_microphones(
@@ -92,17 +92,17 @@ def calibrate_microphones(
     settings = intensity_settings(low, high, window, hop)
     console = plain_console()
     with naming_options(_OPTIONS):
-        kind = decay if decay == AUTO else find_decay(decay)
+        decay_model = decay if decay == AUTO else find_decay(decay)
         files = calibration_files(output)
         make_folder(output.parent, tuple(file.name for file in files))
         with Steps(console, quiet=quiet) as step:
             step("read")
-            touched = read_taps(taps)
-            fit = calibrate(touched, decay=kind, place_error=place_error, intensity=settings, progress=step)
+            tap_data = read_taps(taps)
+            fit = calibrate(tap_data, decay=decay_model, place_error=place_error, intensity=settings, progress=step)
             step("write")
             write_calibration(fit, output)
     if not quiet:
-        _print_summary(console, fit, touched)
+        _print_summary(console, fit, tap_data)
         say_written(console, output, files[1].name)
 
 
@@ -126,18 +126,20 @@ def _print_summary(console, fit: "CalibrationFit", taps: "Taps") -> None:
         ("scale", "a source of strength 1 has intensity 1 at a typical microphone directly below it"),
     ]
     if fit.shared.any():
-        which = ", ".join(str(k) for k in np.flatnonzero(fit.shared))
+        numbers = ", ".join(str(k) for k in np.flatnonzero(fit.shared))
         rows.append(
-            ("tap nearer to", f"{which}: no tap determines the decay of their response; that of the others is used")
+            ("tap nearer to", f"{numbers}: no tap determines the decay of their response; that of the others is used")
         )
     console.print()
     console.print(pairs(calibration.name, rows))
     console.print()
     console.print(_parameter_table(fit))
-    refused = [(f"microphone {k}", f"not usable: {why}") for k, why in enumerate(calibration.reasons) if why]
-    if refused:
+    unusable_rows = [
+        (f"microphone {k}", f"not usable: {reason}") for k, reason in enumerate(calibration.reasons) if reason
+    ]
+    if unusable_rows:
         console.print()
-        console.print(pairs("Left out", refused))
+        console.print(pairs("Left out", unusable_rows))
 
 
 def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:
@@ -147,8 +149,10 @@ def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:
 
     from jeit.acoustic import cramer_rao
 
-    received, usable = fit.strength > 0, np.asarray(fit.calibration.usable)
-    bound = cramer_rao(fit.calibration.microphone_array, taps.positions[received], fit.strength[received], use=usable)
+    is_received, usable = fit.strength > 0, np.asarray(fit.calibration.usable)
+    bound = cramer_rao(
+        fit.calibration.microphone_array, taps.positions[is_received], fit.strength[is_received], use=usable
+    )
     return float(np.median(np.sqrt(np.linalg.eigvalsh(bound)[:, -1])))
 
 
@@ -178,7 +182,11 @@ def _parameter_table(fit: "CalibrationFit"):
                 f"{factors[name] * float(getattr(decay, name)[k]):.3g}",
                 f"{error:.1f}" if error == error else "–",
             ]
-        moved = 1e3 * float(np.linalg.norm(fit.displacement[k]))
-        cells += [f"{moved:.1f}", f"{100 * float(noise.relative[k]):.1f}", f"{100 * float(fit.explained[k]):.1f}"]
+        displacement = 1e3 * float(np.linalg.norm(fit.displacement[k]))
+        cells += [
+            f"{displacement:.1f}",
+            f"{100 * float(noise.relative[k]):.1f}",
+            f"{100 * float(fit.explained[k]):.1f}",
+        ]
         table.add_row(str(k), *cells)
     return table

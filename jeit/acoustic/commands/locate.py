@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _OPTIONS = {"intensity": "--low, --high, --window and --hop"}
 # Length of the path of a touch above which its start and end are printed instead of its mean position.
-_STROKE = 0.015  # m
+_MIN_STROKE_LENGTH = 0.015  # m
 
 
 def locate(
@@ -80,28 +80,34 @@ def locate(
     console = plain_console()
     with Steps(console, quiet=quiet) as step, naming_options(_OPTIONS):
         step("read")
-        known = Calibration.load(calibration)
-        sound = read_recording(recording)
-        hush = None if silence is None else _read_silence(silence, sound)
-        options = {"method": method, "gap": gap, "intensity": settings, "silence": hush, "gain_drift": gain_drift}
-        found = locate_touches(sound, known, **options, progress=step)
+        loaded_calibration = Calibration.load(calibration)
+        loaded_recording = read_recording(recording)
+        silence_recording = None if silence is None else _read_silence(silence, loaded_recording)
+        options = {
+            "method": method,
+            "gap": gap,
+            "intensity": settings,
+            "silence": silence_recording,
+            "gain_drift": gain_drift,
+        }
+        located_touches = locate_touches(loaded_recording, loaded_calibration, **options, progress=step)
         step("write")
-        write_track(found, output)
+        write_track(located_touches, output)
     if not quiet:
-        _print_summary(console, found)
+        _print_summary(console, located_touches)
         say_written(console, output / "track.csv", "report.json", "track.png")
 
 
-def _read_silence(path: Path, sound) -> "Recording":
+def _read_silence(path: Path, touch_recording) -> "Recording":
     from jeit.acoustic import Recording, read_recording
 
-    hush = read_recording(path)
-    if not (isinstance(sound, Recording) and isinstance(hush, Recording)):
+    silence_recording = read_recording(path)
+    if not (isinstance(touch_recording, Recording) and isinstance(silence_recording, Recording)):
         raise ValueError(
             "--silence applies to recordings of samples, and must contain samples; recordings of intensities "
             "have their floor."
         )
-    return hush
+    return silence_recording
 
 
 def _print_summary(console, located: "LocatedTouches") -> None:
@@ -139,22 +145,31 @@ def _table_rows(located: "LocatedTouches") -> Iterator[tuple[str, ...]]:
     locations, track = located.locations, located.track
     for number, touch in enumerate(track.touches, 1):
         frames = slice(touch.first, touch.last + 1)
-        place = 1e3 * track.position[frames, :2]
-        off = 1e3 * float(np.median(np.sqrt(np.linalg.eigvalsh(track.covariance[frames])[:, -1])))
-        if touch.length > _STROKE:
-            where = [f"{along[0]:z.1f} → {along[-1]:z.1f}" for along in place.T]
+        positions = 1e3 * track.position[frames, :2]
+        error = 1e3 * float(np.median(np.sqrt(np.linalg.eigvalsh(track.covariance[frames])[:, -1])))
+        if touch.length > _MIN_STROKE_LENGTH:
+            position_cells = [f"{coordinates[0]:z.1f} → {coordinates[-1]:z.1f}" for coordinates in positions.T]
         else:
-            where = [f"{along.mean():z.1f}" for along in place.T]
+            position_cells = [f"{coordinates.mean():z.1f}" for coordinates in positions.T]
         kinds = [kind for kind in locations.status[frames] if kind != LocationStatus.NO_TOUCH]
         counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
-        when = (f"{touch.onset:.3f}", f"{touch.offset:.3f}")
-        yield str(number), *when, *where, f"{off:.1f}", f"{1e3 * touch.length:.0f}", counts
-        both = touch.first + np.flatnonzero(locations.status[frames] == LocationStatus.TWO_TOUCHES)
-        if both.size:
+        time_cells = (f"{touch.onset:.3f}", f"{touch.offset:.3f}")
+        yield str(number), *time_cells, *position_cells, f"{error:.1f}", f"{1e3 * touch.length:.0f}", counts
+        two_touch_frames = touch.first + np.flatnonzero(locations.status[frames] == LocationStatus.TWO_TOUCHES)
+        if two_touch_frames.size:
             # The stronger touch may change from frame to frame. The other touch is the one farther from the track.
-            pair = np.stack([locations.position[both], locations.second[both]])
-            apart = np.linalg.norm(pair - track.position[both], axis=-1)
-            other = 1e3 * pair[apart.argmax(axis=0), np.arange(both.size), :2].mean(axis=0)
-            when = (f"{locations.times[both[0]]:.3f}", f"{locations.times[both[-1]]:.3f}")
-            beside = f"{both.size} {LocationStatus.TWO_TOUCHES}"
-            yield f"{number}, other", *when, *(f"{along:z.1f}" for along in other), "", "", beside
+            pair_positions = np.stack([locations.position[two_touch_frames], locations.second[two_touch_frames]])
+            distances = np.linalg.norm(pair_positions - track.position[two_touch_frames], axis=-1)
+            other_position = 1e3 * pair_positions[distances.argmax(axis=0), np.arange(two_touch_frames.size), :2].mean(
+                axis=0
+            )
+            time_cells = (f"{locations.times[two_touch_frames[0]]:.3f}", f"{locations.times[two_touch_frames[-1]]:.3f}")
+            pair_count = f"{two_touch_frames.size} {LocationStatus.TWO_TOUCHES}"
+            yield (
+                f"{number}, other",
+                *time_cells,
+                *(f"{coordinates:z.1f}" for coordinates in other_position),
+                "",
+                "",
+                pair_count,
+            )

@@ -13,7 +13,7 @@ from jeit.acoustic.signal.recording import Intensities, Recording
 from jeit.arguments import check_kind
 
 # Ratio of two noise floors above which they are considered different.
-_SAME_FLOOR = 4.0
+_MAX_FLOOR_RATIO = 4.0
 
 
 def calibrated_intensities(
@@ -30,16 +30,16 @@ def calibrated_intensities(
     is estimated from the quietest windows of the recording. Raises `ValueError` for another number of microphones, for
     a `silence` that is louder than the quietest windows of the recording, and for arguments of the wrong type.
     """
-    given = {"recording": recording} if silence is None else {"recording": recording, "silence": silence}
-    for name, one in given.items():
-        check_kind(name, one, (Recording, Intensities), "a Recording or Intensities, as of read_recording(path)")
+    recordings = {"recording": recording} if silence is None else {"recording": recording, "silence": silence}
+    for name, value in recordings.items():
+        check_kind(name, value, (Recording, Intensities), "a Recording or Intensities, as of read_recording(path)")
     check_kind("calibration", calibration, Calibration, "a Calibration, as of Calibration.load(path)")
     check_settings("intensity", intensity)
-    for one in given.values():
-        number = one.samples.shape[0] if isinstance(one, Recording) else one.power.shape[1]
-        if number != calibration.num_microphones:
+    for value in recordings.values():
+        num_channels = value.samples.shape[0] if isinstance(value, Recording) else value.power.shape[1]
+        if num_channels != calibration.num_microphones:
             raise ValueError(
-                f"'{one.name}' has {number} microphones and the calibration '{calibration.name}' "
+                f"'{value.name}' has {num_channels} microphones and the calibration '{calibration.name}' "
                 f"{calibration.num_microphones}; give the calibration of this array."
             )
     if silence is not None and not (isinstance(recording, Recording) and isinstance(silence, Recording)):
@@ -52,43 +52,48 @@ def calibrated_intensities(
     settings = intensity or calibration.intensity or IntensitySettings()
     recorded = intensities(recording, settings)
     if silence is not None:
-        return _with_floor_of_silence(recorded, intensities(silence, settings))
+        return _replace_floor(recorded, intensities(silence, settings))
     # Noise floors can be compared only if band and windows are those of the calibration.
     if settings != calibration.intensity:
         if calibration.intensity is None:
             return recorded
         note = "band or window are not the calibration's: its decay models may not hold; calibrate with the same."
         return dataclasses.replace(recorded, notes=(note,))
-    usual = np.asarray(calibration.microphone_array.noise.floor)
-    ratio = np.where(calibration.usable, recorded.floor / np.where(usual > 0, usual, np.inf), 0.0)
-    higher = f"the noise floor, taken from the quietest windows, is up to {ratio.max():.3g} times the calibration's"
-    text = describe_faults([higher if one > _SAME_FLOOR else "" for one in ratio])
-    note = (
-        f"{text}. If the recording never pauses, touches count as silence: give a recording of the array untouched "
-        "(silence=). If gain, unit, surroundings or microphones have changed, calibrate again."
+    calibration_floor = np.asarray(calibration.microphone_array.noise.floor)
+    ratio = np.where(
+        calibration.usable, recorded.floor / np.where(calibration_floor > 0, calibration_floor, np.inf), 0.0
     )
-    return dataclasses.replace(recorded, notes=(note,)) if text else recorded
+    description = (
+        f"the noise floor, taken from the quietest windows, is up to {ratio.max():.3g} times the calibration's"
+    )
+    floor_faults = describe_faults([description if value > _MAX_FLOOR_RATIO else "" for value in ratio])
+    note = (
+        f"{floor_faults}. If the recording never pauses, touches count as silence: give a recording of the array "
+        "untouched (silence=). If gain, unit, surroundings or microphones have changed, calibrate again."
+    )
+    return dataclasses.replace(recorded, notes=(note,)) if floor_faults else recorded
 
 
-def _with_floor_of_silence(recorded: Intensities, quiet: Intensities) -> Intensities:
-    """Replace the noise floor of a recording by that of `quiet`, a recording of silence. Microphones that are unusable
-    in the silence become unusable."""
-    known = np.asarray(quiet.usable.any(axis=0))
-    both = (quiet.floor > 0) & (recorded.floor > 0)
-    ratio = float(np.median(quiet.floor[both] / recorded.floor[both])) if both.any() else 1.0
-    if ratio > _SAME_FLOOR:
+def _replace_floor(recorded: Intensities, silence: Intensities) -> Intensities:
+    """Replace the noise floor of a recording by that of `silence`. Microphones that are unusable in the silence become
+    unusable."""
+    is_usable = np.asarray(silence.usable.any(axis=0))
+    has_floors = (silence.floor > 0) & (recorded.floor > 0)
+    ratio = float(np.median(silence.floor[has_floors] / recorded.floor[has_floors])) if has_floors.any() else 1.0
+    if ratio > _MAX_FLOOR_RATIO:
         raise ValueError(
-            f"silence '{quiet.name}' is {ratio:.3g} times as loud as the quietest windows of '{recorded.name}': record "
-            "the array untouched, at the same gain."
+            f"silence '{silence.name}' is {ratio:.3g} times as loud as the quietest windows of '{recorded.name}': "
+            "record the array untouched, at the same gain."
         )
     silence_faults = [
-        ("" if good else f"in the silence: {fault}") for good, fault in zip(known, quiet.faults, strict=True)
+        ("" if is_working else f"in the silence: {fault}")
+        for is_working, fault in zip(is_usable, silence.faults, strict=True)
     ]
     faults = ["; ".join(filter(None, pair)) for pair in zip(recorded.faults, silence_faults, strict=True)]
     return dataclasses.replace(
         recorded,
-        power=recorded.power + recorded.floor - quiet.floor,
-        floor=quiet.floor,
-        usable=recorded.usable & known,
+        power=recorded.power + recorded.floor - silence.floor,
+        floor=silence.floor,
+        usable=recorded.usable & is_usable,
         faults=faults,
     )

@@ -57,10 +57,10 @@ class Consistency(Module):
     ) -> "Consistency":
         """Create the loss from intensities `power`. Values outside the mask `use` are ignored and may be NaN."""
         xp = namespace(power, use)
-        known = xp.where(use, power, 0.0)
-        scale = xp.max(known, axis=0)
-        loudest = xp.argmax(known, axis=0)
-        return cls(known / xp.where(scale > 0, scale, 1.0), loudest, scale, use, microphone_array)
+        used_power = xp.where(use, power, 0.0)
+        scale = xp.max(used_power, axis=0)
+        loudest = xp.argmax(used_power, axis=0)
+        return cls(used_power / xp.where(scale > 0, scale, 1.0), loudest, scale, use, microphone_array)
 
     @property
     def frames(self) -> tuple[Array, ...]:
@@ -71,8 +71,8 @@ class Consistency(Module):
         """Differences I_k g_k − I_i g_i of the estimated strengths; 0 where not used."""
         estimates = self.power / self.microphone_array.response(chart)
         xp = namespace(self, estimates)
-        most = xp.take_along_axis(estimates, self.loudest[None], axis=0)
-        return xp.where(self.use, most - estimates, 0.0)
+        loudest_estimate = xp.take_along_axis(estimates, self.loudest[None], axis=0)
+        return xp.where(self.use, loudest_estimate - estimates, 0.0)
 
     def cost(self, chart: Float[Array, "2 F"]) -> Float[Array, " F"]:
         """Loss L divided by the square of the highest intensity."""
@@ -80,10 +80,15 @@ class Consistency(Module):
 
     def expand(self, chart: Float[Array, "2 F"]) -> tuple[Array, Array, Array]:
         """Loss, its gradient (2, F), and its Gauss-Newton matrix (2, 2, F)."""
-        off, along = kept(slopes(self.differences, chart))
-        gradient = 2 * namespace(off).stack([(off * slope).sum(axis=0) for slope in along])
-        rows = [[2 * (one * other).sum(axis=0) for other in along[: k + 1]] for k, one in enumerate(along)]
-        return (off**2).sum(axis=0), gradient, symmetric_small(rows)
+        differences, derivatives = kept(slopes(self.differences, chart))
+        gradient = 2 * namespace(differences).stack(
+            [(differences * derivative).sum(axis=0) for derivative in derivatives]
+        )
+        rows = [
+            [2 * (derivative_k * derivative_l).sum(axis=0) for derivative_l in derivatives[: k + 1]]
+            for k, derivative_k in enumerate(derivatives)
+        ]
+        return (differences**2).sum(axis=0), gradient, symmetric_small(rows)
 
     def start(self, chart: Float[Array, "2 F"]) -> Float[Array, "2 F"]:
         """Initial unknowns of a minimisation: the chart coordinates."""
@@ -99,9 +104,9 @@ class Consistency(Module):
         """
         if not isinstance(microphone_array.decay, InverseSquare):
             return microphone_array.response(chart)
-        place = microphone_array.surface.place(chart)
-        xp = namespace(place)
-        terms = [xp.sum(place**2, axis=0), *place, xp.ones_like(place[0])]
+        position = microphone_array.surface.place(chart)
+        xp = namespace(position)
+        terms = [xp.sum(position**2, axis=0), *position, xp.ones_like(position[0])]
         return xp.stack([terms[i] * terms[j] for i in range(len(terms)) for j in range(i + 1)])
 
     def screen(self, features: Float[Array, "N P"]) -> Float[Array, "F P"]:
@@ -112,23 +117,29 @@ class Consistency(Module):
         as the product of its coefficients and the features.
         """
         xp = namespace(self, features)
-        number = xp.sum(self.use, axis=0)
+        num_used = xp.sum(self.use, axis=0)
         if not isinstance(self.microphone_array.decay, InverseSquare):
             inverse = 1 / features
-            most = xp.take(inverse, self.loudest, axis=0)
-            return (number[:, None] * most - 2 * (self.power.T @ inverse)) * most + (self.power.T**2) @ inverse**2
-        decay, where = self.microphone_array.decay, self.microphone_array.microphones
-        constant = xp.sum(where**2, axis=1) + decay.b
-        quadratic = xp.column_stack([xp.ones(len(where)), -2 * where, constant]) / decay.a[:, None]
+            loudest_strengths = xp.take(inverse, self.loudest, axis=0)
+            return (num_used[:, None] * loudest_strengths - 2 * (self.power.T @ inverse)) * loudest_strengths + (
+                self.power.T**2
+            ) @ inverse**2
+        decay, positions = self.microphone_array.decay, self.microphone_array.microphones
+        constant = xp.sum(positions**2, axis=1) + decay.b
+        quadratic = xp.column_stack([xp.ones(len(positions)), -2 * positions, constant]) / decay.a[:, None]
         estimates = [self.power * column[:, None] for column in quadratic.T]
-        most = [xp.take_along_axis(each, self.loudest[None], axis=0)[0] for each in estimates]
-        total = [xp.sum(each, axis=0) for each in estimates]
+        loudest_strengths = [xp.take_along_axis(estimate, self.loudest[None], axis=0)[0] for estimate in estimates]
+        totals = [xp.sum(estimate, axis=0) for estimate in estimates]
         coefficients = []
         for i in range(len(estimates)):
             for j in range(i + 1):
-                both = number * most[i] * most[j] - most[i] * total[j] - most[j] * total[i]
-                both = both + xp.sum(estimates[i] * estimates[j], axis=0)
-                coefficients.append(both if i == j else 2 * both)
+                coefficient = (
+                    num_used * loudest_strengths[i] * loudest_strengths[j]
+                    - loudest_strengths[i] * totals[j]
+                    - loudest_strengths[j] * totals[i]
+                )
+                coefficient = coefficient + xp.sum(estimates[i] * estimates[j], axis=0)
+                coefficients.append(coefficient if i == j else 2 * coefficient)
         return xp.stack(coefficients, axis=1) @ features
 
     def covariance(self, chart: Float[Array, "2 F"], strength: Float[Array, " F"]) -> Float[Array, "2 2 F"]:
@@ -137,30 +148,36 @@ class Consistency(Module):
         The implicit function theorem gives the derivative of the minimum, ∂u/∂I = −H⁻¹ ∂²L/∂u∂I. Second derivatives are
         approximated for small differences I_k g_k − I_i g_i.
         """
-        estimates, along = slopes(lambda u: 1 / self.microphone_array.response(u), chart)
+        estimates, derivatives = slopes(lambda u: 1 / self.microphone_array.response(u), chart)
         xp = namespace(self, estimates)
-        slope = xp.stack(along) * self.power
-        most = xp.take_along_axis(slope, self.loudest[None, None], axis=1)
-        rise = xp.where(self.use, most - slope, 0.0)
-        matrix = xp.einsum("kmf,lmf->klf", rise, rise)
+        gradients = xp.stack(derivatives) * self.power
+        loudest_gradient = xp.take_along_axis(gradients, self.loudest[None, None], axis=1)
+        difference_gradients = xp.where(self.use, loudest_gradient - gradients, 0.0)
+        matrix = xp.einsum("kmf,lmf->klf", difference_gradients, difference_gradients)
         # Derivative of ½ ∂L/∂u with respect to I_i: −g_i times the gradient of the difference of microphone i. For the
         # loudest microphone k it is g_k times the sum of these gradients over all microphones.
         is_loudest = xp.arange(estimates.shape[0])[:, None] == self.loudest
-        drive = xp.where(is_loudest, xp.sum(rise, axis=1, keepdims=True) * estimates, -estimates * rise)
+        mixed_derivatives = xp.where(
+            is_loudest,
+            xp.sum(difference_gradients, axis=1, keepdims=True) * estimates,
+            -estimates * difference_gradients,
+        )
         received = strength / estimates
         variance = self.microphone_array.noise.variance(received) / xp.where(self.scale > 0, self.scale, 1.0) ** 2
-        spread = xp.einsum("kmf,lmf,mf->klf", drive, drive, xp.where(self.use, variance, 0.0))
+        gradient_covariance = xp.einsum(
+            "kmf,lmf,mf->klf", mixed_derivatives, mixed_derivatives, xp.where(self.use, variance, 0.0)
+        )
         inverse = inverse_small(matrix)
-        return xp.einsum("ijf,jkf,klf->ilf", inverse, spread, inverse)
+        return xp.einsum("ijf,jkf,klf->ilf", inverse, gradient_covariance, inverse)
 
 
 # Number of candidate positions along the outline.
 _OUTLINE_CANDIDATES = 240
 # Distance, as a fraction of the skin's size, below which two minima are considered the same.
-_SAME_VALLEY = 0.05
+_MIN_VALLEY_DISTANCE = 0.05
 # Number of steps in the second valley before its cost is compared with that of the first; maximum difference of cost
 # for which the minimisation continues; maximum number of steps of a minimisation.
-_TRIAL_STEPS, _MOST_EXCESS, _MOST_STEPS = 8, 8.0, 30
+_TRIAL_STEPS, _MAX_EXCESS, _MAX_STEPS = 8, 8.0, 30
 # Tolerance of the minimisation: predicted decrease of the cost in the next step, relative to 1 + |cost|.
 _TOLERANCE = 1e-12
 
@@ -168,60 +185,69 @@ _TOLERANCE = 1e-12
 def find_minima(objective, first, second, try_second):
     """Minimise the objective from the starting positions `first` and `second` (2, F).
 
-    `try_second`: mask of the frames for which the second start is tried, or None for none; it is given up if it is not
-    promising. Returns the unknowns (n, F) at the minimum; the cost on the outline minus the cost of the minimum beyond
-    it; the difference of cost between the two minima; whether the minimisation converged; and the start and end (2, 2,
-    F) of the side of the outline to which the position was moved, NaN for positions inside.
+    `try_second`: mask of the frames for which the second start is tried, or None for none; the second start is
+    abandoned if it is not promising. Returns the unknowns (n, F) at the minimum; the cost on the outline minus the cost
+    of the minimum beyond it; the difference of cost between the two minima; whether the minimisation converged; and the
+    start and end (2, 2, F) of the side of the outline to which the position was moved, NaN for positions inside.
     """
     surface = objective.microphone_array.surface
-    found = _minimise(objective, objective.start(first), None)
-    unknowns, converged = found.x, found.converged
+    first_minimum = _minimise(objective, objective.start(first), None)
+    unknowns, converged = first_minimum.x, first_minimum.converged
     xp = namespace(objective, unknowns)
-    value = xp.where(xp.isfinite(found.value), found.value, xp.inf)
-    within = surface.outline.contains(unknowns[:2].T)
-    rival, least = xp.full(value.shape, xp.inf), value
+    value = xp.where(xp.isfinite(first_minimum.value), first_minimum.value, xp.inf)
+    is_inside = surface.outline.contains(unknowns[:2].T)
+    rival_excess, lowest_value = xp.full(value.shape, xp.inf), value
     if try_second is not None:
         # After a few steps, the minimisation continues only in promising second valleys.
-        tried = _minimise(objective, objective.start(second), ~try_second, max_steps=_TRIAL_STEPS)
-        try_second = try_second & (tried.value < value + _MOST_EXCESS)
-        other = _minimise(objective, tried.x, ~try_second)
-        other_value = xp.where(try_second & xp.isfinite(other.value), other.value, xp.inf)
-        other_within = surface.outline.contains(other.x[:2].T)
-        apart = xp.linalg.norm(other.x[:2] - unknowns[:2], axis=0) > _SAME_VALLEY * longer_side(surface)
-        rival = xp.where(apart & try_second & within & other_within, xp.abs(other_value - value), xp.inf)
-        least = xp.minimum(value, other_value)
+        trial_minimum = _minimise(objective, objective.start(second), ~try_second, max_steps=_TRIAL_STEPS)
+        try_second = try_second & (trial_minimum.value < value + _MAX_EXCESS)
+        second_minimum = _minimise(objective, trial_minimum.x, ~try_second)
+        second_value = xp.where(try_second & xp.isfinite(second_minimum.value), second_minimum.value, xp.inf)
+        second_is_inside = surface.outline.contains(second_minimum.x[:2].T)
+        is_distinct = xp.linalg.norm(second_minimum.x[:2] - unknowns[:2], axis=0) > _MIN_VALLEY_DISTANCE * longer_side(
+            surface
+        )
+        rival_excess = xp.where(
+            is_distinct & try_second & is_inside & second_is_inside, xp.abs(second_value - value), xp.inf
+        )
+        lowest_value = xp.minimum(value, second_value)
         # If one of the two minima is outside the outline, the other is selected. A position on the outline may still be
         # better.
-        better = xp.where(other_within == within, other_value < value, other_within & xp.isfinite(other_value))
-        unknowns = xp.where(better, other.x, unknowns)
-        converged = xp.where(better, other.converged, converged)
-        value, within = xp.where(better, other_value, value), xp.where(better, other_within, within)
+        second_is_better = xp.where(
+            second_is_inside == is_inside, second_value < value, second_is_inside & xp.isfinite(second_value)
+        )
+        unknowns = xp.where(second_is_better, second_minimum.x, unknowns)
+        converged = xp.where(second_is_better, second_minimum.converged, converged)
+        value, is_inside = (
+            xp.where(second_is_better, second_value, value),
+            xp.where(second_is_better, second_is_inside, is_inside),
+        )
     # Minima outside the outline are replaced by the best position on the outline. A minimum inside is also compared
     # with it, if the other minimum, outside, has a lower cost.
-    beyond = xp.isfinite(value) & (~within | (least < value))
-    nowhere = xp.full((2, 2, value.size), xp.nan)
+    try_outline = xp.isfinite(value) & (~is_inside | (lowest_value < value))
+    no_side = xp.full((2, 2, value.size), xp.nan)
 
     def move_to_outline(_):
-        held, side = _minimise_on_outline(objective, ~beyond)
-        moved = beyond & (~within | (held.value < value))
+        outline_minimum, side = _minimise_on_outline(objective, ~try_outline)
+        is_moved = try_outline & (~is_inside | (outline_minimum.value < value))
         return (
-            xp.where(moved, held.x, unknowns),
-            xp.where(beyond, xp.where(moved, held.value, value) - least, 0.0),
-            xp.where(moved, held.converged, converged),
-            xp.where(moved, side, nowhere),
+            xp.where(is_moved, outline_minimum.x, unknowns),
+            xp.where(try_outline, xp.where(is_moved, outline_minimum.value, value) - lowest_value, 0.0),
+            xp.where(is_moved, outline_minimum.converged, converged),
+            xp.where(is_moved, side, no_side),
         )
 
     def keep_inside(_):
-        return unknowns, xp.zeros_like(value), converged, nowhere
+        return unknowns, xp.zeros_like(value), converged, no_side
 
-    some = xp.any(beyond)
-    held = (
-        (move_to_outline(None) if some else keep_inside(None))
+    any_on_outline = xp.any(try_outline)
+    minima = (
+        (move_to_outline(None) if any_on_outline else keep_inside(None))
         if xp is np
-        else jax.lax.cond(some, move_to_outline, keep_inside, None)
+        else jax.lax.cond(any_on_outline, move_to_outline, keep_inside, None)
     )
-    unknowns, excess, converged, side = held
-    return unknowns, excess, rival, converged, side
+    unknowns, excess, converged, side = minima
+    return unknowns, excess, rival_excess, converged, side
 
 
 def _minimise(objective, start, skip, *, max_steps: int | None = None) -> Minimum:
@@ -234,8 +260,8 @@ def _minimise(objective, start, skip, *, max_steps: int | None = None) -> Minimu
     surface = objective.microphone_array.surface
     low, high = bounding_box(surface)
     xp = namespace(objective, start)
-    rest = xp.full(start.shape[0] - 2, xp.inf)
-    reach = longer_side(surface)
+    no_bounds = xp.full(start.shape[0] - 2, xp.inf)
+    skin_size = longer_side(surface)
 
     def expand_frames(frames):
         return type(objective)(*frames, objective.microphone_array)
@@ -245,10 +271,10 @@ def _minimise(objective, start, skip, *, max_steps: int | None = None) -> Minimu
         start,
         objective.frames,
         finish=None if max_steps is not None else lambda x, frames: _expand_exactly(expand_frames(frames), x),
-        max_steps=max_steps or _MOST_STEPS,
-        lower=xp.concatenate([low - reach, -rest])[:, None],
-        upper=xp.concatenate([high + reach, rest])[:, None],
-        largest_step=xp.concatenate([xp.full(2, reach / 4), xp.full_like(rest, 2.3)])[:, None],
+        max_steps=max_steps or _MAX_STEPS,
+        lower=xp.concatenate([low - skin_size, -no_bounds])[:, None],
+        upper=xp.concatenate([high + skin_size, no_bounds])[:, None],
+        largest_step=xp.concatenate([xp.full(2, skin_size / 4), xp.full_like(no_bounds, 2.3)])[:, None],
         tolerance=_TOLERANCE,
         skip=skip,
     )
@@ -270,72 +296,74 @@ def _minimise_on_outline(objective, skip) -> tuple[Minimum, Array]:
     xp = namespace(objective, start)
     length = xp.linalg.norm(end - start, axis=0)
     # Candidate positions are equally spaced along the outline, and given by a side and a fraction of its length.
-    stops = xp.concatenate([xp.zeros(1), xp.cumsum(length)])
-    walked = stops[-1] * (xp.arange(_OUTLINE_CANDIDATES) + 0.5) / _OUTLINE_CANDIDATES
-    which = xp.clip(xp.searchsorted(stops, walked, side="right") - 1, 0, length.size - 1)
-    share = (walked - stops[which]) / length[which]
-    chart = start[:, which] + share * (end - start)[:, which]
+    arc_lengths = xp.concatenate([xp.zeros(1), xp.cumsum(length)])
+    candidate_arc_lengths = arc_lengths[-1] * (xp.arange(_OUTLINE_CANDIDATES) + 0.5) / _OUTLINE_CANDIDATES
+    side_indices = xp.clip(xp.searchsorted(arc_lengths, candidate_arc_lengths, side="right") - 1, 0, length.size - 1)
+    side_fractions = (candidate_arc_lengths - arc_lengths[side_indices]) / length[side_indices]
+    chart = start[:, side_indices] + side_fractions * (end - start)[:, side_indices]
     maps = objective.screen(type(objective).features(objective.microphone_array, chart))
-    best = xp.argmin(xp.where(xp.isnan(maps), xp.inf, maps), axis=1)
-    origin, along = start[:, which[best]], (end - start)[:, which[best]]
-    first = objective.start(chart[:, best])[2:]
+    best_candidates = xp.argmin(xp.where(xp.isnan(maps), xp.inf, maps), axis=1)
+    origin, directions = start[:, side_indices[best_candidates]], (end - start)[:, side_indices[best_candidates]]
+    log_strengths = objective.start(chart[:, best_candidates])[2:]
 
-    def unknowns_of(z, origin, along):
-        return xp.concatenate([origin + z[0] * along, z[1:]])
+    def to_unknowns(side_unknowns, origin, directions):
+        return xp.concatenate([origin + side_unknowns[0] * directions, side_unknowns[1:]])
 
-    def expand(z, data):
-        origin, along, frames = data
-        some = type(objective)(*frames, objective.microphone_array)
-        value, gradient, matrix = some.expand(unknowns_of(z, origin, along))
-        turned = xp.concatenate([xp.sum(along * gradient[:2], axis=0)[None], gradient[2:]])
-        rows = xp.concatenate([xp.einsum("kf,klf->lf", along, matrix[:2])[None], matrix[2:]])
-        columns = xp.concatenate([xp.einsum("klf,lf->kf", rows[:, :2], along)[:, None], rows[:, 2:]], axis=1)
-        return value, turned, columns
+    def expand(side_unknowns, data):
+        origin, directions, frames = data
+        frame_objective = type(objective)(*frames, objective.microphone_array)
+        value, gradient, matrix = frame_objective.expand(to_unknowns(side_unknowns, origin, directions))
+        projected_gradient = xp.concatenate([xp.sum(directions * gradient[:2], axis=0)[None], gradient[2:]])
+        rows = xp.concatenate([xp.einsum("kf,klf->lf", directions, matrix[:2])[None], matrix[2:]])
+        projected_matrix = xp.concatenate(
+            [xp.einsum("klf,lf->kf", rows[:, :2], directions)[:, None], rows[:, 2:]], axis=1
+        )
+        return value, projected_gradient, projected_matrix
 
-    rest = first.shape[0]
-    found = minimise_small(
+    num_strengths = log_strengths.shape[0]
+    minimum = minimise_small(
         expand,
-        xp.concatenate([share[best][None], first]),
-        (origin, along, objective.frames),
-        lower=xp.array([0.0] + rest * [-xp.inf])[:, None],
-        upper=xp.array([1.0] + rest * [xp.inf])[:, None],
-        largest_step=xp.array([0.5] + rest * [2.3])[:, None],
+        xp.concatenate([side_fractions[best_candidates][None], log_strengths]),
+        (origin, directions, objective.frames),
+        lower=xp.array([0.0] + num_strengths * [-xp.inf])[:, None],
+        upper=xp.array([1.0] + num_strengths * [xp.inf])[:, None],
+        largest_step=xp.array([0.5] + num_strengths * [2.3])[:, None],
         tolerance=_TOLERANCE,
         skip=skip,
     )
-    end_of = origin + along
-    corner = (found.x[0] <= 0) | (found.x[0] >= 1)
+    side_ends = origin + directions
+    in_corner = (minimum.x[0] <= 0) | (minimum.x[0] >= 1)
     # A position in a corner of the outline cannot move along a side, so its side is given the length zero.
-    side = xp.stack([origin, xp.where(corner, origin, end_of)])
-    return Minimum(unknowns_of(found.x, origin, along), found.value, found.converged, found.steps), side
+    side = xp.stack([origin, xp.where(in_corner, origin, side_ends)])
+    return Minimum(to_unknowns(minimum.x, origin, directions), minimum.value, minimum.converged, minimum.steps), side
 
 
-def differentiable_minima(objective, unknowns, side, reach):
+def differentiable_minima(objective, unknowns, side, skin_size):
     """Return the minimum `unknowns` as a differentiable function of all arrays in `objective`.
 
     The result is a Newton step x − H⁻¹ ∇cost from the minimum x, with x and H held constant. The step is zero, and its
     derivative −H⁻¹ ∂∇cost is that of the minimum by the implicit function theorem. `side`: start and end of the side of
-    the outline on which the minimum lies, or NaN. `reach`: size of the skin in metres.
+    the outline on which the minimum lies, or NaN. `skin_size`: size of the skin in metres.
     """
-    at, xp = undifferentiated(unknowns), namespace(objective, unknowns)
+    minimum, xp = undifferentiated(unknowns), namespace(objective, unknowns)
 
-    def finite_cost(at):
-        cost = objective.cost(at)
+    def finite_cost(minimum):
+        cost = objective.cost(minimum)
         return xp.where(xp.isfinite(cost), cost, 0.0)
 
-    matrix = hessian_small(undifferentiated(objective).cost, at)
-    gradient = gradient_small(finite_cost, at)
-    # Positions on the outline can move along their side only, so the step is projected onto the side.
-    held = ~xp.isnan(side[0, 0])
-    along = xp.where(held, side[1] - side[0], 0.0)
-    length = xp.linalg.norm(xp.where(along == 0, 1e-300, along), axis=0)
-    along = xp.where(length > 1e-12 * reach, along / length, 0.0)
-    plane = xp.where(held, along[:, None] * along[None], xp.eye(2)[:, :, None])
-    keep = set_at(xp.zeros_like(matrix) + xp.eye(len(at))[:, :, None], np.s_[:2, :2], plane)
-    gradient = xp.einsum("klf,lf->kf", keep, gradient)
-    inner = xp.einsum("klf,lmf,mnf->knf", keep, matrix, keep)
-    trace = xp.maximum(xp.einsum("kkf->f", inner), 1e-300)
-    matrix = inner + (xp.eye(len(at))[:, :, None] - keep) * trace
-    step = solve_small(matrix, gradient)
-    usable = xp.all(xp.isfinite(step), axis=0) & (xp.max(xp.abs(step[:2]), axis=0) < 1e-3 * reach)
-    return at - xp.where(usable, step, 0.0)
+    hessian = hessian_small(undifferentiated(objective).cost, minimum)
+    gradient = gradient_small(finite_cost, minimum)
+    # Positions on the outline can move only along their side, so the step is projected onto the side.
+    on_outline = ~xp.isnan(side[0, 0])
+    direction = xp.where(on_outline, side[1] - side[0], 0.0)
+    length = xp.linalg.norm(xp.where(direction == 0, 1e-300, direction), axis=0)
+    direction = xp.where(length > 1e-12 * skin_size, direction / length, 0.0)
+    tangent_projector = xp.where(on_outline, direction[:, None] * direction[None], xp.eye(2)[:, :, None])
+    projector = set_at(xp.zeros_like(hessian) + xp.eye(len(minimum))[:, :, None], np.s_[:2, :2], tangent_projector)
+    gradient = xp.einsum("klf,lf->kf", projector, gradient)
+    projected_hessian = xp.einsum("klf,lmf,mnf->knf", projector, hessian, projector)
+    trace = xp.maximum(xp.einsum("kkf->f", projected_hessian), 1e-300)
+    hessian = projected_hessian + (xp.eye(len(minimum))[:, :, None] - projector) * trace
+    step = solve_small(hessian, gradient)
+    usable = xp.all(xp.isfinite(step), axis=0) & (xp.max(xp.abs(step[:2]), axis=0) < 1e-3 * skin_size)
+    return minimum - xp.where(usable, step, 0.0)

@@ -33,14 +33,14 @@ from jeit_solvers.engines import as_array, host, on_device, on_host, slopes
 # Factors on the standard deviation that are tried in turn. The first is accepted if one source explains half of the
 # frames, the others if it explains nearly all of them: one source explains some pairs of touches too if the gains may
 # have changed much.
-_FACTORS, _HALF, _NEARLY_ALL = (1.0, 2.0, 4.0), 0.5, 0.9
+_DEVIATION_FACTORS, _MIN_EXPLAINED_FIRST, _MIN_EXPLAINED_LATER = (1.0, 2.0, 4.0), 0.5, 0.9
 # Maximum number of iterations; change of the logarithms below which the iteration ends.
-_ROUNDS, _SETTLED = 4, 0.05
+_MAX_ITERATIONS, _CONVERGED_CHANGE = 4, 0.05
 # Side of the square cells in which all frames together have the weight of one, as a fraction of the skin's size: the
 # errors of a decay model are alike at neighbouring positions.
-_CELL = 0.3
+_CELL_SIZE = 0.3
 # Probability that changes are significant if the gains have not changed; relative tolerance of the rank of A.
-_FALSE_CHANGE, _RANK = 0.01, 1e-8
+_FALSE_CHANGE, _RANK_TOLERANCE = 0.01, 1e-8
 # Share of its trace that is added to the Fisher matrix of a frame, which is singular where few microphones respond.
 _RIDGE = 1e-12
 
@@ -83,67 +83,78 @@ def estimate_gain_changes(
     frame by maximum likelihood with a given array, and also returns the mask (F,) of the frames that one source
     explains.
 
-    Returns the estimate. If one source explains too few frames for an estimate, it returns two possibilities, the
-    second of which is the last resort: no changes, and unknown changes with the given standard deviation.
+    Returns a tuple with the estimate. If one source explains too few frames for an estimate, the tuple has two
+    possibilities, to be tried in turn: no changes, and unknown changes with the given standard deviation.
     """
-    used = use.any(axis=0).astype(float)
+    used_mask = use.any(axis=0).astype(float)
     # A factor common to all gains cannot be distinguished from the strengths of the touches.
-    centred = np.diag(used) - np.outer(used, used) / max(used.sum(), 1.0)
-    none = GainChanges(np.zeros(len(used)), np.zeros_like(centred))
+    centring_matrix = np.diag(used_mask) - np.outer(used_mask, used_mask) / max(used_mask.sum(), 1.0)
+    no_changes = GainChanges(np.zeros(len(used_mask)), np.zeros_like(centring_matrix))
     if deviation == 0:
-        return (none,)
-    for factor in _FACTORS:
-        changes, explained = _estimate(microphone_array, power, use, factor * deviation * centred, locate_frames)
-        if explained >= (_HALF if factor == 1 else _NEARLY_ALL):
+        return (no_changes,)
+    for factor in _DEVIATION_FACTORS:
+        changes, explained_share = _estimate_for_deviation(
+            microphone_array, power, use, factor * deviation * centring_matrix, locate_frames
+        )
+        if explained_share >= (_MIN_EXPLAINED_FIRST if factor == 1 else _MIN_EXPLAINED_LATER):
             return (changes,)
-    return none, none._replace(covariance=deviation**2 * centred)
+    return no_changes, no_changes._replace(covariance=deviation**2 * centring_matrix)
 
 
-def _estimate(microphone_array: MicrophoneArray, power, use, scale, locate_frames) -> tuple[GainChanges, float]:
-    """Changes of the gains for one standard deviation, and the fraction of the frames that one source explains. `scale`
-    (M, M): projection onto changes with the mean 0, times the standard deviation."""
+def _estimate_for_deviation(
+    microphone_array: MicrophoneArray, power, use, scale, locate_frames
+) -> tuple[GainChanges, float]:
+    """Estimate the changes of the gains for one standard deviation, and the fraction of the frames that one source
+    explains. `scale` (M, M): projection onto changes with the mean 0, times the standard deviation."""
     deviation = np.linalg.norm(scale, 2)
-    centred = scale / deviation
-    changes, explained = GainChanges(np.zeros(len(scale)), deviation * scale), 0.0
-    significant = False
-    for _ in range(_ROUNDS):
-        found, touch = locate_frames(changes.apply(microphone_array))
-        explained = float(np.mean(touch))
-        if not touch.any():
+    centring_matrix = scale / deviation
+    changes, explained_share = GainChanges(np.zeros(len(scale)), deviation * scale), 0.0
+    is_significant = False
+    for _ in range(_MAX_ITERATIONS):
+        sources, is_explained = locate_frames(changes.apply(microphone_array))
+        explained_share = float(np.mean(is_explained))
+        if not is_explained.any():
             break
-        array = _with_known_gains(microphone_array, changes)
-        matrix, right = _normal_equations(array, power[touch], use[touch], _unknowns_of_sources(array, found, touch))
-        right = right + matrix @ changes.logarithm
-        significant = _are_significant(matrix, right)
+        array_with_changes = _with_known_gains(microphone_array, changes)
+        matrix, right_hand_side = _normal_equations(
+            array_with_changes,
+            power[is_explained],
+            use[is_explained],
+            _unknowns_of_sources(array_with_changes, sources, is_explained),
+        )
+        right_hand_side = right_hand_side + matrix @ changes.logarithm
+        is_significant = _are_significant(matrix, right_hand_side)
         covariance = np.linalg.inv(matrix + np.eye(len(scale)) / deviation**2)
-        before = changes.logarithm
-        changes = GainChanges(centred @ covariance @ right, centred @ covariance @ centred)
-        if np.abs(changes.logarithm - before).max() < _SETTLED:
+        previous_logarithm = changes.logarithm
+        changes = GainChanges(
+            centring_matrix @ covariance @ right_hand_side, centring_matrix @ covariance @ centring_matrix
+        )
+        if np.abs(changes.logarithm - previous_logarithm).max() < _CONVERGED_CHANGE:
             break
-    if not significant:
-        # The mean square of the changes about 0, instead of about their estimate.
+    if not is_significant:
+        # The covariance becomes the mean square of the changes about 0 instead of about their estimate.
         logarithm = changes.logarithm
         changes = GainChanges(np.zeros_like(logarithm), changes.covariance + np.outer(logarithm, logarithm))
-    return changes, explained
+    return changes, explained_share
 
 
 def _are_significant(matrix: np.ndarray, right_hand_side: np.ndarray) -> bool:
     """Whether the changes are larger than is due to the noise and the errors of the decay models."""
-    values, vectors = np.linalg.eigh(matrix)
-    kept = values > _RANK * values[-1]
-    square = (vectors[:, kept].T @ right_hand_side) ** 2 / values[kept]
-    return bool(chdtrc(kept.sum(), square.sum()) < _FALSE_CHANGE)
+    eigenvalues, eigenvectors = np.linalg.eigh(matrix)
+    is_determined = eigenvalues > _RANK_TOLERANCE * eigenvalues[-1]
+    squared_components = (eigenvectors[:, is_determined].T @ right_hand_side) ** 2 / eigenvalues[is_determined]
+    return bool(chdtrc(is_determined.sum(), squared_components.sum()) < _FALSE_CHANGE)
 
 
 def covariance_with_gains(
     microphone_array: MicrophoneArray,
     power: Float[np.ndarray, "F M"],
     use: Bool[np.ndarray, "F M"],
-    found: SourceEstimate,
+    sources: SourceEstimate,
     changes: GainChanges,
 ) -> Float[np.ndarray, "F d d"]:
-    """Covariance (F, d, d) in m² of the positions of `found`, including the errors of the gains. NaN for frames without
-    a position.
+    """Covariance (F, d, d) in m² of the positions of `sources`, including the errors of the gains; NaN for frames
+    without a position.
 
     `microphone_array`: the array before `GainChanges.apply`. With the Fisher matrix F of a frame for known gains, the
     derivative of its unknowns with respect to the changes is B = F⁻¹ Jᵀ W S, and their covariance in the joint estimate
@@ -151,26 +162,28 @@ def covariance_with_gains(
     """
     array, unknowns = (
         _with_known_gains(microphone_array, changes),
-        _unknowns_of_sources(microphone_array, found, slice(None)),
+        _unknowns_of_sources(microphone_array, sources, slice(None)),
     )
-    known = np.isfinite(unknowns).all(axis=0)
-    unknowns = host.where(known, unknowns, 0.0)
-    likelihood, jacobian, share, weight = _linearise(array, power, use, unknowns)
-    inverse = _inverse_fisher(likelihood.expand(unknowns)[2])
-    slope = np.einsum("klf,lmf->kmf", inverse[:2], weight * share * jacobian)
-    total = inverse[:2, :2] + host.einsum("kmf,mn,lnf->klf", slope, changes.covariance, slope, optimize=True)
-    return np.where(known[:, None, None], to_space(array.surface, unknowns[:2], total)[1], np.nan)
+    has_position = np.isfinite(unknowns).all(axis=0)
+    unknowns = host.where(has_position, unknowns, 0.0)
+    likelihood, jacobian, signal_share, weight = _linearise(array, power, use, unknowns)
+    inverse_fisher = _inverse_fisher(likelihood.expand(unknowns)[2])
+    gain_derivatives = np.einsum("klf,lmf->kmf", inverse_fisher[:2], weight * signal_share * jacobian)
+    total_covariance = inverse_fisher[:2, :2] + host.einsum(
+        "kmf,mn,lnf->klf", gain_derivatives, changes.covariance, gain_derivatives, optimize=True
+    )
+    return np.where(has_position[:, None, None], to_space(array.surface, unknowns[:2], total_covariance)[1], np.nan)
 
 
 def _with_known_gains(microphone_array: MicrophoneArray, changes: GainChanges) -> MicrophoneArray:
-    """The array with the changed gains, in NumPy, and without the variances of the changes."""
+    """Return the array with the changed gains, in NumPy, without the variances of the changes in its noise."""
     return on_host(changes._replace(covariance=np.zeros_like(changes.covariance)).apply(microphone_array))
 
 
 def _unknowns_of_sources(
     microphone_array: MicrophoneArray, sources: SourceEstimate, frames
 ) -> Float[np.ndarray, "3 F"]:
-    """Chart coordinates and logarithm of the strength of the sources `sources` in the frames `frames`."""
+    """Chart coordinates and logarithm of the strength of `sources` in the frames with the indices or mask `frames`."""
     chart = on_host(microphone_array.surface).project(np.asarray(sources.position)[frames].T)
     return np.concatenate([chart, np.log(np.asarray(sources.strength))[None, frames]])
 
@@ -179,25 +192,29 @@ def _linearise(array: MicrophoneArray, power, use, unknowns) -> tuple[Likelihood
     """Likelihood of the frames, derivatives J (3, M, F) of the levels, shares s (M, F), and weights W (M, F)."""
     use = use.T & (power.T + array.noise.floor[:, None] > 0)
     likelihood = Likelihood.create(power.T, use, array)
-    (mean, variance), along = slopes(array.expected, unknowns)
-    share = 1 - array.noise.floor[:, None] * np.exp(-mean)
-    return likelihood, np.stack([dm for dm, _ in along]), share, np.where(use, 1 / variance, 0.0)
+    (mean, variance), derivatives = slopes(array.expected, unknowns)
+    signal_share = 1 - array.noise.floor[:, None] * np.exp(-mean)
+    return likelihood, np.stack([dm for dm, _ in derivatives]), signal_share, np.where(use, 1 / variance, 0.0)
 
 
 def _normal_equations(array: MicrophoneArray, power, use, unknowns) -> tuple[np.ndarray, np.ndarray]:
     """Matrix (M, M) and right-hand side (M,) of the changes of the gains, without the prior."""
-    likelihood, jacobian, share, weight = _linearise(array, power, use, unknowns)
-    size = _CELL * float(longer_side(array.surface))
-    _, cell, count = np.unique(np.floor(unknowns[:2] / size), axis=1, return_inverse=True, return_counts=True)
-    weight = weight / count[cell.ravel()]
-    off = likelihood.level - array.expected(unknowns)[0]
-    weighted = weight * share
+    likelihood, jacobian, signal_share, weight = _linearise(array, power, use, unknowns)
+    cell_size = _CELL_SIZE * float(longer_side(array.surface))
+    _, cell_indices, frames_per_cell = np.unique(
+        np.floor(unknowns[:2] / cell_size), axis=1, return_inverse=True, return_counts=True
+    )
+    weight = weight / frames_per_cell[cell_indices.ravel()]
+    residual = likelihood.level - array.expected(unknowns)[0]
+    weighted = weight * signal_share
     coupling = weighted * jacobian
-    inverse = _inverse_fisher(np.einsum("kmf,lmf->klf", weight * jacobian, jacobian))
-    eliminated = np.einsum("klf,lmf->kmf", inverse, coupling)
-    matrix = np.diag((weighted * share).sum(axis=1)) - np.einsum("kmf,knf->mn", coupling, eliminated)
-    right = (weighted * off).sum(axis=1) - np.einsum("kmf,kf->m", eliminated, (weight * jacobian * off).sum(axis=1))
-    return matrix, right
+    inverse_fisher = _inverse_fisher(np.einsum("kmf,lmf->klf", weight * jacobian, jacobian))
+    eliminated = np.einsum("klf,lmf->kmf", inverse_fisher, coupling)
+    matrix = np.diag((weighted * signal_share).sum(axis=1)) - np.einsum("kmf,knf->mn", coupling, eliminated)
+    right_hand_side = (weighted * residual).sum(axis=1) - np.einsum(
+        "kmf,kf->m", eliminated, (weight * jacobian * residual).sum(axis=1)
+    )
+    return matrix, right_hand_side
 
 
 def _inverse_fisher(fisher) -> np.ndarray:

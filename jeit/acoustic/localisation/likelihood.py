@@ -40,8 +40,8 @@ class Likelihood(Module):
         cls, power: Float[Array, "M F"], use: Bool[Array, "M F"], microphone_array: MicrophoneArray
     ) -> "Likelihood":
         """Create the likelihood from intensities `power`. Values outside the mask `use` are ignored and may be NaN."""
-        known = namespace(power, use).where(use, power, 1.0)
-        return cls(known, microphone_array.noise.level(known), use, microphone_array)
+        used_power = namespace(power, use).where(use, power, 1.0)
+        return cls(used_power, microphone_array.noise.level(used_power), use, microphone_array)
 
     @property
     def frames(self) -> tuple[Array, ...]:
@@ -68,23 +68,23 @@ class Likelihood(Module):
 
     def expand(self, unknowns: Float[Array, "n F"]) -> tuple[Array, Array, Array]:
         """Cost, its gradient (n, F), and the Fisher matrix (n, n, F)."""
-        (mean, variance), along = slopes(self.microphone_array.expected, unknowns)
+        (mean, variance), derivatives = slopes(self.microphone_array.expected, unknowns)
         # `kept` makes the compiler compute these arrays once for all sums below. From here on, `dv` is the derivative
         # of log v.
-        mean, variance, along = kept((mean, variance, [(dm, dv / variance) for dm, dv in along]))
+        mean, variance, derivatives = kept((mean, variance, [(dm, dv / variance) for dm, dv in derivatives]))
         xp = namespace(self, mean)
         used = xp.where(self.use, 1.0, 0.0)
-        off = self.level - mean
+        residual = self.level - mean
         weight = used / variance
-        scaled = off * weight
-        cost = 0.5 * xp.sum(scaled * off + used * xp.log(variance), axis=0)
-        excess = 0.5 * (used - scaled * off)
-        weight, scaled, excess, used = kept((weight, scaled, excess, used))
-        gradient = xp.stack([xp.sum(excess * dv - scaled * dm, axis=0) for dm, dv in along])
+        weighted_residual = residual * weight
+        cost = 0.5 * xp.sum(weighted_residual * residual + used * xp.log(variance), axis=0)
+        variance_terms = 0.5 * (used - weighted_residual * residual)
+        weight, weighted_residual, variance_terms, used = kept((weight, weighted_residual, variance_terms, used))
+        gradient = xp.stack([xp.sum(variance_terms * dv - weighted_residual * dm, axis=0) for dm, dv in derivatives])
         matrix = symmetric_small(
             [
-                [xp.sum(weight * dm * em + 0.5 * used * dv * ev, axis=0) for em, ev in along[: k + 1]]
-                for k, (dm, dv) in enumerate(along)
+                [xp.sum(weight * dm * em + 0.5 * used * dv * ev, axis=0) for em, ev in derivatives[: k + 1]]
+                for k, (dm, dv) in enumerate(derivatives)
             ]
         )
         return cost, gradient, matrix
@@ -99,9 +99,9 @@ class Likelihood(Module):
         """Strength of sources with given responses f, by least squares with weights from the observed power. The result
         is positive."""
         weight, xp = self._power_weights(), namespace(self, response)
-        fitted = xp.sum(weight * self.power * response, axis=0) / xp.sum(weight * response**2, axis=0)
+        fitted_strength = xp.sum(weight * self.power * response, axis=0) / xp.sum(weight * response**2, axis=0)
         loudest = xp.max(xp.where(self.use, self.power / response, 0.0), axis=0)
-        return xp.maximum(fitted, 1e-6 * loudest)
+        return xp.maximum(fitted_strength, 1e-6 * loudest)
 
     @staticmethod
     def features(microphone_array: MicrophoneArray, chart: Float[Array, "2 P"]) -> Float[Array, "M P"]:
@@ -113,9 +113,9 @@ class Likelihood(Module):
         strength: ½ (Σ w p² − (Σ w p f)² / Σ w f²), with observed powers p and weights w derived from them. It
         approximates the cost, and takes two matrix products for all frames and positions."""
         weight, xp = self._power_weights(), namespace(self, response)
-        seen = weight * self.power
-        fitted = xp.maximum(seen.T @ response, 0.0) ** 2 / (weight.T @ response**2)
-        return 0.5 * (xp.sum(self.power * seen, axis=0)[:, None] - fitted)
+        weighted_power = weight * self.power
+        explained_sum = xp.maximum(weighted_power.T @ response, 0.0) ** 2 / (weight.T @ response**2)
+        return 0.5 * (xp.sum(self.power * weighted_power, axis=0)[:, None] - explained_sum)
 
     def _power_weights(self) -> Float[Array, "M F"]:
         xp = namespace(self)
@@ -151,18 +151,18 @@ def cramer_rao(
     ```
     """
     check_array(microphone_array)
-    present = np.ones(len(microphone_array.microphones), bool) if use is None else use
-    return _bound_covariance(microphone_array, position, strength, present)
+    used_microphones = np.ones(len(microphone_array.microphones), bool) if use is None else use
+    return _bound_covariance(microphone_array, position, strength, used_microphones)
 
 
 @either_engine
-def _bound_covariance(microphone_array: MicrophoneArray, position, strength, present) -> Float[Array, "N d d"]:
-    xp = namespace(microphone_array, position, strength, present)
+def _bound_covariance(microphone_array: MicrophoneArray, position, strength, used_microphones) -> Float[Array, "N d d"]:
+    xp = namespace(microphone_array, position, strength, used_microphones)
     position = xp.asarray(position, float)
     chart = microphone_array.surface.project(position.T)
-    number = chart.shape[1]
-    unknowns = xp.concatenate([chart, xp.log(xp.broadcast_to(xp.asarray(strength, float), (number,)))[None]])
-    there = xp.broadcast_to(xp.asarray(present, bool)[:, None], (len(present), number))
+    num_sources = chart.shape[1]
+    unknowns = xp.concatenate([chart, xp.log(xp.broadcast_to(xp.asarray(strength, float), (num_sources,)))[None]])
+    use = xp.broadcast_to(xp.asarray(used_microphones, bool)[:, None], (len(used_microphones), num_sources))
     # The Fisher matrix does not depend on the measured values.
-    _, _, matrix = Likelihood.create(xp.ones(there.shape), there, microphone_array).expand(unknowns)
+    _, _, matrix = Likelihood.create(xp.ones(use.shape), use, microphone_array).expand(unknowns)
     return to_space(microphone_array.surface, chart, inverse_small(matrix)[:2, :2])[1]

@@ -36,12 +36,12 @@ from jeit_solvers.module import Module
 
 METHODS = {"likelihood": Likelihood, "consistency": Consistency}
 # Approximate number of positions of the coarse grid over the bounding box of the outline.
-_COARSE = 400
+_NUM_COARSE_PIXELS = 400
 # Number of frames processed together, so that their arrays fit into the processor's cache: with the coarse grid, and
 # with a map.
-_CHUNK, _CHUNK_OF_MAPS = 1024, 32
+_MAX_CHUNK_FRAMES, _MAX_MAP_FRAMES = 1024, 32
 # Minimum relative error of the decay models assumed when a grid is screened.
-_SCREENED_AT = 0.2
+_SCREENING_ERROR = 0.2
 
 
 class SourceEstimate(Module):
@@ -109,17 +109,17 @@ class Localiser(Module):
         check_array(microphone_array)
         check_name("method", method, METHODS)
         low, high = bounding_box(on_host(microphone_array.surface))
-        sides_of_box = np.asarray(high - low)
-        spacing = np.sqrt(np.prod(sides_of_box) / _COARSE)
-        counts = [max(3, round(side / spacing)) for side in sides_of_box]
-        coarse = Pixels.create(microphone_array.surface, *counts)
+        box_sides = np.asarray(high - low)
+        spacing = np.sqrt(np.prod(box_sides) / _NUM_COARSE_PIXELS)
+        counts = [max(3, round(side / spacing)) for side in box_sides]
+        coarse_grid = Pixels.create(microphone_array.surface, *counts)
         if map_shape is None:
-            return cls(microphone_array, coarse, None, None, method, compiled)
+            return cls(microphone_array, coarse_grid, None, None, method, compiled)
         if np.shape(map_shape) != (2,) or min(map_shape) < 2:
             raise ValueError(f"map_shape must be (rows, columns) of at least two each; it is {map_shape!r}.")
         pixels = Pixels.create(microphone_array.surface, int(map_shape[1]), int(map_shape[0]))
         features = _features(METHODS[method], microphone_array, pixels.chart)
-        return cls(microphone_array, coarse, pixels, features, method, compiled)
+        return cls(microphone_array, coarse_grid, pixels, features, method, compiled)
 
     def __call__(self, power: ArrayLike, use: ArrayLike | None = None) -> SourceEstimate:
         """Locate the source of each frame. `power` (F, M): intensities minus the floor. `use` (F, M): mask of the
@@ -145,8 +145,8 @@ class Localiser(Module):
 
     def _call_validated(self, function, power, use):
         """Validate the intensities and the mask, and call `function` with the localiser and both arrays."""
-        at_hand = not self.compiled and has_values(self, power, use)
-        xp = np if at_hand else jnp
+        use_numpy = not self.compiled and has_values(self, power, use)
+        xp = np if use_numpy else jnp
         power = xp.asarray(power, float)
         finite = xp.isfinite(power)
         use = finite if use is None else finite & xp.asarray(use, bool)
@@ -156,9 +156,11 @@ class Localiser(Module):
                 f"{len(self.microphone_array.microphones)} microphones."
             )
         if not len(power):  # without frames, the result of an unusable frame gives the structure of the output
-            found = self._call_validated(function, np.full((1, power.shape[1]), np.nan), None)
-            return jax.tree.map(lambda array: array[:0], found)
-        return on_device(at_once(function, self, power, use)) if at_hand else _call_compiled(function, self, power, use)
+            padded_result = self._call_validated(function, np.full((1, power.shape[1]), np.nan), None)
+            return jax.tree.map(lambda array: array[:0], padded_result)
+        return (
+            on_device(at_once(function, self, power, use)) if use_numpy else _call_compiled(function, self, power, use)
+        )
 
 
 @eqx.filter_jit
@@ -166,21 +168,21 @@ def _call_compiled(function, localiser: Localiser, power, use):
     return function(localiser, power, use)
 
 
-def _in_chunks(function, max_frames: int, *arrays):
+def _apply_in_chunks(function, max_frames: int, *arrays):
     """Call `function` for at most `max_frames` frames at a time. The `arrays` (F, M) are split into chunks, padded, and
     transposed to (M, F). In the results, frames are the leading axis."""
-    number = arrays[0].shape[0]
-    size_of_chunk = min(max_frames, max(number, 1))
-    chunks = -(-number // size_of_chunk)
-    pad = ((0, chunks * size_of_chunk - number), (0, 0))
+    num_frames = arrays[0].shape[0]
+    chunk_size = min(max_frames, max(num_frames, 1))
+    num_chunks = -(-num_frames // chunk_size)
+    padding = ((0, num_chunks * chunk_size - num_frames), (0, 0))
 
     xp = namespace(arrays)
 
     def split(array):
-        return xp.pad(array, pad).reshape(chunks, size_of_chunk, -1).transpose(0, 2, 1)
+        return xp.pad(array, padding).reshape(num_chunks, chunk_size, -1).transpose(0, 2, 1)
 
-    _, found = scan(lambda _, chunk: (None, function(*chunk)), None, tuple(split(array) for array in arrays))
-    return jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[:number], found)
+    _, results = scan(lambda _, chunk: (None, function(*chunk)), None, tuple(split(array) for array in arrays))
+    return jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[:num_frames], results)
 
 
 @either_engine
@@ -206,20 +208,22 @@ def _maps(localiser: Localiser, power, use) -> Array:
 def _starting_positions(localiser: Localiser, power, use):
     """Starting positions of the minimisation: those of the first valley (F, 2) and the second valley (F, 2), and the
     mask (F,) of the frames whose second valley is worth a minimisation."""
-    still = undifferentiated(localiser.microphone_array)
-    pixels, features = _raster(localiser, still)
+    constant_array = undifferentiated(localiser.microphone_array)
+    pixels, features = _raster(localiser, constant_array)
     # The valleys of a very accurate model are narrower than the grid spacing, so a minimum relative error is assumed.
-    still = eqx.tree_at(
-        lambda one: one.noise.relative, still, namespace(still).maximum(still.noise.relative, _SCREENED_AT)
+    constant_array = eqx.tree_at(
+        lambda tree: tree.noise.relative,
+        constant_array,
+        namespace(constant_array).maximum(constant_array.noise.relative, _SCREENING_ERROR),
     )
 
     def screen(power, use):
-        maps = METHODS[localiser.method].create(power, use, still).screen(features)
-        first, second, worth = valleys(maps, pixels)
-        return first.T, second.T, worth
+        maps = METHODS[localiser.method].create(power, use, constant_array).screen(features)
+        first, second, try_second = valleys(maps, pixels)
+        return first.T, second.T, try_second
 
-    most = _CHUNK if localiser.pixels is None else _CHUNK_OF_MAPS
-    return _in_chunks(screen, most, undifferentiated(power), use)
+    max_frames = _MAX_CHUNK_FRAMES if localiser.pixels is None else _MAX_MAP_FRAMES
+    return _apply_in_chunks(screen, max_frames, undifferentiated(power), use)
 
 
 def _usable_readings(localiser: Localiser, power, use):
@@ -229,27 +233,27 @@ def _usable_readings(localiser: Localiser, power, use):
 
 def _locate(localiser: Localiser, power, use) -> SourceEstimate:
     use = _usable_readings(localiser, power, use)
-    first, second, worth = _starting_positions(localiser, power, use)
+    first, second, try_second = _starting_positions(localiser, power, use)
 
-    def refine(power, use, first, second, worth):
-        return _refine(localiser, power, use, first, second, worth[0])
+    def refine(power, use, first, second, try_second):
+        return _refine(localiser, power, use, first, second, try_second[0])
 
-    return _in_chunks(refine, _CHUNK, power, use, first, second, worth[:, None])
+    return _apply_in_chunks(refine, _MAX_CHUNK_FRAMES, power, use, first, second, try_second[:, None])
 
 
-def _refine(localiser: Localiser, power, use, first, second, worth) -> SourceEstimate:
+def _refine(localiser: Localiser, power, use, first, second, try_second) -> SourceEstimate:
     """Minimise the objective of each frame from the starting positions `first` and `second` (2, F). `power`, `use`: (M,
     F)."""
     microphone_array = localiser.microphone_array
-    fixed = undifferentiated(microphone_array)
-    still = METHODS[localiser.method].create(undifferentiated(power), use, fixed)
+    constant_array = undifferentiated(microphone_array)
+    constant_objective = METHODS[localiser.method].create(undifferentiated(power), use, constant_array)
     # If there are maps, the minimisation starts from the best pixel only.
     unknowns, excess, rival, converged, side = find_minima(
-        still, first, second, worth if localiser.pixels is None else None
+        constant_objective, first, second, try_second if localiser.pixels is None else None
     )
     likelihood = Likelihood.create(power, use, microphone_array)
     objective = likelihood if localiser.method == "likelihood" else Consistency.create(power, use, microphone_array)
-    unknowns = differentiable_minima(objective, unknowns, side, longer_side(fixed.surface))
+    unknowns = differentiable_minima(objective, unknowns, side, longer_side(constant_array.surface))
     return _source_estimate(objective, likelihood, unknowns, excess, rival, converged)
 
 
@@ -258,21 +262,21 @@ def _source_estimate(objective, likelihood: Likelihood, unknowns, excess, rival,
     surface, chart = likelihood.microphone_array.surface, unknowns[:2]
     if isinstance(objective, Likelihood):
         strength = xp.exp(unknowns[2])
-        spread = inverse_small(likelihood.expand(unknowns)[2])[:2, :2]
+        chart_covariance = inverse_small(likelihood.expand(unknowns)[2])[:2, :2]
     else:
         strength = likelihood.strength(likelihood.microphone_array.response(chart))
-        spread = objective.covariance(chart, strength)
+        chart_covariance = objective.covariance(chart, strength)
     misfit = likelihood.misfit(xp.concatenate([chart, xp.log(strength)[None]]))
-    place, covariance = to_space(surface, chart, spread)
-    number = xp.sum(likelihood.use, axis=0)
-    known = (number >= 3) & xp.all(xp.isfinite(unknowns), axis=0)
+    position, covariance = to_space(surface, chart, chart_covariance)
+    num_used = xp.sum(likelihood.use, axis=0)
+    has_position = (num_used >= 3) & xp.all(xp.isfinite(unknowns), axis=0)
     return SourceEstimate(
-        position=xp.where(known[:, None], place, xp.nan),
-        covariance=xp.where(known[:, None, None], covariance, xp.nan),
-        strength=xp.where(known, strength, xp.nan),
-        misfit=xp.where(known, misfit, xp.nan),
-        freedom=xp.maximum(number - 3, 0),
-        excess=xp.where(known, 2 * excess, xp.nan),
-        rival=xp.where(known, 2 * rival, xp.nan),
-        converged=converged & known,
+        position=xp.where(has_position[:, None], position, xp.nan),
+        covariance=xp.where(has_position[:, None, None], covariance, xp.nan),
+        strength=xp.where(has_position, strength, xp.nan),
+        misfit=xp.where(has_position, misfit, xp.nan),
+        freedom=xp.maximum(num_used - 3, 0),
+        excess=xp.where(has_position, 2 * excess, xp.nan),
+        rival=xp.where(has_position, 2 * rival, xp.nan),
+        converged=converged & has_position,
     )

@@ -13,7 +13,7 @@ from jeit.acoustic.calibration.calibration import Calibration
 from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
 from jeit.acoustic.localisation.gain_changes import GainChanges, covariance_with_gains, estimate_gain_changes
 from jeit.acoustic.localisation.localiser import Localiser, SourceEstimate
-from jeit.acoustic.localisation.locations import FEW_FRAMES, Locations, LocationStatus
+from jeit.acoustic.localisation.locations import MAX_NUMPY_FRAMES, Locations, LocationStatus
 from jeit.acoustic.localisation.setup_changes import find_setup_changes
 from jeit.acoustic.localisation.two_sources import locate_two
 from jeit.acoustic.microphones import MicrophoneArray
@@ -35,20 +35,20 @@ _ALARM_DEVIATIONS = 6.0
 # Thresholds of differences of −2 log-likelihood: a frame is "outside" if a position beyond the outline is better by
 # more than this (three standard deviations); a frame is "ambiguous" if its second valley is worse by less than this
 # (two standard deviations).
-_OUTSIDE, _RIVAL = 9.0, 4.0
+_MIN_OUTSIDE_EXCESS, _MAX_AMBIGUOUS_DIFFERENCE = 9.0, 4.0
 # Thresholds for accepting two sources whose misfit is statistically significant: maximum ratio of their misfit to that
 # of one source, and maximum misfit per degree of freedom. Minimum ratio of the strengths of two sources, since errors
 # of the model look like a weak second source.
-_MOST_MISFIT_RATIO, _MOST_MISFIT, _WEAKEST = 0.2, 10.0, 0.05
+_MAX_MISFIT_RATIO, _MAX_MISFIT, _MIN_STRENGTH_RATIO = 0.2, 10.0, 0.05
 # Fraction of the touches that are not explained by one source on the skin, above which changes of the setup are
 # searched for.
-_MOST_UNEXPLAINED = 0.25
+_MAX_UNEXPLAINED = 0.25
 # Minimum fraction of the frames that one or two sources must explain if the gains have not changed.
-_EXPLAINED = 0.9
+_MIN_EXPLAINED = 0.9
 # Minimum ratio of the intensity of a touch to the highest intensity of the recording, if no floor is known (−60 dB).
 _DYNAMIC_RANGE = 1e-6
 # Maximum plausible ratio of the strength of touches to that of the calibration taps, or its inverse (40 dB).
-_MOST_STRENGTH_RATIO = 1e4
+_MAX_STRENGTH_RATIO = 1e4
 
 
 def locate(
@@ -93,29 +93,29 @@ def locate(
         raise ValueError(f"gain_drift must be zero or positive, as a fraction; it is {describe(gain_drift)}.")
     intensities = calibrated_intensities(recording, calibration, intensity, silence=silence)
     microphone_array, use, faults = microphones_in_use(intensities, calibration)
-    touched = use.any(axis=1) & _detected_frames(intensities, microphone_array.noise, use)
-    enough = use.sum(axis=1) >= 3
-    solve = touched & enough
-    compiled = int(solve.sum()) > FEW_FRAMES if compiled is None else compiled
-    frames, d = len(intensities.times), calibration.microphone_array.microphones.shape[1]
-    status = np.where(touched, LocationStatus.TOUCH, LocationStatus.NO_TOUCH).astype(object)
-    status[~enough] = LocationStatus.UNUSABLE
+    has_touch = use.any(axis=1) & _detected_frames(intensities, microphone_array.noise, use)
+    has_enough_readings = use.sum(axis=1) >= 3
+    is_processed = has_touch & has_enough_readings
+    compiled = int(is_processed.sum()) > MAX_NUMPY_FRAMES if compiled is None else compiled
+    num_frames, dimension = len(intensities.times), calibration.microphone_array.microphones.shape[1]
+    status = np.where(has_touch, LocationStatus.TOUCH, LocationStatus.NO_TOUCH).astype(object)
+    status[~has_enough_readings] = LocationStatus.UNUSABLE
     result = {
-        "position": np.full((frames, d), np.nan),
-        "covariance": np.full((frames, d, d), np.nan),
-        "strength": np.full(frames, np.nan),
-        "misfit": np.full(frames, np.nan),
-        "freedom": np.zeros(frames, int),
-        "second": np.full((frames, d), np.nan),
-        "second_strength": np.full(frames, np.nan),
+        "position": np.full((num_frames, dimension), np.nan),
+        "covariance": np.full((num_frames, dimension, dimension), np.nan),
+        "strength": np.full(num_frames, np.nan),
+        "misfit": np.full(num_frames, np.nan),
+        "freedom": np.zeros(num_frames, int),
+        "second": np.full((num_frames, dimension), np.nan),
+        "second_strength": np.full(num_frames, np.nan),
     }
     notes = list(intensities.notes)
-    if solve.any():
+    if is_processed.any():
         settings = _Settings(method, map_shape, gain_drift, compiled)
-        frames_in_use = intensities.power[solve], use[solve]
-        status[solve], found, changes = _locate_frames(microphone_array, *frames_in_use, settings)
-        for key, values in found.items():
-            result[key][solve] = values
+        frames_in_use = intensities.power[is_processed], use[is_processed]
+        status[is_processed], frame_results, changes = _locate_frames(microphone_array, *frames_in_use, settings)
+        for key, values in frame_results.items():
+            result[key][is_processed] = values
         result["covariance"] *= calibration.widening
         _limit_uncertainty(status, result, float(longer_side(on_host(microphone_array.surface))))
         notes += [*_gain_note(changes), *_setup_notes(status, intensities, use, microphone_array)]
@@ -143,43 +143,47 @@ class _Settings(NamedTuple):
 def _locate_frames(
     microphone_array: MicrophoneArray, power: np.ndarray, use: np.ndarray, settings: _Settings
 ) -> tuple[np.ndarray, dict[str, np.ndarray], GainChanges]:
-    """Status (F,) of frames with a touch, their results by the names of the fields of `Locations`, and the changes of
-    the gains with which they were located."""
-    compiled, number = settings.compiled, len(power)
-    padded = _pad_frames(power, use, compiled)
+    """Locate the sources of frames with a touch. Returns the status (F,), a dictionary of the results by the names of
+    the fields of `Locations`, and the changes of the gains with which they were computed."""
+    compiled, num_frames = settings.compiled, len(power)
+    padded_frames = _pad_frames(power, use, compiled)
 
     def estimate(array: MicrophoneArray, method: str, map_shape: tuple[int, int] | None) -> SourceEstimate:
         localiser = Localiser.create(array, method=method, map_shape=map_shape, compiled=compiled)
-        return jax.tree.map(lambda values: np.array(values)[:number], localiser(*padded))
+        return jax.tree.map(lambda values: np.array(values)[:num_frames], localiser(*padded_frames))
 
-    def most_likely(array: MicrophoneArray) -> tuple[SourceEstimate, np.ndarray]:
-        found = estimate(array, "likelihood", None)
-        return found, _initial_status(found, found) == LocationStatus.TOUCH
+    def locate_most_likely(array: MicrophoneArray) -> tuple[SourceEstimate, np.ndarray]:
+        likelihood_estimate = estimate(array, "likelihood", None)
+        return likelihood_estimate, _initial_status(likelihood_estimate, likelihood_estimate) == LocationStatus.TOUCH
 
-    *others, last = estimate_gain_changes(microphone_array, power, use, settings.gain_drift, most_likely)
+    *possible_changes, last_changes = estimate_gain_changes(
+        microphone_array, power, use, settings.gain_drift, locate_most_likely
+    )
 
     def locate_with(changes: GainChanges) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         array = changes.apply(microphone_array)
         # The status of a frame is always determined from the likelihood, also if another method locates the touch.
-        judge, _ = most_likely(array)
-        standard = settings.method == "likelihood" and settings.map_shape is None
-        found = judge if standard else estimate(array, settings.method, settings.map_shape)
-        result = {key: np.array(getattr(found, key)) for key in ("position", "covariance", "strength")}
-        result |= {key: np.array(getattr(judge, key)) for key in ("misfit", "freedom")}
-        result |= {"second": np.full_like(result["position"], np.nan), "second_strength": np.full(number, np.nan)}
+        likelihood_estimate, _ = locate_most_likely(array)
+        is_default_method = settings.method == "likelihood" and settings.map_shape is None
+        selected_estimate = (
+            likelihood_estimate if is_default_method else estimate(array, settings.method, settings.map_shape)
+        )
+        result = {key: np.array(getattr(selected_estimate, key)) for key in ("position", "covariance", "strength")}
+        result |= {key: np.array(getattr(likelihood_estimate, key)) for key in ("misfit", "freedom")}
+        result |= {"second": np.full_like(result["position"], np.nan), "second_strength": np.full(num_frames, np.nan)}
         if settings.method == "likelihood":
-            result["covariance"] = covariance_with_gains(microphone_array, power, use, found, changes)
-        status = _initial_status(judge, found)
+            result["covariance"] = covariance_with_gains(microphone_array, power, use, selected_estimate, changes)
+        status = _initial_status(likelihood_estimate, selected_estimate)
         _fit_two_sources(status, result, power, use, array, compiled)
-        excess = np.asarray(judge.excess)
-        status[(status == LocationStatus.MISFIT) & (excess > _OUTSIDE)] = LocationStatus.OUTSIDE
+        excess = np.asarray(likelihood_estimate.excess)
+        status[(status == LocationStatus.MISFIT) & (excess > _MIN_OUTSIDE_EXCESS)] = LocationStatus.OUTSIDE
         return status, result
 
-    for changes in others:
+    for changes in possible_changes:
         status, result = locate_with(changes)
-        if np.mean(status != LocationStatus.MISFIT) > _EXPLAINED:
+        if np.mean(status != LocationStatus.MISFIT) > _MIN_EXPLAINED:
             return status, result, changes
-    return *locate_with(last), last
+    return *locate_with(last_changes), last_changes
 
 
 def _initial_status(most_likely: SourceEstimate, estimate: SourceEstimate) -> np.ndarray:
@@ -187,12 +191,12 @@ def _initial_status(most_likely: SourceEstimate, estimate: SourceEstimate) -> np
     estimates, which determine the status; `estimate`: estimates of the selected method."""
     misfit, freedom = np.asarray(most_likely.misfit), np.asarray(most_likely.freedom)
     excess = np.asarray(most_likely.excess)
-    rivalled = np.asarray(most_likely.rival) < _RIVAL
-    status = np.where(rivalled, LocationStatus.AMBIGUOUS, LocationStatus.TOUCH).astype(object)
+    has_rival = np.asarray(most_likely.rival) < _MAX_AMBIGUOUS_DIFFERENCE
+    status = np.where(has_rival, LocationStatus.AMBIGUOUS, LocationStatus.TOUCH).astype(object)
     status[_exceeds_noise(misfit, freedom)] = LocationStatus.MISFIT
     # A frame is "outside" if a source beyond the outline explains it, and is clearly better than any source inside. Two
     # sources are not explained by one source beyond the outline.
-    status[(excess > _OUTSIDE) & ~_exceeds_noise(misfit - excess, freedom)] = LocationStatus.OUTSIDE
+    status[(excess > _MIN_OUTSIDE_EXCESS) & ~_exceeds_noise(misfit - excess, freedom)] = LocationStatus.OUTSIDE
     status[~np.isfinite(np.asarray(estimate.position)).all(axis=1)] = LocationStatus.UNUSABLE
     return status
 
@@ -212,36 +216,49 @@ def _fit_two_sources(
 ) -> None:
     """Fit two sources to the frames that one source does not explain, and enlarge the covariances of the frames that
     two sources do not explain either. Modifies `status` and `result` in place."""
-    tried = np.flatnonzero((status == LocationStatus.MISFIT) & (use.sum(axis=1) > 6))
-    if tried.size:
-        two = locate_two(microphone_array, *_pad_frames(power[tried], use[tried], compiled), compiled=compiled)
-        misfit, freedom = np.asarray(two.misfit)[: tried.size], np.asarray(two.freedom)[: tried.size]
-        stronger, weaker = np.asarray(two.strength)[: tried.size].T
-        much_better = (misfit < _MOST_MISFIT_RATIO * result["misfit"][tried]) & (misfit < _MOST_MISFIT * freedom)
-        both = (~_exceeds_noise(misfit, freedom) | much_better) & (weaker > _WEAKEST * stronger)
-        chosen, index = tried[both], np.flatnonzero(both)
-        status[chosen] = LocationStatus.TWO_TOUCHES
-        result["misfit"][chosen], result["freedom"][chosen] = misfit[both], freedom[both]
-        position, strength = np.asarray(two.position)[index], np.asarray(two.strength)[index]
-        result["position"][chosen], result["second"][chosen] = position[:, 0], position[:, 1]
-        result["strength"][chosen], result["second_strength"][chosen] = strength.T
-        result["covariance"][chosen] = np.asarray(two.covariance)[index, 0]
-    left = np.flatnonzero(status == LocationStatus.MISFIT)
-    wide = result["misfit"][left] / np.maximum(result["freedom"][left], 1)
-    result["covariance"][left] *= np.maximum(wide, 1.0)[:, None, None]
+    tried_frames = np.flatnonzero((status == LocationStatus.MISFIT) & (use.sum(axis=1) > 6))
+    if tried_frames.size:
+        two_sources = locate_two(
+            microphone_array, *_pad_frames(power[tried_frames], use[tried_frames], compiled), compiled=compiled
+        )
+        misfit, freedom = (
+            np.asarray(two_sources.misfit)[: tried_frames.size],
+            np.asarray(two_sources.freedom)[: tried_frames.size],
+        )
+        stronger, weaker = np.asarray(two_sources.strength)[: tried_frames.size].T
+        is_much_better = (misfit < _MAX_MISFIT_RATIO * result["misfit"][tried_frames]) & (
+            misfit < _MAX_MISFIT * freedom
+        )
+        is_accepted = (~_exceeds_noise(misfit, freedom) | is_much_better) & (weaker > _MIN_STRENGTH_RATIO * stronger)
+        accepted_frames, accepted_indices = tried_frames[is_accepted], np.flatnonzero(is_accepted)
+        status[accepted_frames] = LocationStatus.TWO_TOUCHES
+        result["misfit"][accepted_frames], result["freedom"][accepted_frames] = (
+            misfit[is_accepted],
+            freedom[is_accepted],
+        )
+        position, strength = (
+            np.asarray(two_sources.position)[accepted_indices],
+            np.asarray(two_sources.strength)[accepted_indices],
+        )
+        result["position"][accepted_frames], result["second"][accepted_frames] = position[:, 0], position[:, 1]
+        result["strength"][accepted_frames], result["second_strength"][accepted_frames] = strength.T
+        result["covariance"][accepted_frames] = np.asarray(two_sources.covariance)[accepted_indices, 0]
+    misfit_frames = np.flatnonzero(status == LocationStatus.MISFIT)
+    variance_factors = result["misfit"][misfit_frames] / np.maximum(result["freedom"][misfit_frames], 1)
+    result["covariance"][misfit_frames] *= np.maximum(variance_factors, 1.0)[:, None, None]
 
 
-def _limit_uncertainty(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> None:
+def _limit_uncertainty(status: np.ndarray, result: dict[str, np.ndarray], skin_size: float) -> None:
     """Mark touches as ambiguous if their standard deviation exceeds a fourth of the skin's size, and replace
     covariances that extend beyond the skin. Modifies `status` and `result` in place."""
-    located = np.isfinite(result["position"]).all(axis=1)
-    finite = np.isfinite(result["covariance"]).all(axis=(1, 2))
-    width = np.zeros(len(status))
-    width[finite] = np.sqrt(np.abs(np.linalg.eigvalsh(result["covariance"][finite])).max(axis=1))
-    vague = located & (status == LocationStatus.TOUCH) & (~finite | (width > reach / 4))
-    status[vague] = LocationStatus.AMBIGUOUS
-    boundless = located & (~finite | (width > reach))
-    result["covariance"][boundless] = (reach / 2) ** 2 * np.eye(result["covariance"].shape[1])
+    has_position = np.isfinite(result["position"]).all(axis=1)
+    is_finite = np.isfinite(result["covariance"]).all(axis=(1, 2))
+    deviation = np.zeros(len(status))
+    deviation[is_finite] = np.sqrt(np.abs(np.linalg.eigvalsh(result["covariance"][is_finite])).max(axis=1))
+    is_uncertain = has_position & (status == LocationStatus.TOUCH) & (~is_finite | (deviation > skin_size / 4))
+    status[is_uncertain] = LocationStatus.AMBIGUOUS
+    exceeds_skin = has_position & (~is_finite | (deviation > skin_size))
+    result["covariance"][exceeds_skin] = (skin_size / 2) ** 2 * np.eye(result["covariance"].shape[1])
 
 
 def _gain_note(changes: GainChanges) -> list[str]:
@@ -249,10 +266,10 @@ def _gain_note(changes: GainChanges) -> list[str]:
     factor = np.exp(changes.logarithm)
     if (factor == 1).all():
         return []
-    most = int(np.abs(changes.logarithm).argmax())
+    most_changed = int(np.abs(changes.logarithm).argmax())
     return [
         "gains have changed since the calibration, and the places are corrected for it: most that of microphone "
-        f"{most}, by {100 * (factor[most] - 1):+.0f} % of its intensity."
+        f"{most_changed}, by {100 * (factor[most_changed] - 1):+.0f} % of its intensity."
     ]
 
 
@@ -262,24 +279,24 @@ def _setup_notes(
     """Notes on changes of the setup since the calibration, which are searched for if one source does not explain many
     of the frames."""
     notes = []
-    placed = ~np.isin(status, [LocationStatus.NO_TOUCH, LocationStatus.UNUSABLE])
-    odd = np.isin(status, [LocationStatus.MISFIT, LocationStatus.OUTSIDE, LocationStatus.TWO_TOUCHES])
-    if odd.sum() > _MOST_UNEXPLAINED * placed.sum():
-        exchanged, altered = find_setup_changes(microphone_array, intensities.power[placed], use[placed])
+    has_touch = ~np.isin(status, [LocationStatus.NO_TOUCH, LocationStatus.UNUSABLE])
+    is_unexplained = np.isin(status, [LocationStatus.MISFIT, LocationStatus.OUTSIDE, LocationStatus.TWO_TOUCHES])
+    if is_unexplained.sum() > _MAX_UNEXPLAINED * has_touch.sum():
+        exchanged, altered = find_setup_changes(microphone_array, intensities.power[has_touch], use[has_touch])
         notes += [
-            f"microphones {one} and {other} look exchanged since the calibration: exchanged back, their intensities "
-            "fit one source. The places are not corrected: exchange the channels and locate again."
-            for one, other in exchanged
+            f"microphones {microphone} and {other_microphone} look exchanged since the calibration: exchanged back, "
+            "their intensities fit one source. The places are not corrected: exchange the channels and locate again."
+            for microphone, other_microphone in exchanged
         ]
         notes += [
-            f"microphone {one} does not measure as when it was calibrated: without it, one source explains the others. "
-            "The places are not corrected: make its channel NaN and locate again, or calibrate anew."
-            for one in altered
+            f"microphone {microphone} does not measure as when it was calibrated: without it, one source explains the "
+            "others. The places are not corrected: make its channel NaN and locate again, or calibrate anew."
+            for microphone in altered
         ]
         if (
             not exchanged
             and not altered
-            and (status == LocationStatus.MISFIT).sum() > 2 * _MOST_UNEXPLAINED * placed.sum()
+            and (status == LocationStatus.MISFIT).sum() > 2 * _MAX_UNEXPLAINED * has_touch.sum()
         ):
             notes.append("most touches fit no single source: is this the calibration of this array?")
     return notes
@@ -288,21 +305,25 @@ def _setup_notes(
 def _unit_note(strength: np.ndarray, intensities: Intensities, use: np.ndarray, calibration: Calibration) -> list[str]:
     """Return a note if the intensities differ by orders of magnitude from those of the calibration, which suggests
     another gain or unit."""
-    asked = "do the recording and the taps have the same gain and unit?"
+    question = "do the recording and the taps have the same gain and unit?"
     if np.isfinite(strength).any():
-        typical = float(np.nanmedian(strength))
-        ratio = typical / np.clip(typical, *(calibration.strengths or (typical, typical)))
-        if max(ratio, 1 / ratio) > _MOST_STRENGTH_RATIO:
-            return [f"touches are {ratio:.3g} times as strong as the calibration's taps: {asked}"]
+        median_strength = float(np.nanmedian(strength))
+        ratio = median_strength / np.clip(
+            median_strength, *(calibration.strengths or (median_strength, median_strength))
+        )
+        if max(ratio, 1 / ratio) > _MAX_STRENGTH_RATIO:
+            return [f"touches are {ratio:.3g} times as strong as the calibration's taps: {question}"]
         return []
     # Without a touch and without a known floor, the intensities are compared with the noise of the calibration.
     deviation = np.asarray(calibration.microphone_array.noise.deviation)
-    known = use.any(axis=0) & (deviation > 0)
-    if intensities.floor.any() or not known.any():
+    has_noise = use.any(axis=0) & (deviation > 0)
+    if intensities.floor.any() or not has_noise.any():
         return []
-    ratio = float(np.median(np.where(use, np.abs(intensities.power), 0.0).max(axis=0)[known] / deviation[known]))
-    low = ratio < 1 / _MOST_STRENGTH_RATIO
-    return [f"the sound is {ratio:.3g} times as loud as the calibration's noise: {asked}"] if low else []
+    ratio = float(
+        np.median(np.where(use, np.abs(intensities.power), 0.0).max(axis=0)[has_noise] / deviation[has_noise])
+    )
+    is_quiet = ratio < 1 / _MAX_STRENGTH_RATIO
+    return [f"the sound is {ratio:.3g} times as loud as the calibration's noise: {question}"] if is_quiet else []
 
 
 def microphones_in_use(
@@ -315,7 +336,7 @@ def microphones_in_use(
     """
     use = np.asarray(intensities.usable) & calibration.usable
     faults = tuple(
-        "; ".join(part for part in (fault, reason and f"not calibrated: {reason}") if part)
+        "; ".join(text for text in (fault, reason and f"not calibrated: {reason}") if text)
         for fault, reason in zip(intensities.faults, calibration.reasons, strict=True)
     )
     if use.any(axis=0).sum() < 3:
@@ -323,20 +344,27 @@ def microphones_in_use(
             f"'{intensities.name}': {use.any(axis=0).sum()} of {len(faults)} microphones can be used, and three are "
             f"needed to locate a touch. {describe_faults(faults)}."
         )
-    known = calibration.microphone_array.noise
+    calibrated_noise = calibration.microphone_array.noise
     if np.any(intensities.floor > 0):
         noise = IntensityNoise.create(
-            len(faults), floor=intensities.floor, freedom=intensities.freedom, relative=np.asarray(known.relative)
+            len(faults),
+            floor=intensities.floor,
+            freedom=intensities.freedom,
+            relative=np.asarray(calibrated_noise.relative),
         )
     else:
         # Negative intensities are due to noise, which may be larger than in the calibration.
-        wider = np.maximum(noise_from_negative_powers(intensities.power, use), np.asarray(known.deviation))
+        deviation = np.maximum(
+            noise_from_negative_powers(intensities.power, use), np.asarray(calibrated_noise.deviation)
+        )
         noise = eqx.tree_at(
-            lambda n: (n.deviation, n.floor),
-            known,
+            lambda tree: (tree.deviation, tree.floor),
+            calibrated_noise,
             (
-                as_array(wider),
-                as_array(np.maximum(known.floor, IntensityNoise.create(len(wider), deviation=wider).floor)),
+                as_array(deviation),
+                as_array(
+                    np.maximum(calibrated_noise.floor, IntensityNoise.create(len(deviation), deviation=deviation).floor)
+                ),
             ),
         )
     return (
@@ -350,18 +378,20 @@ def _detected_frames(intensities: Intensities, noise: IntensityNoise, use: np.nd
     """Mask of the frames in which the intensity of at least one microphone exceeds the detection threshold."""
     power = np.where(use, intensities.power, -np.inf)
     if np.any(intensities.floor > 0) and np.isfinite(intensities.freedom):
-        least = intensities.floor * (chdtri(intensities.freedom, _FALSE_ALARM / use.shape[1]) / intensities.freedom - 1)
+        threshold = intensities.floor * (
+            chdtri(intensities.freedom, _FALSE_ALARM / use.shape[1]) / intensities.freedom - 1
+        )
     else:
         loudest = power.max(initial=0.0)
-        least = np.maximum(_ALARM_DEVIATIONS * np.asarray(noise.deviation), _DYNAMIC_RANGE * loudest)
-    return np.asarray((power > least).any(axis=1))
+        threshold = np.maximum(_ALARM_DEVIATIONS * np.asarray(noise.deviation), _DYNAMIC_RANGE * loudest)
+    return np.asarray((power > threshold).any(axis=1))
 
 
 def _pad_frames(power: np.ndarray, use: np.ndarray, compiled: bool) -> tuple[np.ndarray, np.ndarray]:
     """Repeat the last frame up to a round number of frames if `compiled`, so that few sizes are compiled."""
     if not compiled:
         return power, use
-    number = len(power)
-    round_number = max(64, 1 << (number - 1).bit_length()) if number <= 1024 else -(-number // 1024) * 1024
-    index = np.minimum(np.arange(round_number), number - 1)
+    num_frames = len(power)
+    num_padded = max(64, 1 << (num_frames - 1).bit_length()) if num_frames <= 1024 else -(-num_frames // 1024) * 1024
+    index = np.minimum(np.arange(num_padded), num_frames - 1)
     return power[index], use[index]

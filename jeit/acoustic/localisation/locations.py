@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from jeit_solvers.module import Module
 
 # Number of frames up to which a computation with NumPy is faster than compiling it.
-FEW_FRAMES = 1024
+MAX_NUMPY_FRAMES = 1024
 
 
 class LocationStatus(StrEnum):

@@ -13,7 +13,7 @@ from jeit_solvers.module import Module
 
 # Condition for a minimisation from the second valley: its value is less than this factor times the value of the best
 # valley, plus this offset. On rasters with more than this number of pixels, only the best valley is used.
-_WORTH_FACTOR, _WORTH_OFFSET, _MOST_PIXELS = 1.5, 8.0, 2000
+_SECOND_VALLEY_FACTOR, _SECOND_VALLEY_OFFSET, _MAX_VALLEY_PIXELS = 1.5, 8.0, 2000
 
 
 class Pixels(Module):
@@ -32,10 +32,12 @@ class Pixels(Module):
     def create(cls, surface, columns: int, rows: int) -> "Pixels":
         """Create a raster of rows × columns pixels, bottom row first. Raises `ValueError` if no pixel lies inside the
         outline."""
-        grid, within = chart_grid(surface, columns, rows)
-        if not within.any():
+        centres, is_inside = chart_grid(surface, columns, rows)
+        if not is_inside.any():
             raise ValueError(f"shape: none of {columns} × {rows} pixels has its middle inside the outline; take more.")
-        return cls(as_array(grid.reshape(2, -1)), as_array(within.ravel()), (rows, columns), bool(within.all()))
+        return cls(
+            as_array(centres.reshape(2, -1)), as_array(is_inside.ravel()), (rows, columns), bool(is_inside.all())
+        )
 
 
 def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Array]:
@@ -48,29 +50,35 @@ def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Ar
     inside, xp = pixels.inside.reshape(rows, columns), namespace(maps, pixels)
 
     def fill_outside(values, inside):
-        known = ~xp.isnan(values) if pixels.full else inside & ~xp.isnan(values)
-        return xp.where(known, values, xp.inf)
+        is_valid = ~xp.isnan(values) if pixels.full else inside & ~xp.isnan(values)
+        return xp.where(is_valid, values, xp.inf)
 
     # The row of the minimum is found first, and then the pixel in the row, which is faster than a single search.
-    square = maps.reshape(-1, rows, columns)
-    row = xp.argmin(xp.min(fill_outside(square, inside), axis=2), axis=1)
-    in_row = fill_outside(xp.take_along_axis(square, row[:, None, None], axis=1)[:, 0], inside[row])
-    best = row * columns + xp.argmin(in_row, axis=1)
-    first = pixels.chart[:, best]
-    if rows * columns > _MOST_PIXELS:  # fine rasters have spurious local minima
-        return first, first, xp.zeros(best.shape, bool)
-    square = fill_outside(square, inside)
-    values = square.reshape(len(best), -1)
-    wide = xp.pad(square, ((0, 0), (1, 1), (1, 1)), constant_values=xp.inf)
-    around = [wide[:, i : i + rows, j : j + columns] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
-    lowest = xp.isfinite(square)
-    for neighbour in around:
-        lowest &= square <= neighbour
-    lowest = set_at(lowest.reshape(values.shape), (xp.arange(len(best)), best), False)
-    rivals = xp.where(lowest, values, xp.inf)
-    other = xp.argmin(rivals, axis=1)
-    least, second = xp.min(values, axis=1), xp.min(rivals, axis=1)
-    return first, pixels.chart[:, other], second < _WORTH_FACTOR * least + _WORTH_OFFSET
+    rasters = maps.reshape(-1, rows, columns)
+    best_rows = xp.argmin(xp.min(fill_outside(rasters, inside), axis=2), axis=1)
+    row_values = fill_outside(xp.take_along_axis(rasters, best_rows[:, None, None], axis=1)[:, 0], inside[best_rows])
+    best_pixels = best_rows * columns + xp.argmin(row_values, axis=1)
+    best_chart = pixels.chart[:, best_pixels]
+    if rows * columns > _MAX_VALLEY_PIXELS:  # fine rasters have spurious local minima
+        return best_chart, best_chart, xp.zeros(best_pixels.shape, bool)
+    rasters = fill_outside(rasters, inside)
+    values = rasters.reshape(len(best_pixels), -1)
+    padded_rasters = xp.pad(rasters, ((0, 0), (1, 1), (1, 1)), constant_values=xp.inf)
+    neighbours = [
+        padded_rasters[:, i : i + rows, j : j + columns] for i in range(3) for j in range(3) if (i, j) != (1, 1)
+    ]
+    is_minimum = xp.isfinite(rasters)
+    for neighbour in neighbours:
+        is_minimum &= rasters <= neighbour
+    is_minimum = set_at(is_minimum.reshape(values.shape), (xp.arange(len(best_pixels)), best_pixels), False)
+    other_minima = xp.where(is_minimum, values, xp.inf)
+    second_pixels = xp.argmin(other_minima, axis=1)
+    best_values, second_values = xp.min(values, axis=1), xp.min(other_minima, axis=1)
+    return (
+        best_chart,
+        pixels.chart[:, second_pixels],
+        second_values < _SECOND_VALLEY_FACTOR * best_values + _SECOND_VALLEY_OFFSET,
+    )
 
 
 def map_brightness(
@@ -105,16 +113,19 @@ def map_brightness(
         raise ValueError(f"method must be likelihood or consistency; it is {method!r}.")
     if not 0 < share < 1:
         raise ValueError(f"share must be between 0 and 1; it is {share}.")
-    flat = np.where(np.isnan(values), np.inf, values).reshape(len(values), -1)
-    least = flat.min(axis=1, keepdims=True)
-    known = np.isfinite(least)
-    least = np.where(known, least, 0.0)
+    flat_maps = np.where(np.isnan(values), np.inf, values).reshape(len(values), -1)
+    minimum = flat_maps.min(axis=1, keepdims=True)
+    has_minimum = np.isfinite(minimum)
+    minimum = np.where(has_minimum, minimum, 0.0)
     scale = 1.0
     if method == "consistency":
-        rank = max(1, int(share * np.isfinite(flat).sum(axis=1).max(initial=1)))
-        scale = np.partition(flat, min(rank, flat.shape[1] - 1), axis=1)[:, [min(rank, flat.shape[1] - 1)]] - least
+        rank = max(1, int(share * np.isfinite(flat_maps).sum(axis=1).max(initial=1)))
+        scale = (
+            np.partition(flat_maps, min(rank, flat_maps.shape[1] - 1), axis=1)[:, [min(rank, flat_maps.shape[1] - 1)]]
+            - minimum
+        )
         scale = np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
-    return np.where(known, np.exp(-(flat - least) / scale), 0.0).reshape(values.shape)
+    return np.where(has_minimum, np.exp(-(flat_maps - minimum) / scale), 0.0).reshape(values.shape)
 
 
 def overlay_images(
@@ -140,26 +151,30 @@ def overlay_images(
     faded = overlay_images(bright, times=[0.0, 0.1])
     ```
     """
-    frames, when = np.nan_to_num(np.asarray(images, float)), np.asarray(times, float)
-    if frames.ndim != 3 or when.shape != (len(frames),) or not len(frames):
-        raise ValueError(f"images has shape {frames.shape} and times {when.shape}; give (F, rows, columns) and (F,).")
-    if not (np.diff(when) > 0).all():
+    frames, frame_times = np.nan_to_num(np.asarray(images, float)), np.asarray(times, float)
+    if frames.ndim != 3 or frame_times.shape != (len(frames),) or not len(frames):
+        raise ValueError(
+            f"images has shape {frames.shape} and times {frame_times.shape}; give (F, rows, columns) and (F,)."
+        )
+    if not (np.diff(frame_times) > 0).all():
         raise ValueError("times must increase, in seconds.")
     if not (np.isfinite(time_constant) and time_constant > 0):
         raise ValueError(f"time_constant must be positive, in seconds; it is {time_constant}.")
     result = np.empty_like(frames)
-    left = np.zeros_like(frames[0])
-    for number, fade in enumerate(np.exp(-np.diff(when, prepend=when[0]) / time_constant)):
-        left = np.maximum(fade * left, frames[number])
-        result[number] = left
+    overlay = np.zeros_like(frames[0])
+    for frame_index, fade_factor in enumerate(np.exp(-np.diff(frame_times, prepend=frame_times[0]) / time_constant)):
+        overlay = np.maximum(fade_factor * overlay, frames[frame_index])
+        result[frame_index] = overlay
     return result
 
 
-def fade(images: ArrayLike, times: ArrayLike, *, at: float, time_constant: float) -> Float[np.ndarray, "rows columns"]:
-    """Compute the last image (rows, columns) of `overlay_images` only, as seen at the time `at` in seconds.
+def last_overlay_image(
+    images: ArrayLike, times: ArrayLike, *, time: float, time_constant: float
+) -> Float[np.ndarray, "rows columns"]:
+    """Compute only the last image (rows, columns) of `overlay_images`, for the time `time` in seconds.
 
     A long recording can be processed in parts: the image of the whole is the maximum of the images of its parts.
     """
-    age = np.maximum(at - np.asarray(times, float), 0.0)
+    age = np.maximum(time - np.asarray(times, float), 0.0)
     weight = np.exp(-age / time_constant)
     return np.max(np.nan_to_num(np.asarray(images, float)) * weight[:, None, None], axis=0)

@@ -15,11 +15,11 @@ from jeit.acoustic.microphones import MicrophoneArray
 # Number of the loudest frames that are used; misfit per degree of freedom above which changes are searched for; value
 # at which the misfit per degree of freedom is clipped; maximum ratio of the misfits after and before an accepted
 # change.
-_FRAMES, _WRONG, _MOST, _BETTER = 24, 3.0, 100.0, 0.7
+_NUM_FRAMES, _LARGE_MISFIT, _MAX_MISFIT, _MAX_MISFIT_RATIO = 24, 3.0, 100.0, 0.7
 # Maximum number of changes that are searched for.
-_MOST_CHANGES = 4
+_MAX_CHANGES = 4
 # A single microphone is left out for a test only if more than this number of microphones remain.
-_LEAST_LEFT = 5
+_MIN_REMAINING = 5
 
 
 class SetupChanges(NamedTuple):
@@ -44,51 +44,55 @@ def find_setup_changes(
     most, so it finds several changes only if each of them alone lowers the misfit. No changes are returned for fewer
     than three frames, if one source explains the frames without a change, or if no change explains them.
     """
-    loudest = np.argsort(-np.where(use, power, 0.0).sum(axis=1))[:_FRAMES]
+    loudest_frames = np.argsort(-np.where(use, power, 0.0).sum(axis=1))[:_NUM_FRAMES]
     changes = SetupChanges([], [])
-    if len(loudest) < 3:
+    if len(loudest_frames) < 3:
         return changes
-    loudest = loudest[np.arange(_FRAMES) % len(loudest)]
-    power, use = np.where(use, power, 0.0)[loudest], use[loudest]
+    loudest_frames = loudest_frames[np.arange(_NUM_FRAMES) % len(loudest_frames)]
+    power, use = np.where(use, power, 0.0)[loudest_frames], use[loudest_frames]
     localiser = Localiser.create(microphone_array)
 
-    def misfit(tried: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    def mean_misfit(states: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         """Mean misfit per degree of freedom for each candidate, given by the order and the mask of the channels."""
-        found = localiser(
-            np.concatenate([power[:, order] for order, _ in tried]),
-            np.concatenate([use[:, order] & kept for order, kept in tried]),
+        estimates = localiser(
+            np.concatenate([power[:, order] for order, _ in states]),
+            np.concatenate([use[:, order] & mask for order, mask in states]),
         )
-        ratio = np.asarray(found.misfit) / np.maximum(np.asarray(found.freedom), 1)
-        return np.minimum(np.nan_to_num(ratio, nan=_MOST), _MOST).reshape(len(tried), -1).mean(axis=1)
+        ratio = np.asarray(estimates.misfit) / np.maximum(np.asarray(estimates.freedom), 1)
+        return np.minimum(np.nan_to_num(ratio, nan=_MAX_MISFIT), _MAX_MISFIT).reshape(len(states), -1).mean(axis=1)
 
     state = np.arange(power.shape[1]), np.ones(power.shape[1], bool)
-    now = float(misfit([state])[0])
-    left = np.flatnonzero(use.any(axis=0))
-    while now > _WRONG and len(changes.exchanged) + len(changes.altered) < _MOST_CHANGES and left.size:
+    current_misfit = float(mean_misfit([state])[0])
+    remaining = np.flatnonzero(use.any(axis=0))
+    while (
+        current_misfit > _LARGE_MISFIT
+        and len(changes.exchanged) + len(changes.altered) < _MAX_CHANGES
+        and remaining.size
+    ):
         # Altered microphones come first among the candidates, since exchanging an altered microphone may lower the
         # misfit too.
-        singles = [(int(k),) for k in left if left.size > _LEAST_LEFT]
-        candidates = singles + [(int(k), int(m)) for k, m in combinations(left, 2)]
-        tried = [_apply_change(state, which) for which in candidates]
-        values = misfit(tried)
-        best = int(values.argmin())
-        if not values[best] < _BETTER * now:
+        singles = [(int(k),) for k in remaining if remaining.size > _MIN_REMAINING]
+        candidates = singles + [(int(k), int(m)) for k, m in combinations(remaining, 2)]
+        candidate_states = [_apply_change(state, channels) for channels in candidates]
+        misfits = mean_misfit(candidate_states)
+        best_index = int(misfits.argmin())
+        if not misfits[best_index] < _MAX_MISFIT_RATIO * current_misfit:
             break
-        now, state = float(values[best]), tried[best]
-        which = candidates[best]
-        if len(which) == 2:
-            changes.exchanged.append((which[0], which[1]))
+        current_misfit, state = float(misfits[best_index]), candidate_states[best_index]
+        channels = candidates[best_index]
+        if len(channels) == 2:
+            changes.exchanged.append((channels[0], channels[1]))
         else:
-            changes.altered.append(which[0])
-        left = left[~np.isin(left, which)]
-    return changes if now <= _WRONG else SetupChanges([], [])
+            changes.altered.append(channels[0])
+        remaining = remaining[~np.isin(remaining, channels)]
+    return changes if current_misfit <= _LARGE_MISFIT else SetupChanges([], [])
 
 
 def _apply_change(state: tuple[np.ndarray, np.ndarray], channels: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return the order and the mask of the channels after exchanging two channels, or leaving out one."""
-    order, kept = (part.copy() for part in state)
+    order, mask = (array.copy() for array in state)
     if len(channels) == 2:
         order[list(channels)] = order[list(channels[::-1])]
     else:
-        kept[channels[0]] = False
-    return order, kept
+        mask[channels[0]] = False
+    return order, mask

@@ -17,7 +17,7 @@ from jeit_solvers.engines import at_once, has_values, namespace, on_device, on_h
 from jeit_solvers.module import Module
 
 # Approximate number of grid positions, all pairs of which are screened; number of pairs that are refined.
-_PLACES, _STARTS = 150, 3
+_NUM_PIXELS, _NUM_STARTS = 150, 3
 
 
 class TwoSources(Module):
@@ -60,16 +60,16 @@ def locate_two(
     print(pair.position.shape)
     ```
     """
-    at_hand = not compiled and np.size(power) > 0 and has_values(microphone_array, power, use)
-    xp = np if at_hand else jnp
+    use_numpy = not compiled and np.size(power) > 0 and has_values(microphone_array, power, use)
+    xp = np if use_numpy else jnp
     power = xp.asarray(power, float)
     use = xp.isfinite(power) if use is None else xp.isfinite(power) & xp.asarray(use, bool)
     low, high = bounding_box(on_host(microphone_array.surface))
-    spacing = np.sqrt(np.prod(high - low) / _PLACES)
+    spacing = np.sqrt(np.prod(high - low) / _NUM_PIXELS)
     columns, rows = (max(3, round(side / spacing)) for side in high - low)
     pixels = Pixels.create(microphone_array.surface, columns, rows)
     arguments = microphone_array, pixels, power.T, use.T
-    return on_device(at_once(_locate_two, *arguments)) if at_hand else jax.jit(_locate_two)(*arguments)
+    return on_device(at_once(_locate_two, *arguments)) if use_numpy else jax.jit(_locate_two)(*arguments)
 
 
 def _locate_two(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -> TwoSources:
@@ -82,42 +82,45 @@ def _locate_two(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -
         power, use = frame
         return None, _best_pairs(power, use, response, pixels, microphone_array)
 
-    _, starts = scan(screen, None, (power.T, use.T))
-    start = starts.transpose(2, 1, 0).reshape(6, -1)  # (6, starts · F)
+    _, pair_unknowns = scan(screen, None, (power.T, use.T))
+    start = pair_unknowns.transpose(2, 1, 0).reshape(6, -1)  # (6, starts · F)
     low, high = bounding_box(microphone_array.surface)
-    reach = longer_side(microphone_array.surface)
-    far = xp.full(1, xp.inf)
-    found = minimise_small(
-        lambda x, data: Likelihood(data[0], data[1], data[2], microphone_array).expand(x),
+    skin_size = longer_side(microphone_array.surface)
+    no_bound = xp.full(1, xp.inf)
+    minimum = minimise_small(
+        lambda unknowns, data: Likelihood(data[0], data[1], data[2], microphone_array).expand(unknowns),
         start,
-        jax.tree.map(lambda array: xp.tile(array, _STARTS), likelihood.frames),
-        lower=xp.concatenate([low, -far, low, -far])[:, None],
-        upper=xp.concatenate([high, far, high, far])[:, None],
-        largest_step=xp.tile(xp.array([0.1, 0.1, 2.3]) * xp.array([reach, reach, 1.0]), 2)[:, None],
+        jax.tree.map(lambda array: xp.tile(array, _NUM_STARTS), likelihood.frames),
+        lower=xp.concatenate([low, -no_bound, low, -no_bound])[:, None],
+        upper=xp.concatenate([high, no_bound, high, no_bound])[:, None],
+        largest_step=xp.tile(xp.array([0.1, 0.1, 2.3]) * xp.array([skin_size, skin_size, 1.0]), 2)[:, None],
         max_steps=60,
         tolerance=1e-10,
     )
-    frames = power.shape[1]
-    value = xp.where(xp.isfinite(found.value), found.value, xp.inf).reshape(_STARTS, frames)
-    best = xp.argmin(value, axis=0) * frames + xp.arange(frames)
-    x, converged = found.x[:, best], found.converged[best]
-    x = xp.where(x[5] > x[2], xp.roll(x, 3, axis=0), x)
-    _, _, matrix = likelihood.expand(x)
-    spread = inverse_small(matrix)
-    number = xp.sum(use, axis=0)
-    known = (number >= 6) & xp.isfinite(xp.min(value, axis=0))
-    each = [to_space(microphone_array.surface, x[k : k + 2], spread[k : k + 2, k : k + 2]) for k in (0, 3)]
+    num_frames = power.shape[1]
+    values = xp.where(xp.isfinite(minimum.value), minimum.value, xp.inf).reshape(_NUM_STARTS, num_frames)
+    best_indices = xp.argmin(values, axis=0) * num_frames + xp.arange(num_frames)
+    unknowns, converged = minimum.x[:, best_indices], minimum.converged[best_indices]
+    unknowns = xp.where(unknowns[5] > unknowns[2], xp.roll(unknowns, 3, axis=0), unknowns)
+    _, _, matrix = likelihood.expand(unknowns)
+    unknowns_covariance = inverse_small(matrix)
+    num_used = xp.sum(use, axis=0)
+    has_positions = (num_used >= 6) & xp.isfinite(xp.min(values, axis=0))
+    sources = [
+        to_space(microphone_array.surface, unknowns[k : k + 2], unknowns_covariance[k : k + 2, k : k + 2])
+        for k in (0, 3)
+    ]
 
-    def frames_first(array):
-        return xp.where(known.reshape(-1, *(1,) * (array.ndim - 1)), array, xp.nan)
+    def mask_unlocated(array):
+        return xp.where(has_positions.reshape(-1, *(1,) * (array.ndim - 1)), array, xp.nan)
 
     return TwoSources(
-        position=frames_first(xp.stack([place for place, _ in each], axis=1)),
-        covariance=frames_first(xp.stack([covariance for _, covariance in each], axis=1)),
-        strength=frames_first(xp.exp(x[2::3]).T),
-        misfit=frames_first(likelihood.misfit(x)),
-        freedom=xp.maximum(number - 6, 0),
-        converged=converged & known,
+        position=mask_unlocated(xp.stack([position for position, _ in sources], axis=1)),
+        covariance=mask_unlocated(xp.stack([covariance for _, covariance in sources], axis=1)),
+        strength=mask_unlocated(xp.exp(unknowns[2::3]).T),
+        misfit=mask_unlocated(likelihood.misfit(unknowns)),
+        freedom=xp.maximum(num_used - 6, 0),
+        converged=converged & has_positions,
     )
 
 
@@ -129,24 +132,30 @@ def _best_pairs(power, use, response, pixels: Pixels, microphone_array: Micropho
     # The unit of intensities is arbitrary, so they are divided by the highest intensity of the frame.
     scale = xp.max(xp.where(use, power, 0.0))
     weight = weight * scale**2
-    seen = xp.where(use, power, 0.0) / scale
+    scaled_power = xp.where(use, power, 0.0) / scale
     gram = (weight[:, None] * response).T @ response
-    moment = (weight * seen) @ response
-    own = xp.diag(gram)
-    determinant = own[:, None] * own - gram**2
-    first = (own * moment[:, None] - gram * moment) / determinant
-    second = first.T
-    both = (first > 0) & (second > 0) & (determinant > 1e-9 * own[:, None] * own)
-    both = both & pixels.inside[:, None] & pixels.inside
-    gained = xp.where(both, first * moment[:, None] + second * moment, -xp.inf)
+    moment = (weight * scaled_power) @ response
+    diagonal = xp.diag(gram)
+    determinant = diagonal[:, None] * diagonal - gram**2
+    first_strengths = (diagonal * moment[:, None] - gram * moment) / determinant
+    second_strengths = first_strengths.T
+    is_valid = (first_strengths > 0) & (second_strengths > 0) & (determinant > 1e-9 * diagonal[:, None] * diagonal)
+    is_valid = is_valid & pixels.inside[:, None] & pixels.inside
+    residual_decrease = xp.where(is_valid, first_strengths * moment[:, None] + second_strengths * moment, -xp.inf)
     chart = pixels.chart
-    apart = xp.linalg.norm(chart[:, :, None] - chart[:, None], axis=0)
-    near = apart < 1.6 * xp.sort(apart[0])[1]
+    distances = xp.linalg.norm(chart[:, :, None] - chart[:, None], axis=0)
+    is_neighbour = distances < 1.6 * xp.sort(distances[0])[1]
     pairs = []
-    for _ in range(_STARTS):
-        one, other = xp.unravel_index(xp.argmax(gained), gained.shape)
-        strengths = xp.log(xp.maximum(scale * xp.stack([first[one, other], second[one, other]]), 1e-300))
-        pairs.append(xp.stack([*chart[:, one], strengths[0], *chart[:, other], strengths[1]]))
-        same = near[one][:, None] & near[other]
-        gained = xp.where(same | same.T, -xp.inf, gained)
+    for _ in range(_NUM_STARTS):
+        first_index, second_index = xp.unravel_index(xp.argmax(residual_decrease), residual_decrease.shape)
+        log_strengths = xp.log(
+            xp.maximum(
+                scale
+                * xp.stack([first_strengths[first_index, second_index], second_strengths[first_index, second_index]]),
+                1e-300,
+            )
+        )
+        pairs.append(xp.stack([*chart[:, first_index], log_strengths[0], *chart[:, second_index], log_strengths[1]]))
+        is_similar = is_neighbour[first_index][:, None] & is_neighbour[second_index]
+        residual_decrease = xp.where(is_similar | is_similar.T, -xp.inf, residual_decrease)
     return xp.stack(pairs)

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import ArrayLike
 
-from jeit.acoustic.plots.surface_view import FOUND, AnySurface, draw_legend, draw_surface, view_of
+from jeit.acoustic.plots.surface_view import ESTIMATE_COLOUR, AnySurface, draw_legend, draw_surface, view_of
 from jeit.arguments import check_kind, check_name
 from jeit.plot.axes import INK, SERIES_COLOURS, SERIES_MARKERS, axes_or_new, draw_horizontal_grid, soften_axes
 
@@ -53,21 +53,36 @@ def plot_position_errors(
     ```
     """
     view = view_of(surface, microphones)
-    place, guess = view.chart(true, "true"), view.chart(found, "found")
-    if place.shape != guess.shape:
-        raise ValueError(f"true has {len(place)} places and found {len(guess)}; give them pair by pair.")
-    there = np.isfinite(guess).all(axis=1)
-    error = 1e3 * np.linalg.norm(np.asarray(found, float) - np.asarray(true, float), axis=1)[there]
+    true_points, estimated_points = view.chart(true, "true"), view.chart(found, "found")
+    if true_points.shape != estimated_points.shape:
+        raise ValueError(
+            f"true has {len(true_points)} places and found {len(estimated_points)}; give them pair by pair."
+        )
+    has_estimate = np.isfinite(estimated_points).all(axis=1)
+    error = 1e3 * np.linalg.norm(np.asarray(found, float) - np.asarray(true, float), axis=1)[has_estimate]
     ax = axes_or_new(ax)
     handles = draw_surface(ax, view)
     ax.add_collection(
-        LineCollection(list(np.stack([place, guess], axis=1)[there]), colors=INK, linewidths=0.9, zorder=3)
+        LineCollection(
+            list(np.stack([true_points, estimated_points], axis=1)[has_estimate]), colors=INK, linewidths=0.9, zorder=3
+        )
     )
-    dot = {"marker": "o", "linestyle": "none", "markersize": 4.2}
-    handles += ax.plot(*place[there].T, color=INK, markeredgewidth=0, zorder=4, label="true", **dot)
-    if not there.all():
-        handles += ax.plot(*place[~there].T, color=INK, fillstyle="none", zorder=4, label="not found", **dot)
-    handles += ax.plot(*guess[there].T, color=FOUND, markeredgewidth=0, zorder=5, label="estimated", **dot)
+    marker_style = {"marker": "o", "linestyle": "none", "markersize": 4.2}
+    handles += ax.plot(
+        *true_points[has_estimate].T, color=INK, markeredgewidth=0, zorder=4, label="true", **marker_style
+    )
+    if not has_estimate.all():
+        handles += ax.plot(
+            *true_points[~has_estimate].T, color=INK, fillstyle="none", zorder=4, label="not found", **marker_style
+        )
+    handles += ax.plot(
+        *estimated_points[has_estimate].T,
+        color=ESTIMATE_COLOUR,
+        markeredgewidth=0,
+        zorder=5,
+        label="estimated",
+        **marker_style,
+    )
     draw_legend(ax, handles)
     if title is None:
         title = f"{error.mean():.1f} ± {error.std():.1f} mm" if error.size else "none found"
@@ -119,20 +134,20 @@ def plot_error_curve(
     if not 1 <= len(errors) <= len(SERIES_COLOURS):
         raise ValueError(f"errors has {len(errors)} methods; give 1 to {len(SERIES_COLOURS)}, {{name: errors}}.")
     check_name("statistic", statistic, _STATISTICS)
-    each = {name: _errors_in_millimetres(array, f"errors['{name}']", x.size) for name, array in errors.items()}
-    least = None if bound is None else _STATISTICS[statistic](_errors_in_millimetres(bound, "bound", x.size))
+    error_rows = {name: _errors_in_millimetres(array, f"errors['{name}']", x.size) for name, array in errors.items()}
+    bound_values = None if bound is None else _STATISTICS[statistic](_errors_in_millimetres(bound, "bound", x.size))
     order = np.argsort(x)
     ax = axes_or_new(ax, (5.8, 4.2))
     ax.set_yscale("log")
-    for (name, rows), colour, marker in zip(each.items(), SERIES_COLOURS, SERIES_MARKERS, strict=False):
-        line = {"color": colour, "marker": marker, "markersize": 5, "linewidth": 1.8, "zorder": 3}
-        ax.plot(x[order], _STATISTICS[statistic](rows)[order], label=name, **line)
+    for (name, rows), colour, marker in zip(error_rows.items(), SERIES_COLOURS, SERIES_MARKERS, strict=False):
+        line_style = {"color": colour, "marker": marker, "markersize": 5, "linewidth": 1.8, "zorder": 3}
+        ax.plot(x[order], _STATISTICS[statistic](rows)[order], label=name, **line_style)
         if rows.shape[1] > 1:
             low, high = np.nanquantile(rows, [0.25, 0.75], axis=1)
             ax.fill_between(x[order], low[order], high[order], color=colour, alpha=0.18, linewidth=0, zorder=2)
-    if least is not None:
+    if bound_values is not None:
         style = {"color": INK, "linewidth": 1.4, "linestyle": (0, (4, 3)), "zorder": 4}
-        ax.plot(x[order], least[order], label="Cramér-Rao bound", **style)
+        ax.plot(x[order], bound_values[order], label="Cramér-Rao bound", **style)
     ax.set_xlabel(quantity, color=INK)
     ax.set_ylabel({"rms": "RMS error (mm)"}.get(statistic, f"{statistic.capitalize()} error (mm)"), color=INK)
     ax.set_title(title or "")

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 
 from jeit.acoustic.calibration.calibrate import CalibrationFit
 from jeit.acoustic.plots.surface_view import (
-    FOUND,
+    ESTIMATE_COLOUR,
     HALO,
-    MICROPHONE,
+    MICROPHONE_COLOUR,
     AnySurface,
     View,
     draw_ellipse,
@@ -32,10 +32,10 @@ from jeit_solvers.engines import on_host
 
 # Dynamic range in decibels of the circles that show the received intensities: the circle of a microphone this far below
 # the loudest one has the minimum size.
-_RANGE = 30.0
+_DYNAMIC_RANGE = 30.0
 # Maximum of the colour scale above the minimum of the map: standard deviations ("likelihood"), decibels
 # ("consistency").
-_MOST = {"likelihood": 15.0, "consistency": 40.0}
+_MAX_COLOUR_VALUES = {"likelihood": 15.0, "consistency": 40.0}
 _MAP_LABELS = {
     "likelihood": "Standard deviations worse than the best place",
     "consistency": "Loss above the least (dB)",
@@ -106,18 +106,20 @@ def plot_loss_map(
         raise ValueError(f"values has shape {pixels.shape}; give (rows, columns) with at least one finite value.")
     check_name("method", method, _MAP_LABELS)
     view = view_of(surface, microphones)
-    number = len(view.microphones)
+    num_microphones = len(view.microphones)
     level = None if received is None else np.asarray(received, float)
-    if level is not None and level.shape != (number,):
-        raise ValueError(f"received has shape {level.shape}; give one for each of the {number} microphones.")
+    if level is not None and level.shape != (num_microphones,):
+        raise ValueError(f"received has shape {level.shape}; give one for each of the {num_microphones} microphones.")
     ax = axes_or_new(ax)
-    shown = _above_minimum(pixels, method)
-    most = min(float(np.nanmax(shown)), _MOST[method]) or 1.0
-    colours = colormaps[SEQUENTIAL + "_r"].copy()
-    colours.colorbar_extend = "max" if np.nanmax(shown) > most else "neither"  # pyright: ignore[reportAttributeAccessIssue]
-    drawn = ax.imshow(shown, extent=view.extent, origin="lower", interpolation="nearest", cmap=colours, clim=(0, most))
-    drawn.set_clip_path(outline_of(view), ax.transData)
-    handles = draw_surface(ax, view, microphones=level is None and number > 0)
+    map_values = _above_minimum(pixels, method)
+    max_value = min(float(np.nanmax(map_values)), _MAX_COLOUR_VALUES[method]) or 1.0
+    colour_map = colormaps[SEQUENTIAL + "_r"].copy()
+    colour_map.colorbar_extend = "max" if np.nanmax(map_values) > max_value else "neither"  # pyright: ignore[reportAttributeAccessIssue]
+    image = ax.imshow(
+        map_values, extent=view.extent, origin="lower", interpolation="nearest", cmap=colour_map, clim=(0, max_value)
+    )
+    image.set_clip_path(outline_of(view), ax.transData)
+    handles = draw_surface(ax, view, microphones=level is None and num_microphones > 0)
     if level is not None:
         handles.append(_draw_levels(ax, view.microphones, level))
     if marks is not None:
@@ -125,7 +127,7 @@ def plot_loss_map(
     draw_legend(ax, handles)
     ax.set_title(title or "")
     if colour_bar:
-        draw_colour_bar(ax, drawn, _MAP_LABELS[method])
+        draw_colour_bar(ax, image, _MAP_LABELS[method])
     return ax
 
 
@@ -137,24 +139,25 @@ def _draw_marks(ax: Axes, view: View, marks: MapMarks) -> list[Line2D]:
     handles = []
     style: dict[str, Any] = {"linestyle": "none", "zorder": 5, "path_effects": HALO}
     if marks.truth is not None:
-        cross: dict[str, Any] = {"marker": "+", "color": INK, "markersize": 13, "markeredgewidth": 1.8}
-        handles += ax.plot(*view.chart_point(marks.truth, "truth"), label="truth", **cross, **style)
+        cross_style: dict[str, Any] = {"marker": "+", "color": INK, "markersize": 13, "markeredgewidth": 1.8}
+        handles += ax.plot(*view.chart_point(marks.truth, "truth"), label="truth", **cross_style, **style)
     if marks.estimate is not None:
-        found, label = view.chart_point(marks.estimate, "estimate"), "estimate"
+        estimate_point, label = view.chart_point(marks.estimate, "estimate"), "estimate"
         if marks.covariance is not None:
-            draw_ellipse(ax, found, view.chart_covariance(marks.covariance, marks.estimate))
+            draw_ellipse(ax, estimate_point, view.chart_covariance(marks.covariance, marks.estimate))
             label = "estimate, 95 %"
-        handles += ax.plot(*found, marker="o", color=FOUND, markersize=5.5, label=label, **style)
+        handles += ax.plot(*estimate_point, marker="o", color=ESTIMATE_COLOUR, markersize=5.5, label=label, **style)
     return handles
 
 
 def _above_minimum(pixels: np.ndarray, method: str) -> np.ndarray:
-    least = np.nanmin(pixels)
+    """Convert a map to standard deviations ("likelihood") or decibels ("consistency") above its minimum."""
+    minimum = np.nanmin(pixels)
     if method == "likelihood":
-        return np.sqrt(2 * (pixels - least))
+        return np.sqrt(2 * (pixels - minimum))
     # Without noise the minimum of the loss may be zero: the loss is clipped at 120 dB below its maximum.
-    bottom = max(least, 1e-12 * np.nanmax(pixels), np.finfo(float).tiny)
-    return 10 * np.log10(np.maximum(pixels, bottom) / bottom)
+    lower_limit = max(minimum, 1e-12 * np.nanmax(pixels), np.finfo(float).tiny)
+    return 10 * np.log10(np.maximum(pixels, lower_limit) / lower_limit)
 
 
 def _draw_levels(ax: Axes, microphones: np.ndarray, received: np.ndarray) -> Line2D:
@@ -163,8 +166,10 @@ def _draw_levels(ax: Axes, microphones: np.ndarray, received: np.ndarray) -> Lin
     positive = np.isfinite(received) & (received > 0)
     loudest = received[positive].max(initial=1e-300)
     level = 10 * np.log10(np.where(positive, received, 1e-300) / loudest)
-    area = 8 + 150 * np.clip(1 + level / _RANGE, 0, 1)
-    ax.scatter(*microphones.T, s=area, facecolor="white", edgecolor=MICROPHONE, linewidth=1.2, alpha=0.9, zorder=3)
+    area = 8 + 150 * np.clip(1 + level / _DYNAMIC_RANGE, 0, 1)
+    ax.scatter(
+        *microphones.T, s=area, facecolor="white", edgecolor=MICROPHONE_COLOUR, linewidth=1.2, alpha=0.9, zorder=3
+    )
     return Line2D(
         [],
         [],
@@ -172,12 +177,12 @@ def _draw_levels(ax: Axes, microphones: np.ndarray, received: np.ndarray) -> Lin
         linestyle="none",
         markersize=8,
         markerfacecolor="white",
-        markeredgecolor=MICROPHONE,
+        markeredgecolor=MICROPHONE_COLOUR,
         label="microphone, by level",
     )
 
 
-_TAP = "#8fb4d9"
+_TAP_COLOUR = "#8fb4d9"
 
 
 def plot_receptive_fields(
@@ -208,100 +213,113 @@ def plot_receptive_fields(
     ```
     """
     check_kind("fit", fit, CalibrationFit, "a CalibrationFit, as of calibrate_microphones")
-    number = fit.power.shape[1]
-    chosen = np.arange(number) if microphones is None else np.atleast_1d(np.asarray(microphones))
-    if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or not chosen.size:
-        raise ValueError(f"microphones: give indices of microphones, whole numbers; got shape {chosen.shape}.")
-    if chosen.min() < 0 or chosen.max() >= number:
-        raise ValueError(f"microphones must be from 0 to {number - 1}; they are {chosen.min()} to {chosen.max()}.")
-    columns = chosen.size if chosen.size <= 3 else int(np.ceil(np.sqrt(chosen.size)))
-    rows = -(-chosen.size // columns)
+    num_microphones = fit.power.shape[1]
+    selected = np.arange(num_microphones) if microphones is None else np.atleast_1d(np.asarray(microphones))
+    if selected.ndim != 1 or selected.dtype.kind not in "iu" or not selected.size:
+        raise ValueError(f"microphones: give indices of microphones, whole numbers; got shape {selected.shape}.")
+    if selected.min() < 0 or selected.max() >= num_microphones:
+        raise ValueError(
+            f"microphones must be from 0 to {num_microphones - 1}; they are {selected.min()} to {selected.max()}."
+        )
+    columns = selected.size if selected.size <= 3 else int(np.ceil(np.sqrt(selected.size)))
+    rows = -(-selected.size // columns)
     ax = axes_or_new(ax, (max(4.8, min(11.0, 2.2 * columns)), max(3.6, min(9.0, 1.75 * rows))))
     ax.set_axis_off()
     # The position of the title is fixed, since matplotlib would derive it from all panels.
     ax.set_title(title or "", loc="left", y=1.0, pad=26)
     distance = np.linspace(0, float(fit.distance.max()), 200)
     decay = on_host(fit.calibration.microphone_array.decay)
-    curve = np.asarray(decay.response(np.broadcast_to(distance**2, (number, distance.size))))
-    relative = fit.power / _strengths(fit)[:, None]
+    curve = np.asarray(decay.response(np.broadcast_to(distance**2, (num_microphones, distance.size))))
+    relative = fit.power / _tap_strengths(fit)[:, None]
     noise = np.asarray(fit.calibration.microphone_array.noise.deviation) / np.nanmedian(fit.strength)
-    seen = relative[:, chosen][np.isfinite(relative[:, chosen]) & (relative[:, chosen] > 0)]
-    usable = fit.calibration.usable[chosen]
-    curves = curve[chosen][usable] if usable.any() else curve[chosen]
-    low = min(curves.min(), np.quantile(seen, 0.02) if seen.size else np.inf) / 1.5
-    high = max(curves.max(), np.quantile(seen, 0.999) if seen.size else 0.0) * 1.8
-    wide, tall = 1 / columns, 1 / rows
-    for place, index in enumerate(chosen):
-        row, column = divmod(place, columns)
-        panel = ax.inset_axes((column * wide, 1 - (row + 1) * tall, 0.93 * wide, 0.9 * tall))
+    positive_values = relative[:, selected][np.isfinite(relative[:, selected]) & (relative[:, selected] > 0)]
+    usable = fit.calibration.usable[selected]
+    curves = curve[selected][usable] if usable.any() else curve[selected]
+    low = min(curves.min(), np.quantile(positive_values, 0.02) if positive_values.size else np.inf) / 1.5
+    high = max(curves.max(), np.quantile(positive_values, 0.999) if positive_values.size else 0.0) * 1.8
+    panel_width, panel_height = 1 / columns, 1 / rows
+    for panel_index, index in enumerate(selected):
+        row, column = divmod(panel_index, columns)
+        panel = ax.inset_axes(
+            (column * panel_width, 1 - (row + 1) * panel_height, 0.93 * panel_width, 0.9 * panel_height)
+        )
         panel.set_in_layout(False)  # the labels of panels extend beyond the axes
-        _draw_field(panel, fit, int(index), relative[:, index], (distance, curve[index], noise[index]), columns)
+        _draw_receptive_field(
+            panel, fit, int(index), relative[:, index], (distance, curve[index], noise[index]), columns
+        )
         panel.set_xlim(0, 1e3 * distance[-1])
         panel.set_ylim(low, high)
-        panel.tick_params(labelleft=column == 0, labelbottom=place + columns >= chosen.size)
-    _label_panels(ax, fit, noise_shown=bool(noise[chosen].max() > low))
+        panel.tick_params(labelleft=column == 0, labelbottom=panel_index + columns >= selected.size)
+    _label_panels(ax, fit, noise_shown=bool(noise[selected].max() > low))
     return ax
 
 
 def _label_panels(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
     """Draw the axis labels shared by all panels, and the legend above the panels."""
-    label: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "color": INK}
-    label["annotation_clip"] = False
-    ax.annotate("Distance (mm)", (0.5, 0), (0, -22), ha="center", va="top", **label)
-    ax.annotate("Intensity / strength of the tap", (0, 0.5), (-34, 0), ha="right", va="center", rotation=90, **label)
+    label_style: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "color": INK}
+    label_style["annotation_clip"] = False
+    ax.annotate("Distance (mm)", (0.5, 0), (0, -22), ha="center", va="top", **label_style)
+    ax.annotate(
+        "Intensity / strength of the tap", (0, 0.5), (-34, 0), ha="right", va="center", rotation=90, **label_style
+    )
     handles = [
-        Line2D([], [], marker="o", linestyle="none", color=_TAP, markersize=4, label="tap"),
+        Line2D([], [], marker="o", linestyle="none", color=_TAP_COLOUR, markersize=4, label="tap"),
         Line2D([], [], color=INK, linewidth=1.6, label=f"fit, {type(fit.calibration.microphone_array.decay).name}"),
     ]
     if noise_shown:
         handles.append(Line2D([], [], color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), label="noise, 1 σ"))
     if fit.outlier.any():
-        ring: dict[str, Any] = {"marker": "o", "linestyle": "none", "fillstyle": "none", "markersize": 4}
-        handles.append(Line2D([], [], color=FOUND, label="left out", **ring))
-    place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 4}
-    ax.legend(handles=handles, frameon=False, fontsize=9.5, borderpad=0, **place)
+        ring_style: dict[str, Any] = {"marker": "o", "linestyle": "none", "fillstyle": "none", "markersize": 4}
+        handles.append(Line2D([], [], color=ESTIMATE_COLOUR, label="left out", **ring_style))
+    legend_style: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 4}
+    ax.legend(handles=handles, frameon=False, fontsize=9.5, borderpad=0, **legend_style)
 
 
-def _strengths(fit: CalibrationFit) -> Float[np.ndarray, " T"]:
+def _tap_strengths(fit: CalibrationFit) -> Float[np.ndarray, " T"]:
     """Strength of each tap. For taps excluded from the fit it is the median over the usable microphones of intensity
     divided by response."""
     response = np.asarray(on_host(fit.calibration.microphone_array.decay).response(fit.distance.T**2)).T
     strength = np.where((fit.power > 0) & fit.calibration.usable, fit.power / response, np.nan)
-    received = np.isfinite(strength).any(axis=1)
+    is_received = np.isfinite(strength).any(axis=1)
     median = np.full(len(strength), np.nan)
-    median[received] = np.nanmedian(strength[received], axis=1)
+    median[is_received] = np.nanmedian(strength[is_received], axis=1)
     return np.where(np.isfinite(fit.strength), fit.strength, median)
 
 
-def _draw_field(panel: Axes, fit: CalibrationFit, index: int, relative, lines, columns: int) -> None:
+def _draw_receptive_field(panel: Axes, fit: CalibrationFit, index: int, relative, lines, columns: int) -> None:
     """Draw the panel of one microphone: its taps, fitted curve and noise. `lines`: distances in metres, the response at
     these distances, and the noise."""
     distance, curve, noise = lines
     reason = fit.calibration.reasons[index]
-    shown = np.isfinite(relative) & (relative > 0)
+    is_positive = np.isfinite(relative) & (relative > 0)
     panel.set_yscale("log")
-    for which, style in (
-        (shown & ~fit.outlier, {"color": SOFT if reason else _TAP, "alpha": 0.6, "linewidths": 0}),
-        (shown & fit.outlier, {"facecolors": "none", "edgecolors": FOUND, "linewidths": 0.7, "zorder": 2.5}),
+    for mask, style in (
+        (is_positive & ~fit.outlier, {"color": SOFT if reason else _TAP_COLOUR, "alpha": 0.6, "linewidths": 0}),
+        (
+            is_positive & fit.outlier,
+            {"facecolors": "none", "edgecolors": ESTIMATE_COLOUR, "linewidths": 0.7, "zorder": 2.5},
+        ),
     ):
         size = 9 if columns <= 2 else 5
-        panel.scatter(1e3 * fit.distance[which, index], relative[which], s=size, rasterized=True, **style)
+        panel.scatter(1e3 * fit.distance[mask, index], relative[mask], s=size, rasterized=True, **style)
     style = {"color": SOFT, "linewidth": 1.2, "linestyle": (0, (1, 1))} if reason else {"color": INK, "linewidth": 1.6}
     # No curve is drawn for a microphone without readings.
-    near = (distance <= fit.distance[:, index].max()) & shown.any()
-    panel.plot(1e3 * distance[near], curve[near], zorder=3, **style)
+    is_in_range = (distance <= fit.distance[:, index].max()) & is_positive.any()
+    panel.plot(1e3 * distance[is_in_range], curve[is_in_range], zorder=3, **style)
     if noise > 0:
         panel.axhline(noise, color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), zorder=1)
     fontsize = 8.5 if columns <= 5 else 7
-    text: dict[str, Any] = {"transform": panel.transAxes, "va": "top", "path_effects": HALO, "zorder": 4}
-    panel.text(0.05, 0.97, str(index), ha="left", fontsize=fontsize, fontweight="bold", color=INK, **text)
+    text_style: dict[str, Any] = {"transform": panel.transAxes, "va": "top", "path_effects": HALO, "zorder": 4}
+    panel.text(0.05, 0.97, str(index), ha="left", fontsize=fontsize, fontweight="bold", color=INK, **text_style)
     if reason:
-        short = textwrap.shorten(reason.split(" (")[0], 60, placeholder=" …")
-        wrapped = textwrap.fill(short, 24 if columns <= 5 else 18)
-        panel.text(0.97, 0.97, wrapped, ha="right", fontsize=fontsize - 1, color=FOUND, **text)
+        short_reason = textwrap.shorten(reason.split(" (")[0], 60, placeholder=" …")
+        wrapped = textwrap.fill(short_reason, 24 if columns <= 5 else 18)
+        panel.text(0.97, 0.97, wrapped, ha="right", fontsize=fontsize - 1, color=ESTIMATE_COLOUR, **text_style)
     elif columns <= 6:
-        half = distance[np.argmin(np.abs(curve / curve[0] - 0.5))]
-        panel.text(0.97, 0.97, f"½ at {1e3 * half:.0f} mm", ha="right", fontsize=fontsize - 1, color=INK, **text)
+        half_distance = distance[np.argmin(np.abs(curve / curve[0] - 0.5))]
+        panel.text(
+            0.97, 0.97, f"½ at {1e3 * half_distance:.0f} mm", ha="right", fontsize=fontsize - 1, color=INK, **text_style
+        )
     soften_axes(panel)
     panel.tick_params(length=2.5, labelsize=fontsize - 0.5, which="both")
     panel.xaxis.set_major_locator(MaxNLocator(4 if columns <= 5 else 3, steps=[1, 2, 5, 10], prune="upper"))

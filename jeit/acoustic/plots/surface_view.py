@@ -19,10 +19,10 @@ from jeit.mesh import Domain
 from jeit.plot.axes import INK, SOFT, draw_scale_bar, extent_of, hide_axes
 from jeit_solvers.engines import host, on_host, slopes
 
-MICROPHONE, FOUND = "#1f6fb4", "#c8102e"
+MICROPHONE_COLOUR, ESTIMATE_COLOUR = "#1f6fb4", "#c8102e"
 HALO = (withStroke(linewidth=2.5, foreground="white"),)
 # Radius, in standard deviations, of the ellipse that contains 95 % of a two-dimensional normal distribution.
-_REACH = float(np.sqrt(chdtri(2, 0.05)))
+_ELLIPSE_RADIUS = float(np.sqrt(chdtri(2, 0.05)))
 
 AnySurface = Calibration | MicrophoneArray | AbstractSurface | Domain | ArrayLike
 
@@ -52,22 +52,24 @@ class View(NamedTuple):
     def chart_point(self, point: ArrayLike, name: str) -> np.ndarray:
         """Chart coordinates (2,) of one `point` (d,) in metres. Raises `ValueError` for another shape; `name` is the
         argument's name in the message."""
-        place = np.asarray(point, float)
-        if place.shape != (self.surface.dimension,):
-            raise ValueError(f"{name} has shape {place.shape}; give one place ({self.surface.dimension},) in metres.")
-        return self.chart(place[None], name)[0]
+        coordinates = np.asarray(point, float)
+        if coordinates.shape != (self.surface.dimension,):
+            raise ValueError(
+                f"{name} has shape {coordinates.shape}; give one place ({self.surface.dimension},) in metres."
+            )
+        return self.chart(coordinates[None], name)[0]
 
     def chart_covariance(self, covariance: ArrayLike, point: ArrayLike, name: str = "covariance") -> np.ndarray:
         """Transform a `covariance` (d, d) in m² at `point` (d,) in metres to a covariance (2, 2) in the chart.
 
         Raises `ValueError` for another shape; `name` is the argument's name in the message.
         """
-        spread, d = np.asarray(covariance, float), self.surface.dimension
-        if spread.shape != (d, d):
-            raise ValueError(f"{name} has shape {spread.shape}; give ({d}, {d}) in m².")
-        _, along = slopes(self.surface.project, np.asarray(point, float)[:, None])
-        turn = np.concatenate(along, axis=1)
-        return turn @ spread @ turn.T
+        matrix, dimension = np.asarray(covariance, float), self.surface.dimension
+        if matrix.shape != (dimension, dimension):
+            raise ValueError(f"{name} has shape {matrix.shape}; give ({dimension}, {dimension}) in m².")
+        _, derivatives = slopes(self.surface.project, np.asarray(point, float)[:, None])
+        jacobian = np.concatenate(derivatives, axis=1)
+        return jacobian @ matrix @ jacobian.T
 
 
 def view_of(surface: AnySurface, microphones: ArrayLike | None = None, usable: ArrayLike | None = None) -> View:
@@ -82,21 +84,23 @@ def view_of(surface: AnySurface, microphones: ArrayLike | None = None, usable: A
     if isinstance(surface, MicrophoneArray):
         microphones = surface.microphones if microphones is None else microphones
         surface = surface.surface
-    seen: AbstractSurface = on_host(surface if isinstance(surface, AbstractSurface) else make_surface(surface))
-    place = np.zeros((0, 2)) if microphones is None else chart_of(seen, microphones, "microphones")
-    good = np.ones(len(place), bool) if usable is None else np.asarray(usable, bool)
-    if good.shape != (len(place),):
-        raise ValueError(f"usable has shape {good.shape}; give one for each of the {len(place)} microphones.")
-    return View(seen, place, good)
+    host_surface: AbstractSurface = on_host(surface if isinstance(surface, AbstractSurface) else make_surface(surface))
+    positions = np.zeros((0, 2)) if microphones is None else chart_of(host_surface, microphones, "microphones")
+    usable_mask = np.ones(len(positions), bool) if usable is None else np.asarray(usable, bool)
+    if usable_mask.shape != (len(positions),):
+        raise ValueError(
+            f"usable has shape {usable_mask.shape}; give one for each of the {len(positions)} microphones."
+        )
+    return View(host_surface, positions, usable_mask)
 
 
 def chart_of(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarray:
     """Chart coordinates (n, 2) of `points` (n, d) in metres. Raises `ValueError` for other shapes; `name` is the
     argument's name in the message."""
-    place = np.asarray(points, float)
-    if place.ndim != 2 or place.shape[1] != surface.dimension:
-        raise ValueError(f"{name} has shape {place.shape}; give (n, {surface.dimension}) in metres.")
-    return np.asarray(surface.project(host.asarray(place.T))).T
+    coordinates = np.asarray(points, float)
+    if coordinates.ndim != 2 or coordinates.shape[1] != surface.dimension:
+        raise ValueError(f"{name} has shape {coordinates.shape}; give (n, {surface.dimension}) in metres.")
+    return np.asarray(surface.project(host.asarray(coordinates.T))).T
 
 
 def outline_of(view: View) -> Path:
@@ -111,36 +115,45 @@ def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool 
         PathPatch(outline_of(view), facecolor="none", edgecolor=INK, linewidth=0.9, joinstyle="round", zorder=2)
     )
     # Microphones may lie outside the outline.
-    shown = np.concatenate([np.reshape(view.extent, (2, 2)).T, view.microphones])
-    x_min, x_max, y_min, y_max = extent_of(shown)
-    room = 0.06 * max(x_max - x_min, y_max - y_min)
+    shown_points = np.concatenate([np.reshape(view.extent, (2, 2)).T, view.microphones])
+    x_min, x_max, y_min, y_max = extent_of(shown_points)
+    margin = 0.06 * max(x_max - x_min, y_max - y_min)
     hide_axes(ax, (x_min, x_max, y_min, y_max))
     # The scale bar is closer to the outline than in plots of electrodes, since no labels are drawn outside the outline.
-    draw_scale_bar(ax, (x_min + room, x_max, y_min + room, y_max))
-    ax.set_xlim(x_min - 0.5 * room, x_max + 0.5 * room)
-    ax.set_ylim(y_min - 2 * room, y_max + 0.5 * room)
+    draw_scale_bar(ax, (x_min + margin, x_max, y_min + margin, y_max))
+    ax.set_xlim(x_min - 0.5 * margin, x_max + 0.5 * margin)
+    ax.set_ylim(y_min - 2 * margin, y_max + 0.5 * margin)
     if not microphones:
         return []
-    named = []
+    handles = []
     style = {"marker": "o", "linestyle": "none", "markersize": 6.5, "zorder": 2.5, "label": "microphone"}
     style |= {"markerfacecolor": "none", "markeredgewidth": 1.0} if faint else {"markeredgewidth": 0.8}
-    style |= {"markeredgecolor": SOFT} if faint else {"markerfacecolor": MICROPHONE, "markeredgecolor": "white"}
-    dead = {"marker": "x", "linestyle": "none", "markersize": 7, "markeredgewidth": 1.6, "color": INK, "zorder": 2.6}
+    style |= {"markeredgecolor": SOFT} if faint else {"markerfacecolor": MICROPHONE_COLOUR, "markeredgecolor": "white"}
+    cross_style = {
+        "marker": "x",
+        "linestyle": "none",
+        "markersize": 7,
+        "markeredgewidth": 1.6,
+        "color": INK,
+        "zorder": 2.6,
+    }
     if view.usable.any():
-        named += ax.plot(*view.microphones[view.usable].T, **style)
+        handles += ax.plot(*view.microphones[view.usable].T, **style)
     if not view.usable.all():
-        named += ax.plot(*view.microphones[~view.usable].T, **dead, label="not usable")
-    return named
+        handles += ax.plot(*view.microphones[~view.usable].T, **cross_style, label="not usable")
+    return handles
 
 
-def draw_ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray, *, colour: str = FOUND) -> None:
+def draw_ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray, *, colour: str = ESTIMATE_COLOUR) -> None:
     """Draw the 95 % ellipse of a normal distribution with mean `middle` (2,) in metres and `covariance` (2, 2) in
     m²."""
     variances, axes = np.linalg.eigh(covariance)
-    long, short = 2 * _REACH * np.sqrt(np.maximum(variances[::-1], 0))
+    major_axis, minor_axis = 2 * _ELLIPSE_RADIUS * np.sqrt(np.maximum(variances[::-1], 0))
     angle = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
     x, y = middle
-    ellipse = Ellipse((x, y), long, short, angle=angle, fill=False, edgecolor=colour, linewidth=1.4, zorder=4)
+    ellipse = Ellipse(
+        (x, y), major_axis, minor_axis, angle=angle, fill=False, edgecolor=colour, linewidth=1.4, zorder=4
+    )
     ellipse.set_path_effects([*HALO])
     ax.add_patch(ellipse)
 
@@ -151,8 +164,8 @@ def draw_legend(ax: Axes, handles: list) -> None:
         return
     # 0.45 inches for a marker with its gaps, and 0.065 inches for each letter.
     widths = [0.45 + 0.065 * len(str(handle.get_label())) for handle in handles]
-    room = ax.bbox.width / ax.figure.dpi
-    columns = len(handles) if sum(widths) <= room else max(1, int(room / max(widths)))
+    available_width = ax.bbox.width / ax.figure.dpi
+    columns = len(handles) if sum(widths) <= available_width else max(1, int(available_width / max(widths)))
     ax.legend(
         handles=handles,
         loc="upper center",

@@ -30,7 +30,7 @@ _STATUS_MARKERS = {
 }
 # Thresholds of motion below which a touch is drawn as a single position: the distance of its path from the mean of the
 # path, in standard deviations; and the diameter of the path, as a fraction of the size of the surface.
-_MOVED_DEVIATIONS, _LEAST = 4.0, 0.05
+_MIN_MOTION_DEVIATIONS, _MIN_MOTION_SHARE = 4.0, 0.05
 
 
 def plot_track(
@@ -75,115 +75,138 @@ def plot_track(
     check_kind("track", track, Track, "a Track, as of jeit.acoustic.track(locations)")
     check_kind("locations", locations, Locations, "Locations, as of jeit.acoustic.locate")
     view = view_of(array)
-    number = len(view.microphones)
-    if locations.used.shape != (len(track.times), number) or track.position.shape != locations.position.shape:
+    num_microphones = len(view.microphones)
+    if locations.used.shape != (len(track.times), num_microphones) or track.position.shape != locations.position.shape:
         raise ValueError(
             f"locations: {locations.used.shape[0]} frames of {locations.used.shape[1]} microphones do not go with a "
-            f"track of {len(track.times)} frames and an array of {number} microphones."
+            f"track of {len(track.times)} frames and an array of {num_microphones} microphones."
         )
     image = None if overlay is None else np.asarray(overlay, float)
     if image is not None and image.ndim != 2:
         raise ValueError(f"overlay has shape {image.shape}; give one picture (rows, columns), the last of several.")
     if len(track.times):
         view = view._replace(usable=view.usable & locations.used.any(axis=0))
-    known = None if truth is None else view.chart(truth, "truth")
+    true_path = None if truth is None else view.chart(truth, "truth")
     path = view.chart(track.position, "track")
     ax = axes_or_new(ax)
     if image is not None:
         style: dict[str, Any] = {"interpolation": "bilinear", "cmap": _GLOW, "clim": (0, 1)}
-        drawn = ax.imshow(np.nan_to_num(image), extent=view.extent, origin="lower", **style)
-        drawn.set_clip_path(outline_of(view), ax.transData)
+        image_artist = ax.imshow(np.nan_to_num(image), extent=view.extent, origin="lower", **style)
+        image_artist.set_clip_path(outline_of(view), ax.transData)
     handles = draw_surface(ax, view, faint=True)
     ax.set_title(title or "")
-    if known is not None:
-        handles += ax.plot(*known.T, color=INK, linewidth=0.9, linestyle=(0, (4, 3)), zorder=3.6, label="truth")
+    if true_path is not None:
+        handles += ax.plot(*true_path.T, color=INK, linewidth=0.9, linestyle=(0, (4, 3)), zorder=3.6, label="truth")
     if not track.touches:
         _label_no_touch(ax, view, locations)
         draw_legend(ax, handles)
         return ax
-    first, last = track.touches[0].onset, track.touches[-1].offset
-    times = ScalarMappable(Normalize(first, last if last > first else first + 1e-3), _TIME)
+    start_time, end_time = track.touches[0].onset, track.touches[-1].offset
+    time_colours = ScalarMappable(
+        Normalize(start_time, end_time if end_time > start_time else start_time + 1e-3), _TIME
+    )
     for touch in track.touches:
-        handles += _draw_touch(ax, view, track, touch, path, times, named={handle.get_label() for handle in handles})
-    handles += _draw_frames(ax, view, track, locations, times)
+        handles += _draw_touch(
+            ax, view, track, touch, path, time_colours, existing_labels={handle.get_label() for handle in handles}
+        )
+    handles += _draw_frames(ax, view, track, locations, time_colours)
     draw_legend(ax, handles)
-    if colour_bar and last > first:
-        draw_colour_bar(ax, times, "Time (s)")
+    if colour_bar and end_time > start_time:
+        draw_colour_bar(ax, time_colours, "Time (s)")
     return ax
 
 
 def _label_no_touch(ax: Axes, view: View, locations: Locations) -> None:
     left, right, bottom, top = view.extent
-    words = "no touch" if (locations.status != LocationStatus.UNUSABLE).any() else "no usable frame"
+    label = "no touch" if (locations.status != LocationStatus.UNUSABLE).any() else "no usable frame"
     box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-    text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 15, "color": INK, "zorder": 5}
-    ax.text((left + right) / 2, (bottom + top) / 2, words, bbox=box, **text)
+    text_style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 15, "color": INK, "zorder": 5}
+    ax.text((left + right) / 2, (bottom + top) / 2, label, bbox=box, **text_style)
 
 
-def _draw_touch(ax: Axes, view: View, track: Track, touch: Touch, path, times: ScalarMappable, named: set) -> list:
-    """Draw a touch and return its legend entries whose labels are not in `named`."""
+def _draw_touch(
+    ax: Axes, view: View, track: Track, touch: Touch, path, time_colours: ScalarMappable, existing_labels: set
+) -> list:
+    """Draw a touch and return its legend entries whose labels are not in `existing_labels`."""
     frames = slice(touch.first, touch.last + 1)
-    places, when = path[frames], track.times[frames]
-    surest = touch.first + int(np.argmin(np.trace(track.covariance[frames], axis1=1, axis2=2)))
-    spread = view.chart_covariance(track.covariance[surest], track.position[surest])
+    positions, frame_times = path[frames], track.times[frames]
+    best_frame = touch.first + int(np.argmin(np.trace(track.covariance[frames], axis1=1, axis2=2)))
+    covariance = view.chart_covariance(track.covariance[best_frame], track.position[best_frame])
     left, right, bottom, top = view.extent
-    moved = np.linalg.norm(places - places.mean(axis=0), axis=1).max()
-    still = max(
-        _MOVED_DEVIATIONS * np.sqrt(np.linalg.eigvalsh(spread)[-1]), 0.5 * _LEAST * max(right - left, top - bottom)
+    max_displacement = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max()
+    min_displacement = max(
+        _MIN_MOTION_DEVIATIONS * np.sqrt(np.linalg.eigvalsh(covariance)[-1]),
+        0.5 * _MIN_MOTION_SHARE * max(right - left, top - bottom),
     )
-    mark: dict[str, Any] = {"linestyle": "none", "markeredgecolor": INK, "markeredgewidth": 1.2, "zorder": 5}
-    if moved < still:
-        colour = times.to_rgba(track.times[surest])
-        draw_ellipse(ax, path[surest], spread, colour=INK)
-        ax.plot(*path[surest], marker="o", markersize=5, markerfacecolor=colour, **mark)
-        dot = Line2D([], [], marker="o", markersize=5, markerfacecolor=SOFT, label="touch, 95 %", **mark)
-        return [] if "touch, 95 %" in named else [dot]
-    segments = np.stack([places[:-1], places[1:]], axis=1)
-    for width, colours, order in ((5.0, "white", 3.4), (3.0, times.to_rgba((when[:-1] + when[1:]) / 2), 3.5)):
+    mark_style: dict[str, Any] = {"linestyle": "none", "markeredgecolor": INK, "markeredgewidth": 1.2, "zorder": 5}
+    if max_displacement < min_displacement:
+        colour = time_colours.to_rgba(track.times[best_frame])
+        draw_ellipse(ax, path[best_frame], covariance, colour=INK)
+        ax.plot(*path[best_frame], marker="o", markersize=5, markerfacecolor=colour, **mark_style)
+        dot_handle = Line2D([], [], marker="o", markersize=5, markerfacecolor=SOFT, label="touch, 95 %", **mark_style)
+        return [] if "touch, 95 %" in existing_labels else [dot_handle]
+    segments = np.stack([positions[:-1], positions[1:]], axis=1)
+    for width, colours, order in (
+        (5.0, "white", 3.4),
+        (3.0, time_colours.to_rgba((frame_times[:-1] + frame_times[1:]) / 2), 3.5),
+    ):
         line = LineCollection(list(segments), colors=colours, linewidths=width, capstyle="round", zorder=order)
         ax.add_collection(line)
     ends = []
-    for place, marker, name in ((places[0], "o", "onset"), (places[-1], "s", "offset")):
-        end = ax.plot(*place, marker=marker, markersize=7.5, markerfacecolor="white", **mark, label=name)
-        ends += [] if name in named else end
+    for position, marker, name in ((positions[0], "o", "onset"), (positions[-1], "s", "offset")):
+        end = ax.plot(*position, marker=marker, markersize=7.5, markerfacecolor="white", **mark_style, label=name)
+        ends += [] if name in existing_labels else end
     return ends
 
 
-def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, times: ScalarMappable) -> list:
+def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, time_colours: ScalarMappable) -> list:
     """Draw the position of each frame: a dot; a ring if the track rejects the position; a marker for each status other
     than "touch". Return the legend entries."""
-    places = view.chart(locations.position, "locations")
-    plain = locations.has_position & ~np.isin(locations.status, list(_STATUS_MARKERS))
-    believed, doubted = plain & ~track.rejected, locations.has_position & track.rejected
+    positions = view.chart(locations.position, "locations")
+    has_no_marker = locations.has_position & ~np.isin(locations.status, list(_STATUS_MARKERS))
+    is_accepted, is_rejected = has_no_marker & ~track.rejected, locations.has_position & track.rejected
     handles = []
-    dots = {"s": 7, "linewidths": 0, "alpha": 0.6, "zorder": 3.7}
-    ax.scatter(*places[believed].T, color=times.to_rgba(track.times[believed]), **dots)
-    if doubted.any():
+    dot_options = {"s": 7, "linewidths": 0, "alpha": 0.6, "zorder": 3.7}
+    ax.scatter(*positions[is_accepted].T, color=time_colours.to_rgba(track.times[is_accepted]), **dot_options)
+    if is_rejected.any():
         # If the frame has a marker for its status, the ring is drawn larger, around that marker.
-        rings: dict[str, Any] = {"s": np.where(plain, 16, 60)[doubted], "linewidths": 0.8, "facecolors": "none"}
-        rings |= {"zorder": 3.7, "edgecolors": times.to_rgba(track.times[doubted])}
-        ax.scatter(*places[doubted].T, **rings)
-        ring: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "markeredgecolor": SOFT}
-        handles.append(Line2D([], [], marker="o", markersize=4, label=f"not believed ({doubted.sum()})", **ring))
-    return handles + _draw_other_frames(ax, view, locations, places, times)
+        ring_options: dict[str, Any] = {
+            "s": np.where(has_no_marker, 16, 60)[is_rejected],
+            "linewidths": 0.8,
+            "facecolors": "none",
+        }
+        ring_options |= {"zorder": 3.7, "edgecolors": time_colours.to_rgba(track.times[is_rejected])}
+        ax.scatter(*positions[is_rejected].T, **ring_options)
+        ring_style: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "markeredgecolor": SOFT}
+        handles.append(
+            Line2D([], [], marker="o", markersize=4, label=f"not believed ({is_rejected.sum()})", **ring_style)
+        )
+    return handles + _draw_other_frames(ax, view, locations, positions, time_colours)
 
 
-def _draw_other_frames(ax: Axes, view: View, locations: Locations, places: np.ndarray, times: ScalarMappable) -> list:
-    """Draw frames with the status "outside", "misfit", "ambiguous" or "two touches", and the second touch of the last;
-    return the legend entries."""
+def _draw_other_frames(
+    ax: Axes, view: View, locations: Locations, positions: np.ndarray, time_colours: ScalarMappable
+) -> list:
+    """Draw frames with the status "outside", "misfit", "ambiguous" or "two touches", the last with both touches; return
+    the legend entries."""
     handles = []
     second = view.chart(locations.second, "locations.second")
     for status, marker in _STATUS_MARKERS.items():
-        which = (locations.status == status) & locations.has_position
-        if not which.any():
+        has_status = (locations.status == status) & locations.has_position
+        if not has_status.any():
             continue
-        style = {"marker": marker, "s": 22, "linewidths": 0.8, "edgecolors": INK, "zorder": 4.5}
-        both = which & np.isfinite(second).all(axis=1)
-        if both.any():
-            pairs = list(np.stack([places, second], axis=1)[both])
+        marker_style = {"marker": marker, "s": 22, "linewidths": 0.8, "edgecolors": INK, "zorder": 4.5}
+        has_second = has_status & np.isfinite(second).all(axis=1)
+        if has_second.any():
+            pairs = list(np.stack([positions, second], axis=1)[has_second])
             ax.add_collection(LineCollection(pairs, colors=SOFT, linewidths=0.5, zorder=3))
-            ax.scatter(*second[both].T, color=times.to_rgba(locations.times[both]), **style)
-        ax.scatter(*places[which].T, color=times.to_rgba(locations.times[which]), **style)
-        named: dict[str, Any] = {"markersize": 5, "markerfacecolor": SOFT, "markeredgecolor": INK, "linestyle": "none"}
-        handles.append(Line2D([], [], marker=marker, label=f"{status} ({which.sum()})", **named))
+            ax.scatter(*second[has_second].T, color=time_colours.to_rgba(locations.times[has_second]), **marker_style)
+        ax.scatter(*positions[has_status].T, color=time_colours.to_rgba(locations.times[has_status]), **marker_style)
+        legend_style: dict[str, Any] = {
+            "markersize": 5,
+            "markerfacecolor": SOFT,
+            "markeredgecolor": INK,
+            "linestyle": "none",
+        }
+        handles.append(Line2D([], [], marker=marker, label=f"{status} ({has_status.sum()})", **legend_style))
     return handles

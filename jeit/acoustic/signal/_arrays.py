@@ -8,14 +8,14 @@ from scipy.spatial import KDTree
 from jeit.mesh.topology import distance, inside
 
 # Minimum sampling rate at which the vibrations of a touch can be recorded.
-LOWEST_RATE = 100.0  # Hz
+MIN_RATE = 100.0  # Hz
 # Maximum plausible length of a skin. Larger coordinates are probably in millimetres.
-LARGEST_EXTENT = 5.0  # m
+MAX_EXTENT = 5.0  # m
 # Maximum distance of a tap from the outline, as a fraction of the skin's length; distance in metres below which two
 # microphones coincide.
-_BESIDE, _SAME = 0.05, 1e-6  # of the length; m
+_MAX_OUTSIDE_SHARE, _MIN_SPACING = 0.05, 1e-6  # of the length; m
 # Maximum magnitude of a coordinate in metres; squares of larger lengths would lose precision.
-_FARTHEST = 1e9
+_MAX_COORDINATE = 1e9
 
 
 def choose_array(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
@@ -24,8 +24,8 @@ def choose_array(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
     if first in arrays and second in arrays:
         raise ValueError(f"it holds both '{first}' and '{second}'; keep the one to use.")
     if second not in arrays and first not in arrays:
-        held = ", ".join(str(name) for name in arrays[""][:12]) or "nothing"
-        raise ValueError(f"there is neither '{second}' nor '{first}'; the file holds {held}.")
+        names = ", ".join(str(name) for name in arrays[""][:12]) or "nothing"
+        raise ValueError(f"there is neither '{second}' nor '{first}'; the file holds {names}.")
     return first if first in arrays else second
 
 
@@ -65,10 +65,10 @@ def sampling_rate(value) -> float:
     """Return the sampling rate in Hz as a float. Raises `ValueError` if it is not a finite number, or too low to record
     touches."""
     rate = real_number(value, "rate")
-    if not np.isfinite(rate) or rate < LOWEST_RATE:
+    if not np.isfinite(rate) or rate < MIN_RATE:
         raise ValueError(
             f"rate is {rate:g}; give the samples a second of each microphone in Hz (40000, not 40 kHz or 25 µs): "
-            f"finite and at least {LOWEST_RATE:g}."
+            f"finite and at least {MIN_RATE:g}."
         )
     return rate
 
@@ -91,10 +91,10 @@ def check_coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarr
             f"{label} has shape {points.shape}; give one row of 2 or 3 coordinates each, as many for microphones, "
             "outline and positions."
         )
-    bad = np.flatnonzero(~(np.abs(points) < _FARTHEST).all(axis=1))
-    if bad.size:
-        row = points[bad[0]].tolist()
-        raise ValueError(f"{label}: row {bad[0]} is {row}; every coordinate must be finite, in metres.")
+    invalid_rows = np.flatnonzero(~(np.abs(points) < _MAX_COORDINATE).all(axis=1))
+    if invalid_rows.size:
+        row = points[invalid_rows[0]].tolist()
+        raise ValueError(f"{label}: row {invalid_rows[0]} is {row}; every coordinate must be finite, in metres.")
     return points
 
 
@@ -102,42 +102,44 @@ def check_extent(points: np.ndarray, label: str) -> None:
     """Raise `ValueError` if the extent of points (n, d) along an axis exceeds the maximum plausible length of a
     skin."""
     extent = np.ptp(points, axis=0).max()
-    if extent > LARGEST_EXTENT:
+    if extent > MAX_EXTENT:
         raise ValueError(
             f"{label} spread over {extent:.4g}: are these metres? Divide millimetres by 1000; no side may be longer "
-            f"than {LARGEST_EXTENT:g} m."
+            f"than {MAX_EXTENT:g} m."
         )
 
 
-def check_microphones(places: np.ndarray, skin: np.ndarray) -> None:
-    """Raise `ValueError` if two of the microphones `places` (M, d) coincide, or if one is farther from the bounding box
-    of the points `skin` (n, d) than the length of the box. All are in metres."""
+def check_microphones(positions: np.ndarray, skin: np.ndarray) -> None:
+    """Raise `ValueError` if two microphones with `positions` (M, d) coincide, or if one is farther from the bounding
+    box of the points `skin` (n, d) than the length of the box. All are in metres."""
     low, high = skin.min(axis=0), skin.max(axis=0)
     extent = (high - low).max()
-    beyond = np.linalg.norm(places - np.clip(places, low, high), axis=1)
-    far = int(beyond.argmax())
-    if beyond[far] > extent:
+    distances = np.linalg.norm(positions - np.clip(positions, low, high), axis=1)
+    farthest = int(distances.argmax())
+    if distances[farthest] > extent:
         raise ValueError(
-            f"microphones: number {far} at {places[far].tolist()} is {beyond[far]:.3g} m away from a skin that is only "
-            f"{extent:.3g} m long: are these metres, in the outline's coordinates? Divide millimetres by 1000."
+            f"microphones: number {farthest} at {positions[farthest].tolist()} is {distances[farthest]:.3g} m away "
+            f"from a skin that is only {extent:.3g} m long: are these metres, in the outline's coordinates? Divide "
+            "millimetres by 1000."
         )
-    pairs = sorted(KDTree(places).query_pairs(_SAME))
+    pairs = sorted(KDTree(positions).query_pairs(_MIN_SPACING))
     if pairs:
-        one, other = pairs[0]
+        first, second = pairs[0]
         raise ValueError(
-            f"microphones: numbers {one} and {other} are at the same place, {places[one].tolist()}; give each its own."
+            f"microphones: numbers {first} and {second} are at the same place, {positions[first].tolist()}; give each "
+            "its own."
         )
 
 
-def check_taps(places: np.ndarray, outline: np.ndarray) -> None:
+def check_taps(positions: np.ndarray, outline: np.ndarray) -> None:
     """Raise `ValueError` if a tap (T, 2) is outside the outline (K, 2) by more than 5 % of the skin's length."""
     extent = np.ptp(outline, axis=0).max()
-    outside = np.flatnonzero(~inside(places, [outline]))
-    beyond = distance(places[outside], outline, np.roll(outline, -1, axis=0)).min(axis=1)
-    if outside.size and beyond.max() > _BESIDE * extent:
-        row = int(outside[beyond.argmax()])
+    outside = np.flatnonzero(~inside(positions, [outline]))
+    distances = distance(positions[outside], outline, np.roll(outline, -1, axis=0)).min(axis=1)
+    if outside.size and distances.max() > _MAX_OUTSIDE_SHARE * extent:
+        row = int(outside[distances.argmax()])
         raise ValueError(
-            f"positions: row {row}, {places[row].tolist()}, is {1e3 * beyond.max():.3g} mm outside the outline; taps "
-            f"must be on the skin, or within {1e3 * _BESIDE * extent:.3g} mm of it. Correct the place, or leave the "
-            "tap out."
+            f"positions: row {row}, {positions[row].tolist()}, is {1e3 * distances.max():.3g} mm outside the outline; "
+            f"taps must be on the skin, or within {1e3 * _MAX_OUTSIDE_SHARE * extent:.3g} mm of it. Correct the place, "
+            "or leave the tap out."
         )

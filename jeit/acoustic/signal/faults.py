@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 
 # Fault codes of samples, as returned by `sample_faults`. Descriptions list the faults in this order.
 SOUND, NOT_FINITE, STUCK, CLIPPING = range(4)
-_WORDS = {NOT_FINITE: "NaN or infinite", STUCK: "stuck", CLIPPING: "clipping"}
+_FAULT_WORDS = {NOT_FINITE: "NaN or infinite", STUCK: "stuck", CLIPPING: "clipping"}
 
 # Minimum duration of a stuck stretch: in seconds, and in samples.
 _STUCK_TIME, _STUCK_SAMPLES = 0.02, 64
@@ -27,7 +27,7 @@ _REST_STEPS, _REST_RANGE = 3.0, 1e-4
 _TOP_RANGE, _TOP_FULL_SCALE = 3e-4, 1e-3
 # Minimum number of converted values at the top of a clipped peak, and minimum ratio of the fall beside it to the fall
 # of a parabola.
-_FLAT, _SHARP = 3, 3.0
+_MIN_FLAT_VALUES, _MIN_FALL_RATIO = 3, 3.0
 
 
 def sample_faults(
@@ -38,51 +38,51 @@ def sample_faults(
     The code is 0 (`SOUND`) for a good sample, otherwise `NOT_FINITE`, `STUCK` or `CLIPPING`. `rate`: sampling rate in
     Hz. `full_scale`: largest possible magnitude of a sample, or None if unknown.
     """
-    kind = np.zeros(samples.shape, np.uint8)
+    codes = np.zeros(samples.shape, np.uint8)
     finite = np.isfinite(samples)
-    whole = bool(finite.all())
-    if not whole:
-        kind[~finite] = NOT_FINITE
+    all_finite = bool(finite.all())
+    if not all_finite:
+        codes[~finite] = NOT_FINITE
         if not finite.any():
-            return kind, "dead: every sample is NaN or infinite"
+            return codes, "dead: every sample is NaN or infinite"
         samples = np.where(finite, samples, np.nan)
     lowest, highest = np.fmin.reduce(samples), np.fmax.reduce(samples)
     if lowest == highest:
-        return kind, f"dead: every {'' if whole else 'finite '}sample is {lowest:g}"
+        return codes, f"dead: every {'' if all_finite else 'finite '}sample is {lowest:g}"
     stuck = _stuck_samples(samples, rate, float(highest - lowest))
     # A channel that stays at one end of its range is stuck, not clipping.
-    live = samples if stuck is None else np.where(stuck, np.nan, samples)
-    clipping = _clipped_samples(live, full_scale)
+    moving_samples = samples if stuck is None else np.where(stuck, np.nan, samples)
+    clipping = _clipped_samples(moving_samples, full_scale)
     if clipping is not None:
-        kind[clipping] = CLIPPING
+        codes[clipping] = CLIPPING
     if stuck is not None:
-        kind[stuck] = STUCK
-    return kind, ""
+        codes[stuck] = STUCK
+    return codes, ""
 
 
 def window_faults(
-    kind: UInt8[np.ndarray, "*batch S"], dead: str, length: int, hop: int
+    codes: UInt8[np.ndarray, "*batch S"], dead: str, length: int, hop: int
 ) -> tuple[Bool[np.ndarray, "*batch F"], str]:
     """Return the mask of the usable windows of one channel, and a description of the channel's faults ("" for none).
 
-    `kind`, `dead`: as returned by `sample_faults`. Windows of `length` samples begin every `hop` samples along the last
-    axis. A window with at least one faulty sample is not usable.
+    `codes`, `dead`: as returned by `sample_faults`. Windows of `length` samples begin every `hop` samples along the
+    last axis. A window with at least one faulty sample is not usable.
     """
-    number = 1 + (kind.shape[-1] - length) // hop
-    usable = np.ones((*kind.shape[:-1], number), bool)
+    num_windows = 1 + (codes.shape[-1] - length) // hop
+    usable = np.ones((*codes.shape[:-1], num_windows), bool)
     if dead:
         return np.zeros_like(usable), dead
-    if not kind.any():
+    if not codes.any():
         return usable, ""
-    start = hop * np.arange(number)
+    starts = hop * np.arange(num_windows)
     reasons = []
-    for which, word in _WORDS.items():
-        total = np.cumsum(kind == which, axis=-1)
-        total = np.concatenate([np.zeros((*kind.shape[:-1], 1), int), total], axis=-1)
-        hit = total[..., start + length] > total[..., start]
-        if hit.any():
-            usable &= ~hit
-            reasons.append(f"{word} in {_format_share(hit)} windows")
+    for code, word in _FAULT_WORDS.items():
+        counts = np.cumsum(codes == code, axis=-1)
+        counts = np.concatenate([np.zeros((*codes.shape[:-1], 1), int), counts], axis=-1)
+        is_faulty = counts[..., starts + length] > counts[..., starts]
+        if is_faulty.any():
+            usable &= ~is_faulty
+            reasons.append(f"{word} in {_format_share(is_faulty)} windows")
     return usable, "; ".join(reasons)
 
 
@@ -90,16 +90,16 @@ def intensity_faults(power: Float[np.ndarray, "F M"]) -> tuple[Bool[np.ndarray, 
     """Return the mask of the usable intensities and a description of each channel's fault, for intensities given
     without samples. Faults are NaN, infinity, and channels that contain only zeros."""
     finite = np.isfinite(power)
-    dead = ~(finite & (power != 0)).any(axis=0)
+    dead_channels = ~(finite & (power != 0)).any(axis=0)
     reasons = []
-    for channel, none in zip(finite.T, dead, strict=True):
-        if none and channel.any():
+    for channel, is_dead in zip(finite.T, dead_channels, strict=True):
+        if is_dead and channel.any():
             reasons.append(f"dead: every {'' if channel.all() else 'finite '}intensity is 0")
-        elif none:
+        elif is_dead:
             reasons.append("dead: every intensity is NaN or infinite")
         else:
             reasons.append("" if channel.all() else f"NaN or infinite in {_format_share(~channel)} windows")
-    return finite & ~dead, tuple(reasons)
+    return finite & ~dead_channels, tuple(reasons)
 
 
 def describe_faults(reasons: Sequence[str]) -> str:
@@ -110,19 +110,19 @@ def describe_faults(reasons: Sequence[str]) -> str:
         if reason:
             groups.setdefault(reason, []).append(k)
     return "; ".join(
-        f"{'microphone' if len(which) == 1 else 'microphones'} {_ranges(np.array(which))}: {reason}"
-        for reason, which in groups.items()
+        f"{'microphone' if len(indices) == 1 else 'microphones'} {_format_ranges(np.array(indices))}: {reason}"
+        for reason, indices in groups.items()
     )
 
 
-def _ranges(numbers: np.ndarray) -> str:
+def _format_ranges(numbers: np.ndarray) -> str:
     """Format increasing integers as ranges: 0, 1, 2, 5 as "0-2, 5"."""
-    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
-    return ", ".join(f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts)
+    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
+    return ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
 
 
-def _format_share(hit: np.ndarray) -> str:
-    return f"all {hit.size}" if hit.all() else f"{int(hit.sum())} of {hit.size}"
+def _format_share(mask: np.ndarray) -> str:
+    return f"all {mask.size}" if mask.all() else f"{int(mask.sum())} of {mask.size}"
 
 
 def _true_runs(flags: Bool[np.ndarray, " S"]) -> Shaped[np.ndarray, "2 R"]:
@@ -140,49 +140,49 @@ def _converter_step(samples: np.ndarray) -> float:
 def _stuck_samples(samples: np.ndarray, rate: float, extent: float) -> Bool[np.ndarray, " S"] | None:
     """Mask of the samples in long constant stretches, unless the signal also comes to rest elsewhere; None if no sample
     is stuck. `extent`: range of the samples."""
-    stretch = max(_STUCK_SAMPLES, round(_STUCK_TIME * rate))
+    min_length = max(_STUCK_SAMPLES, round(_STUCK_TIME * rate))
     # A stuck stretch covers at least two whole blocks. Runs are searched for only if a block is constant, which saves
     # time.
-    block = stretch // 4
+    block = min_length // 4
     blocks = samples[: samples.size // block * block].reshape(-1, block)
-    span = blocks.max(axis=1) - blocks.min(axis=1)
-    if not (span == 0).any():
+    block_ranges = blocks.max(axis=1) - blocks.min(axis=1)
+    if not (block_ranges == 0).any():
         return None
     # Each flag stands for a pair of equal neighbours, so a run of n flags is a stretch of n + 1 samples.
     start, stop = _true_runs(samples[1:] == samples[:-1])
-    long = stop - start + 1 >= stretch
-    if not long.any():
+    is_long = stop - start + 1 >= min_length
+    if not is_long.any():
         return None
     stuck = np.zeros(samples.shape, bool)
-    for first, last in zip(start[long], stop[long], strict=True):
+    for first, last in zip(start[is_long], stop[is_long], strict=True):
         stuck[first : last + 1] = True
     # Silence can be constant too: with a coarse converter, or in a simulation without noise. The sound then fades into
     # silence, so that some other blocks are almost constant. In a stuck channel with noise no other block is.
-    live = ~stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(span)
-    rest = max(_REST_STEPS * _converter_step(samples), _REST_RANGE * extent)
-    return None if live.any() and span[live].min() <= rest else stuck
+    is_moving = ~stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(block_ranges)
+    rest_range = max(_REST_STEPS * _converter_step(samples), _REST_RANGE * extent)
+    return None if is_moving.any() and block_ranges[is_moving].min() <= rest_range else stuck
 
 
 def _clipped_samples(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray, " S"] | None:
     """Mask of the samples at an end of the channel's range, if its peaks are cut off there; None if they are not."""
     lowest, highest = np.fmin.reduce(samples), np.fmax.reduce(samples)
-    found = None
-    step = hold = 0.0
-    for sign, top in ((1.0, highest), (-1.0, -lowest)):
+    clipped = None
+    step = samples_per_value = 0.0
+    for sign, peak in ((1.0, highest), (-1.0, -lowest)):
         heights = [_TOP_RANGE * (highest - lowest)]
-        if full_scale is not None and top >= (1 - _TOP_FULL_SCALE) * full_scale:
-            heights.append(top - (1 - _TOP_FULL_SCALE) * full_scale)
-        fall = top - sign * samples
+        if full_scale is not None and peak >= (1 - _TOP_FULL_SCALE) * full_scale:
+            heights.append(peak - (1 - _TOP_FULL_SCALE) * full_scale)
+        distance_below_top = peak - sign * samples
         # Most channels need no further test: they have too few samples near the end of the range to be clipped.
-        if np.count_nonzero(fall <= max(heights)) < _FLAT:
+        if np.count_nonzero(distance_below_top <= max(heights)) < _MIN_FLAT_VALUES:
             continue
-        if not hold:
-            step, hold = _converter_step(samples), _samples_per_value(samples)
+        if not samples_per_value:
+            step, samples_per_value = _converter_step(samples), _samples_per_value(samples)
         for height in heights:
-            near = fall <= height + step
-            if _has_clipped_peak(fall, near, height + 2 * step, hold):
-                found = near if found is None else found | near
-    return found
+            near_top = distance_below_top <= height + step
+            if _has_clipped_peak(distance_below_top, near_top, height + 2 * step, samples_per_value):
+                clipped = near_top if clipped is None else clipped | near_top
+    return clipped
 
 
 def _has_clipped_peak(
@@ -198,13 +198,19 @@ def _has_clipped_peak(
     """
     start, stop = _true_runs(near)
     conversions = (stop - start) / samples_per_value
-    for which in np.flatnonzero(conversions >= _FLAT):
-        number, first, last = conversions[which], start[which], stop[which]
-        beyond = max(1, int(number) // 2)
-        reach = int(beyond * samples_per_value)
-        sides = (distance_below_top[max(0, first - reach) : first], distance_below_top[last : last + reach])
-        least = min(np.fmax.reduce(side) if side.size else np.inf for side in sides)
-        if least > _SHARP * height * ((number - 1 + 2 * beyond) / (number - 1)) ** 2:
+    for run_index in np.flatnonzero(conversions >= _MIN_FLAT_VALUES):
+        num_values, first, last = conversions[run_index], start[run_index], stop[run_index]
+        num_values_beyond = max(1, int(num_values) // 2)
+        num_samples_beyond = int(num_values_beyond * samples_per_value)
+        sides = (
+            distance_below_top[max(0, first - num_samples_beyond) : first],
+            distance_below_top[last : last + num_samples_beyond],
+        )
+        smallest_fall = min(np.fmax.reduce(side) if side.size else np.inf for side in sides)
+        if (
+            smallest_fall
+            > _MIN_FALL_RATIO * height * ((num_values - 1 + 2 * num_values_beyond) / (num_values - 1)) ** 2
+        ):
             return True
     return False
 

@@ -30,9 +30,9 @@ from jeit.arguments import check_kind
 from jeit_solvers.module import Module
 
 # Minimum number of frequency bins in the band.
-_FEWEST_BINS = 4.0
+_MIN_BINS = 4.0
 # Number of samples transformed at a time: 2 MiB, so that samples and transforms fit into the processor's cache.
-_CHUNK = 2**18
+_MAX_CHUNK_SAMPLES = 2**18
 
 
 class WindowGrid(NamedTuple):
@@ -49,11 +49,11 @@ class WindowGrid(NamedTuple):
     weights: np.ndarray
 
 
-def window_grid(settings, rate: float, samples: int | None, name: str) -> WindowGrid:
+def window_grid(settings, rate: float, num_samples: int | None, name: str) -> WindowGrid:
     """Convert `IntensitySettings` to windows and bins at the sampling rate `rate` in Hz.
 
-    `samples`: number of samples of the recording, if known; `name`: its name in messages. Raises `ValueError` if band,
-    window, rate and number of samples are not compatible.
+    `num_samples`: number of samples of the recording, if known; `name`: its name in messages. Raises `ValueError` if
+    band, window, rate and number of samples are not compatible.
     """
     length, hop = round(settings.window * rate), max(1, round(settings.hop * rate))
     if settings.high > rate / 2:
@@ -62,25 +62,25 @@ def window_grid(settings, rate: float, samples: int | None, name: str) -> Window
             f"set high to {rate / 2:g} Hz or less."
         )
     bins = (settings.high - settings.low) * length / rate
-    if bins < _FEWEST_BINS:
+    if bins < _MIN_BINS:
         raise ValueError(
             f"{name}: a window of {settings.window:g} s resolves frequencies {1 / settings.window:.3g} Hz apart: too "
             f"few in the band {settings.low:g} to {settings.high:g} Hz. Set window to "
-            f"{_FEWEST_BINS / (settings.high - settings.low):.2g} s or more, or widen the band."
+            f"{_MIN_BINS / (settings.high - settings.low):.2g} s or more, or widen the band."
         )
-    if samples is not None and samples < length:
+    if num_samples is not None and num_samples < length:
         raise ValueError(
-            f"{name}: {samples} samples at {rate:g} Hz last {samples / rate:.3g} s, less than one window of "
+            f"{name}: {num_samples} samples at {rate:g} Hz last {num_samples / rate:.3g} s, less than one window of "
             f"{settings.window:g} s. Record longer, or shorten window=."
         )
     # The periodic Hann window is used instead of the symmetric one: its transform is nonzero in three bins only.
     taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
     edges = np.clip((np.arange(length // 2 + 2) - 0.5) * rate / length, 0, rate / 2)
-    overlap = np.clip(edges, settings.low, settings.high)
-    weights = np.diff(overlap) * length / rate
-    (used,) = np.nonzero(weights)
-    weights = weights[used[0] : used[-1] + 1] * 2 / (length * (taper**2).sum())
-    return WindowGrid(length, hop, taper, int(used[0]), weights)
+    clipped_edges = np.clip(edges, settings.low, settings.high)
+    weights = np.diff(clipped_edges) * length / rate
+    (bin_indices,) = np.nonzero(weights)
+    weights = weights[bin_indices[0] : bin_indices[-1] + 1] * 2 / (length * (taper**2).sum())
+    return WindowGrid(length, hop, taper, int(bin_indices[0]), weights)
 
 
 def band_power(samples: np.ndarray, grid: WindowGrid) -> np.ndarray:
@@ -92,20 +92,20 @@ def band_power(samples: np.ndarray, grid: WindowGrid) -> np.ndarray:
     # A large constant would cost precision. The remaining mean of each window is removed below.
     samples = samples - samples.mean(axis=1, keepdims=True, dtype=float)
     windows = sliding_window_view(samples, grid.length, axis=-1)[:, :: grid.hop]
-    count, number = windows.shape[:2]
-    power = np.empty((number, count))
+    num_microphones, num_windows = windows.shape[:2]
+    power = np.empty((num_windows, num_microphones))
     last = grid.first + len(grid.weights)
-    step = max(1, _CHUNK // (count * grid.length))
-    constant = np.fft.rfft(grid.taper)[grid.first : last]
-    room = np.empty(count * min(step, number) * grid.length)
-    for start in range(0, number, step):
-        part = windows[:, start : start + step]
-        tapered = np.multiply(part, grid.taper, out=room[: part.size].reshape(part.shape))
+    chunk_size = max(1, _MAX_CHUNK_SAMPLES // (num_microphones * grid.length))
+    taper_spectrum = np.fft.rfft(grid.taper)[grid.first : last]
+    buffer = np.empty(num_microphones * min(chunk_size, num_windows) * grid.length)
+    for start in range(0, num_windows, chunk_size):
+        chunk = windows[:, start : start + chunk_size]
+        tapered = np.multiply(chunk, grid.taper, out=buffer[: chunk.size].reshape(chunk.shape))
         spectrum = np.asarray(scipy.fft.rfft(tapered, workers=2))[..., grid.first : last]
         if grid.first < 2:
             # In bins from 2 on, the transform of the Hann window is zero, and the mean has no effect.
-            spectrum = spectrum - part.mean(axis=-1)[..., None] * constant
-        power[start : start + step] = ((np.real(spectrum) ** 2 + np.imag(spectrum) ** 2) @ grid.weights).T
+            spectrum = spectrum - chunk.mean(axis=-1)[..., None] * taper_spectrum
+        power[start : start + chunk_size] = ((np.real(spectrum) ** 2 + np.imag(spectrum) ** 2) @ grid.weights).T
     return power
 
 
@@ -122,9 +122,9 @@ def _overlap_trace(grid: WindowGrid, lag: int) -> float:
     # The inverse real transform counts all bins twice except the first and, for even N, the last.
     weights[1 : (grid.length + 1) // 2] /= 2
     squared = (grid.length * np.fft.irfft(weights, grid.length)) ** 2
-    both = np.zeros(grid.length)
-    both[: grid.length - lag] = grid.taper[: grid.length - lag] * grid.taper[lag:]
-    correlation = np.fft.irfft(np.abs(np.fft.rfft(both)) ** 2, grid.length)
+    taper_product = np.zeros(grid.length)
+    taper_product[: grid.length - lag] = grid.taper[: grid.length - lag] * grid.taper[lag:]
+    correlation = np.fft.irfft(np.abs(np.fft.rfft(taper_product)) ** 2, grid.length)
     return float((squared * correlation).sum())
 
 
@@ -135,13 +135,13 @@ def white_freedom(grid: WindowGrid) -> float:
     return float(((grid.taper**2).sum() * grid.weights.sum()) ** 2 / _overlap_trace(grid, 0))
 
 
-def noise_correlation(grid: WindowGrid, windows: int) -> Float[np.ndarray, "F F"]:
-    """Correlation (F, F) between the powers of white noise in any two of the `windows`, which overlap."""
-    overlapping = range(min(windows, -(-grid.length // grid.hop)))
-    by_lag = np.zeros(windows)
-    by_lag[: len(overlapping)] = [_overlap_trace(grid, j * grid.hop) for j in overlapping]
-    between = np.abs(np.arange(windows)[:, None] - np.arange(windows))
-    return by_lag[between] / by_lag[0]
+def noise_correlation(grid: WindowGrid, num_windows: int) -> Float[np.ndarray, "F F"]:
+    """Correlation (F, F) between the powers of white noise in F = `num_windows` overlapping windows."""
+    overlapping_lags = range(min(num_windows, -(-grid.length // grid.hop)))
+    lag_traces = np.zeros(num_windows)
+    lag_traces[: len(overlapping_lags)] = [_overlap_trace(grid, j * grid.hop) for j in overlapping_lags]
+    lags = np.abs(np.arange(num_windows)[:, None] - np.arange(num_windows))
+    return lag_traces[lags] / lag_traces[0]
 
 
 # A tap is audible in a window if its loudness there is at least this fraction of its maximum loudness.
@@ -241,15 +241,15 @@ def intensities(
     check_settings("settings", settings)
     samples, rate = recording.samples, recording.rate
     grid = window_grid(settings or IntensitySettings(), rate, samples.shape[-1], recording.name)
-    found = [
+    fault_results = [
         window_faults(*sample_faults(channel, rate, recording.full_scale), grid.length, grid.hop) for channel in samples
     ]
-    usable = np.stack([good for good, _ in found], axis=1)
+    usable = np.stack([usable_windows for usable_windows, _ in fault_results], axis=1)
     power = band_power(samples, grid)
     freedom = white_freedom(grid)
     noise = noise_floor(power, usable, freedom) if floor is None else _check_floor(floor, samples.shape[0])
     times = (grid.hop * np.arange(len(power)) + grid.length / 2) / rate
-    faults = tuple(reason for _, reason in found)
+    faults = tuple(reason for _, reason in fault_results)
     return Intensities(
         times,
         power - noise,
@@ -293,35 +293,35 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     if taps.samples is None or taps.rate is None:
         assert taps.power is not None
         usable, faults = intensity_faults(taps.power)
-        count, microphones = taps.power.shape
-        return TapIntensities(taps.power, np.zeros(microphones), np.full(count, np.inf), usable, faults)
+        num_taps, num_microphones = taps.power.shape
+        return TapIntensities(taps.power, np.zeros(num_microphones), np.full(num_taps, np.inf), usable, faults)
     samples, rate = taps.samples, taps.rate
     grid = window_grid(settings or IntensitySettings(), rate, samples.shape[-1], taps.name)
-    good, faults = [], []
+    usable_masks, faults = [], []
     for m in range(samples.shape[1]):
         # All taps of a microphone are tested together, since range, converter step and silence are properties of the
         # channel.
-        kind, dead = sample_faults(samples[:, m].ravel(), rate, taps.full_scale)
-        one, reason = window_faults(kind.reshape(-1, samples.shape[-1]), dead, grid.length, grid.hop)
-        good.append(one)
+        codes, dead = sample_faults(samples[:, m].ravel(), rate, taps.full_scale)
+        mask, reason = window_faults(codes.reshape(-1, samples.shape[-1]), dead, grid.length, grid.hop)
+        usable_masks.append(mask)
         faults.append(reason)
-    usable = np.stack(good, axis=-1)
+    usable = np.stack(usable_masks, axis=-1)
     power = np.stack([band_power(tap, grid) for tap in samples])
-    count, windows, microphones = power.shape
+    num_taps, num_windows, num_microphones = power.shape
     freedom = white_freedom(grid)
-    floor = noise_floor(power.reshape(-1, microphones), usable.reshape(-1, microphones), freedom)
+    floor = noise_floor(power.reshape(-1, num_microphones), usable.reshape(-1, num_microphones), freedom)
     # The minimum floor prevents a simulated channel without noise from dominating. Dead channels are ignored.
-    alive = usable.any(axis=(0, 1))
-    least = np.maximum(floor, max(1e-9 * power.max(), np.finfo(float).tiny))
-    loudness = np.where(alive, power / least - floor / least, 0).sum(axis=-1)
-    audible = loudness >= _AUDIBLE_SHARE * loudness.max(axis=1, keepdims=True)
+    is_alive = usable.any(axis=(0, 1))
+    positive_floor = np.maximum(floor, max(1e-9 * power.max(), np.finfo(float).tiny))
+    loudness = np.where(is_alive, power / positive_floor - floor / positive_floor, 0).sum(axis=-1)
+    is_audible = loudness >= _AUDIBLE_SHARE * loudness.max(axis=1, keepdims=True)
     # The loudest window is always included, also if no window is above the floor.
-    audible |= loudness == loudness.max(axis=1, keepdims=True)
-    mean = np.einsum("tf,tfm->tm", audible, power) / audible.sum(axis=1)[:, None]
-    shared = noise_correlation(grid, windows)
-    each = np.array([freedom * one.sum() ** 2 / shared[np.ix_(one, one)].sum() for one in audible])
-    whole = (usable | ~audible[..., None]).all(axis=1)
-    return TapIntensities(mean - floor, floor, each, whole, tuple(faults))
+    is_audible |= loudness == loudness.max(axis=1, keepdims=True)
+    mean = np.einsum("tf,tfm->tm", is_audible, power) / is_audible.sum(axis=1)[:, None]
+    correlation = noise_correlation(grid, num_windows)
+    tap_freedom = np.array([freedom * mask.sum() ** 2 / correlation[np.ix_(mask, mask)].sum() for mask in is_audible])
+    all_usable = (usable | ~is_audible[..., None]).all(axis=1)
+    return TapIntensities(mean - floor, floor, tap_freedom, all_usable, tuple(faults))
 
 
 def noise_floor(
@@ -354,27 +354,27 @@ def noise_floor(
         raise ValueError(f"freedom must be positive; it is {freedom!r}.")
     if not (np.isfinite(power) | ~usable).all():
         raise ValueError("power is NaN or infinite in windows that usable calls usable; mark those False.")
-    number = usable.sum(axis=0)
-    ordered = np.sort(np.where(usable, power, np.inf), axis=0)
+    num_usable = usable.sum(axis=0)
+    sorted_power = np.sort(np.where(usable, power, np.inf), axis=0)
     # The median of the quietest `share` of the windows.
-    rank = np.clip(np.floor(0.5 * share * number).astype(int), 0, max(len(power) - 1, 0))
-    floor = np.take_along_axis(ordered, rank[None], axis=0)[0] if len(power) else np.zeros(power.shape[1])
-    floor = np.where(number > 0, floor, 0.0)
+    rank = np.clip(np.floor(0.5 * share * num_usable).astype(int), 0, max(len(power) - 1, 0))
+    floor = np.take_along_axis(sorted_power, rank[None], axis=0)[0] if len(power) else np.zeros(power.shape[1])
+    floor = np.where(num_usable > 0, floor, 0.0)
     if np.isinf(freedom):
         return floor
-    half = freedom / 2
+    half_freedom = freedom / 2
     # Quantiles of χ²_ν / ν, and its mean below the cut-off c: ∫_0^c y p(y) dy is the distribution function of χ² with
     # ν + 2 degrees of freedom, at ν c.
-    floor = floor / (gammaincinv(half, 0.5 * share) / half)
-    cut = gammaincinv(half, 0.9) / half
-    below = gammainc(half + 1, half * cut) / 0.9
+    floor = floor / (gammaincinv(half_freedom, 0.5 * share) / half_freedom)
+    cutoff = gammaincinv(half_freedom, 0.9) / half_freedom
+    mean_below_cutoff = gammainc(half_freedom + 1, half_freedom * cutoff) / 0.9
     for _ in range(50):
-        quiet = usable & (power <= cut * floor)
-        mean = np.where(quiet, power, 0).sum(axis=0) / np.maximum(quiet.sum(axis=0), 1) / below
-        new = np.where(quiet.any(axis=0), mean, floor)
-        if np.allclose(new, floor, rtol=1e-6, atol=0):
+        is_quiet = usable & (power <= cutoff * floor)
+        mean = np.where(is_quiet, power, 0).sum(axis=0) / np.maximum(is_quiet.sum(axis=0), 1) / mean_below_cutoff
+        new_floor = np.where(is_quiet.any(axis=0), mean, floor)
+        if np.allclose(new_floor, floor, rtol=1e-6, atol=0):
             break
-        floor = new
+        floor = new_floor
     return floor
 
 
@@ -384,11 +384,15 @@ def degrees_of_freedom(settings: IntensitySettings, rate: float) -> float:
     return white_freedom(window_grid(settings, rate, None, "settings"))
 
 
-def _check_floor(floor, microphones: int) -> Float[np.ndarray, " M"]:
-    given = np.asarray(floor)
-    if given.dtype.kind not in "fiu" or given.shape != (microphones,) or not (np.isfinite(given) & (given >= 0)).all():
+def _check_floor(floor, num_microphones: int) -> Float[np.ndarray, " M"]:
+    values = np.asarray(floor)
+    if (
+        values.dtype.kind not in "fiu"
+        or values.shape != (num_microphones,)
+        or not (np.isfinite(values) & (values >= 0)).all()
+    ):
         raise ValueError(
-            f"floor must be finite and not negative, one for each of the {microphones} microphones; it is "
-            f"{given.dtype} of shape {given.shape}."
+            f"floor must be finite and not negative, one for each of the {num_microphones} microphones; it is "
+            f"{values.dtype} of shape {values.shape}."
         )
-    return given.astype(float)
+    return values.astype(float)

@@ -35,7 +35,7 @@ from jeit_solvers.module import Module
 # Error message for files of an unknown format.
 _UNKNOWN_FORMAT = "neither an NPZ nor a sound file"
 # Maximum magnitude of a sample in any unit; squares of larger samples would overflow in single precision.
-_LOUDEST = 1e15
+_MAX_SAMPLE = 1e15
 
 
 class Recording(Module):
@@ -67,14 +67,14 @@ class Recording(Module):
     ):
         """Raises `ValueError` for samples that are not real, have another shape than (M, S) or look transposed, and for
         an implausible rate."""
-        given = real_array_of(samples, "samples", "microphones, samples")
-        beyond = np.abs(given) > _LOUDEST if given.dtype.kind == "f" else np.zeros(0, bool)
-        self.samples = np.where(beyond, np.inf, given) if beyond.any() else given
-        count, length = self.samples.shape
-        if count > length:
+        array = real_array_of(samples, "samples", "microphones, samples")
+        is_too_large = np.abs(array) > _MAX_SAMPLE if array.dtype.kind == "f" else np.zeros(0, bool)
+        self.samples = np.where(is_too_large, np.inf, array) if is_too_large.any() else array
+        num_microphones, num_samples = self.samples.shape
+        if num_microphones > num_samples:
             raise ValueError(
-                f"samples has shape {self.samples.shape}: {count} microphones with {length} samples each. It looks "
-                "transposed: give (microphones, samples)."
+                f"samples has shape {self.samples.shape}: {num_microphones} microphones with {num_samples} samples "
+                "each. It looks transposed: give (microphones, samples)."
             )
         self.rate, self.full_scale, self.name = sampling_rate(rate), check_full_scale(full_scale), name
 
@@ -136,10 +136,10 @@ class Intensities(Module):
             real_array_of(times, "times", "windows"),
             real_array_of(power, "intensity", "windows, microphones"),
         )
-        shape, length = self.power.shape, len(self.times)
-        if shape[0] != length:
-            hint = " It looks transposed: give (windows, microphones)." if shape[1] == length else ""
-            raise ValueError(f"intensity has shape {shape}, but there are {length} times, one a window.{hint}")
+        shape, num_windows = self.power.shape, len(self.times)
+        if shape[0] != num_windows:
+            hint = " It looks transposed: give (windows, microphones)." if shape[1] == num_windows else ""
+            raise ValueError(f"intensity has shape {shape}, but there are {num_windows} times, one a window.{hint}")
         if not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
             raise ValueError("times must be finite and increasing, in seconds: the middle of each window.")
         self.floor = np.zeros(shape[1]) if floor is None else real_array_of(floor, "floor", "microphones")
@@ -152,20 +152,20 @@ class Intensities(Module):
         if not self.freedom > 0:
             raise ValueError(f"freedom must be positive (infinite when unknown); it is {self.freedom}.")
         self.overlap = real_number(overlap, "overlap")
-        if not 1 <= self.overlap <= max(length, 1):
+        if not 1 <= self.overlap <= max(num_windows, 1):
             raise ValueError(
-                f"overlap must be at least 1 and no more than the {length} windows: how many of them share a sample "
-                f"(window / hop); it is {self.overlap:g}."
+                f"overlap must be at least 1 and no more than the {num_windows} windows: how many of them share a "
+                f"sample (window / hop); it is {self.overlap:g}."
             )
-        found, reasons = intensity_faults(self.power)
-        given = found if usable is None else np.asarray(usable)
+        default_usable, reasons = intensity_faults(self.power)
+        usable_mask = default_usable if usable is None else np.asarray(usable)
         self.faults = reasons if faults is None else tuple(str(reason) for reason in faults)
-        if given.shape != shape or given.dtype != bool or len(self.faults) != shape[1]:
+        if usable_mask.shape != shape or usable_mask.dtype != bool or len(self.faults) != shape[1]:
             raise ValueError(
-                f"usable is {given.dtype} of shape {given.shape} with {len(self.faults)} faults; give booleans of "
-                f"shape {shape}, and one string a microphone."
+                f"usable is {usable_mask.dtype} of shape {usable_mask.shape} with {len(self.faults)} faults; give "
+                f"booleans of shape {shape}, and one string a microphone."
             )
-        self.usable, self.name, self.notes = given & np.isfinite(self.power), name, tuple(notes)
+        self.usable, self.name, self.notes = usable_mask & np.isfinite(self.power), name, tuple(notes)
 
 
 class Taps(Module):
@@ -229,24 +229,24 @@ class Taps(Module):
             ("positions", self.positions),
         ):
             check_extent(np.concatenate([self.outline, points]), label)
-        flat = self.outline.shape[1] == 2
-        check_microphones(self.microphones, self.outline if flat else np.vstack([self.outline, self.positions]))
-        if flat:
+        is_plane = self.outline.shape[1] == 2
+        check_microphones(self.microphones, self.outline if is_plane else np.vstack([self.outline, self.positions]))
+        if is_plane:
             check_taps(self.positions, self.outline)
         if (power is None) == (samples is None):
-            both = "neither" if power is None else "both"
-            raise ValueError(f"taps need either intensity or samples with their rate; {both} were given.")
+            supplied = "neither" if power is None else "both"
+            raise ValueError(f"taps need either intensity or samples with their rate; {supplied} were given.")
         expected = (len(self.positions), len(self.microphones))
         self.power = None if power is None else real_array_of(power, "intensity", "taps, microphones")
         self.samples = None if samples is None else real_array_of(samples, "samples", "taps, microphones, samples")
-        label, given = ("intensity", self.power) if self.samples is None else ("samples", self.samples)
-        assert given is not None
-        if given.shape[:2] != expected:
-            transposed = given.shape == expected[::-1] or (given.ndim == 3 and given.shape[::2] == expected)
+        label, values = ("intensity", self.power) if self.samples is None else ("samples", self.samples)
+        assert values is not None
+        if values.shape[:2] != expected:
+            transposed = values.shape == expected[::-1] or (values.ndim == 3 and values.shape[::2] == expected)
             hint = " It looks transposed." if transposed else ""
             raise ValueError(
-                f"{label} has shape {given.shape}, but there are {expected[0]} positions and {expected[1]} "
-                f"microphones: give (taps, microphones{', samples' if given.ndim == 3 else ''}).{hint}"
+                f"{label} has shape {values.shape}, but there are {expected[0]} positions and {expected[1]} "
+                f"microphones: give (taps, microphones{', samples' if values.ndim == 3 else ''}).{hint}"
             )
         if self.samples is not None and rate is None:
             raise ValueError("rate is missing: samples need the samples a second of each microphone, in Hz.")
@@ -285,15 +285,15 @@ def read_recording(path: str | Path) -> Recording | Intensities:
         arrays = npz_arrays(
             path, "samples", "rate", "full_scale", "intensity", "times", *optional, otherwise=_UNKNOWN_FORMAT
         )
-        kind = choose_array(arrays, "intensity", "samples")
-        if kind == "samples":
+        content = choose_array(arrays, "intensity", "samples")
+        if content == "samples":
             if arrays["samples"].ndim == 3:
                 raise ValueError("samples has three axes, as a file of taps has: read that with read_taps.")
             need(arrays, "rate")
             return Recording(arrays["samples"], arrays["rate"], full_scale=arrays.get("full_scale"), name=path.stem)
         need(arrays, "times")
-        known = {key: arrays[key] for key in optional if key in arrays}
-        return Intensities(arrays["times"], arrays["intensity"], **known, name=path.stem)
+        optional_arrays = {key: arrays[key] for key in optional if key in arrays}
+        return Intensities(arrays["times"], arrays["intensity"], **optional_arrays, name=path.stem)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
 
@@ -320,16 +320,16 @@ def read_taps(path: str | Path) -> Taps:
     path = Path(path)
     geometry = ("microphones", "outline", "positions")
     try:
-        asked = (*geometry, "intensity", "samples", "rate", "full_scale")
-        arrays = npz_arrays(path, *asked, otherwise=_UNKNOWN_FORMAT)
+        keys = (*geometry, "intensity", "samples", "rate", "full_scale")
+        arrays = npz_arrays(path, *keys, otherwise=_UNKNOWN_FORMAT)
         need(arrays, *geometry)
-        kind = choose_array(arrays, "intensity", "samples")
-        values = {"power" if kind == "intensity" else "samples": arrays[kind]}
-        if kind == "samples":
+        content = choose_array(arrays, "intensity", "samples")
+        arguments = {"power" if content == "intensity" else "samples": arrays[content]}
+        if content == "samples":
             need(arrays, "rate")
-            values |= {"rate": arrays["rate"]}
+            arguments |= {"rate": arrays["rate"]}
         full_scale = arrays.get("full_scale")
-        return Taps(*(arrays[key] for key in geometry), **values, full_scale=full_scale, name=path.stem)
+        return Taps(*(arrays[key] for key in geometry), **arguments, full_scale=full_scale, name=path.stem)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
 
@@ -352,8 +352,8 @@ def write_recording(path: str | Path, recording: Recording | Intensities) -> Non
     if isinstance(recording, Recording):
         _write_npz(path, samples=recording.samples, rate=recording.rate, full_scale=recording.full_scale)
     else:
-        known = {key: getattr(recording, key) for key in ("times", "floor", "freedom", "overlap")}
-        _write_npz(path, intensity=np.where(recording.usable, recording.power, np.nan), **known)
+        fields = {key: getattr(recording, key) for key in ("times", "floor", "freedom", "overlap")}
+        _write_npz(path, intensity=np.where(recording.usable, recording.power, np.nan), **fields)
 
 
 def write_taps(path: str | Path, taps: Taps) -> None:

@@ -13,7 +13,7 @@ from jeit.arguments.extras import optional
 from jeit.files import check_memory, read_as, reason
 
 # Bytes of memory needed per byte of a file with eight bits per sample.
-_IN_MEMORY = 16
+_MEMORY_FACTOR = 16
 # First bytes of the formats read by `soundfile`: FLAC, Ogg, AIFF, CAF, AU, Wave64, VOC, MP3 with a tag.
 _SOUNDFILE_STARTS = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"riff", b"Creative", b"ID3")
 # Bytes that identify formats which `soundfile` does not read: MP4 (from the fifth byte on); WebM, WMA and AMR.
@@ -28,7 +28,7 @@ def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
     full scale is None (unknown). Raises `ValueError` for broken files, for formats that cannot be read, and if
     `soundfile` is needed but not installed.
     """
-    check_memory(path.name, _IN_MEMORY * path.stat().st_size)
+    check_memory(path.name, _MEMORY_FACTOR * path.stat().st_size)
     with path.open("rb") as file:
         start = file.read(8)
     if start.startswith((b"RIFF", b"RIFX", b"RF64")):
@@ -50,14 +50,14 @@ def _is_mp3(start: bytes) -> bool:
 
 def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
     problem, rate, data = None, 0, np.zeros(0)
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught_warnings:
         warnings.simplefilter("always")
         try:
             rate, data = scipy.io.wavfile.read(path)
         except Exception as error:  # damaged files raise exceptions of many types
             problem = error
     # SciPy only warns of a truncated file, or fails later. Its other warnings concern chunks without sound.
-    if any("prematurely" in str(one.message) for one in said):
+    if any("prematurely" in str(warning.message) for warning in caught_warnings):
         raise ValueError("the WAV file is cut off: it holds fewer samples than its header says. Copy it again.")
     if "Unknown wave file format" in str(problem):  # A-law or ADPCM, for example
         return _read_with_soundfile(path)
@@ -77,15 +77,15 @@ def _read_with_soundfile(path: Path) -> tuple[np.ndarray, float, float | None]:
         soundfile: Any = optional("soundfile", "a format that is not plain WAV", "Or convert it to plain WAV.")
     except ImportError as error:
         raise ValueError(str(error)) from None  # like other faults of this file: the caller may read further files
-    unread = "not a sound file that soundfile reads"
-    with read_as(unread):
+    error_message = "not a sound file that soundfile reads"
+    with read_as(error_message):
         file = soundfile.SoundFile(path)
     with file:
         check_memory(path.name, 16.0 * file.frames * file.channels)
-        with read_as(unread):
-            data, rate, kind = file.read(file.frames, "float64", always_2d=True), file.samplerate, file.subtype
+        with read_as(error_message):
+            data, rate, subtype = file.read(file.frames, "float64", always_2d=True), file.samplerate, file.subtype
     # Decoded samples of compressed formats may slightly exceed 1, although their full scale is 1.
-    return data.T, rate, _full_scale(data) if kind in ("FLOAT", "DOUBLE") else 1.0
+    return data.T, rate, _full_scale(data) if subtype in ("FLOAT", "DOUBLE") else 1.0
 
 
 def _full_scale(samples: np.ndarray) -> float | None:

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 from jeit.acoustic.simulate.propagation import noise_power, transfer
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.acoustic.simulate.synthesis import (
-    ONSET,
-    RINGING,
-    VIBRATOR,
+    FIRST_ONSET,
+    RINGING_TIME,
+    VIBRATOR_BURST,
     Burst,
     bin_frequencies,
     check_burst,
@@ -30,7 +30,7 @@ from jeit.arguments.checks import check_not_negative
 from jeit_solvers.module import Module
 
 # Number of samples computed at once: 32 MB.
-PIECE = 2**22
+MAX_CHUNK_SAMPLES = 2**22
 
 
 class CalibrationTaps(Module):
@@ -52,7 +52,7 @@ def simulate_calibration_taps(
     positions: ArrayLike,
     *,
     repeats: int = 3,
-    burst: Burst = VIBRATOR,
+    burst: Burst = VIBRATOR_BURST,
     strength_spread: float = 0.3,
     duration: float = 0.15,
     noise: bool = True,
@@ -84,52 +84,61 @@ def simulate_calibration_taps(
     ```
     """
     check_skin_and_key(skin, key)
-    places = skin.layer.check_inside("positions", positions)
+    tap_positions = skin.layer.check_inside("positions", positions)
     if repeats < 1:
         raise ValueError(f"repeats: give at least one tap for each position, not {repeats}.")
     check_not_negative("strength_spread", strength_spread)
     check_burst(burst, duration)
     times = sample_times(skin, duration)
-    loudness, rest = jax.random.split(key)
+    strength_key, tap_key = jax.random.split(key)
     strengths = burst.strength * np.exp(
-        strength_spread * np.asarray(jax.random.normal(loudness, (len(places), repeats)))
+        strength_spread * np.asarray(jax.random.normal(strength_key, (len(tap_positions), repeats)))
     )
-    envelope = burst.envelope(times, np.array([ONSET]), np.array([1.0]))
-    size = transform_size(len(times), skin.layer.longest_delay + RINGING, skin.rate)
-    samples = np.empty((len(places), repeats, skin.num_microphones, len(times)))
+    envelope = burst.envelope(times, np.array([FIRST_ONSET]), np.array([1.0]))
+    size = transform_size(len(times), skin.layer.longest_delay + RINGING_TIME, skin.rate)
+    samples = np.empty((len(tap_positions), repeats, skin.num_microphones, len(times)))
     level = noise_power(skin) if noise else None
-    keys = jax.random.split(rest, len(places))
-    # The taps are computed in pieces, which limits memory. All pieces have the same size, so that one compiled program
+    keys = jax.random.split(tap_key, len(tap_positions))
+    # The taps are computed in chunks, which limits memory. All chunks have the same size, so that one compiled program
     # serves all.
-    pieces = min(len(places), -(-samples.size // PIECE))
-    for part in np.array_split(np.arange(-(-len(places) // pieces) * pieces), pieces):
-        part = np.minimum(part, len(places) - 1)
-        samples[part] = _tap_samples(
-            skin, keys[part], places[part], strengths[part], envelope, level, size, num_filled_bins(skin, size)
+    num_chunks = min(len(tap_positions), -(-samples.size // MAX_CHUNK_SAMPLES))
+    for chunk in np.array_split(np.arange(-(-len(tap_positions) // num_chunks) * num_chunks), num_chunks):
+        chunk = np.minimum(chunk, len(tap_positions) - 1)
+        samples[chunk] = _tap_samples(
+            skin,
+            keys[chunk],
+            tap_positions[chunk],
+            strengths[chunk],
+            envelope,
+            level,
+            size,
+            num_filled_bins(skin, size),
         )
         if progress is not None:
-            progress(f"{part[-1] + 1} of {len(places)} places")
+            progress(f"{chunk[-1] + 1} of {len(tap_positions)} places")
     return CalibrationTaps(
-        samples.reshape(-1, *samples.shape[2:]), skin.rate, np.repeat(places, repeats, axis=0), strengths.ravel()
+        samples.reshape(-1, *samples.shape[2:]), skin.rate, np.repeat(tap_positions, repeats, axis=0), strengths.ravel()
     )
 
 
 @partial(jax.jit, static_argnums=(6, 7))
-def _tap_samples(skin, keys, places, strengths, envelope, level, size, bins):
+def _tap_samples(skin, keys, positions, strengths, envelope, level, size, bins):
     frequencies = bin_frequencies(skin, size, bins)
 
     def samples_at_position(item):
-        key, place, loudness = item
-        sources, own = jax.random.split(key)
-        channels = transfer(skin, frequencies, place)
+        key, position, tap_strengths = item
+        source_key, noise_key = jax.random.split(key)
+        channels = transfer(skin, frequencies, position)
 
-        def samples_of_tap(key, own, strength):
+        def samples_of_tap(key, noise_key, strength):
             spectrum = strength * source_spectrum(skin, key, envelope, size, bins) * channels
             if level is not None:
-                spectrum += noise_spectrum(skin, own, level, size, bins)
+                spectrum += noise_spectrum(skin, noise_key, level, size, bins)
             return jnp.fft.irfft(spectrum, size)[:, : len(envelope)]
 
-        repeats = len(loudness)
-        return jax.vmap(samples_of_tap)(jax.random.split(sources, repeats), jax.random.split(own, repeats), loudness)
+        repeats = len(tap_strengths)
+        return jax.vmap(samples_of_tap)(
+            jax.random.split(source_key, repeats), jax.random.split(noise_key, repeats), tap_strengths
+        )
 
-    return jax.lax.map(samples_at_position, (keys, places, strengths))
+    return jax.lax.map(samples_at_position, (keys, positions, strengths))

@@ -12,8 +12,8 @@ from jeit_solvers.module import Module
 
 # Time between two slots of a multiplexer in seconds, and number of slots. Eight 4:1 multiplexers switch simultaneously
 # every 25 µs, so each microphone is sampled every 100 µs (Park 2022, text S3).
-STEP = 25e-6
-SLOTS = 4
+SLOT_TIME = 25e-6
+NUM_SLOTS = 4
 
 
 class MicrophoneModel(Module):
@@ -79,7 +79,7 @@ class Readout(Module):
     @property
     def rate(self) -> float:
         """Sampling rate of each microphone in Hz."""
-        return 1 / (SLOTS * STEP) if self.multiplexed else 1 / STEP
+        return 1 / (NUM_SLOTS * SLOT_TIME) if self.multiplexed else 1 / SLOT_TIME
 
     @property
     def coupling(self):
@@ -88,7 +88,7 @@ class Readout(Module):
 
     def stagger(self, number: int) -> np.ndarray:
         """Sampling delay (M,) of each of `number` microphones relative to the first, in seconds."""
-        return STEP * (np.arange(number) % SLOTS) * self.multiplexed
+        return SLOT_TIME * (np.arange(number) % NUM_SLOTS) * self.multiplexed
 
 
 def microphone_grid(number: int, *, width: float = 0.2, height: float = 0.2) -> np.ndarray:
@@ -110,6 +110,6 @@ def microphone_grid(number: int, *, width: float = 0.2, height: float = 0.2) -> 
     """
     if number < 1:
         raise ValueError(f"number: give the number of points in a row, at least 1; it is {number}.")
-    along = (np.arange(number) + 0.5) / number - 0.5
-    y, x = np.meshgrid(along * height, along * width, indexing="ij")
+    cell_centres = (np.arange(number) + 0.5) / number - 0.5
+    y, x = np.meshgrid(cell_centres * height, cell_centres * width, indexing="ij")
     return np.stack([x.ravel(), y.ravel()], axis=-1)

@@ -10,9 +10,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, record, simulate_silence
+from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, simulate_recording, simulate_silence
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
-from jeit.acoustic.simulate.synthesis import ONSET, Burst, microphone_noise, sample_times
+from jeit.acoustic.simulate.synthesis import FIRST_ONSET, Burst, microphone_noise, sample_times
 from jeit.acoustic.simulate.touches import NOMINAL_SPEED
 from jeit.acoustic.simulate.wind_sound import TURBULENCE, simulate_room_sound, simulate_wind
 from jeit.arguments import check_key, check_kind, check_name, describe
@@ -21,7 +21,7 @@ from jeit_solvers.module import Module
 
 # Standard deviation of the logarithm of a trait between the clips of one person; and standard deviation of `slope`,
 # which varies linearly, between people. Between the clips of one person, `slope` varies half as much.
-WITHIN, SLOPE_AMONG = 0.25, 0.3
+WITHIN_PERSON_SPREAD, SLOPE_SPREAD = 0.25, 0.3
 
 
 @dataclass(frozen=True)
@@ -41,26 +41,26 @@ SOUND_MANNERS: dict[str, dict[str, Trait]] = {
         "strength": Trait(2.0, 0.4),
         "length": Trait(0.08, 0.25),
         "interval": Trait(0.3, 0.3),
-        "slope": Trait(1.5, SLOPE_AMONG),
+        "slope": Trait(1.5, SLOPE_SPREAD),
     },
     "tickle": {
         "strength": Trait(0.7, 0.4),
         "length": Trait(0.04, 0.25),
         "interval": Trait(1 / 15, 0.3),
         "radius": Trait(0.01, 0.3),
-        "slope": Trait(1.0, SLOPE_AMONG),
+        "slope": Trait(1.0, SLOPE_SPREAD),
     },
     "stroke": {
         "strength": Trait(1.0, 0.4),
         "speed": Trait(0.1, 0.35),
         "path": Trait(0.12, 0.35),
-        "slope": Trait(0.7, SLOPE_AMONG),
+        "slope": Trait(0.7, SLOPE_SPREAD),
     },
     "wind": {
         "strength": Trait(1.0, 0.4),
         "radius": Trait(0.03, 0.3),
         "gusts": Trait(0.15, 0.4),
-        "slope": Trait(TURBULENCE, SLOPE_AMONG),
+        "slope": Trait(TURBULENCE, SLOPE_SPREAD),
     },
     "none": {},
 }
@@ -72,12 +72,12 @@ MODALITIES = tuple(SOUND_MANNERS)
 
 # Standard deviations between the taps of one clip: of the logarithm of strength, and of the logarithm of the interval;
 # and maximum distance in metres of a pat from its mean position.
-_STRENGTH, _RHYTHM, _PAT_RADIUS = 0.25, 0.12, 4e-3
+_STRENGTH_SPREAD, _RHYTHM_SPREAD, _PAT_RADIUS = 0.25, 0.12, 4e-3
 # Minimum distance of the centre of a touch from the edge, in metres; minimum speed of a hand at a turn, divided by its
 # mean speed.
-_MARGIN, _SLOWEST = 0.02, 0.1
+_EDGE_MARGIN, _MIN_SPEED_RATIO = 0.02, 0.1
 # Minimum length of a burst in seconds, which limits random values.
-_SHORTEST = 0.01
+_MIN_BURST_LENGTH = 0.01
 
 
 class SoundingPerson(Module):
@@ -110,16 +110,16 @@ class SoundingPerson(Module):
         `ValueError` if `key` is not a random key."""
         check_key(key)
         rng = _numpy_generator(key)
-        own = {}
+        medians = {}
         for name, traits in SOUND_MANNERS.items():
-            own[name] = {}
-            for trait, usual in traits.items():
+            medians[name] = {}
+            for trait, distribution in traits.items():
                 normal = rng.normal()
                 if trait == "slope":
-                    own[name][trait] = max(usual.median + usual.spread * normal, 0.1)
+                    medians[name][trait] = max(distribution.median + distribution.spread * normal, 0.1)
                 else:
-                    own[name][trait] = float(usual.median * np.exp(usual.spread * normal))
-        return cls(own)
+                    medians[name][trait] = float(distribution.median * np.exp(distribution.spread * normal))
+        return cls(medians)
 
     def touch(self, key: Array, modality: str, skin: SoundingSkin, *, duration: float = 2.9) -> SimulatedSound:
         """Simulate `duration` seconds of a touch of this person at a random position on the skin, without noise.
@@ -130,42 +130,42 @@ class SoundingPerson(Module):
         check_skin_and_key(skin, key)
         check_name("modality", modality, MODALITIES)
         check_positive("duration", duration)
-        drawn, rest = jax.random.split(key)
-        rng = _numpy_generator(drawn)
+        trait_key, sound_key = jax.random.split(key)
+        rng = _numpy_generator(trait_key)
         if modality == "none":
-            return _silence(skin, duration)
+            return _simulate_no_touch(skin, duration)
         traits = {}
-        for name, own in self.medians[modality].items():
+        for name, median in self.medians[modality].items():
             if name == "slope":
-                traits[name] = max(own + SLOPE_AMONG / 2 * rng.normal(), 0.1)
+                traits[name] = max(median + SLOPE_SPREAD / 2 * rng.normal(), 0.1)
             else:
-                traits[name] = float(own * np.exp(WITHIN * rng.normal()))
+                traits[name] = float(median * np.exp(WITHIN_PERSON_SPREAD * rng.normal()))
         # The touch is simulated with its own spectral slope in place of the skin's. The microphones' noise depends on
         # the skin's slope and is therefore not added here.
-        toned = eqx.tree_at(lambda one: one.spectral_slope, skin, traits.pop("slope"))
-        return _SIMULATIONS[modality](rng, toned, rest, traits, duration)
+        sloped_skin = eqx.tree_at(lambda tree: tree.spectral_slope, skin, traits.pop("slope"))
+        return _SIMULATIONS[modality](rng, sloped_skin, sound_key, traits, duration)
 
 
 def _simulate_taps(
     rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float
 ) -> SimulatedSound:
     """Simulate a pat or tickle: taps of random strength and rhythm at random positions within a small disc."""
-    burst = Burst(traits["strength"], max(traits["length"], _SHORTEST))
+    burst = Burst(traits["strength"], max(traits["length"], _MIN_BURST_LENGTH))
     interval, radius = traits["interval"], traits.get("radius", _PAT_RADIUS)
-    count = int(np.ceil(2 * duration / interval)) + 2
-    gaps = interval * np.exp(_RHYTHM * rng.normal(size=count))
+    num_taps = int(np.ceil(2 * duration / interval)) + 2
+    intervals = interval * np.exp(_RHYTHM_SPREAD * rng.normal(size=num_taps))
     # The recording begins at a random phase of the rhythm.
-    onsets = ONSET - rng.uniform(0, interval) + np.cumsum(gaps) - gaps[0]
+    onsets = FIRST_ONSET - rng.uniform(0, interval) + np.cumsum(intervals) - intervals[0]
     onsets = onsets[(onsets > -burst.length) & (onsets < duration)]
-    strengths = burst.strength * np.exp(_STRENGTH * rng.normal(size=len(onsets)))
+    strengths = burst.strength * np.exp(_STRENGTH_SPREAD * rng.normal(size=len(onsets)))
     times = sample_times(skin, duration)
-    spread = radius * np.sqrt(rng.uniform(size=len(onsets)))
+    distances = radius * np.sqrt(rng.uniform(size=len(onsets)))
     angle = rng.uniform(0, 2 * np.pi, len(onsets))
-    landed = _clip_to_skin(
-        skin, _random_position(rng, skin) + np.stack([spread * np.cos(angle), spread * np.sin(angle)], axis=-1)
+    tap_positions = _clip_to_skin(
+        skin, _random_position(rng, skin) + np.stack([distances * np.cos(angle), distances * np.sin(angle)], axis=-1)
     )
     blocks = np.maximum(np.searchsorted(onsets, block_times(skin, len(times)) + HOP, side="right") - 1, 0)
-    return record(skin, key, landed[blocks], burst.envelope(times, onsets, strengths), False)
+    return simulate_recording(skin, key, tap_positions[blocks], burst.envelope(times, onsets, strengths), False)
 
 
 def _simulate_stroke(
@@ -173,18 +173,25 @@ def _simulate_stroke(
 ) -> SimulatedSound:
     """Simulate a stroke back and forth along a straight path, slower at the turns."""
     angle, phase = rng.uniform(0, 2 * np.pi, 2)
-    half = traits["path"] / 2 * np.array([np.cos(angle), np.sin(angle)])
-    room = np.array([skin.layer.width, skin.layer.height]) / 2 - _MARGIN
-    half = half * min(1.0, float(np.min(room / np.maximum(np.abs(half), 1e-9))))
-    length = 2 * float(np.linalg.norm(half))
-    middle = np.clip(_random_position(rng, skin), -(room - np.abs(half)), room - np.abs(half))
+    half_path = traits["path"] / 2 * np.array([np.cos(angle), np.sin(angle)])
+    max_coordinates = np.array([skin.layer.width, skin.layer.height]) / 2 - _EDGE_MARGIN
+    half_path = half_path * min(1.0, float(np.min(max_coordinates / np.maximum(np.abs(half_path), 1e-9))))
+    length = 2 * float(np.linalg.norm(half_path))
+    path_centre = np.clip(
+        _random_position(rng, skin), -(max_coordinates - np.abs(half_path)), max_coordinates - np.abs(half_path)
+    )
     times = sample_times(skin, duration)
     # The mean speed of a sinusoidal motion of amplitude L/2 and angular frequency w is L w / π.
-    turning = np.pi * traits["speed"] / length
-    speed = np.maximum(length / 2 * turning * np.abs(np.cos(turning * times + phase)), _SLOWEST * traits["speed"])
-    centres = block_times(skin, len(times))
-    places = _clip_to_skin(skin, middle + np.sin(turning * centres + phase)[:, None] * half)
-    return record(skin, key, places, traits["strength"] * np.sqrt(speed / NOMINAL_SPEED), False)
+    angular_frequency = np.pi * traits["speed"] / length
+    speed = np.maximum(
+        length / 2 * angular_frequency * np.abs(np.cos(angular_frequency * times + phase)),
+        _MIN_SPEED_RATIO * traits["speed"],
+    )
+    block_centres = block_times(skin, len(times))
+    positions = _clip_to_skin(
+        skin, path_centre + np.sin(angular_frequency * block_centres + phase)[:, None] * half_path
+    )
+    return simulate_recording(skin, key, positions, traits["strength"] * np.sqrt(speed / NOMINAL_SPEED), False)
 
 
 def _simulate_wind(
@@ -204,7 +211,7 @@ _SIMULATIONS: dict[str, Callable[..., SimulatedSound]] = {
 }
 
 
-def _silence(skin: SoundingSkin, duration: float) -> SimulatedSound:
+def _simulate_no_touch(skin: SoundingSkin, duration: float) -> SimulatedSound:
     """Simulate a recording without a touch and without noise."""
     silence = simulate_silence(skin, jax.random.key(0), duration=duration)
     return SimulatedSound(
@@ -213,13 +220,14 @@ def _silence(skin: SoundingSkin, duration: float) -> SimulatedSound:
 
 
 def _random_position(rng: np.random.Generator, skin: SoundingSkin) -> np.ndarray:
-    half = np.array([skin.layer.width, skin.layer.height]) / 2
-    return rng.uniform(-1, 1, 2) * np.maximum(half - _MARGIN, half / 2)
+    """Draw a position (2,) in metres from a uniform distribution on the skin, away from its edges."""
+    half_size = np.array([skin.layer.width, skin.layer.height]) / 2
+    return rng.uniform(-1, 1, 2) * np.maximum(half_size - _EDGE_MARGIN, half_size / 2)
 
 
-def _clip_to_skin(skin: SoundingSkin, places: np.ndarray) -> np.ndarray:
-    half = np.array([skin.layer.width, skin.layer.height]) / 2
-    return np.clip(places, -half, half)
+def _clip_to_skin(skin: SoundingSkin, positions: np.ndarray) -> np.ndarray:
+    half_size = np.array([skin.layer.width, skin.layer.height]) / 2
+    return np.clip(positions, -half_size, half_size)
 
 
 def _numpy_generator(key: Array) -> np.random.Generator:
@@ -228,7 +236,7 @@ def _numpy_generator(key: Array) -> np.random.Generator:
 
 # Mean level of the room's sound relative to the microphones' noise, and its standard deviation between clips, in
 # decibels.
-_ROOM, _ROOM_SPREAD = -6.0, 4.0
+_ROOM_LEVEL, _ROOM_SPREAD = -6.0, 4.0
 
 
 @dataclass(frozen=True)
@@ -290,25 +298,25 @@ def simulate_sound_clips(
     """
     check_skin_and_key(skin, key)
     check_kind("people", people, (list, tuple), "a list of them, such as [SoundingPerson.draw(key)]")
-    for number, person in enumerate(people):
-        check_kind(f"people[{number}]", person, SoundingPerson, "a SoundingPerson, such as SoundingPerson.draw(key)")
+    for index, person in enumerate(people):
+        check_kind(f"people[{index}]", person, SoundingPerson, "a SoundingPerson, such as SoundingPerson.draw(key)")
     if not people:
         raise ValueError("people: give one at least, such as [SoundingPerson.draw(key)].")
     check_kind("modalities", modalities, (list, tuple), "a list of names, such as ['pat', 'none']")
-    for number, modality in enumerate(modalities):
-        check_name(f"modalities[{number}]", modality, MODALITIES)
+    for index, modality in enumerate(modalities):
+        check_name(f"modalities[{index}]", modality, MODALITIES)
     if not (isinstance(each, int) and each >= 1):
         raise ValueError(f"each must be a number of clips, 1 or more; it is {describe(each)}.")
     check_positive("duration", duration)
-    return _clips(key, skin, people, each, tuple(modalities), duration)
+    return _generate_clips(key, skin, people, each, tuple(modalities), duration)
 
 
-def _clips(key, skin, people, each, modalities, duration) -> Iterator[SoundClip]:
-    count = len(sample_times(skin, duration))
-    rows = [(person, modality) for person in range(len(people)) for modality in modalities for _ in range(each)]
-    for number, (person, modality) in enumerate(rows):
-        touched, own, room, loud = jax.random.split(jax.random.fold_in(key, number), 4)
-        touch = people[person].touch(touched, modality, skin, duration=duration)
-        level = _ROOM + _ROOM_SPREAD * float(jax.random.normal(loud))
-        around = simulate_room_sound(skin, room, level_db=level, duration=duration).samples
-        yield SoundClip(touch, microphone_noise(skin, own, count) + around, modality, person)
+def _generate_clips(key, skin, people, each, modalities, duration) -> Iterator[SoundClip]:
+    num_samples = len(sample_times(skin, duration))
+    labels = [(person, modality) for person in range(len(people)) for modality in modalities for _ in range(each)]
+    for clip_index, (person, modality) in enumerate(labels):
+        touch_key, noise_key, room_key, level_key = jax.random.split(jax.random.fold_in(key, clip_index), 4)
+        touch = people[person].touch(touch_key, modality, skin, duration=duration)
+        level = _ROOM_LEVEL + _ROOM_SPREAD * float(jax.random.normal(level_key))
+        room_samples = simulate_room_sound(skin, room_key, level_db=level, duration=duration).samples
+        yield SoundClip(touch, microphone_noise(skin, noise_key, num_samples) + room_samples, modality, person)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from jeit.acoustic.simulate.microphones import SLOTS, STEP
+from jeit.acoustic.simulate.microphones import NUM_SLOTS, SLOT_TIME
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin
 
 
@@ -51,23 +51,25 @@ def transfer(skin: SoundingSkin, frequencies: Float[Array, " F"], position: Floa
     x, y = position
     width, height = layer.width, layer.height
     weight = jnp.array([1.0, layer.reflection, layer.reflection])
-    across, along = jnp.array([x, width - x, -width - x]), jnp.array([y, height - y, -height - y])
-    squared = (across[:, None] - skin.microphones[:, 0, None, None]) ** 2
-    squared += (along - skin.microphones[:, 1, None, None]) ** 2
-    length = jnp.sqrt(squared + skin.microphone_depth[:, None, None] ** 2).reshape(-1, 9)
+    x_offsets, y_offsets = jnp.array([x, width - x, -width - x]), jnp.array([y, height - y, -height - y])
+    squared_distances = (x_offsets[:, None] - skin.microphones[:, 0, None, None]) ** 2
+    squared_distances += (y_offsets - skin.microphones[:, 1, None, None]) ** 2
+    path_lengths = jnp.sqrt(squared_distances + skin.microphone_depth[:, None, None] ** 2).reshape(-1, 9)
     amplitude = (
-        jnp.outer(weight, weight).reshape(9) * layer.spreading(length, skin.microphone_model.depth) * skin.gain[:, None]
+        jnp.outer(weight, weight).reshape(9)
+        * layer.spreading(path_lengths, skin.microphone_model.depth)
+        * skin.gain[:, None]
     )
     decay = layer.material.loss(frequencies) + 1j * layer.material.wavenumber(frequencies)
-    received = jnp.sum(amplitude[..., None] * jnp.exp(-length[..., None] * decay), axis=1)
+    received = jnp.sum(amplitude[..., None] * jnp.exp(-path_lengths[..., None] * decay), axis=1)
     if not skin.readout.multiplexed:
         return received
     # Microphone i is connected to slot i mod 4 of multiplexer i div 4. The slot read 25 µs earlier may be open.
     index = np.arange(skin.num_microphones)
-    before = index - index % SLOTS + (index - 1) % SLOTS
-    connected = before < skin.num_microphones
-    leak = jnp.where(connected[:, None], received[np.where(connected, before, 0)], 0)
-    received += skin.readout.coupling * leak * jnp.exp(-2j * jnp.pi * frequencies * STEP)
+    previous_index = index - index % NUM_SLOTS + (index - 1) % NUM_SLOTS
+    has_previous = previous_index < skin.num_microphones
+    crosstalk = jnp.where(has_previous[:, None], received[np.where(has_previous, previous_index, 0)], 0)
+    received += skin.readout.coupling * crosstalk * jnp.exp(-2j * jnp.pi * frequencies * SLOT_TIME)
     return received * jnp.exp(2j * jnp.pi * frequencies * skin.stagger[:, None])
 
 

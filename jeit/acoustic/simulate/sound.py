@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jeit.acoustic.simulate.propagation import transfer
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.acoustic.simulate.synthesis import (
-    RINGING,
+    RINGING_TIME,
     bin_frequencies,
     microphone_noise,
     num_filled_bins,
@@ -97,25 +97,42 @@ def superpose(skin: SoundingSkin, key: Array | None, *recordings: SimulatedSound
         raise ValueError(
             f"recordings: all must come from this skin and last equally long; shapes and rates are {shapes}."
         )
-    together = np.sum([recording.samples for recording in recordings], axis=0)
-    return together if key is None else together + microphone_noise(skin, key, together.shape[1])
+    samples = np.sum([recording.samples for recording in recordings], axis=0)
+    return samples if key is None else samples + microphone_noise(skin, key, samples.shape[1])
 
 
-def record(skin: SoundingSkin, key: Array, places: np.ndarray, envelope: np.ndarray, noise: bool) -> SimulatedSound:
-    """Simulate the recording of a source with the root mean square `envelope` (S,) at the positions `places` in metres:
-    (B, 2), one per block, or (1, 2) for a source at rest."""
-    source, own = jax.random.split(key)
-    count, centres = len(envelope), block_times(skin, len(envelope))
-    places = np.broadcast_to(places, (len(centres), 2))
-    whole = transform_size(count, RINGING, skin.rate)
-    block = transform_size(2 * round(HOP * skin.rate), skin.layer.longest_delay, skin.rate)
+def simulate_recording(
+    skin: SoundingSkin, key: Array, positions: np.ndarray, envelope: np.ndarray, noise: bool
+) -> SimulatedSound:
+    """Simulate the recording of a source with the root mean square `envelope` (S,) at `positions` in metres: (B, 2),
+    one per block, or (1, 2) for a source at rest."""
+    source_key, noise_key = jax.random.split(key)
+    num_samples, block_centres = len(envelope), block_times(skin, len(envelope))
+    positions = np.broadcast_to(positions, (len(block_centres), 2))
+    transform_length = transform_size(num_samples, RINGING_TIME, skin.rate)
+    block_length = transform_size(2 * round(HOP * skin.rate), skin.layer.longest_delay, skin.rate)
     samples = np.asarray(
-        _moving_source_samples(skin, source, places, envelope, whole, block, num_filled_bins(skin, block, blur=4 / HOP))
+        _moving_source_samples(
+            skin,
+            source_key,
+            positions,
+            envelope,
+            transform_length,
+            block_length,
+            num_filled_bins(skin, block_length, blur=4 / HOP),
+        )
     )
     if noise:
-        samples = samples + microphone_noise(skin, own, count)
-    kept = centres <= count / skin.rate
-    return SimulatedSound(samples, skin.rate, np.array(places[kept]), centres[kept], envelope, noise)
+        samples = samples + microphone_noise(skin, noise_key, num_samples)
+    is_within_recording = block_centres <= num_samples / skin.rate
+    return SimulatedSound(
+        samples,
+        skin.rate,
+        np.array(positions[is_within_recording]),
+        block_centres[is_within_recording],
+        envelope,
+        noise,
+    )
 
 
 def block_times(skin: SoundingSkin, count: int) -> np.ndarray:
@@ -124,20 +141,24 @@ def block_times(skin: SoundingSkin, count: int) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnums=(4, 5, 6))
-def _moving_source_samples(skin, key, places, envelope, num_samples, block, bins):
-    count, hop = envelope.shape[0], round(HOP * skin.rate)
-    sound = jnp.fft.irfft(source_spectrum(skin, key, envelope, num_samples, num_samples // 2 + 1), num_samples)[:count]
-    sound = jnp.pad(sound, (hop, places.shape[0] * hop + hop - count))
+def _moving_source_samples(skin, key, positions, envelope, num_samples, block_length, num_bins):
+    num_recorded, hop = envelope.shape[0], round(HOP * skin.rate)
+    sound = jnp.fft.irfft(source_spectrum(skin, key, envelope, num_samples, num_samples // 2 + 1), num_samples)[
+        :num_recorded
+    ]
+    sound = jnp.pad(sound, (hop, positions.shape[0] * hop + hop - num_recorded))
     window = jnp.sin(jnp.pi * jnp.arange(2 * hop) / (2 * hop)) ** 2
-    frequencies = bin_frequencies(skin, block, bins)
+    frequencies = bin_frequencies(skin, block_length, num_bins)
 
     def add_block(output, item):
-        index, place = item
-        piece = jax.lax.dynamic_slice(sound, (index * hop,), (2 * hop,)) * window
-        spectrum = jnp.fft.rfft(piece, block)[:bins] * transfer(skin, frequencies, place)
-        here = jax.lax.dynamic_slice(output, (0, index * hop), (output.shape[0], block))
-        return jax.lax.dynamic_update_slice(output, here + jnp.fft.irfft(spectrum, block), (0, index * hop)), None
+        index, position = item
+        block_sound = jax.lax.dynamic_slice(sound, (index * hop,), (2 * hop,)) * window
+        spectrum = jnp.fft.rfft(block_sound, block_length)[:num_bins] * transfer(skin, frequencies, position)
+        output_block = jax.lax.dynamic_slice(output, (0, index * hop), (output.shape[0], block_length))
+        return jax.lax.dynamic_update_slice(
+            output, output_block + jnp.fft.irfft(spectrum, block_length), (0, index * hop)
+        ), None
 
-    output = jnp.zeros((skin.num_microphones, places.shape[0] * hop + block))
-    output, _ = jax.lax.scan(add_block, output, (jnp.arange(places.shape[0]), places))
-    return output[:, hop : hop + count]
+    output = jnp.zeros((skin.num_microphones, positions.shape[0] * hop + block_length))
+    output, _ = jax.lax.scan(add_block, output, (jnp.arange(positions.shape[0]), positions))
+    return output[:, hop : hop + num_recorded]

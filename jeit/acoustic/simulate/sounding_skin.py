@@ -115,25 +115,27 @@ class ElastomerLayer(Module):
         """Return `points` (P, 2) in metres as floats. Raises `ValueError` unless all are finite and on the layer;
         `name` is the argument's name in the message."""
         try:
-            place = np.asarray(points, float)
+            positions = np.asarray(points, float)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{name}: give (x, y) in metres for each; {error}.") from None
-        if place.ndim != 2 or place.shape[1] != 2 or len(place) == 0:
-            raise ValueError(f"{name}: give (x, y) in metres for each, shape (P, 2), not {place.shape}.")
-        if not np.isfinite(place).all():
-            raise ValueError(f"{name}: row {np.argmin(np.isfinite(place).all(axis=1))} is not finite.")
-        half = np.array([self.width, self.height]) / 2 * (1 + 1e-9)
-        outside = (np.abs(place) > half).any(axis=1)
+        if positions.ndim != 2 or positions.shape[1] != 2 or len(positions) == 0:
+            raise ValueError(f"{name}: give (x, y) in metres for each, shape (P, 2), not {positions.shape}.")
+        if not np.isfinite(positions).all():
+            raise ValueError(f"{name}: row {np.argmin(np.isfinite(positions).all(axis=1))} is not finite.")
+        half_size = np.array([self.width, self.height]) / 2 * (1 + 1e-9)
+        outside = (np.abs(positions) > half_size).any(axis=1)
         if outside.any():
             row = int(np.argmax(outside))
-            in_millimetres = (np.abs(place) > 10 * half).any() and (np.abs(place) <= 1000 * half).all()
+            in_millimetres = (np.abs(positions) > 10 * half_size).any() and (
+                np.abs(positions) <= 1000 * half_size
+            ).all()
             hint = " Are they in millimetres? Divide by 1000." if in_millimetres else ""
             raise ValueError(
-                f"{name}: row {row}, ({place[row, 0]:g}, {place[row, 1]:g}) m, lies off the skin, which is "
+                f"{name}: row {row}, ({positions[row, 0]:g}, {positions[row, 1]:g}) m, lies off the skin, which is "
                 f"{self.width:g} m by {self.height:g} m about the origin. Positions are in metres from its middle."
                 f"{hint}"
             )
-        return place
+        return positions
 
 
 class SoundingSkin(Module):
@@ -202,10 +204,10 @@ class SoundingSkin(Module):
             raise ValueError(f"spectral_slope must be finite; it is {spectral_slope}.")
         self.spectral_slope = spectral_slope
         width, height = self.layer.width, self.layer.height
-        place = microphone_grid(5, width=width, height=height) if microphones is None else microphones
-        place = self.layer.check_inside("microphones", place)
-        draws = np.asarray(jax.random.normal(key, (3, len(place))))
-        self.microphones = jnp.asarray(place)
+        positions = microphone_grid(5, width=width, height=height) if microphones is None else microphones
+        positions = self.layer.check_inside("microphones", positions)
+        draws = np.asarray(jax.random.normal(key, (3, len(positions))))
+        self.microphones = jnp.asarray(positions)
         self.microphone_depth = jnp.asarray(
             self.microphone_model.depth * np.exp(self.microphone_model.depth_spread * draws[0])
         )

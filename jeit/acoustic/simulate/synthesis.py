@@ -23,7 +23,7 @@ from jeit_solvers.module import Module
 
 # Duration in seconds for which the source's filter rings before and after a burst, since it has zero phase: about the
 # inverse of its lowest frequency.
-RINGING = 0.05
+RINGING_TIME = 0.05
 
 
 def bin_frequencies(skin: SoundingSkin, num_samples: int, bins: int) -> Array:
@@ -39,8 +39,8 @@ def num_filled_bins(skin: SoundingSkin, num_samples: int, *, blur: float = 0.0) 
 
 def transform_size(count: int, padding: float, rate: float) -> int:
     """Length in samples of a fast transform of `count` samples with at least `padding` seconds of zeros."""
-    needed = count + int(np.ceil(padding * rate))
-    return 2 * int(np.asarray(next_fast_len((needed + 1) // 2)))
+    min_size = count + int(np.ceil(padding * rate))
+    return 2 * int(np.asarray(next_fast_len((min_size + 1) // 2)))
 
 
 def source_spectrum(skin: SoundingSkin, key: Array, envelope: Array, num_samples: int, bins: int) -> Array:
@@ -73,7 +73,7 @@ def microphone_noise(skin: SoundingSkin, key: Array, count: int) -> Float[np.nda
     """Simulate `count` samples (M, S) of microphone noise."""
     # Noise synthesised from a spectrum is periodic with period `size`. More samples than needed are generated, so that
     # the last samples are independent of the first.
-    size = transform_size(count, RINGING, skin.rate)
+    size = transform_size(count, RINGING_TIME, skin.rate)
     return np.asarray(_noise_samples(skin, key, noise_power(skin), count, size, num_filled_bins(skin, size)))
 
 
@@ -83,7 +83,7 @@ def sample_times(skin: SoundingSkin, duration: float) -> Float[np.ndarray, " S"]
 
 
 # Time in seconds at which the first burst begins, which leaves room for the ringing of the filter.
-ONSET = 0.02
+FIRST_ONSET = 0.02
 
 
 class Burst(Module):
@@ -110,10 +110,10 @@ class Burst(Module):
     def check_fits(self, duration: float) -> None:
         """Raises `ValueError` if a recording of `duration` seconds is too short for one burst."""
         check_positive("duration", duration)
-        if duration < ONSET + self.length:
+        if duration < FIRST_ONSET + self.length:
             raise ValueError(
-                f"duration: a burst of {self.length:g} s that begins at {ONSET:g} s does not fit in {duration:g} s. "
-                f"Give at least {ONSET + self.length:g} s, or a shorter length."
+                f"duration: a burst of {self.length:g} s that begins at {FIRST_ONSET:g} s does not fit in {duration:g} "
+                f"s. Give at least {FIRST_ONSET + self.length:g} s, or a shorter length."
             )
 
     def envelope(
@@ -126,9 +126,9 @@ class Burst(Module):
         is 4 % of it at the end. The integral of its square is a³ / 4; divided by `length`, this is the mean square by
         which the shape is normalised.
         """
-        rise = self.length / 6
-        after = np.maximum(times - onsets[:, None], 0)
-        shape = after * np.exp(-after / rise) / np.sqrt(rise**3 / 4 / self.length)
+        rise_time = self.length / 6
+        elapsed = np.maximum(times - onsets[:, None], 0)
+        shape = elapsed * np.exp(-elapsed / rise_time) / np.sqrt(rise_time**3 / 4 / self.length)
         # Overlapping bursts are treated as independent noises, so their powers add.
         return np.sqrt(((strengths[:, None] * shape) ** 2).sum(axis=0))
 
@@ -140,4 +140,4 @@ def check_burst(burst: Burst, duration: float) -> None:
 
 
 # Bursts of a vibrator with a rubber tip, of the palm of a hand, and of tickling fingers.
-VIBRATOR, FIRM, LIGHT = Burst(), Burst(2.0, 0.08), Burst(0.7, 0.04)
+VIBRATOR_BURST, FIRM_BURST, LIGHT_BURST = Burst(), Burst(2.0, 0.08), Burst(0.7, 0.04)

@@ -12,9 +12,17 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
-from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, record
+from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, simulate_recording
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
-from jeit.acoustic.simulate.synthesis import FIRM, LIGHT, ONSET, VIBRATOR, Burst, check_burst, sample_times
+from jeit.acoustic.simulate.synthesis import (
+    FIRM_BURST,
+    FIRST_ONSET,
+    LIGHT_BURST,
+    VIBRATOR_BURST,
+    Burst,
+    check_burst,
+    sample_times,
+)
 from jeit.arguments.checks import check_positive
 
 # Speed in m/s at which a stroke has its nominal strength. The power dissipated by friction is force times speed, so the
@@ -27,7 +35,7 @@ def simulate_tap(
     key: Array,
     position: ArrayLike,
     *,
-    burst: Burst = VIBRATOR,
+    burst: Burst = VIBRATOR_BURST,
     repeats: int = 1,
     frequency: float = 10.0,
     duration: float = 0.15,
@@ -61,10 +69,10 @@ def simulate_tap(
     if repeats < 1:
         raise ValueError(f"repeats: give at least one tap, not {repeats}.")
     check_burst(burst, duration)
-    onsets = ONSET + np.arange(repeats) / frequency
+    onsets = FIRST_ONSET + np.arange(repeats) / frequency
     times = sample_times(skin, max(duration, onsets[-1] + burst.length + 0.03))
     envelope = burst.envelope(times, onsets, np.full(repeats, burst.strength))
-    return record(skin, key, _check_place(skin, position), envelope, noise)
+    return simulate_recording(skin, key, _check_position(skin, position), envelope, noise)
 
 
 def simulate_pat(
@@ -72,7 +80,7 @@ def simulate_pat(
     key: Array,
     position: ArrayLike,
     *,
-    burst: Burst = FIRM,
+    burst: Burst = FIRM_BURST,
     taps: int = 3,
     interval: float = 0.3,
     duration: float = 1.0,
@@ -101,8 +109,8 @@ def simulate_pat(
     ```
     """
     check_positive("interval", interval)
-    repeated = {"repeats": taps, "frequency": 1 / interval}
-    return simulate_tap(skin, key, position, burst=burst, **repeated, duration=duration, noise=noise)
+    repetition = {"repeats": taps, "frequency": 1 / interval}
+    return simulate_tap(skin, key, position, burst=burst, **repetition, duration=duration, noise=noise)
 
 
 def simulate_tickle(
@@ -110,7 +118,7 @@ def simulate_tickle(
     key: Array,
     position: ArrayLike,
     *,
-    burst: Burst = LIGHT,
+    burst: Burst = LIGHT_BURST,
     radius: float = 0.01,
     taps_per_second: float = 15.0,
     duration: float = 1.0,
@@ -143,25 +151,28 @@ def simulate_tickle(
     ```
     """
     check_skin_and_key(skin, key)
-    middle = _check_place(skin, position)[0]
+    centre = _check_position(skin, position)[0]
     check_positive("radius", radius)
     check_positive("taps_per_second", taps_per_second)
     check_burst(burst, duration)
     times = sample_times(skin, duration)
-    count = max(1, int((duration - ONSET - burst.length) * taps_per_second))
-    where, jitter, loudness, rest = jax.random.split(key, 4)
-    onsets = ONSET + (np.arange(count) + 0.25 * np.asarray(jax.random.uniform(jitter, (count,)))) / taps_per_second
-    strengths = burst.strength * np.exp(0.3 * np.asarray(jax.random.normal(loudness, (count,))))
-    distance, angle = np.asarray(jax.random.uniform(where, (2, count)))
+    num_taps = max(1, int((duration - FIRST_ONSET - burst.length) * taps_per_second))
+    position_key, jitter_key, strength_key, sound_key = jax.random.split(key, 4)
+    onsets = (
+        FIRST_ONSET
+        + (np.arange(num_taps) + 0.25 * np.asarray(jax.random.uniform(jitter_key, (num_taps,)))) / taps_per_second
+    )
+    strengths = burst.strength * np.exp(0.3 * np.asarray(jax.random.normal(strength_key, (num_taps,))))
+    distance, angle = np.asarray(jax.random.uniform(position_key, (2, num_taps)))
     # The square root makes the positions uniform over the disc.
     offsets = (radius * np.sqrt(distance) * [np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)]).T
-    for index in range(1, count):
+    for index in range(1, num_taps):
         offsets[index] = (offsets[index - 1] + offsets[index]) / 2
-    half = np.array([skin.layer.width, skin.layer.height]) / 2
-    places = np.clip(middle + offsets, -half, half)
+    half_size = np.array([skin.layer.width, skin.layer.height]) / 2
+    tap_positions = np.clip(centre + offsets, -half_size, half_size)
     # The source moves to the position of a tap at the onset of that tap.
     blocks = np.maximum(np.searchsorted(onsets, block_times(skin, len(times)) + HOP, side="right") - 1, 0)
-    return record(skin, rest, places[blocks], burst.envelope(times, onsets, strengths), noise)
+    return simulate_recording(skin, sound_key, tap_positions[blocks], burst.envelope(times, onsets, strengths), noise)
 
 
 def simulate_stroke(
@@ -198,27 +209,31 @@ def simulate_stroke(
     check_positive("strength", strength)
     check_positive("duration", duration)
     times = sample_times(skin, duration)
-    follow = path if callable(path) else _position_on_polyline(skin, path, duration)
-    track = skin.layer.check_inside("path", follow(times))
-    if len(track) != len(times):
-        raise ValueError(f"path: the function gave {len(track)} positions for {len(times)} times; give one for each.")
-    speed = np.linalg.norm(np.gradient(track, times, axis=0), axis=1)
+    position_at = path if callable(path) else _position_on_polyline(skin, path, duration)
+    path_positions = skin.layer.check_inside("path", position_at(times))
+    if len(path_positions) != len(times):
+        raise ValueError(
+            f"path: the function gave {len(path_positions)} positions for {len(times)} times; give one for each."
+        )
+    speed = np.linalg.norm(np.gradient(path_positions, times, axis=0), axis=1)
     if not speed.any():
         raise ValueError(
             "path: its length is zero, and a finger at rest makes no sound; give a longer path, or simulate a tap."
         )
     # The stroke fades in and out over 20 ms.
-    ends = np.sin(np.pi / 2 * np.clip(np.minimum(times, duration - times) / 0.02, 0, 1))
-    centres = block_times(skin, len(times))
-    places = np.stack([np.interp(centres, times, axis) for axis in track.T], axis=-1)
-    return record(skin, key, places, strength * np.sqrt(speed / NOMINAL_SPEED) * ends, noise)
+    fade = np.sin(np.pi / 2 * np.clip(np.minimum(times, duration - times) / 0.02, 0, 1))
+    block_centres = block_times(skin, len(times))
+    positions = np.stack([np.interp(block_centres, times, axis) for axis in path_positions.T], axis=-1)
+    return simulate_recording(skin, key, positions, strength * np.sqrt(speed / NOMINAL_SPEED) * fade, noise)
 
 
 def _position_on_polyline(skin: SoundingSkin, corners, duration: float) -> Callable[[np.ndarray], np.ndarray]:
-    place = skin.layer.check_inside("path", corners)
-    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
-    return lambda times: np.stack([np.interp(times / duration * along[-1], along, axis) for axis in place.T], axis=-1)
+    vertices = skin.layer.check_inside("path", corners)
+    arc_lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(vertices, axis=0), axis=1))])
+    return lambda times: np.stack(
+        [np.interp(times / duration * arc_lengths[-1], arc_lengths, axis) for axis in vertices.T], axis=-1
+    )
 
 
-def _check_place(skin: SoundingSkin, position) -> np.ndarray:
+def _check_position(skin: SoundingSkin, position) -> np.ndarray:
     return skin.layer.check_inside("position", [position])

@@ -12,7 +12,7 @@ from jeit.acoustic.simulate.propagation import band_filter, noise_power, transfe
 from jeit.acoustic.simulate.sound import SimulatedSound, block_times
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.acoustic.simulate.synthesis import (
-    RINGING,
+    RINGING_TIME,
     bin_frequencies,
     microphone_noise,
     num_filled_bins,
@@ -23,7 +23,7 @@ from jeit.arguments.checks import check_not_negative, check_positive
 
 # Number of source positions in a jet, and number of frequencies at which their total power is computed. The power is
 # interpolated between these frequencies, where it is smooth.
-_PLACES, _FREQUENCIES = 64, 160
+_NUM_EDDIES, _NUM_FREQUENCIES = 64, 160
 # Exponent of Kolmogorov's law of turbulence: the energy density is proportional to frequency to minus this power.
 TURBULENCE = 5 / 3
 
@@ -70,23 +70,27 @@ def simulate_wind(
     ```
     """
     check_skin_and_key(skin, key)
-    middle = skin.layer.check_inside("position", [position])[0]
+    centre = skin.layer.check_inside("position", [position])[0]
     for name, value in (("strength", strength), ("radius", radius), ("gust_time", gust_time), ("duration", duration)):
         check_positive(name, value)
     for name, value in (("gusts", gusts), ("slope", slope)):
         check_not_negative(name, value)
-    where, gust, own, rest = jax.random.split(key, 4)
-    half = np.array([skin.layer.width, skin.layer.height]) / 2
-    places = np.clip(middle + radius * np.asarray(jax.random.normal(where, (_PLACES, 2))), -half, half)
+    position_key, gust_key, wind_key, noise_key = jax.random.split(key, 4)
+    half_size = np.array([skin.layer.width, skin.layer.height]) / 2
+    eddy_positions = np.clip(
+        centre + radius * np.asarray(jax.random.normal(position_key, (_NUM_EDDIES, 2))), -half_size, half_size
+    )
     times = sample_times(skin, duration)
-    loud = np.exp(gusts * _slow_noise(gust, len(times), gust_time * skin.rate) - gusts**2)
-    density = _density(skin, slope, _received_power(skin, jnp.asarray(places), _frequency_grid(skin)))
-    samples = strength * loud * _coloured_noise(skin, own, density, len(times))
+    amplitude = np.exp(gusts * _slow_noise(gust_key, len(times), gust_time * skin.rate) - gusts**2)
+    density = _density(skin, slope, _received_power(skin, jnp.asarray(eddy_positions), _frequency_grid(skin)))
+    samples = strength * amplitude * _coloured_noise(skin, wind_key, density, len(times))
     if noise:
-        samples = samples + microphone_noise(skin, rest, len(times))
+        samples = samples + microphone_noise(skin, noise_key, len(times))
     centres = block_times(skin, len(times))
-    kept = centres[centres <= len(times) / skin.rate]
-    return SimulatedSound(samples, skin.rate, np.tile(middle, (len(kept), 1)), kept, strength * loud, noise)
+    position_times = centres[centres <= len(times) / skin.rate]
+    return SimulatedSound(
+        samples, skin.rate, np.tile(centre, (len(position_times), 1)), position_times, strength * amplitude, noise
+    )
 
 
 def simulate_room_sound(
@@ -118,27 +122,27 @@ def simulate_room_sound(
         raise ValueError(f"level_db must be finite, in decibels; it is {level_db}.")
     times = sample_times(skin, duration)
     power = float(np.median(noise_power(skin) / np.asarray(skin.noise_factor))) * 10 ** (level_db / 10)
-    one = _coloured_noise(skin, key, power * _density(skin, slope, np.ones((1, _FREQUENCIES))), len(times))
-    samples = np.asarray(skin.gain)[:, None] * one
+    room_signal = _coloured_noise(skin, key, power * _density(skin, slope, np.ones((1, _NUM_FREQUENCIES))), len(times))
+    samples = np.asarray(skin.gain)[:, None] * room_signal
     return SimulatedSound(samples, skin.rate, np.zeros((0, 2)), np.zeros(0), np.zeros(len(times)), False)
 
 
 def _frequency_grid(skin: SoundingSkin) -> Float[np.ndarray, " G"]:
     """Frequencies (G,) in Hz from half an octave below the band to half an octave above it, with equal ratios."""
     low, high = skin.readout.band
-    return np.geomspace(low / np.sqrt(2), high * np.sqrt(2), _FREQUENCIES)
+    return np.geomspace(low / np.sqrt(2), high * np.sqrt(2), _NUM_FREQUENCIES)
 
 
 @jax.jit
-def _received_power(skin: SoundingSkin, places: Array, frequencies: Array) -> Array:
+def _received_power(skin: SoundingSkin, positions: Array, frequencies: Array) -> Array:
     """Power (M, G) received by each microphone from equal sources at all positions (P, 2), divided by the total power
     of the sources."""
     total = jnp.zeros((skin.microphones.shape[0], len(frequencies)))
 
     def add_source(index, total):
-        return total + jnp.abs(transfer(skin, frequencies, places[index])) ** 2
+        return total + jnp.abs(transfer(skin, frequencies, positions[index])) ** 2
 
-    return jax.lax.fori_loop(0, len(places), add_source, total) / len(places)
+    return jax.lax.fori_loop(0, len(positions), add_source, total) / len(positions)
 
 
 def _density(skin: SoundingSkin, slope: float, received: ArrayLike) -> Float[np.ndarray, "M G"]:
@@ -151,12 +155,12 @@ def _density(skin: SoundingSkin, slope: float, received: ArrayLike) -> Float[np.
 
 def _coloured_noise(skin: SoundingSkin, key: Array, density: Float[np.ndarray, "M G"], count: int) -> np.ndarray:
     """Simulate `count` samples (M, S) of independent noises with the power spectral densities `density`."""
-    size = transform_size(count, RINGING, skin.rate)
+    size = transform_size(count, RINGING_TIME, skin.rate)
     bins = num_filled_bins(skin, size)
     frequencies = np.asarray(bin_frequencies(skin, size, bins))
     grid = _frequency_grid(skin)
     # In a real signal of `size` samples, bin k > 0 with variance v_k contributes 2 v_k / size² to the mean square.
-    variance = np.stack([np.interp(frequencies, grid, one, left=0.0, right=0.0) for one in density])
+    variance = np.stack([np.interp(frequencies, grid, row, left=0.0, right=0.0) for row in density])
     draws = np.asarray(jax.random.normal(key, (2, len(density), bins)))
     spectrum = np.sqrt(variance * skin.rate * size / 4) * (draws[0] + 1j * draws[1])
     return np.fft.irfft(spectrum, size)[:, :count]
@@ -164,10 +168,10 @@ def _coloured_noise(skin: SoundingSkin, key: Array, density: Float[np.ndarray, "
 
 def _slow_noise(key: Array, count: int, correlation_length: float) -> Float[np.ndarray, " S"]:
     """Slowly varying normal noise (S,) of variance 1, with a correlation length of `correlation_length` samples."""
-    knots = int(np.ceil(count / correlation_length)) + 3
-    values = np.asarray(jax.random.normal(key, (knots,)))
+    num_knots = int(np.ceil(count / correlation_length)) + 3
+    values = np.asarray(jax.random.normal(key, (num_knots,)))
     # The interpolation weights are the cosine and sine of the same angle, so the variance is 1 everywhere.
-    at = np.arange(count) / correlation_length
-    first = at.astype(int)
-    angle = np.pi / 2 * (at - first)
-    return np.cos(angle) * values[first] + np.sin(angle) * values[first + 1]
+    knot_coordinates = np.arange(count) / correlation_length
+    knot_index = knot_coordinates.astype(int)
+    angle = np.pi / 2 * (knot_coordinates - knot_index)
+    return np.cos(angle) * values[knot_index] + np.sin(angle) * values[knot_index + 1]

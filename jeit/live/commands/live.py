@@ -120,7 +120,7 @@ def live(
 
     need_extra("live", "a page in the browser")
     check_positive({"--untouched": untouched} | ({} if rate is None else {"--rate": rate}))
-    given = {
+    options = {
         "solver": method,
         "max_steps": steps,
         "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
@@ -129,24 +129,24 @@ def live(
         "num_points": num_points,
         "as_is": as_is or None,
     }
-    given = {name: value for name, value in given.items() if value is not None}
-    _check_use(given, model, calibration, contacts)
+    options = {name: value for name, value in options.items() if value is not None}
+    _check_use(options, model, calibration, contacts)
     if source.partition(":")[0] == "demo" and steps is None:
-        given.setdefault("solver", "one-step")  # compiles in half the time
-    with naming_options(_NAMES):
-        settings = StreamSettings(**given)
+        options.setdefault("solver", "one-step")  # compiles in half the time
+    with naming_options(_OPTION_NAMES):
+        settings = StreamSettings(**options)
     console = plain_console()
     check_port(host, port)
     _check_folder(output)
-    with Steps(console, quiet=quiet) as step, naming_options(_OPTIONS):
+    with Steps(console, quiet=quiet) as step, naming_options(_ARGUMENT_OPTIONS):
         step("read")
         # A reference for a model is plain frames, as `jeit touch predict` reads them.
-        base = reference
+        reference_input = reference
         if reference is not None and model is None:
-            base = read_file("--reference", reference, format, description, key=reference_key)
-        ready = prepare(
+            reference_input = read_file("--reference", reference, format, description, key=reference_key)
+        prepared = prepare(
             source,
-            base,
+            reference_input,
             description=description,
             model=model,
             calibration=calibration,
@@ -157,25 +157,25 @@ def live(
             progress=step,
         )
     if not quiet:
-        for _, note in ready.source.messages.copy():
+        for _, note in prepared.source.messages.copy():
             console.print(f"  note: {note}", soft_wrap=True)
     if until_end:
-        ready.source.end_when_lost()
-    recorder = Recorder(output, reference=ready.reference)
+        prepared.source.end_when_lost()
+    recorder = Recorder(output, reference=prepared.reference)
     if record:
         recorder.start()
-    with _terminated() as terminated:
-        with Session(ready.source, ready.view, recorder=recorder) as session:
+    with _handle_sigterm() as terminated:
+        with Session(prepared.source, prepared.view, recorder=recorder) as session:
             serve(
                 session,
                 host=host,
                 port=port,
                 stay=not until_end,
-                opened=lambda address: _open(address, console, browser=not no_browser, quiet=quiet),
+                opened=lambda address: _open_page(address, console, browser=not no_browser, quiet=quiet),
             )
         state = session.state()
     if not quiet:
-        _say(console, state)
+        _print_counters(console, state)
     if until_end and not state["imaged"]:
         first = next(iter(state["reasons"]), "the source ended before the first")
         raise ValueError(f"{counted(state['read'], 'frame')}, and none could be imaged: {first}")
@@ -184,28 +184,28 @@ def live(
 
 
 @contextmanager
-def _terminated() -> Iterator[list[int]]:
-    """Let SIGTERM end what runs as Ctrl-C does, and collect it."""
-    got: list[int] = []
+def _handle_sigterm() -> Iterator[list[int]]:
+    """Treat SIGTERM like Ctrl-C within the context. Yields the list of received signals."""
+    received_signals: list[int] = []
 
-    def stop(number: int, _) -> None:
-        got.append(number)
+    def stop(signal_number: int, _) -> None:
+        received_signals.append(signal_number)
         raise KeyboardInterrupt
 
     if threading.current_thread() is not threading.main_thread():
-        yield got
+        yield received_signals
         return
-    earlier = signal.signal(signal.SIGTERM, stop)
+    previous_handler = signal.signal(signal.SIGTERM, stop)
     try:
-        yield got
+        yield received_signals
     finally:
-        signal.signal(signal.SIGTERM, earlier)
+        signal.signal(signal.SIGTERM, previous_handler)
 
 
-# Reasons of refused frames that are printed.
-_SHOWN = 8
-_NAMES = {"solver": "--method", "max_steps": "--steps"}
-_OPTIONS = {
+# Maximum number of reasons of refused frames that are printed.
+_MAX_REASONS = 8
+_OPTION_NAMES = {"solver": "--method", "max_steps": "--steps"}
+_ARGUMENT_OPTIONS = {
     "source": "SOURCE",
     "rate": "--rate",
     "description": "--description",
@@ -218,25 +218,28 @@ _OPTIONS = {
 
 def _check_folder(output: Path) -> None:
     """Raise `ValueError` if no folder can be made at `output`; none is made before a recording begins."""
-    there = next(one for one in (output.absolute(), *output.absolute().parents) if one.exists())
-    if not (there.is_dir() and os.access(there, os.W_OK)):
-        raise ValueError(f"--output: no folder '{output}' can be made or written to; '{there}' is in the way.")
+    existing_path = next(path for path in (output.absolute(), *output.absolute().parents) if path.exists())
+    if not (existing_path.is_dir() and os.access(existing_path, os.W_OK)):
+        raise ValueError(f"--output: no folder '{output}' can be made or written to; '{existing_path}' is in the way.")
 
 
-def _check_use(given: dict, model: Path | None, calibration: Path | None, contacts: bool) -> None:
-    """Raise `ValueError` for options of images together with a model or microphones, which use none of them."""
-    used = [_NAMES.get(one, f"--{one.replace('_', '-')}") for one in given] + ["--contacts"] * contacts
+def _check_use(options: dict, model: Path | None, calibration: Path | None, contacts: bool) -> None:
+    """Raise `ValueError` if options of images are given together with a model or microphones, which do not use
+    them."""
+    used_options = [_OPTION_NAMES.get(name, f"--{name.replace('_', '-')}") for name in options] + [
+        "--contacts"
+    ] * contacts
     for option, value in (("--model", model), ("--calibration", calibration)):
-        if value is not None and used:
-            raise ValueError(f"{used[0]} has no use with {option}; leave it out.")
+        if value is not None and used_options:
+            raise ValueError(f"{used_options[0]} has no use with {option}; leave it out.")
 
 
-def _open(address: str, console, *, browser: bool, quiet: bool) -> None:
-    """Print the address of the page, and open it where there is a display."""
-    shown = browser and _has_display()
-    if not (quiet and shown):
-        console.print(f"  {address}" + ("" if shown else "  (open it in a browser)"), soft_wrap=True)
-    if shown:
+def _open_page(address: str, console, *, browser: bool, quiet: bool) -> None:
+    """Print the address of the page, and open it in a browser if there is a display."""
+    opens_browser = browser and _has_display()
+    if not (quiet and opens_browser):
+        console.print(f"  {address}" + ("" if opens_browser else "  (open it in a browser)"), soft_wrap=True)
+    if opens_browser:
         import webbrowser
 
         # Some browsers return only when their window is closed.
@@ -244,26 +247,26 @@ def _open(address: str, console, *, browser: bool, quiet: bool) -> None:
 
 
 def _has_display() -> bool:
-    """Whether a window can be opened; a text browser would take the terminal."""
+    """Whether a window can be opened. A text browser is not opened, since it would occupy the terminal."""
     if sys.platform in ("win32", "darwin"):
         return True
     return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
 
 
-def _say(console, state: dict) -> None:
+def _print_counters(console, state: dict) -> None:
     """Print the counters of a session."""
     from jeit.arguments import counted
 
-    words = [f"{state[name]} {name}" for name in ("imaged", "dropped", "refused") if state[name]]
-    console.print(f"\n{counted(state['read'], 'frame')}: {', '.join(words) or 'none imaged'}")
+    counts = [f"{state[name]} {name}" for name in ("imaged", "dropped", "refused") if state[name]]
+    console.print(f"\n{counted(state['read'], 'frame')}: {', '.join(counts) or 'none imaged'}")
     if state["latency_median"] is not None:
-        median, high = 1e3 * state["latency_median"], 1e3 * state["latency_99"]
-        console.print(f"latency to the picture: median {median:.1f} ms, 99 % within {high:.1f} ms")
+        median, latency_99 = 1e3 * state["latency_median"], 1e3 * state["latency_99"]
+        console.print(f"latency to the picture: median {median:.1f} ms, 99 % within {latency_99:.1f} ms")
     for status in ("partial", "unchanged", "step limit"):
         if state["statuses"].get(status):
             console.print(f"  {state['statuses'][status]} {status}")
-    reasons = sorted(state["reasons"].items(), key=lambda one: -one[1])
-    for reason, number in reasons[:_SHOWN]:
-        console.print(f"  {number} × {reason}", soft_wrap=True)
-    if len(reasons) > _SHOWN:
-        console.print(f"  {len(reasons) - _SHOWN} more reasons")
+    reasons = sorted(state["reasons"].items(), key=lambda item: -item[1])
+    for reason, count in reasons[:_MAX_REASONS]:
+        console.print(f"  {count} × {reason}", soft_wrap=True)
+    if len(reasons) > _MAX_REASONS:
+        console.print(f"  {len(reasons) - _MAX_REASONS} more reasons")

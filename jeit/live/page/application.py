@@ -29,15 +29,15 @@ from jeit.live.page.wire import (
     to_json,
 )
 
-MOST_VIEWERS = 16
-_MOST_FAULTS = 20
-_TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
+MAX_VIEWERS = 16
+_MAX_FAULTS = 20
+_MEDIA_TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
 
 
 def page_files() -> dict[str, bytes]:
-    """Return the page's files by name; they are read once, so that no request names a path on disk."""
+    """Return the contents of the page's files by name. They are read once, so that no request accesses the disk."""
     folder = resources.files("jeit.live.page").joinpath("static")
-    return {file.name: file.read_bytes() for file in folder.iterdir() if file.name.rpartition(".")[2] in _TYPES}
+    return {file.name: file.read_bytes() for file in folder.iterdir() if file.name.rpartition(".")[2] in _MEDIA_TYPES}
 
 
 def make_application(hub: Hub, *, host: str, token: str | None) -> Starlette:
@@ -48,10 +48,10 @@ def make_application(hub: Hub, *, host: str, token: str | None) -> Starlette:
         name = request.path_params.get("name", "index.html")
         if name not in files:
             return Response("There is no such page.\n", 404, media_type="text/plain")
-        return Response(files[name], media_type=_TYPES[name.rpartition(".")[2]])
+        return Response(files[name], media_type=_MEDIA_TYPES[name.rpartition(".")[2]])
 
     async def socket(websocket: WebSocket) -> None:
-        await _attend(hub, websocket)
+        await _serve_viewer(hub, websocket)
 
     @contextlib.asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:
@@ -68,39 +68,39 @@ def make_application(hub: Hub, *, host: str, token: str | None) -> Starlette:
     )
 
 
-async def _attend(hub: Hub, websocket: WebSocket) -> None:
-    """Serve one page until it leaves."""
+async def _serve_viewer(hub: Hub, websocket: WebSocket) -> None:
+    """Serve one page until it disconnects."""
     await websocket.accept()
-    if len(hub.viewers) >= MOST_VIEWERS:
-        await websocket.close(1013, f"{MOST_VIEWERS} pages are open already")
+    if len(hub.viewers) >= MAX_VIEWERS:
+        await websocket.close(1013, f"{MAX_VIEWERS} pages are open already")
         return
     viewer = Viewer()
     hub.viewers.add(viewer)
-    viewer.news.set()
-    sending = asyncio.create_task(_send(hub, viewer, websocket))
+    viewer.wake_event.set()
+    send_task = asyncio.create_task(_send_pictures(hub, viewer, websocket))
     try:
-        await _receive(hub, viewer, websocket)
+        await _receive_commands(hub, viewer, websocket)
     finally:
         hub.viewers.discard(viewer)
-        sending.cancel()
+        send_task.cancel()
         with contextlib.suppress(asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
-            await sending
+            await send_task
 
 
-async def _send(hub: Hub, viewer: Viewer, websocket: WebSocket) -> None:
+async def _send_pictures(hub: Hub, viewer: Viewer, websocket: WebSocket) -> None:
     await websocket.send_text(hub.scene)
     while True:
-        await viewer.news.wait()
-        viewer.news.clear()
+        await viewer.wake_event.wait()
+        viewer.wake_event.clear()
         if viewer.wants_state():
             await websocket.send_text(hub.state_message(viewer))
         newest = hub.newest()
         if newest is not None and viewer.ready_for(newest[0].frame.number):
-            viewer.sent(newest[0].frame.number, newest[0].frame.arrived)
+            viewer.note_sent(newest[0].frame.number, newest[0].frame.arrived)
             await websocket.send_bytes(newest[1])
 
 
-async def _receive(hub: Hub, viewer: Viewer, websocket: WebSocket) -> None:
+async def _receive_commands(hub: Hub, viewer: Viewer, websocket: WebSocket) -> None:
     faults = 0
     while True:
         message = await websocket.receive()
@@ -110,39 +110,40 @@ async def _receive(hub: Hub, viewer: Viewer, websocket: WebSocket) -> None:
             command = read_command(message.get("text") or message.get("bytes") or "")
         except ValueError as error:
             faults += 1
-            if faults > _MOST_FAULTS:
+            if faults > _MAX_FAULTS:
                 await websocket.close(1008, "too many messages that are no commands")
                 return
             await websocket.send_text(to_json("answer", {"to": "message", "problem": str(error)}))
             continue
-        await _carry_out(command, hub, viewer, websocket)
+        await _execute_command(command, hub, viewer, websocket)
 
 
-async def _carry_out(command: Command, hub: Hub, viewer: Viewer, websocket: WebSocket) -> None:
+async def _execute_command(command: Command, hub: Hub, viewer: Viewer, websocket: WebSocket) -> None:
     match command:
         case Drawn(number=number, hidden=hidden):
-            viewer.drew(number, hidden=hidden)
+            viewer.note_drawn(number, hidden=hidden)
             return
         case Seen():
             viewer.read_state()
             return
         case Follow(on=on):
             viewer.following = on
-            viewer.news.set()
+            viewer.wake_event.set()
             return
         case Show(number=number, direction=direction):
-            past = hub.past(number, direction)
-            if past is not None:
-                await websocket.send_bytes(past)
+            past_message = hub.past_message(number, direction)
+            if past_message is not None:
+                await websocket.send_bytes(past_message)
                 return
             answer = ("show", "that picture is no longer kept: the last minute is")
         case _:
-            answer = await _act(command, hub)
+            answer = await _execute_session_command(command, hub)
     await websocket.send_text(to_json("answer", {"to": answer[0], "problem": answer[1]}))
 
 
-async def _act(command: Command, hub: Hub) -> tuple[str, str | None]:
-    """Carry out a command that changes the session, away from the event loop, as it may write to disk."""
+async def _execute_session_command(command: Command, hub: Hub) -> tuple[str, str | None]:
+    """Carry out a command that changes the session, in another thread, since it may write to disk. Returns the name of
+    the command, and the error message or None."""
     session = hub.session
     try:
         match command:

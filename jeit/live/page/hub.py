@@ -1,4 +1,5 @@
-"""Pictures of a live session handed to open pages: the newest to each, as fast as that page draws."""
+"""Distribution of the pictures of a live session to open pages. Each page is sent the newest picture, as fast as it
+draws."""
 
 from __future__ import annotations
 
@@ -13,70 +14,72 @@ import numpy as np
 from jeit.live.page.wire import picture_message, scene_message, to_json
 from jeit.live.session import Result, Session
 
-_IN_FLIGHT = 2
-"""Pictures sent to a page and not yet drawn: one on its way while another is drawn."""
+_MAX_IN_FLIGHT = 2
+"""Maximum number of pictures that are sent to a page and not yet drawn: one is on its way while another is drawn."""
 
 _STATE_PERIOD = 0.5
-_LATENCIES = 10.0
+_LATENCY_SPAN = 10.0
 """Seconds over which a page's latency is computed."""
 
 
 class Viewer:
-    """One open page: what was sent to it and is not drawn yet, and how late its pictures were drawn.
+    """State of an open page: the pictures that were sent and are not yet drawn, and the latencies of its pictures.
 
-    A page that is slow or asleep reports nothing drawn, is sent nothing more, and sees the newest when it wakes.
+    A page that is slow or suspended reports no picture as drawn. It is sent no further pictures until it resumes, and
+    then the newest.
     """
 
     def __init__(self) -> None:
-        self.news = asyncio.Event()
+        self.wake_event = asyncio.Event()
         self.following = True
         self.state_due = True
         self._state_read = True
-        self._sent = -1
-        self._flying: deque[tuple[int, float]] = deque()
+        self._last_sent = -1
+        self._in_flight: deque[tuple[int, float]] = deque()
         self._drawn: deque[tuple[float, float]] = deque(maxlen=2000)
 
     def ready_for(self, number: int) -> bool:
         """Whether a picture may be sent now."""
-        return self.following and number > self._sent and len(self._flying) < _IN_FLIGHT
+        return self.following and number > self._last_sent and len(self._in_flight) < _MAX_IN_FLIGHT
 
-    def sent(self, number: int, arrived: float) -> None:
-        """Note that a picture was sent."""
-        self._sent = number
-        self._flying.append((number, arrived))
+    def note_sent(self, number: int, arrived: float) -> None:
+        """Record that a picture was sent."""
+        self._last_sent = number
+        self._in_flight.append((number, arrived))
 
-    def drew(self, number: int, *, hidden: bool) -> None:
-        """Note that the page has drawn a picture, and with it has passed over those sent before."""
+    def note_drawn(self, number: int, *, hidden: bool) -> None:
+        """Record that the page has drawn a picture, and has skipped those sent before."""
         now = time.monotonic()
-        while self._flying and self._flying[0][0] <= number:
-            sent, arrived = self._flying.popleft()
-            if sent == number and not hidden:
+        while self._in_flight and self._in_flight[0][0] <= number:
+            sent_number, arrived = self._in_flight.popleft()
+            if sent_number == number and not hidden:
                 self._drawn.append((now, now - arrived))
-        self.news.set()
+        self.wake_event.set()
 
     def wants_state(self) -> bool:
-        """Whether a state is due, and the last one was read."""
+        """Whether a state is to be sent now: it is due, and the page has read the last one."""
         if not (self.state_due and self._state_read):
             return False
         self.state_due = self._state_read = False
         return True
 
     def read_state(self) -> None:
-        """Note that the page has read the last state."""
+        """Record that the page has read the last state."""
         self._state_read = True
 
     def summary(self) -> dict[str, float | None]:
-        """Pictures drawn a second, and the latency from a frame's last byte until the page reports it drawn, seconds.
+        """Pictures drawn per second, and the latency from a frame's last byte until the page reports it drawn, in
+        seconds.
 
-        The report's way back counts as well, so that no two clocks are compared.
+        The latency includes the transmission of the report, so that all times are from the same clock.
         """
         now = time.monotonic()
-        late = [delay for at, delay in self._drawn if now - at <= _LATENCIES]
-        recent = sum(now - at <= 2.0 for at, _ in self._drawn)
-        if not late:
+        latencies = [latency for draw_time, latency in self._drawn if now - draw_time <= _LATENCY_SPAN]
+        num_recent = sum(now - draw_time <= 2.0 for draw_time, _ in self._drawn)
+        if not latencies:
             return {"rate": 0.0, "latency_median": None, "latency_99": None}
-        median, worst = np.percentile(late, [50, 99])
-        return {"rate": recent / 2.0, "latency_median": float(median), "latency_99": float(worst)}
+        median, latency_99 = np.percentile(latencies, [50, 99])
+        return {"rate": num_recent / 2.0, "latency_median": float(median), "latency_99": float(latency_99)}
 
 
 class Hub:
@@ -92,8 +95,8 @@ class Hub:
         self._encoded: tuple[int, bytes] | None = None
         self._state: dict[str, Any] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._woken = False
-        self._thread = threading.Thread(target=self._pump, name="jeit-live-pages", daemon=True)
+        self._is_woken = False
+        self._thread = threading.Thread(target=self._watch_session, name="jeit-live-pages", daemon=True)
 
     def start(self) -> None:
         """Begin, in the event loop that serves the pages."""
@@ -107,7 +110,7 @@ class Hub:
         self._thread.join(5.0)
 
     def newest(self) -> tuple[Result, bytes] | None:
-        """Return the newest picture, and its bytes; they are made once for all pages."""
+        """Return the newest picture and its bytes, which are computed once for all pages."""
         result = self._newest
         if result is None:
             return None
@@ -117,28 +120,29 @@ class Hub:
         return result, self._encoded[1]
 
     def state_message(self, viewer: Viewer) -> str:
-        """Return the session's state, and that of a page, as JSON text."""
+        """Return the state of the session and of a page as JSON text."""
         return to_json("state", {**self._state, "drawn": viewer.summary(), "viewers": len(self.viewers)})
 
-    def past(self, number: int, direction: int) -> bytes | None:
-        """Return the bytes of a picture of the last minute: that of a frame, or else the nearest in a direction."""
+    def past_message(self, number: int, direction: int) -> bytes | None:
+        """Return the bytes of a picture of the last minute: that of a frame, or otherwise the nearest in a
+        direction."""
         for candidate in range(number, max(-1, number + 600 * direction), direction):
             result = self.session.result(candidate)
             if result is not None and (result.frame.number - number) * direction >= 0:
                 return picture_message(result.frame, result.picture, latency=result.latency, past=True)
         return None
 
-    def _pump(self) -> None:
-        after, state_at = -1, 0.0
+    def _watch_session(self) -> None:
+        last_number, state_time = -1, 0.0
         while not self._closing.is_set():
-            result = self.session.newest(after, 0.1)
+            result = self.session.newest(last_number, 0.1)
             now = time.monotonic()
             if result is not None:
-                after = result.frame.number
+                last_number = result.frame.number
                 self._newest = result
                 self._wake()
-            if now - state_at >= _STATE_PERIOD:
-                state_at = now
+            if now - state_time >= _STATE_PERIOD:
+                state_time = now
                 self._state = self.session.state()
                 if self._state.get("connection") == "ended":
                     self.ended.set()
@@ -147,17 +151,17 @@ class Hub:
                 self._closing.wait(0.1)
 
     def _wake(self, *, state: bool = False) -> None:
-        """Have the event loop look at what is new, once, however many pictures came meanwhile."""
-        if self._loop is None or (self._woken and not state):
+        """Wake the pages in the event loop. Several pictures that arrive meanwhile wake them only once."""
+        if self._loop is None or (self._is_woken and not state):
             return
-        self._woken = True
+        self._is_woken = True
         try:
             self._loop.call_soon_threadsafe(self._notify, state)
         except RuntimeError:  # the loop has been closed
             self._closing.set()
 
     def _notify(self, state: bool) -> None:
-        self._woken = False
+        self._is_woken = False
         for viewer in self.viewers:
             viewer.state_due = viewer.state_due or state
-            viewer.news.set()
+            viewer.wake_event.set()

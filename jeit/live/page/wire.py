@@ -1,4 +1,4 @@
-"""What goes over the wire between a live session and its page: pictures as bytes, state as JSON, checked commands."""
+"""Messages between a live session and its page: pictures as bytes, states as JSON, and validated commands."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from jeit.live.pictures import LiveFrame, Picture, Scene
 NO_PIXEL = -32768
 """Value of a pixel outside the body, in 16-bit integers."""
 
-LONGEST_COMMAND = 4096
-"""Bytes of the longest message that a page may send."""
+MAX_COMMAND_LENGTH = 4096
+"""Maximum length in bytes of a message that a page may send."""
 
-_WIDEST_CURVE = 2000
+_MAX_CURVE_POINTS = 2000
 
 
 class Command(BaseModel):
-    """What a page asks for; anything beside the fields is refused."""
+    """Base class of the commands of a page. Keys that are not fields are refused."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 class Drawn(Command):
-    """The page has drawn a picture; `hidden`: it was out of sight meanwhile, so that the time says nothing."""
+    """The page has drawn a picture. `hidden`: whether the page was hidden meanwhile, so that the latency is not
+    meaningful."""
 
     do: Literal["drawn"]
     number: Annotated[int, Field(ge=0, lt=2**53)]
@@ -38,7 +39,7 @@ class Drawn(Command):
 
 
 class Seen(Command):
-    """The page has read the last state, and can be sent the next."""
+    """The page has read the last state, so that the next can be sent."""
 
     do: Literal["seen"]
 
@@ -65,8 +66,8 @@ class Reference(Command):
     count: Annotated[int, Field(ge=1, le=10_000)]
 
 
-def _one_line(text: str) -> str:
-    line = " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())
+def _to_one_line(text: str) -> str:
+    line = " ".join("".join(character if character.isprintable() else " " for character in text).split())
     if not line:
         raise ValueError("a label needs a letter")
     return line
@@ -76,7 +77,7 @@ class Mark(Command):
     """Note an event now."""
 
     do: Literal["mark"]
-    label: Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_one_line)]
+    label: Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_to_one_line)]
 
 
 class Record(Command):
@@ -93,50 +94,50 @@ _COMMANDS: TypeAdapter[Any] = TypeAdapter(
 
 def read_command(text: str | bytes) -> Command:
     """Return the command in a page's message; raises `ValueError` for anything else."""
-    if len(text) > LONGEST_COMMAND:
-        raise ValueError(f"a message of {len(text)} characters: at most {LONGEST_COMMAND}")
+    if len(text) > MAX_COMMAND_LENGTH:
+        raise ValueError(f"a message of {len(text)} characters: at most {MAX_COMMAND_LENGTH}")
     try:
         return _COMMANDS.validate_json(text)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise ValueError(f"{place or 'message'}: {first['msg']}") from None
+        location = ".".join(str(part) for part in first["loc"])
+        raise ValueError(f"{location or 'message'}: {first['msg']}") from None
 
 
-def plain(value: Any) -> Any:
-    """Return a value as JSON has it: NaN and infinity as null, NumPy's numbers and arrays as numbers and lists."""
+def to_json_types(value: Any) -> Any:
+    """Convert a value to types of JSON: NaN and infinity to null, numbers and arrays of NumPy to numbers and lists."""
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_json_types(item) for key, item in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
-        return [plain(item) for item in value]
+        return [to_json_types(item) for item in value]
     return value if value is None or isinstance(value, bool | int | str) else str(value)
 
 
 def to_json(kind: str, content: Mapping[str, Any]) -> str:
     """Return a message of a kind as JSON text."""
-    return json.dumps({"kind": kind, **plain(content)}, allow_nan=False, separators=(",", ":"))
+    return json.dumps({"kind": kind, **to_json_types(content)}, allow_nan=False, separators=(",", ":"))
 
 
-def _curves(curves: Sequence[np.ndarray]) -> list[list[list[float]]]:
-    """Curves with at most 2,000 points each, in tenths of micrometres' precision."""
-    thinned = [np.asarray(curve, float)[:: 1 + len(curve) // _WIDEST_CURVE] for curve in curves]
+def _curve_lists(curves: Sequence[np.ndarray]) -> list[list[list[float]]]:
+    """Convert curves to lists of at most 2,000 points each, rounded to tenths of a micrometre."""
+    thinned = [np.asarray(curve, float)[:: 1 + len(curve) // _MAX_CURVE_POINTS] for curve in curves]
     return [np.round(curve, 7).tolist() for curve in thinned]
 
 
 def scene_message(scene: Scene) -> str:
-    """Return what a page needs to know of a view once, as JSON text."""
+    """Return the scene of a view, which is sent to a page once, as JSON text."""
     content = {
         "title": scene.title,
         "quantity": scene.quantity,
         "unit": scene.unit,
         "diverging": bool(scene.diverging),
         "extent": [float(edge) for edge in scene.extent],
-        "outline": _curves(scene.outline),
-        "electrodes": _curves(scene.electrodes),
+        "outline": _curve_lists(scene.outline),
+        "electrodes": _curve_lists(scene.electrodes),
         "names": list(scene.names),
         "channels": list(scene.channels),
         "notes": list(scene.notes),
@@ -145,40 +146,42 @@ def scene_message(scene: Scene) -> str:
 
 
 @dataclass(frozen=True)
-class _Layout:
-    """Channels and pixels as bytes, and what a reader of the bytes needs to know of them."""
+class _EncodedArray:
+    """An array as bytes, with the part of the header that describes it."""
 
     header: dict[str, Any]
     body: bytes
 
 
-def _values(frame: LiveFrame) -> _Layout:
+def _encode_values(frame: LiveFrame) -> _EncodedArray:
     if isinstance(frame.values, str):
-        return _Layout({"channels": 0}, b"")
+        return _EncodedArray({"channels": 0}, b"")
     values = np.asarray(frame.values, "<f4").ravel()
-    return _Layout({"channels": values.size}, values.tobytes())
+    return _EncodedArray({"channels": values.size}, values.tobytes())
 
 
-def _pixels(picture: Picture) -> _Layout:
-    """Pixels in 16-bit integers: a 32,767th of the largest value, which is beyond what a colour shows."""
+def _encode_pixels(picture: Picture) -> _EncodedArray:
+    """Encode pixels as 16-bit integers, in units of the largest magnitude divided by 32,767. This is finer than the
+    colours of the page."""
     if picture.pixels is None or picture.pixels.ndim != 2 or not picture.pixels.size:
-        return _Layout({"shape": None, "scale": 0.0}, b"")
+        return _EncodedArray({"shape": None, "scale": 0.0}, b"")
     pixels = np.asarray(picture.pixels, np.float32)
     valid = np.isfinite(pixels)
     largest = float(np.abs(pixels, where=valid, out=np.zeros_like(pixels)).max())
     scale = largest / 32767 if largest > 0 else 1.0
-    whole = np.full(pixels.shape, NO_PIXEL, "<i2")
-    whole[valid] = np.rint(pixels[valid] / scale)
-    return _Layout({"shape": list(pixels.shape), "scale": scale}, whole.tobytes())
+    integers = np.full(pixels.shape, NO_PIXEL, "<i2")
+    integers[valid] = np.rint(pixels[valid] / scale)
+    return _EncodedArray({"shape": list(pixels.shape), "scale": scale}, integers.tobytes())
 
 
 def picture_message(frame: LiveFrame, picture: Picture, *, latency: float, past: bool = False) -> bytes:
-    """Return the bytes of one picture for the page; `past`: it was asked for, and is no news.
+    """Return the bytes of one picture for the page. `past`: whether the page requested it as a past picture.
 
-    Length of the header (4 bytes, little endian); header, JSON padded with spaces to a multiple of four; channels,
-    float32; pixels from the largest y, int16, to be multiplied by the header's `scale`.
+    The message consists of the length of the header (4 bytes, little endian); the header, JSON padded with spaces to a
+    multiple of four bytes; the channels, float32; and the pixels, row of the largest y first, int16, to be multiplied
+    by `scale` of the header.
     """
-    values, pixels = _values(frame), _pixels(picture)
+    values, pixels = _encode_values(frame), _encode_pixels(picture)
     markers = [[mark.x, mark.y, mark.label, mark.radius, mark.track] for mark in picture.markers]
     header = {
         "number": int(frame.number),
@@ -191,6 +194,6 @@ def picture_message(frame: LiveFrame, picture: Picture, *, latency: float, past:
         **values.header,
         **pixels.header,
     }
-    text = json.dumps(plain(header), allow_nan=False, separators=(",", ":")).encode()
+    text = json.dumps(to_json_types(header), allow_nan=False, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     return struct.pack("<I", len(text)) + text + values.body + pixels.body

@@ -1,4 +1,4 @@
-"""View of the change of conductivity: frames imaged by an `Imager`."""
+"""View of the change of conductivity, reconstructed from frames by an `Imager`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ConductivityView(AbstractView):
     - `title`: title of the page.
     - `notes`: remarks for the page.
 
-    Raises `ValueError` for objects of another kind, and for a surface in space, which has no flat image.
+    Raises `ValueError` for objects of another type, and for a surface in space, which has no plane image.
 
     **Example:**
 
@@ -52,7 +52,7 @@ class ConductivityView(AbstractView):
         self.grid = PixelGrid(model.mesh)
         self._strongest = StrongestRegion(model.mesh)
         self._state = StreamState(imager)
-        plane = model.mesh.dimension == 2
+        is_plane = model.mesh.dimension == 2
         self.scene = scene_of(
             model.mesh,
             model.electrodes,
@@ -60,9 +60,9 @@ class ConductivityView(AbstractView):
             self.grid,
             title=title,
             quantity="conductivity change",
-            unit="S" if plane else "S/m",
+            unit="S" if is_plane else "S/m",
             diverging=True,
-            notes=(*notes, *(() if plane else ("The image is a slice at half the height of the body.",))),
+            notes=(*notes, *(() if is_plane else ("The image is a slice at half the height of the body.",))),
         )
 
     @classmethod
@@ -73,44 +73,44 @@ class ConductivityView(AbstractView):
         *,
         progress: Callable[[str], None] | None = None,
     ) -> ConductivityView:
-        """Prepare the view of a sensor from `reference`, frames of the undisturbed sensor, which say what it is.
+        """Prepare the view of a sensor from `reference`, a measurement of the undisturbed sensor.
 
-        Raises `ValueError` as `jeit.imaging.prepare_imager`.
+        Raises `ValueError` as `jeit.imaging.prepare_imager` does.
         """
         imager, calibration = prepare_imager(reference, settings, progress=progress)
         return cls(imager, calibration, title=f"Conductivity change, {reference.name}", notes=reference.notes)
 
     def picture(self, frame: LiveFrame) -> Picture:
-        """The image of a frame; see `AbstractView.picture`."""
+        """Compute the image of a frame; see `AbstractView.picture`."""
         return self.image(frame)[1]
 
     def image(self, frame: LiveFrame) -> tuple[FrameImage, Picture]:
-        """The image of a frame on the cells of the mesh, and its picture."""
-        one = self._state.image(frame.number, frame.values)
-        if one.conductivity is None:
-            return one, Picture(None, status=one.status, reason=one.reason)
-        change = one.conductivity - self.background
+        """Compute the image of a frame on the cells of the mesh, and its picture."""
+        frame_image = self._state.image(frame.number, frame.values)
+        if frame_image.conductivity is None:
+            return frame_image, Picture(None, status=frame_image.status, reason=frame_image.reason)
+        change = frame_image.conductivity - self.background
         markers = ()
-        if one.status != FrameStatus.UNCHANGED:
+        if frame_image.status != FrameStatus.UNCHANGED:
             centroid, peak = self._strongest(change)
             x, y = centroid[:2].tolist()
             markers = (Marker(x, y, f"{100 * peak / self.background:+.0f} %"),)
-        return one, Picture(self.grid(change), markers, one.status, one.reason)
+        return frame_image, Picture(self.grid(change), markers, frame_image.status, frame_image.reason)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
-        """Take the mean of frames (N, M) as the new reference; images with a memory begin anew."""
+        """Take the mean of frames (N, M) as the new reference. The memory of the images is reset."""
         self.imager = self.imager.with_reference(mean_frame(frames))
         self._state = StreamState(self.imager)
 
 
 def mean_frame(frames: Float[np.ndarray, "N M"]) -> Float[np.ndarray, " M"]:
-    """Mean (M,) of the readings of each channel in frames (N, M), NaN for a channel without one.
+    """Mean (M,) of the readings of each channel in frames (N, M); NaN for a channel without readings.
 
     Raises `ValueError` if there are no frames, or frames that are not (N, M).
     """
     values = np.asarray(frames, float)
     if values.ndim != 2 or not len(values):
         raise ValueError(f"reference: give frames (N, M) of the undisturbed sensor; they have shape {values.shape}.")
-    known = np.isfinite(values)
-    number = known.sum(axis=0)
-    return np.where(number, np.where(known, values, 0).sum(axis=0) / np.maximum(number, 1), np.nan)
+    is_finite = np.isfinite(values)
+    counts = is_finite.sum(axis=0)
+    return np.where(counts, np.where(is_finite, values, 0).sum(axis=0) / np.maximum(counts, 1), np.nan)

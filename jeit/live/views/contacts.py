@@ -1,4 +1,4 @@
-"""Views of sheets that are touched: contacts with their paths, and gestures as they are named."""
+"""Views of sheets that are touched: contacts with their paths, and gestures that are classified."""
 
 from __future__ import annotations
 
@@ -26,27 +26,28 @@ from jeit.touch import (
     find_contacts,
 )
 
-# Fewest frames of the reference from which the noise of images is estimated.
-_LEAST_FRAMES = 10
-# Time between two frames with the same time, and seconds for which the name of a gesture stays on the image.
-_STEP, _SHOWN = 1e-6, 1.5
+# Minimum number of frames of the reference from which the noise of images is estimated.
+_MIN_FRAMES = 10
+# Time in seconds by which a frame with the time of the previous one is delayed; time in seconds for which the name of a
+# gesture is shown on the image.
+_MIN_TIME_STEP, _LABEL_TIME = 1e-6, 1.5
 
-Given = TypeVar("Given")
-Made = TypeVar("Made")
+Item = TypeVar("Item")
+Output = TypeVar("Output")
 
 
-class Fed(Generic[Given, Made]):
-    """A generator over items that are given one by one: each call returns the result for its item."""
+class StepwiseGenerator(Generic[Item, Output]):
+    """Callable that passes items one by one to a generator function: each call returns the result for its item."""
 
-    def __init__(self, follow: Callable[[Iterable[Given]], Iterator[Made]]):
-        self._items: list[Given] = []
-        self._results = follow(self._given())
+    def __init__(self, generate: Callable[[Iterable[Item]], Iterator[Output]]):
+        self._items: list[Item] = []
+        self._results = generate(self._take_items())
 
-    def __call__(self, item: Given) -> Made:
+    def __call__(self, item: Item) -> Output:
         self._items.append(item)
         return next(self._results)
 
-    def _given(self) -> Iterator[Given]:
+    def _take_items(self) -> Iterator[Item]:
         while True:
             yield self._items.pop()
 
@@ -54,14 +55,14 @@ class Fed(Generic[Given, Made]):
 class ContactsView(AbstractView):
     """Contacts in images of change, with their paths: a marker for each, with the number of its touch.
 
-    Contacts are those of `jeit.touch.find_contacts`, followed by a `jeit.touch.ContactTracker`. The noise of images is
-    that of the frames of the reference, ten or more, otherwise it is estimated from each image.
+    Contacts are found by `jeit.touch.find_contacts`, and tracked by a `jeit.touch.ContactTracker`. The noise of images
+    is estimated from the frames of the reference if there are ten or more, otherwise from each image.
 
     **Arguments:**
 
     - `images`: view of the images, of a sheet.
     - `still`: frames (N, M) of the untouched sheet, volts.
-    - `sign`: 1 if touched skin conducts better, -1 if worse; None: as the strongest change of each image.
+    - `sign`: 1 if touched skin conducts better, -1 if worse; by default the sign of the strongest change of each image.
 
     Raises `ValueError` for a solid, and for another sign.
 
@@ -79,17 +80,17 @@ class ContactsView(AbstractView):
         mesh = images.imager.inversion.model.mesh
         self.images, self.scene = images, replace(images.scene, title=f"Contacts, {images.scene.title}")
         signs = (1, -1) if sign is None else (sign,)
-        self._finders = {one: CellFinder(mesh, sign=one) for one in signs}
-        self._noise = None if still is None else _noise_of(images, still)
+        self._finders = {candidate_sign: CellFinder(mesh, sign=candidate_sign) for candidate_sign in signs}
+        self._noise = None if still is None else _estimate_noise(images, still)
         self._tracker = ContactTracker()
 
     def picture(self, frame: LiveFrame) -> Picture:
-        """The image of a frame with its contacts; see `AbstractView.picture`."""
-        one, picture = self.images.image(frame)
-        if one.conductivity is None:
+        """Compute the image of a frame with its contacts; see `AbstractView.picture`."""
+        frame_image, picture = self.images.image(frame)
+        if frame_image.conductivity is None:
             return picture
-        found = self.contacts(one.conductivity - self.images.background)
-        self._follow(frame.second, found)
+        contacts = self.contacts(frame_image.conductivity - self.images.background)
+        self._track_contacts(frame.second, contacts)
         tracks = {tuple(touch.position): touch.number for touch in self._tracker.open}
         background = self.images.background
         markers = tuple(
@@ -100,50 +101,51 @@ class ContactsView(AbstractView):
                 radius=contact.deviation,
                 track=tracks.get(tuple(contact.centroid)),
             )
-            for contact in found
+            for contact in contacts
         )
         return replace(picture, markers=markers)
 
     def contacts(self, change: Float[np.ndarray, " m"]) -> list[Contact]:
-        """Contacts in a change (m,), S, strongest first."""
+        """Find the contacts in a change (m,) of conductivity in S, the strongest first."""
         strongest = 1 if change.max() >= -change.min() else -1
         finder = self._finders.get(strongest) or next(iter(self._finders.values()))
         return find_contacts(finder, change, self._noise)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
-        """Take the mean of frames (N, M) as the new reference, and the noise of images from ten or more of them."""
+        """Take the mean of frames (N, M) as the new reference, and estimate the noise of images from them if there are
+        ten or more."""
         self.images.set_reference(frames)
-        self._noise = _noise_of(self.images, np.asarray(frames, float))
+        self._noise = _estimate_noise(self.images, np.asarray(frames, float))
         self._tracker = ContactTracker()
 
-    def _follow(self, second: float, found: list[Contact]) -> None:
-        tracker = self._tracker.follow(max(second, self._tracker.time + _STEP), found)
-        # Only the last frame of a touch is needed here, whose memory would grow with time.
-        going = tuple(replace(touch, observations=touch.observations[-1:]) for touch in tracker.open)
-        self._tracker = replace(tracker, open=going, closed=())
+    def _track_contacts(self, second: float, contacts: list[Contact]) -> None:
+        tracker = self._tracker.follow(max(second, self._tracker.time + _MIN_TIME_STEP), contacts)
+        # Only the last frame of a touch is needed here. Keeping all frames would use ever more memory.
+        open_touches = tuple(replace(touch, observations=touch.observations[-1:]) for touch in tracker.open)
+        self._tracker = replace(tracker, open=open_touches, closed=())
 
 
-def _noise_of(images: ConductivityView, still: Float[np.ndarray, "N M"]) -> ImageNoise | None:
-    """Noise of the images of frames (N, M) of the untouched sheet; None if there are too few."""
+def _estimate_noise(images: ConductivityView, still: Float[np.ndarray, "N M"]) -> ImageNoise | None:
+    """Estimate the noise of images from frames (N, M) of the untouched sheet; None if there are too few."""
     state = StreamState(images.imager)
-    imaged = [state.image(number, frame).conductivity for number, frame in enumerate(still)]
-    found = np.array([one for one in imaged if one is not None])
-    if len(found) < _LEAST_FRAMES or not found.std(axis=0).any():
+    images_or_none = [state.image(number, frame).conductivity for number, frame in enumerate(still)]
+    conductivities = np.array([image for image in images_or_none if image is not None])
+    if len(conductivities) < _MIN_FRAMES or not conductivities.std(axis=0).any():
         return None
-    return ImageNoise.of_images(found)
+    return ImageNoise.of_images(conductivities)
 
 
 class GestureView(AbstractView):
-    """Touches of a skin as they come, and their gestures as they end, as `jeit.touch.TouchWatch` classifies them.
+    """View of the touches of a skin, and of their gestures, which `jeit.touch.TouchWatch` classifies when a touch ends.
 
     **Arguments:**
 
     - `description`: description of the skin.
     - `model`: the learnt gestures.
     - `still`: frames (N, M) of the untouched skin, volts.
-    - `rate`: frames/s, by default that of the frames learnt from.
+    - `rate`: frames/s; by default that of the training data.
     - `patience`: time after which a touch becomes part of the reference, seconds.
-    - `progress`: called with each step as it begins.
+    - `progress`: called with the name of each step when it begins.
 
     Raises `ValueError` as `jeit.touch.TouchImages.prepare` and `jeit.touch.TouchWatch.create` do.
 
@@ -166,17 +168,17 @@ class GestureView(AbstractView):
         progress: Callable[[str], None] | None = None,
     ):
         self._model, self._patience = model, patience
-        usual = 60.0 if model.reading is None else model.reading.rate
-        self._rate = usual if rate is None else rate
+        default_rate = 60.0 if model.reading is None else model.reading.rate
+        self._rate = default_rate if rate is None else rate
         self._sign = 1 if model.reading is None else model.reading.sign
         images = TouchImages.prepare(description, still, progress=progress)
-        own = images.calibration.model
-        self.grid = PixelGrid(own.mesh)
-        self._begin(images, still)
+        forward_model = images.calibration.model
+        self.grid = PixelGrid(forward_model.mesh)
+        self._start_watch(images, still)
         self.scene = scene_of(
-            own.mesh,
-            own.electrodes,
-            own.protocol,
+            forward_model.mesh,
+            forward_model.electrodes,
+            forward_model.protocol,
             self.grid,
             title=f"Gestures, {description.title}",
             quantity="conductivity change",
@@ -186,46 +188,58 @@ class GestureView(AbstractView):
         )
 
     def picture(self, frame: LiveFrame) -> Picture:
-        """The image of a frame, the touch in it, and the gesture if one has ended; see `AbstractView.picture`."""
+        """Compute the image of a frame with its touch, and the gesture if one has ended; see
+        `AbstractView.picture`."""
         self._second = max(frame.second, self._second)
-        seen = self._follow((self._second, frame.values))
-        image = seen.image
-        events = tuple(one for one in (self._named(seen.named), *map(_held, seen.ended), seen.note) if one)
+        observation = self._watch_frame((self._second, frame.values))
+        image = observation.image
+        events = tuple(
+            sentence
+            for sentence in (
+                self._classified_sentence(observation.named),
+                *map(_held_sentence, observation.ended),
+                observation.note,
+            )
+            if sentence
+        )
         if image is None or image.conductivity is None:
             reason = "" if image is None else image.reason
             return Picture(None, status=FrameStatus.REFUSED, reason=reason, events=events)
         change = image.conductivity - self.watch.images.background
-        markers = () if seen.second > self._shown[1] else (self._shown[0],)
-        if seen.touched:
-            course = self.watch.level.course(np.array([seen.second]), self._sign * change[None])
+        markers = () if observation.second > self._gesture_label[1] else (self._gesture_label[0],)
+        if observation.touched:
+            course = self.watch.level.course(np.array([observation.second]), self._sign * change[None])
             x, y = course.centroid[0].tolist()
-            markers = (Marker(x, y, track=self._number + 1),)
+            markers = (Marker(x, y, track=self._touch_number + 1),)
         return Picture(self.grid(change), markers, image.status, image.reason, events)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
-        """Take frames (N, M) of the untouched skin as the new reference; a touch under way is given up."""
-        still = np.asarray(frames, float)
-        images = replace(self.watch.images, imager=self.watch.images.imager.with_reference(mean_frame(still)))
-        self._begin(images, still)
+        """Take frames (N, M) of the untouched skin as the new reference. A touch in progress is discarded."""
+        reference_frames = np.asarray(frames, float)
+        images = replace(
+            self.watch.images, imager=self.watch.images.imager.with_reference(mean_frame(reference_frames))
+        )
+        self._start_watch(images, reference_frames)
 
-    def _begin(self, images: TouchImages, still: Float[np.ndarray, "N M"]) -> None:
+    def _start_watch(self, images: TouchImages, still: Float[np.ndarray, "N M"]) -> None:
         self.watch = TouchWatch.create(images, self._model, still, rate=self._rate, patience=self._patience)
-        self._follow = Fed(self.watch.follow)
-        self._second, self._number = -np.inf, 0
-        self._shown = Marker(0.0, 0.0), -np.inf
+        self._watch_frame = StepwiseGenerator(self.watch.follow)
+        self._second, self._touch_number = -np.inf, 0
+        self._gesture_label = Marker(0.0, 0.0), -np.inf
 
-    def _named(self, one: NamedTouch | None) -> str:
-        """Sentence for a touch that has been classified, whose name then stands on the image for a while."""
-        if one is None:
+    def _classified_sentence(self, touch: NamedTouch | None) -> str:
+        """Return the sentence for a touch that has been classified, and show its name on the image for a while. Returns
+        an empty string if there is none."""
+        if touch is None:
             return ""
-        self._number = one.number
-        course = one.touch.course
+        self._touch_number = touch.number
+        course = touch.touch.course
         x, y = course.centroid[int(course.peak.argmax())].tolist()
-        name = "unlike any gesture" if one.unlike else f"{one.gesture} {100 * one.probability:.0f} %"
-        self._shown = Marker(x, y, name), self._second + _SHOWN
-        return f"{name} at ({1e3 * x:+.0f}, {1e3 * y:+.0f}) mm, {one.touch.offset - one.touch.onset:.2f} s long"
+        name = "unlike any gesture" if touch.unlike else f"{touch.gesture} {100 * touch.probability:.0f} %"
+        self._gesture_label = Marker(x, y, name), self._second + _LABEL_TIME
+        return f"{name} at ({1e3 * x:+.0f}, {1e3 * y:+.0f}) mm, {touch.touch.offset - touch.touch.onset:.2f} s long"
 
 
-def _held(one: NamedTouch) -> str:
-    """Sentence for a touch that became part of the reference; empty for others."""
-    return f"a touch is held since {one.touch.onset:.1f} s and counts as the skin at rest" if one.held else ""
+def _held_sentence(touch: NamedTouch) -> str:
+    """Return the sentence for a touch that became part of the reference; an empty string for other touches."""
+    return f"a touch is held since {touch.touch.onset:.1f} s and counts as the skin at rest" if touch.held else ""

@@ -1,4 +1,4 @@
-"""Scenes: outline, electrodes, channels and raster of a body, as a page draws them."""
+"""Scenes: outline, electrodes, channels and raster of a body, which a page draws."""
 
 from __future__ import annotations
 
@@ -13,42 +13,42 @@ from jeit.live.pictures import Scene
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
 
-# Number of pixels along the longer side of an image, and of corners of a circle.
-_PIXELS, _CORNERS = 160, 36
-# Coefficient of a pattern, relative to its largest, below which an electrode takes no part.
-_NOTHING = 1e-9
+# Number of pixels along the longer side of an image, and number of vertices of a circle.
+_NUM_PIXELS, _NUM_VERTICES = 160, 36
+# Coefficient of a pattern, relative to the largest one, below which an electrode is considered unused.
+_MIN_COEFFICIENT = 1e-9
 
 
 class PixelGrid:
-    """Raster of a plane mesh, or of a slice through a solid at half its height, for images of a page.
+    """Raster of a plane mesh, or of a slice through a solid at half its height, for the images of a page.
 
     `extent`: x of the left and right edge, y of the lower and upper edge, metres. Raises `ValueError` for a surface in
     space.
     """
 
-    def __init__(self, mesh: Mesh, longest: int = _PIXELS):
+    def __init__(self, mesh: Mesh, num_pixels: int = _NUM_PIXELS):
         points = np.asarray(mesh.points)[:, :2]
         (x_min, y_min), (x_max, y_max) = points.min(axis=0), points.max(axis=0)
-        size = max(x_max - x_min, y_max - y_min) / longest
+        size = max(x_max - x_min, y_max - y_min) / num_pixels
         shape = max(1, round((y_max - y_min) / size)), max(1, round((x_max - x_min) / size))
         raster = Raster.create(mesh, shape=shape, extent=(x_min, x_max, y_min, y_max))
         cell = np.asarray(raster.cell)
         self.extent = raster.extent
-        self._inside = np.flatnonzero(cell.ravel() >= 0)
-        self._cell = cell.ravel()[self._inside]
-        self._blank = np.full(shape, np.nan, np.float32)
+        self._inside_indices = np.flatnonzero(cell.ravel() >= 0)
+        self._cell_indices = cell.ravel()[self._inside_indices]
+        self._blank_image = np.full(shape, np.nan, np.float32)
 
     @property
     def inside(self) -> np.ndarray:
-        """True for pixels (H, W) in the body."""
-        found = np.zeros(self._blank.size, bool)
-        found[self._inside] = True
-        return found.reshape(self._blank.shape)
+        """Mask (H, W) of the pixels inside the body."""
+        mask = np.zeros(self._blank_image.size, bool)
+        mask[self._inside_indices] = True
+        return mask.reshape(self._blank_image.shape)
 
     def __call__(self, image: Float[np.ndarray, " m"]) -> Float[np.ndarray, "H W"]:
-        """Pixels (H, W) of an image (m,) on the cells, single precision; NaN outside the body."""
-        pixels = self._blank.copy()
-        pixels.ravel()[self._inside] = image[self._cell]
+        """Sample an image (m,) on the cells at the pixels (H, W), in single precision; NaN outside the body."""
+        pixels = self._blank_image.copy()
+        pixels.ravel()[self._inside_indices] = image[self._cell_indices]
         return pixels
 
 
@@ -64,7 +64,7 @@ def scene_of(
     diverging: bool,
     notes: Sequence[str] = (),
 ) -> Scene:
-    """The scene of a body with electrodes, whose images are sampled on `grid`."""
+    """Create the scene of a body with electrodes, whose images are sampled on `grid`."""
     outline = closed_outline(mesh) if mesh.dimension == 2 else _slice_outline(grid)
     names = [str(number) for number in range(1, electrodes.num_electrodes + 1)]
     return Scene(
@@ -82,36 +82,41 @@ def scene_of(
 
 
 def channel_names(protocol: Protocol) -> list[str]:
-    """Names of the channels of a protocol, such as "1-2 → 3-4": electrodes that drive and that measure, from 1."""
+    """Names of the channels of a protocol, such as "1-2 → 3-4": numbers, from 1, of the electrodes that drive and of
+    those that measure."""
     drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
-    return [f"{_pattern(one)} → {_pattern(other)}" for one, other in zip(drive, measurement, strict=True)]
+    return [
+        f"{_pattern_name(drive_row)} → {_pattern_name(measurement_row)}"
+        for drive_row, measurement_row in zip(drive, measurement, strict=True)
+    ]
 
 
 def electrode_curves(mesh: Mesh, electrodes: AbstractElectrodes) -> list[Float[np.ndarray, "n 2"]]:
-    """A curve (n, 2) of each electrode as seen from above, metres; a single point for an electrode without a size."""
+    """Curve (n, 2) of each electrode as seen from above, in metres; a single point for a point electrode."""
     pen = _CurvePen()
     electrodes.draw(mesh, pen)
     return pen.curves
 
 
-def _pattern(row: np.ndarray) -> str:
-    """Electrodes of a pattern: those with positive before those with negative coefficients; "…" for more than two."""
-    size = np.abs(row).max()
-    plus, minus = (np.flatnonzero(sign * row > _NOTHING * size) + 1 for sign in (1, -1))
-    if len(plus) + len(minus) > 2:
-        return f"{(plus if len(plus) else minus)[0]}…"
-    return "-".join(map(str, (*plus, *minus)))
+def _pattern_name(row: np.ndarray) -> str:
+    """Name a pattern by its electrodes, those with positive before those with negative coefficients; for more than two
+    electrodes, by the first one and "…"."""
+    max_coefficient = np.abs(row).max()
+    positive, negative = (np.flatnonzero(sign * row > _MIN_COEFFICIENT * max_coefficient) + 1 for sign in (1, -1))
+    if len(positive) + len(negative) > 2:
+        return f"{(positive if len(positive) else negative)[0]}…"
+    return "-".join(map(str, (*positive, *negative)))
 
 
 def closed_outline(mesh: Mesh) -> list[Float[np.ndarray, "n 2"]]:
     """Closed curves (n, 2) along the boundary of a plane mesh, metres."""
     facets, points = np.asarray(mesh.facets), np.asarray(mesh.points)
     starts = np.flatnonzero(np.append(True, facets[1:, 0] != facets[:-1, 1]))
-    return [points[np.append(part[:, 0], part[0, 0])] for part in np.split(facets, starts[1:])]
+    return [points[np.append(loop[:, 0], loop[0, 0])] for loop in np.split(facets, starts[1:])]
 
 
 def _slice_outline(grid: PixelGrid) -> list[np.ndarray]:
-    """Edge of a slice through a solid, where the pixels end."""
+    """Outline of a slice through a solid, from the mask of its pixels."""
     from contourpy import contour_generator
 
     inside = np.pad(grid.inside.astype(float), 1)
@@ -129,10 +134,12 @@ class _CurvePen:
         self.curves: list[np.ndarray] = []
 
     def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
-        self.curves.append(np.concatenate([np.asarray(one)[:, :2] for one in pieces]) if pieces else middle[None, :2])
+        self.curves.append(
+            np.concatenate([np.asarray(piece)[:, :2] for piece in pieces]) if pieces else middle[None, :2]
+        )
 
     def disc(self, middle: np.ndarray, radius: float) -> None:
-        angle = np.linspace(0, 2 * np.pi, _CORNERS + 1)
+        angle = np.linspace(0, 2 * np.pi, _NUM_VERTICES + 1)
         circle = np.column_stack([np.cos(angle), np.sin(angle)])
         self.curves.append(np.asarray(middle)[:2] + float(radius) * circle)
 

@@ -1,4 +1,4 @@
-"""View of microphones: the loss map of a frame of intensities, and the place of the touch."""
+"""View of an array of microphones: the loss map of a frame of intensities, and the position of the touch."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from jeit.inverse.streaming.stream import FrameStatus
 from jeit.live.pictures import AbstractView, LiveFrame, Marker, Picture, Scene
 from jeit.live.views.conductivity import mean_frame
 
-# Pixels along the longer side of the map; radius that holds 68 % of a round normal distribution of deviation 1.
-_PIXELS, _RADIUS = 100, float(np.sqrt(-2 * np.log(1 - 0.68)))
+# Number of pixels along the longer side of the map; radius that contains 68 % of an isotropic normal distribution of
+# standard deviation 1.
+_NUM_PIXELS, _RADIUS_68 = 100, float(np.sqrt(-2 * np.log(1 - 0.68)))
 _LIKELIHOOD = "likelihood"
 
 
 class SoundView(AbstractView):
-    """Loss map and place of a touch, from the intensities of microphones: a frame is an intensity for each.
+    """Loss map and position of a touch, from frames with the intensity of each microphone.
 
-    Places are those of `jeit.acoustic.locate` without changes of gains, which it estimates from all touches of a
-    recording. With the method "likelihood" pixels are distances from the most likely place, in standard deviations: √(2
-    (loss − least loss)); with "consistency", the loss of Park et al. (2022).
+    Positions are those of `jeit.acoustic.locate` without changes of gains, since these are estimated from all touches
+    of a recording. With the method "likelihood", pixels are distances from the most likely position in standard
+    deviations, √(2 (loss − minimum loss)); with "consistency", they are the loss of Park et al. (2022).
 
     **Arguments:**
 
@@ -52,62 +53,62 @@ class SoundView(AbstractView):
     ):
         self.calibration, self.method = calibration, method
         self.floor, self.freedom = floor, freedom
-        self._silence = np.zeros(calibration.num_microphones)
-        array, _, _ = microphones_in_use(self._intensities(self._silence, 0.0), calibration)
-        low, high = (np.asarray(one, float) for one in bounding_box(array.surface))
-        size = (high - low).max() / _PIXELS
+        self._silent_power = np.zeros(calibration.num_microphones)
+        array, _, _ = microphones_in_use(self._intensities(self._silent_power, 0.0), calibration)
+        low, high = (np.asarray(corner, float) for corner in bounding_box(array.surface))
+        size = (high - low).max() / _NUM_PIXELS
         columns, rows = (max(2, round(side / size)) for side in (high - low).tolist())
         self._localiser = Localiser.create(array, method=method, map_shape=(rows, columns), compiled=False)
-        edge = np.asarray(array.surface.outline.loops()[0])
-        places = np.asarray(array.surface.project(array.microphones.T)).T
-        names = [str(one) for one in range(1, len(places) + 1)]
-        likely = method == _LIKELIHOOD
+        outline = np.asarray(array.surface.outline.loops()[0])
+        positions = np.asarray(array.surface.project(array.microphones.T)).T
+        names = [str(number) for number in range(1, len(positions) + 1)]
+        is_likelihood = method == _LIKELIHOOD
         (x_min, y_min), (x_max, y_max) = low.tolist(), high.tolist()
         self.scene = Scene(
-            title=f"Touches located by {len(places)} microphones, {calibration.name}",
-            quantity="distance from the most likely place" if likely else "loss",
-            unit="σ" if likely else "",
+            title=f"Touches located by {len(positions)} microphones, {calibration.name}",
+            quantity="distance from the most likely place" if is_likelihood else "loss",
+            unit="σ" if is_likelihood else "",
             diverging=False,
             extent=(x_min, x_max, y_min, y_max),
-            outline=[np.concatenate([edge, edge[:1]])],
-            electrodes=[place[None] for place in places],
+            outline=[np.concatenate([outline, outline[:1]])],
+            electrodes=[position[None] for position in positions],
             names=names,
             channels=names,
             notes=("A ring holds the place with a probability of 68 %.",),
         )
 
     def picture(self, frame: LiveFrame) -> Picture:
-        """The loss map of a frame with the place of the touch; see `AbstractView.picture`."""
+        """Compute the loss map of a frame with the position of the touch; see `AbstractView.picture`."""
         values = frame.values
-        if isinstance(values, str) or values.shape != self._silence.shape:
-            kind = "text" if isinstance(values, str) else f"of {len(values)} numbers"
-            reason = f"The frame is {kind}, not {len(self._silence)} intensities."
+        if isinstance(values, str) or values.shape != self._silent_power.shape:
+            content = "text" if isinstance(values, str) else f"of {len(values)} numbers"
+            reason = f"The frame is {content}, not {len(self._silent_power)} intensities."
             return Picture(None, status=FrameStatus.REFUSED, reason=reason)
         try:
-            intensities = self._intensities(values - self._silence, frame.second)
-            found = locate(intensities, self.calibration, method=self.method, gain_drift=0.0, compiled=False)
+            intensities = self._intensities(values - self._silent_power, frame.second)
+            locations = locate(intensities, self.calibration, method=self.method, gain_drift=0.0, compiled=False)
         except ValueError as error:
             return Picture(None, status=FrameStatus.REFUSED, reason=str(error))
-        status = found.status[0]
+        status = locations.status[0]
         if status == LocationStatus.UNUSABLE:
             return Picture(None, status=FrameStatus.REFUSED, reason="Fewer than three microphones can be used.")
         if status == LocationStatus.NO_TOUCH:
             return Picture(None, status=FrameStatus.UNCHANGED)
-        loss = np.asarray(self._localiser.maps(intensities.power, found.used))[0, ::-1]
+        loss = np.asarray(self._localiser.maps(intensities.power, locations.used))[0, ::-1]
         if self.method == _LIKELIHOOD:
             loss = np.sqrt(2 * (loss - np.nanmin(loss)))
         reason = "" if status == LocationStatus.TOUCH else f"{status}: see the statuses of jeit locate.".capitalize()
-        return Picture(loss.astype(np.float32), self._markers(found), reason=reason)
+        return Picture(loss.astype(np.float32), self._markers(locations), reason=reason)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
         """Take the mean of frames (N, M) without a touch as silence, which is subtracted from later frames.
 
-        Raises `ValueError` for another number of microphones, and if one that is calibrated has no reading.
+        Raises `ValueError` for another number of microphones, and if a calibrated microphone has no reading.
         """
         mean = mean_frame(frames)
-        if mean.shape != self._silence.shape or not np.isfinite(mean[self.calibration.usable]).all():
-            raise ValueError(f"reference: give intensities of all {len(self._silence)} microphones.")
-        self._silence = np.where(np.isfinite(mean), mean, 0.0)
+        if mean.shape != self._silent_power.shape or not np.isfinite(mean[self.calibration.usable]).all():
+            raise ValueError(f"reference: give intensities of all {len(self._silent_power)} microphones.")
+        self._silent_power = np.where(np.isfinite(mean), mean, 0.0)
 
     def _intensities(self, power: Float[np.ndarray, " M"], second: float) -> Intensities:
         usable = np.isfinite(power)[None]
@@ -121,13 +122,13 @@ class SoundView(AbstractView):
             name="live",
         )
 
-    def _markers(self, found) -> tuple[Marker, ...]:
-        """Markers of the touch, and of the second one where there are two."""
+    def _markers(self, locations) -> tuple[Marker, ...]:
+        """Markers of the touch, and of the second touch if there are two."""
         project = self._localiser.microphone_array.surface.project
-        deviation = float(np.sqrt(np.trace(found.covariance[0]) / 2))
-        places = [(found.position[0], _RADIUS * deviation), (found.second[0], float("nan"))]
+        deviation = float(np.sqrt(np.trace(locations.covariance[0]) / 2))
+        positions_and_radii = [(locations.position[0], _RADIUS_68 * deviation), (locations.second[0], float("nan"))]
         return tuple(
-            Marker(*np.asarray(project(place[:, None]))[:, 0].tolist(), radius=radius)
-            for place, radius in places
-            if np.isfinite(place).all()
+            Marker(*np.asarray(project(position[:, None]))[:, 0].tolist(), radius=radius)
+            for position, radius in positions_and_radii
+            if np.isfinite(position).all()
         )
