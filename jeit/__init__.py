@@ -4,8 +4,9 @@ The most common names, and the packages with further ones:
 
 - `read`: reading of measured files (`jeit.data`);
 - `image_difference`: an image from two frames, in one call (`jeit.imaging`, `jeit.report`);
-- `Disk`: outlines and their meshes (`jeit.mesh`);
+- `Disk`, `Rectangle`: outlines and their meshes (`jeit.mesh`);
 - `BoundaryElectrodes`, `ring`: electrodes (`jeit.electrodes`) and their layouts (`jeit.layout`);
+- `body_mesh`: a mesh with smaller cells at the electrodes;
 - `adjacent`: drive and measurement patterns (`jeit.protocol`);
 - `ForwardModel`: voltages and Jacobian for a given conductivity (`jeit.forward`);
 - `calibrate`, `one_step`, `reconstruct`: linear and nonlinear imaging (`jeit.inverse`);

@@ -15,13 +15,13 @@ from . import (
     touch,
 )
 from .data import read
-from .electrodes import BoundaryElectrodes
+from .electrodes import BoundaryElectrodes, body_mesh
 from .forward import ForwardModel
 from .image import find_inclusions
 from .imaging import image_difference
 from .inverse import calibrate, one_step, reconstruct
 from .layout import ring
-from .mesh import Disk
+from .mesh import Disk, Rectangle
 from .plot import plot_image
 from .protocol import adjacent
 
@@ -31,8 +31,10 @@ __all__ = [
     "BoundaryElectrodes",
     "Disk",
     "ForwardModel",
+    "Rectangle",
     "acoustic",
     "adjacent",
+    "body_mesh",
     "calibrate",
     "data",
     "design",

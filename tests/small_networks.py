@@ -30,9 +30,9 @@ def small_maps():
     compilation."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learn, "SHAPE", SHAPE)
-        patch.setattr(learn, "_PLACES", 5)
-        patch.setattr(linear_channels, "_PLACES", 5)
-        patch.setattr(linear_channels, "_AT_ONCE", 1)
+        patch.setattr(learn, "_PLACES_PER_SIDE", 5)
+        patch.setattr(linear_channels, "_PLACES_PER_SIDE", 5)
+        patch.setattr(linear_channels, "_MAX_BODIES", 1)
         patch.setattr(linear_channels, "touching_bodies", lambda: [DiscIndenter(0.02)])
         yield
 

@@ -104,16 +104,16 @@ Interval = tuple[float | None, float | None]
 
 
 def interval_text(interval: Interval, format_end: Callable[[float], str]) -> str:
-    """Text of an interval, whose ends `format_end` formats; "at least" or "at most" the known end if the other one is
-    open."""
+    """Text of an interval, whose ends `format_end` formats. If one end is open, "at least" or "at most" the known end,
+    or "beyond" it if it is a decrease, because "at most -90 %" might mean a smaller one."""
     lower_end, upper_end = interval
     if lower_end is None:
-        return "not determined" if upper_end is None else f"at most {format_end(upper_end)}"
-    return (
-        f"at least {format_end(lower_end)}"
-        if upper_end is None
-        else f"{format_end(lower_end)} to {format_end(upper_end)}"
-    )
+        if upper_end is None:
+            return "not determined"
+        return f"{'beyond' if upper_end < 0 else 'at most'} {format_end(upper_end)}"
+    if upper_end is None:
+        return f"at least {format_end(lower_end)}"
+    return f"{format_end(lower_end)} to {format_end(upper_end)}"
 
 
 # Maximum reading of any instrument, in volts or fractions of volts; squares of such numbers do not overflow.

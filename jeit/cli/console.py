@@ -184,7 +184,8 @@ def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Tabl
         )
         rows.append([size, change, strength])
     table = _inclusion_table_with(inclusions, [f"{noun}\n/ {unit}", "change\n/ %", f"strength\n/ {unit}"], rows)
-    table.caption, table.caption_justify = "below each value its 68 % interval", "left"
+    table.caption = "below size, change and strength their 68 % intervals; places have none"
+    table.caption_justify = "left"
     return table
 
 

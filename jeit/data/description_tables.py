@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import FailFast, Field, model_validator
@@ -33,6 +33,9 @@ Indices = Annotated[np.ndarray, Numbers(((1, math.inf),), 0, 2**31 - 1, kind=int
 Gains = Annotated[np.ndarray, Numbers(((1, math.inf),), 1e-6, 1e6)]
 Reading = Literal["adjacent", "mean", "mean-removed", "against"]
 SelectionMask = Annotated[np.ndarray, Numbers(((1, math.inf), (1, math.inf)), kind=bool)]
+
+
+_UNKNOWN_IMPEDANCE = "; if it is not known, write {}, which the reference frame corrects"
 
 
 class DiskTable(Table):
@@ -133,6 +136,7 @@ class BoundaryTable(PlacedTable):
     """Table of electrodes that are arcs on the edge of a sheet. `contact_impedance` in ohm·m."""
 
     subject = "electrodes of kind 'boundary'"
+    hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("0.01 (ohm·m)")}
     kind: Literal["boundary"] = "boundary"
     width: Sizes
     contact_impedance: Impedances
@@ -142,6 +146,7 @@ class DiscTable(PlacedTable):
     """Table of electrodes that are discs."""
 
     subject = "electrodes of kind 'disc'"
+    hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("1e-3 (ohm·m²)")}
     kind: Literal["disc"]
     radius: Sizes
     contact_impedance: Impedances
@@ -151,6 +156,7 @@ class PatchTable(PlacedTable):
     """Table of electrodes that are rectangles on a solid."""
 
     subject = "electrodes of kind 'patch'"
+    hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("1e-3 (ohm·m²)")}
     kind: Literal["patch"]
     width: Sizes
     height: Sizes
@@ -168,6 +174,7 @@ class FacetsTable(Table):
     """Table of electrodes that are named groups of facets of a mesh."""
 
     subject = "electrodes of kind 'facets'"
+    hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("1e-3 (ohm·m²)")}
     kind: Literal["facets"]
     tags: Annotated[list[Word], Field(min_length=1, max_length=MOST_ELECTRODES), FailFast()]
     contact_impedance: Impedances
@@ -186,7 +193,11 @@ class DrivenTable(Table):
     def _check_current(self) -> "DrivenTable":
         pattern = self.current_from_name
         if pattern is None and self.current is None:
-            raise fault("is missing; give it, or current_from_name.", "current")
+            raise fault(
+                "is missing; give it, or current_from_name. If it is not known, write 1e-3 (A): it scales "
+                "conductivities alone, and relative changes not at all.",
+                "current",
+            )
         if pattern is not None and self.current is not None:
             raise fault("has no effect beside current_from_name; leave out one or the other.", "current")
         if pattern is not None and pattern.count("{current}") != 1:

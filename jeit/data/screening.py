@@ -111,6 +111,24 @@ def screen(
     return measurement if note is None else replace(measurement, notes=(*measurement.notes, note))
 
 
+def _hint_of_number(number: int, channels: int) -> str:
+    """What may be wrong if `number` numbers are not frames of a protocol with so many `channels`: lines that are
+    missing, or another number of electrodes."""
+    if 0 < channels - number <= channels // 4:
+        return f" They are {number} numbers, {channels - number} fewer than a frame has: is a line missing?"
+    counts = {
+        electrodes * (electrodes - 3) // share: (electrodes, pair_text)
+        for electrodes in range(64, 3, -1)
+        for share, pair_text in ((2, "half of the adjacent pairs"), (1, "adjacent pairs"))
+    } | {electrodes * (electrodes - 1) // 2: (electrodes, "all pairs") for electrodes in range(4, 65)}
+    if number not in counts:
+        return ""
+    electrodes, pair_text = counts[number]
+    return (
+        f" {number} numbers are what {electrodes} electrodes give with {pair_text}: is the number of electrodes right?"
+    )
+
+
 def _as_frames(voltages, protocol: Protocol, name: str) -> np.ndarray:
     values = np.asarray(voltages)
     if values.dtype.kind not in "fiuc":
@@ -121,9 +139,10 @@ def _as_frames(voltages, protocol: Protocol, name: str) -> np.ndarray:
         hint = " It looks transposed: give one row per frame." if values.shape[0] == num_channels else ""
         if values.ndim == 2 and 0 < (num_extra := values.shape[1] - num_channels) <= _MAX_EXTRA_COLUMNS:
             hint = f" There are {num_extra} too many: are there times, counters or states among them? Leave them out."
+        hint = hint or _hint_of_number(values.size, num_channels)
         raise ValueError(
             f"{name}: the data have shape {values.shape}, but the protocol '{protocol.name}' has {num_channels} "
-            f"channels, so (frames, {num_channels}) is needed.{hint} Otherwise choose the protocol that the data "
+            f"channels, so (frames, {num_channels}) is needed.{hint} Or describe the protocol that the data "
             "were measured with."
         )
     return values

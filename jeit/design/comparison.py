@@ -67,13 +67,13 @@ def skin_response(
     check_skin("skin", skin)
     check_grid(grid)
     check_key(key)
-    number = number_of_taxels(grid, num_taxels)
+    checked_num_taxels = number_of_taxels(grid, num_taxels)
     touched = skin.touched_cells(grid.places) if touched is None else touched
     if len(touched.places) != len(grid.places):
         raise ValueError(f"touched is of {len(touched.places)} places, and grid has {len(grid.places)}; give its own.")
     sensitivity = SensitivityMap(grid, skin.voltage_changes(touched, linear=linear))
     taxels = find_taxels(
-        sensitivity.changes, grid.places, grid.cell_area, num_taxels=number, threshold=threshold, key=key
+        sensitivity.changes, grid.places, grid.cell_area, num_taxels=checked_num_taxels, threshold=threshold, key=key
     )
     return SkinResponse(skin.layout, sensitivity, taxels)
 
@@ -153,17 +153,17 @@ def compare_layouts(
     check_skin("second", second)
     check_same_outline(first.layout, second.layout)
     report = progress or (lambda step: None)
-    ready = []
+    prepared_skins = []
     # Both skins are checked before any response is computed, so that errors are raised at once.
     for skin in (first, second):
         grid = touches_away_from_the_edge(skin.outline, margin, places, places)
-        number = number_of_taxels(grid, num_taxels)
-        ready.append((skin, grid, skin.touched_cells(grid.places, contrast=contrast), number))
+        checked_num_taxels = number_of_taxels(grid, num_taxels)
+        prepared_skins.append((skin, grid, skin.touched_cells(grid.places, contrast=contrast), checked_num_taxels))
     responses = []
-    for skin, grid, touched, number in ready:
+    for skin, grid, touched, checked_num_taxels in prepared_skins:
         report(f"touch {skin.layout.name}")
         key = jax.random.key(seed)
-        responses.append(skin_response(skin, grid, key=key, touched=touched, num_taxels=number))
+        responses.append(skin_response(skin, grid, key=key, touched=touched, num_taxels=checked_num_taxels))
     return LayoutComparison((first, second), (responses[0], responses[1]), margin, places, contrast, seed)
 
 
@@ -182,13 +182,16 @@ def check_same_outline(first: Layout | SurfaceLayout, second: Layout | SurfaceLa
     for layout in (first, second):
         low_x, high_x, low_y, high_y = layout.known_outline.extent
         sizes.append((high_x - low_x, high_y - low_y, layout.known_outline.area))
-    if any(abs(a - b) > 1e-3 * a for a, b in zip(*sizes, strict=True)):
-        said = " and ".join(
+    if any(
+        abs(first_length - second_length) > 1e-3 * first_length
+        for first_length, second_length in zip(*sizes, strict=True)
+    ):
+        size_text = " and ".join(
             f"'{layout.name}' {1e3 * width:.4g} × {1e3 * height:.4g} mm"
             for layout, (width, height, _) in zip((first, second), sizes, strict=True)
         )
         raise ValueError(
-            f"the layouts are on different skins, {said}; a file that does not say its skin is read with outline=."
+            f"the layouts are on different skins, {size_text}; a file that does not say its skin is read with outline=."
         )
 
 
@@ -211,17 +214,19 @@ def comparison_figures(first: SkinResponse, second: SkinResponse) -> list[dict]:
     return [_score_figures(*pair) for pair in ((first, second), (second, first))]
 
 
-def _score_figures(response: SkinResponse, other: SkinResponse) -> dict:
-    theta, taxels = response.sensitivity, response.taxels
+def _score_figures(response: SkinResponse, other_response: SkinResponse) -> dict:
+    sensitivity, taxels = response.sensitivity, response.taxels
     areas = 1e4 * np.asarray(taxels.areas)
     return {
         "layout": response.layout.name,
         "electrodes": response.layout.num_electrodes,
-        "measurements": theta.changes.shape[1],
-        "sensitivity_min_V": float(theta.minimum),
-        "sensitivity_mean_V": float(theta.mean),
-        "sensitivity_uniformity": float(theta.uniformity),
-        "blind_spot_fraction": float(theta.blind_spot((1 - _BLIND_SPOT_MARGIN) * other.sensitivity.minimum)),
+        "measurements": sensitivity.changes.shape[1],
+        "sensitivity_min_V": float(sensitivity.minimum),
+        "sensitivity_mean_V": float(sensitivity.mean),
+        "sensitivity_uniformity": float(sensitivity.uniformity),
+        "blind_spot_fraction": float(
+            sensitivity.blind_spot((1 - _BLIND_SPOT_MARGIN) * other_response.sensitivity.minimum)
+        ),
         "taxel_count": int((areas > 0).sum()),
         "taxel_area_cm2": {"mean": float(areas.mean()), "std": float(areas.std()), "max": float(areas.max())},
         "taxel_overlap": float(taxels.overlap),

@@ -24,7 +24,7 @@ from jeit_solvers.module import Module
 
 # Ratio of the number of nodes of the mesh for the final scores to that of the mesh used in the optimisation; number of
 # touched positions along a side in the optimisation, and for the final scores.
-_REFINEMENT_RATIO, _OPTIMISED_PLACES, _SCORED_PLACES = 4, 16, 24
+_REFINEMENT_RATIO, _NUM_OPTIMISED_POSITIONS, _NUM_SCORED_POSITIONS = 4, 16, 24
 
 
 class ImprovedLayout(Module):
@@ -95,22 +95,25 @@ def improve_layout(
     report = progress or (lambda step: None)
     space = DesignSpace(minimum_spacing=MINIMUM_SPACING) if space is None else space
     report("mesh")
-    sheet, objective = _skin_and_objective(layout, num_points, _OPTIMISED_PLACES, noise, material)
+    coarse_skin, objective = _skin_and_objective(layout, num_points, _NUM_OPTIMISED_POSITIONS, noise, material)
     report("optimise")
     key = jax.random.key(seed)
-    found = optimise_layout(sheet, objective, space, steps=steps, starts=starts, key=key, callback=callback)
-    if found.status == "infeasible":
-        raise ValueError(f"no layout found: {found.reason}")
+    optimisation = optimise_layout(
+        coarse_skin, objective, space, steps=steps, starts=starts, key=key, callback=callback
+    )
+    if optimisation.status == "infeasible":
+        raise ValueError(f"no layout found: {optimisation.reason}")
     report("confirm")
-    finer, objective = _skin_and_objective(layout, _REFINEMENT_RATIO * num_points, _SCORED_PLACES, noise, material)
-    moved = finer.with_layout(found.layout, material.get("contact_impedance"))
-    before, after = objective.scores(finer), objective.scores(moved)
-    return ImprovedLayout(layout, sheet, found, before, after, space, noise, seed, num_points)
+    num_fine_points = _REFINEMENT_RATIO * num_points
+    fine_skin, objective = _skin_and_objective(layout, num_fine_points, _NUM_SCORED_POSITIONS, noise, material)
+    optimised_skin = fine_skin.with_layout(optimisation.layout, material.get("contact_impedance"))
+    scores = objective.scores(fine_skin), objective.scores(optimised_skin)
+    return ImprovedLayout(layout, coarse_skin, optimisation, *scores, space, noise, seed, num_points)
 
 
 def _skin_and_objective(
-    layout: Layout, num_points: int, places: int, noise: float, options: dict
+    layout: Layout, num_points: int, num_positions: int, noise: float, options: dict
 ) -> tuple[Skin, Objective]:
-    pairs = two_terminal(layout.num_electrodes)
-    skin = Skin.create(layout, num_layers=0, num_points=num_points, protocol=pairs, **options)
-    return skin, Objective.create(skin, touch_grid(skin.outline, places, places).places, noise=noise)
+    protocol = two_terminal(layout.num_electrodes)
+    skin = Skin.create(layout, num_layers=0, num_points=num_points, protocol=protocol, **options)
+    return skin, Objective.create(skin, touch_grid(skin.outline, num_positions, num_positions).places, noise=noise)

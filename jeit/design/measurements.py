@@ -79,23 +79,25 @@ class Candidates(Module):
         return self.rows.shape[0]
 
 
-def _check_candidates(jacobian, prior, noise, weights, shape: tuple[str, str]) -> tuple[Array, Array, Array, Array]:
-    """Check the arguments of `Candidates` and return them as arrays of matching shapes. `shape`: names of the axes of
-    `prior`, for error messages."""
+def _check_candidates(
+    jacobian, prior, noise, weights, axis_names: tuple[str, str]
+) -> tuple[Array, Array, Array, Array]:
+    """Check the arguments of `Candidates` and return them as arrays of matching shapes. `axis_names`: names of the axes
+    of `prior`, for error messages."""
     jacobian, prior = jnp.asarray(jacobian, float), jnp.asarray(prior, float)
     noise = jnp.asarray(noise, float)
     if jacobian.ndim != 2 or prior.ndim != 2 or jacobian.shape[1] != prior.shape[0]:
         raise ValueError(
             f"jacobian has shape {jacobian.shape} and the prior's matrix {prior.shape}; give (measurements, cells) and "
-            f"({', '.join(shape)})."
+            f"({', '.join(axis_names)})."
         )
     weights = jnp.ones(len(prior)) if weights is None else jnp.asarray(weights, float)
     if noise.shape not in ((), jacobian.shape[:1]):
         raise ValueError(f"noise has shape {noise.shape}; give one number, or one for each of {len(jacobian)} rows.")
     if weights.shape != prior.shape[:1]:
         raise ValueError(f"weights has shape {weights.shape}; give one for each of the {len(prior)} cells.")
-    named = {"jacobian": jacobian, "the prior's matrix": prior, "noise": noise, "weights": weights}
-    for name, values in named.items():
+    arrays_by_name = {"jacobian": jacobian, "the prior's matrix": prior, "noise": noise, "weights": weights}
+    for name, values in arrays_by_name.items():
         if not has_values(values):
             continue
         if not np.isfinite(values).all():
@@ -112,14 +114,16 @@ def _candidates_from_product(jacobian, product, noise, weights) -> Candidates:
     """Compute the candidates from ΓJᵀ, with the factor S = ΓJᵀ N^-½ U Λ^-½ of the prior, where N^-½ JΓJᵀ N^-½ = UΛUᵀ
     and N is the covariance of the noise.
 
-    SSᵀ is the part of Γ that the measurements depend on; they are independent of the rest.
+    SSᵀ is the part of Γ that the measurements depend on; they do not depend on the remaining part.
     """
     kernel = jacobian @ product / (noise[:, None] * noise)
-    values, vectors = jnp.linalg.eigh((kernel + kernel.T) / 2)
-    seen = values > len(values) * jnp.finfo(values.dtype).eps * values[-1]
-    root = jnp.sqrt(jnp.where(seen, values, 1))
-    factor = product @ (vectors / noise[:, None] * jnp.where(seen, 1 / root, 0))
-    return Candidates(vectors * jnp.where(seen, root, 0), factor.T @ (weights[:, None] * factor))
+    eigenvalues, eigenvectors = jnp.linalg.eigh((kernel + kernel.T) / 2)
+    is_significant = eigenvalues > len(eigenvalues) * jnp.finfo(eigenvalues.dtype).eps * eigenvalues[-1]
+    root_eigenvalues = jnp.sqrt(jnp.where(is_significant, eigenvalues, 1))
+    factor = product @ (eigenvectors / noise[:, None] * jnp.where(is_significant, 1 / root_eigenvalues, 0))
+    return Candidates(
+        eigenvectors * jnp.where(is_significant, root_eigenvalues, 0), factor.T @ (weights[:, None] * factor)
+    )
 
 
 Criterion = Literal["D", "A"]
@@ -248,7 +252,9 @@ def random_selections(key: Array, num_candidates: int, number: int, count: int) 
     if not 1 <= number <= num_candidates:
         raise ValueError(f"number must be from 1 to the {num_candidates} candidates; it is {number}.")
     check_key(key)
-    orders = jax.vmap(lambda one: jax.random.permutation(one, num_candidates))(jax.random.split(key, count))
+    orders = jax.vmap(lambda permutation_key: jax.random.permutation(permutation_key, num_candidates))(
+        jax.random.split(key, count)
+    )
     return orders[:, :number]
 
 
@@ -271,7 +277,7 @@ def farthest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N
     return _pairs_by_length(centres, number, -1, lengths)
 
 
-def _pairs_by_length(centres, number: int, sign: int, lengths) -> np.ndarray:
+def _pairs_by_length(centres, number: int, length_sign: int, lengths) -> np.ndarray:
     centres = np.asarray(centres, float)
     first, second = np.triu_indices(len(centres), 1)
     if not 1 <= number <= len(first):
@@ -285,8 +291,8 @@ def _pairs_by_length(centres, number: int, sign: int, lengths) -> np.ndarray:
         raise ValueError(
             f"lengths has shape {np.shape(lengths)}; give one between any two of {len(centres)} electrodes."
         )
-    length = np.asarray(lengths, float)[first, second].round(9)
-    return np.argsort(sign * length, kind="stable")[:number]
+    pair_lengths = np.asarray(lengths, float)[first, second].round(9)
+    return np.argsort(length_sign * pair_lengths, kind="stable")[:number]
 
 
 def _check_number(candidates: Candidates, number: int, criterion: Criterion) -> None:
@@ -298,23 +304,27 @@ def _check_number(candidates: Candidates, number: int, criterion: Criterion) -> 
 
 @partial(jax.jit, static_argnames=("number", "criterion", "limit"))
 def _select_with_swaps(candidates: Candidates, number: int, criterion: Criterion, limit: int) -> Selection:
-    chosen, gains = _greedy_selection(candidates, number, criterion)
+    selected, gains = _greedy_selection(candidates, number, criterion)
     total, _ = _information_and_slope(candidates, jnp.ones(candidates.num_candidates), criterion)
 
-    def helps(state):
+    def can_improve(state):
         _, swaps, settled = state
         return (swaps < limit) & ~settled
 
     def swap(state):
-        chosen, swaps, _ = state
-        gain = _swap_gains(candidates, chosen, criterion)
-        leaves, enters = jnp.unravel_index(jnp.argmax(gain), gain.shape)
-        worth = gain[leaves, enters] > _MIN_GAIN * total
-        return jnp.where(worth, chosen.at[leaves].set(enters), chosen), swaps + worth, ~worth
+        selected, swaps, _ = state
+        swap_gains = _swap_gains(candidates, selected, criterion)
+        removed_position, added_candidate = jnp.unravel_index(jnp.argmax(swap_gains), swap_gains.shape)
+        is_gain = swap_gains[removed_position, added_candidate] > _MIN_GAIN * total
+        return (
+            jnp.where(is_gain, selected.at[removed_position].set(added_candidate), selected),
+            swaps + is_gain,
+            ~is_gain,
+        )
 
-    chosen, swaps, settled = jax.lax.while_loop(helps, swap, (chosen, jnp.array(0), jnp.array(False)))
-    kept = _information_of_sets(candidates, chosen[None], criterion)[0]
-    return Selection(chosen, gains, kept, total, swaps, settled)
+    selected, swaps, settled = jax.lax.while_loop(can_improve, swap, (selected, jnp.array(0), jnp.array(False)))
+    final_information = _information_of_sets(candidates, selected[None], criterion)[0]
+    return Selection(selected, gains, final_information, total, swaps, settled)
 
 
 def _greedy_selection(candidates: Candidates, number: int, criterion: Criterion):
@@ -322,32 +332,40 @@ def _greedy_selection(candidates: Candidates, number: int, criterion: Criterion)
     F are the rows f_i, with the best candidate as the next pivot.
 
     Choosing candidate p changes the posterior covariance from C to C - uuᵀ with u = C f_p / √(1 + f_pᵀC f_p). The rows
-    of `known` are the vectors u found so far.
+    of `directions` are the vectors u found so far.
     """
     rows, weight = candidates.rows, candidates.weight
 
-    def covariance(known, vector):
-        return vector - known.T @ (known @ vector)
+    def covariance(directions, vector):
+        return vector - directions.T @ (directions @ vector)
 
-    def step(state, turn):
-        known, left, removable, free = state
-        gain = jnp.log1p(left) if criterion == "D" else removable / (1 + left)
-        best = jnp.argmax(jnp.where(free, gain, -jnp.inf))
-        direction = covariance(known, rows[best]) / jnp.sqrt(1 + left[best])
-        seen = rows @ direction
+    def step(state, step_index):
+        directions, variances, reductions, is_available = state
+        gains = jnp.log1p(variances) if criterion == "D" else reductions / (1 + variances)
+        best_candidate = jnp.argmax(jnp.where(is_available, gains, -jnp.inf))
+        direction = covariance(directions, rows[best_candidate]) / jnp.sqrt(1 + variances[best_candidate])
+        projections = rows @ direction
         if criterion == "A":
-            # Update f_jᵀCVC f_j to the new C, which changes C f_j by a multiple of `seen`.
-            pulled = weight @ direction
-            change = rows @ covariance(known, pulled)
-            removable = jnp.maximum(removable - 2 * seen * change + (direction @ pulled) * seen**2, 0)
-        state = known.at[turn].set(direction), jnp.maximum(left - seen**2, 0), removable, free.at[best].set(False)
-        return state, (best, gain[best])
+            # Update f_jᵀCVC f_j to the new C, which changes C f_j by a multiple of `projections`.
+            weighted_direction = weight @ direction
+            weighted_projections = rows @ covariance(directions, weighted_direction)
+            reductions = jnp.maximum(
+                reductions - 2 * projections * weighted_projections + (direction @ weighted_direction) * projections**2,
+                0,
+            )
+        state = (
+            directions.at[step_index].set(direction),
+            jnp.maximum(variances - projections**2, 0),
+            reductions,
+            is_available.at[best_candidate].set(False),
+        )
+        return state, (best_candidate, gains[best_candidate])
 
-    left = jnp.sum(rows**2, axis=1)  # f_jᵀC f_j: remaining variance of measurement j
-    removable = jnp.sum((rows @ weight) * rows, axis=1)  # f_jᵀCVC f_j
-    known = jnp.zeros((number, rows.shape[1]))
-    start = (known, left, removable, jnp.ones(len(rows), bool))
-    return jax.lax.scan(step, start, jnp.arange(number))[1]
+    variances = jnp.sum(rows**2, axis=1)  # f_jᵀC f_j: remaining variance of measurement j
+    reductions = jnp.sum((rows @ weight) * rows, axis=1)  # f_jᵀCVC f_j
+    directions = jnp.zeros((number, rows.shape[1]))
+    initial_state = (directions, variances, reductions, jnp.ones(len(rows), bool))
+    return jax.lax.scan(step, initial_state, jnp.arange(number))[1]
 
 
 def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[Array, "N M"]:
@@ -358,54 +376,56 @@ def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[A
     ((1 - c_ii) b_jj + 2 c_ij b_ij - (1 + c_jj) b_ii) / q.
     """
     rows, weight = candidates.rows, candidates.weight
-    picked = rows[chosen]
-    cross = picked @ rows.T
+    selected_rows = rows[chosen]
+    products = selected_rows @ rows.T
     # F_T: the rows of the set. C F_Tᵀ = F_Tᵀ (I + F_T F_Tᵀ)⁻¹ gives c_ij and 1 - c_ii without differences of large
     # numbers.
-    root = _inverse_root(cross[:, chosen])
-    half = root @ cross
-    c_j = jnp.maximum(jnp.sum(rows**2, axis=1) - jnp.sum(half**2, axis=0), 0)
-    c_ij = root.T @ half
-    rest_i = jnp.sum(root**2, axis=0)[:, None]  # 1 - c_ii
-    ratio = (1 + c_j) * rest_i + c_ij**2
+    inverse_root = _inverse_root(products[:, chosen])
+    half_products = inverse_root @ products
+    c_j = jnp.maximum(jnp.sum(rows**2, axis=1) - jnp.sum(half_products**2, axis=0), 0)
+    c_ij = inverse_root.T @ half_products
+    complement_i = jnp.sum(inverse_root**2, axis=0)[:, None]  # 1 - c_ii
+    determinant_ratio = (1 + c_j) * complement_i + c_ij**2
     if criterion == "D":
-        gain = jnp.log(ratio)
+        gains = jnp.log(determinant_ratio)
     else:
-        smoothed = rows - c_ij.T @ picked  # rows f_jᵀC
-        kept = root.T @ (root @ picked) @ weight  # rows f_iᵀCV
-        b_ij = kept @ smoothed.T
-        b_j = jnp.sum((smoothed @ weight) * smoothed, axis=1)
-        gain = (rest_i * b_j + 2 * c_ij * b_ij - (1 + c_j) * b_j[chosen][:, None]) / ratio
-    return gain.at[:, chosen].set(-jnp.inf)
+        filtered_rows = rows - c_ij.T @ selected_rows  # rows f_jᵀC
+        weighted_selected = inverse_root.T @ (inverse_root @ selected_rows) @ weight  # rows f_iᵀCV
+        b_ij = weighted_selected @ filtered_rows.T
+        b_j = jnp.sum((filtered_rows @ weight) * filtered_rows, axis=1)
+        gains = (complement_i * b_j + 2 * c_ij * b_ij - (1 + c_j) * b_j[chosen][:, None]) / determinant_ratio
+    return gains.at[:, chosen].set(-jnp.inf)
 
 
-def _information_of_set(candidates: Candidates, weighted: Float[Array, "M r"], chosen, criterion: Criterion):
-    """Information of one set, from the N × N matrix I + F_T F_Tᵀ, where F_T are the rows of the set; `weighted`: the
-    rows of all candidates times V."""
-    picked = candidates.rows[chosen]
-    root = _inverse_root(picked @ picked.T)
+def _information_of_set(candidates: Candidates, weighted_rows: Float[Array, "M r"], chosen, criterion: Criterion):
+    """Information of one set, from the N × N matrix I + F_T F_Tᵀ, where F_T are the rows of the set; `weighted_rows`:
+    the rows of all candidates times V."""
+    selected_rows = candidates.rows[chosen]
+    inverse_root = _inverse_root(selected_rows @ selected_rows.T)
     if criterion == "D":
-        return -2 * jnp.sum(jnp.log(jnp.diag(root)))
-    return jnp.sum((root @ weighted[chosen]) * (root @ picked))
+        return -2 * jnp.sum(jnp.log(jnp.diag(inverse_root)))
+    return jnp.sum((inverse_root @ weighted_rows[chosen]) * (inverse_root @ selected_rows))
 
 
 @partial(jax.jit, static_argnames="criterion")
-def _information_of_sets(candidates: Candidates, sets, criterion: Criterion):
-    weighted = candidates.rows @ candidates.weight
-    return jax.lax.map(lambda chosen: _information_of_set(candidates, weighted, chosen, criterion), sets, batch_size=64)
+def _information_of_sets(candidates: Candidates, index_sets, criterion: Criterion):
+    weighted_rows = candidates.rows @ candidates.weight
+    return jax.lax.map(
+        lambda chosen: _information_of_set(candidates, weighted_rows, chosen, criterion), index_sets, batch_size=64
+    )
 
 
-def _information_and_slope(candidates: Candidates, parts: Float[Array, " M"], criterion: Criterion):
-    """Information if candidate i is measured with weight `parts[i]`, and its derivative (M,) with respect to the
-    weights, from the r × r matrix C⁻¹."""
+def _information_and_slope(candidates: Candidates, fractions: Float[Array, " M"], criterion: Criterion):
+    """Information if candidate i is measured with the weight `fractions[i]`, and its derivative (M,) with respect to
+    the weights, from the r × r matrix C⁻¹."""
     rows, weight = candidates.rows, candidates.weight
-    root = _inverse_root(rows.T @ (parts[:, None] * rows))
-    half = root @ rows.T
+    inverse_root = _inverse_root(rows.T @ (fractions[:, None] * rows))
+    half_products = inverse_root @ rows.T
     if criterion == "D":
-        return -2 * jnp.sum(jnp.log(jnp.diag(root))), jnp.sum(half**2, axis=0)  # f_jᵀC f_j
-    smoothed = root.T @ half
-    value = jnp.trace(weight) - jnp.sum((root @ weight) * root)
-    return value, jnp.sum(smoothed * (weight @ smoothed), axis=0)  # f_jᵀCVC f_j
+        return -2 * jnp.sum(jnp.log(jnp.diag(inverse_root))), jnp.sum(half_products**2, axis=0)  # f_jᵀC f_j
+    filtered_rows = inverse_root.T @ half_products
+    value = jnp.trace(weight) - jnp.sum((inverse_root @ weight) * inverse_root)
+    return value, jnp.sum(filtered_rows * (weight @ filtered_rows), axis=0)  # f_jᵀCVC f_j
 
 
 def _inverse_root(matrix: Float[Array, "s s"]) -> Float[Array, "s s"]:
@@ -416,15 +436,15 @@ def _inverse_root(matrix: Float[Array, "s s"]) -> Float[Array, "s s"]:
 
 @partial(jax.jit, static_argnames=("number", "criterion", "iterations"))
 def _relaxed_bound(candidates: Candidates, number: int, criterion: Criterion, iterations: int):
-    def step(turn, state):
-        parts, bound = state
-        value, slope = _information_and_slope(candidates, parts, criterion)
-        _, best = jax.lax.top_k(slope, number)
-        target = jnp.zeros_like(parts).at[best].set(1.0)
-        bound = jnp.minimum(bound, value + slope @ (target - parts))
-        return parts + 2 / (turn + 2) * (target - parts), bound
+    def step(step_index, state):
+        fractions, bound = state
+        value, slope = _information_and_slope(candidates, fractions, criterion)
+        _, best_candidates = jax.lax.top_k(slope, number)
+        vertex = jnp.zeros_like(fractions).at[best_candidates].set(1.0)
+        bound = jnp.minimum(bound, value + slope @ (vertex - fractions))
+        return fractions + 2 / (step_index + 2) * (vertex - fractions), bound
 
-    start = jnp.full(candidates.num_candidates, number / candidates.num_candidates)
-    # The step size is 2 / (turn + 2): from turn 2 it is 1/2 and below, whereas a full step at turn 0 would discard the
-    # start.
-    return jax.lax.fori_loop(2, iterations + 2, step, (start, jnp.array(jnp.inf)))[1]
+    initial_fractions = jnp.full(candidates.num_candidates, number / candidates.num_candidates)
+    # The step size is 2 / (k + 2) at step k. The loop starts at k = 2, with a step size of 1/2, since the full step at
+    # k = 0 would discard the initial fractions.
+    return jax.lax.fori_loop(2, iterations + 2, step, (initial_fractions, jnp.array(jnp.inf)))[1]

@@ -70,14 +70,16 @@ class TouchPrior(Module):
             raise ValueError(
                 f"correlation (metres) and deviation must be positive; they are {correlation!r} and {deviation!r}."
             )
-        place = check_places(places, 3 if np.shape(places)[-1:] == (3,) else 2)
-        straight = np.sum((place[:, None] - place) ** 2, axis=-1)
-        squared = straight if lengths is None else np.asarray(lengths, float) ** 2
-        if squared.shape != straight.shape:
-            raise ValueError(f"lengths has shape {squared.shape}; give one between any two of {len(place)} places.")
-        values, vectors = np.linalg.eigh(deviation**2 * np.exp(-squared / (2 * correlation**2)))
-        kept = values > 1e-6 * values[-1]
-        return cls(as_array(vectors[:, kept] * np.sqrt(values[kept])))
+        positions = check_places(places, 3 if np.shape(places)[-1:] == (3,) else 2)
+        squared_distances = np.sum((positions[:, None] - positions) ** 2, axis=-1)
+        squared_lengths = squared_distances if lengths is None else np.asarray(lengths, float) ** 2
+        if squared_lengths.shape != squared_distances.shape:
+            raise ValueError(
+                f"lengths has shape {squared_lengths.shape}; give one between any two of {len(positions)} places."
+            )
+        eigenvalues, eigenvectors = np.linalg.eigh(deviation**2 * np.exp(-squared_lengths / (2 * correlation**2)))
+        is_significant = eigenvalues > 1e-6 * eigenvalues[-1]
+        return cls(as_array(eigenvectors[:, is_significant] * np.sqrt(eigenvalues[is_significant])))
 
 
 class Scores(Module):
@@ -174,7 +176,7 @@ def layout_scores(
 
 
 def _check_arguments(model: ForwardModel, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> None:
-    channels = model.protocol.num_measurements
+    num_channels = model.protocol.num_measurements
     if model.mesh.dimension != 2:
         raise ValueError(f"model is of a {model.mesh.dimension}-D body; scores are of the equivalent sheet.")
     if len(prior.factor) != len(touches.slope):
@@ -182,8 +184,8 @@ def _check_arguments(model: ForwardModel, touches: SheetTouches, prior: TouchPri
             f"prior is of {len(prior.factor)} places and there are {len(touches.slope)} touches; make it of theirs, "
             "TouchPrior.create(touches.touched.places, …)."
         )
-    if noise.shape not in ((), (channels,)):
-        raise ValueError(f"noise has shape {noise.shape}; give one number, or one for each of {channels} channels.")
+    if noise.shape not in ((), (num_channels,)):
+        raise ValueError(f"noise has shape {noise.shape}; give one number, or one for each of {num_channels} channels.")
     if has_values(noise) and not (np.isfinite(noise) & (np.asarray(noise) > 0)).all():
         raise ValueError("noise must be positive and finite: the standard deviation of each channel, in volts.")
     if has_values(temperature) and not 0 < temperature < np.inf:
@@ -194,23 +196,23 @@ def _check_arguments(model: ForwardModel, touches: SheetTouches, prior: TouchPri
 def _compute_scores(jacobian, conductivity, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> Scores:
     """Compute the scores from the Jacobian (M, m) of the voltages."""
     xp = namespace(jacobian)
-    weights, slopes = touches.weights(conductivity)
+    weights, weight_slopes = touches.weights(conductivity)
     changes = weights @ jacobian.T  # (n, M)
     sensitivity = xp.linalg.norm(changes, axis=1)
     powers = -xp.log(sensitivity) / temperature
-    largest = undifferentiated(powers.max())
-    log_mean = largest + xp.log(xp.exp(powers - largest).mean())
-    seen = changes / noise
-    rows = prior.factor.T @ seen  # (r, M)
-    root = inverse_cholesky((xp.eye(len(rows)) + rows @ rows.T)[None])[0]
-    half = prior.factor @ root.T  # C = half halfᵀ
+    max_power = undifferentiated(powers.max())
+    log_mean = max_power + xp.log(xp.exp(powers - max_power).mean())
+    whitened_changes = changes / noise
+    information_rows = prior.factor.T @ whitened_changes  # (r, M)
+    inverse_root = inverse_cholesky((xp.eye(len(information_rows)) + information_rows @ information_rows.T)[None])[0]
+    covariance_factor = prior.factor @ inverse_root.T  # a factor B of C = BBᵀ
     return Scores(
         sensitivity,
         xp.exp(-temperature * log_mean),
-        (half**2).sum(axis=1),
-        -2 * xp.log(xp.diagonal(root)).sum(),
-        _largest_eigenvalue(half.T @ half),
-        _localisation_error(seen, slopes @ jacobian.T / noise),
+        (covariance_factor**2).sum(axis=1),
+        -2 * xp.log(xp.diagonal(inverse_root)).sum(),
+        _largest_eigenvalue(covariance_factor.T @ covariance_factor),
+        _localisation_error(whitened_changes, weight_slopes @ jacobian.T / noise),
     )
 
 
@@ -236,8 +238,10 @@ def _localisation_error(
     voltages with respect to the amplitude, and to x and y."""
     xp, size = namespace(amplitude_slope), (amplitude_slope**2).sum(axis=1)
     # Part of the derivatives orthogonal to that of the amplitude, computed before squaring since it may be small.
-    x, y = position_slopes - ((position_slopes * amplitude_slope).sum(axis=2) / size)[..., None] * amplitude_slope
-    xx, yy, xy = (x * x).sum(axis=1), (y * y).sum(axis=1), (x * y).sum(axis=1)
+    x_slope, y_slope = (
+        position_slopes - ((position_slopes * amplitude_slope).sum(axis=2) / size)[..., None] * amplitude_slope
+    )
+    xx, yy, xy = (x_slope * x_slope).sum(axis=1), (y_slope * y_slope).sum(axis=1), (x_slope * y_slope).sum(axis=1)
     determinant = xx * yy - xy**2
-    known = determinant > 1e-12 * xx * yy
-    return xp.where(known, xp.sqrt((xx + yy) / xp.where(known, determinant, 1.0)), xp.inf)
+    is_regular = determinant > 1e-12 * xx * yy
+    return xp.where(is_regular, xp.sqrt((xx + yy) / xp.where(is_regular, determinant, 1.0)), xp.inf)

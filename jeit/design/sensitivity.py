@@ -18,15 +18,15 @@ from jeit_solvers.module import Module
 
 
 @either_engine
-def uniformity(sensitivity: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
+def uniformity(sensitivities: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
     """Mean of Θ over n positions divided by its root mean square: 1 if all values are equal, and smaller the more they
     differ."""
-    return sensitivity.mean(axis=-1) / namespace(sensitivity).sqrt((sensitivity**2).mean(axis=-1))
+    return sensitivities.mean(axis=-1) / namespace(sensitivities).sqrt((sensitivities**2).mean(axis=-1))
 
 
 @either_engine
-def _share_below(level, sensitivity: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
-    return (sensitivity < level).astype(sensitivity.dtype).mean(axis=-1)
+def _fraction_below(level, sensitivities: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
+    return (sensitivities < level).astype(sensitivities.dtype).mean(axis=-1)
 
 
 class SensitivityMap(Module):
@@ -70,7 +70,7 @@ class SensitivityMap(Module):
         """
         if has_values(level) and not np.all(np.asarray(level) >= 0):
             raise ValueError(f"level must be a sensitivity in volts, not negative; it is {level!r}.")
-        return _share_below(level, self.values)
+        return _fraction_below(level, self.values)
 
     def histogram(self, bins: int | np.ndarray = 40) -> tuple[np.ndarray, np.ndarray]:
         """Fraction of the area in each bin of Θ, and the edges of the bins in volts; `bins` as in `numpy.histogram`."""

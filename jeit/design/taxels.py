@@ -53,9 +53,9 @@ class Taxels(Module):
     @either_engine
     def positions(self) -> Float[Array, "*layouts k d"]:
         """Centroid of the positions in each cluster, metres; on a curved skin, it lies slightly below the surface."""
-        count = self.similarity.shape[-2]
-        weight = (self.labels[..., None, :] == np.arange(count)[:, None]) * self.cell_area[..., None, :]
-        return weight @ self.places / weight.sum(axis=-1, keepdims=True)
+        num_taxels = self.similarity.shape[-2]
+        weights = (self.labels[..., None, :] == np.arange(num_taxels)[:, None]) * self.cell_area[..., None, :]
+        return weights @ self.places / weights.sum(axis=-1, keepdims=True)
 
     @property
     @either_engine
@@ -160,31 +160,33 @@ def find_taxels(
     """
     check_key(key)
     _check_arguments(changes, places, cell_area, num_taxels, threshold)
-    change, place = jnp.asarray(changes, float), jnp.asarray(places, float)
-    unit = _normalise(change)
-    clusters = kmeans(unit if directions else change, num_taxels, key, restarts=restarts)
-    area = as_array(namespace(cell_area).broadcast_to(cell_area, place.shape[:1]), float)
-    return Taxels(place, area, clusters, _cosine_similarities(clusters.centres, unit), float(threshold))
+    checked_changes, positions = jnp.asarray(changes, float), jnp.asarray(places, float)
+    unit_changes = _normalise(checked_changes)
+    clusters = kmeans(unit_changes if directions else checked_changes, num_taxels, key, restarts=restarts)
+    cell_areas = as_array(namespace(cell_area).broadcast_to(cell_area, positions.shape[:1]), float)
+    return Taxels(
+        positions, cell_areas, clusters, _cosine_similarities(clusters.centres, unit_changes), float(threshold)
+    )
 
 
 @either_engine
-def _cosine_similarities(vectors: Float[Array, "k m"], unit: Float[Array, "n m"]) -> Float[Array, "k n"]:
-    return _normalise(vectors) @ unit.T
+def _cosine_similarities(vectors: Float[Array, "k m"], unit_changes: Float[Array, "n m"]) -> Float[Array, "k n"]:
+    return _normalise(vectors) @ unit_changes.T
 
 
 @either_engine
 def _normalise(vectors: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """Scale vectors to length 1; zero vectors remain zero and have a derivative of zero."""
-    xp, square = namespace(vectors), (vectors**2).sum(axis=1, keepdims=True)
-    return xp.where(square > 0, vectors / xp.sqrt(xp.where(square > 0, square, 1)), 0)
+    xp, squared_norms = namespace(vectors), (vectors**2).sum(axis=1, keepdims=True)
+    return xp.where(squared_norms > 0, vectors / xp.sqrt(xp.where(squared_norms > 0, squared_norms, 1)), 0)
 
 
 def _check_arguments(changes, places, cell_area, num_taxels, threshold) -> None:
     """Raise `ValueError` for invalid arguments; of traced arrays, only the shape is checked."""
     shape = np.shape(changes)
-    in_space = np.shape(places) == (*shape[:1], 3) and not (has_values(places) and not np.ptp(places, axis=0).any())
-    fits = np.shape(places) == (*shape[:1], 2) or in_space
-    if len(shape) != 2 or 0 in shape or not fits or np.shape(cell_area) not in ((), shape[:1]):
+    is_in_space = np.shape(places) == (*shape[:1], 3) and not (has_values(places) and not np.ptp(places, axis=0).any())
+    has_valid_shape = np.shape(places) == (*shape[:1], 2) or is_in_space
+    if len(shape) != 2 or 0 in shape or not has_valid_shape or np.shape(cell_area) not in ((), shape[:1]):
         raise ValueError(
             f"changes has shape {shape}, places {np.shape(places)} and cell_area {np.shape(cell_area)}; give (n, m), "
             "(n, 2), on a curved skin (n, 3), and a number or (n,): one touch for each of n places, m voltages each."
@@ -196,9 +198,9 @@ def _check_arguments(changes, places, cell_area, num_taxels, threshold) -> None:
     if not 0 < threshold < 1:
         raise ValueError(f"threshold is a cosine, more than 0 and less than 1; it is {threshold!r}.")
     if has_values(changes):
-        silent = ~np.isfinite(np.asarray(changes)).all(axis=1)
-        if silent.any():
-            raise ValueError(f"changes: those of {silent.sum()} of {shape[0]} places are NaN or infinite.")
+        is_invalid = ~np.isfinite(np.asarray(changes)).all(axis=1)
+        if is_invalid.any():
+            raise ValueError(f"changes: those of {is_invalid.sum()} of {shape[0]} places are NaN or infinite.")
         if not np.asarray(changes).any():
             raise ValueError("changes are all zero: none of the touches changes any voltage.")
     if has_values(places, cell_area):
@@ -210,10 +212,10 @@ def _check_lengths(places: np.ndarray, cell_area: np.ndarray) -> None:
         raise ValueError("places must be finite, in metres.")
     if not (np.isfinite(cell_area) & (cell_area > 0)).all():
         raise ValueError("cell_area must be positive and finite, in m².")
-    box = float(np.prod(np.sort(np.ptp(places, axis=0))[-2:]))
+    box_area = float(np.prod(np.sort(np.ptp(places, axis=0))[-2:]))
     # The cells approximately fill the bounding box of the positions; a factor of 100 indicates wrong units.
-    if box > 0 and not 0.01 < cell_area.sum() / box < 100:
+    if box_area > 0 and not 0.01 < cell_area.sum() / box_area < 100:
         raise ValueError(
-            f"cell_area: the cells are {cell_area.sum():.3g} m² together, but the box round the places is {box:.3g} "
-            "m²; give places in metres and cell_area in m²."
+            f"cell_area: the cells are {cell_area.sum():.3g} m² together, but the box round the places is "
+            f"{box_area:.3g} m²; give places in metres and cell_area in m²."
         )

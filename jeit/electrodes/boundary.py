@@ -67,8 +67,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw the arcs of the boundary of `mesh` that the electrodes cover."""
-        for place, width in zip(np.asarray(self.position), np.asarray(self.width), strict=True):
-            pen.lines([_arc_points(mesh, place, width)], place)
+        for position, width in zip(np.asarray(self.position), np.asarray(self.width), strict=True):
+            pen.lines([_arc_points(mesh, position, width)], position)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
         """Refine cells to a quarter of their size at the ends of the electrodes, where the current density is largest
@@ -79,17 +79,17 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         instead, it is 57 %.
         """
         edge = body.loops(720)[0]
-        middle, half = along(np.asarray(self.position), np.asarray(edge)), np.asarray(self.width) / 2
-        ends = polyline.along(edge, np.concatenate([middle - half, middle + half]))
+        centres, half_width = along(np.asarray(self.position), np.asarray(edge)), np.asarray(self.width) / 2
+        ends = polyline.along(edge, np.concatenate([centres - half_width, centres + half_width]))
         return (Refine(np.asarray(ends), factor=4.0),)
 
     def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:
         """Unit tangents of the boundary of `mesh` at the electrodes, counter-clockwise."""
         start, end = np.asarray(mesh.points)[np.asarray(mesh.facets)].swapaxes(0, 1)
-        place = np.asarray(self.position)
-        nearest = np.argmin(np.linalg.norm(place[:, None] - (start + end) / 2, axis=-1), axis=1)
-        along = (end - start)[nearest]
-        return (along / np.linalg.norm(along, axis=1, keepdims=True))[:, None]
+        positions = np.asarray(self.position)
+        nearest = np.argmin(np.linalg.norm(positions[:, None] - (start + end) / 2, axis=-1), axis=1)
+        tangents = (end - start)[nearest]
+        return (tangents / np.linalg.norm(tangents, axis=1, keepdims=True))[:, None]
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The boundary edges of `mesh`."""
@@ -104,18 +104,18 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         # The basis functions on an edge are φ_1 = t / length and φ_0 = 1 - φ_1. Simpson's rule is exact for their
         # products over [start, end] and sums only positive terms, so it is accurate also for edges that an electrode
         # hardly covers.
-        after = xp.stack([start, (start + end) / 2, end]) / length
-        before = 1 - after
-        share = (end - start) * np.array([1.0, 4.0, 1.0], start.dtype)[:, None, None, None] / 6
+        phi_end = xp.stack([start, (start + end) / 2, end]) / length
+        phi_start = 1 - phi_end
+        weights = (end - start) * np.array([1.0, 4.0, 1.0], start.dtype)[:, None, None, None] / 6
 
         # The sum over the turns, (b, L), is explicit, because XLA converts a sum over such a short axis into a slow
         # matrix product.
         def integral(values):
-            values = share[0] * values[0] + share[1] * values[1] + share[2] * values[2]
+            values = weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2]
             return values[0] + values[1] + values[2]
 
-        phi = xp.stack([integral(before), integral(after)])
-        phi_phi = xp.stack([integral(before**2), integral(before * after), integral(after**2)])
+        phi = xp.stack([integral(phi_start), integral(phi_end)])
+        phi_phi = xp.stack([integral(phi_start**2), integral(phi_start * phi_end), integral(phi_end**2)])
         admittance = 1 / self.contact_impedance
         entries = phi_phi @ admittance  # (3, b)
         mass = xp.stack([entries[:2], entries[1:]]).transpose(2, 0, 1)
@@ -129,19 +129,19 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
             return
         position, width, mesh = on_host((self.position, self.width, mesh))
         distance, (start, end) = _project(position, mesh)[2], _covered_intervals(position, width, mesh)
-        far = np.flatnonzero(distance > np.maximum(0.5 * width, 2e-3 * np.ptp(mesh.points, axis=0).max()))
-        if far.size:
+        off_boundary = np.flatnonzero(distance > np.maximum(0.5 * width, 2e-3 * np.ptp(mesh.points, axis=0).max()))
+        if off_boundary.size:
             raise ValueError(
-                f"position: electrode {far[0] + 1} lies {distance[far[0]]:.3g} m from the boundary of the mesh; "
-                "they must lie on it (are both in metres?). For electrodes inside a sheet use SheetDiscs."
+                f"position: electrode {off_boundary[0] + 1} lies {distance[off_boundary[0]]:.3g} m from the boundary "
+                "of the mesh; they must lie on it (are both in metres?). For electrodes inside a sheet use SheetDiscs."
             )
         covered = np.clip(end - start, 0, None).sum(axis=0)  # (b, L)
         rounding = max(1e-9, 1e3 * np.finfo(covered.dtype).eps)
-        short = np.flatnonzero(covered.sum(axis=0) < (1 - rounding) * width)
-        if short.size:
+        too_wide = np.flatnonzero(covered.sum(axis=0) < (1 - rounding) * width)
+        if too_wide.size:
             raise ValueError(
-                f"width: electrode {short[0] + 1} is {float(self.width[short[0]]):.3g} m wide, more than the boundary "
-                "it lies on; widths are in metres."
+                f"width: electrode {too_wide[0] + 1} is {float(self.width[too_wide[0]]):.3g} m wide, more than the "
+                "boundary it lies on; widths are in metres."
             )
         pairs = overlapping_pairs(start, end)
         if pairs:
@@ -169,22 +169,26 @@ def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int
 def _arc_points(mesh: Mesh, centre: np.ndarray, width: float) -> np.ndarray:
     """Points (k, 2) of the arc of the boundary with length `width` in metres around the point nearest to `centre`."""
     points, facets = np.asarray(mesh.points), np.asarray(mesh.facets)
-    ends = points[facets]
-    along = ends[:, 1] - ends[:, 0]
-    squared = np.sum(along**2, axis=1)
-    fraction = np.clip(np.sum((centre - ends[:, 0]) * along, axis=1) / squared, 0, 1)
-    nearest = np.argmin(np.sum((ends[:, 0] + fraction[:, None] * along - centre) ** 2, axis=1))
+    edge_points = points[facets]
+    edge_vectors = edge_points[:, 1] - edge_points[:, 0]
+    squared_lengths = np.sum(edge_vectors**2, axis=1)
+    fraction = np.clip(np.sum((centre - edge_points[:, 0]) * edge_vectors, axis=1) / squared_lengths, 0, 1)
+    nearest = np.argmin(np.sum((edge_points[:, 0] + fraction[:, None] * edge_vectors - centre) ** 2, axis=1))
     # The loop that contains this edge, as vertices with their arc length from the start of the loop.
     loop = np.cumsum(np.concatenate([[0], facets[1:, 0] != facets[:-1, 1]]))
     edges = np.flatnonzero(loop == loop[nearest])
-    length = np.sqrt(squared[edges])
-    arc = np.concatenate([[0], np.cumsum(length)])
-    middle = arc[nearest - edges[0]] + fraction[nearest] * np.sqrt(squared[nearest])
-    vertices = np.concatenate([ends[edges, 0], ends[edges[-1:], 1]])
-    stops = np.concatenate([arc - arc[-1], arc, arc + arc[-1]])
-    inside = stops[(stops > middle - width / 2) & (stops < middle + width / 2)]
-    where = np.mod(np.concatenate([[middle - width / 2], inside, [middle + width / 2]]), arc[-1])
-    return np.stack([np.interp(where, arc, vertices[:, axis]) for axis in range(2)], axis=1)
+    lengths = np.sqrt(squared_lengths[edges])
+    arc = np.concatenate([[0], np.cumsum(lengths)])
+    middle_position = arc[nearest - edges[0]] + fraction[nearest] * np.sqrt(squared_lengths[nearest])
+    vertices = np.concatenate([edge_points[edges, 0], edge_points[edges[-1:], 1]])
+    vertex_positions = np.concatenate([arc - arc[-1], arc, arc + arc[-1]])
+    covered_positions = vertex_positions[
+        (vertex_positions > middle_position - width / 2) & (vertex_positions < middle_position + width / 2)
+    ]
+    arc_positions = np.mod(
+        np.concatenate([[middle_position - width / 2], covered_positions, [middle_position + width / 2]]), arc[-1]
+    )
+    return np.stack([np.interp(arc_positions, arc, vertices[:, axis]) for axis in range(2)], axis=1)
 
 
 @either_engine
@@ -198,27 +202,29 @@ def _project(position, mesh: Mesh):
     """
     xp = namespace(position, mesh)
     corners = mesh.points[mesh.facets]
-    along = corners[:, 1] - corners[:, 0]
+    edge_vectors = corners[:, 1] - corners[:, 0]
     offset = position[:, None, :] - corners[:, 0]  # (L, b, 2)
-    clipped = xp.clip(_dot_products(offset, along) / _dot_products(along, along), 0, 1)
-    beside = offset - clipped[..., None] * along
-    squared = undifferentiated(_dot_products(beside, beside))
-    facet = xp.argmin(squared, axis=1)
-    tail, head = mesh.facets[facet].T
-    before = xp.argmax(mesh.facets[:, 1] == tail[:, None], axis=1)
-    after = xp.argmax(mesh.facets[:, 0] == head[:, None], axis=1)
-    along = along[facet]
-    length = xp.sqrt(_dot_products(along, along))
-    before, middle, after = (_normalised(corners[:, 1] - corners[:, 0])[index] for index in (before, facet, after))
-    first, second = _normalised(before + middle), _normalised(middle + after)
+    clipped = xp.clip(_dot_products(offset, edge_vectors) / _dot_products(edge_vectors, edge_vectors), 0, 1)
+    perpendicular = offset - clipped[..., None] * edge_vectors
+    squared_distances = undifferentiated(_dot_products(perpendicular, perpendicular))
+    facet = xp.argmin(squared_distances, axis=1)
+    start_node, end_node = mesh.facets[facet].T
+    previous_edge = xp.argmax(mesh.facets[:, 1] == start_node[:, None], axis=1)
+    next_edge = xp.argmax(mesh.facets[:, 0] == end_node[:, None], axis=1)
+    edge_vectors = edge_vectors[facet]
+    length = xp.sqrt(_dot_products(edge_vectors, edge_vectors))
+    previous_edge, tangent, next_edge = (
+        _normalised(corners[:, 1] - corners[:, 0])[index] for index in (previous_edge, facet, next_edge)
+    )
+    start_tangent, end_tangent = _normalised(previous_edge + tangent), _normalised(tangent + next_edge)
     offset = position - corners[facet, 0]
     # (offset - t along)·τ(t) = 0 reads constant + linear t + quadratic t² = 0; take the root that is regular as
     # quadratic → 0.
-    constant = _dot_products(offset, first)
-    linear = _dot_products(offset, second - first) - _dot_products(along, first)
-    quadratic = -_dot_products(along, second - first)
+    constant = _dot_products(offset, start_tangent)
+    linear = _dot_products(offset, end_tangent - start_tangent) - _dot_products(edge_vectors, start_tangent)
+    quadratic = -_dot_products(edge_vectors, end_tangent - start_tangent)
     fraction = 2 * constant / (xp.sqrt(xp.maximum(linear**2 - 4 * quadratic * constant, 0)) - linear)
-    return facet, fraction * length, xp.sqrt(squared.min(axis=1))
+    return facet, fraction * length, xp.sqrt(squared_distances.min(axis=1))
 
 
 def _dot_products(first, second):
@@ -241,12 +247,12 @@ def _covered_intervals(position, width, mesh: Mesh):
     xp = namespace(position, width, mesh)
     length = facet_measures(mesh)
     loop, arc_start = boundary_loops(mesh)
-    facet, along, _ = _project(position, mesh)
-    same = loop[:, None] == loop[facet]  # (b, L)
-    perimeter = xp.sum(xp.where(same, length[:, None], 0), axis=0)
-    centre = arc_start[facet] + along
-    turns = np.array([-1.0, 0.0, 1.0], length.dtype)[:, None] * perimeter
-    middle = (centre + turns)[:, None, :] - arc_start[:, None]
-    half, limit = 0.5 * width, length[:, None]
-    start, end = xp.clip(middle - half, 0, limit), xp.clip(middle + half, 0, limit)
-    return xp.where(same, start, 0), xp.where(same, end, 0)
+    facet, arc_offset, _ = _project(position, mesh)
+    is_same_loop = loop[:, None] == loop[facet]  # (b, L)
+    perimeter = xp.sum(xp.where(is_same_loop, length[:, None], 0), axis=0)
+    centre = arc_start[facet] + arc_offset
+    turn_offsets = np.array([-1.0, 0.0, 1.0], length.dtype)[:, None] * perimeter
+    middle = (centre + turn_offsets)[:, None, :] - arc_start[:, None]
+    half_width, limit = 0.5 * width, length[:, None]
+    start, end = xp.clip(middle - half_width, 0, limit), xp.clip(middle + half_width, 0, limit)
+    return xp.where(is_same_loop, start, 0), xp.where(is_same_loop, end, 0)

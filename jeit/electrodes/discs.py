@@ -97,12 +97,14 @@ class AbstractDiscs(AbstractPlacedElectrodes):
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw discs, or dots for electrodes on walls."""
-        flat = seen_flat(mesh, self.position)
-        for place, radius, whole in zip(np.asarray(self.position), np.asarray(self.radius), flat, strict=True):
-            if whole:
-                pen.disc(place, radius)
+        flat_flags = seen_flat(mesh, self.position)
+        for position, radius, is_flat in zip(
+            np.asarray(self.position), np.asarray(self.radius), flat_flags, strict=True
+        ):
+            if is_flat:
+                pen.disc(position, radius)
             else:
-                pen.dot(place)
+                pen.dot(position)
 
 
 class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
@@ -150,10 +152,10 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
         area = measures(mesh)
         barycentric, _ = triangle_quadrature()
         points = xp.einsum("pi,mid->mpd", barycentric, mesh.points[mesh.cells])
-        edge = EDGE_WIDTH * xp.sqrt(area)
-        near = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
-        window = disc_window(points, self.position[near], self.radius[near], edge)
-        return window_contact(mesh.cells, area, window, near, self.contact_impedance, mesh.num_points)
+        edge_width = EDGE_WIDTH * xp.sqrt(area)
+        nearest = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
+        window = disc_window(points, self.position[nearest], self.radius[nearest], edge_width)
+        return window_contact(mesh.cells, area, window, nearest, self.contact_impedance, mesh.num_points)
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for discs that lie off the sheet, overlap, or are too small for the mesh."""
@@ -207,12 +209,12 @@ class FaceDiscs(AbstractDiscs, AbstractMovableElectrodes):
         area = facet_measures(mesh)
         barycentric, _ = triangle_quadrature()
         points = xp.einsum("pi,bid->bpd", barycentric, mesh.points[mesh.facets])
-        edge = EDGE_WIDTH * xp.sqrt(area)
-        near = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
-        window = disc_window(points, self.position[near], self.radius[near], edge)
-        reached = xp.take_along_axis(same_face(mesh, self.position, self.radius), near, axis=1)
+        edge_width = EDGE_WIDTH * xp.sqrt(area)
+        nearest = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
+        window = disc_window(points, self.position[nearest], self.radius[nearest], edge_width)
+        is_reached = xp.take_along_axis(same_face(mesh, self.position, self.radius), nearest, axis=1)
         return window_contact(
-            mesh.facets, area, window * reached[..., None], near, self.contact_impedance, mesh.num_points
+            mesh.facets, area, window * is_reached[..., None], nearest, self.contact_impedance, mesh.num_points
         )
 
     def check(self, mesh: Mesh) -> None:
@@ -274,10 +276,10 @@ def same_face(mesh: Mesh, position: Float[Array, "L 3"], radius: Float[Array, " 
     height = abs(normal @ position.T - (normal * corner).sum(axis=1)[:, None])
     # Near an edge of the body the nearest triangle may lie on the adjacent face; its plane, however, is far from the
     # position.
-    own = nearest_facets(mesh, position, 100 * height.T**2)
-    facing = normal @ normal[own].T
-    curved = (height < 0.55 * radius) & (facing > 0.45)
-    return undifferentiated((height < 0.2 * radius) & (facing > -0.5) | curved).astype(position.dtype)
+    own_facet = nearest_facets(mesh, position, 100 * height.T**2)
+    normal_cosine = normal @ normal[own_facet].T
+    is_on_curved_face = (height < 0.55 * radius) & (normal_cosine > 0.45)
+    return undifferentiated((height < 0.2 * radius) & (normal_cosine > -0.5) | is_on_curved_face).astype(position.dtype)
 
 
 def nearest_facets(
@@ -289,9 +291,9 @@ def nearest_facets(
     """
     xp = namespace(mesh, position)
     centres = mesh.points[mesh.facets].mean(axis=1)
-    apart = xp.sum((position[:, None] - centres) ** 2, axis=-1) + added_distance
+    squared_distances = xp.sum((position[:, None] - centres) ** 2, axis=-1) + added_distance
     # A tolerance for ties, so that the result does not depend on rounding in the unit of length.
-    return xp.argmax(apart <= (1 + 1e-9) * apart.min(axis=1, keepdims=True), axis=1)
+    return xp.argmax(squared_distances <= (1 + 1e-9) * squared_distances.min(axis=1, keepdims=True), axis=1)
 
 
 def tangent_frames(mesh: Mesh, position):
@@ -299,11 +301,11 @@ def tangent_frames(mesh: Mesh, position):
     differentiated."""
     xp = namespace(mesh, position)
     normal = facet_normals(mesh)[nearest_facets(mesh, position)]
-    horizontal = abs(normal[:, 2:]) > 0.9
-    upward = xp.where(horizontal, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).astype(normal.dtype)
-    across = xp.cross(upward, normal)
-    across = across / xp.linalg.norm(across, axis=1, keepdims=True)
-    return tuple(map(undifferentiated, (normal, across, xp.cross(normal, across))))
+    is_horizontal = abs(normal[:, 2:]) > 0.9
+    upward = xp.where(is_horizontal, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).astype(normal.dtype)
+    tangent = xp.cross(upward, normal)
+    tangent = tangent / xp.linalg.norm(tangent, axis=1, keepdims=True)
+    return tuple(map(undifferentiated, (normal, tangent, xp.cross(normal, tangent))))
 
 
 def check_discs(electrodes: AbstractDiscs, mesh: Mesh, area) -> None:
@@ -313,28 +315,28 @@ def check_discs(electrodes: AbstractDiscs, mesh: Mesh, area) -> None:
         return
     electrodes, mesh = on_host((electrodes, mesh))
     position, radius = electrodes.position, electrodes.radius
-    gap = np.linalg.norm(position[:, None] - position, axis=-1) - radius[:, None] - radius
-    np.fill_diagonal(gap, np.inf)
-    if gap.min() < 0:
-        first, second = np.unravel_index(gap.argmin(), gap.shape)
-        raise ValueError(f"Electrodes {first + 1} and {second + 1} overlap by {-gap.min():.3g} m; move them apart.")
-    covered = electrodes.contact(mesh).load.sum(axis=0) * electrodes.contact_impedance
+    gaps = np.linalg.norm(position[:, None] - position, axis=-1) - radius[:, None] - radius
+    np.fill_diagonal(gaps, np.inf)
+    if gaps.min() < 0:
+        first, second = np.unravel_index(gaps.argmin(), gaps.shape)
+        raise ValueError(f"Electrodes {first + 1} and {second + 1} overlap by {-gaps.min():.3g} m; move them apart.")
+    covered_areas = electrodes.contact(mesh).load.sum(axis=0) * electrodes.contact_impedance
     for electrode in range(len(radius)):
-        share = covered[electrode] / (np.pi * radius[electrode] ** 2)
-        where = f"electrode {electrode + 1} at {position[electrode].tolist()} m with radius {radius[electrode]:.3g} m"
+        share = covered_areas[electrode] / (np.pi * radius[electrode] ** 2)
+        label = f"electrode {electrode + 1} at {position[electrode].tolist()} m with radius {radius[electrode]:.3g} m"
         if share < 0.01:
             raise ValueError(
-                f"position: {where} touches nothing; it lies off the mesh, which spans "
+                f"position: {label} touches nothing; it lies off the mesh, which spans "
                 f"{np.asarray(mesh.points).min(axis=0).tolist()} to {np.asarray(mesh.points).max(axis=0).tolist()} m, "
                 "or is far smaller than a cell."
             )
         if share < 0.8:
             raise ValueError(
-                f"position: only {100 * share:.0f} % of {where} lies on the mesh; move it inside, or refine the mesh "
-                "there if the disc is smaller than a cell."
+                f"position: only {100 * share:.0f} % of {label} lies on the mesh; move it inside, or refine "
+                "the mesh there if the disc is smaller than a cell."
             )
         if share > 1.2:
-            raise ValueError(f"radius: {where} is too small for the mesh there; refine the mesh around it.")
+            raise ValueError(f"radius: {label} is too small for the mesh there; refine the mesh around it.")
 
 
 # Minimum cosine of the angle between normals within a disc: the normal turns by one radian along a radius equal to the
@@ -388,20 +390,20 @@ class SurfaceDiscs(AbstractDiscs):
         barycentric, _ = triangle_quadrature()
         corners = mesh.points[mesh.cells]
         points = xp.einsum("pi,mid->mpd", barycentric, corners)
-        edge = EDGE_WIDTH * xp.sqrt(area)
-        middle = points.mean(axis=1)
-        near = nearest_electrodes(middle, self.position, self.radius)
-        longest = xp.sqrt(((corners - xp.roll(corners, 1, axis=1)) ** 2).sum(axis=-1).max(axis=1))
-        around = unfold(mesh, self.position, self.radius[:, None] + edge + longest)
+        edge_width = EDGE_WIDTH * xp.sqrt(area)
+        cell_centres = points.mean(axis=1)
+        nearest = nearest_electrodes(cell_centres, self.position, self.radius)
+        longest_side = xp.sqrt(((corners - xp.roll(corners, 1, axis=1)) ** 2).sum(axis=-1).max(axis=1))
+        chart = unfold(mesh, self.position, self.radius[:, None] + edge_width + longest_side)
         normal = xp.asarray(undifferentiated(normals(mesh)))
-        at = xp.argmin(undifferentiated(((self.position[:, None] - middle) ** 2).sum(axis=-1)), axis=1)
-        along, faces = around.exact[near], xp.take_along_axis(normal @ normal[at].T, near, axis=1) > 0
-        covered = xp.where(along, xp.take_along_axis(around.reached.T, near, axis=1), faces)
-        squared = xp.where(
-            along[..., None], around.squared(barycentric, near), squared_distances(points, self.position[near])
+        centre = xp.argmin(undifferentiated(((self.position[:, None] - cell_centres) ** 2).sum(axis=-1)), axis=1)
+        is_exact, facing = chart.exact[nearest], xp.take_along_axis(normal @ normal[centre].T, nearest, axis=1) > 0
+        is_covered = xp.where(is_exact, xp.take_along_axis(chart.reached.T, nearest, axis=1), facing)
+        squared_distance = xp.where(
+            is_exact[..., None], chart.squared(barycentric, nearest), squared_distances(points, self.position[nearest])
         )
-        window = window_within(squared, self.radius[near], edge) * covered[..., None]
-        return window_contact(mesh.cells, area, window, near, self.contact_impedance, mesh.num_points)
+        window = window_within(squared_distance, self.radius[nearest], edge_width) * is_covered[..., None]
+        return window_contact(mesh.cells, area, window, nearest, self.contact_impedance, mesh.num_points)
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for discs that lie off the surface, extend over its border, are as large as its radius of
@@ -421,25 +423,25 @@ def check_on_surface(position, radius, surface: Triangles) -> None:
     """Raise `ValueError` for discs at `position` (L, 3) with `radius` (L,), metres, that are farther from the surface
     than their radius, extend over its border, or are as large as its radius of curvature."""
     position, radius = np.asarray(position), np.asarray(radius)
-    at = surface.nearest(position)
-    border = surface.distance_to_border(at.points)
+    nearest = surface.nearest(position)
+    margins = surface.distance_to_border(nearest.points)
     middles, normal = surface.corners.mean(axis=1), surface.normals
-    for number, (place, size) in enumerate(zip(position, radius, strict=True)):
-        x, y, z = 1e3 * place
-        where = f"electrode {number + 1}, {2e3 * size:.3g} mm across at ({x:.4g}, {y:.4g}, {z:.4g}) mm,"
-        if at.away[number] > size:
+    for number, (centre, disc_radius) in enumerate(zip(position, radius, strict=True)):
+        x, y, z = 1e3 * centre
+        label = f"electrode {number + 1}, {2e3 * disc_radius:.3g} mm across at ({x:.4g}, {y:.4g}, {z:.4g}) mm,"
+        if nearest.away[number] > disc_radius:
             raise ValueError(
-                f"position: {where} is {1e3 * at.away[number]:.3g} mm off the surface, farther than its radius; move "
-                "it onto the surface. Are both in metres?"
+                f"position: {label} is {1e3 * nearest.away[number]:.3g} mm off the surface, farther than its "
+                "radius; move it onto the surface. Are both in metres?"
             )
-        if border[number] < 0.9 * size:
+        if margins[number] < 0.9 * disc_radius:
             raise ValueError(
-                f"position: {where} lies on the surface's edge, {1e3 * border[number]:.3g} mm from it; move it inside."
+                f"position: {label} lies on the surface's edge, {1e3 * margins[number]:.3g} mm from it; move it inside."
             )
-        within = np.linalg.norm(middles - at.points[number], axis=1) < size
-        turned = normal[within] @ normal[at.triangle[number]]
-        if (np.abs(turned) < _MIN_NORMAL_COSINE).any():
+        is_inside = np.linalg.norm(middles - nearest.points[number], axis=1) < disc_radius
+        normal_cosines = normal[is_inside] @ normal[nearest.triangle[number]]
+        if (np.abs(normal_cosines) < _MIN_NORMAL_COSINE).any():
             raise ValueError(
-                f"radius: {where} is larger than the surface's radius of curvature there; a disc so large is no disc, "
-                "give less."
+                f"radius: {label} is larger than the surface's radius of curvature there; a disc so large is "
+                "no disc, give less."
             )

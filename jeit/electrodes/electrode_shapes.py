@@ -131,9 +131,12 @@ class ElectrodeShapes:
 
     def middles(self) -> Float[np.ndarray, "L d"]:
         """Mean of the corners of every electrode."""
-        of_corner = np.repeat(self.electrode, self.sizes)
-        count = np.bincount(of_corner, minlength=self.number)
-        return np.stack([np.bincount(of_corner, one, self.number) / count for one in self.corners.T], axis=1)
+        corner_electrodes = np.repeat(self.electrode, self.sizes)
+        num_corners = np.bincount(corner_electrodes, minlength=self.number)
+        return np.stack(
+            [np.bincount(corner_electrodes, coordinate, self.number) / num_corners for coordinate in self.corners.T],
+            axis=1,
+        )
 
 
 def shapes_of(mesh: Mesh, electrodes: AbstractElectrodes) -> ElectrodeShapes:
@@ -152,10 +155,10 @@ def shapes_of(mesh: Mesh, electrodes: AbstractElectrodes) -> ElectrodeShapes:
     """
     polygons: list[np.ndarray] = []
     owner: list[int] = []
-    for number, of_one in enumerate(_all_polygons(mesh, electrodes)):
-        polygons += of_one
-        owner += [number] * len(of_one)
-    return ElectrodeShapes(np.concatenate(polygons), np.array([len(one) for one in polygons]), np.array(owner))
+    for number, electrode_polygons in enumerate(_all_polygons(mesh, electrodes)):
+        polygons += electrode_polygons
+        owner += [number] * len(electrode_polygons)
+    return ElectrodeShapes(np.concatenate(polygons), np.array([len(polygon) for polygon in polygons]), np.array(owner))
 
 
 def _all_polygons(mesh: Mesh, electrodes: AbstractElectrodes) -> list[list[np.ndarray]]:
@@ -164,39 +167,39 @@ def _all_polygons(mesh: Mesh, electrodes: AbstractElectrodes) -> list[list[np.nd
     if points.shape[1] == 2:
         pen = _PlanePen()
         electrodes.draw(mesh, pen)
-        return pen.drawn
+        return pen.polygons
     from jeit.electrodes.facets import FacetElectrodes
 
     if isinstance(electrodes, CombinedElectrodes):
-        return [one for part in electrodes.parts for one in _all_polygons(mesh, part)]
+        return [polygons for part in electrodes.parts for polygons in _all_polygons(mesh, part)]
     triangles = surface_triangles(mesh)
     if isinstance(electrodes, FacetElectrodes):
         corners = points[np.asarray(mesh.facets)]
         return [list(corners[covered > 0]) for covered in np.asarray(electrodes.covers).T]
-    said = {name: np.asarray(value) for name, value in electrodes.geometry().items() if name != "parts"}
-    if "position" not in said:
+    geometry = {name: np.asarray(value) for name, value in electrodes.geometry().items() if name != "parts"}
+    if "position" not in geometry:
         load = np.asarray(electrodes.contact(mesh).load)
-        return [[one[None]] for one in (load / load.sum(axis=0)).T @ points]
-    places = said["position"]
+        return [[centre[None]] for centre in (load / load.sum(axis=0)).T @ points]
+    positions = geometry["position"]
     surface = ProjectionSurface(points, triangles)
-    frames = surface.frames(places)
-    if "radius" in said:
+    frames = surface.frames(positions)
+    if "radius" in geometry:
         angle = 2 * np.pi * np.arange(_CIRCLE_CORNERS) / _CIRCLE_CORNERS
-        sizes = np.broadcast_to(said["radius"], len(places))
-        flat = [size * np.stack([np.cos(angle), np.sin(angle)], axis=1) for size in sizes]
-    elif "width" in said and "height" in said:
+        sizes = np.broadcast_to(geometry["radius"], len(positions))
+        flat_shapes = [size * np.stack([np.cos(angle), np.sin(angle)], axis=1) for size in sizes]
+    elif "width" in geometry and "height" in geometry:
         side = np.arange(_SIDE_CORNERS) / _SIDE_CORNERS * 2 - 1
-        one = np.ones(_SIDE_CORNERS)
-        square = np.concatenate(
-            [np.stack(pair, axis=1) for pair in ((side, -one), (one, side), (-side, one), (-one, -side))]
+        ones = np.ones(_SIDE_CORNERS)
+        unit_square = np.concatenate(
+            [np.stack(pair, axis=1) for pair in ((side, -ones), (ones, side), (-side, ones), (-ones, -side))]
         )
-        sizes = np.broadcast_to(said["width"], len(places)), np.broadcast_to(said["height"], len(places))
-        flat = [square * [width / 2, height / 2] for width, height in zip(*sizes, strict=True)]
+        sizes = np.broadcast_to(geometry["width"], len(positions)), np.broadcast_to(geometry["height"], len(positions))
+        flat_shapes = [unit_square * [width / 2, height / 2] for width, height in zip(*sizes, strict=True)]
     else:
-        return [[place[None]] for place in places]
+        return [[position[None]] for position in positions]
     return [
-        [surface.project(place + shape @ frame[1:], frame[0])]
-        for place, shape, frame in zip(places, flat, frames, strict=True)
+        [surface.project(position + shape @ frame[1:], frame[0])]
+        for position, shape, frame in zip(positions, flat_shapes, frames, strict=True)
     ]
 
 
@@ -222,49 +225,57 @@ class ProjectionSurface:
         """Unit vectors at each point: outward, horizontal and upward, as in `FacePatches`."""
         normal = self.normals(places)
         upward = np.where(np.abs(normal[:, 2:]) > 0.9, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
-        across = np.cross(upward, normal)
-        across /= np.linalg.norm(across, axis=1, keepdims=True)
-        return np.stack([normal, across, np.cross(normal, across)], axis=1)
+        tangent = np.cross(upward, normal)
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        return np.stack([normal, tangent, np.cross(normal, tangent)], axis=1)
 
     def project(self, places: Float[np.ndarray, "k 3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 3"]:
         """Project points along the normal onto the nearest triangle in that direction; points that meet no triangle are
         returned unchanged."""
-        near = self._tree.query(places, k=min(_NUM_CANDIDATES, len(self._corners)))[1].reshape(len(places), -1)
-        corners = self._corners[near]
-        edge, other = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
-        # Möller and Trumbore: place + t normal = corner + a edge + b other.
-        across = np.cross(normal, other)
-        volume = np.sum(edge * across, axis=-1)
-        flat = np.abs(volume) < 1e-12 * np.linalg.norm(edge, axis=-1) * np.linalg.norm(other, axis=-1)
-        volume = np.where(flat, 1.0, volume)
+        candidates = self._tree.query(places, k=min(_NUM_CANDIDATES, len(self._corners)))[1].reshape(len(places), -1)
+        corners = self._corners[candidates]
+        first_edge, second_edge = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
+        # Möller and Trumbore: place + depth normal = corner + first_coordinate first_edge + second_coordinate
+        # second_edge.
+        edge_normal = np.cross(normal, second_edge)
+        volume = np.sum(first_edge * edge_normal, axis=-1)
+        is_parallel = np.abs(volume) < 1e-12 * np.linalg.norm(first_edge, axis=-1) * np.linalg.norm(
+            second_edge, axis=-1
+        )
+        volume = np.where(is_parallel, 1.0, volume)
         offset = places[:, None] - corners[:, :, 0]
-        a = np.sum(offset * across, axis=-1) / volume
-        turned = np.cross(offset, edge)
-        b = turned @ normal / volume
-        t = np.sum(other * turned, axis=-1) / volume
-        met = ~flat & (a > -1e-6) & (b > -1e-6) & (a + b < 1 + 1e-6)
-        far = np.where(met, np.abs(t), np.inf)
-        nearest, row = far.argmin(axis=1), np.arange(len(places))
-        moved = np.where(np.isfinite(far[row, nearest]), t[row, nearest], 0.0)
-        return places + moved[:, None] * normal
+        first_coordinate = np.sum(offset * edge_normal, axis=-1) / volume
+        offset_normal = np.cross(offset, first_edge)
+        second_coordinate = offset_normal @ normal / volume
+        depth = np.sum(second_edge * offset_normal, axis=-1) / volume
+        is_hit = (
+            ~is_parallel
+            & (first_coordinate > -1e-6)
+            & (second_coordinate > -1e-6)
+            & (first_coordinate + second_coordinate < 1 + 1e-6)
+        )
+        distances = np.where(is_hit, np.abs(depth), np.inf)
+        nearest, row = distances.argmin(axis=1), np.arange(len(places))
+        shift = np.where(np.isfinite(distances[row, nearest]), depth[row, nearest], 0.0)
+        return places + shift[:, None] * normal
 
 
 class _PlanePen:
     """Pen that collects the electrodes of a plane mesh as polygons; arcs become segments with two corners."""
 
     def __init__(self):
-        self.drawn: list[list[np.ndarray]] = []
+        self.polygons: list[list[np.ndarray]] = []
 
     def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
-        ends = [np.asarray(one) for one in pieces]
-        self.drawn.append([one[k : k + 2] for one in ends for k in range(len(one) - 1)])
+        lines = [np.asarray(piece) for piece in pieces]
+        self.polygons.append([piece[k : k + 2] for piece in lines for k in range(len(piece) - 1)])
 
     def disc(self, middle: np.ndarray, radius: float) -> None:
         angle = 2 * np.pi * np.arange(_CIRCLE_CORNERS) / _CIRCLE_CORNERS
-        self.drawn.append([middle[:2] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
+        self.polygons.append([middle[:2] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
 
     def rectangle(self, middle: np.ndarray, width: float, height: float) -> None:
-        self.drawn.append([middle[:2] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, height / 2]])
+        self.polygons.append([middle[:2] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, height / 2]])
 
     def dot(self, middle: np.ndarray) -> None:
-        self.drawn.append([np.asarray(middle[:2])[None]])
+        self.polygons.append([np.asarray(middle[:2])[None]])

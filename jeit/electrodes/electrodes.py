@@ -164,7 +164,7 @@ def replace_contact_impedance(
 ) -> AbstractCompleteElectrodes:
     """Copy electrodes with another `contact_impedance`, one number or (L,). Raises `ValueError` for invalid values."""
     values = as_electrode_values("contact_impedance", contact_impedance, electrodes.num_electrodes, unit="ohm·m²")
-    return eqx.tree_at(lambda each: each.contact_impedance, electrodes, values)
+    return eqx.tree_at(lambda complete_electrodes: complete_electrodes.contact_impedance, electrodes, values)
 
 
 def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) -> Float[Array, " L"]:
@@ -181,9 +181,9 @@ def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) ->
         )
     if not has_values(values):
         return jnp.broadcast_to(values, (num_electrodes,))
-    bad = ~(np.isfinite(values) & (np.asarray(values) > 0))
-    if bad.any():
-        first = int(np.flatnonzero(np.atleast_1d(bad))[0])
+    is_invalid = ~(np.isfinite(values) & (np.asarray(values) > 0))
+    if is_invalid.any():
+        first = int(np.flatnonzero(np.atleast_1d(is_invalid))[0])
         raise ValueError(
             f"{name} must be positive and finite, in {unit}; electrode {first + 1} has "
             f"{float(np.atleast_1d(values)[first])}."
@@ -196,8 +196,10 @@ def as_positions(position, dimensions: tuple[int, ...]) -> Float[Array, "L d"]:
     for other shapes, NaN and infinity."""
     position = as_array(position, float)
     if position.ndim != 2 or position.shape[1] not in dimensions or position.shape[0] == 0:
-        wanted = " or ".join(f"(L, {d})" for d in dimensions)
-        raise ValueError(f"position has shape {position.shape}; give one row per electrode, {wanted}, in metres.")
+        allowed_shapes = " or ".join(f"(L, {dimension})" for dimension in dimensions)
+        raise ValueError(
+            f"position has shape {position.shape}; give one row per electrode, {allowed_shapes}, in metres."
+        )
     if has_values(position) and not np.isfinite(position).all():
         rows = np.flatnonzero(~np.isfinite(position).all(axis=1)) + 1
         raise ValueError(f"position has NaN or infinite coordinates at electrodes {rows.tolist()}.")

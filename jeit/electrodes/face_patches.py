@@ -76,21 +76,27 @@ def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None
     if not isinstance(electrodes, FacePatches):
         return body.mesh(num_points=num_points, refine=electrodes.refinement(body) or None)
     outline, height = body.outline, float(body.thickness)
-    place = np.asarray(electrodes.position)
-    half = np.stack([np.asarray(electrodes.width), np.asarray(electrodes.height)], axis=1) / 2
+    positions = np.asarray(electrodes.position)
+    half_sizes = np.stack([np.asarray(electrodes.width), np.asarray(electrodes.height)], axis=1) / 2
     x_min, x_max, y_min, y_max = outline.extent
-    near = _FACE_TOLERANCE * max(x_max - x_min, y_max - y_min, height)
-    flat = (np.abs(place[:, 2]) < near) | (np.abs(place[:, 2] - height) < near)
-    upright = place[~flat, 2, None] + half[~flat, 1:] * np.array([-1.0, 1.0])
+    tolerance = _FACE_TOLERANCE * max(x_max - x_min, y_max - y_min, height)
+    is_horizontal = (np.abs(positions[:, 2]) < tolerance) | (np.abs(positions[:, 2] - height) < tolerance)
+    vertical_ends = positions[~is_horizontal, 2, None] + half_sizes[~is_horizontal, 1:] * np.array([-1.0, 1.0])
     if isinstance(outline, Rectangle):
-        across = (np.abs(place[:, 0] - x_min) < near) | (np.abs(place[:, 0] - x_max) < near)
-        ends_x = _electrode_ends(place[:, 0], half[:, 0], flat | ~across)
+        is_on_x_wall = (np.abs(positions[:, 0] - x_min) < tolerance) | (np.abs(positions[:, 0] - x_max) < tolerance)
+        ends_x = _electrode_ends(positions[:, 0], half_sizes[:, 0], is_horizontal | ~is_on_x_wall)
         ends_y = np.concatenate(
-            [_electrode_ends(place[:, 1], half[:, 1], flat), _electrode_ends(place[:, 1], half[:, 0], across & ~flat)]
+            [
+                _electrode_ends(positions[:, 1], half_sizes[:, 1], is_horizontal),
+                _electrode_ends(positions[:, 1], half_sizes[:, 0], is_on_x_wall & ~is_horizontal),
+            ]
         )
-        return graded_box(outline, height, (ends_x, ends_y, upright.ravel()), num_points)
-    rims = [np.zeros((0, 2)), *(_rim_points(outline, *one) for one in zip(place, half, flat, strict=True))]
-    return graded_layers(outline, height, upright.ravel(), np.concatenate(rims), num_points)
+        return graded_box(outline, height, (ends_x, ends_y, vertical_ends.ravel()), num_points)
+    rim_points = [
+        np.zeros((0, 2)),
+        *(_rim_points(outline, *patch) for patch in zip(positions, half_sizes, is_horizontal, strict=True)),
+    ]
+    return graded_layers(outline, height, vertical_ends.ravel(), np.concatenate(rim_points), num_points)
 
 
 def _electrode_ends(
@@ -101,19 +107,21 @@ def _electrode_ends(
     return np.concatenate([(centre - half_size)[selected], (centre + half_size)[selected]])
 
 
-def _rim_points(outline, place, half, flat: bool) -> Float[np.ndarray, "p 2"]:
+def _rim_points(outline, centre, half_size, is_horizontal: bool) -> Float[np.ndarray, "p 2"]:
     """Points on the rim of an electrode, seen from above: around it on a horizontal face, its two ends on a wall."""
-    if flat:
+    if is_horizontal:
         angle = 2 * np.pi * np.arange(_NUM_RIM_POINTS) / _NUM_RIM_POINTS
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         # For a rectangle, the points where rays from its centre meet its sides.
-        return place[:2] + circle * half / np.abs(circle).max(axis=1, keepdims=True)
-    nearest = np.asarray(outline.nearest(place[None, :2]))[0]
-    step = 1e-3 * half[0]
-    ahead = np.asarray(outline.nearest(nearest + step * np.eye(2)))
-    tangent = (ahead - nearest)[np.argmax(np.linalg.norm(ahead - nearest, axis=1))]
+        return centre[:2] + circle * half_size / np.abs(circle).max(axis=1, keepdims=True)
+    nearest = np.asarray(outline.nearest(centre[None, :2]))[0]
+    step = 1e-3 * half_size[0]
+    moved_points = np.asarray(outline.nearest(nearest + step * np.eye(2)))
+    tangent = (moved_points - nearest)[np.argmax(np.linalg.norm(moved_points - nearest, axis=1))]
     tangent = tangent / np.linalg.norm(tangent)
-    return np.asarray(outline.nearest(np.stack([place[:2] - half[0] * tangent, place[:2] + half[0] * tangent])))
+    return np.asarray(
+        outline.nearest(np.stack([centre[:2] - half_size[0] * tangent, centre[:2] + half_size[0] * tangent]))
+    )
 
 
 # Distance between two electrodes, divided by the smaller size, below which they are at the same position.
@@ -149,9 +157,9 @@ def _all_on_surface(position, allowed, distance_from_surface: Distance) -> bool:
 def check_apart(position: Float[np.ndarray, "L 3"], size: Float[np.ndarray, " L"]) -> None:
     """Raise `ValueError` for the first two electrodes at the same position. `size`: smaller dimension of each
     electrode, metres."""
-    apart = np.linalg.norm(position[:, None] - position, axis=-1)
-    same = np.argwhere(np.triu(apart < _MIN_SEPARATION * np.minimum(size[:, None], size), 1))
-    for first, second in same[:1]:
+    distances = np.linalg.norm(position[:, None] - position, axis=-1)
+    coincident = np.argwhere(np.triu(distances < _MIN_SEPARATION * np.minimum(size[:, None], size), 1))
+    for first, second in coincident[:1]:
         raise ValueError(
             f"position: electrodes {first + 1} and {second + 1} are at the same place, "
             f"{np.round(position[first], 6).tolist()} m; give each its own."
@@ -172,16 +180,16 @@ def check_size(name: str, sizes: Float[np.ndarray, " L"], max_size: float, objec
 
 def check_placed(electrodes: AbstractMovableElectrodes, mesh: Mesh) -> None:
     """Raise `ValueError` for patches that lie off the surface of the mesh, or are larger than it."""
-    sizes = {name: np.asarray(one) for name, one in electrodes.geometry().items() if name in ("width", "height")}
+    sizes = {name: np.asarray(value) for name, value in electrodes.geometry().items() if name in ("width", "height")}
     points = np.asarray(mesh.points)
     from jeit.mesh.geodesic import Triangles
 
     surface = Triangles(points, np.asarray(mesh.facets))
-    half = np.maximum(*sizes.values()) / 2
-    check_on_surface(np.asarray(electrodes.position), half, lambda places: surface.nearest(places).away)
-    across = float(np.linalg.norm(np.ptp(points, axis=0)))
-    for name, one in sizes.items():
-        check_size(name, one, across, "the body")
+    half_size = np.maximum(*sizes.values()) / 2
+    check_on_surface(np.asarray(electrodes.position), half_size, lambda places: surface.nearest(places).away)
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    for name, size in sizes.items():
+        check_size(name, size, diagonal, "the body")
 
 
 def _length_text(metres: float) -> str:
@@ -234,13 +242,13 @@ class FacePatches(AbstractMovableElectrodes):
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw rectangles on horizontal faces, dots elsewhere."""
-        places, flat = np.asarray(self.position), seen_flat(mesh, self.position)
+        positions, is_flat = np.asarray(self.position), seen_flat(mesh, self.position)
         sizes = np.asarray(self.width), np.asarray(self.height)
-        for place, width, height, whole in zip(places, *sizes, flat, strict=True):
-            if whole:
-                pen.rectangle(place, width, height)
+        for position, width, height, is_undistorted in zip(positions, *sizes, is_flat, strict=True):
+            if is_undistorted:
+                pen.rectangle(position, width, height)
             else:
-                pen.dot(place)
+                pen.dot(position)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
         """Empty, because the electrodes do not lie on a plane mesh."""
@@ -260,25 +268,27 @@ class FacePatches(AbstractMovableElectrodes):
         normals; exact."""
         xp = namespace(self, mesh)
         area, half_size = facet_measures(mesh), xp.stack([self.width, self.height], axis=-1) / 2
-        normal, across, up = tangent_frames(mesh, self.position)
+        normal, tangent, upward = tangent_frames(mesh, self.position)
         corners = mesh.points[mesh.facets]
-        near, reached = _reaching_patches(mesh, self.position, half_size, (normal, across, up))
-        some = reached.any(axis=1).nonzero()[0] if xp is np else np.arange(len(area))
-        near, reached = near[some], reached[some]
-        offset = corners[some][:, None] - self.position[near][:, :, None]  # (q, k, 3, 3)
-        place = xp.stack([(offset * axis[near][:, :, None]).sum(axis=-1) for axis in (across, up)], axis=-1)
+        nearest, is_reached = _reaching_patches(mesh, self.position, half_size, (normal, tangent, upward))
+        reached_facets = is_reached.any(axis=1).nonzero()[0] if xp is np else np.arange(len(area))
+        nearest, is_reached = nearest[reached_facets], is_reached[reached_facets]
+        offset = corners[reached_facets][:, None] - self.position[nearest][:, :, None]  # (q, k, 3, 3)
+        corner_coordinates = xp.stack(
+            [(offset * axis[nearest][:, :, None]).sum(axis=-1) for axis in (tangent, upward)], axis=-1
+        )
         # A triangle perpendicular to the patch has no projected area; replace it to avoid a division by zero.
-        place = xp.where(reached[..., None, None], place, _UNIT_TRIANGLE)
-        once, twice = covered_moments(place, half_size[near])
-        current = xp.where(reached, area[some][:, None] / self.contact_impedance[near], 0)
-        mass = (current[..., None, None] * twice).sum(axis=1)
-        nodes = mesh.facets[some]
+        corner_coordinates = xp.where(is_reached[..., None, None], corner_coordinates, _UNIT_TRIANGLE)
+        covered_area, covered_mass = covered_moments(corner_coordinates, half_size[nearest])
+        current = xp.where(is_reached, area[reached_facets][:, None] / self.contact_impedance[nearest], 0)
+        mass = (current[..., None, None] * covered_mass).sum(axis=1)
+        nodes = mesh.facets[reached_facets]
         shape = mesh.num_points, self.num_electrodes
-        load = sum_into(shape, (nodes[:, None], near[..., None]), current[..., None] * once)
+        load = sum_into(shape, (nodes[:, None], nearest[..., None]), current[..., None] * covered_area)
         if xp is np:
-            every: Any = np.zeros((len(area), 3, 3), mass.dtype)
-            every[some] = mass
-            mass = every
+            all_masses: Any = np.zeros((len(area), 3, 3), mass.dtype)
+            all_masses[reached_facets] = mass
+            mass = all_masses
         return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:
@@ -289,17 +299,18 @@ class FacePatches(AbstractMovableElectrodes):
             return
         electrodes, mesh = on_host((self, mesh))
         check_apart(electrodes.position, np.minimum(electrodes.width, electrodes.height))
-        touched = electrodes.contact(mesh).load * electrodes.contact_impedance
-        share = touched.sum(axis=0) / (electrodes.width * electrodes.height)
+        covered_areas = electrodes.contact(mesh).load * electrodes.contact_impedance
+        share = covered_areas.sum(axis=0) / (electrodes.width * electrodes.height)
         # A patch on a curved wall is longer than its chord: by a tenth at 80° of arc.
-        wrong = np.flatnonzero((share < 0.8) | (share > 1.25))
-        if wrong.size:
+        misplaced = np.flatnonzero((share < 0.8) | (share > 1.25))
+        if misplaced.size:
             check_placed(electrodes, mesh)
             raise ValueError(
-                f"position: {100 * share[wrong[0]]:.0f} % of electrode {wrong[0] + 1}'s area is found on the mesh's "
-                "surface; move it onto the surface, or refine the mesh there if the patch is smaller than a facet."
+                f"position: {100 * share[misplaced[0]]:.0f} % of electrode {misplaced[0] + 1}'s area is found on the "
+                "mesh's surface; move it onto the surface, or refine the mesh there if the patch is smaller than a "
+                "facet."
             )
-        overlap = (touched.T @ touched) / np.sqrt(np.outer(*(2 * [(touched**2).sum(axis=0)])))
+        overlap = (covered_areas.T @ covered_areas) / np.sqrt(np.outer(*(2 * [(covered_areas**2).sum(axis=0)])))
         np.fill_diagonal(overlap, 0)
         if overlap.max() > 0.2:
             first, second = np.unravel_index(overlap.argmax(), overlap.shape)
@@ -314,17 +325,17 @@ def _reaching_patches(mesh: Mesh, position, half_size, frames):
     """
     xp = namespace(mesh, position)
     corners = mesh.points[mesh.facets]
-    middle = corners.mean(axis=1)
-    radius = xp.sqrt(((corners - middle[:, None]) ** 2).sum(axis=-1).max(axis=1))
-    away = [middle @ axis.T - (position * axis).sum(axis=1) for axis in frames]
-    beyond = [xp.maximum(abs(away[1 + i]) - half_size[:, i], 0) for i in range(2)]
-    facing = (facet_normals(mesh) @ frames[0].T > 0.5) & (abs(away[0]) < half_size.max(axis=1))
-    distance = undifferentiated(xp.where(facing, beyond[0] ** 2 + beyond[1] ** 2, xp.inf))
-    reaches = distance <= undifferentiated(radius**2)[:, None]
+    centres = corners.mean(axis=1)
+    radius = xp.sqrt(((corners - centres[:, None]) ** 2).sum(axis=-1).max(axis=1))
+    offsets = [centres @ axis.T - (position * axis).sum(axis=1) for axis in frames]
+    excess = [xp.maximum(abs(offsets[1 + i]) - half_size[:, i], 0) for i in range(2)]
+    is_facing = (facet_normals(mesh) @ frames[0].T > 0.5) & (abs(offsets[0]) < half_size.max(axis=1))
+    distance = undifferentiated(xp.where(is_facing, excess[0] ** 2 + excess[1] ** 2, xp.inf))
+    is_reached = distance <= undifferentiated(radius**2)[:, None]
     count = min(_MAX_PATCHES_PER_TRIANGLE, len(position))
     if xp is np:
-        count = max(1, min(count, int(reaches.sum(axis=1).max(initial=0))))
-        near = np.argsort(distance, axis=1, kind="stable")[:, :count]
+        count = max(1, min(count, int(is_reached.sum(axis=1).max(initial=0))))
+        nearest = np.argsort(distance, axis=1, kind="stable")[:, :count]
     else:
-        near = jax.lax.top_k(-distance, count)[1]
-    return near, xp.take_along_axis(reaches, near, axis=1)
+        nearest = jax.lax.top_k(-distance, count)[1]
+    return nearest, xp.take_along_axis(is_reached, nearest, axis=1)

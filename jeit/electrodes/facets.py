@@ -50,47 +50,50 @@ def covered_moments(
     # Barycentric coordinates of the second and third corner, in which the triangle is (0, 0), (1, 0), (0, 1).
     first, second = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
     offset = outline - corners[..., :1, :]
-    double = _cross(first, second)[..., None]
-    place = xp.stack([_cross(offset, second[..., None, :]), _cross(first[..., None, :], offset)], axis=-1)
-    place = place / double[..., None]
-    following = xp.roll(place, -1, axis=-2)
+    double_area = _cross_product(first, second)[..., None]
+    coordinates = xp.stack(
+        [_cross_product(offset, second[..., None, :]), _cross_product(first[..., None, :], offset)], axis=-1
+    )
+    coordinates = coordinates / double_area[..., None]
+    next_coordinates = xp.roll(coordinates, -1, axis=-2)
     # Signed areas of a fan of triangles from the first corner, doubled, since the area of the reference triangle is
     # 1/2.
-    weight = _cross(place, following)
-    ends = [xp.concatenate([1 - one.sum(axis=-1, keepdims=True), one], axis=-1) for one in (place, following)]
-    total = ends[0] + ends[1] + np.array([1.0, 0.0, 0.0]).astype(place.dtype)
-    twice = sum(xp.einsum("...k,...ki,...kj->...ij", weight, one, one) for one in (total, *ends))
+    fan_areas = _cross_product(coordinates, next_coordinates)
+    barycentric = [
+        xp.concatenate([1 - point.sum(axis=-1, keepdims=True), point], axis=-1)
+        for point in (coordinates, next_coordinates)
+    ]
+    end_sum = barycentric[0] + barycentric[1] + np.array([1.0, 0.0, 0.0]).astype(coordinates.dtype)
+    mass = sum(xp.einsum("...k,...ki,...kj->...ij", fan_areas, point, point) for point in (end_sum, *barycentric))
     corner = np.zeros((3, 3))
     corner[0, 0] = 1
-    twice = (twice + weight.sum(axis=-1)[..., None, None] * corner.astype(place.dtype)) / 12
+    mass = (mass + fan_areas.sum(axis=-1)[..., None, None] * corner.astype(coordinates.dtype)) / 12
     # For triangles that are barely touched, only rounding errors remain, which small contact impedances would amplify:
     # set the value to zero, but keep its derivative. The load is computed as the sum of the mass, since for small
     # contact impedances any difference between them would drive currents.
-    twice = twice - undifferentiated(
-        xp.where(twice.sum(axis=(-1, -2), keepdims=True) > _MIN_COVERED_FRACTION, 0, twice)
-    )
-    twice = (twice + xp.swapaxes(twice, -1, -2)) / 2
-    return twice.sum(axis=-1), twice
+    mass = mass - undifferentiated(xp.where(mass.sum(axis=(-1, -2), keepdims=True) > _MIN_COVERED_FRACTION, 0, mass))
+    mass = (mass + xp.swapaxes(mass, -1, -2)) / 2
+    return mass.sum(axis=-1), mass
 
 
-def _clip_to_band(outline: Float[Array, "*q k 2"], axis: int, half: Float[Array, "*q"]) -> Float[Array, "*q l 2"]:
-    """Move the parts of closed polygons (…, k, 2) beyond ± `half` along an axis to ± `half`; each corner becomes
-    three."""
-    xp = namespace(outline, half)
+def _clip_to_band(outline: Float[Array, "*q k 2"], axis: int, half_width: Float[Array, "*q"]) -> Float[Array, "*q l 2"]:
+    """Move the parts of closed polygons (…, k, 2) beyond ± `half_width` along an axis to ± `half_width`; each corner
+    becomes three."""
+    xp = namespace(outline, half_width)
     step = xp.roll(outline, -1, axis=-2) - outline
-    along, half = step[..., axis], half[..., None]
-    slope = xp.where(along == 0, 1, along)
-    meets = [xp.clip((side * half - outline[..., axis]) / slope, 0, 1) for side in (-1, 1)]
-    share = xp.stack([xp.zeros_like(along), xp.minimum(*meets), xp.maximum(*meets)], axis=-1)
-    corners = outline[..., None, :] + share[..., None] * step[..., None, :]
+    step_along, half_width = step[..., axis], half_width[..., None]
+    slope = xp.where(step_along == 0, 1, step_along)
+    crossings = [xp.clip((side * half_width - outline[..., axis]) / slope, 0, 1) for side in (-1, 1)]
+    fractions = xp.stack([xp.zeros_like(step_along), xp.minimum(*crossings), xp.maximum(*crossings)], axis=-1)
+    corners = outline[..., None, :] + fractions[..., None] * step[..., None, :]
     corners = corners.reshape(*corners.shape[:-3], 3 * corners.shape[-3], 2)  # also if there are no triangles
-    own = xp.clip(corners[..., axis], -half, half)
-    other = corners[..., 1 - axis]
-    return xp.stack([own, other] if axis == 0 else [other, own], axis=-1)
+    clipped = xp.clip(corners[..., axis], -half_width, half_width)
+    other_coordinate = corners[..., 1 - axis]
+    return xp.stack([clipped, other_coordinate] if axis == 0 else [other_coordinate, clipped], axis=-1)
 
 
-def _cross(a: Float[Array, "*q 2"], b: Float[Array, "*q 2"]) -> Float[Array, "*q"]:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+def _cross_product(first: Float[Array, "*q 2"], second: Float[Array, "*q 2"]) -> Float[Array, "*q"]:
+    return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
 
 
 class FacetElectrodes(AbstractCompleteElectrodes):
@@ -205,9 +208,9 @@ def plates(mesh: Mesh, tags: Sequence[str], contact_impedance: ArrayLike) -> Fac
     """
     for tag in tags:
         if tag not in mesh.tags:
-            known = ", ".join(sorted(mesh.tags)) or "none"
-            flat = " It is a surface, without tetrahedra: mesh the volume within." if mesh.is_surface else ""
-            raise ValueError(f"The mesh has no facets tagged '{tag}'; its tags are: {known}.{flat}")
+            known_tags = ", ".join(sorted(mesh.tags)) or "none"
+            surface_hint = " It is a surface, without tetrahedra: mesh the volume within." if mesh.is_surface else ""
+            raise ValueError(f"The mesh has no facets tagged '{tag}'; its tags are: {known_tags}.{surface_hint}")
     return FacetElectrodes(mesh, [np.asarray(mesh.tags[tag]) for tag in tags], contact_impedance)
 
 

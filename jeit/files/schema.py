@@ -45,6 +45,8 @@ class Table(BaseModel):
 
     subject: ClassVar[str] = "the file"
     """Name in messages of the thing that the table describes, such as "a study"."""
+    hints: ClassVar[dict[str, str]] = {}
+    """What to write for a missing key whose value is often not known; continues the sentence "give it"."""
 
     @model_validator(mode="wrap")
     @classmethod
@@ -80,7 +82,7 @@ class Table(BaseModel):
             case "fault":
                 return context["said"]
             case "missing":
-                return "is missing; give it."
+                return f"is missing; give it{cls.hints.get(str(details['loc'][-1]), '')}."
             case "extra_forbidden":
                 known_keys = [*cls.model_fields]
                 suggestion = did_you_mean(str(details["loc"][-1])[:KEY], known_keys)

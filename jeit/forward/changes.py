@@ -55,30 +55,30 @@ class SolvedFields(NamedTuple):
     def derivatives(self, changes: Sequence[ConductivityChange]) -> Float[np.ndarray, "M n"]:
         """Derivatives of the voltages with respect to the coefficients of all `changes`: -∫ dσ ∇u_drive · ∇u_measure,
         computed from the values for pairs of electrodes."""
-        energy = np.concatenate([self._energy(*change) for change in changes])
-        return np.stack([-select_channels(self.protocol, one) for one in energy], axis=1)  # pyright: ignore
+        energies = np.concatenate([self._energy(*change) for change in changes])
+        return np.stack([-select_channels(self.protocol, impedance_change) for impedance_change in energies], axis=1)  # pyright: ignore
 
     def _energy(self, cells, slope) -> Float[np.ndarray, "q L L"]:
         """∫ dσ ∇F_k · ∇F_l for every coefficient: from the stiffness matrix if all cells change, else from the
         gradients in the cells that change."""
         fields: Any = self.fields
         if cells is None:
-            return np.stack([self._energy_everywhere(one) for one in slope.T])
-        there = np.asarray(self.mesh.cells)[cells]
-        nodes, corners = np.unique(there, return_inverse=True)
+            return np.stack([self._energy_everywhere(cell_change) for cell_change in slope.T])
+        changed_cells = np.asarray(self.mesh.cells)[cells]
+        nodes, corners = np.unique(changed_cells, return_inverse=True)
         points = np.asarray(self.mesh.points)[nodes]
-        part = replace(self.mesh, points=points, cells=corners.reshape(there.shape), tags={})
-        return _field_energies(field_gradients(part, fields[nodes]), slope)
+        changed_mesh = replace(self.mesh, points=points, cells=corners.reshape(changed_cells.shape), tags={})
+        return _field_energies(field_gradients(changed_mesh, fields[nodes]), slope)
 
     def _energy_everywhere(self, change: Float[np.ndarray, " m"]) -> Float[np.ndarray, "L L"]:
         cells, size = np.asarray(self.mesh.cells), self.mesh.num_points
         rows, columns = np.tril_indices(cells.shape[1])
         values: Any = np.array(stiffness(self.mesh, change))  # pyright: ignore[reportArgumentType]
         values[rows == columns] /= 2
-        places = (cells[:, rows].T.ravel(), cells[:, columns].T.ravel())
-        lower = scipy.sparse.coo_array((values.ravel(), places), shape=(size, size)).tocsr()
-        half = self.fields.T @ (lower @ self.fields)
-        return half + half.T
+        entry_indices = (cells[:, rows].T.ravel(), cells[:, columns].T.ravel())
+        lower = scipy.sparse.coo_array((values.ravel(), entry_indices), shape=(size, size)).tocsr()
+        lower_part = self.fields.T @ (lower @ self.fields)
+        return lower_part + lower_part.T
 
 
 def solved_fields(model: ForwardModel, conductivity: Float[np.ndarray, " m"]) -> SolvedFields:
@@ -89,13 +89,13 @@ def solved_fields(model: ForwardModel, conductivity: Float[np.ndarray, " m"]) ->
 
 def _field_energies(gradient, slope) -> Float[np.ndarray, "q L L"]:
     """Matrices ∫ dσ ∇F_k · ∇F_l (q, L, L), one per coefficient."""
-    number = gradient.shape[-1]
-    energy = np.zeros((slope.shape[1], number**2), np.result_type(gradient, slope))
+    num_fields = gradient.shape[-1]
+    energy = np.zeros((slope.shape[1], num_fields**2), np.result_type(gradient, slope))
     for start in range(0, len(slope), _CELLS_AT_ONCE):
-        some = slice(start, start + _CELLS_AT_ONCE)
-        local = np.ascontiguousarray(np.moveaxis(gradient[:, some], 0, -1))
-        energy += slope[some].T @ (local @ local.transpose(0, 2, 1)).reshape(len(local), -1)
-    return energy.reshape(-1, number, number)
+        cell_range = slice(start, start + _CELLS_AT_ONCE)
+        local = np.ascontiguousarray(np.moveaxis(gradient[:, cell_range], 0, -1))
+        energy += slope[cell_range].T @ (local @ local.transpose(0, 2, 1)).reshape(len(local), -1)
+    return energy.reshape(-1, num_fields, num_fields)
 
 
 # Contact impedance in ohm·m² beyond which an electrode carries no current, compared with one of unit impedance.
@@ -109,8 +109,8 @@ class _ContactMass(NamedTuple):
 
 def _contact_masses_of(mesh: Mesh, electrodes: AbstractElectrodes, electrode: int) -> list[_ContactMass]:
     """Contact mass of one electrode, for unit contact impedance, where electrodes share facets or cells."""
-    alone = np.where(np.arange(electrodes.num_electrodes) == electrode, 1.0, _OPEN_CONTACT)
-    contact = on_host(electrodes.with_contact_impedance(alone)).contact(mesh)
+    contact_impedance = np.where(np.arange(electrodes.num_electrodes) == electrode, 1.0, _OPEN_CONTACT)
+    contact = on_host(electrodes.with_contact_impedance(contact_impedance)).contact(mesh)
     pieces = []
     for nodes, mass in zip(contact.nodes, contact.mass, strict=True):
         touched = np.abs(mass).max(axis=(1, 2)) > 2 / _OPEN_CONTACT * np.abs(mass).max()
@@ -123,21 +123,21 @@ class ContactSensitivity:
     `electrodes`: electrodes of the complete model; their positions and sizes are fixed."""
 
     def __init__(self, mesh: Mesh, electrodes: AbstractElectrodes):
-        mesh, number = on_host(mesh), electrodes.num_electrodes
-        whole = on_host(electrodes.with_contact_impedance(np.ones(number))).contact(mesh)
-        self._loads: list[Float[np.ndarray, " n"]] = list(np.asarray(whole.load).T)
-        self._pieces: list[list[_ContactMass]] = [[] for _ in range(number)]
-        for nodes, mass in zip(whole.nodes, whole.mass, strict=True):
+        mesh, num_electrodes = on_host(mesh), electrodes.num_electrodes
+        contact = on_host(electrodes.with_contact_impedance(np.ones(num_electrodes))).contact(mesh)
+        self._loads: list[Float[np.ndarray, " n"]] = list(np.asarray(contact.load).T)
+        self._pieces: list[list[_ContactMass]] = [[] for _ in range(num_electrodes)]
+        for nodes, mass in zip(contact.nodes, contact.mass, strict=True):
             nodes, mass = np.asarray(nodes), np.asarray(mass)
-            held = np.flatnonzero(np.abs(mass).max(axis=(1, 2)) > 0)
+            covered_elements = np.flatnonzero(np.abs(mass).max(axis=(1, 2)) > 0)
             # If an electrode covers a part of a facet or cell, all nodes of this facet or cell have a load.
-            touches = (np.asarray(whole.load)[nodes[held]] != 0).all(axis=1)
-            if (touches.sum(axis=1) > 1).any():
-                self._pieces = [_contact_masses_of(mesh, electrodes, one) for one in range(number)]
+            is_touched = (np.asarray(contact.load)[nodes[covered_elements]] != 0).all(axis=1)
+            if (is_touched.sum(axis=1) > 1).any():
+                self._pieces = [_contact_masses_of(mesh, electrodes, electrode) for electrode in range(num_electrodes)]
                 return
             for electrode, pieces in enumerate(self._pieces):
-                own = held[touches[:, electrode]]
-                pieces.append(_ContactMass(nodes[own], mass[own]))
+                electrode_elements = covered_elements[is_touched[:, electrode]]
+                pieces.append(_ContactMass(nodes[electrode_elements], mass[electrode_elements]))
 
     def __call__(
         self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"], contact_impedance
@@ -149,9 +149,9 @@ class ContactSensitivity:
         )
 
     def _energy(self, electrode: int, fields, impedance):
-        load, own = self._loads[electrode], impedance[electrode]
-        across = np.outer(load @ fields, own)
-        energy = load.sum() * np.outer(own, own) - across - across.T
+        load, electrode_impedance = self._loads[electrode], impedance[electrode]
+        cross_energy = np.outer(load @ fields, electrode_impedance)
+        energy = load.sum() * np.outer(electrode_impedance, electrode_impedance) - cross_energy - cross_energy.T
         for nodes, mass in self._pieces[electrode]:
             local = fields[nodes]
             energy += np.einsum("qip,qir->pr", local, np.einsum("qij,qjr->qir", mass, local))
@@ -172,24 +172,28 @@ class PlacementSensitivity:
         self.directions = np.asarray(electrodes.directions(mesh))
         self._contact_impedance = np.asarray(electrodes.contact_impedance)
         self._step = _DIFFERENCE_SHIFT * float(np.ptp(np.asarray(mesh.points), axis=0).max())
-        self._here = ContactSensitivity(mesh, electrodes)
-        self._ends = []
-        for way in range(self.directions.shape[1]):
+        self._sensitivity = ContactSensitivity(mesh, electrodes)
+        self._shifted_sensitivities = []
+        for direction in range(self.directions.shape[1]):
             shift = np.zeros(self.directions.shape[:2])
-            shift[:, way] = self._step
-            ends = [shift_electrodes(electrodes, self.directions, one) for one in (shift, -shift)]
-            self._ends.append([ContactSensitivity(mesh, one) for one in ends])
+            shift[:, direction] = self._step
+            shifted_electrodes = [
+                shift_electrodes(electrodes, self.directions, displacement) for displacement in (shift, -shift)
+            ]
+            self._shifted_sensitivities.append(
+                [ContactSensitivity(mesh, moved_electrodes) for moved_electrodes in shifted_electrodes]
+            )
 
     def __call__(self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"]):
         """Derivatives (p, L, L) of Z: for the L · a shifts, electrode by electrode, in ohms per metre, then for the L
         values log z, in ohms. `fields`: F (n, L), and `impedance`: Z (L, L), both in ohms, with these electrodes."""
         contact = self._contact_impedance
-        by_shift = []
-        for up, down in self._ends:
-            energies = [one(fields, impedance, contact) for one in (down, up)]
-            by_shift.append((energies[0] - energies[1]) / (2 * self._step))
-        by_shift = np.stack(by_shift, axis=1).reshape(-1, *impedance.shape)
-        return np.concatenate([by_shift, self._here(fields, impedance, contact)])
+        shift_derivatives = []
+        for forward, backward in self._shifted_sensitivities:
+            energies = [sensitivity(fields, impedance, contact) for sensitivity in (backward, forward)]
+            shift_derivatives.append((energies[0] - energies[1]) / (2 * self._step))
+        shift_derivatives = np.stack(shift_derivatives, axis=1).reshape(-1, *impedance.shape)
+        return np.concatenate([shift_derivatives, self._sensitivity(fields, impedance, contact)])
 
 
 def shift_electrodes(
@@ -197,5 +201,5 @@ def shift_electrodes(
 ) -> AbstractMovableElectrodes:
     """Copy electrodes, with each position displaced by `shift` (L, a), metres, along its unit vectors `directions` (L,
     a, d)."""
-    place = np.asarray(electrodes.position) + np.einsum("la,lad->ld", shift, directions)
-    return eqx.tree_at(lambda one: one.position, electrodes, as_array(place))
+    position = np.asarray(electrodes.position) + np.einsum("la,lad->ld", shift, directions)
+    return eqx.tree_at(lambda moved_electrodes: moved_electrodes.position, electrodes, as_array(position))

@@ -223,13 +223,13 @@ def evaluate(model: ForwardModel, quantity: Callable[..., Any], conductivity) ->
     """
     if not has_values(model):
         return _COMPILED_QUANTITIES[quantity](model, conductivity)
-    parts = model.mesh, model.electrodes, model.protocol, model.system
+    model_parts = model.mesh, model.electrodes, model.protocol, model.system
     if not (model.at_once and has_values(conductivity)):
-        found = _COMPILED_QUANTITIES[quantity](integrated_model(*parts), conductivity)
-        return on_host(found) if namespace(parts[:3], conductivity) is np else found
+        values = _COMPILED_QUANTITIES[quantity](integrated_model(*model_parts), conductivity)
+        return on_host(values) if namespace(model_parts[:3], conductivity) is np else values
     with np.errstate(all="ignore"):
-        found = quantity(host_model(*parts), on_host(conductivity))
-    return found if namespace(parts[:3]) is np else on_device(found)
+        values = quantity(host_model(*model_parts), on_host(conductivity))
+    return values if namespace(model_parts[:3]) is np else on_device(values)
 
 
 def check_model(model: ForwardModel) -> None:
@@ -261,8 +261,11 @@ def select_channels(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
     """Voltages of the channels: entries of measurement · Z · driveᵀ. The full matrix is computed only where that is
     less work than computing the entries one by one."""
     measured, driven = protocol.measurement, protocol.drive
-    each, every = protocol.num_measurements * len(impedance), len(measured) * (len(impedance) + len(driven))
-    if each < every:
+    num_direct_products, num_matrix_products = (
+        protocol.num_measurements * len(impedance),
+        len(measured) * (len(impedance) + len(driven)),
+    )
+    if num_direct_products < num_matrix_products:
         products = (measured[protocol.measurement_index] @ impedance) * driven[protocol.drive_index]
         return products.sum(axis=1)
     table = measured @ impedance @ driven.T
@@ -272,8 +275,8 @@ def select_channels(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
 def channel_voltages(protocol: Protocol, impedance: ElectrodeImpedance) -> Inexact[Array, " M"]:
     """Voltages of the channels. The contribution of a contact is added only to channels that measure an electrode
     carrying current."""
-    across = select_channels(protocol, namespace(impedance.contact).diag(impedance.contact))
-    return select_channels(protocol, impedance.body) + across
+    contact_voltages = select_channels(protocol, namespace(impedance.contact).diag(impedance.contact))
+    return select_channels(protocol, impedance.body) + contact_voltages
 
 
 def transfer_impedance_of(model: ForwardModel | IntegratedModel, conductivity):
@@ -368,11 +371,11 @@ def field_products(mesh: Mesh, fields: Inexact[Array, "n L"]) -> Iterator[tuple[
     starts = np.cumsum([0, *range(count, 0, -1)])
     for start in range(0, mesh.num_cells, _CELLS_AT_ONCE):
         cells = slice(start, min(start + _CELLS_AT_ONCE, mesh.num_cells))
-        along = np.ascontiguousarray(np.swapaxes(gradient[:, cells], 1, 2))
-        products = np.zeros((starts[-1], along.shape[-1]), along.dtype)
+        gradients = np.ascontiguousarray(np.swapaxes(gradient[:, cells], 1, 2))
+        products = np.zeros((starts[-1], gradients.shape[-1]), gradients.dtype)
         for field in range(count):
             rows = products[starts[field] : starts[field + 1]]
-            for component in along:
+            for component in gradients:
                 rows += component[field] * component[field:]
         yield cells, products
 

@@ -87,15 +87,15 @@ def _check_values(conductivity: Any, normal: Any) -> None:
             raise ValueError("conductivity tensors must be symmetric.")
         real = conductivity.real
         if normal is not None:  # tensors need to be positive only across the normal: add a large value along it
-            along = normal[:, :, None] * normal[:, None]
-            across = np.eye(3) - along
-            real = across @ real @ across + np.abs(real).max() * along
-        least = np.linalg.eigvalsh(real).min()
+            normal_projection = normal[:, :, None] * normal[:, None]
+            projection = np.eye(3) - normal_projection
+            real = projection @ real @ projection + np.abs(real).max() * normal_projection
+        min_value = np.linalg.eigvalsh(real).min()
     else:
-        least = conductivity.real.min()
-    if least <= 0:
+        min_value = conductivity.real.min()
+    if min_value <= 0:
         raise ValueError(
-            f"conductivity must be positive everywhere; its least value is {least:.3g}. For an insulating "
+            f"conductivity must be positive everywhere; its least value is {min_value:.3g}. For an insulating "
             "inclusion use a small positive value, such as a thousandth of the background."
         )
 
@@ -180,8 +180,8 @@ class System(Module):
         coordinates = np.asarray(mesh.points)
         if solver == "auto":
             fronts = find_fronts(pattern, coordinates)
-            chosen = choose_solver(pattern, coordinates)
-            return cls(pattern, chosen, fronts if isinstance(chosen, DirectSolver) else None)
+            chosen_solver = choose_solver(pattern, coordinates)
+            return cls(pattern, chosen_solver, fronts if isinstance(chosen_solver, DirectSolver) else None)
         if solver == "cholesky":
             return cls(pattern, SparseCholesky(analyse(pattern, coordinates)))
         if solver == "cg":
@@ -196,10 +196,12 @@ class System(Module):
 
         `conductivity` per cell, in S/m (2-D: S).
         """
-        nothing = (None,) * len(contact.mass)
-        conducted = self.pattern.assemble(stiffness(mesh, conductivity), *nothing)
-        ground = ground_conductance(self.pattern.diagonal(conducted), contact.load)
-        values = conducted if electrodes.is_point else conducted + self.pattern.assemble(None, *contact.mass)
+        no_contacts = (None,) * len(contact.mass)
+        stiffness_values = self.pattern.assemble(stiffness(mesh, conductivity), *no_contacts)
+        ground = ground_conductance(self.pattern.diagonal(stiffness_values), contact.load)
+        values = (
+            stiffness_values if electrodes.is_point else stiffness_values + self.pattern.assemble(None, *contact.mass)
+        )
         values = values + namespace(values).concatenate([ground, np.zeros(len(values) - len(ground))])
         load = contact.load if electrodes.is_point else with_ground(contact.load, ground)
         return SparseSymmetric(values, self.pattern), load
@@ -209,8 +211,8 @@ class System(Module):
         used."""
         load = load.astype(operator.values.dtype)
         if self.fronts is not None and isinstance(load, np.ndarray):
-            found: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).solve(load)
-            return found.astype(load.dtype)
+            solution: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).solve(load)
+            return solution.astype(load.dtype)
         if isinstance(self.solver, NumpySolver) and isinstance(load, np.ndarray):
             return self.solver.solve_columns(operator, load)
         constant = jax.lax.stop_gradient(operator)  # derivatives come from A X = B, not through the factor
@@ -235,8 +237,8 @@ class System(Module):
         """The product loadᵀ A⁻¹ load; with a direct solver it takes half the work of `solve`."""
         load = load.astype(operator.values.dtype)
         if self.fronts is not None and isinstance(load, np.ndarray):
-            found: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).quadratic_form(load)
-            return found.astype(load.dtype)
+            product: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).quadratic_form(load)
+            return product.astype(load.dtype)
         if isinstance(self.solver, SparseCholesky):
             return quadratic_form(self.solver.plan, factorise(self.solver.plan, operator.values), load)
         return load.T @ self.solve(operator, load)

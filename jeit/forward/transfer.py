@@ -204,15 +204,15 @@ def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
     because the contact impedances may differ by orders of magnitude.
     """
     xp = namespace(product)
-    others = (product + product.T) / 2 * (1 - np.eye(len(product)))
-    diagonal = others.sum(axis=0)
-    kept = np.arange(len(product)) != xp.argmax(undifferentiated(abs(diagonal)))
-    pairs = kept * kept[:, None]
-    scale = undifferentiated(1 / xp.sqrt(xp.where(kept, abs(diagonal), 1)))
+    coupling = (product + product.T) / 2 * (1 - np.eye(len(product)))
+    diagonal = coupling.sum(axis=0)
+    is_not_reference = np.arange(len(product)) != xp.argmax(undifferentiated(abs(diagonal)))
+    pairs = is_not_reference * is_not_reference[:, None]
+    scale = undifferentiated(1 / xp.sqrt(xp.where(is_not_reference, abs(diagonal), 1)))
     scale = scale * scale[:, None]
-    matrix = (xp.diag(xp.where(kept, diagonal, 1)) - pairs * others) * scale
+    matrix = (xp.diag(xp.where(is_not_reference, diagonal, 1)) - pairs * coupling) * scale
     impedance = symmetric_inverse(matrix) * scale * pairs
-    return impedance + undifferentiated(_mean_current_correction(others, impedance, xp.diag(kept)))
+    return impedance + undifferentiated(_mean_current_correction(coupling, impedance, xp.diag(is_not_reference)))
 
 
 def _mean_current_correction(
@@ -258,9 +258,9 @@ def _stationary_form(mesh, conductivity, electrodes, fields, impedance):
 
 def _contact_energy(contact: Contact, fields, impedance):
     """Σ_l (1/z_l) ∫_l (u - U_l)(w - W_l) for all pairs of fields, as a matrix (L, L)."""
-    inside = 0
+    body_term = 0
     for nodes, mass in zip(contact.nodes, contact.mass, strict=True):
         local = fields.at[nodes].get(mode="promise_in_bounds")  # (q, k, L)
-        inside += jnp.einsum("qip,qij,qjr->pr", local, mass, local)
-    across = fields.T @ contact.load @ impedance
-    return inside - across - across.T + impedance.T @ (contact.load.sum(axis=0)[:, None] * impedance)
+        body_term += jnp.einsum("qip,qij,qjr->pr", local, mass, local)
+    coupling = fields.T @ contact.load @ impedance
+    return body_term - coupling - coupling.T + impedance.T @ (contact.load.sum(axis=0)[:, None] * impedance)

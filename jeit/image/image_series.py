@@ -106,11 +106,11 @@ class ImageSeries:
         `region`: (m,) True for the cells of the region (`ball_region`, `box_region`, `half_region`). Raises
         `ValueError` for another shape, and for an empty region.
         """
-        chosen = np.asarray(region)
-        if chosen.dtype != bool or chosen.shape != (self.mesh.num_cells,) or not chosen.any():
+        is_in_region = np.asarray(region)
+        if is_in_region.dtype != bool or is_in_region.shape != (self.mesh.num_cells,) or not is_in_region.any():
             raise ValueError(f"region must be {self.mesh.num_cells} booleans, one a cell, at least one of them True.")
-        size = np.asarray(measures(self.mesh))[chosen]
-        return self.changes[:, chosen].astype(float) @ (size / size.sum())
+        cell_sizes = np.asarray(measures(self.mesh))[is_in_region]
+        return self.changes[:, is_in_region].astype(float) @ (cell_sizes / cell_sizes.sum())
 
 
 Window = Literal["hann", "none"]
@@ -174,28 +174,36 @@ def oscillation(
     breath.frequency, breath.amplitude
     ```
     """
-    kept, at = _finite_rows(values, times)
+    finite_values, finite_times = _finite_rows(values, times)
     check_name("window", window, _WINDOW_RESOLUTION)
-    spread = float(at[-1] - at[0])
-    resolution = _WINDOW_RESOLUTION[window] / spread
-    low, high = _check_band(frequency)
-    rate = (len(at) - 1) / spread
-    if high >= rate / 2:
+    duration = float(finite_times[-1] - finite_times[0])
+    resolution = _WINDOW_RESOLUTION[window] / duration
+    min_frequency, max_frequency = _check_band(frequency)
+    rate = (len(finite_times) - 1) / duration
+    if max_frequency >= rate / 2:
         raise ValueError(
-            f"frequency: {high:g} Hz is not below half the frame rate of {rate:.4g} Hz, and would be another."
+            f"frequency: {max_frequency:g} Hz is not below half the frame rate of {rate:.4g} Hz, and would be another."
         )
-    if high * spread < _MIN_PERIODS:
-        raise ValueError(f"frequency: {high:g} Hz has no whole period in the {spread:.3g} s measured; measure longer.")
-    low = max(low, _MIN_PERIODS / spread)
-    weight = _window_weights(at, window)
-    flat = kept.reshape(len(kept), -1)
-    found = low if low == high else _strongest_frequency(flat, at, weight, (low, high, resolution))
-    coefficients, left, spreads = _fit_sinusoid(flat, at, weight, found)
-    shape = kept.shape[1:]
+    if max_frequency * duration < _MIN_PERIODS:
+        raise ValueError(
+            f"frequency: {max_frequency:g} Hz has no whole period in the {duration:.3g} s measured; measure longer."
+        )
+    min_frequency = max(min_frequency, _MIN_PERIODS / duration)
+    weights = _window_weights(finite_times, window)
+    flat_values = finite_values.reshape(len(finite_values), -1)
+    best_frequency = (
+        min_frequency
+        if min_frequency == max_frequency
+        else _strongest_frequency(flat_values, finite_times, weights, (min_frequency, max_frequency, resolution))
+    )
+    coefficients, residual_variance, coefficient_variances = _fit_sinusoid(
+        flat_values, finite_times, weights, best_frequency
+    )
+    shape = finite_values.shape[1:]
     cosine, sine = coefficients[2], coefficients[3]
-    noise = np.sqrt(left) * np.sqrt((spreads[2] + spreads[3]) / 2)
+    noise = np.sqrt(residual_variance) * np.sqrt((coefficient_variances[2] + coefficient_variances[3]) / 2)
     return Oscillation(
-        found,
+        best_frequency,
         np.hypot(cosine, sine).reshape(shape),
         np.arctan2(-sine, cosine).reshape(shape),
         noise.reshape(shape),
@@ -224,20 +232,24 @@ def amplitude_spectrum(
     frequencies, amplitudes = amplitude_spectrum(changes.mean(axis=1), times)
     ```
     """
-    kept, at = _finite_rows(values, times)
+    finite_values, finite_times = _finite_rows(values, times)
     check_name("window", window, _WINDOW_RESOLUTION)
-    spread = float(at[-1] - at[0])
-    frequencies = np.arange(1 / spread, (len(at) - 1) / spread / 2, _WINDOW_RESOLUTION[window] / spread / 2)
-    weight = _window_weights(at, window)
-    rest = kept - np.tensordot(weight, kept, 1) / weight.sum()
-    turned = weight * np.exp(-2j * np.pi * frequencies[:, None] * (at - at[0]))
-    return frequencies, 2 * np.abs(np.tensordot(turned, rest, 1)) / weight.sum()
+    duration = float(finite_times[-1] - finite_times[0])
+    frequencies = np.arange(
+        1 / duration, (len(finite_times) - 1) / duration / 2, _WINDOW_RESOLUTION[window] / duration / 2
+    )
+    weight = _window_weights(finite_times, window)
+    centred = finite_values - np.tensordot(weight, finite_values, 1) / weight.sum()
+    phase_factors = weight * np.exp(-2j * np.pi * frequencies[:, None] * (finite_times - finite_times[0]))
+    return frequencies, 2 * np.abs(np.tensordot(phase_factors, centred, 1)) / weight.sum()
 
 
 def _check_band(frequency) -> tuple[float, float]:
     """The lowest and the highest frequency, equal if a single frequency is given."""
     band = (frequency, frequency) if is_number(frequency) else frequency
-    if not (isinstance(band, tuple | list) and len(band) == 2 and all(is_number(one) and one > 0 for one in band)):
+    if not (
+        isinstance(band, tuple | list) and len(band) == 2 and all(is_number(limit) and limit > 0 for limit in band)
+    ):
         raise ValueError(f"frequency must be positive hertz, or a band (lowest, highest); it is {describe(frequency)}.")
     if band[0] > band[1]:
         raise ValueError(f"frequency: the band from {band[0]:g} to {band[1]:g} Hz is the wrong way round.")
@@ -246,17 +258,17 @@ def _check_band(frequency) -> tuple[float, float]:
 
 def _finite_rows(values, times) -> tuple[np.ndarray, np.ndarray]:
     """Rows without NaN as real numbers, and their times."""
-    given, at = np.asarray(values), np.asarray(times, float)
-    if given.ndim < 1 or given.dtype.kind not in "iuf" or at.shape != given.shape[:1]:
+    rows, row_times = np.asarray(values), np.asarray(times, float)
+    if rows.ndim < 1 or rows.dtype.kind not in "iuf" or row_times.shape != rows.shape[:1]:
         raise ValueError(
-            f"values are {given.dtype} of shape {given.shape}, times {at.shape}; give a row for each time."
+            f"values are {rows.dtype} of shape {rows.shape}, times {row_times.shape}; give a row for each time."
         )
-    if not np.isfinite(at).all() or (np.diff(at) <= 0).any():
+    if not np.isfinite(row_times).all() or (np.diff(row_times) <= 0).any():
         raise ValueError("times must be finite and rise, in seconds.")
-    kept = np.isfinite(given.reshape(len(given), -1)).all(axis=1)
-    if kept.sum() < 5:
-        raise ValueError(f"values: {int(kept.sum())} frames without NaN; an oscillation takes five at least.")
-    return given[kept].astype(float), at[kept]
+    is_finite = np.isfinite(rows.reshape(len(rows), -1)).all(axis=1)
+    if is_finite.sum() < 5:
+        raise ValueError(f"values: {int(is_finite.sum())} frames without NaN; an oscillation takes five at least.")
+    return rows[is_finite].astype(float), row_times[is_finite]
 
 
 def _window_weights(times: np.ndarray, window: Window) -> np.ndarray:
@@ -270,32 +282,41 @@ def _window_weights(times: np.ndarray, window: Window) -> np.ndarray:
 def _fit_sinusoid(values: np.ndarray, times: np.ndarray, weight: np.ndarray, frequency: float):
     """Coefficients (4, n), residual variance (n,), and the variance of each coefficient (4,) for noise of unit
     variance."""
-    turn = 2 * np.pi * frequency * times
-    middle = times - times.mean()
-    design = np.stack([np.ones(len(times)), middle / middle[-1], np.cos(turn), np.sin(turn)], axis=1)
+    angle = 2 * np.pi * frequency * times
+    centred_times = times - times.mean()
+    design = np.stack([np.ones(len(times)), centred_times / centred_times[-1], np.cos(angle), np.sin(angle)], axis=1)
     inverse = np.linalg.pinv(np.sqrt(weight)[:, None] * design) * np.sqrt(weight)
     coefficients = inverse @ values
-    left = ((values - design @ coefficients) ** 2).sum(axis=0) / max(len(times) - 4, 1)
-    return coefficients, left, (inverse**2).sum(axis=1)
+    residual_variance = ((values - design @ coefficients) ** 2).sum(axis=0) / max(len(times) - 4, 1)
+    return coefficients, residual_variance, (inverse**2).sum(axis=1)
 
 
 def _strongest_frequency(
     values: np.ndarray, times: np.ndarray, weight: np.ndarray, band: tuple[float, float, float]
 ) -> float:
     """The frequency in a band (lowest, highest, resolution) at which the power summed over all values is largest."""
-    low, high, resolution = band
+    min_frequency, max_frequency, resolution = band
     # The first eight principal components, in place of all values.
-    rest = values - values.mean(axis=0)
-    left, size, _ = np.linalg.svd(rest @ rest.T if rest.shape[1] > len(rest) else rest, full_matrices=False)
-    size = np.sqrt(size) if rest.shape[1] > len(rest) else size
-    combined = left[:, :8] * size[:8]
+    centred = values - values.mean(axis=0)
+    left_vectors, singular_values, _ = np.linalg.svd(
+        centred @ centred.T if centred.shape[1] > len(centred) else centred, full_matrices=False
+    )
+    singular_values = np.sqrt(singular_values) if centred.shape[1] > len(centred) else singular_values
+    components = left_vectors[:, :8] * singular_values[:8]
 
     def power(frequency: float) -> float:
-        coefficients, _, _ = _fit_sinusoid(combined, times, weight, frequency)
+        coefficients, _, _ = _fit_sinusoid(components, times, weight, frequency)
         return -float((coefficients[2:] ** 2).sum())
 
-    tried = np.linspace(low, high, max(int(np.ceil((high - low) / resolution * _FREQUENCIES_PER_RESOLUTION)), 2) + 1)
-    best = int(np.argmin([power(one) for one in tried]))
-    around = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
-    found: Any = scipy.optimize.minimize_scalar(power, bounds=around, method="bounded", options={"xatol": 1e-9})
-    return float(found.x)
+    trial_frequencies = np.linspace(
+        min_frequency,
+        max_frequency,
+        max(int(np.ceil((max_frequency - min_frequency) / resolution * _FREQUENCIES_PER_RESOLUTION)), 2) + 1,
+    )
+    best_index = int(np.argmin([power(frequency) for frequency in trial_frequencies]))
+    bracket = (
+        trial_frequencies[max(best_index - 1, 0)],
+        trial_frequencies[min(best_index + 1, len(trial_frequencies) - 1)],
+    )
+    result: Any = scipy.optimize.minimize_scalar(power, bounds=bracket, method="bounded", options={"xatol": 1e-9})
+    return float(result.x)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy import sparse
 
 from jeit.arguments.checks import Interval
 from jeit.image.segmentation import basins, shared_facets
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from jeit.image.plane import TriangleSurface
 
 _SURFACE_COLUMNS, _SURFACE_ROWS = 48, 24
+# Edge of the strongest region, as a share of its peak.
+_REGION_LEVEL = 0.5
 
 
 class SolidForm(Module):
@@ -40,22 +43,27 @@ class SolidForm(Module):
         """Closed surface of the shape, as triangles."""
         from jeit.image.plane import TriangleSurface
 
-        up = np.linspace(0, np.pi, _SURFACE_ROWS + 1)
-        radius, height = np.sin(up), -np.cos(up)
+        polar_angle = np.linspace(0, np.pi, _SURFACE_ROWS + 1)
+        radius, height = np.sin(polar_angle), -np.cos(polar_angle)
         if self.column:
             radius, height = np.array([0.0, 1.0, 1.0, 0.0]), np.array([-1.0, -1.0, 1.0, 1.0])
         angle = 2 * np.pi * np.arange(_SURFACE_COLUMNS) / _SURFACE_COLUMNS
-        level = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        unit = np.concatenate(
-            [level, np.broadcast_to(height[:, None, None], (len(height), _SURFACE_COLUMNS, 1))], axis=2
+        circles = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        unit_points = np.concatenate(
+            [circles, np.broadcast_to(height[:, None, None], (len(height), _SURFACE_COLUMNS, 1))], axis=2
         )
         axes = np.array(self.axes)
         axes[0] *= np.sign(np.linalg.det(axes))  # so that all normals point outward
-        low = _SURFACE_COLUMNS * np.arange(len(height) - 1)[:, None] + np.arange(_SURFACE_COLUMNS)
-        low_next = np.roll(low, -1, axis=1)
-        high, high_next = low + _SURFACE_COLUMNS, low_next + _SURFACE_COLUMNS
-        corners = [np.stack([low, low_next, high], axis=-1), np.stack([low_next, high_next, high], axis=-1)]
-        return TriangleSurface(unit.reshape(-1, 3) @ axes + np.array(self.centre), np.stack(corners).reshape(-1, 3))
+        lower_nodes = _SURFACE_COLUMNS * np.arange(len(height) - 1)[:, None] + np.arange(_SURFACE_COLUMNS)
+        next_lower_nodes = np.roll(lower_nodes, -1, axis=1)
+        upper_nodes, next_upper_nodes = lower_nodes + _SURFACE_COLUMNS, next_lower_nodes + _SURFACE_COLUMNS
+        corners = [
+            np.stack([lower_nodes, next_lower_nodes, upper_nodes], axis=-1),
+            np.stack([next_lower_nodes, next_upper_nodes, upper_nodes], axis=-1),
+        ]
+        return TriangleSurface(
+            unit_points.reshape(-1, 3) @ axes + np.array(self.centre), np.stack(corners).reshape(-1, 3)
+        )
 
 
 # Minimum area of an inclusion as a fraction of a sheet (a disc of a fourteenth of its width), and minimum volume as a
@@ -164,6 +172,38 @@ def find_inclusions(
     return [inclusion for inclusion, _ in regions]
 
 
+class StrongestRegion:
+    """Computes where an image is strongest: the centroid of the connected region around its peak in which the change
+    exceeds half of the peak, weighted by area (volume) and change.
+
+    The peak itself is drawn to electrodes, where voltages are most sensitive; the centroid is less so. What depends
+    on the `mesh` alone is computed in advance.
+    """
+
+    def __init__(self, mesh: Mesh):
+        shared = np.asarray(mesh.cells if mesh.dimension == 3 else shared_facets(mesh))
+        rows, columns = np.nonzero(shared >= 0)  # facets of the boundary are not shared
+        entries = np.ones(len(rows), np.float32), (rows, shared[rows, columns])
+        self._incidence = sparse.csr_array(entries, shape=(len(shared), int(shared.max()) + 1))
+        self._transposed = sparse.csr_array(self._incidence.T)
+        self._measures, self._centroids = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
+
+    def __call__(self, change: Float[np.ndarray, " m"]) -> tuple[Float[np.ndarray, " d"], float]:
+        """Return the centroid, in metres, and the peak, with its sign, of a change (m,)."""
+        peak = int(np.abs(change).argmax())
+        relative = change / change[peak] if change[peak] else np.zeros_like(change)
+        candidates = relative >= _REGION_LEVEL
+        region = np.zeros(len(change), np.float32)
+        region[peak] = 1
+        count = 0
+        while count != (count := int(region.sum())):
+            region = ((self._incidence @ (self._transposed @ region) > 0) & candidates).astype(np.float32)
+            region[peak] = 1
+        cells = region > 0
+        weight = self._measures[cells] * np.maximum(relative[cells], _REGION_LEVEL)
+        return weight @ self._centroids[cells] / weight.sum(), float(change[peak])
+
+
 def inclusion_regions(
     mesh: Mesh,
     image: Float[Array, " m"],
@@ -188,29 +228,32 @@ def inclusion_regions(
         raise ValueError("image has NaN or infinite values; reconstruct it from unmasked channels first.")
     if noise is not None and np.shape(noise) != values.shape:
         raise ValueError(f"noise has shape {np.shape(noise)}; give one value for each of the {mesh.num_cells} cells.")
-    strongest = np.abs(values).max()
-    if strongest == 0:
+    max_change = np.abs(values).max()
+    if max_change == 0:
         return []
-    measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
+    cell_measures, cell_centres = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
     # A tetrahedron shares facets with only some of its higher neighbours, so in solids paths along ridges go over
     # nodes.
     shared = np.asarray(mesh.cells) if mesh.dimension == 3 else shared_facets(mesh)
     if least_area is None:
         least_area = _LEAST_AREA[mesh.dimension]
-    found = []
+    inclusions = []
     for sign in (1, -1):
         change = sign * values
-        basin = basins(change, shared, floor=level * least_peak * strongest, least_prominence=least_prominence)
+        basin = basins(change, shared, floor=level * least_peak * max_change, least_prominence=least_prominence)
         for label in np.unique(basin[basin >= 0]):
             peak = change[label]
             region = (basin == label) & (change >= level * peak)
             if noise is not None and peak < least_significance * noise[label]:
                 continue
-            if peak < least_peak * strongest or measure[region].sum() < least_area * measure.sum():
+            if peak < least_peak * max_change or cell_measures[region].sum() < least_area * cell_measures.sum():
                 continue
-            weight = (measure * change)[region]
-            centroid = tuple(float(value) for value in weight @ centre[region] / weight.sum())
-            found.append(
-                (Inclusion(sign, centroid, float(measure[region].sum()), float(sign * peak), mesh.is_surface), region)
+            weight = (cell_measures * change)[region]
+            centroid = tuple(float(value) for value in weight @ cell_centres[region] / weight.sum())
+            inclusions.append(
+                (
+                    Inclusion(sign, centroid, float(cell_measures[region].sum()), float(sign * peak), mesh.is_surface),
+                    region,
+                )
             )
-    return sorted(found, key=lambda one: -abs(one[0].peak))
+    return sorted(inclusions, key=lambda inclusion_and_region: -abs(inclusion_and_region[0].peak))

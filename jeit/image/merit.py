@@ -132,25 +132,25 @@ def _figures_of_one_image(raster, extent, position, area, change):
     x_min, x_max, y_min, y_max = extent
     x = x_min + (jnp.arange(columns) + 0.5) * (x_max - x_min) / columns
     y = (y_max - (jnp.arange(rows) + 0.5) * (y_max - y_min) / rows)[:, None]
-    pixel = (x_max - x_min) * (y_max - y_min) / raster.size
-    body = jnp.isfinite(raster)
-    value = jnp.where(body, raster, 0) / change  # positive values have the target's sign
-    highest = value.max()
-    seen = body & (value >= _TARGET_LEVEL * highest) & (highest > 0)
-    centre, size = _centre_of_gravity(body, x, y), jnp.sum(body)
-    middle, size_seen = _centre_of_gravity(seen, x, y), jnp.sum(seen)
-    circle = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 <= size_seen * pixel / jnp.pi
-    distance = jnp.hypot(*(position - centre))
-    right = jnp.sum(jnp.where(circle, value, 0))
-    wrong = -jnp.sum(jnp.where(circle, 0, jnp.minimum(value, 0)))
+    pixel_area = (x_max - x_min) * (y_max - y_min) / raster.size
+    is_body = jnp.isfinite(raster)
+    value = jnp.where(is_body, raster, 0) / change  # positive values have the target's sign
+    max_value = value.max()
+    target_pixels = is_body & (value >= _TARGET_LEVEL * max_value) & (max_value > 0)
+    body_centre, body_size = _centre_of_gravity(is_body, x, y), jnp.sum(is_body)
+    target_centre, target_size = _centre_of_gravity(target_pixels, x, y), jnp.sum(target_pixels)
+    is_in_circle = (x - target_centre[0]) ** 2 + (y - target_centre[1]) ** 2 <= target_size * pixel_area / jnp.pi
+    distance = jnp.hypot(*(position - body_centre))
+    circle_sum = jnp.sum(jnp.where(is_in_circle, value, 0))
+    negative_sum = -jnp.sum(jnp.where(is_in_circle, 0, jnp.minimum(value, 0)))
     return FiguresOfMerit(
-        amplitude_response=jnp.sum(value) * pixel / area,
-        position_error=distance - jnp.hypot(*(middle - centre)),
-        resolution=jnp.sqrt(jnp.where(size_seen > 0, size_seen, jnp.nan) / size),
-        shape_deformation=jnp.sum(seen & ~circle) / size_seen,
-        ringing=jnp.where(size_seen > 0, jnp.where(right > 0, wrong / right, jnp.inf), jnp.nan),
+        amplitude_response=jnp.sum(value) * pixel_area / area,
+        position_error=distance - jnp.hypot(*(target_centre - body_centre)),
+        resolution=jnp.sqrt(jnp.where(target_size > 0, target_size, jnp.nan) / body_size),
+        shape_deformation=jnp.sum(target_pixels & ~is_in_circle) / target_size,
+        ringing=jnp.where(target_size > 0, jnp.where(circle_sum > 0, negative_sum / circle_sum, jnp.inf), jnp.nan),
         distance=distance,
-        body_radius=jnp.sqrt(size * pixel / jnp.pi),
+        body_radius=jnp.sqrt(body_size * pixel_area / jnp.pi),
     )
 
 
@@ -182,16 +182,16 @@ def _check_arguments(raster, extent, position, area, change) -> None:
         raise ValueError("area of the targets must be positive, in square metres.")
     if not (np.isfinite(change) & (np.asarray(change) != 0)).all():
         raise ValueError("change of the targets must be finite and not zero, in siemens; negative where it falls.")
-    body = np.isfinite(raster)
-    if not body.any(axis=(-2, -1)).all():
+    is_body = np.isfinite(raster)
+    if not is_body.any(axis=(-2, -1)).all():
         raise ValueError("raster: an image has no finite pixel; give a change of conductivity wherever the body is.")
-    if body.ndim == 3 and (body != body[0]).any():
+    if is_body.ndim == 3 and (is_body != is_body[0]).any():
         raise ValueError(
             "raster: the images are NaN at different pixels; NaN stands for outside the body, which is the same for "
             "all. Was a reconstruction given NaN voltages?"
         )
-    place = np.asarray(position)
-    if not ((place >= [x_min, y_min]) & (place <= [x_max, y_max])).all():
+    positions = np.asarray(position)
+    if not ((positions >= [x_min, y_min]) & (positions <= [x_max, y_max])).all():
         raise ValueError(
             f"position: a target lies outside the raster, whose extent is {tuple(extent)}; are both in metres?"
         )

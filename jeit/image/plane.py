@@ -70,17 +70,17 @@ def crossed_edges(triangles: Int[np.ndarray, "b 3"], values: Float[np.ndarray, "
 
 
 def _cut_cells(cells, values, level: float, cases: dict[int, list[list[int]]]) -> CutPieces:
-    number = (values[cells] >= level).sum(axis=1)
-    found = []
+    num_above = (values[cells] >= level).sum(axis=1)
+    pieces = []
     for above, corners in cases.items():
-        cell = np.flatnonzero(number == above)
+        cell = np.flatnonzero(num_above == above)
         order = np.argsort(-values[cells[cell]], axis=1, kind="stable")
         ends = np.take_along_axis(cells[cell], order, axis=1)[:, np.array(corners)]
         high, low = values[ends[..., 0]], values[ends[..., 1]]
         with np.errstate(invalid="ignore"):
             share = np.where(high > low, (high - level) / np.where(high > low, high - low, 1), 0)
-        found.append((ends, share, cell))
-    return CutPieces(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+        pieces.append((ends, share, cell))
+    return CutPieces(*(np.concatenate(arrays) for arrays in zip(*pieces, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -245,20 +245,20 @@ class Plane:
     def through(cls, point: ArrayLike, normal: ArrayLike) -> "Plane":
         """The plane through `point` (3,), in metres, perpendicular to `normal` (3,), which points towards the viewer.
         Raises `ValueError` unless both are three finite numbers and the normal is not zero."""
-        place, direction = (np.asarray(one, dtype=object) for one in (point, normal))
-        for name, value in (("point", place), ("normal", direction)):
-            if value.shape != (3,) or not all(is_number(one) for one in value):
+        point_array, normal_array = (np.asarray(values, dtype=object) for values in (point, normal))
+        for name, value in (("point", point_array), ("normal", normal_array)):
+            if value.shape != (3,) or not all(is_number(coordinate) for coordinate in value):
                 raise ValueError(
                     f"{name} must be three finite numbers; it is {describe(point if name == 'point' else normal)}."
                 )
-        place, direction = place.astype(float), direction.astype(float)
-        length = float(np.linalg.norm(direction))
+        point_array, normal_array = point_array.astype(float), normal_array.astype(float)
+        length = float(np.linalg.norm(normal_array))
         if length == 0:
             raise ValueError("normal is zero; give the direction in which the plane is looked at, such as (0, 0, 1).")
-        toward = direction / length
-        where = ", ".join(_millimetres(value) for value in place)
-        across = ", ".join(f"{value:.2g}" for value in toward).replace("-", "−")
-        return cls(place, toward, *_page_axes(toward), f"through ({where}) mm across ({across})")
+        toward = normal_array / length
+        point_text = ", ".join(_millimetres(value) for value in point_array)
+        normal_text = ", ".join(f"{value:.2g}" for value in toward).replace("-", "−")
+        return cls(point_array, toward, *_page_axes(toward), f"through ({point_text}) mm across ({normal_text})")
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Distance of points (n, 3) from the plane in metres, positive towards the viewer."""
@@ -318,7 +318,7 @@ def cut_by_plane(mesh: Mesh, plane: Plane) -> Cut:
     """
     check_solid(mesh)
     check_kind("plane", plane, Plane, "a Plane, such as Plane.at('z', 0.02)")
-    points, cells, facets = (np.asarray(one) for one in (mesh.points, mesh.cells, mesh.facets))
+    points, cells, facets = (np.asarray(values) for values in (mesh.points, mesh.cells, mesh.facets))
     height = plane.distance(points)
     size = float(np.ptp(points, axis=0).max())
     height = np.where(np.abs(height) < _IN_PLANE_TOLERANCE * size, 0.0, height)
@@ -326,9 +326,9 @@ def cut_by_plane(mesh: Mesh, plane: Plane) -> Cut:
     if len(pieces.cell) == 0:
         pieces, edges = crossed_cells(cells, -height), crossed_edges(facets, -height)
     if len(pieces.cell) == 0:
-        low, high = (1e3 * value for value in (height.min(), height.max()))
-        beside = f"{low:.3g} mm before" if low > 0 else f"{-high:.3g} mm behind"
-        raise ValueError(f"plane {plane.name} misses the body, which lies {beside} it; are both in metres?")
+        min_height, max_height = (1e3 * value for value in (height.min(), height.max()))
+        distance_text = f"{min_height:.3g} mm before" if min_height > 0 else f"{-max_height:.3g} mm behind"
+        raise ValueError(f"plane {plane.name} misses the body, which lies {distance_text} it; are both in metres?")
     polygons, outline = plane.on_page(pieces.at_corners(points)), plane.on_page(edges.at_corners(points))
     return Cut(polygons, pieces.cell, outline[np.ptp(outline, axis=1).max(axis=1) > 0])
 
@@ -342,12 +342,12 @@ def check_solid(mesh: Mesh) -> None:
 
 def _page_axes(toward) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors to the right and up on the page, for a plane viewed from the direction `toward`."""
-    upward = (
+    reference = (
         np.array([0.0, 0.0, 1.0]) if abs(toward[2]) < 1 - 1e-9 else np.array([0.0, math.copysign(1, toward[2]), 0.0])
     )
-    up = upward - (upward @ toward) * toward
-    up /= np.linalg.norm(up)
-    return np.cross(up, toward) + 0.0, up + 0.0
+    page_up = reference - (reference @ toward) * toward
+    page_up /= np.linalg.norm(page_up)
+    return np.cross(page_up, toward) + 0.0, page_up + 0.0
 
 
 def _millimetres(value: float) -> str:

@@ -93,27 +93,33 @@ def find_cells(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> 
     the bounding box of the positions are considered, for a slice those that it cuts.
     """
     corners = points[cells]
-    slack = 1e-9 * np.ptp(points, axis=0).max()
-    low, high = positions.min(axis=0) - slack, positions.max(axis=0) + slack
-    near = np.flatnonzero(((corners.max(axis=1) >= low) & (corners.min(axis=1) <= high)).all(axis=1))
-    if not len(near):
+    tolerance = 1e-9 * np.ptp(points, axis=0).max()
+    lower_corner, upper_corner = positions.min(axis=0) - tolerance, positions.max(axis=0) + tolerance
+    candidates = np.flatnonzero(
+        ((corners.max(axis=1) >= lower_corner) & (corners.min(axis=1) <= upper_corner)).all(axis=1)
+    )
+    if not len(candidates):
         return np.full(len(positions), -1)
-    corners = corners[near]
+    corners = corners[candidates]
     inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
     tree = KDTree(corners.mean(axis=1))
-    reach = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=-1).max()
-    found = np.full(len(positions), -1)
-    left = np.flatnonzero(tree.query(positions)[0] <= reach)
-    tried, number = 0, 8
-    while left.size and tried < len(near):
-        number = min(number, len(near))
-        nearest = tree.query(positions[left], k=number)
-        distance, candidate = np.asarray(nearest[0])[:, tried:], np.asarray(nearest[1])[:, tried:]
-        local = np.einsum("qkij,qkj->qki", inverse[candidate], positions[left][:, None] - corners[candidate, 0])
-        inside = np.minimum(local.min(axis=-1), 1 - local.sum(axis=-1)) > -1e-9
-        hit = inside.any(axis=1)
-        found[left[hit]] = near[candidate[hit, inside[hit].argmax(axis=1)]]
+    max_reach = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=-1).max()
+    cell_of_position = np.full(len(positions), -1)
+    remaining = np.flatnonzero(tree.query(positions)[0] <= max_reach)
+    num_tried, num_nearest = 0, 8
+    while remaining.size and num_tried < len(candidates):
+        num_nearest = min(num_nearest, len(candidates))
+        nearest = tree.query(positions[remaining], k=num_nearest)
+        distance, candidate_index = np.asarray(nearest[0])[:, num_tried:], np.asarray(nearest[1])[:, num_tried:]
+        barycentric = np.einsum(
+            "qkij,qkj->qki", inverse[candidate_index], positions[remaining][:, None] - corners[candidate_index, 0]
+        )
+        is_inside = np.minimum(barycentric.min(axis=-1), 1 - barycentric.sum(axis=-1)) > -1e-9
+        is_found = is_inside.any(axis=1)
+        cell_of_position[remaining[is_found]] = candidates[
+            candidate_index[is_found, is_inside[is_found].argmax(axis=1)]
+        ]
         # A cell cannot contain a position that is farther from its centroid than its farthest corner.
-        left = left[~hit & (distance[:, -1] <= reach)]
-        tried, number = number, 4 * number
-    return found
+        remaining = remaining[~is_found & (distance[:, -1] <= max_reach)]
+        num_tried, num_nearest = num_nearest, 4 * num_nearest
+    return cell_of_position

@@ -78,30 +78,33 @@ def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None
     region = half_region(mesh, [1.0, 0.0])
     ```
     """
-    towards = np.asarray(direction, float)
-    if towards.shape != (mesh.dimension,) or not np.isfinite(towards).all() or not towards.any():
+    normal = np.asarray(direction, float)
+    if normal.shape != (mesh.dimension,) or not np.isfinite(normal).all() or not normal.any():
         raise ValueError(f"direction must be {mesh.dimension} finite numbers, not all zero; it is {direction!r}.")
-    size = np.asarray(measures(mesh))
-    middle = size @ np.asarray(centroids(mesh)) / size.sum() if point is None else point
+    cell_sizes = np.asarray(measures(mesh))
+    origin = cell_sizes @ np.asarray(centroids(mesh)) / cell_sizes.sum() if point is None else point
     return _check_not_empty(
-        mesh, _centroids_from(mesh, middle, "point") @ towards > 0, "no cell lies in direction of point"
+        mesh, _centroids_from(mesh, origin, "point") @ normal > 0, "no cell lies in direction of point"
     )
 
 
 def _centroids_from(mesh: Mesh, point: ArrayLike, name: str) -> Float[np.ndarray, "m d"]:
     """Centroids of the cells relative to a place. Raises `ValueError` for a place with another number of
     coordinates."""
-    given = np.asarray(point, float)
-    if given.shape != (mesh.dimension,) or not np.isfinite(given).all():
-        raise ValueError(f"{name} must be {mesh.dimension} finite numbers in metres; it has shape {given.shape}.")
-    return np.asarray(centroids(mesh)) - given
+    coordinates = np.asarray(point, float)
+    if coordinates.shape != (mesh.dimension,) or not np.isfinite(coordinates).all():
+        raise ValueError(f"{name} must be {mesh.dimension} finite numbers in metres; it has shape {coordinates.shape}.")
+    return np.asarray(centroids(mesh)) - coordinates
 
 
 def _check_not_empty(mesh: Mesh, region, message: str) -> Bool[np.ndarray, " m"]:
     if not region.any():
         points = np.asarray(mesh.points)
-        low, high = (", ".join(f"{x:.2g}" for x in one) for one in (points.min(axis=0), points.max(axis=0)))
-        raise ValueError(f"the region is empty: {message}. The body spans [{low}] to [{high}], metres.")
+        lower_text, upper_text = (
+            ", ".join(f"{coordinate:.2g}" for coordinate in corner)
+            for corner in (points.min(axis=0), points.max(axis=0))
+        )
+        raise ValueError(f"the region is empty: {message}. The body spans [{lower_text}] to [{upper_text}], metres.")
     return np.asarray(region)
 
 
@@ -131,24 +134,24 @@ def basins(
     meeting point by at least `least_prominence` times its height.
     """
     peak = np.full(len(change), -1)
-    reached: dict[int, int] = {}
-    swallowed: dict[int, int] = {}
+    label_of_place: dict[int, int] = {}
+    merged_labels: dict[int, int] = {}
 
     def root(label: int) -> int:
-        while label in swallowed:
-            label = swallowed[label]
+        while label in merged_labels:
+            label = merged_labels[label]
         return label
 
     cells = np.flatnonzero(change > floor)
     for cell in cells[np.argsort(-change[cells], kind="stable")].tolist():
-        places = [place for place in shared[cell].tolist() if place >= 0]
-        labels = {root(reached[place]) for place in places if place in reached}
+        shared_places = [place for place in shared[cell].tolist() if place >= 0]
+        labels = {root(label_of_place[place]) for place in shared_places if place in label_of_place}
         highest = max(labels, key=lambda label: change[label], default=cell)
         for label in labels - {highest}:
             if change[label] - change[cell] < least_prominence * change[label]:
-                swallowed[label] = highest
+                merged_labels[label] = highest
         peak[cell] = highest
-        reached.update(dict.fromkeys(places, highest))
+        label_of_place.update(dict.fromkeys(shared_places, highest))
     peak[cells] = [root(label) for label in peak[cells].tolist()]
     return peak
 
@@ -185,19 +188,19 @@ def segment(
         raise ValueError(
             f"level, least_peak and least_area are shares, from 0 to 1: {level}, {least_peak}, {least_area}."
         )
-    inside = np.isfinite(values)
-    if not inside.any():
+    is_inside = np.isfinite(values)
+    if not is_inside.any():
         raise ValueError("image: no pixel lies inside the body; all are NaN.")
-    values = np.where(inside, values, 0)
-    strongest = np.abs(values).max()
+    values = np.where(is_inside, values, 0)
+    max_value = np.abs(values).max()
     labels = np.zeros(values.shape, np.uint8)
     for sign, label in ((1, CONDUCTIVE), (-1, RESISTIVE)):
         peak = (sign * values).max()
-        if peak <= 0 or peak < least_peak * strongest:
+        if peak <= 0 or peak < least_peak * max_value:
             continue
         islands = np.zeros(values.shape, np.int32)
         ndimage.label(sign * values > level * peak, output=islands)
-        size = np.bincount(islands.ravel())
-        size[0] = 0
-        labels[size[islands] >= max(1, least_area * inside.sum())] = label
+        island_sizes = np.bincount(islands.ravel())
+        island_sizes[0] = 0
+        labels[island_sizes[islands] >= max(1, least_area * is_inside.sum())] = label
     return labels

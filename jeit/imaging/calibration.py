@@ -23,7 +23,7 @@ from jeit_solvers.engines import as_array
 # Misfit of the reference up to which described electrode positions are taken as they are; standard deviation of these
 # positions, relative to the width of the body: 2° of a disk; and the ratios of misfits below which estimated positions
 # are used, each channel relative to its noise, and all volts alike.
-_EXPLAINED, _MISPLACED, _BETTER, _WORSE = 0.01, 0.0175, 0.7, 2.0
+_MAX_EXACT_MISFIT, _POSITION_DEVIATION, _MAX_RELATIVE_RATIO, _MAX_MISFIT_RATIO = 0.01, 0.0175, 0.7, 2.0
 
 
 class Clock:
@@ -67,21 +67,21 @@ def calibrated_model(
     """
     clock = Clock(None) if clock is None else clock
     with clock("calibrate"), threads_for(model.mesh):
-        chosen = contact or default_contact(base)
+        contact_method = contact or default_contact(base)
         voltages, mask = np.asarray(base.voltages)[0], np.asarray(base.mask)[0]
-        calibration = calibrate(model, voltages, mask=mask, contact=chosen)
-        if contact is None and chosen == "each" and not calibration.distinguishes_contacts:
-            chosen = "common"  # the data do not determine one impedance per electrode
-            calibration = calibrate(model, voltages, mask=mask, contact=chosen)
+        calibration = calibrate(model, voltages, mask=mask, contact=contact_method)
+        if contact is None and contact_method == "each" and not calibration.distinguishes_contacts:
+            contact_method = "common"  # the data do not determine one impedance per electrode
+            calibration = calibrate(model, voltages, mask=mask, contact=contact_method)
         position = (base.uncertainty or Uncertainty()).position
-        calibration = _with_places(calibration, model, voltages, mask, position)
+        calibration = _with_estimated_positions(calibration, model, voltages, mask, position)
         calibration = jax.block_until_ready(calibration)
         if not np.isfinite(calibration.misfit):
             raise ValueError(
                 f"'{base.name}': calibration on it failed ({calibration.reason}); is this a frame of the empty body, "
                 "and are geometry and protocol right?"
             )
-    return calibration, chosen
+    return calibration, contact_method
 
 
 def threads_for(mesh: Mesh) -> AbstractContextManager:
@@ -90,39 +90,44 @@ def threads_for(mesh: Mesh) -> AbstractContextManager:
     return one_thread_of_blas() if mesh.dimension == 2 else nullcontext()
 
 
-def _with_places(calibration: Calibration, model: ForwardModel, voltages, mask, deviation: float | None) -> Calibration:
-    """The calibration with electrode positions estimated along, if that explains the reference far better.
+def _with_estimated_positions(
+    calibration: Calibration, model: ForwardModel, voltages, mask, deviation: float | None
+) -> Calibration:
+    """The calibration with estimated electrode positions, if these explain the reference far better.
 
-    Described positions that explain the reference are kept. So are they where a misfit has other causes: estimated
-    positions explain little of a deep tank under a two-dimensional model. The background is estimated with the
-    positions, from the channels in proportion to what they show: fitted to the largest voltages, those at the drives,
-    it would follow what a two-dimensional model misses there.
+    The described positions are kept if they explain the reference, and if the misfit has other causes: estimated
+    positions explain little of the misfit of a two-dimensional model of a deep tank. The background is estimated
+    together with the positions, from channels weighted by their relative noise. If it were fitted mainly to the largest
+    voltages, those at the drives, it would follow the errors of a two-dimensional model there.
     """
-    described = relative_misfit(calibration.voltages, voltages, mask)
-    if not described > _EXPLAINED or (placed := estimated_positions(model, voltages, mask, deviation)) is None:
+    described_misfit = relative_misfit(calibration.voltages, voltages, mask)
+    if (
+        not described_misfit > _MAX_EXACT_MISFIT
+        or (placement := estimated_positions(model, voltages, mask, deviation)) is None
+    ):
         return calibration
-    predicted = np.asarray(placed.model.voltages(placed.conductivity))
+    predicted = np.asarray(placement.model.voltages(placement.conductivity))
     misfit = float(np.linalg.norm((predicted - voltages)[mask]) / np.linalg.norm(voltages[mask]))
-    better = relative_misfit(predicted, voltages, mask) < _BETTER * described
-    if not (better and misfit < _WORSE * float(calibration.misfit)):
-        return replace(calibration, model_error=placed.error)
+    is_better = relative_misfit(predicted, voltages, mask) < _MAX_RELATIVE_RATIO * described_misfit
+    if not (is_better and misfit < _MAX_MISFIT_RATIO * float(calibration.misfit)):
+        return replace(calibration, model_error=placement.error)
     return replace(
         calibration,
-        model=placed.model,
-        conductivity=as_array(placed.conductivity),
+        model=placement.model,
+        conductivity=as_array(placement.conductivity),
         voltages=as_array(predicted),
         misfit=as_array(misfit),
-        contact_deviation=as_array(np.linalg.norm(placed.error.factor, axis=1)[placed.shift.size :]),
-        shift=as_array(placed.shift),
-        model_error=placed.error,
+        contact_deviation=as_array(np.linalg.norm(placement.error.factor, axis=1)[placement.shift.size :]),
+        shift=as_array(placement.shift),
+        model_error=placement.error,
     )
 
 
 def relative_misfit(predicted, measured, mask) -> float:
     """Misfit of predicted voltages (M,), each channel relative to its expected noise, as a share of the voltages."""
     noise = np.asarray(relative_noise(measured, mask))[mask]
-    off = (np.asarray(predicted) - measured)[mask]
-    return float(np.linalg.norm(off / noise) / np.linalg.norm(measured[mask] / noise))
+    errors = (np.asarray(predicted) - measured)[mask]
+    return float(np.linalg.norm(errors / noise) / np.linalg.norm(measured[mask] / noise))
 
 
 def estimated_positions(model: ForwardModel, voltages, mask, deviation: float | None) -> Placement | None:
@@ -131,7 +136,7 @@ def estimated_positions(model: ForwardModel, voltages, mask, deviation: float | 
     if not isinstance(model.electrodes, AbstractMovableElectrodes) or np.iscomplexobj(voltages):
         return None
     if deviation is None:
-        deviation = _MISPLACED * float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
+        deviation = _POSITION_DEVIATION * float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
     try:
         return place_electrodes(model, voltages, deviation=deviation, mask=mask)
     except ValueError:

@@ -123,33 +123,33 @@ def compare_on_data(
     check_real(prepared.measurement)
     mesh = prepared.mesh
     with clock("linearise"):
-        linear = Linearisation.create(
+        linearisation = Linearisation.create(
             prepared.model,
             prepared.calibration.conductivity,
             prior=prior_for(settings.prior, prepared.domain),
             noise=prepared.relative_noise,
             mask=prepared.mask,
         )
-        data = linear.whiten(prepared.difference)
-        jax.block_until_ready(linear.spectrum)
+        data = linearisation.whiten(prepared.difference)
+        jax.block_until_ready(linearisation.spectrum)
     outcomes, refused = {}, {}
     with clock("choose"):
-        figures = choose(linear.spectrum, "noise-figure", data, mesh)
+        noise_figure_choice = choose(linearisation.spectrum, "noise-figure", data, mesh)
         for name in names:
             try:
-                rule = figures if name == figures.rule else rule_for(name, prepared)
-                choice = choose(linear.spectrum, rule, data, mesh)
+                rule = noise_figure_choice if name == noise_figure_choice.rule else rule_for(name, prepared)
+                choice = choose(linearisation.spectrum, rule, data, mesh)
             except ValueError as error:
                 if len(names) == 1:
                     raise
                 refused[name] = str(error)
                 continue
-            change = linear.spectrum.image(data, choice.hyperparameter)
+            change = linearisation.spectrum.image(data, choice.hyperparameter)
             inclusions = find_inclusions(mesh, change, level=settings.level, least_peak=settings.least_peak)
             outcomes[name] = RuleOutcome(
                 choice,
                 choice.read(choice.residual) / float(jnp.linalg.norm(data)),
-                figures.read(figures.criterion, choice.hyperparameter),
+                noise_figure_choice.read(noise_figure_choice.criterion, choice.hyperparameter),
                 change,
                 tuple(inclusions),
             )

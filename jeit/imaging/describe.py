@@ -37,26 +37,26 @@ _FEWEST, _MOST, _NODES = 4, 64, {2: 700, 3: 4000}
 # Unexplained share of the empty body above which an explanation is not good enough to go on; and that above which it is
 # not although the kind of protocol is known, or any other order of the channels leaves `_ORDERED` times as much.
 _HOPELESS, _HOPELESS_EVEN_SO, _ORDERED = 0.25, 0.5, 2.0
-# Spread of the frames of the empty body above which they are none of one; channels needed for each electrode: a few fit
-# anything.
-_UNLIKE, _LEAST_CHANNELS = 0.2, 2
-# Candidates whose misfit is computed, and how much more than the best an explanation must leave to be ruled out.
-_FEW, _UNDECIDED, _SMALL = 12, 1.3, 0.01
+# Maximum spread of the frames of an empty body; minimum number of channels for each electrode.
+_MAX_SPREAD, _MIN_CHANNELS = 0.2, 2
+# Maximum number of candidates whose misfit is computed; ratio to the best candidate, and difference from it, above
+# which an explanation is ruled out.
+_MAX_COMPARED, _RIVAL_RATIO, _RIVAL_MARGIN = 12, 1.3, 0.01
 # Reciprocity error from which gains are estimated, and ratio of the error that they may leave to it.
-_ACCURATE, _GAINED = 0.03, 0.4
-# An arrangement of which nothing is stated.
-_FOUND_OUT = TableLayout()
-# Contact impedance that a description starts from, times conductivity over the size of the body.
-_CONTACT = 0.01
+_MIN_GAIN_ERROR, _MAX_GAIN_RATIO = 0.03, 0.4
+# Table layout of which nothing is stated.
+_UNKNOWN_LAYOUT = TableLayout()
+# Contact impedance of a new description, times conductivity over the size of the body.
+_RELATIVE_CONTACT = 0.01
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """What a file may be. **Fields**: `protocol`: the table `[protocol]` of a description, without the current;
-    `frames`: number of frames; `spread`: deviation of the frames of the empty body from their mean, relative;
-    `reciprocity`: error of the mean, None if no two channels are reciprocal; `measurement`: the mean, so read;
-    `wiring`: how a uniform body explains it; `gains`: of its measurement patterns, where these explain what breaks
-    reciprocity."""
+    """Possible interpretation of a file. **Fields**: `protocol`: the table `[protocol]` of a description, without the
+    current; `frames`: number of frames; `spread`: deviation of the frames of the empty body from their mean, relative;
+    `reciprocity`: error of the mean, None if no two channels are reciprocal; `measurement`: the mean frame,
+    read with this protocol; `wiring`: the wiring with which a uniform body explains it; `gains`: gains of the
+    measurement patterns, if they explain the reciprocity error."""
 
     protocol: dict[str, Any]
     frames: int
@@ -75,13 +75,13 @@ class Candidate:
 
     @property
     def reversed_signs(self) -> bool:
-        """Whether a uniform body explains the voltages with the opposite sign, and as they are otherwise."""
+        """Whether a uniform body explains the voltages with the opposite sign and an otherwise unchanged wiring."""
         return self.wiring is not None and self.wiring == Wiring(tuple(range(len(self.wiring.places))), "", True)
 
     @property
     def unexplained(self) -> float:
-        """What the explanation leaves of all frames, relative: misfit and spread, and the reciprocity error, which has
-        twice the variance of its noise."""
+        """Relative error of the explanation of all frames: misfit, spread, and the reciprocity error, which has twice
+        the variance of its noise."""
         return float(np.sqrt(self.misfit**2 + self.spread**2 + (self.reciprocity or 0) ** 2 / 2))
 
     @property
@@ -89,20 +89,20 @@ class Candidate:
         """Whether the same voltages in another order of the channels would be explained far worse: a share of
         √(1 - r²) would be left on the average, with r the square of their mean over the mean of their squares."""
         values = np.asarray(self.measurement.voltages)[np.asarray(self.measurement.mask)]
-        alike = abs(values.mean()) ** 2 / np.mean(np.abs(values) ** 2)
-        return bool(_ORDERED * self.unexplained < np.sqrt(1 - alike**2))
+        mean_ratio = abs(values.mean()) ** 2 / np.mean(np.abs(values) ** 2)
+        return bool(_ORDERED * self.unexplained < np.sqrt(1 - mean_ratio**2))
 
     @property
     def name(self) -> str:
         """The protocol in words."""
         options = {key: value for key, value in self.protocol.items() if key not in ("kind", "number")}
-        said = ", ".join(f"{key} {str(value).lower()}" for key, value in options.items())
-        return f"{self.protocol['kind']}, {self.protocol['number']} electrodes{said and ', ' + said}"
+        option_text = ", ".join(f"{key} {str(value).lower()}" for key, value in options.items())
+        return f"{self.protocol['kind']}, {self.protocol['number']} electrodes{option_text and ', ' + option_text}"
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What was found out of a file. **Fields**: `candidates`: the best first; `undecided`: others that explain it as
+    """Result of `find_description`. **Fields**: `candidates`: the best first; `undecided`: others that explain it as
     well; `text`: a commented description, TOML, of the best; `known`: whether the kind of the protocol was known."""
 
     candidates: tuple[Candidate, ...]
@@ -112,23 +112,23 @@ class Findings:
 
     @property
     def fault(self) -> str:
-        """Why the best explanation is not good enough to go on; empty if it is."""
+        """Reason why the best explanation is not good enough to be used; empty if it is."""
         best = self.candidates[0]
-        bound = _HOPELESS_EVEN_SO if self.known or best.ordered else _HOPELESS
-        if best.unexplained < bound and best.spread < _UNLIKE:
+        limit = _HOPELESS_EVEN_SO if self.known or best.ordered else _HOPELESS
+        if best.unexplained < limit and best.spread < _MAX_SPREAD:
             return ""
-        if best.spread >= _UNLIKE:
-            parts = " If its two columns are real and imaginary parts, keep one of them." if best.frames == 2 else ""
+        if best.spread >= _MAX_SPREAD:
+            advice = " If its two columns are real and imaginary parts, keep one of them." if best.frames == 2 else ""
             return (
                 f"the best explanation, {best.name}, makes frames of the empty body differ by {percent(best.spread)}: "
                 "that is not good enough to go on. Are there columns of other things than voltages, or is the "
-                f"reference one of another sensor? Name the protocol if you know it.{parts}"
+                f"reference one of another sensor? Name the protocol if you know it.{advice}"
             )
-        broken = "" if best.reciprocity is None else f" and breaks reciprocity by {percent(best.reciprocity)}"
-        wired = best.wiring.explanation if best.wiring is not None else ""
+        remark = "" if best.reciprocity is None else f" and breaks reciprocity by {percent(best.reciprocity)}"
+        hint = best.wiring.explanation if best.wiring is not None else ""
         return (
-            f"the best explanation, {best.name}, misses {percent(best.misfit)} of the empty body{broken}: that is not "
-            f"good enough to go on. {wired or 'Are body and electrodes as given? Name the protocol if you know it.'}"
+            f"the best explanation, {best.name}, misses {percent(best.misfit)} of the empty body{remark}: that is not "
+            f"good enough to go on. {hint or 'Are body and electrodes as given? Name the protocol if you know it.'}"
         )
 
 
@@ -143,7 +143,7 @@ def find_description(
     current: float = 1e-3,
     progress: Callable[[str], None] = lambda step: None,
 ) -> Findings:
-    """Find out what a file of voltages may be: compare the protocols that fit it, and describe the best.
+    """Compare the protocols that fit a file of voltages, and write a description with the best.
 
     **Arguments:**
 
@@ -152,7 +152,7 @@ def find_description(
       the contact impedance, ohm·m (on a solid ohm·m²), which is estimated roughly unless given.
     - `reference`: file of the empty body; without it, the mean of all frames stands for it.
     - `keys`: arrays of the file and of the reference, where files hold several.
-    - `known`: what is known of `[protocol]`, such as its kind or number.
+    - `known`: known entries of `[protocol]`, such as its kind or number.
     - `current`: amplitude, amperes.
     - `progress`: called with the name of each step when it begins.
 
@@ -165,41 +165,41 @@ def find_description(
     print(find_description(file, geometry, electrodes).text)
     ```
     """
-    if (own := format_with_protocol(path)) is not None:
+    if (format_name := format_with_protocol(path)) is not None:
         progress("read")
-        return _described_body(path, own, geometry, electrodes, reference or path, known or {})
+        return _described_body(path, format_name, geometry, electrodes, reference or path, known or {})
     if not known and openeit.recognises(path):
         known = openeit.protocol_table(path)
     number = (known or {}).get("number")
     if number is not None and not _FEWEST <= number <= _MOST:
         raise ValueError(f"number must be from {_FEWEST} to {_MOST} electrodes; it is {number}.")
     progress("read")
-    numbers = _Numbers.read(path, keys[0], other=keys[1] if reference is None else None)
-    rest = numbers if reference is None and keys[1] is None else _Numbers.read(reference or path, keys[1])
+    numbers = _Numbers.read(path, keys[0], excluded=keys[1] if reference is None else None)
+    base_numbers = numbers if reference is None and keys[1] is None else _Numbers.read(reference or path, keys[1])
     progress("protocols that fit")
-    found = list(_fitting(numbers, rest, geometry, electrodes, known or {}, current))
-    if not found:
+    candidates = list(_fitting(numbers, base_numbers, geometry, electrodes, known or {}, current))
+    if not candidates:
         counts = _channel_counts(known or {})
-        wanted = f" (of what is known: {listed(counts)})" if counts else ""
+        count_text = f" (of what is known: {listed(counts)})" if counts else ""
         raise ValueError(
-            f"{path.name}: no protocol of common kinds has as many channels{wanted} as there are numbers: "
+            f"{path.name}: no protocol of common kinds has as many channels{count_text} as there are numbers: "
             f"{numbers.shape}. Are there columns of other things? Otherwise write a description with your own "
             "[protocol], see docs/reference/description.md."
         )
-    found.sort(key=lambda one: np.hypot(one.spread, 0.3 if one.reciprocity is None else one.reciprocity))
+    candidates.sort(key=lambda item: np.hypot(item.spread, 0.3 if item.reciprocity is None else item.reciprocity))
     progress("uniform body")
     models: dict[int, ForwardModel] = {}
-    compared = [_with_misfit(one, models) for one in found[:_FEW]]
-    compared.sort(key=lambda one: (round(one.unexplained, 3), len(one.protocol)))
-    best = compared[0]
-    near = [one for one in compared[1:] if one.unexplained < _UNDECIDED * best.unexplained + _SMALL]
-    best = _with_gains(best, models)
-    compared[0] = best
-    contact = {"contact_impedance": _contact_impedance(best, models[best.protocol["number"]])}
-    tables = {"geometry": geometry, "electrodes": {**contact, **electrodes, "number": best.protocol["number"]}}
-    tables["protocol"] = {**best.protocol, "current": current}
-    text = _text(path, numbers.shape, numbers.data, best, near, tables)
-    return Findings((*compared, *found[_FEW:]), tuple(near), text, known="kind" in (known or {}))
+    compared = [_with_misfit(item, models) for item in candidates[:_MAX_COMPARED]]
+    compared.sort(key=lambda item: (round(item.unexplained, 3), len(item.protocol)))
+    winner = compared[0]
+    rivals = [item for item in compared[1:] if item.unexplained < _RIVAL_RATIO * winner.unexplained + _RIVAL_MARGIN]
+    winner = _with_gains(winner, models)
+    compared[0] = winner
+    contact = {"contact_impedance": _contact_impedance(winner, models[winner.protocol["number"]])}
+    tables = {"geometry": geometry, "electrodes": {**contact, **electrodes, "number": winner.protocol["number"]}}
+    tables["protocol"] = {**winner.protocol, "current": current}
+    text = _text(path, numbers.shape, numbers.data, winner, rivals, tables)
+    return Findings((*compared, *candidates[_MAX_COMPARED:]), tuple(rivals), text, known="kind" in (known or {}))
 
 
 def _described_body(
@@ -211,36 +211,37 @@ def _described_body(
     known: dict[str, Any],
 ) -> Findings:
     """Findings of a file that states its protocol: a description of the body alone."""
-    measured, rest = read(path, format), read(reference, format)
-    number = measured.protocol.num_electrodes
+    data, base = read(path, format), read(reference, format)
+    number = data.protocol.num_electrodes
     if known.get("number", number) != number or "kind" in known or "order" in known:
         raise ValueError(
             f"number: {path.name} is of format '{format}', and states its protocol, of {number} electrodes: leave out "
             "what is said of it."
         )
-    placed, written = {**electrodes, "number": number}, {**electrodes, "number": number}
+    placements, entries = {**electrodes, "number": number}, {**electrodes, "number": number}
     if format == "quadrupoles" and (places := quadrupoles.electrode_positions(path)) is not None:
         sizes = {key: value for key, value in electrodes.items() if key not in ("layout", "levels")}
-        placed, written = {**sizes, "positions": places.tolist()}, sizes
-    tables = {"geometry": geometry, "electrodes": {"contact_impedance": 1.0, **placed}}
-    body = parse_description(tables, "the description")
-    empty = replace(rest.mean_frame(), domain=body.domain, electrodes=body.electrodes)
-    empty = with_signs(replace(empty, voltages=np.real(np.asarray(empty.voltages))))
-    spread = _spread(np.real(np.asarray(rest.filled())))
+        placements, entries = {**sizes, "positions": places.tolist()}, sizes
+    tables = {"geometry": geometry, "electrodes": {"contact_impedance": 1.0, **placements}}
+    description = parse_description(tables, "the description")
+    empty_frame = replace(base.mean_frame(), domain=description.domain, electrodes=description.electrodes)
+    empty_frame = with_signs(replace(empty_frame, voltages=np.real(np.asarray(empty_frame.voltages))))
+    spread = _spread(np.real(np.asarray(base.filled())))
     models: dict[int, ForwardModel] = {}
     protocol = {"kind": format, "number": number}
-    found = Candidate(protocol, measured.num_frames, spread, reciprocity_error(empty), empty)
-    found = _with_misfit(found, models)
-    contact = {"contact_impedance": _contact_impedance(found, models[number])}
-    shape = f"{counted(measured.num_frames, 'frame')} of {measured.num_channels}"
-    text = _text(path, shape, {}, found, (), {"geometry": geometry, "electrodes": {**contact, **written}})
-    return Findings((found,), (), text, known=True)
+    candidate = Candidate(protocol, data.num_frames, spread, reciprocity_error(empty_frame), empty_frame)
+    candidate = _with_misfit(candidate, models)
+    contact = {"contact_impedance": _contact_impedance(candidate, models[number])}
+    shape = f"{counted(data.num_frames, 'frame')} of {data.num_channels}"
+    text = _text(path, shape, {}, candidate, (), {"geometry": geometry, "electrodes": {**contact, **entries}})
+    return Findings((candidate,), (), text, known=True)
 
 
 @dataclass(frozen=True)
 class _Numbers:
-    """The numbers of a file: a function that arranges them in frames of one of several numbers of channels, their shape
-    in words, numbers that a frame may have, and what a description has to say of their arrangement."""
+    """The numbers of a file. **Fields**: `frames`: function that arranges them in frames with one of several numbers of
+    channels; `shape`: their shape in words; `sizes`: possible numbers of values in a frame; `data`: entries of `[data]`
+    that describe their arrangement."""
 
     path: Path
     frames: Callable[[Sequence[int]], Frames]
@@ -249,82 +250,84 @@ class _Numbers:
     data: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def read(cls, path: Path, key: str | None, other: str | None = None) -> _Numbers:
-        """Read a file; `key`: name of its array; `other`: array that is not the one."""
+    def read(cls, path: Path, key: str | None, excluded: str | None = None) -> _Numbers:
+        """Read a file; `key`: name of its array; `excluded`: array that is not the one."""
         if path.suffix.lower() in (".mat", ".npz", ".npy"):
-            table, usual = _array(path, key, other)
-            said = " × ".join(map(str, table.shape))
+            table, axis = _array(path, key, excluded)
+            shape = " × ".join(map(str, table.shape))
             sizes = tuple(sorted({*table.shape, table.size}, reverse=True))
-            return cls(path, lambda counts: frames_in_table(table, counts, _FOUND_OUT, default_axis=usual), said, sizes)
+            return cls(
+                path, lambda counts: frames_in_table(table, counts, _UNKNOWN_LAYOUT, default_axis=axis), shape, sizes
+            )
         if key is not None:
             raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
         if openeit.recognises(path):
             table = openeit.numbers(path)[0]
-            said, sizes = f"{counted(len(table), 'line')} of {table.shape[1]}", table.shape[1:]
-            return cls(path, lambda counts: frames_in_table(table, counts, _FOUND_OUT), said, sizes)
+            shape, sizes = f"{counted(len(table), 'line')} of {table.shape[1]}", table.shape[1:]
+            return cls(path, lambda counts: frames_in_table(table, counts, _UNKNOWN_LAYOUT), shape, sizes)
         text = read_text(path)
         length, lines = int(text.lengths[0]), len(text.lengths)
-        total, said = len(text.values), f"{counted(lines, 'line')} of {length}"
-        parts = {total // k for k in range(1, 1 + total // max(length, 1)) if length < total // k}
+        total, shape = len(text.values), f"{counted(lines, 'line')} of {length}"
+        divisors = {total // k for k in range(1, 1 + total // max(length, 1)) if length < total // k}
         table = text.values.reshape(lines, length) if total == lines * length else np.zeros((0, 0))
-        sizes = tuple({length, length - 1, lines, *parts})
+        sizes = tuple({length, length - 1, lines, *divisors})
         if lines == length == len(table) and _spread(table.T) < _spread(table):  # alike are the columns
             data = {"frames_in": "columns"}
-            return cls(path, lambda counts: frames_in_table(table.T, counts, _FOUND_OUT), said, sizes, data)
-        return cls(path, lambda counts: frames_in_text(text, counts, _FOUND_OUT, path.name), said, sizes)
+            return cls(path, lambda counts: frames_in_table(table.T, counts, _UNKNOWN_LAYOUT), shape, sizes, data)
+        return cls(path, lambda counts: frames_in_text(text, counts, _UNKNOWN_LAYOUT, path.name), shape, sizes)
 
 
 def _spread(rows: np.ndarray) -> float:
     """Deviation of rows from their mean, relative."""
-    known = np.where(np.isfinite(rows), rows, 0)
-    size = float(np.linalg.norm(known))
-    return float(np.linalg.norm(known - known.mean(axis=0))) / size if size else 0.0
+    values = np.where(np.isfinite(rows), rows, 0)
+    norm = float(np.linalg.norm(values))
+    return float(np.linalg.norm(values - values.mean(axis=0))) / norm if norm else 0.0
 
 
-def _array(path: Path, key: str | None, other: str | None) -> tuple[np.ndarray, str]:
+def _array(path: Path, key: str | None, excluded: str | None) -> tuple[np.ndarray, str]:
     """The array of frames in a file, and where its frames usually are."""
     if path.suffix.lower() == ".npy":
         return np.atleast_2d(npy_array(path)), "rows"
     if path.suffix.lower() == ".mat":
-        held, usual = matlab.shapes(path), "columns"
+        sizes, axis = matlab.shapes(path), "columns"
     else:
         arrays = npz_arrays(path, *([key] if key else ["voltages"]))
-        held, usual = {one: np.shape(arrays[one]) if one in arrays else () for one in np.ravel(arrays[""])}, "rows"
+        sizes, axis = {item: np.shape(arrays[item]) if item in arrays else () for item in np.ravel(arrays[""])}, "rows"
     name = key
     if name is None:
-        long = [one for one, shape in held.items() if one != other and int(np.prod(shape)) > 3]
-        if len(long) != 1:
-            shown = listed([f"{one} ({' × '.join(map(str, held[one]))})" for one in long]) if long else "none"
-            raise ValueError(f"{path.name}: arrays of numbers are {shown}. Name that of the frames by key=.")
-        name = long[0]
-    if name not in held:
-        raise ValueError(f"key: {path.name} has no array {name!r}{did_you_mean(name, held)}; it has {listed(held)}.")
+        tables = [item for item, shape in sizes.items() if item != excluded and int(np.prod(shape)) > 3]
+        if len(tables) != 1:
+            names = listed([f"{item} ({' × '.join(map(str, sizes[item]))})" for item in tables]) if tables else "none"
+            raise ValueError(f"{path.name}: arrays of numbers are {names}. Name that of the frames by key=.")
+        name = tables[0]
+    if name not in sizes:
+        raise ValueError(f"key: {path.name} has no array {name!r}{did_you_mean(name, sizes)}; it has {listed(sizes)}.")
     if path.suffix.lower() == ".npz":
-        return np.atleast_2d(npz_arrays(path, name)[name]), usual
+        return np.atleast_2d(npz_arrays(path, name)[name]), axis
     table = matlab.numbers(matlab.load(path, name), name, path)
-    return table.reshape(-1, 1) if 1 in table.shape else table, usual
+    return table.reshape(-1, 1) if 1 in table.shape else table, axis
 
 
 def _protocols(number: int) -> Iterator[dict[str, Any]]:
     """Tables of the protocols of common kinds of so many electrodes."""
-    plain = {"driven_electrodes": (False, True), "order": ("rotating", "fixed")}
+    common_options = {"driven_electrodes": (False, True), "order": ("rotating", "fixed")}
     for kind, options in (
-        ("adjacent", {**plain, "reciprocal": ("all", "half")}),
+        ("adjacent", {**common_options, "reciprocal": ("all", "half")}),
         ("two_terminal", {}),
-        ("opposite", {**plain, "drives": ("distinct", "all")}),
-        *(("skip", {"skipped": (skipped,), **plain}) for skipped in range(1, number // 2)),
+        ("opposite", {**common_options, "drives": ("distinct", "all")}),
+        *(("skip", {"skipped": (skipped,), **common_options}) for skipped in range(1, number // 2)),
     ):
         for values in product(*options.values()):
-            usual = {"driven_electrodes": False, "reciprocal": "all", "drives": "distinct"}
-            given = {key: value for key, value in zip(options, values, strict=True) if usual.get(key) != value}
-            yield {"kind": kind, "number": number, **given}
+            defaults = {"driven_electrodes": False, "reciprocal": "all", "drives": "distinct"}
+            entries = {key: value for key, value in zip(options, values, strict=True) if defaults.get(key) != value}
+            yield {"kind": kind, "number": number, **entries}
 
 
 def _fitting(
-    numbers: _Numbers, rest: _Numbers, geometry: dict, electrodes: dict, known: dict, current: float
+    numbers: _Numbers, base_numbers: _Numbers, geometry: dict, electrodes: dict, known: dict, current: float
 ) -> Iterator[Candidate]:
     """Candidates whose frames fit both files, without those that are the same in another order."""
-    counts, seen = set(numbers.sizes), set()
+    counts, found_protocols = set(numbers.sizes), set()
     for number in [known["number"]] if "number" in known else range(_FEWEST, _MOST + 1):
         if not any(number * (number - 4) / 4 <= count <= number**2 for count in counts):
             continue
@@ -334,29 +337,29 @@ def _fitting(
             protocol = _protocol({**table, "current": current}, numbers.path)
             if protocol is None or protocol.num_measurements not in counts:
                 continue
-            if protocol.num_measurements < _LEAST_CHANNELS * number:
+            if protocol.num_measurements < _MIN_CHANNELS * number:
                 continue
-            same = number, protocol.drive_index.tobytes(), protocol.channel_measurement.tobytes()
-            if same in seen:
+            protocol_key = number, protocol.drive_index.tobytes(), protocol.channel_measurement.tobytes()
+            if protocol_key in found_protocols:
                 continue
-            seen.add(same)
-            described = _described(geometry, electrodes, table, current)
-            read = [_measured(one, described, protocol) for one in (numbers, rest)]
-            if read[0] is not None and read[1] is not None:
-                empty = read[1].mean_frame()
-                spread = _spread(np.asarray(read[1].filled()))
-                yield Candidate(table, read[0].num_frames, spread, reciprocity_error(empty), empty)
+            found_protocols.add(protocol_key)
+            description = _describe_body(geometry, electrodes, table, current)
+            measurements = [_measurement_of(values, description, protocol) for values in (numbers, base_numbers)]
+            if measurements[0] is not None and measurements[1] is not None:
+                empty_frame = measurements[1].mean_frame()
+                spread = _spread(np.asarray(measurements[1].filled()))
+                yield Candidate(table, measurements[0].num_frames, spread, reciprocity_error(empty_frame), empty_frame)
 
 
 def _channel_counts(known: dict) -> list[int]:
     """Numbers of channels of the protocols that agree with what is known, if the number of electrodes is."""
     tables = _protocols(known["number"]) if "number" in known else ()
-    fitting = [one for one in tables if all(one.get(key, value) == value for key, value in known.items())]
-    made = [_protocol({**one, "current": 1.0}, Path("a")) for one in fitting]
-    return sorted({one.num_measurements for one in made if one is not None})
+    fitting = [table for table in tables if all(table.get(key, value) == value for key, value in known.items())]
+    protocols = [_protocol({**table, "current": 1.0}, Path("a")) for table in fitting]
+    return sorted({protocol.num_measurements for protocol in protocols if protocol is not None})
 
 
-def _described(geometry: dict, electrodes: dict, protocol: dict, current: float) -> Description:
+def _describe_body(geometry: dict, electrodes: dict, protocol: dict, current: float) -> Description:
     places = {"contact_impedance": 1.0, **electrodes, "number": protocol["number"]}
     tables = {"geometry": geometry, "electrodes": places, "protocol": {**protocol, "current": current}}
     return parse_description(tables, "the description")
@@ -370,53 +373,57 @@ def _protocol(table: dict, path: Path) -> Protocol | None:
         return None
 
 
-def _measured(numbers: _Numbers, described: Description, protocol: Protocol) -> Measurement | None:
-    """The measurement of numbers that are of this protocol; None if they do not fit it."""
+def _measurement_of(numbers: _Numbers, description: Description, protocol: Protocol) -> Measurement | None:
+    """The measurement in which the numbers are read with this protocol; None if they do not fit it."""
     try:
-        found = numbers.frames([protocol.num_measurements])
-        if found.table.shape[1] != protocol.num_measurements:
+        frames = numbers.frames([protocol.num_measurements])
+        if frames.table.shape[1] != protocol.num_measurements:
             return None
-        return measurement_in(numbers.path, described, found, [(protocol, "")])
+        return measurement_in(numbers.path, description, frames, [(protocol, "")])
     except ValueError:
         return None
 
 
-def _with_misfit(one: Candidate, models: dict[int, ForwardModel]) -> Candidate:
+def _with_misfit(candidate: Candidate, models: dict[int, ForwardModel]) -> Candidate:
     """The candidate with the wiring that explains the empty body best, on a mesh that candidates of as many electrodes
     share."""
-    number, empty = one.protocol["number"], one.measurement
-    assert empty.domain is not None
-    assert empty.electrodes is not None
+    number, empty_frame = candidate.protocol["number"], candidate.measurement
+    assert empty_frame.domain is not None
+    assert empty_frame.electrodes is not None
     if number not in models:
-        solid = isinstance(empty.domain, Solid)
-        mesh = body_mesh(empty.domain, empty.electrodes, _NODES[3 if solid else 2])
-        models[number] = ForwardModel(mesh, empty.electrodes, empty.protocol)
-    return replace(one, wiring=find_wiring(models[number].with_protocol(empty.protocol), empty))
+        is_solid = isinstance(empty_frame.domain, Solid)
+        mesh = body_mesh(empty_frame.domain, empty_frame.electrodes, _NODES[3 if is_solid else 2])
+        models[number] = ForwardModel(mesh, empty_frame.electrodes, empty_frame.protocol)
+    return replace(candidate, wiring=find_wiring(models[number].with_protocol(empty_frame.protocol), empty_frame))
 
 
-def _with_gains(one: Candidate, models: dict[int, ForwardModel]) -> Candidate:
-    """The candidate with gains of its measurements, if they explain most of what breaks reciprocity."""
-    if one.reciprocity is None or one.reciprocity < _ACCURATE:
-        return one
-    gains, left = channel_gains(one.measurement)
-    if gains is None or left is None or left > _GAINED * one.reciprocity:
-        return one
-    values = np.asarray(one.measurement.voltages) / gains[np.asarray(one.measurement.protocol.measurement_index)]
-    corrected = replace(one, measurement=replace(one.measurement, voltages=values), reciprocity=left, gains=gains)
+def _with_gains(candidate: Candidate, models: dict[int, ForwardModel]) -> Candidate:
+    """The candidate with gains of its measurements, if they explain most of the reciprocity error."""
+    if candidate.reciprocity is None or candidate.reciprocity < _MIN_GAIN_ERROR:
+        return candidate
+    gains, error = channel_gains(candidate.measurement)
+    if gains is None or error is None or error > _MAX_GAIN_RATIO * candidate.reciprocity:
+        return candidate
+    values = (
+        np.asarray(candidate.measurement.voltages) / gains[np.asarray(candidate.measurement.protocol.measurement_index)]
+    )
+    corrected = replace(
+        candidate, measurement=replace(candidate.measurement, voltages=values), reciprocity=error, gains=gains
+    )
     return _with_misfit(corrected, models)
 
 
-def _contact_impedance(best: Candidate, model: ForwardModel) -> float:
-    """A contact impedance to begin with: a hundredth of the size of the body over the conductivity that explains the
+def _contact_impedance(winner: Candidate, model: ForwardModel) -> float:
+    """Initial contact impedance: a hundredth of the size of the body, divided by the conductivity that explains the
     empty body."""
     size = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
-    there = model.with_protocol(best.measurement.protocol)
-    each = np.full(best.protocol["number"], _CONTACT * size)
-    there = there.with_electrodes(there.electrodes.with_contact_impedance(each))
-    used = np.asarray(best.measurement.mask)[0]
-    expected, measured = np.asarray(there.voltages(1.0))[used], np.asarray(best.measurement.voltages)[0][used]
+    winner_model = model.with_protocol(winner.measurement.protocol)
+    contacts = np.full(winner.protocol["number"], _RELATIVE_CONTACT * size)
+    winner_model = winner_model.with_electrodes(winner_model.electrodes.with_contact_impedance(contacts))
+    used = np.asarray(winner.measurement.mask)[0]
+    expected, measured = np.asarray(winner_model.voltages(1.0))[used], np.asarray(winner.measurement.voltages)[0][used]
     resistivity = abs(np.vdot(expected, measured)) / np.vdot(expected, expected).real
-    return float(f"{_CONTACT * size * resistivity:.2g}")
+    return float(f"{_RELATIVE_CONTACT * size * resistivity:.2g}")
 
 
 def _text(
@@ -424,35 +431,35 @@ def _text(
     shape: str,
     data: dict[str, Any],
     best: Candidate,
-    near: Sequence[Candidate],
+    rivals: Sequence[Candidate],
     tables: dict[str, dict[str, Any]],
 ) -> str:
-    """The description in TOML, with the evidence as comments. `shape` of the numbers in words; `data`: what `[data]`
-    has to say of their arrangement."""
+    """The description in TOML, with the evidence as comments. `shape`: shape of the numbers in words; `data`:
+    entries of `[data]` that describe their arrangement."""
     notes = [note for note in best.measurement.notes if not note.startswith("[protocol]")]
     reversed_signs = best.reversed_signs or any("polarity" in note for note in notes)
-    broken = "no two channels are reciprocal" if best.reciprocity is None else f"broken by {percent(best.reciprocity)}"
-    explained = best.wiring.explanation if best.wiring is not None and not best.reversed_signs else ""
+    remark = "no two channels are reciprocal" if best.reciprocity is None else f"broken by {percent(best.reciprocity)}"
+    explanation = best.wiring.explanation if best.wiring is not None and not best.reversed_signs else ""
     lines = [
         f"Written by `jeit describe {path.name}` ({shape} numbers). Lengths in metres, currents in amperes.",
-        f"{best.name}: a uniform body misses {percent(best.misfit)} of the empty one; reciprocity: {broken}.",
-        *(f"It may as well be {one.name}: {percent(one.misfit)}." for one in near),
+        f"{best.name}: a uniform body misses {percent(best.misfit)} of the empty one; reciprocity: {remark}.",
+        *(f"It may as well be {rival.name}: {percent(rival.misfit)}." for rival in rivals),
         *notes,
-        *([explained] if explained else []),
+        *([explanation] if explanation else []),
     ]
     data = {**data, **({"polarity": "reversed"} if reversed_signs else {})}
     if best.gains is not None:
         lines.append(f"Gains of the measurements differ by {percent(float(np.std(best.gains)))}, found by reciprocity.")
-        data["gains"] = [round(float(one), 4) for one in best.gains]
+        data["gains"] = [round(float(gain), 4) for gain in best.gains]
     places = "Electrodes are where the file places them."
     if "layout" in tables["electrodes"]:
         places = "No voltage says where electrode 1 is, nor which way round: taken at 12 o'clock, counter-clockwise."
     scale = "The current, and the unit of voltages, scale conductivities alone."
-    parts = [
+    sections = [
         [f"# {line}" for line in lines],
         ["[geometry]", *assignments(tables["geometry"])],
         [f"# {places}", "[electrodes]", *assignments(tables["electrodes"])],
         *([[f"# {scale}", "[protocol]", *assignments(tables["protocol"])]] if "protocol" in tables else []),
         *([["[data]", *assignments(data)]] if data else []),
     ]
-    return "\n\n".join("\n".join(part) for part in parts) + "\n"
+    return "\n\n".join("\n".join(section) for section in sections) + "\n"

@@ -15,14 +15,14 @@ from jaxtyping import Array, Float, Inexact, UInt8
 from jeit.arguments import brief, page, percent, picture
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
-from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster, SolidForm
 from jeit.image.inclusions import inclusion_regions
 from jeit.image.merit import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically
 from jeit.imaging.calibration import Clock, threads_for
-from jeit.imaging.method import AUTO, METHODS, Asked, ImagingSettings, as_settings
+from jeit.imaging.method import AUTO, METHODS, ImagingSettings, MethodOptions, as_settings
 from jeit.imaging.preparation import prepare_difference
 from jeit.imaging.wiring import Wiring
 from jeit.inverse.calibration import Calibration
@@ -30,18 +30,21 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import KINDS, Ellipsoid, ShapeReconstruction, Star
 from jeit.inverse.uncertainty import image_noise
-from jeit.mesh import Mesh
+from jeit.mesh import Domain, Mesh
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array
 
 _MIDDLE = 0.5
+# Minimum width of electrodes relative to their distance that raises no doubt; misfit of the reference above which it
+# may have been exchanged with the frame, and ratio of the misfits below which that is likely.
+_MIN_RELATIVE_WIDTH, _MIN_SUSPICIOUS_MISFIT, _MAX_EXCHANGED_MISFIT = 0.005, 0.1, 0.5
 # Maximum misfit of an image's voltages, in standard deviations, that raises no doubt.
 _MISFIT = 3.0
 # Minimum share of usable voltages that raises no doubt, and ranges of plausible conductivities: of solids in S/m, from
 # tap water and fat to brine, with a margin on both sides; of sheets in S, from a megohm a square to metal.
-_FEW_CHANNELS, _CONDUCTIVITIES = 0.5, {2: (1e-6, 1e5), 3: (1e-3, 30.0)}
-# Volts that no amplifier of such an instrument reads; and units that are smaller than a volt, with their number in it.
-_MOST_VOLTS, _SMALLER = 60.0, (("mV", 1e3), ("uV", 1e6))
+_MIN_USABLE_SHARE, _CONDUCTIVITIES = 0.5, {2: (1e-6, 1e5), 3: (1e-3, 30.0)}
+# Voltage that no amplifier of such an instrument reads; and units smaller than a volt, with their number in a volt.
+_MAX_VOLTS, _SMALLER_UNITS = 60.0, (("mV", 1e3), ("uV", 1e6))
 
 
 @dataclass(frozen=True)
@@ -125,9 +128,11 @@ class ImagedDifference:
         """68 % interval of the change in each inclusion, S/m (2-D: S). Empty without fitted bodies, and where the data
         leave an end open."""
         background = float(np.real(self.calibration.conductivity))
-        known = [one.contrast_interval or (None, None) for one in self.inclusions]
-        ranges = [(background * low, background * high) for low, high in known if low is not None and high is not None]
-        return tuple(ranges) if len(ranges) == len(known) else ()
+        intervals = [inclusion.contrast_interval or (None, None) for inclusion in self.inclusions]
+        ranges = [
+            (background * low, background * high) for low, high in intervals if low is not None and high is not None
+        ]
+        return tuple(ranges) if len(ranges) == len(intervals) else ()
 
     @property
     def mesh(self) -> Mesh:
@@ -143,37 +148,39 @@ class ImagedDifference:
     def chosen_by(self) -> str:
         """Source of the hyperparameter: the name of a rule, "default" for the method's default number, "given" for any
         other number, "none" for methods without a hyperparameter."""
-        rule, asked = self.reconstruction.rule, self.settings.hyperparameter
-        own = asked is None or asked == METHODS[self.settings.method].hyperparameter
-        return "default" if rule == "given" and own else rule
+        rule, requested_hyperparameter = self.reconstruction.rule, self.settings.hyperparameter
+        is_default = (
+            requested_hyperparameter is None or requested_hyperparameter == METHODS[self.settings.method].hyperparameter
+        )
+        return "default" if rule == "given" and is_default else rule
 
     @property
     def doubts(self) -> tuple[str, ...]:
         """Reasons to doubt the image, in sentences: too few channels, an implausible background, an iteration that did
         not converge, voltages not explained by the image, or bodies whose kind the data do not determine."""
-        found, said = self.reconstruction, _doubts_of_data(self)
-        if isinstance(found, LinearReconstruction):
-            return tuple(said)
-        if isinstance(found, Reconstruction) and found.status != Status.CONVERGED:
-            said.append(
-                f"the iteration did not converge ({found.status}): neither peaks nor places are to be trusted. "
-                "Take the default hyperparameter, or a larger one."
+        reconstruction, doubts = self.reconstruction, _doubts_of_data(self)
+        if isinstance(reconstruction, LinearReconstruction):
+            return tuple(doubts)
+        if isinstance(reconstruction, Reconstruction) and reconstruction.status != Status.CONVERGED:
+            doubts.append(
+                f"the iteration did not converge ({reconstruction.status}): neither peaks nor places are to be "
+                "trusted. Take the default hyperparameter, or a larger one."
             )
-        if (misfit := float(found.misfit)) > _MISFIT:
-            said.append(
+        if (misfit := float(reconstruction.misfit)) > _MISFIT:
+            doubts.append(
                 f"its voltages miss the data by {misfit:.2g} standard deviations: bodies may be missing, or shown "
                 "where none are."
             )
-        for one in found.alternatives if isinstance(found, ShapeReconstruction) else ():
-            if one is not None:
-                x, y = 1e3 * one.centroid[:2]
-                kind = "a column through the whole height" if one.column else "no column but an ellipsoid"
-                said.append(
+        for body in reconstruction.alternatives if isinstance(reconstruction, ShapeReconstruction) else ():
+            if body is not None:
+                x, y = 1e3 * body.centroid[:2]
+                kind = "a column through the whole height" if body.column else "no column but an ellipsoid"
+                doubts.append(
                     f"the body at x {x:.0f} mm, y {y:.0f} mm may as well be {kind}, of "
-                    f"{np.exp(one.sign * one.contrast):.2g} times the background and {1e6 * one.volume:.3g} cm³: these "
-                    "electrodes do not determine which. If you know, bodies (--bodies) says so."
+                    f"{np.exp(body.sign * body.contrast):.2g} times the background and {1e6 * body.volume:.3g} cm³: "
+                    "these electrodes do not determine which. If you know, bodies (--bodies) says so."
                 )
-        return tuple(said)
+        return tuple(doubts)
 
     @property
     def level(self) -> float:
@@ -200,52 +207,94 @@ class ImagedDifference:
         return as_array(np.log1p(np.asarray(self.change) / float(self.calibration.conductivity)))
 
 
-def _imaged_on(found, calibration: Calibration) -> ForwardModel:
+def _imaged_on(reconstruction, calibration: Calibration) -> ForwardModel:
     """Forward model on the mesh of the result."""
-    finer = found.finer if isinstance(found, ShapeReconstruction) else None
-    return calibration.model if finer is None else finer.model
+    finer_image = reconstruction.finer if isinstance(reconstruction, ShapeReconstruction) else None
+    return calibration.model if finer_image is None else finer_image.model
 
 
-def _doubts_of_data(found: ImagedDifference) -> list[str]:
+def _doubts_of_data(imaged: ImagedDifference) -> list[str]:
     """Reasons to doubt the data: too few usable voltages, or a level of the voltages that is implausible."""
-    used, said = np.asarray(found.measurement.mask)[0], []
-    if (left := np.mean(used)) < _FEW_CHANNELS:
-        said.append(
-            f"only {used.sum()} of {used.size} voltages are left ({percent(float(left))}): they determine little of "
-            "what is where."
+    used, doubts = np.asarray(imaged.measurement.mask)[0], []
+    if (usable_share := np.mean(used)) < _MIN_USABLE_SHARE:
+        doubts.append(
+            f"only {used.sum()} of {used.size} voltages are left ({percent(float(usable_share))}): they determine "
+            "little of what is where."
         )
-    if doubt := _doubt_of_units(found):
-        said.append(doubt)
-    return said
+    return [*doubts, *filter(None, (_doubt_of_units(imaged), _doubt_of_lengths(imaged), _doubt_of_order(imaged)))]
 
 
-def _doubt_of_units(found: ImagedDifference) -> str:
+def _doubt_of_lengths(imaged: ImagedDifference) -> str:
+    """Whether electrodes on the edge of a sheet are so narrow that lengths may be in another unit; empty if not."""
+    electrodes, domain = imaged.measurement.electrodes, imaged.measurement.domain
+    if not isinstance(electrodes, BoundaryElectrodes) or not isinstance(domain, Domain):
+        return ""
+    width, pitch = float(np.max(electrodes.width)), domain.perimeter / electrodes.num_electrodes
+    if width > _MIN_RELATIVE_WIDTH * pitch:
+        return ""
+    x_min, x_max, _, _ = domain.extent
+    return (
+        f"the electrodes are {1e3 * width:.3g} mm wide and {1e3 * pitch:.3g} mm apart, on a body {x_max - x_min:.3g} m "
+        "wide: are all lengths in metres?"
+    )
+
+
+def _doubt_of_order(imaged: ImagedDifference) -> str:
+    """Whether the frame fits an undisturbed body much better than the reference does; empty if not."""
+    misfit = float(imaged.calibration.misfit)
+    if not misfit > _MIN_SUSPICIOUS_MISFIT:
+        return ""
+    usable = np.asarray(imaged.measurement.mask)[0] & np.asarray(imaged.reference.mask)[0]
+    frame = np.asarray(imaged.measurement.voltages)[0][usable]
+    predicted = np.asarray(imaged.calibration.voltages)[usable]
+    scale = np.vdot(predicted, frame) / np.vdot(predicted, predicted)
+    frame_misfit = float(np.linalg.norm(frame - scale * predicted) / np.linalg.norm(frame))
+    if frame_misfit > _MAX_EXCHANGED_MISFIT * misfit:
+        return ""
+    return (
+        f"the frame fits an undisturbed body better ({percent(frame_misfit)} misfit) than the reference does "
+        f"({percent(misfit)}): are the two exchanged?"
+    )
+
+
+def _doubt_of_units(imaged: ImagedDifference) -> str:
     """What is wrong with the level of the voltages, and the unit that is likely; empty if nothing is, or if the notes
     say that the scale is not known."""
-    low, high = _CONDUCTIVITIES[found.mesh.dimension]
-    background = abs(complex(found.calibration.conductivity))
-    frames = [np.abs(np.asarray(one.voltages)[np.asarray(one.mask)]) for one in (found.measurement, found.reference)]
-    largest = max(float(one.max(initial=0)) for one in frames)
-    stated = any("trust relative changes" in note for note in (*found.measurement.notes, *found.reference.notes))
-    if stated or (low < background < high and largest < _MOST_VOLTS):
+    lower, upper = _CONDUCTIVITIES[imaged.mesh.dimension]
+    background = abs(complex(imaged.calibration.conductivity))
+    frames = [
+        np.abs(np.asarray(frame.voltages)[np.asarray(frame.mask)]) for frame in (imaged.measurement, imaged.reference)
+    ]
+    max_voltage = max(float(voltages.max(initial=0)) for voltages in frames)
+    is_scale_unknown = any(
+        "trust relative changes" in note for note in (*imaged.measurement.notes, *imaged.reference.notes)
+    )
+    if is_scale_unknown or (lower < background < upper and max_voltage < _MAX_VOLTS):
         return ""
-    solid = found.mesh.dimension == 3
-    unit, of = ("S/m", "no water's, gel's or tissue's") if solid else ("S", "no sheet's or shallow tank's")
-    if not low < background < high:
-        said = f"a background of {background:.3g} {unit} is {of}, which conduct {low:g} to {high:g} {unit}"
+    is_solid = imaged.mesh.dimension == 3
+    unit, comparison = ("S/m", "no water's, gel's or tissue's") if is_solid else ("S", "no sheet's or shallow tank's")
+    if not lower < background < upper:
+        fault = f"a background of {background:.3g} {unit} is {comparison}, which conduct {lower:g} to {upper:g} {unit}"
     else:
-        said = f"voltages of up to {largest:.3g} V are beyond what instruments read"
-    if background < high:
-        likely = [f'"{name}" (a background of {background * factor:.3g} {unit})' for name, factor in _SMALLER
-                  if low < background * factor < high and largest < _MOST_VOLTS * factor]  # fmt: skip
+        fault = f"voltages of up to {max_voltage:.3g} V are beyond what instruments read"
+    if background < upper:
+        likely_units = [
+            f'"{name}" (a background of {background * factor:.3g} {unit})'
+            for name, factor in _SMALLER_UNITS
+            if lower < background * factor < upper and max_voltage < _MAX_VOLTS * factor
+        ]
         key = "[data] unit"
     else:
-        likely = [f'"{name}"' for name, factor in (("mA", 1e3), ("uA", 1e6)) if low < background / factor < high]
+        likely_units = [
+            f'"{name}"' for name, factor in (("mA", 1e3), ("uA", 1e6)) if lower < background / factor < upper
+        ]
         key = "[protocol] current_unit"
-    likely = [f"{key} = {' or '.join(likely)}?"] if likely else []
-    if all((one == np.round(one)).all() for one in frames) and largest > 1:
-        likely.append("They are whole numbers, as the counts of a converter are: those show relative changes, not S/m.")
-    return f"{said}: {' '.join(likely) or 'are currents in amperes, voltages in volts, lengths in metres?'}"
+    likely_units = [f"{key} = {' or '.join(likely_units)}?"] if likely_units else []
+    if all((voltages == np.round(voltages)).all() for voltages in frames) and max_voltage > 1:
+        likely_units.append(
+            "They are whole numbers, as the counts of a converter are: those show relative changes, not S/m."
+        )
+    return f"{fault}: {' '.join(likely_units) or 'are currents in amperes, voltages in volts, lengths in metres?'}"
 
 
 def image_difference(
@@ -292,16 +341,16 @@ def image_difference(
     if prepared.mesh.dimension == 2 and settings.bodies != KINDS[0]:
         raise ValueError("bodies: ellipsoids and columns are of solids, and this is a sheet; leave it out.")
     with clock("image"), threads_for(prepared.mesh):
-        why, shapes = "", None
-        asked = Asked(settings.prior, settings.hyperparameter, settings.bodies, progress)
+        reason, shapes = "", None
+        options = MethodOptions(settings.prior, settings.hyperparameter, settings.bodies, progress)
         if settings.method == AUTO:
-            chosen, why, (reconstruction, change), shapes = image_automatically(prepared, asked, settings.segment)
-            settings = replace(settings, method=chosen)
+            method, reason, (reconstruction, change), shapes = image_automatically(prepared, options, settings.segment)
+            settings = replace(settings, method=method)
         else:
-            reconstruction, change = METHODS[settings.method].image(prepared, asked)
+            reconstruction, change = METHODS[settings.method].image(prepared, options)
             shapes = reconstruction if isinstance(reconstruction, ShapeReconstruction) else None
-        largest = float(np.abs(change).max())
-        if not largest > 1e-9 * abs(complex(calibration.conductivity)):
+        max_change = float(np.abs(change).max())
+        if not max_change > 1e-9 * abs(complex(calibration.conductivity)):
             raise ValueError(
                 f"'{prepared.measurement.name}': the image is empty, no change reaches a billionth of the background. "
                 f"The hyperparameter {float(reconstruction.hyperparameter):.3g} leaves nothing of the data: give "
@@ -309,7 +358,7 @@ def image_difference(
             )
     with clock("raster and inclusions"):
         grid = Raster.create(_imaged_on(reconstruction, calibration).mesh, shape=settings.raster_shape)
-        found = ImagedDifference(
+        imaged = ImagedDifference(
             measurement=prepared.measurement,
             reference=prepared.reference,
             quality=prepared.quality,
@@ -321,51 +370,51 @@ def image_difference(
             extent=grid.extent,
             inclusions=(),
             wiring=prepared.wiring,
-            why=why,
+            why=reason,
             unlike_electrodes=prepared.unlike_electrodes,
             shapes=shapes,
             timings=clock.seconds,
             frame=prepared.frame,
             num_frames=prepared.num_frames,
         )
-        inclusions, labels = _inclusions(found, grid)
-    return replace(found, inclusions=tuple(inclusions), labels=labels)
+        inclusions, labels = _inclusions(imaged, grid)
+    return replace(imaged, inclusions=tuple(inclusions), labels=labels)
 
 
 def _inclusions(
-    found: ImagedDifference, grid: Raster
+    imaged: ImagedDifference, grid: Raster
 ) -> tuple[list[Inclusion], UInt8[np.ndarray, "rows columns"] | None]:
     """Inclusions of an image, with the change of conductivity as their peak; and labels of the pixels, if requested."""
-    settings, reconstruction, background = found.settings, found.reconstruction, found.calibration.conductivity
-    if found.shapes is not None:
-        bodies = found.shapes.bodies
-        labels = _labels(found.mesh, bodies, grid) if settings.segment else None
-        return [_of_body(one, float(background)) for one in bodies], labels
-    departure, noise = as_array(np.real(found.departure)), None
+    settings, reconstruction, background = imaged.settings, imaged.reconstruction, imaged.calibration.conductivity
+    if imaged.shapes is not None:
+        bodies = imaged.shapes.bodies
+        labels = _labels(imaged.mesh, bodies, grid) if settings.segment else None
+        return [_body_inclusion(body, float(background)) for body in bodies], labels
+    departure, noise = as_array(np.real(imaged.departure)), None
     if isinstance(reconstruction, Reconstruction) and reconstruction.inversion.penalty.is_standard_normal:
         noise = as_array(image_noise(reconstruction))
-    regions = inclusion_regions(found.mesh, departure, level=found.level, least_peak=settings.least_peak, noise=noise)
-    inclusions = [_with_change(one, background) if found.iterative else one for one, _ in regions]
-    return inclusions, _covered(regions, grid) if settings.segment else None
+    regions = inclusion_regions(imaged.mesh, departure, level=imaged.level, least_peak=settings.least_peak, noise=noise)
+    inclusions = [_with_change(inclusion, background) if imaged.iterative else inclusion for inclusion, _ in regions]
+    return inclusions, _region_labels(regions, grid) if settings.segment else None
 
 
-def _of_body(body: Star | Ellipsoid, background: float) -> Inclusion:
+def _body_inclusion(body: Star | Ellipsoid, background: float) -> Inclusion:
     """The inclusion that a fitted body is, with its intervals if they were estimated."""
-    place = tuple(body.centroid.tolist())
-    if (known := body.quantities) is not None:
+    centroid = tuple(body.centroid.tolist())
+    if (quantities := body.quantities) is not None:
         return Inclusion(
             body.sign,
-            place,
-            known.measure,
-            background * known.change,
+            centroid,
+            quantities.measure,
+            background * quantities.change,
             form=_form(body),
-            contrast_interval=known.change_interval,
-            area_interval=known.measure_interval,
-            strength=known.strength,
-            strength_interval=known.strength_interval,
+            contrast_interval=quantities.change_interval,
+            area_interval=quantities.measure_interval,
+            strength=quantities.strength,
+            strength_interval=quantities.strength_interval,
         )
-    one = Inclusion(body.sign, place, body.measure, body.sign * body.contrast, form=_form(body))
-    return _with_change(one, background)
+    inclusion = Inclusion(body.sign, centroid, body.measure, body.sign * body.contrast, form=_form(body))
+    return _with_change(inclusion, background)
 
 
 def _form(body: Star | Ellipsoid) -> SolidForm | None:
@@ -376,12 +425,12 @@ def _form(body: Star | Ellipsoid) -> SolidForm | None:
     return SolidForm(tuple(body.centre.tolist()), tuple(map(tuple, axes)), body.column)
 
 
-def _covered(regions, grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
+def _region_labels(regions, grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
     """Label the pixels in the regions of resistive and conductive inclusions."""
     cell = np.asarray(grid.cell)
     labels = np.zeros(cell.shape, np.uint8)
-    for one, region in regions:
-        labels[(cell >= 0) & region[cell]] = CONDUCTIVE if one.sign > 0 else RESISTIVE
+    for inclusion, region in regions:
+        labels[(cell >= 0) & region[cell]] = CONDUCTIVE if inclusion.sign > 0 else RESISTIVE
     return labels
 
 
@@ -393,8 +442,8 @@ def _labels(mesh: Mesh, bodies: Sequence[Star | Ellipsoid], grid: Raster) -> UIn
         z = np.asarray(mesh.points)[:, 2]
         centres = np.concatenate([centres, np.full((*inside.shape, 1), (z.min() + z.max()) / 2)], axis=-1)
     labels = np.zeros(inside.shape, np.uint8)
-    for one in reversed(bodies):
-        labels[inside & one.holds(centres)] = CONDUCTIVE if one.sign > 0 else RESISTIVE
+    for body in reversed(bodies):
+        labels[inside & body.holds(centres)] = CONDUCTIVE if body.sign > 0 else RESISTIVE
     return labels
 
 
@@ -402,8 +451,8 @@ def _sampled(grid: Raster, change) -> Inexact[Array, "rows columns"]:
     """Sample an image on a raster, real and imaginary part separately for complex images."""
     if not np.iscomplexobj(change):
         return grid.sample(change)
-    parts = [np.asarray(grid.sample(as_array(part))) for part in (np.real(change), np.imag(change))]
-    return as_array(parts[0] + 1j * parts[1])
+    rasters = [np.asarray(grid.sample(as_array(values))) for values in (np.real(change), np.imag(change))]
+    return as_array(rasters[0] + 1j * rasters[1])
 
 
 def _with_change(inclusion: Inclusion, background) -> Inclusion:

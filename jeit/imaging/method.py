@@ -103,9 +103,9 @@ class ImagingSettings:
         check_body(self.contact, self.num_points)
 
 
-def as_settings(given: ImagingSettings | None) -> ImagingSettings:
+def as_settings(requested: ImagingSettings | None) -> ImagingSettings:
     """Return the given settings, or the defaults for None. Raises `ValueError` for an argument of another type."""
-    settings = ImagingSettings() if given is None else given
+    settings = ImagingSettings() if requested is None else requested
     check_kind("settings", settings, ImagingSettings, "ImagingSettings, such as ImagingSettings(method='gauss-newton')")
     return settings
 
@@ -141,7 +141,7 @@ NamedWeight = float | str | None
 """λ, or the name of the rule that chooses it; None for methods without a hyperparameter."""
 
 
-class Asked(NamedTuple):
+class MethodOptions(NamedTuple):
     """Settings passed to a method: `prior`; `hyperparameter`: λ or the name of its rule; `kinds`: kinds of bodies in a
     solid (see `jeit.inverse.shapes.EllipsoidPrior`); `progress`: called with the name of each stage of long
     computations."""
@@ -154,7 +154,7 @@ class Asked(NamedTuple):
 
 # Inclusions of a smooth image from which fits of shapes start, artefacts among them: minimum peak and minimum area, see
 # `jeit.image.find_inclusions`, and maximum number.
-_PEAK, _AREA, _MOST = 0.15, 0.002, 8
+_MIN_PEAK, _MIN_AREA, _MAX_STARTS = 0.15, 0.002, 8
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class Method:
     - `number`: a suitable λ, for methods whose λ cannot be chosen by a rule.
     """
 
-    image: Callable[[PreparedDifference, Asked], Imaged]
+    image: Callable[[PreparedDifference, MethodOptions], Imaged]
     takes_prior: bool = False
     prior: str | None = None
     hyperparameter: float | str | None = None
@@ -200,41 +200,45 @@ def rule_for(name: str, prepared: PreparedDifference) -> Rule:
     return partial(discrepancy, noise=prepared.noise)
 
 
-def _weight(prepared: PreparedDifference, hyperparameter: NamedWeight) -> float | Rule:
+def _number_or_rule(prepared: PreparedDifference, hyperparameter: NamedWeight) -> float | Rule:
     """Return λ as a number, or the rule that chooses it."""
     assert hyperparameter is not None
     return rule_for(hyperparameter, prepared) if isinstance(hyperparameter, str) else hyperparameter
 
 
-def _one_step(prepared: PreparedDifference, asked: Asked) -> Imaged:
-    found = one_step(
+def _one_step(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
+    reconstruction = one_step(
         prepared.model,
         prepared.calibration.conductivity,
-        prior=prior_for(asked.prior, prepared.domain),
-        hyperparameter=_weight(prepared, asked.hyperparameter),
+        prior=prior_for(options.prior, prepared.domain),
+        hyperparameter=_number_or_rule(prepared, options.hyperparameter),
         difference=prepared.difference,
         noise=prepared.relative_noise,
         mask=prepared.mask,
     )
-    return found, found.image(prepared.difference)
+    return reconstruction, reconstruction.image(prepared.difference)
 
 
-def _back_projection(prepared: PreparedDifference, asked: Asked, *, filtered: bool) -> Imaged:
-    weight = asked.hyperparameter
-    given = {"hyperparameter": weight} if isinstance(weight, (int, float)) else {}
+def _back_projection(prepared: PreparedDifference, options: MethodOptions, *, filtered: bool) -> Imaged:
+    weight = options.hyperparameter
+    keywords = {"hyperparameter": weight} if isinstance(weight, (int, float)) else {}
     # The equipotential lines are those of the real background; real and imaginary voltages are projected separately.
     conductivity = np.real(prepared.calibration.conductivity)
-    found = back_projection(prepared.model, conductivity, filtered=filtered, mask=prepared.mask, **given)
-    return found, found.image(prepared.difference)
+    reconstruction = back_projection(prepared.model, conductivity, filtered=filtered, mask=prepared.mask, **keywords)
+    return reconstruction, reconstruction.image(prepared.difference)
 
 
-def _iterated(
-    prepared: PreparedDifference, asked: Asked, *, solver: AbstractSolver, own: AbstractPrior | None = None
+def _iterative_image(
+    prepared: PreparedDifference,
+    options: MethodOptions,
+    *,
+    solver: AbstractSolver,
+    own_prior: AbstractPrior | None = None,
 ) -> Imaged:
     """Estimate conductivity iteratively from the model's reference voltages plus the measured difference.
 
-    Model errors that are the same in the frame and its reference cancel. `own`: a prior of the method that replaces the
-    requested prior. Raises `ValueError` if the solver fails, and for complex voltages.
+    Model errors that are the same in the frame and its reference cancel. `own_prior`: a prior of the method that
+    replaces the requested prior. Raises `ValueError` if the solver fails, and for complex voltages.
     """
     model, background = prepared.model, prepared.calibration.conductivity
     if np.iscomplexobj(prepared.difference):
@@ -242,57 +246,57 @@ def _iterated(
             f"'{prepared.measurement.name}' is complex, and iterative methods are for real voltages: take one-step, or "
             "choose a part with [data] component in its description."
         )
-    found = reconstruct(
+    reconstruction = reconstruct(
         model,
         host.add(model.voltages(background), prepared.difference),
         background,
-        prior=prior_for(asked.prior, prepared.domain) if own is None else own,
-        hyperparameter=_weight(prepared, asked.hyperparameter),
-        noise=prepared.modelled_noise if own is None else prepared.relative_noise,
+        prior=prior_for(options.prior, prepared.domain) if own_prior is None else own_prior,
+        hyperparameter=_number_or_rule(prepared, options.hyperparameter),
+        noise=prepared.modelled_noise if own_prior is None else prepared.relative_noise,
         mask=prepared.mask,
         solver=solver,
     )
-    if found.status == Status.FAILED:
-        raise ValueError(f"'{prepared.measurement.name}': the reconstruction failed. {found.reason}")
-    return found, found.conductivity - background
+    if reconstruction.status == Status.FAILED:
+        raise ValueError(f"'{prepared.measurement.name}': the reconstruction failed. {reconstruction.reason}")
+    return reconstruction, reconstruction.conductivity - background
 
 
-def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, asked: Asked) -> ShapeReconstruction:
+def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, options: MethodOptions) -> ShapeReconstruction:
     """Fit bodies that explain a difference, starting from the inclusions of its smooth image.
 
     A body is kept only if the objective without it is larger by the factor `least_rise` and the evidence favours it.
     The factor allows for model errors, which the noise does not include.
     """
     model, background = prepared.model, prepared.calibration.conductivity
-    solid = prepared.mesh.dimension == 3
+    is_solid = prepared.mesh.dimension == 3
     departure = as_array(np.log(np.asarray(smooth.conductivity) / float(background)))
-    peaks = find_inclusions(prepared.mesh, departure, level=0.5, least_peak=_PEAK, least_area=_AREA)
+    inclusions = find_inclusions(prepared.mesh, departure, level=0.5, least_peak=_MIN_PEAK, least_area=_MIN_AREA)
     return reconstruct_shapes(
         model,
         host.add(model.voltages(background), prepared.difference),
         background,
-        start=[(one.sign, one.centroid, one.radius) for one in peaks[:_MOST]],
+        start=[(inclusion.sign, inclusion.centroid, inclusion.radius) for inclusion in inclusions[:_MAX_STARTS]],
         noise=prepared.sharp_noise,
         mask=prepared.mask,
-        prior=EllipsoidPrior(kinds=asked.kinds) if solid else None,
+        prior=EllipsoidPrior(kinds=options.kinds) if is_solid else None,
         # In a solid, model errors are represented by a smooth field instead.
-        least_rise=1 if solid else 1 + (LEAST_RISE - 1) * prepared.modelled_share,
-        smooth=smooth if solid else None,
+        least_rise=1 if is_solid else 1 + (LEAST_RISE - 1) * prepared.modelled_share,
+        smooth=smooth if is_solid else None,
         accuracy=prepared.accuracy,
-        progress=asked.progress,
+        progress=options.progress,
     )
 
 
-def _shapes(prepared: PreparedDifference, asked: Asked) -> Imaged:
-    smooth, _ = _iterated(prepared, Asked(MEASURED, ITERATED), solver=_GAUSS_NEWTON)
+def _shapes(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
+    smooth, _ = _iterative_image(prepared, MethodOptions(MEASURED, ITERATED), solver=_GAUSS_NEWTON)
     assert isinstance(smooth, Reconstruction)
-    return of_shapes(prepared, shapes_in(prepared, smooth, asked))
+    return of_shapes(prepared, shapes_in(prepared, smooth, options))
 
 
-def of_shapes(prepared: PreparedDifference, found: ShapeReconstruction) -> Imaged:
+def of_shapes(prepared: PreparedDifference, shapes: ShapeReconstruction) -> Imaged:
     """Shapes and their change of conductivity; for a solid, per cell of the refined mesh."""
-    drawn = found if found.finer is None else found.finer
-    return found, drawn.conductivity - prepared.calibration.conductivity
+    image = shapes if shapes.finer is None else shapes.finer
+    return shapes, image.conductivity - prepared.calibration.conductivity
 
 
 _GAUSS_NEWTON, _LEVENBERG_MARQUARDT = GaussNewton(100, 1e-4), LevenbergMarquardt(100, 1e-4)
@@ -300,12 +304,12 @@ METHODS: dict[str, Method] = {
     "one-step": Method(_one_step, takes_prior=True, hyperparameter=RULE),
     "back-projection": Method(partial(_back_projection, filtered=False), takes_hyperparameter=False),
     "filtered-back-projection": Method(partial(_back_projection, filtered=True), number=0.05),
-    "gauss-newton": Method(partial(_iterated, solver=_GAUSS_NEWTON), takes_prior=True, hyperparameter=ITERATED),
+    "gauss-newton": Method(partial(_iterative_image, solver=_GAUSS_NEWTON), takes_prior=True, hyperparameter=ITERATED),
     "levenberg-marquardt": Method(
-        partial(_iterated, solver=_LEVENBERG_MARQUARDT), takes_prior=True, hyperparameter=ITERATED
+        partial(_iterative_image, solver=_LEVENBERG_MARQUARDT), takes_prior=True, hyperparameter=ITERATED
     ),
     "total-variation": Method(
-        partial(_iterated, solver=_GAUSS_NEWTON, own=TotalVariation()),
+        partial(_iterative_image, solver=_GAUSS_NEWTON, own_prior=TotalVariation()),
         prior="total variation",
         hyperparameter=EDGE_PRICE,
         number=EDGE_PRICE,

@@ -52,15 +52,15 @@ def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
 # Default number of mesh nodes for a solid and for a sheet.
 SOLID_POINTS, SHEET_POINTS = 10_000, 2000
 # Minimum share of a difference that is assumed to remain unexplained by any model.
-_LEAST_MISFIT = 0.03
+_MIN_MISFIT = 0.03
 # Factor by which this share is larger for images with sharp outlines.
-_SHARP = 3.0
+_SHARP_FACTOR = 3.0
 # Relative standard deviation of strengths due to the discretisation, of a sheet and a solid: the cells of a solid are
 # coarse beside its bodies. Estimated on 23 bodies in simulated boxes and cylinders.
-_DISCRETE = {2: 0.0, 3: 0.03}
+_DISCRETISATION_DEVIATION = {2: 0.0, 3: 0.03}
 # Misfit of an electrode, relative to that of the others, above which it counts as unlike them. In sound tanks the ratio
 # was at most 2.6.
-_UNLIKE = 3.0
+_MIN_UNLIKE_MISFIT = 3.0
 
 
 @dataclass(frozen=True)
@@ -118,23 +118,27 @@ class PreparedDifference:
     def relative_noise(self) -> Float[Array, " M"]:
         """Noise of the channels relative to each other, volts: `jeit.inverse.relative_noise` of the reference,
         multiplied by the relative misfit of unlike electrodes for channels that measure on them."""
-        trusted = relative_noise(np.asarray(self.reference.voltages)[0], self.mask)
-        reads = np.asarray(self.model.protocol.channel_measurement) != 0
-        return as_array(trusted * np.max(np.where(reads, self._doubt, 1), axis=1))
+        noise = relative_noise(np.asarray(self.reference.voltages)[0], self.mask)
+        is_reading = np.asarray(self.model.protocol.channel_measurement) != 0
+        return as_array(noise * np.max(np.where(is_reading, self._electrode_weights, 1), axis=1))
 
     @property
     def unlike_electrodes(self) -> dict[int, float]:
         """Electrodes, numbered from 0, whose channels in the reference are fitted far worse than those of the others,
         each with the ratio of the misfits. They may be loose or displaced, or their gain may differ. Channels that
         measure on them have less weight."""
-        return {int(one): float(self._doubt[one]) for one in np.flatnonzero(self._doubt > 1)}
+        return {
+            int(electrode): float(self._electrode_weights[electrode])
+            for electrode in np.flatnonzero(self._electrode_weights > 1)
+        }
 
     @functools.cached_property
-    def _doubt(self) -> Float[np.ndarray, " L"]:
+    def _electrode_weights(self) -> Float[np.ndarray, " L"]:
+        """Relative misfit (L,) of unlike electrodes, by which their noise is multiplied; 1 for the others."""
         base = np.asarray(self.reference.voltages)[0]
         residual = np.asarray(self.calibration.voltages) - base
         misfits = electrode_misfits(self.model.protocol, residual, relative_noise(base, self.mask), self.mask)
-        return np.where(misfits > _UNLIKE, misfits, 1)
+        return np.where(misfits > _MIN_UNLIKE_MISFIT, misfits, 1)
 
     @property
     def noise(self) -> float | None:
@@ -142,8 +146,8 @@ class PreparedDifference:
         `relative_noise`; None if not known."""
         if self.quality.trusted_noise is None:
             return None
-        rounded = np.asarray(self._rounding)[self.mask] / np.asarray(self.relative_noise)[self.mask]
-        return float(np.hypot(self.quality.trusted_noise, np.sqrt(np.mean(rounded**2))))
+        relative_rounding = np.asarray(self._rounding)[self.mask] / np.asarray(self.relative_noise)[self.mask]
+        return float(np.hypot(self.quality.trusted_noise, np.sqrt(np.mean(relative_rounding**2))))
 
     @property
     def modelled_noise(self) -> Float[Array, " M"]:
@@ -153,53 +157,57 @@ class PreparedDifference:
 
         If the noise is not known, 0.1 of the difference is used instead, at most 1 in units of `relative_noise`.
         """
-        return self._off_by(max(self._misfit, _LEAST_MISFIT))
+        return self._noise_with_error_share(max(self._misfit, _MIN_MISFIT))
 
     @property
     def sharp_noise(self) -> Float[Array, " M"]:
         """`modelled_noise` for bodies with sharp outlines, volts. Its model error is three times larger, since bodies
         with sharp outlines, unlike smooth images, cannot adapt to model errors."""
-        return self._off_by(_SHARP * max(self._misfit, _LEAST_MISFIT))
+        return self._noise_with_error_share(_SHARP_FACTOR * max(self._misfit, _MIN_MISFIT))
 
     @property
     def accuracy(self) -> Accuracy:
-        """Errors of the difference, from which intervals are computed: noise, the unknown part of electrode positions
-        and contacts, and the share of the difference that equals the misfit of the reference, at least 2 %; and of all
-        strengths, the part of that misfit that noise does not explain, and in a solid the discretisation."""
-        error = self.calibration.model_error
-        if error is None:  # a reference that the described places explain still leaves them uncertain
+        """Errors of the difference, from which intervals are computed.
+
+        The errors of the voltages are noise, the unknown part of electrode positions and contacts, and a share of the
+        difference that equals the misfit of the reference, at least 2 %. The errors of all strengths are the part of
+        that misfit that noise does not explain and, in a solid, the discretisation.
+        """
+        model_error = self.calibration.model_error
+        if model_error is None:  # a reference that the described places explain still leaves them uncertain
             reference = np.asarray(self.reference.voltages)[0]
-            placed = estimated_positions(self.model, reference, self.mask, self.uncertainty.position)
-            error = placed and placed.error
-        known = self.uncertainty
-        error = error and error._replace(drift=known.drift)
-        share = max(self._misfit, known.other)
-        strength = float(np.hypot(self._unexplained, _DISCRETE[self.mesh.dimension]))
-        return Accuracy(self._off_by(share), error, known.size, strength)
+            placement = estimated_positions(self.model, reference, self.mask, self.uncertainty.position)
+            model_error = placement and placement.error
+        uncertainty = self.uncertainty
+        model_error = model_error and model_error._replace(drift=uncertainty.drift)
+        share = max(self._misfit, uncertainty.other)
+        strength = float(np.hypot(self._field_error, _DISCRETISATION_DEVIATION[self.mesh.dimension]))
+        return Accuracy(self._noise_with_error_share(share), model_error, uncertainty.size, strength)
 
     @property
     def modelled_share(self) -> float:
         """Share of the variance of `sharp_noise` that is due to the model error, from 0 to 1; 1 if the noise is not
         known."""
-        sharp = np.asarray(self.sharp_noise)[self.mask] / np.asarray(self.relative_noise)[self.mask]
-        return 1 - (0 if self.noise is None else self.noise**2 / float(np.mean(sharp**2)))
+        relative_sharp_noise = np.asarray(self.sharp_noise)[self.mask] / np.asarray(self.relative_noise)[self.mask]
+        return 1 - (0 if self.noise is None else self.noise**2 / float(np.mean(relative_sharp_noise**2)))
 
-    def _off_by(self, share: float) -> Float[Array, " M"]:
+    def _noise_with_error_share(self, share: float) -> Float[Array, " M"]:
         """Root of the sum of squares of noise, rounding, and an error that is a `share` of the difference, volts."""
-        shape, used = np.asarray(self.relative_noise), np.asarray(self.mask)
-        size = np.sqrt(np.mean(np.abs(np.asarray(self.difference)[used] / shape[used]) ** 2))
-        noise = min(1.0, 0.1 * size) if self.noise is None else self.quality.trusted_noise
-        return as_array(np.hypot(shape * np.hypot(noise, share * size), self._rounding))
+        relative_noise, used = np.asarray(self.relative_noise), np.asarray(self.mask)
+        relative_size = np.sqrt(np.mean(np.abs(np.asarray(self.difference)[used] / relative_noise[used]) ** 2))
+        noise = min(1.0, 0.1 * relative_size) if self.noise is None else self.quality.trusted_noise
+        return as_array(np.hypot(relative_noise * np.hypot(noise, share * relative_size), self._rounding))
 
     @functools.cached_property
     def _misfit(self) -> float:
-        """Misfit of the reference: of all volts alike, or of each channel relative to its noise if that is less."""
+        """Relative misfit of the reference, with equal weights or, if that is less, with channels weighted by their
+        noise."""
         reference = np.asarray(self.reference.voltages)[0], np.asarray(self.reference.mask)[0]
         return min(float(self.calibration.misfit), relative_misfit(self.calibration.voltages, *reference))
 
     @property
-    def _unexplained(self) -> float:
-        """What the noise leaves of the misfit of the reference, relative: how far the model's fields are off."""
+    def _field_error(self) -> float:
+        """Relative error of the model's fields: the part of the misfit of the reference that noise does not explain."""
         measured, used = np.asarray(self.reference.voltages)[0], np.asarray(self.mask)
         size = np.sqrt(np.mean(np.abs(measured[used] / np.asarray(self.relative_noise)[used]) ** 2))
         noise = 0.0 if self.noise is None else self.noise / np.sqrt(2) / size
@@ -241,20 +249,20 @@ def prepare_difference(
     ```
     """
     clock = Clock(None) if clock is None else clock
-    one, base = select_frames(measurement, reference, frame)
+    frame_data, base = select_frames(measurement, reference, frame)
     number = chosen_frame(measurement, frame)
     with clock("check"), naming_frame(measurement, number):
-        check_same_setup(one, base)
+        check_same_setup(frame_data, base)
         if not as_is:
-            one = mask_spikes(one, base)
-            base = replace(base, mask=as_array(np.asarray(base.mask) & np.asarray(one.mask)))
-        (quality,) = assess(one, base)
-        domain, electrodes = body_of(one, base)
-        base = base if one.uncertainty is None else replace(base, uncertainty=one.uncertainty)
-        both = np.asarray(one.mask)[0] & np.asarray(base.mask)[0]
-        difference = as_array(np.where(both, np.asarray(one.voltages)[0] - np.asarray(base.voltages)[0], 0))
-        if not as_is and (exchanged := exchanges_message(one, base)):
-            raise ValueError(f"'{one.name}' does not fit its reference: {exchanged}")
+            frame_data = mask_spikes(frame_data, base)
+            base = replace(base, mask=as_array(np.asarray(base.mask) & np.asarray(frame_data.mask)))
+        (quality,) = assess(frame_data, base)
+        domain, electrodes = body_of(frame_data, base)
+        base = base if frame_data.uncertainty is None else replace(base, uncertainty=frame_data.uncertainty)
+        usable = np.asarray(frame_data.mask)[0] & np.asarray(base.mask)[0]
+        difference = as_array(np.where(usable, np.asarray(frame_data.voltages)[0] - np.asarray(base.voltages)[0], 0))
+        if not as_is and (exchange_message := exchanges_message(frame_data, base)):
+            raise ValueError(f"'{frame_data.name}' does not fit its reference: {exchange_message}")
     with clock("mesh"):
         model = ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, base.protocol)
     with clock("wiring"):
@@ -265,10 +273,20 @@ def prepare_difference(
             check_wiring(wiring, base, as_is)
         if not quality.imageable:
             with naming_frame(measurement, number):
-                raise ValueError(f"'{one.name}' cannot be imaged: {quality.reason}")
-    calibration, chosen = calibrated_model(model, base, contact=contact, clock=clock)
+                raise ValueError(f"'{frame_data.name}' cannot be imaged: {quality.reason}")
+    calibration, contact_method = calibrated_model(model, base, contact=contact, clock=clock)
     return PreparedDifference(
-        one, base, quality, domain, chosen, wiring, calibration, difference, both, number, measurement.num_frames
+        frame_data,
+        base,
+        quality,
+        domain,
+        contact_method,
+        wiring,
+        calibration,
+        difference,
+        usable,
+        number,
+        measurement.num_frames,
     )
 
 
@@ -276,10 +294,10 @@ def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
     """Check the wiring found in `reference`. Raises `ValueError` if it differs from its description, unless `as_is`."""
     if wiring.fault and not as_is:
         # Voltages of the opposite sign cannot be calibrated, even with `as_is`.
-        otherwise = "" if wiring.reversed_signs else "; or go on as it is (as_is=True, --as-is)"
+        advice = "" if wiring.reversed_signs else "; or go on as it is (as_is=True, --as-is)"
         raise ValueError(
             f"'{reference.name}' does not fit its description: {wiring.fault} Mend the wires or the description"
-            f"{otherwise}."
+            f"{advice}."
         )
 
 
@@ -311,8 +329,8 @@ def select_frames(
         _, reference = measurement.split_reference()
     if "reference" in reference.frame_names and reference.num_frames > 1:
         _, reference = reference.split_reference()
-    one = measurement.frame(chosen_frame(measurement, frame))
-    return one, as_driven(reference.mean_frame(), one)
+    frame_data = measurement.frame(chosen_frame(measurement, frame))
+    return frame_data, as_driven(reference.mean_frame(), frame_data)
 
 
 def check_measurement(name: str, given: Measurement) -> None:
@@ -361,9 +379,9 @@ def body_of(measurement: Measurement, reference: Measurement) -> tuple[Body, Abs
     domain = measurement.domain if measurement.domain is not None else reference.domain
     electrodes = measurement.electrodes if measurement.electrodes is not None else reference.electrodes
     if domain is None or electrodes is None:
-        missing = "[geometry]" if domain is None else "[electrodes]"
+        missing_table = "[geometry]" if domain is None else "[electrodes]"
         raise ValueError(
-            f"'{measurement.name}' does not say what it was measured on: give a description with {missing} "
+            f"'{measurement.name}' does not say what it was measured on: give a description with {missing_table} "
             "(a TOML file beside the data, or description=)."
         )
     position = (measurement.uncertainty or reference.uncertainty or Uncertainty()).position

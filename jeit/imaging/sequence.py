@@ -21,7 +21,7 @@ from jeit.files import check_memory
 from jeit.image.image_series import ImageSeries
 from jeit.imaging.calibration import Clock
 from jeit.imaging.difference import ImagedDifference, image_difference
-from jeit.imaging.method import AUTO, METHODS, Asked, ImagingSettings, as_settings
+from jeit.imaging.method import AUTO, METHODS, ImagingSettings, MethodOptions, as_settings
 from jeit.imaging.preparation import (
     PreparedDifference,
     check_measurement,
@@ -36,7 +36,7 @@ from jeit_solvers.engines import as_array
 # Number of frames imaged at once, and number of bytes of a stored value.
 _BATCH, _VALUE_BYTES = 256, 4
 # Minimum share of the frames that must have a channel for the channel to be used.
-_MOST_FRAMES = 0.5
+_MIN_FRAME_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -116,15 +116,15 @@ def image_sequence(
         measurement = mask_spikes(measurement, base, fill=True)
     voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     expected = np.asarray(base.voltages)[0]
-    common = (mask.mean(axis=0) >= _MOST_FRAMES) & np.asarray(base.mask)[0]
-    refused = np.asarray(~mask[:, common].all(axis=1))
-    if not common.any() or refused.all():
+    is_common = (mask.mean(axis=0) >= _MIN_FRAME_SHARE) & np.asarray(base.mask)[0]
+    refused = np.asarray(~mask[:, is_common].all(axis=1))
+    if not is_common.any() or refused.all():
         raise ValueError(f"'{measurement.name}': no channel is usable in most frames, or none has all of them.")
-    away = np.abs(np.where(common, voltages - expected, 0)).sum(axis=1)
-    strongest = int(np.argmax(np.where(refused, -1, away)))
-    usable = measurement.masked(common, "they are missing in most frames, or in the reference.")
+    total_change = np.abs(np.where(is_common, voltages - expected, 0)).sum(axis=1)
+    strongest = int(np.argmax(np.where(refused, -1, total_change)))
+    usable = measurement.masked(is_common, "they are missing in most frames, or in the reference.")
     prepared = prepare_difference(
-        usable if not common.all() else measurement,
+        usable if not is_common.all() else measurement,
         base,
         frame=strongest,
         contact=settings.contact,
@@ -132,24 +132,28 @@ def image_sequence(
         as_is=settings.as_is,
         clock=clock,
     )
-    chosen = {name: region(prepared.mesh) for name, region in (regions or {}).items()}
-    number, cells = measurement.num_frames, prepared.mesh.num_cells
-    check_memory(f"the images of '{measurement.name}', {number} frames,", float(_VALUE_BYTES * number * cells))
+    region_masks = {name: region(prepared.mesh) for name, region in (regions or {}).items()}
+    num_frames, num_cells = measurement.num_frames, prepared.mesh.num_cells
+    check_memory(
+        f"the images of '{measurement.name}', {num_frames} frames,", float(_VALUE_BYTES * num_frames * num_cells)
+    )
     with clock("image"):
-        found, _ = METHODS[settings.method].image(prepared, Asked(settings.prior, settings.hyperparameter))
-        if not isinstance(found, LinearReconstruction):
+        reconstruction, _ = METHODS[settings.method].image(
+            prepared, MethodOptions(settings.prior, settings.hyperparameter)
+        )
+        if not isinstance(reconstruction, LinearReconstruction):
             raise ValueError(
                 f"method: {settings.method} images frame by frame; take a linear one, or `jeit.inverse.stream`."
             )
-        changes = np.full((number, cells), np.nan, np.float32)
-        good = np.flatnonzero(~refused)
-        for start in range(0, len(good), _BATCH):
-            some = good[start : start + _BATCH]
-            difference = as_array(np.where(common, voltages[some] - expected, 0))
-            changes[some] = np.asarray(found.image(difference))
+        changes = np.full((num_frames, num_cells), np.nan, np.float32)
+        imaged_frames = np.flatnonzero(~refused)
+        for start in range(0, len(imaged_frames), _BATCH):
+            batch = imaged_frames[start : start + _BATCH]
+            difference = as_array(np.where(is_common, voltages[batch] - expected, 0))
+            changes[batch] = np.asarray(reconstruction.image(difference))
     background = float(np.real(prepared.calibration.conductivity))
     series = ImageSeries(prepared.mesh, changes, times, background, timed=measurement.times is not None)
-    return ImagedSequence(series, prepared, found, refused, chosen)
+    return ImagedSequence(series, prepared, reconstruction, refused, region_masks)
 
 
 @dataclass(frozen=True)
@@ -202,12 +206,14 @@ def image_frequencies(
     """
     check_measurement("second", second)
     check_measurement("first", first)
-    one = second.frame(0 if frame is None else frame)
-    base = first.mean_frame()
-    weight = frequency_weight(one, base) if weighted else 1.0
-    voltages = as_array(weight * np.asarray(base.voltages))
-    scaled = replace(base, voltages=voltages, name=f"{_weight_text(weight)} × {base.name}" if weighted else base.name)
-    return ImagedFrequencies(image_difference(one, scaled, settings), complex(weight))
+    frame_data = second.frame(0 if frame is None else frame)
+    reference = first.mean_frame()
+    weight = frequency_weight(frame_data, reference) if weighted else 1.0
+    voltages = as_array(weight * np.asarray(reference.voltages))
+    scaled_reference = replace(
+        reference, voltages=voltages, name=f"{_weight_text(weight)} × {reference.name}" if weighted else reference.name
+    )
+    return ImagedFrequencies(image_difference(frame_data, scaled_reference, settings), complex(weight))
 
 
 def frequency_weight(second: Measurement, first: Measurement) -> float | complex:
@@ -226,11 +232,14 @@ def frequency_weight(second: Measurement, first: Measurement) -> float | complex
     weight = frequency_weight(pressed, rest)
     ```
     """
-    ahead, before = np.asarray(second.voltages)[0], np.asarray(first.voltages)[0]
-    if ahead.shape != before.shape:
-        raise ValueError(f"second has {ahead.size} channels and first {before.size}; measure both with one protocol.")
+    second_voltages, first_voltages = np.asarray(second.voltages)[0], np.asarray(first.voltages)[0]
+    if second_voltages.shape != first_voltages.shape:
+        raise ValueError(
+            f"second has {second_voltages.size} channels and first {first_voltages.size}; measure both with one "
+            "protocol."
+        )
     used = np.asarray(second.mask)[0] & np.asarray(first.mask)[0]
-    weight = np.vdot(before[used], ahead[used]) / np.vdot(before[used], before[used])
+    weight = np.vdot(first_voltages[used], second_voltages[used]) / np.vdot(first_voltages[used], first_voltages[used])
     if not (np.isfinite(weight) and weight.real > 0):
         raise ValueError(
             f"second and first have nothing in common (α = {weight:.3g}); are they the same body at two frequencies, "

@@ -142,9 +142,9 @@ def described_reference(
     """
     protocol = description.protocol(description.origin)
     if protocol is None or description.domain is None or description.electrodes is None:
-        said = {"geometry": description.domain, "electrodes": description.electrodes, "protocol": protocol}
-        missing = ", ".join(f"[{section}]" for section, one in said.items() if one is None)
-        raise ValueError(f"{description.origin}: images need {missing} too; describe it.")
+        sections = {"geometry": description.domain, "electrodes": description.electrodes, "protocol": protocol}
+        missing_sections = ", ".join(f"[{section}]" for section, value in sections.items() if value is None)
+        raise ValueError(f"{description.origin}: images need {missing_sections} too; describe it.")
     return screen(
         frames,
         protocol,
@@ -175,8 +175,8 @@ def parse_frames(lines: Iterable[str]) -> Iterator[object]:
     """Parse a frame from each line that is not empty: voltages separated by spaces, commas or semicolons. A line that
     does not contain numbers is returned as text, and refused later."""
     for line in lines:
-        parts = line.strip().rstrip(",;").replace(";", ",").split(",")
-        words = line.split() if len(parts) == 1 else [part.strip() or "nan" for part in parts]
+        cells = line.strip().rstrip(",;").replace(";", ",").split(",")
+        words = line.split() if len(cells) == 1 else [cell.strip() or "nan" for cell in cells]
         if not line.strip():
             continue
         try:

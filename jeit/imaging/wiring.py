@@ -28,7 +28,7 @@ from jeit_solvers.engines import on_host
 
 # Maximum ratio of the difference after an exchange to that before, for each exchange and for all reported exchanges
 # together; and maximum number of exchanges.
-_EXCHANGE_STEP, _EXCHANGE_BETTER, _MOST = 0.9, 0.5, 4
+_MAX_EXCHANGE_RATIO, _MAX_TOTAL_RATIO, _MAX_EXCHANGES = 0.9, 0.5, 4
 
 
 def exchanges_message(frame: Measurement, reference: Measurement) -> str:
@@ -38,63 +38,67 @@ def exchanges_message(frame: Measurement, reference: Measurement) -> str:
     order = _order(frame)
     if order is None:
         return ""
-    both = (np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0])[order]
-    measured, rest = (np.where(both, np.asarray(one.filled())[0][order], 0) for one in (frame, reference))
-    described = float(np.linalg.norm(measured - rest))
-    found = [
-        (*_exchanges(measured, rest), "drives"),
-        (*_exchanges(measured.T, rest.T), "measurements of every drive"),
+    usable = (np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0])[order]
+    frame_values, reference_values = (
+        np.where(usable, np.asarray(measurement.filled())[0][order], 0) for measurement in (frame, reference)
+    )
+    described_norm = float(np.linalg.norm(frame_values - reference_values))
+    candidates = [
+        (*_exchanges(frame_values, reference_values), "drives"),
+        (*_exchanges(frame_values.T, reference_values.T), "measurements of every drive"),
     ]
-    left, pairs, what = min(found, key=lambda one: one[0])
-    if not pairs or left > _EXCHANGE_BETTER * described:
+    remaining_norm, pairs, exchanged_kind = min(candidates, key=lambda candidate: candidate[0])
+    if not pairs or remaining_norm > _MAX_TOTAL_RATIO * described_norm:
         return ""
-    size = float(np.linalg.norm(rest))
-    named = ", ".join(f"{one + 1} and {other + 1}" for one, other in pairs)
+    reference_norm = float(np.linalg.norm(reference_values))
+    pair_text = ", ".join(f"{first + 1} and {second + 1}" for first, second in pairs)
     return (
-        f"{what} {named} look exchanged in it, and not in its reference: so taken it differs from that by "
-        f"{percent(left / size)}, as it is by {percent(described / size)}. Mend its order; or go on as it is "
-        "(as_is=True, --as-is)."
+        f"{exchanged_kind} {pair_text} look exchanged in it, and not in its reference: so taken it differs from that "
+        f"by {percent(remaining_norm / reference_norm)}, as it is by {percent(described_norm / reference_norm)}. Mend "
+        "its order; or go on as it is (as_is=True, --as-is)."
     )
 
 
 def _order(frame: Measurement) -> np.ndarray | None:
     """Index of the channel of each drive and measurement, (drives, measurements); None if a drive lacks a
     measurement."""
-    drive, reading = (np.asarray(one) for one in (frame.protocol.drive_index, frame.protocol.measurement_index))
-    shape = int(drive.max()) + 1, int(reading.max()) + 1
+    drive, measurement = (np.asarray(index) for index in (frame.protocol.drive_index, frame.protocol.measurement_index))
+    shape = int(drive.max()) + 1, int(measurement.max()) + 1
     order = np.full(shape, -1)
-    order[drive, reading] = np.arange(len(drive))
+    order[drive, measurement] = np.arange(len(drive))
     return None if (order < 0).any() else order
 
 
 def _exchanges(
-    measured: Inexact[np.ndarray, "n k"], rest: Inexact[np.ndarray, "n k"]
+    measured: Inexact[np.ndarray, "n k"], reference: Inexact[np.ndarray, "n k"]
 ) -> tuple[float, list[tuple[int, int]]]:
     """Norm of the difference between two matrices after exchanges of rows, and the exchanges, most effective first."""
-    square = np.sum(np.abs(measured) ** 2, axis=1)[:, None] + np.sum(np.abs(rest) ** 2, axis=1)
-    apart: Float[np.ndarray, "n n"] = np.maximum(square - 2 * np.real(measured @ rest.conj().T), 0)
-    left, pairs = float(np.trace(apart)), []
-    for _ in range(_MOST):
-        own = np.diag(apart)
-        gain = own[:, None] + own - apart - apart.T
-        one, other = np.unravel_index(np.argmax(gain), gain.shape)
-        if left - gain[one, other] > _EXCHANGE_STEP**2 * left:
+    squared_norms = np.sum(np.abs(measured) ** 2, axis=1)[:, None] + np.sum(np.abs(reference) ** 2, axis=1)
+    squared_distances: Float[np.ndarray, "n n"] = np.maximum(
+        squared_norms - 2 * np.real(measured @ reference.conj().T), 0
+    )
+    total, pairs = float(np.trace(squared_distances)), []
+    for _ in range(_MAX_EXCHANGES):
+        diagonal = np.diag(squared_distances)
+        gain = diagonal[:, None] + diagonal - squared_distances - squared_distances.T
+        first, second = np.unravel_index(np.argmax(gain), gain.shape)
+        if total - gain[first, second] > _MAX_EXCHANGE_RATIO**2 * total:
             break
-        left = max(left - float(gain[one, other]), 0.0)
-        pairs.append((int(min(one, other)), int(max(one, other))))
-        apart[[one, other]] = apart[[other, one]]
-    return float(np.sqrt(left)), pairs
+        total = max(total - float(gain[first, second]), 0.0)
+        pairs.append((int(min(first, second)), int(max(first, second))))
+        squared_distances[[first, second]] = squared_distances[[second, first]]
+    return float(np.sqrt(total)), pairs
 
 
 MOST_MISFIT = 0.15
 """Relative misfit of the empty body above which a wiring error is suspected."""
 # Maximum ratio of the misfit with another wiring to that before: for each exchange, and for the wiring reported.
-_STEP, _BETTER = 0.85, 0.6
-_MOST_EXCHANGES = 4
+_MAX_STEP_RATIO, _MAX_WIRING_RATIO = 0.85, 0.6
+_MAX_ELECTRODE_EXCHANGES = 4
 # Relative misfit of the empty body above which imaging is refused even if no other wiring explains the frame.
 _HOPELESS = 0.5
 # Contact impedance times conductivity, divided by the size of the body: from negligible to dominant.
-_CONTACTS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+_RELATIVE_CONTACTS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 
 
 @dataclass(frozen=True)
@@ -133,25 +137,26 @@ class Wiring:
     @property
     def explanation(self) -> str:
         """The wiring found, in a sentence, with electrodes numbered from 1; empty if it is the described one."""
-        found = [_exchanged_places(self.places, self._cycles())]
-        found.append(self.order and f"the channels look ordered {self.order}")
-        found.append(
+        faults = [_exchange_text(self.places, self._cycles())]
+        faults.append(self.order and f"the channels look ordered {self.order}")
+        faults.append(
             'all voltages look to have the opposite sign ([data] polarity = "reversed")' if self.reversed_signs else ""
         )
-        found.append("the voltages look to be magnitudes, without signs" if self.magnitudes else "")
-        said = ", and ".join(one for one in found if one)
+        faults.append("the voltages look to be magnitudes, without signs" if self.magnitudes else "")
+        description = ", and ".join(fault for fault in faults if fault)
         return (
-            said and f"{said}: so taken the misfit is {percent(self.misfit)}, as described {percent(self.described)}."
+            description
+            and f"{description}: so taken the misfit is {percent(self.misfit)}, as described {percent(self.described)}."
         )
 
     def _cycles(self) -> list[list[int]]:
         """Cycles of the permutation of electrodes: each electrode is at the place of the next in its cycle."""
-        cycles, left = [], {k for k, place in enumerate(self.places) if place != k}
-        while left:
-            cycle = [min(left)]
+        cycles, moved = [], {k for k, place in enumerate(self.places) if place != k}
+        while moved:
+            cycle = [min(moved)]
             while self.places[cycle[-1]] != cycle[0]:
                 cycle.append(self.places[cycle[-1]])
-            left -= set(cycle)
+            moved -= set(cycle)
             cycles.append(cycle)
         return cycles
 
@@ -165,52 +170,64 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
     the described wiring gives them, may be magnitudes: they are compared without signs if that explains more. Errors
     that leave the voltages unchanged, such as a rotation of the electrodes of a symmetric body, cannot be found.
     """
-    count, orders = model.protocol.num_electrodes, channel_orders(model.protocol)
-    plain = Wiring(tuple(range(count)))
+    num_electrodes, orders = model.protocol.num_electrodes, channel_orders(model.protocol)
+    described_wiring = Wiring(tuple(range(num_electrodes)))
     if not np.any(np.asarray(measurement.filled())[0]):
-        return replace(plain, misfit=1.0, described=0.0)  # a frame without signal does not determine the wiring
+        return replace(
+            described_wiring, misfit=1.0, described=0.0
+        )  # a frame without signal does not determine the wiring
     misfit_of = _comparison(model, measurement, orders)
-    best = misfit_of(plain)
-    described = 1.0 if best.reversed_signs else best.misfit
-    if best.misfit < MOST_MISFIT:  # as described, except possibly for the sign
-        return replace(best, described=described)
-    found = _explained(misfit_of, plain, best, orders)
-    if (one_way := _signs_say_nothing(model, measurement)) is not None:
+    compared = misfit_of(described_wiring)
+    described_misfit = 1.0 if compared.reversed_signs else compared.misfit
+    if compared.misfit < MOST_MISFIT:  # as described, except possibly for the sign
+        return replace(compared, described=described_misfit)
+    best_wiring = _explained(misfit_of, described_wiring, compared, orders)
+    if (has_one_sign := _has_one_sign(model, measurement)) is not None:
         misfit_of = _comparison(model, measurement, orders, signs=False)
-        without = _explained(misfit_of, plain, misfit_of(plain), orders)
-        if without.misfit < _STEP * found.misfit:
-            found = replace(without, magnitudes=one_way)
-    found = replace(plain, misfit=described) if found.misfit > _BETTER * described else found
-    return replace(found, described=described)
+        unsigned_wiring = _explained(misfit_of, described_wiring, misfit_of(described_wiring), orders)
+        if unsigned_wiring.misfit < _MAX_STEP_RATIO * best_wiring.misfit:
+            best_wiring = replace(unsigned_wiring, magnitudes=has_one_sign)
+    best_wiring = (
+        replace(described_wiring, misfit=described_misfit)
+        if best_wiring.misfit > _MAX_WIRING_RATIO * described_misfit
+        else best_wiring
+    )
+    return replace(best_wiring, described=described_misfit)
 
 
-def _explained(misfit_of: Callable[[Wiring], Wiring], plain: Wiring, best: Wiring, orders: Iterable[str]) -> Wiring:
-    """The wiring that explains a frame far better than `best`, the described one, or that."""
-    count = len(plain.places)
+def _explained(
+    misfit_of: Callable[[Wiring], Wiring], described_wiring: Wiring, best_wiring: Wiring, orders: Iterable[str]
+) -> Wiring:
+    """The wiring that explains a frame far better than `best_wiring`, which is the described one; otherwise
+    `best_wiring`."""
+    num_electrodes = len(described_wiring.places)
 
-    def least(tried: Iterable[Wiring], so_far: Wiring) -> Wiring:
+    def best_of(wirings: Iterable[Wiring], last_best: Wiring) -> Wiring:
         # Misfits are rounded so that the first of equivalent wirings is taken, such as orders that are the same by
         # reciprocity.
-        best = min((misfit_of(one) for one in tried), key=lambda one: round(one.misfit, 9))
-        return best if best.misfit < _STEP * so_far.misfit else so_far
+        best_wiring = min((misfit_of(wiring) for wiring in wirings), key=lambda wiring: round(wiring.misfit, 9))
+        return best_wiring if best_wiring.misfit < _MAX_STEP_RATIO * last_best.misfit else last_best
 
-    def with_exchanges(best: Wiring) -> Wiring:
-        for _ in range(_MOST_EXCHANGES):
-            pairs = combinations(range(count), 2)
-            so_far = best
-            best = least([replace(best, places=_exchanged(best.places, *pair)) for pair in pairs], best)
-            if best is so_far:
+    def with_exchanges(best_wiring: Wiring) -> Wiring:
+        for _ in range(_MAX_ELECTRODE_EXCHANGES):
+            pairs = combinations(range(num_electrodes), 2)
+            last_best = best_wiring
+            best_wiring = best_of(
+                [replace(best_wiring, places=_exchange_places(best_wiring.places, *pair)) for pair in pairs],
+                best_wiring,
+            )
+            if best_wiring is last_best:
                 break
-        return best
+        return best_wiring
 
-    best = with_exchanges(least([replace(plain, order=order) for order in orders], best))
-    turned = [Wiring(places, order) for places in _turns(count) for order in orders]
-    return least([with_exchanges(least(turned, misfit_of(plain)))], best)
+    best_wiring = with_exchanges(best_of([replace(described_wiring, order=order) for order in orders], best_wiring))
+    turned_wirings = [Wiring(places, order) for places in _turns(num_electrodes) for order in orders]
+    return best_of([with_exchanges(best_of(turned_wirings, misfit_of(described_wiring)))], best_wiring)
 
 
-def _signs_say_nothing(model: ForwardModel, measurement: Measurement) -> bool | None:
-    """Whether all voltages have one sign; False if they have the signs of a uniform body with the described wiring, as
-    magnitudes are given on reading; None if neither."""
+def _has_one_sign(model: ForwardModel, measurement: Measurement) -> bool | None:
+    """True if all voltages have one sign; False if they have the signs of a uniform body with the described wiring,
+    which magnitudes are given when they are read; None otherwise."""
     used = np.asarray(measurement.mask)[0]
     signs = np.sign(np.real(np.asarray(measurement.filled())[0]))[used]
     expected = np.sign(select_channels(on_host(model.protocol), _impedances(model)[0]))[used]
@@ -226,7 +243,7 @@ def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
     channels = np.arange(len(drive))
     first = np.asarray(protocol.measurement).argmax(axis=1)[measurement]
     source, sink = (choose(np.asarray(protocol.drive), axis=1)[drive] for choose in (np.argmax, np.argmin))
-    ways = {
+    sort_keys = {
         'from electrode 1 on in every drive (order = "fixed")': (first, drive),
         'from the driven electrodes on in every drive (order = "rotating")': (
             (first - source) % protocol.num_electrodes,
@@ -239,10 +256,10 @@ def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
         "measurement by measurement, not drive by drive": (drive, first),
     }
     orders = {"": channels}
-    for name, keys in ways.items():
+    for name, keys in sort_keys.items():
         order = np.empty_like(channels)
         order[np.lexsort(keys)] = channels
-        if not any(np.array_equal(order, known) for known in orders.values()):
+        if not any(np.array_equal(order, found_order) for found_order in orders.values()):
             orders[name] = order
     return orders
 
@@ -257,58 +274,64 @@ def _comparison(
     impedances, voltages = _impedances(model), voltages if signs else np.abs(voltages)
 
     def misfit_of(wiring: Wiring) -> Wiring:
-        places, order = np.array(wiring.places), orders[wiring.order]
+        electrode_places, order = np.array(wiring.places), orders[wiring.order]
         measured, used = voltages[order], mask[order]
-        size, best = np.linalg.norm(measured), wiring
+        norm, best_wiring = np.linalg.norm(measured), wiring
         for impedance in impedances:
-            expected = np.where(used, select_channels(protocol, impedance[np.ix_(places, places)]), 0)
+            expected = np.where(
+                used, select_channels(protocol, impedance[np.ix_(electrode_places, electrode_places)]), 0
+            )
             expected = expected if signs else np.abs(expected)
             scale = expected @ measured / (expected @ expected)
-            misfit = float(np.linalg.norm(measured - scale * expected) / size)
-            if misfit < best.misfit or best is wiring:
-                best = replace(wiring, misfit=misfit, reversed_signs=bool(scale < 0))
-        return best
+            misfit = float(np.linalg.norm(measured - scale * expected) / norm)
+            if misfit < best_wiring.misfit or best_wiring is wiring:
+                best_wiring = replace(wiring, misfit=misfit, reversed_signs=bool(scale < 0))
+        return best_wiring
 
     return misfit_of
 
 
 def _impedances(model: ForwardModel) -> list[Float[np.ndarray, "L L"]]:
-    """Transfer impedances of the uniform body of unit conductivity, for each contact impedance of `_CONTACTS`."""
+    """Transfer impedances of the uniform body of unit conductivity, for each contact impedance of
+    `_RELATIVE_CONTACTS`."""
     electrodes = model.electrodes
     if electrodes.is_point:
         return [np.asarray(model.transfer_impedance(1.0))]
     size = np.ptp(np.asarray(model.mesh.points), axis=0).max()
     relative = np.asarray(electrodes.contact_impedance) / np.mean(electrodes.contact_impedance)
-    models = (model.with_electrodes(electrodes.with_contact_impedance(one * size * relative)) for one in _CONTACTS)
-    return [np.asarray(one.transfer_impedance(1.0)) for one in models]
+    models = (
+        model.with_electrodes(electrodes.with_contact_impedance(contact * size * relative))
+        for contact in _RELATIVE_CONTACTS
+    )
+    return [np.asarray(model.transfer_impedance(1.0)) for model in models]
 
 
-def _turns(count: int) -> Iterator[tuple[int, ...]]:
+def _turns(num_electrodes: int) -> Iterator[tuple[int, ...]]:
     """Places of electrodes for each other first electrode, and for the reverse order."""
-    for shift in range(count):
-        for way in (1, -1):
-            if (shift, way) != (0, 1):
-                yield tuple((shift + way * k) % count for k in range(count))
+    for shift in range(num_electrodes):
+        for direction in (1, -1):
+            if (shift, direction) != (0, 1):
+                yield tuple((shift + direction * k) % num_electrodes for k in range(num_electrodes))
 
 
-def _exchanged(places: tuple[int, ...], first: int, second: int) -> tuple[int, ...]:
-    changed = list(places)
-    changed[first], changed[second] = changed[second], changed[first]
-    return tuple(changed)
+def _exchange_places(places: tuple[int, ...], first: int, second: int) -> tuple[int, ...]:
+    new_places = list(places)
+    new_places[first], new_places[second] = new_places[second], new_places[first]
+    return tuple(new_places)
 
 
-def _exchanged_places(places: tuple[int, ...], cycles: list[list[int]]) -> str:
+def _exchange_text(places: tuple[int, ...], cycles: list[list[int]]) -> str:
     """Description of exchanged electrodes, in words."""
     if cycles and places in _turns(len(places)):
-        way = "from another one" if (places[1] - places[0]) % len(places) == 1 else "the other way round"
+        direction = "from another one" if (places[1] - places[0]) % len(places) == 1 else "the other way round"
         first = f", electrode 1 standing where {places[0] + 1} should" if places[0] else ""
-        return f"the electrodes look counted {way}{first}"
-    pairs = [f"{first + 1} and {second + 1}" for first, second in (one for one in cycles if len(one) == 2)]
-    found = [f"electrodes {', '.join(pairs)} look exchanged"] if pairs else []
-    found += [
+        return f"the electrodes look counted {direction}{first}"
+    pairs = [f"{first + 1} and {second + 1}" for first, second in (cycle for cycle in cycles if len(cycle) == 2)]
+    descriptions = [f"electrodes {', '.join(pairs)} look exchanged"] if pairs else []
+    descriptions += [
         f"electrodes {' → '.join(str(k + 1) for k in [*cycle, cycle[0]])} each look as if they stood where the next "
         "one should"
         for cycle in cycles
         if len(cycle) > 2
     ]
-    return ", and ".join(found)
+    return ", and ".join(descriptions)

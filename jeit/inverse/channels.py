@@ -6,9 +6,10 @@ values, 2356 channels of a tank have 376. All channels v are combinations of r i
 (M, r). For data y with weights W = 1 / noise², the weighted estimates ŷ of the independent channels hold the same
 information,
 
-    ‖W^½ (T u - y)‖² = (u - ŷ)ᵀ G (u - ŷ) + rest,   G = TᵀWT,   ŷ = G⁻¹TᵀWy,
+    ‖W^½ (T u - y)‖² = (u - ŷ)ᵀ G (u - ŷ) + c,   G = TᵀWT,   ŷ = G⁻¹TᵀWy,
 
-and least squares with ŷ is much cheaper, because the work grows with the square of the number of channels.
+where c does not depend on u, and least squares with ŷ is much cheaper, because the work grows with the square of the
+number of channels.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ class Data(Module):
     """Voltages of independent channels and their noise.
 
     **Fields**: `voltages` (r,): ŷ, volts; `weight` (r,): 1 / volts; `covariance`, `precision` (r, r): covariance of
-    weight · ŷ and its inverse, which has a unit diagonal; `rest`: sum of squared residuals that no conductivity can
-    explain.
+    weight · ŷ and its inverse, which has a unit diagonal; `rest`: the constant c above, the sum of squared
+    residuals that no conductivity can explain.
     """
 
     voltages: Float[Array, " r"]
@@ -58,23 +59,23 @@ class IndependentChannels(Module):
         """Choose channels by a pivoted QR factorisation of the linear forms that map Z to the channels. If the protocol
         is traced, all channels are used."""
         if not has_values(protocol):
-            number = protocol.num_measurements
-            return cls(as_array(np.arange(number)), as_array(np.eye(number)))
+            num_channels = protocol.num_measurements
+            return cls(as_array(np.arange(num_channels)), as_array(np.eye(num_channels)))
         drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
         forms = drive[:, :, None] * measurement[:, None, :]
         rows, columns = np.triu_indices(protocol.num_electrodes)
         forms = (forms + np.swapaxes(forms, 1, 2))[:, rows, columns]
-        size = np.linalg.norm(forms, axis=1)
-        factors: Any = scipy.linalg.qr((forms / size[:, None]).T, mode="r", pivoting=True)
-        triangle, order = factors[-2:]
+        form_norms = np.linalg.norm(forms, axis=1)
+        factorisation: Any = scipy.linalg.qr((forms / form_norms[:, None]).T, mode="r", pivoting=True)
+        triangle, order = factorisation[-2:]
         rank = int(np.sum(np.abs(np.diag(triangle)) > _RANK_TOLERANCE))
-        others = scipy.linalg.solve_triangular(triangle[:rank, :rank], triangle[:rank, rank:])
+        dependent_coefficients = scipy.linalg.solve_triangular(triangle[:rank, :rank], triangle[:rank, rank:])
         combination = np.empty((len(forms), rank))
-        combination[order] = np.concatenate([np.eye(rank), others.T]) / size[order[:rank]]
-        combination *= size[:, None]
+        combination[order] = np.concatenate([np.eye(rank), dependent_coefficients.T]) / form_norms[order[:rank]]
+        combination *= form_norms[:, None]
         combination[np.abs(combination) < _RANK_TOLERANCE * np.abs(combination).max()] = 0
-        sort = np.argsort(order[:rank])
-        return cls(as_array(order[:rank][sort]), as_array(combination[:, sort]))
+        ascending_order = np.argsort(order[:rank])
+        return cls(as_array(order[:rank][ascending_order]), as_array(combination[:, ascending_order]))
 
     def weigh(self, noise: Float[Array, " M"]) -> "Weighing":
         """Compute the map from voltages with noise of this standard deviation, (M,) volts, to `Data`."""
@@ -102,10 +103,12 @@ class Weighing(Module):
 @either_engine
 def _combine_voltages(weighing: Weighing, voltages) -> Data:
     estimate = weighing.estimator @ voltages
-    scaled = weighing.weight * estimate
-    rest = ((voltages / weighing.noise) ** 2).sum() - scaled @ weighing.precision @ scaled
-    kept = weighing.weight, weighing.covariance, weighing.precision
-    return Data(estimate, *kept, namespace(weighing, voltages).maximum(rest, 0))
+    weighted_estimate = weighing.weight * estimate
+    unexplained_sum = (
+        (voltages / weighing.noise) ** 2
+    ).sum() - weighted_estimate @ weighing.precision @ weighted_estimate
+    weights_and_covariances = weighing.weight, weighing.covariance, weighing.precision
+    return Data(estimate, *weights_and_covariances, namespace(weighing, voltages).maximum(unexplained_sum, 0))
 
 
 @either_engine
@@ -142,10 +145,10 @@ def relative_noise(
     ```
     """
     xp = namespace(voltages, mask)
-    size = abs(xp.asarray(voltages))
-    used = xp.isfinite(size) if mask is None else xp.asarray(mask) & xp.isfinite(size)
-    typical = xp.nanmedian(xp.where(used, size, xp.nan))
-    return xp.where(used, relative * xp.sqrt(xp.where(used, size, 0) ** 2 + (floor * typical) ** 2), 1.0)
+    magnitude = abs(xp.asarray(voltages))
+    used = xp.isfinite(magnitude) if mask is None else xp.asarray(mask) & xp.isfinite(magnitude)
+    median_magnitude = xp.nanmedian(xp.where(used, magnitude, xp.nan))
+    return xp.where(used, relative * xp.sqrt(xp.where(used, magnitude, 0) ** 2 + (floor * median_magnitude) ** 2), 1.0)
 
 
 def electrode_misfits(
@@ -158,12 +161,12 @@ def electrode_misfits(
     offset or position differs from the model's.
     """
     used = np.asarray(mask)
-    reads = (np.asarray(protocol.channel_measurement) != 0) & used[:, None]
-    square = np.where(used, np.abs(np.asarray(residual) / np.asarray(noise)) ** 2, 0) @ reads
-    count = reads.sum(axis=0)
-    missed = np.sqrt(square / np.maximum(count, 1))
-    typical = np.median(missed[count > 0])
-    return np.where((count > 0) & (typical > 0), missed / max(typical, 1e-300), 1.0)
+    reads_electrode = (np.asarray(protocol.channel_measurement) != 0) & used[:, None]
+    squared_sums = np.where(used, np.abs(np.asarray(residual) / np.asarray(noise)) ** 2, 0) @ reads_electrode
+    num_readings = reads_electrode.sum(axis=0)
+    root_mean_squares = np.sqrt(squared_sums / np.maximum(num_readings, 1))
+    median_misfit = np.median(root_mean_squares[num_readings > 0])
+    return np.where((num_readings > 0) & (median_misfit > 0), root_mean_squares / max(median_misfit, 1e-300), 1.0)
 
 
 def repeated_noise(
@@ -205,14 +208,14 @@ def repeated_noise(
     used = np.broadcast_to(used, values.shape)
     if not np.isfinite(values[used]).all():
         raise ValueError("frames: some voltages in use are NaN or infinite; mask them.")
-    count = used.sum(axis=0)
-    mean = np.where(used, values, 0).sum(axis=0) / np.maximum(count, 1)
+    num_frames = used.sum(axis=0)
+    mean = np.where(used, values, 0).sum(axis=0) / np.maximum(num_frames, 1)
     squares = np.where(used, (values - mean) ** 2, 0).sum(axis=0)
-    known = count >= 2
-    if not known.any():
+    has_variance = num_frames >= 2
+    if not has_variance.any():
         raise ValueError("mask: it leaves no channel with two frames.")
-    if not squares[known].any():
+    if not squares[has_variance].any():
         raise ValueError("frames: all are alike, so the noise cannot be estimated; is one frame repeated?")
-    typical = np.median((squares[known] / (count[known] - 1))[squares[known] > 0])
-    freedom = np.where(known, count - 1, 1) + prior_frames
-    return np.where(known, np.sqrt((squares + prior_frames * typical) / freedom), 1.0)
+    median_variance = np.median((squares[has_variance] / (num_frames[has_variance] - 1))[squares[has_variance] > 0])
+    degrees_of_freedom = np.where(has_variance, num_frames - 1, 1) + prior_frames
+    return np.where(has_variance, np.sqrt((squares + prior_frames * median_variance) / degrees_of_freedom), 1.0)

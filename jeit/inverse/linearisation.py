@@ -1,4 +1,4 @@
-"""The linearised problem of difference imaging: its arguments are checked, and it is whitened and decomposed.
+"""Linearised problem of difference imaging: checks of its arguments, whitening and decomposition.
 
 Without derivatives the problem is solved with the eigendecomposition of `jeit.inverse.spectrum`. For traced arguments
 it is solved for one hyperparameter without an eigendecomposition (`DirectProblem`), because eigenvectors of equal
@@ -50,15 +50,23 @@ class DirectProblem(Module):
 
     def reconstruction(self, hyperparameter) -> Float[Array, "m M"]:
         """Reconstruction matrix R_λ (m, M) for whitened data."""
-        outer = self.jacobian @ self.product
-        damped = (outer + adjoint(outer)) / 2 + hyperparameter**2 * jnp.eye(len(outer))
-        inverse = jnp.linalg.inv(damped) if jnp.iscomplexobj(damped) else symmetric_inverse(damped)
+        data_covariance = self.jacobian @ self.product
+        damped_covariance = (data_covariance + adjoint(data_covariance)) / 2 + hyperparameter**2 * jnp.eye(
+            len(data_covariance)
+        )
+        inverse = (
+            jnp.linalg.inv(damped_covariance)
+            if jnp.iscomplexobj(damped_covariance)
+            else symmetric_inverse(damped_covariance)
+        )
         matrix = self.product @ inverse
         if self.null_space.shape[1]:
-            seen = self.jacobian @ self.null_space
-            weighted = inverse @ seen
-            free = weighted @ jnp.linalg.pinv(adjoint(seen) @ weighted)
-            matrix = matrix + (self.null_space - matrix @ seen) @ adjoint(free)
+            null_space_data = self.jacobian @ self.null_space
+            weighted_null_space_data = inverse @ null_space_data
+            null_space_weights = weighted_null_space_data @ jnp.linalg.pinv(
+                adjoint(null_space_data) @ weighted_null_space_data
+            )
+            matrix = matrix + (self.null_space - matrix @ null_space_data) @ adjoint(null_space_weights)
         return matrix @ self.directions.T
 
 
@@ -106,17 +114,19 @@ class Linearisation(Module):
         channels, root_weight = used_channels(model, noise, mask)
         if has_values(model, conductivity, root_weight, prior):
             directions = data_directions(model.protocol, channels, root_weight)
-            reduced: Any = combined_jacobian(model, conductivity, channels, (root_weight[:, None] * directions).T)
-            product = prior.covariance_product(model.mesh, reduced.conj())
-            repeated = model.protocol.repeated_facts(channels)
+            reduced_jacobian: Any = combined_jacobian(
+                model, conductivity, channels, (root_weight[:, None] * directions).T
+            )
+            product = prior.covariance_product(model.mesh, reduced_jacobian.conj())
+            num_repeated = model.protocol.repeated_facts(channels)
             null_space = prior.null_space(model.mesh)
-            spectrum = Spectrum.create(reduced, product, null_space, as_array(directions), repeated)
+            spectrum = Spectrum.create(reduced_jacobian, product, null_space, as_array(directions), num_repeated)
         else:
             jacobian = model.jacobian(conductivity)
             directions = _traced_directions(model.protocol, channels, root_weight)
-            reduced = directions.T @ (root_weight[:, None] * jacobian[channels])
-            product = prior.covariance_product(model.mesh, reduced.conj())
-            spectrum = DirectProblem(directions, reduced, product, prior.null_space(model.mesh))
+            reduced_jacobian = directions.T @ (root_weight[:, None] * jacobian[channels])
+            product = prior.covariance_product(model.mesh, reduced_jacobian.conj())
+            spectrum = DirectProblem(directions, reduced_jacobian, product, prior.null_space(model.mesh))
         return cls(spectrum, prior, channels, root_weight, model.protocol.num_measurements)
 
     def whiten(self, difference: ArrayLike) -> Float[Array, " K"]:
@@ -139,8 +149,12 @@ class Linearisation(Module):
     def matrix(self, hyperparameter) -> Float[Array, "m M"]:
         """Reconstruction matrix: change of conductivity per volt, zero for channels not in use."""
         if not has_values(self.spectrum, self.root_weight, hyperparameter):
-            used = jnp.asarray(self.spectrum.reconstruction(hyperparameter)) * self.root_weight
-            return jnp.zeros((used.shape[0], self.num_channels), used.dtype).at[:, self.channels].set(used)
+            channel_matrix = jnp.asarray(self.spectrum.reconstruction(hyperparameter)) * self.root_weight
+            return (
+                jnp.zeros((channel_matrix.shape[0], self.num_channels), channel_matrix.dtype)
+                .at[:, self.channels]
+                .set(channel_matrix)
+            )
         images, weights = self.factors(hyperparameter)
         return as_array(images @ weights)
 
@@ -148,8 +162,8 @@ class Linearisation(Module):
         """Factors of the reconstruction matrix: images (m, k), and their weights (k, M) in 1 / volts. Not available for
         traced problems."""
         assert isinstance(self.spectrum, Spectrum)
-        known, chosen = on_host((self.spectrum, hyperparameter))  # NumPy arrays are not copied
-        images, whitened = (np.asarray(part) for part in known.factors(chosen))
+        spectrum, host_hyperparameter = on_host((self.spectrum, hyperparameter))  # NumPy arrays are not copied
+        images, whitened = (np.asarray(factor) for factor in spectrum.factors(host_hyperparameter))
         weights: Any = np.zeros((whitened.shape[0], self.num_channels), whitened.dtype)
         weights[:, self.channels] = whitened * self.root_weight
         return images, weights
@@ -165,9 +179,9 @@ def combined_blocks(
     """
     fields = evaluate(model, fields_and_impedance_of, check_conductivity(model.mesh, conductivity))[0]
     mesh, protocol, fields = on_host((model.mesh, model.protocol.subset(channels), fields))
-    electrodes = protocol.num_electrodes
-    if electrodes * (electrodes + 1) // 2 < len(channels):
-        # There are fewer products of fields than channels: ∂v = -Σ_ab d_a m_b ∫ ∇u_a · ∇u_b.
+    num_electrodes = protocol.num_electrodes
+    if num_electrodes * (num_electrodes + 1) // 2 < len(channels):
+        # Products of fields are fewer than channels, so they are computed: ∂v = -Σ_ab d_a m_b ∫ ∇u_a · ∇u_b.
         weights, blocks = -weights @ _linear_forms(model.protocol, channels), field_products(mesh, fields)
     else:
         blocks = jacobian_blocks(mesh, protocol, fields)
@@ -179,11 +193,11 @@ def combined_jacobian(
     model: ForwardModel, conductivity, channels: Int[np.ndarray, " K"], weights: Float[Any, "r K"]
 ) -> Inexact[Any, "r m"]:
     """Weighted sums (r, m) of the channels' Jacobians; `conductivity` in S/m (2-D: S)."""
-    kind = complex if np.iscomplexobj(conductivity) else float
-    found = np.empty((len(weights), model.mesh.num_cells), kind)
+    number_type = complex if np.iscomplexobj(conductivity) else float
+    jacobian = np.empty((len(weights), model.mesh.num_cells), number_type)
     for cells, block in combined_blocks(model, conductivity, channels, weights):
-        found[:, cells] = block
-    return found
+        jacobian[:, cells] = block
+    return jacobian
 
 
 def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, Float[Array, " K"]]:
@@ -207,8 +221,8 @@ def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, Float[A
 
 def check_mask(mask) -> None:
     """Raise `ValueError` for a traced mask, because the number of channels in use must be known."""
-    instead = "give it as an array of NumPy, outside; to weigh channels by what is traced, give noise"
-    check_has_values("mask", mask, "which channels are used depends on", instead)
+    advice = "give it as an array of NumPy, outside; to weigh channels by what is traced, give noise"
+    check_has_values("mask", mask, "which channels are used depends on", advice)
 
 
 def data_directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarray, "K r"]:
@@ -218,24 +232,26 @@ def data_directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarr
     For a drive d and a measurement m, which sum to zero, and a symmetric matrix G (the transfer impedance or its
     derivative), Σ_ab d_a m_b G_ab = Σ_a<b (d_a m_b + d_b m_a)(G_ab - (G_aa + G_bb)/2).
     """
-    directions, size, _ = np.linalg.svd(
+    directions, singular_values, _ = np.linalg.svd(
         root_weight[:, None] * _pair_coefficients(protocol, channels), full_matrices=False
     )
-    return directions[:, size > _RANK_TOLERANCE * size[0]]
+    return directions[:, singular_values > _RANK_TOLERANCE * singular_values[0]]
 
 
 def _traced_directions(protocol: Protocol, channels, root_weight) -> Float[Array, "K r"]:
     """`data_directions`, differentiable with respect to the weights; the identity if the protocol is traced."""
     if not has_values(protocol):
         return jnp.eye(len(channels))
-    directions, size, _ = np.linalg.svd(_pair_coefficients(protocol, channels), full_matrices=False)
-    return jnp.linalg.qr(root_weight[:, None] * directions[:, size > _RANK_TOLERANCE * size[0]])[0]
+    directions, singular_values, _ = np.linalg.svd(_pair_coefficients(protocol, channels), full_matrices=False)
+    return jnp.linalg.qr(root_weight[:, None] * directions[:, singular_values > _RANK_TOLERANCE * singular_values[0]])[
+        0
+    ]
 
 
 def _pair_coefficients(protocol: Protocol, channels) -> Float[np.ndarray, "K e"]:
     """Coefficients (K, e) of the channels for each of the e pairs of electrodes."""
-    first, second = np.triu_indices(protocol.num_electrodes)
-    return _linear_forms(protocol, channels)[:, first < second]
+    rows, columns = np.triu_indices(protocol.num_electrodes)
+    return _linear_forms(protocol, channels)[:, rows < columns]
 
 
 def _linear_forms(protocol: Protocol, channels) -> Float[np.ndarray, "K f"]:
@@ -243,6 +259,6 @@ def _linear_forms(protocol: Protocol, channels) -> Float[np.ndarray, "K f"]:
     matrix between electrodes."""
     drive = np.asarray(protocol.drive)[np.asarray(protocol.drive_index)[channels]]
     measurement = np.asarray(protocol.measurement)[np.asarray(protocol.measurement_index)[channels]]
-    first, second = np.triu_indices(protocol.num_electrodes)
-    both = drive[:, first] * measurement[:, second] + drive[:, second] * measurement[:, first]
-    return np.where(first < second, both, both / 2)
+    rows, columns = np.triu_indices(protocol.num_electrodes)
+    symmetric_sums = drive[:, rows] * measurement[:, columns] + drive[:, columns] * measurement[:, rows]
+    return np.where(rows < columns, symmetric_sums, symmetric_sums / 2)

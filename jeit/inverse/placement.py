@@ -1,12 +1,12 @@
 """Electrode positions and contact impedances estimated from a reference frame.
 
-Electrodes are rarely exactly where a description says, and their contacts differ. A frame of the homogeneous body shows
-by how much: with shifts t of the electrodes along the ways in which they can move, contact impedances z = z₀ e^ζ and a
-conductivity σ, the estimate minimises
+Electrodes are rarely exactly where a description says, and their contact impedances differ. Both are estimated from a
+frame of the homogeneous body. With shifts t of the electrodes along the directions in which they can move, contact
+impedances z = z₀ e^ζ and a conductivity σ, the estimate minimises
 
     ½ ‖(v(σ, t, z) - y) / κn‖² + ½ ‖t / s‖² + ½ ζᵀ Γ⁻¹ ζ,
 
-n being the `relative_noise` of the channels, s the standard deviation of the positions before the data, and Γ the
+where n is the `relative_noise` of the channels, s the prior standard deviation of the positions, and Γ the prior
 covariance of the logarithms of the contact impedances, which have a common part. κ is estimated from the residual.
 Derivatives need no further solve: at fixed fields only the energy of electrode l depends on t_l
 (`jeit.forward.changes`).
@@ -35,25 +35,25 @@ from jeit.inverse.nonlinear.problem import check_frame
 from jeit_solvers import Descent, QuadraticModel, ridge_model
 from jeit_solvers.engines import as_array, on_host
 
-# Standard deviations of the logarithms of contact impedances: of each electrode's own part, and of the common one. And
-# of the logarithm of the conductivity, about that which fits the described model best.
+# Prior standard deviations: of the logarithm of each contact impedance, of the common part of these logarithms, and of
+# the logarithm of the conductivity about the value that best fits the described model.
 _OWN_CONTACT_DEVIATION, _COMMON_CONTACT_DEVIATION, _CONDUCTIVITY_DEVIATION = 1.0, 4.0, 2.0
-# Steps of the two fits, before and after κ is estimated, in sheets and in solids, where each takes a second; the
-# tolerance of their cost.
+# Maximum numbers of steps of the two fits, before and after κ is estimated, and the tolerance of their cost, by
+# dimension of the mesh. A step in a solid takes a second.
 _MAX_STEPS, _RTOL = {2: (40, 40), 3: (5, 3)}, {2: 1e-4, 3: 3e-3}
-# κ in units of `relative_noise`: 0.1 % of a voltage at least.
+# Minimum of κ, which is in units of `relative_noise`: 0.1 means 0.1 % of a voltage.
 _MIN_NOISE = 0.1
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """How accurately a sensor is described, as standard deviations. All but the first are shares: 0.1 is 10 %.
+    """Uncertainty of the description of a sensor, as standard deviations. All but the first are relative: 0.1 is 10 %.
 
     **Fields**: `position`: of electrode positions, metres, in every direction in which they can move; default: 0.0175
-    of the width of the body, 2° of a disk. `drift`: of the logarithm of each contact impedance, from the reference to
-    the frame. `size`: of the lengths of the body, relative. `other`: of whatever else differs from the model, as a
-    share of the difference of the two frames; the misfit of the reference, if that is larger. Raises `ValueError` for
-    values that are negative or not finite, and for sizes and others above 1.
+    of the width of the body, which is 2° on a disk. `drift`: of the logarithm of each contact impedance, from the
+    reference to the frame. `size`: of the lengths of the body, relative. `other`: of all other errors of the model, as
+    a share of the difference of the two frames; if the misfit of the reference is larger, it is used instead. Raises
+    `ValueError` for values that are negative or not finite, and for sizes and others above 1.
 
     **Example:**
 
@@ -68,13 +68,13 @@ class Uncertainty:
     other: float = 0.02
 
     def __post_init__(self):
-        for name, most in (("position", np.inf), ("drift", np.inf), ("size", 1.0), ("other", 1.0)):
+        for name, upper_limit in (("position", np.inf), ("drift", np.inf), ("size", 1.0), ("other", 1.0)):
             value: Any = getattr(self, name)
-            known = is_number(value) and np.isfinite(value) and 0 <= float(value) <= most
-            if not (known or (value is None and name == "position")):
-                wanted = "metres, 0 or more" if name == "position" else "a share, not per cent"
-                wanted += " from 0 to 1" if most == 1 else ""
-                raise ValueError(f"{name} must be a number, {wanted}; it is {describe(value)}.")
+            is_valid = is_number(value) and np.isfinite(value) and 0 <= float(value) <= upper_limit
+            if not (is_valid or (value is None and name == "position")):
+                expected = "metres, 0 or more" if name == "position" else "a share, not per cent"
+                expected += " from 0 to 1" if upper_limit == 1 else ""
+                raise ValueError(f"{name} must be a number, {expected}; it is {describe(value)}.")
 
 
 class Placement(NamedTuple):
@@ -130,11 +130,13 @@ class ModelError(NamedTuple):
         sensitivity, protocol = PlacementSensitivity(model.mesh, electrodes), on_host(model.protocol)
 
         def channels(impedances):
-            return np.stack([np.asarray(select_channels(protocol, one)) for one in impedances], axis=1)
+            return np.stack([np.asarray(select_channels(protocol, impedance)) for impedance in impedances], axis=1)
 
-        there, here = (sensitivity(*map(np.asarray, model.fields(one))) for one in (conductivity, background))
-        drifted = self.drift * channels(there[-electrodes.num_electrodes :])
-        return np.concatenate([channels(there - here) @ self.factor, drifted], axis=1)
+        derivatives, background_derivatives = (
+            sensitivity(*map(np.asarray, model.fields(cell_values))) for cell_values in (conductivity, background)
+        )
+        drift_errors = self.drift * channels(derivatives[-electrodes.num_electrodes :])
+        return np.concatenate([channels(derivatives - background_derivatives) @ self.factor, drift_errors], axis=1)
 
 
 class _LinearisedModel(NamedTuple):
@@ -184,58 +186,63 @@ def place_electrodes(
     if not isinstance(model.electrodes, AbstractMovableElectrodes):
         raise ValueError(f"electrodes: {type(model.electrodes).__name__} have no position that can be estimated.")
     problem = _PlacementProblem(model, np.asarray(measured), used, deviation)
-    size, scale = len(problem.spread), 1.0
-    found: Any = np.zeros(size)
-    here, covariance = None, np.eye(size)
-    for steps in _MAX_STEPS[model.mesh.dimension]:
-        descent = Descent(rtol=_RTOL[model.mesh.dimension], damping=1e-2, history=steps + 1)
-        found, _ = descent.at_once(problem.expand, found, scale, steps)
-        here = problem.at(found)
-        if here is None or not np.isfinite(here.voltages).all():
+    num_coefficients, noise_scale = len(problem.spread), 1.0
+    coefficients: Any = np.zeros(num_coefficients)
+    fitted_point, covariance = None, np.eye(num_coefficients)
+    for max_steps in _MAX_STEPS[model.mesh.dimension]:
+        descent = Descent(rtol=_RTOL[model.mesh.dimension], damping=1e-2, history=max_steps + 1)
+        coefficients, _ = descent.at_once(problem.expand, coefficients, noise_scale, max_steps)
+        fitted_point = problem.at(coefficients)
+        if fitted_point is None or not np.isfinite(fitted_point.voltages).all():
             raise ValueError("voltages: no electrode positions were found that explain them.")
-        scale, covariance = problem.noise_and_covariance(here, scale)
-    assert here is not None
+        noise_scale, covariance = problem.noise_and_covariance(fitted_point, noise_scale)
+    assert fitted_point is not None
     factor, shape = problem.factor(covariance), problem.directions.shape[:2]
-    number = shape[0] * shape[1]
-    shift = (problem.spread @ found)[1 : 1 + number].reshape(shape)
-    left = np.linalg.norm(factor[:number], axis=1).reshape(shape)
-    return Placement(here.model, here.conductivity, shift, left, ModelError(factor))
+    num_shifts = shape[0] * shape[1]
+    shift = (problem.spread @ coefficients)[1 : 1 + num_shifts].reshape(shape)
+    shift_deviation = np.linalg.norm(factor[:num_shifts], axis=1).reshape(shape)
+    return Placement(fitted_point.model, fitted_point.conductivity, shift, shift_deviation, ModelError(factor))
 
 
 class _PlacementProblem:
-    """Voltages and their derivatives by coefficients of unit variance: those of log σ, of the shifts, and of log zσ."""
+    """Voltages and their derivatives with respect to coefficients of unit variance of log σ, the shifts and log zσ."""
 
     def __init__(self, model: ForwardModel, measured: np.ndarray, used: np.ndarray, deviation: float):
-        self.given, self.mesh, self.protocol = model, on_host(model.mesh), on_host(model.protocol)
+        self.described_model, self.mesh, self.protocol = model, on_host(model.mesh), on_host(model.protocol)
         self.used = used
         self.measured = measured
-        self.independent = len(IndependentChannels.create(self.protocol).index)
+        self.num_independent = len(IndependentChannels.create(self.protocol).index)
         self.noise = np.asarray(relative_noise(as_array(measured), as_array(self.used)))
         electrodes: Any = model.electrodes
         self.directions = np.asarray(electrodes.directions(self.mesh))
-        number, ways = self.directions.shape[:2]
-        unit = np.asarray(model.voltages(1.0))[self.used]
-        if not unit @ measured[self.used] > 0:
+        num_electrodes, num_directions = self.directions.shape[:2]
+        unit_voltages = np.asarray(model.voltages(1.0))[self.used]
+        if not unit_voltages @ measured[self.used] > 0:
             raise ValueError("voltages: they have the opposite sign of the model's.")
-        self.first = float(np.log(unit @ unit / (unit @ measured[self.used])))
-        contact = _OWN_CONTACT_DEVIATION**2 * np.eye(number) + _COMMON_CONTACT_DEVIATION**2
-        self.spread = np.zeros((1 + number * (ways + 1),) * 2)
+        self.log_conductivity = float(np.log(unit_voltages @ unit_voltages / (unit_voltages @ measured[self.used])))
+        contact_covariance = _OWN_CONTACT_DEVIATION**2 * np.eye(num_electrodes) + _COMMON_CONTACT_DEVIATION**2
+        self.spread = np.zeros((1 + num_electrodes * (num_directions + 1),) * 2)
         self.spread[0, 0] = _CONDUCTIVITY_DEVIATION
-        middle = np.arange(1, 1 + number * ways)
-        self.spread[middle, middle] = deviation
-        self.spread[1 + number * ways :, 1 + number * ways :] = np.linalg.cholesky(contact)
+        shift_indices = np.arange(1, 1 + num_electrodes * num_directions)
+        self.spread[shift_indices, shift_indices] = deviation
+        self.spread[1 + num_electrodes * num_directions :, 1 + num_electrodes * num_directions :] = np.linalg.cholesky(
+            contact_covariance
+        )
 
     def at(self, coefficients: Float[np.ndarray, " p"]) -> _LinearisedModel | None:
         """The model at some coefficients; None where electrodes would overlap or leave the body."""
-        number, ways = self.directions.shape[:2]
-        values = self.spread @ coefficients
-        shift, contact = values[1 : 1 + number * ways].reshape(number, ways), values[1 + number * ways :]
-        log_conductivity = self.first + values[0]
-        given: Any = self.given.electrodes
-        electrodes: Any = shift_electrodes(given, self.directions, shift)
-        impedance = np.asarray(given.contact_impedance) * np.exp(contact - values[0])
+        num_electrodes, num_directions = self.directions.shape[:2]
+        parameters = self.spread @ coefficients
+        shifts, log_contact = (
+            parameters[1 : 1 + num_electrodes * num_directions].reshape(num_electrodes, num_directions),
+            parameters[1 + num_electrodes * num_directions :],
+        )
+        log_conductivity = self.log_conductivity + parameters[0]
+        described_electrodes: Any = self.described_model.electrodes
+        shifted_electrodes: Any = shift_electrodes(described_electrodes, self.directions, shifts)
+        impedance = np.asarray(described_electrodes.contact_impedance) * np.exp(log_contact - parameters[0])
         try:
-            model = self.given.with_electrodes(electrodes.with_contact_impedance(impedance))
+            model = self.described_model.with_electrodes(shifted_electrodes.with_contact_impedance(impedance))
         except ValueError:
             return None
         conductivity = float(np.exp(log_conductivity))
@@ -245,51 +252,57 @@ class _PlacementProblem:
 
     def expand(self, coefficients, scale: float) -> QuadraticModel:
         """Cost, and a step of Levenberg-Marquardt, at a `scale` κ of the noise."""
-        here = self.at(coefficients)
-        if here is None:
+        point = self.at(coefficients)
+        if point is None:
             return np.inf, lambda damping: None  # pyright: ignore
-        residual = self._residual(here) / scale
+        residual = self._residual(point) / scale
         cost = 0.5 * (residual @ residual + coefficients @ coefficients)
-        same: Any = np.eye(len(residual))
+        identity: Any = np.eye(len(residual))
 
         def step(damping):
-            rows = self._jacobian(here) / scale
-            return ridge_model(residual, rows, coefficients, same, same)[1](damping)  # pyright: ignore
+            rows = self._jacobian(point) / scale
+            return ridge_model(residual, rows, coefficients, identity, identity)[1](damping)  # pyright: ignore
 
         return cost, step
 
     def noise_and_covariance(self, point: _LinearisedModel, scale: float) -> tuple[float, Float[np.ndarray, "p p"]]:
         """κ estimated from the residual of a fit at `scale`, and the posterior covariance of the coefficients with it.
 
-        Dependent channels count once: the residual has as many degrees of freedom as independent channels, less those
-        that the fit has used.
+        Dependent channels count once: the number of degrees of freedom of the residual is the number of independent
+        channels minus the number that the fit has used.
         """
         residual, rows = self._residual(point), self._jacobian(point)
-        independent = min(self.independent, len(residual))
-        share = independent / len(residual)
+        num_independent = min(self.num_independent, len(residual))
+        independent_share = num_independent / len(residual)
         # With eigenvalues, the covariance stays definite where the Hessian's inverse loses its sign to rounding.
-        values, axes = np.linalg.eigh(rows.T @ rows)
-        values = np.maximum(values, 0)
-        fitted = np.sum(values / (values + scale**2))
-        freedom = max(independent - fitted, 0.3 * independent)
-        scale = max(_MIN_NOISE, float(np.sqrt(share * (residual @ residual) / freedom)))
-        return scale, (axes / (1 + values / scale**2)) @ axes.T
+        eigenvalues, eigenvectors = np.linalg.eigh(rows.T @ rows)
+        eigenvalues = np.maximum(eigenvalues, 0)
+        num_fitted = np.sum(eigenvalues / (eigenvalues + scale**2))
+        degrees_of_freedom = max(num_independent - num_fitted, 0.3 * num_independent)
+        scale = max(_MIN_NOISE, float(np.sqrt(independent_share * (residual @ residual) / degrees_of_freedom)))
+        return scale, (eigenvectors / (1 + eigenvalues / scale**2)) @ eigenvectors.T
 
     def factor(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "q q"]:
         """Factor of the covariance of shifts, metres, and of log z, from that of the coefficients."""
-        of_values = self.spread.copy()
-        of_values[1 + self.directions.shape[0] * self.directions.shape[1] :] -= self.spread[0]  # log z = log zσ - log σ
-        of_values = of_values[1:]
-        values, axes = np.linalg.eigh(of_values @ covariance @ of_values.T)
-        return axes * np.sqrt(np.maximum(values, 0))
+        parameter_root = self.spread.copy()
+        parameter_root[1 + self.directions.shape[0] * self.directions.shape[1] :] -= self.spread[
+            0
+        ]  # log z = log zσ - log σ
+        parameter_root = parameter_root[1:]
+        eigenvalues, eigenvectors = np.linalg.eigh(parameter_root @ covariance @ parameter_root.T)
+        return eigenvectors * np.sqrt(np.maximum(eigenvalues, 0))
 
     def _residual(self, point: _LinearisedModel) -> Float[np.ndarray, " u"]:
         return ((point.voltages - self.measured) / self.noise)[self.used]
 
     def _jacobian(self, point: _LinearisedModel) -> Float[np.ndarray, "u p"]:
-        """Derivatives of the weighted voltages by the coefficients."""
+        """Derivatives of the weighted voltages with respect to the coefficients."""
         electrodes: Any = point.model.electrodes
-        by_placement = PlacementSensitivity(self.mesh, electrodes)(point.fields, point.impedance)
-        every = np.concatenate([-point.impedance[None], by_placement])  # the first by log σ at fixed zσ
-        rows = np.stack([np.asarray(select_channels(self.protocol, one)) for one in every], axis=1)
+        placement_derivatives = PlacementSensitivity(self.mesh, electrodes)(point.fields, point.impedance)
+        impedance_derivatives = np.concatenate(
+            [-point.impedance[None], placement_derivatives]
+        )  # the first with respect to log σ at fixed zσ
+        rows = np.stack(
+            [np.asarray(select_channels(self.protocol, impedance)) for impedance in impedance_derivatives], axis=1
+        )
         return (rows / self.noise[:, None])[self.used] @ self.spread

@@ -59,9 +59,11 @@ class Spectrum(Module):
     ):
         """Create from the whitened Jacobian of all channels, or of their orthonormal combinations `directions`, its
         product with the prior covariance, and the prior's null space."""
-        given = host.asarray(np.eye(len(jacobian))) if directions is None else directions
-        basis, eigenvalues, seen, outer = _decompose(jacobian, product, null_space, given)
-        return cls(basis, eigenvalues, given, jacobian, product, null_space, seen, outer, repeated)
+        data_basis = host.asarray(np.eye(len(jacobian))) if directions is None else directions
+        basis, eigenvalues, null_space_data, data_covariance = _decompose(jacobian, product, null_space, data_basis)
+        return cls(
+            basis, eigenvalues, data_basis, jacobian, product, null_space, null_space_data, data_covariance, repeated
+        )
 
     @property
     def freedom(self) -> int:
@@ -103,14 +105,14 @@ class Spectrum(Module):
     def squared_modes(self) -> Float[np.ndarray, " k"]:
         """Mean over cells of the squared absolute value of each of the `modes`; over a subset of about
         `_NUM_MEAN_CELLS` cells on large meshes."""
-        images, weights = (np.asarray(part) for part in _mode_factors(self))
-        some = images[:: max(1, len(images) // _NUM_MEAN_CELLS)]
-        return np.mean(np.abs(some @ weights) ** 2, axis=0)
+        images, weights = (np.asarray(factor) for factor in _mode_factors(self))
+        sampled_images = images[:: max(1, len(images) // _NUM_MEAN_CELLS)]
+        return np.mean(np.abs(sampled_images @ weights) ** 2, axis=0)
 
     def candidates(self, size: int = 200) -> Float[np.ndarray, " K"]:
         """Candidate λ (K,), logarithmically spaced from 1e-6 to 10 times the square root of the largest eigenvalue."""
-        largest = np.sqrt(np.asarray(self.eigenvalues).max())
-        return largest * np.logspace(-6, 1, size)
+        max_singular_value = np.sqrt(np.asarray(self.eigenvalues).max())
+        return max_singular_value * np.logspace(-6, 1, size)
 
     def curves(self, data: ArrayLike | None, candidates: Float[np.ndarray, " K"]) -> tuple[np.ndarray, np.ndarray]:
         """Residual ‖v - JR_λv‖ and penalty √(xᵀQx), each (K,), for every candidate λ; empty arrays without data or if
@@ -126,15 +128,15 @@ class Spectrum(Module):
 @either_engine
 def _decompose(jacobian, product, null_space, directions):
     xp = namespace(jacobian, product, null_space)
-    outer = directions @ (jacobian @ product) @ directions.T
-    seen = directions @ (jacobian @ null_space)
+    data_covariance = directions @ (jacobian @ product) @ directions.T
+    null_space_data = directions @ (jacobian @ null_space)
     if null_space.shape[1] == 0:
-        eigenvalues, vectors = symmetric_eigen((outer + adjoint(outer)) / 2)
-        return vectors, xp.maximum(eigenvalues, 0), seen, outer
-    complement = xp.linalg.qr(seen, mode="complete")[0][:, null_space.shape[1] :]
-    projected = adjoint(complement) @ outer @ complement
+        eigenvalues, vectors = symmetric_eigen((data_covariance + adjoint(data_covariance)) / 2)
+        return vectors, xp.maximum(eigenvalues, 0), null_space_data, data_covariance
+    complement = xp.linalg.qr(null_space_data, mode="complete")[0][:, null_space.shape[1] :]
+    projected = adjoint(complement) @ data_covariance @ complement
     eigenvalues, vectors = symmetric_eigen((projected + adjoint(projected)) / 2)
-    return complement @ vectors, xp.maximum(eigenvalues, 0), seen, outer
+    return complement @ vectors, xp.maximum(eigenvalues, 0), null_space_data, data_covariance
 
 
 @either_engine
@@ -146,19 +148,19 @@ def _reconstruction_factors(spectrum: Spectrum, hyperparameter):
         return spectrum.images, weights
     # Coefficients of the null space, fitted by least squares to the data that the penalised part does not explain.
     coefficients = xp.linalg.pinv(spectrum.seen)
-    rest = np.eye(basis.shape[0]) - spectrum.outer @ inverse
+    unexplained = np.eye(basis.shape[0]) - spectrum.outer @ inverse
     images = xp.concatenate([spectrum.images, spectrum.null_space], axis=1)
-    return images, xp.concatenate([weights, coefficients @ rest])
+    return images, xp.concatenate([weights, coefficients @ unexplained])
 
 
 @either_engine
 def _spectrum_image(spectrum: Spectrum, data, hyperparameter):
-    inner = spectrum.basis @ ((adjoint(spectrum.basis) @ data) / (spectrum.eigenvalues + hyperparameter**2))
-    image = spectrum.images @ (spectrum.directions.T @ inner)
+    dual_image = spectrum.basis @ ((adjoint(spectrum.basis) @ data) / (spectrum.eigenvalues + hyperparameter**2))
+    image = spectrum.images @ (spectrum.directions.T @ dual_image)
     if spectrum.null_space.shape[1] == 0:
         return image
-    free = namespace(spectrum).linalg.pinv(spectrum.seen)
-    return image + spectrum.null_space @ (free @ (data - spectrum.outer @ inner))
+    null_space_weights = namespace(spectrum).linalg.pinv(spectrum.seen)
+    return image + spectrum.null_space @ (null_space_weights @ (data - spectrum.outer @ dual_image))
 
 
 @either_engine
@@ -171,5 +173,7 @@ def _mode_factors(spectrum: Spectrum):
     weights, xp = spectrum.directions.T @ spectrum.basis, namespace(spectrum)
     if spectrum.null_space.shape[1] == 0:
         return spectrum.images, weights
-    free = xp.linalg.pinv(spectrum.seen) @ (spectrum.outer @ spectrum.basis)
-    return xp.concatenate([spectrum.images, -spectrum.null_space], axis=1), xp.concatenate([weights, free])
+    null_space_weights = xp.linalg.pinv(spectrum.seen) @ (spectrum.outer @ spectrum.basis)
+    return xp.concatenate([spectrum.images, -spectrum.null_space], axis=1), xp.concatenate(
+        [weights, null_space_weights]
+    )

@@ -75,10 +75,12 @@ class Posterior(Module):
         """
         if not 0 < probability < 1:
             raise ValueError(f"probability must lie between 0 and 1; it is {probability}.")
-        reach = scipy.special.ndtri(0.5 + probability / 2)
+        normal_quantile = scipy.special.ndtri(0.5 + probability / 2)
         estimate, deviation = _sample_estimates(self)
         link = self.inversion.link
-        return link.conductivity(estimate - reach * deviation), link.conductivity(estimate + reach * deviation)
+        return link.conductivity(estimate - normal_quantile * deviation), link.conductivity(
+            estimate + normal_quantile * deviation
+        )
 
     def region(self, cells: ArrayLike) -> tuple[float | Float[Array, ""], float | Float[Array, ""]]:
         """Mean conductivity of the given cells, weighted by area (3-D: volume), and its standard deviation, S/m
@@ -86,18 +88,18 @@ class Posterior(Module):
 
         `cells`: booleans (m,) or indices. Raises `ValueError` for an empty selection, invalid indices and traced cells.
         """
-        measure = on_host(measures(self.inversion.model.mesh))
-        chosen = np.zeros(measure.size, bool)
+        cell_measures = on_host(measures(self.inversion.model.mesh))
+        is_in_region = np.zeros(cell_measures.size, bool)
         check_has_values("cells", cells, "the region is made of", "choose them outside")
         indices = np.asarray(cells)
-        if (indices.dtype == bool and indices.shape != chosen.shape) or indices.dtype.kind not in "iub":
-            raise ValueError(f"cells must be booleans ({measure.size},), or indices of cells.")
-        if indices.dtype != bool and indices.size and (indices.min() < 0 or indices.max() >= measure.size):
-            raise ValueError(f"cells must be indices from 0 to {measure.size - 1}.")
-        chosen[indices] = True
-        if not chosen.any():
+        if (indices.dtype == bool and indices.shape != is_in_region.shape) or indices.dtype.kind not in "iub":
+            raise ValueError(f"cells must be booleans ({cell_measures.size},), or indices of cells.")
+        if indices.dtype != bool and indices.size and (indices.min() < 0 or indices.max() >= cell_measures.size):
+            raise ValueError(f"cells must be indices from 0 to {cell_measures.size - 1}.")
+        is_in_region[indices] = True
+        if not is_in_region.any():
             raise ValueError("cells: none is chosen; give at least one.")
-        weight = jnp.where(chosen, measure, 0) / measure[chosen].sum()
+        weight = jnp.where(is_in_region, cell_measures, 0) / cell_measures[is_in_region].sum()
         mean, deviation = _weighted_mean(self, weight)
         return (float(mean), float(deviation)) if has_values(mean) else (mean, deviation)
 
@@ -105,23 +107,27 @@ class Posterior(Module):
         """Standard deviations of the unknowns estimated along with the conductivity, in the units of
         `Reconstruction.unknowns`; linearised for quantities whose logarithm was estimated."""
         model, values = self.inversion.model, self.inversion.values(self.coefficients)
-        start = self.inversion.basis.num_coefficients
+        first_index = self.inversion.basis.num_coefficients
         deviation = jnp.sqrt(1 - jnp.sum((self.root @ self.cross) ** 2, axis=0))
-        found = {}
+        deviations = {}
         for unknown, value in zip(self.inversion.unknowns, values, strict=True):
-            ones = jnp.ones_like(value)
-            _, slope = jax.jvp(lambda values, one=unknown: one.quantity(model, values), (value,), (ones,))
-            found[type(unknown).__name__] = slope * unknown.deviation * deviation[start : start + unknown.size]
-            start += unknown.size
-        return found
+            tangent = jnp.ones_like(value)
+            _, slope = jax.jvp(
+                lambda values, parameter=unknown: parameter.quantity(model, values), (value,), (tangent,)
+            )
+            deviations[type(unknown).__name__] = (
+                slope * unknown.deviation * deviation[first_index : first_index + unknown.size]
+            )
+            first_index += unknown.size
+        return deviations
 
     def sample(self, key: PRNGKeyArray, number: int) -> Float[Array, "number m"]:
         """Draw conductivities (number, m) from the posterior, S/m (2-D: S). Raises `ValueError` if `key` is not a key
         of `jax.random`."""
         check_key(key)
-        prior, noise = jax.random.split(key)
-        numbers = jax.random.normal(prior, (number, self.prior.num_draws(len(self.coefficients))))
-        return as_array(_draw_samples(self, numbers, jax.random.normal(noise, (number, len(self.root)))))
+        prior_key, noise_key = jax.random.split(key)
+        prior_draws = jax.random.normal(prior_key, (number, self.prior.num_draws(len(self.coefficients))))
+        return as_array(_draw_samples(self, prior_draws, jax.random.normal(noise_key, (number, len(self.root)))))
 
 
 def posterior(reconstruction: Reconstruction) -> Posterior:
@@ -149,23 +155,23 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
     inversion, coefficients = reconstruction.inversion, reconstruction.coefficients
     if has_values(reconstruction.outcome) and Status.FAILED.number in np.ravel(reconstruction.outcome):
         raise ValueError(f"posterior: the reconstruction failed. {reconstruction.reason}")
-    in_pieces = inversion.model.mesh.dimension == 3 or not inversion.penalty.is_standard_normal
-    if not (has_values(inversion, coefficients) and in_pieces):
+    runs_uncompiled = inversion.model.mesh.dimension == 3 or not inversion.penalty.is_standard_normal
+    if not (has_values(inversion, coefficients) and runs_uncompiled):
         return _compute_posterior(inversion, coefficients)
     # For a solid body, compiled programs would hold several copies of the Jacobian; with sparse factors, compilation
     # takes seconds.
     with np.errstate(all="ignore"):
-        known, ended = on_host((inversion, coefficients))
-        jacobian, cross, inner, normal = _data_space_matrices(known, ended)
-        root = scipy.linalg.inv(np.linalg.cholesky(inner))
-    return Posterior(known, ended, jacobian, root, cross, normal)
+        host_inversion, host_coefficients = on_host((inversion, coefficients))
+        jacobian, cross, data_covariance, normal = _data_space_matrices(host_inversion, host_coefficients)
+        root = scipy.linalg.inv(np.linalg.cholesky(data_covariance))
+    return Posterior(host_inversion, host_coefficients, jacobian, root, cross, normal)
 
 
 @eqx.filter_jit
 def _compute_posterior(inversion: Inversion, coefficients) -> Posterior:
-    jacobian, cross, inner, normal = _data_space_matrices(inversion, coefficients)
-    lower = jnp.linalg.cholesky(inner)
-    root = jax.scipy.linalg.solve_triangular(lower, jnp.eye(len(lower)), lower=True)
+    jacobian, cross, data_covariance, normal = _data_space_matrices(inversion, coefficients)
+    lower_factor = jnp.linalg.cholesky(data_covariance)
+    root = jax.scipy.linalg.solve_triangular(lower_factor, jnp.eye(len(lower_factor)), lower=True)
     return Posterior(inversion, coefficients, jacobian, root, cross, normal)
 
 
@@ -192,18 +198,18 @@ def _sample_estimates(posterior: Posterior):
     """
     inversion, coefficients = posterior.inversion, posterior.coefficients
     basis, xp = inversion.basis, namespace(posterior)
-    estimate, count = inversion.estimate(coefficients), basis.num_coefficients
+    estimate, num_basis = inversion.estimate(coefficients), basis.num_coefficients
     # An unknown changes the image linearly or not at all.
-    further = [np.arange(len(coefficients)) == number for number in range(count, len(coefficients))]
-    added = [inversion.estimate(coefficients + one) - estimate for one in further]
-    variance = posterior.prior.variance(basis) + sum(one**2 for one in added)
-    rows = len(posterior.root)
-    for start in range(0, rows, _ROWS_AT_ONCE):
+    unknown_indicators = [np.arange(len(coefficients)) == index for index in range(num_basis, len(coefficients))]
+    unknown_images = [inversion.estimate(coefficients + indicator) - estimate for indicator in unknown_indicators]
+    variance = posterior.prior.variance(basis) + sum(image**2 for image in unknown_images)
+    num_rows = len(posterior.root)
+    for start in range(0, num_rows, _ROWS_AT_ONCE):
         gain = posterior.root[start : start + _ROWS_AT_ONCE] @ posterior.cross
-        seen = xp.stack([basis.expand(row[:count]) for row in gain])
-        for number, one in enumerate(added):
-            seen = seen + gain[:, count + number, None] * one
-        variance = variance - (seen**2).sum(axis=0)
+        row_images = xp.stack([basis.expand(row[:num_basis]) for row in gain])
+        for index, image in enumerate(unknown_images):
+            row_images = row_images + gain[:, num_basis + index, None] * image
+        variance = variance - (row_images**2).sum(axis=0)
     return estimate, xp.sqrt(xp.maximum(variance, 0))
 
 
@@ -211,25 +217,27 @@ def _sample_estimates(posterior: Posterior):
 def _weighted_mean(posterior: Posterior, weight):
     """Weighted sum of the cells' conductivities, and its standard deviation."""
     inversion, coefficients, xp = posterior.inversion, posterior.coefficients, namespace(posterior, weight)
-    estimate, count = inversion.estimate(coefficients), inversion.basis.num_coefficients
+    estimate, num_basis = inversion.estimate(coefficients), inversion.basis.num_coefficients
     slope = weight * inversion.link.slope(estimate)
-    further = [np.arange(len(coefficients)) == number for number in range(count, len(coefficients))]
-    added = [slope @ (inversion.estimate(coefficients + one) - estimate) for one in further]
-    gradient = xp.concatenate([inversion.basis.restrict(slope[None])[0], xp.asarray(added, slope.dtype)])
-    own = gradient @ posterior.prior.covariance_product(gradient[:, None])[:, 0]
-    variance = own - xp.sum((posterior.root @ (posterior.cross @ gradient)) ** 2)
+    unknown_indicators = [np.arange(len(coefficients)) == index for index in range(num_basis, len(coefficients))]
+    unknown_slopes = [
+        slope @ (inversion.estimate(coefficients + indicator) - estimate) for indicator in unknown_indicators
+    ]
+    gradient = xp.concatenate([inversion.basis.restrict(slope[None])[0], xp.asarray(unknown_slopes, slope.dtype)])
+    prior_variance = gradient @ posterior.prior.covariance_product(gradient[:, None])[:, 0]
+    variance = prior_variance - xp.sum((posterior.root @ (posterior.cross @ gradient)) ** 2)
     return weight @ inversion.link.conductivity(estimate), xp.sqrt(xp.maximum(variance, 0))
 
 
 @either_engine
-def _draw_samples(posterior: Posterior, numbers, errors):
+def _draw_samples(posterior: Posterior, prior_draws, noise_draws):
     """Sample conductivities with c = ĉ + z - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹(Jz + e), where z is drawn from the prior and e from
     the noise."""
-    inversion, root, xp = posterior.inversion, posterior.root, namespace(posterior, numbers)
-    drawn = posterior.prior.drawn(numbers.T).T
-    seen = drawn @ posterior.jacobian.T + errors @ xp.linalg.cholesky(inversion.data.covariance).T
-    change = drawn - (seen @ root.T @ root) @ posterior.cross
-    return xp.stack([inversion.conductivity(one) for one in posterior.coefficients + change])
+    inversion, root, xp = posterior.inversion, posterior.root, namespace(posterior, prior_draws)
+    prior_samples = posterior.prior.drawn(prior_draws.T).T
+    data_samples = prior_samples @ posterior.jacobian.T + noise_draws @ xp.linalg.cholesky(inversion.data.covariance).T
+    samples = prior_samples - (data_samples @ root.T @ root) @ posterior.cross
+    return xp.stack([inversion.conductivity(sample) for sample in posterior.coefficients + samples])
 
 
 def image_noise(reconstruction: Reconstruction) -> Float[np.ndarray, " m"]:
@@ -253,10 +261,10 @@ def image_noise(reconstruction: Reconstruction) -> Float[np.ndarray, " m"]:
         raise ValueError("reconstruction: only images with smooth priors and unbounded solvers have such a noise.")
     inversion, coefficients = on_host((reconstruction.inversion, reconstruction.coefficients))
     _, jacobian = inversion.linearise(coefficients)
-    covariance, count = inversion.data.covariance, inversion.basis.num_coefficients
-    root = np.linalg.cholesky(covariance).T @ np.linalg.inv(jacobian @ jacobian.T + covariance)
+    covariance, num_basis = inversion.data.covariance, inversion.basis.num_coefficients
+    noise_root = np.linalg.cholesky(covariance).T @ np.linalg.inv(jacobian @ jacobian.T + covariance)
     variance = np.zeros(len(inversion.reference))
-    for start in range(0, len(root), _ROWS_AT_ONCE):
-        gain = root[start : start + _ROWS_AT_ONCE] @ jacobian
-        variance += np.sum([inversion.basis.expand(row[:count]) ** 2 for row in gain], axis=0)
+    for start in range(0, len(noise_root), _ROWS_AT_ONCE):
+        gain = noise_root[start : start + _ROWS_AT_ONCE] @ jacobian
+        variance += np.sum([inversion.basis.expand(row[:num_basis]) ** 2 for row in gain], axis=0)
     return max(1.0, float(reconstruction.misfit)) * np.sqrt(variance)

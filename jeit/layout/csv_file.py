@@ -157,7 +157,7 @@ def _find_columns(header: list[str], length_columns: Sequence[str]) -> dict[str,
     """Index and unit (in metres) of every column, by name. Raises `ValueError` for columns that are missing, unknown,
     repeated, or do not state their unit."""
     columns: dict[str, tuple[int, float]] = {}
-    for place, title in enumerate(header):
+    for index, title in enumerate(header):
         length = _LENGTH_TITLE.fullmatch(title.lower())
         name = length[1] if length else title.lower()
         if name in length_columns and not length:
@@ -172,11 +172,12 @@ def _find_columns(header: list[str], length_columns: Sequence[str]) -> dict[str,
             )
         if name in columns:
             raise ValueError(f"there are two columns for {name}; keep one.")
-        columns[name] = (place, _UNITS[length[2]] if length else 1.0)
-    missing = [name for name in length_columns if name not in columns]
-    if missing:
+        columns[name] = (index, _UNITS[length[2]] if length else 1.0)
+    missing_columns = [name for name in length_columns if name not in columns]
+    if missing_columns:
         raise ValueError(
-            f"there is no column {missing[0]}_mm; the first line names the columns: {_header_example(length_columns)}."
+            f"there is no column {missing_columns[0]}_mm; the first line names the columns: "
+            f"{_header_example(length_columns)}."
         )
     return columns
 

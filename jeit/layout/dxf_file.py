@@ -83,30 +83,35 @@ def read_dxf(path: Path, outline: Domain | None) -> Layout:
         drawing = ezdxf.readfile(path)
         units = ezdxf.units
         unit = units.conversion_factor(units.InsertUnits(drawing.units or units.MM), units.InsertUnits.Meters)
-        space = [(entity.dxf.layer, entity) for entity in drawing.modelspace()]
-        drawn = {name: [one for layer, one in space if layer.upper() == name] for name in _LAYER_COLOURS}
-    if not drawn[_ELECTRODE_LAYER]:
+        model_space = [(entity.dxf.layer, entity) for entity in drawing.modelspace()]
+        layer_entities = {
+            name: [entity for layer, entity in model_space if layer.upper() == name] for name in _LAYER_COLOURS
+        }
+    if not layer_entities[_ELECTRODE_LAYER]:
         raise ValueError(
             f"nothing is drawn on the layer {_ELECTRODE_LAYER}, where electrodes are circles; "
-            f"the layers in use are {listed(sorted({layer for layer, _ in space}))}."
+            f"the layers in use are {listed(sorted({layer for layer, _ in model_space}))}."
         )
-    check_electrodes("the drawing", len(drawn[_ELECTRODE_LAYER]))
+    check_electrodes("the drawing", len(layer_entities[_ELECTRODE_LAYER]))
     with read_as("this is not a DXF drawing that is read"):
         decode = ezdxf.lldxf.encoding.decode_dxf_unicode
-        entities = {name: [_convert_entity(one, decode) for one in ones] for name, ones in drawn.items()}
-    circles = np.array([_circle_of_entity(one) for one in entities[_ELECTRODE_LAYER]]) * unit
+        entities = {
+            name: [_convert_entity(entity, decode) for entity in drawn_entities]
+            for name, drawn_entities in layer_entities.items()
+        }
+    circles = np.array([_circle_of_entity(entity) for entity in entities[_ELECTRODE_LAYER]]) * unit
     centres, radii = circles[:, :2], circles[:, 2]
-    texts = [one for one in entities[_LABEL_LAYER] if one.kind == "TEXT"]
-    places = np.array([one.place for one in texts]).reshape(-1, 2) * unit
+    texts = [entity for entity in entities[_LABEL_LAYER] if entity.kind == "TEXT"]
+    text_positions = np.array([entity.place for entity in texts]).reshape(-1, 2) * unit
     labels = []
     for electrode, (centre, radius) in enumerate(zip(centres, radii, strict=True), start=1):
-        inside = np.linalg.norm(centre - places, axis=-1) <= radius
-        written = [texts[index].text for index in np.flatnonzero(inside)]
-        if len(written) > 1:
-            raise ValueError(f"electrode {electrode} has several labels: {listed(map(repr, written))}.")
-        labels += written or [str(electrode)]
-    found = _outline_of_entities(entities[_OUTLINE_LAYER], unit)
-    return Layout(centres, 2 * radii, outline=found or outline, labels=labels, name=path.stem)
+        inside = np.linalg.norm(centre - text_positions, axis=-1) <= radius
+        electrode_labels = [texts[index].text for index in np.flatnonzero(inside)]
+        if len(electrode_labels) > 1:
+            raise ValueError(f"electrode {electrode} has several labels: {listed(map(repr, electrode_labels))}.")
+        labels += electrode_labels or [str(electrode)]
+    drawn_outline = _outline_of_entities(entities[_OUTLINE_LAYER], unit)
+    return Layout(centres, 2 * radii, outline=drawn_outline or outline, labels=labels, name=path.stem)
 
 
 def _convert_entity(entity, decode: Callable[[str], str]) -> _Entity:

@@ -146,10 +146,10 @@ class Layout(Module):
         `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if neither is
         known.
         """
-        chosen = self.contact_impedance if contact_impedance is None else contact_impedance
-        if chosen is None:
+        impedance = self.contact_impedance if contact_impedance is None else contact_impedance
+        if impedance is None:
             raise ValueError(f"contact_impedance: '{self.name}' does not say it; give it in ohm·m².")
-        return SheetDiscs(self.centres, self.diameters / 2, chosen)
+        return SheetDiscs(self.centres, self.diameters / 2, impedance)
 
 
 def check_discs_fit(
@@ -160,28 +160,30 @@ def check_discs_fit(
     x_min, x_max, y_min, y_max = bounds(centres, diameters) if outline is None else outline.extent
     size = max(x_max - x_min, y_max - y_min)
     check_size(size)
-    gap = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
-    np.fill_diagonal(gap, np.inf)
-    if gap.min() < -_ROUNDING:
-        first, second = map(int, np.unravel_index(gap.argmin(), gap.shape))
-        same = np.linalg.norm(centres[first] - centres[second]) < _ROUNDING
-        how = "are at the same place" if same else f"overlap by {-1e3 * gap.min():.3g} mm"
-        raise ValueError(f"centres: {disc_names[first]} and {disc_names[second]} {how}; remove one or move them apart.")
+    gaps = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
+    np.fill_diagonal(gaps, np.inf)
+    if gaps.min() < -_ROUNDING:
+        first, second = map(int, np.unravel_index(gaps.argmin(), gaps.shape))
+        is_same_place = np.linalg.norm(centres[first] - centres[second]) < _ROUNDING
+        fault = "are at the same place" if is_same_place else f"overlap by {-1e3 * gaps.min():.3g} mm"
+        raise ValueError(
+            f"centres: {disc_names[first]} and {disc_names[second]} {fault}; remove one or move them apart."
+        )
     if outline is None:
         return
-    room = np.asarray(outline.signed_distance(centres)) - diameters / 2
-    worst = int(room.argmin())
-    if room[worst] < -_ROUNDING:
+    clearances = np.asarray(outline.signed_distance(centres)) - diameters / 2
+    index = int(clearances.argmin())
+    if clearances[index] < -_ROUNDING:
         hint = ""
         if (np.abs(centres) > LARGEST).any() and bool((outline.signed_distance(centres / 1000) > 0).all()):
             hint = " Are they in millimetres? Divide by 1000."
-        elif diameters[worst] > size:
+        elif diameters[index] > size:
             hint = " Is its diameter in metres?"
-        x, y = 1e3 * centres[worst]
+        x, y = 1e3 * centres[index]
         raise ValueError(
-            f"centres: {disc_names[worst]}, {1e3 * diameters[worst]:g} mm across at ({x:g}, {y:g}) mm, reaches "
-            f"{-1e3 * room[worst]:.3g} mm beyond the outline, which spans {1e3 * x_min:g} to {1e3 * x_max:g} mm by "
-            f"{1e3 * y_min:g} to {1e3 * y_max:g} mm.{hint}"
+            f"centres: {disc_names[index]}, {1e3 * diameters[index]:g} mm across at ({x:g}, {y:g}) mm, reaches "
+            f"{-1e3 * clearances[index]:.3g} mm beyond the outline, which spans {1e3 * x_min:g} to {1e3 * x_max:g} "
+            f"mm by {1e3 * y_min:g} to {1e3 * y_max:g} mm.{hint}"
         )
 
 

@@ -222,26 +222,26 @@ def named_layout(name: str, outline: Domain | None = None, *, diameter: float = 
     ```
     """
     outline = Rectangle(_PARK_SIDE, _PARK_SIDE) if outline is None else outline
-    made = re.fullmatch(r"(perimeter|inner)-(\d{1,4})", name) if isinstance(name, str) else None
-    counts = re.fullmatch(r"grid-(\d{1,4})x(\d{1,4})", name) if isinstance(name, str) else None
+    spread_match = re.fullmatch(r"(perimeter|inner)-(\d{1,4})", name) if isinstance(name, str) else None
+    grid_match = re.fullmatch(r"grid-(\d{1,4})x(\d{1,4})", name) if isinstance(name, str) else None
     if name in _PARK_NAMES:
         _check_park(name, outline)
         centres = _park_centres(name)
-    elif counts is not None:
-        centres = _grid_centres(name, outline, diameter, int(counts[1]), int(counts[2]))
-    elif made is not None:
-        number = int(made[2])
+    elif grid_match is not None:
+        centres = _grid_centres(name, outline, diameter, int(grid_match[1]), int(grid_match[2]))
+    elif spread_match is not None:
+        number = int(spread_match[2])
         if number > _MAX_ELECTRODES:
             raise ValueError(f"name: {name!r} has {number} electrodes; give {_MAX_ELECTRODES} or fewer.")
         centres = (
             _inner_centres(outline, number, diameter)
-            if made[1] == "inner"
+            if spread_match[1] == "inner"
             else _perimeter_centres(name, outline, diameter, number)
         )
     else:
-        meant = did_you_mean(name, [*_PARK_NAMES, *NAMES[2:]])
+        suggestion = did_you_mean(name, [*_PARK_NAMES, *NAMES[2:]])
         raise ValueError(
-            f"name: there is no layout {name!r}{meant}; take {', '.join(BUILT_IN)} (or another grid-CxR), "
+            f"name: there is no layout {name!r}{suggestion}; take {', '.join(BUILT_IN)} (or another grid-CxR), "
             "perimeter-N, inner-N, or a file's."
         )
     return Layout(centres, diameter, outline=outline, name=name)
@@ -268,9 +268,9 @@ def _park_centres(name: str) -> np.ndarray:
 
 def _check_park(name: str, outline: Domain) -> None:
     if not same_outline(outline, Rectangle(_PARK_SIDE, _PARK_SIDE)):
-        span = f"{-5e2 * _PARK_SIDE:g} to {5e2 * _PARK_SIDE:g} mm"
-        other = "inner-32" if name == "park-inner" else "perimeter-32"
-        raise ValueError(f"name: its skin spans {span} by {span}; on another take {other}.")
+        span_text = f"{-5e2 * _PARK_SIDE:g} to {5e2 * _PARK_SIDE:g} mm"
+        alternative = "inner-32" if name == "park-inner" else "perimeter-32"
+        raise ValueError(f"name: its skin spans {span_text} by {span_text}; on another take {alternative}.")
 
 
 def _grid_centres(name: str, outline: Domain, diameter: float, columns: int, rows: int) -> np.ndarray:

@@ -68,47 +68,53 @@ def spread(
     usable = np.flatnonzero(weight > 0)
     if len(usable) < number:
         raise ValueError(f"margin: {1e3 * margin:g} mm leaves no room for {number} electrodes on the surface.")
-    ways = Geodesics.create(triangles)
-    position = triangles.points[_initial_nodes(ways, usable, weight, number)]
+    geodesics = Geodesics.create(triangles)
+    position = triangles.points[_initial_nodes(geodesics, usable, weight, number)]
     for _ in range(iterations):
         owner = (
-            ways.owners(position)[0] if number <= _MAX_GEODESIC_POSITIONS else _nearest_positions(triangles, position)
+            geodesics.owners(position)[0]
+            if number <= _MAX_GEODESIC_POSITIONS
+            else _nearest_positions(triangles, position)
         )[usable]
-        own = np.bincount(owner, weight[usable], number)
-        middle = np.stack([np.bincount(owner, weight[usable] * x, number) for x in triangles.points[usable].T], axis=1)
-        moved = np.where(own[:, None] > 0, middle / np.maximum(own, 1e-300)[:, None], position)
-        moved = triangles.nearest(moved).points
-        settled = np.linalg.norm(moved - position, axis=1).max() < 1e-3 * np.sqrt(weight.sum() / number)
-        position = moved
-        if settled:
+        position_weights = np.bincount(owner, weight[usable], number)
+        centroid_sums = np.stack(
+            [np.bincount(owner, weight[usable] * x, number) for x in triangles.points[usable].T], axis=1
+        )
+        new_positions = np.where(
+            position_weights[:, None] > 0, centroid_sums / np.maximum(position_weights, 1e-300)[:, None], position
+        )
+        new_positions = triangles.nearest(new_positions).points
+        is_converged = np.linalg.norm(new_positions - position, axis=1).max() < 1e-3 * np.sqrt(weight.sum() / number)
+        position = new_positions
+        if is_converged:
             break
     return position
 
 
 def _nearest_positions(triangles: Triangles, position: Float[np.ndarray, "L 3"]) -> np.ndarray:
     """Index of the nearest position of each node, by the distance in space and the difference of their normals."""
-    half = 0.5 * np.sqrt(triangles.areas.sum() / len(position))
-    facing = half * triangles.normals[triangles.nearest(position).triangle]
-    tree = KDTree(np.hstack([position, facing]))
-    return np.asarray(tree.query(np.hstack([triangles.points, half * triangles.node_normals]))[1])
+    half_spacing = 0.5 * np.sqrt(triangles.areas.sum() / len(position))
+    scaled_normals = half_spacing * triangles.normals[triangles.nearest(position).triangle]
+    tree = KDTree(np.hstack([position, scaled_normals]))
+    return np.asarray(tree.query(np.hstack([triangles.points, half_spacing * triangles.node_normals]))[1])
 
 
 def _initial_nodes(geodesics: Geodesics, usable: np.ndarray, weight: np.ndarray, number: int) -> np.ndarray:
     """Indices of `number` nodes with which Lloyd's algorithm starts: by farthest-point sampling or, for many positions,
     drawn at random with probabilities proportional to their areas."""
     if number > _MAX_GEODESIC_POSITIONS:
-        share = weight[usable] / weight.sum()
-        return np.random.default_rng(0).choice(usable, number, replace=False, p=share)
+        probabilities = weight[usable] / weight.sum()
+        return np.random.default_rng(0).choice(usable, number, replace=False, p=probabilities)
     points = geodesics.surface.points
     # The first node is the one farthest from the centroid, so that the result depends on the surface only.
-    middle = np.average(points[usable], axis=0, weights=weight[usable])
-    chosen = [usable[np.linalg.norm(points[usable] - middle, axis=1).round(9).argmax()]]
-    lengths = geodesics.distances(points[chosen[:1]])[0]
-    while len(chosen) < number:
-        chosen.append(usable[lengths[usable].argmax()])
-        farthest = float(lengths[usable].max())
-        lengths = np.minimum(lengths, geodesics.distances(points[chosen[-1:]], limit=farthest)[0])
-    return np.array(chosen)
+    centroid = np.average(points[usable], axis=0, weights=weight[usable])
+    nodes = [usable[np.linalg.norm(points[usable] - centroid, axis=1).round(9).argmax()]]
+    distances = geodesics.distances(points[nodes[:1]])[0]
+    while len(nodes) < number:
+        nodes.append(usable[distances[usable].argmax()])
+        max_distance = float(distances[usable].max())
+        distances = np.minimum(distances, geodesics.distances(points[nodes[-1:]], limit=max_distance)[0])
+    return np.array(nodes)
 
 
 # Tolerance for discs that overlap.
@@ -228,22 +234,22 @@ class SurfaceLayout(Module):
         `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if neither is
         known.
         """
-        chosen = self.contact_impedance if contact_impedance is None else contact_impedance
-        if chosen is None:
+        impedance = self.contact_impedance if contact_impedance is None else contact_impedance
+        if impedance is None:
             raise ValueError(f"contact_impedance: '{self.name}' does not say it; give it in ohm·m².")
-        return (SurfaceDiscs if sheet else FaceDiscs)(self.centres, self.diameters / 2, chosen)
+        return (SurfaceDiscs if sheet else FaceDiscs)(self.centres, self.diameters / 2, impedance)
 
 
 def _check_apart(centres: np.ndarray, diameters: np.ndarray, labels: Sequence[str]) -> None:
     """Raise `ValueError` for discs that overlap. Distances are straight lines, since between discs that overlap they
     hardly differ from those along the surface."""
-    gap = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
-    np.fill_diagonal(gap, np.inf)
-    if gap.min() < -_ROUNDING:
-        first, second = map(int, np.unravel_index(gap.argmin(), gap.shape))
+    gaps = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
+    np.fill_diagonal(gaps, np.inf)
+    if gaps.min() < -_ROUNDING:
+        first, second = map(int, np.unravel_index(gaps.argmin(), gaps.shape))
         raise ValueError(
             f"centres: electrode {first + 1} ('{labels[first]}') and electrode {second + 1} ('{labels[second]}') "
-            f"overlap by {-1e3 * gap.min():.3g} mm; remove one or move them apart."
+            f"overlap by {-1e3 * gaps.min():.3g} mm; remove one or move them apart."
         )
 
 

@@ -26,32 +26,35 @@ ROUND = ("circle", "ellipse")
 
 def transform_of(element: ElementTree.Element) -> np.ndarray:
     """Matrix (2, 3) of the transform of an element. Raises `ValueError` for a transform that cannot be read."""
-    text, found = element.get("transform", "").strip(), np.eye(2, 3)
+    text, matrix = element.get("transform", "").strip(), np.eye(2, 3)
     if re.fullmatch(r"(\w++\s*+\([^()]*+\)[\s,]*+)*+", text) is None:
         raise ValueError(f"transform of {describe_element(element)} is {describe(text)}, not a list of transforms.")
-    for kind, inside in re.findall(r"(\w+)\s*\(([^()]*)\)", text):
-        numbers = [number_of(element, "transform", part) for part in re.split(r"[\s,]+", inside.strip()) if part]
+    for kind, argument_text in re.findall(r"(\w+)\s*\(([^()]*)\)", text):
+        numbers = [
+            number_of(element, "transform", number_text)
+            for number_text in re.split(r"[\s,]+", argument_text.strip())
+            if number_text
+        ]
         match kind, numbers:
             case "matrix", [_, _, _, _, _, _]:
-                one = np.array(numbers).reshape(3, 2).T
+                step = np.array(numbers).reshape(3, 2).T
             case "translate", [x, *rest] if len(rest) < 2:
-                one = np.array([[1, 0, x], [0, 1, rest[0] if rest else 0]])
+                step = np.array([[1, 0, x], [0, 1, rest[0] if rest else 0]])
             case "scale", [x, *rest] if len(rest) < 2:
-                one = np.array([[x, 0, 0], [0, rest[0] if rest else x, 0]])
-            case "rotate", [degrees, *middle] if len(middle) in (0, 2):
-                angle, middle = math.radians(degrees), np.array(middle or [0.0, 0.0])
-                turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-                one = np.column_stack([turn, middle - turn @ middle])
+                step = np.array([[x, 0, 0], [0, rest[0] if rest else x, 0]])
+            case "rotate", [degrees, *centre] if len(centre) in (0, 2):
+                angle, centre = math.radians(degrees), np.array(centre or [0.0, 0.0])
+                rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+                step = np.column_stack([rotation, centre - rotation @ centre])
             case _:
                 raise ValueError(
-                    f"{describe_element(element)} has {kind[:20]}({inside[:40]}); jeit reads matrix, translate, scale "
-                    "and "
-                    "rotate."
+                    f"{describe_element(element)} has {kind[:20]}({argument_text[:40]}); jeit reads matrix, "
+                    "translate, scale and rotate."
                 )
-        found = compose_transforms(found, one)
-    if not (np.abs(found) < LARGEST).all():
+        matrix = compose_transforms(matrix, step)
+    if not (np.abs(matrix) < LARGEST).all():
         raise ValueError(f"transform of {describe_element(element)} is too large for a drawing.")
-    return found
+    return matrix
 
 
 def compose_transforms(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
@@ -96,15 +99,14 @@ def disc_of(element: ElementTree.Element, matrix: np.ndarray) -> tuple[float, fl
     x, y = (number_of(element, name, element.get(name, "0")) for name in ("cx", "cy"))
     names = ("r", "r") if tag_of(element) == "circle" else ("rx", "ry")
     radii = [number_of(element, name, element.get(name)) for name in names]
-    half = np.linalg.svd(matrix[:, :2] * radii, compute_uv=False)
-    if half[0] > half[1] * (1 + 1e-3):
+    half_axes = np.linalg.svd(matrix[:, :2] * radii, compute_uv=False)
+    if half_axes[0] > half_axes[1] * (1 + 1e-3):
         raise ValueError(
-            f"{describe_element(element)} is {2e3 * half[0]:.4g} mm long and {2e3 * half[1]:.4g} mm wide as it is "
-            "drawn; "
-            "electrodes are circles."
+            f"{describe_element(element)} is {2e3 * half_axes[0]:.4g} mm long and {2e3 * half_axes[1]:.4g} mm wide "
+            "as it is drawn; electrodes are circles."
         )
     centre = transform_points([x, y], matrix)[0]
-    return float(centre[0]), float(centre[1]), float(half.mean())
+    return float(centre[0]), float(centre[1]), float(half_axes.mean())
 
 
 def loops_of(element: ElementTree.Element) -> list[np.ndarray]:
@@ -160,10 +162,10 @@ def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
 
 def _closed_loop(element: ElementTree.Element, loop: np.ndarray, closed: bool) -> np.ndarray:
     """Vertices of a loop without a repetition of the first. Raises `ValueError` if the loop is not closed."""
-    meets = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-6 * np.ptp(loop))
-    if not (closed or meets):
+    is_repeated = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-6 * np.ptp(loop))
+    if not (closed or is_repeated):
         raise ValueError(f"{describe_element(element)} is not closed; close the skin's outline.")
-    return loop[:-1] if meets else loop
+    return loop[:-1] if is_repeated else loop
 
 
 _SVG_NAMESPACE = "http://www.w3.org/2000/svg"
@@ -181,23 +183,23 @@ def write_svg(layout: Layout, file: BinaryIO) -> None:
     """Write a layout as a drawing. Both have the same origin; y points down in the drawing, so its y is minus that of
     the layout."""
     x_min, x_max, y_min, y_max = layout.extent
-    left, top = millimetres(x_min - _MARGIN), millimetres(-y_max - _MARGIN)
+    view_left, view_top = millimetres(x_min - _MARGIN), millimetres(-y_max - _MARGIN)
     width, height = millimetres(x_max - x_min + 2 * _MARGIN), millimetres(y_max - y_min + 2 * _MARGIN)
-    size = {"width": f"{width}mm", "height": f"{height}mm", "viewBox": f"{left} {top} {width} {height}"}
+    size = {"width": f"{width}mm", "height": f"{height}mm", "viewBox": f"{view_left} {view_top} {width} {height}"}
     root = ElementTree.Element("svg", {"xmlns": _SVG_NAMESPACE, **size})
     _add_element(root, "title").text = layout.name
-    line = {"fill": "none", "stroke-width": "0.1"}
-    group = _add_element(root, "g", id="OUTLINE", stroke="#ff0000", **line)
+    line_style = {"fill": "none", "stroke-width": "0.1"}
+    group = _add_element(root, "g", id="OUTLINE", stroke="#ff0000", **line_style)
     if layout.outline is not None:
         layout.outline.draw(_SvgPen(group))
-    group = _add_element(root, "g", id="ELECTRODES", stroke="#0000ff", **line)
-    centred = {"text-anchor": "middle", "dominant-baseline": "central", "font-family": "sans-serif"}
-    names = _add_element(root, "g", id="LABELS", fill="#808080", **centred)
+    group = _add_element(root, "g", id="ELECTRODES", stroke="#0000ff", **line_style)
+    text_style = {"text-anchor": "middle", "dominant-baseline": "central", "font-family": "sans-serif"}
+    label_group = _add_element(root, "g", id="LABELS", fill="#808080", **text_style)
     for centre, diameter, label in zip(layout.centres, layout.diameters, layout.labels, strict=True):
         circle = _add_circle(centre, diameter)
         _add_element(group, "circle", **circle)
-        place = {"x": circle["cx"], "y": circle["cy"], "font-size": str(millimetres(float(diameter) / 3))}
-        _add_element(names, "text", **place).text = label
+        text_position = {"x": circle["cx"], "y": circle["cy"], "font-size": str(millimetres(float(diameter) / 3))}
+        _add_element(label_group, "text", **text_position).text = label
     ElementTree.indent(root)
     ElementTree.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
 
@@ -212,19 +214,31 @@ def read_svg(path: Path, outline: Domain | None) -> Layout:
         raise ValueError(f"this is not an SVG drawing: it begins with <{str(root.tag)[:40]}>.")
     shapes = list(_drawn_shapes(root))
     roles = {role for _, role, _ in shapes}
-    labels = ["".join(one.itertext()).strip() for one, role, _ in shapes if role == "LABELS" and tag_of(one) == "text"]
-    chosen = "ELECTRODES" if "ELECTRODES" in roles else None
-    electrodes = [(one, to) for one, role, to in shapes if role == chosen and (chosen or tag_of(one) in ROUND)]
+    labels = [
+        "".join(element.itertext()).strip()
+        for element, role, _ in shapes
+        if role == "LABELS" and tag_of(element) == "text"
+    ]
+    electrode_role = "ELECTRODES" if "ELECTRODES" in roles else None
+    electrodes = [
+        (element, matrix)
+        for element, role, matrix in shapes
+        if role == electrode_role and (electrode_role or tag_of(element) in ROUND)
+    ]
     if not electrodes:
         raise ValueError("there is no circle in the drawing; electrodes are circles, in a group ELECTRODES or all.")
     check_electrodes("the drawing", len(electrodes))
-    circles = np.array([disc_of(one, to) for one, to in electrodes])
-    drawn = (
-        _outline_of_shapes([(one, to) for one, role, to in shapes if role == "OUTLINE"]) if "OUTLINE" in roles else None
+    circles = np.array([disc_of(element, matrix) for element, matrix in electrodes])
+    drawn_outline = (
+        _outline_of_shapes([(element, matrix) for element, role, matrix in shapes if role == "OUTLINE"])
+        if "OUTLINE" in roles
+        else None
     )
     if "OUTLINE" not in roles:
-        drawn = _single_closed_outline([(one, to) for one, role, to in shapes if role is None])
-    return Layout(circles[:, :2], 2 * circles[:, 2], outline=drawn or outline, labels=labels or None, name=path.stem)
+        drawn_outline = _single_closed_outline([(element, matrix) for element, role, matrix in shapes if role is None])
+    return Layout(
+        circles[:, :2], 2 * circles[:, 2], outline=drawn_outline or outline, labels=labels or None, name=path.stem
+    )
 
 
 def _add_element(parent: ElementTree.Element, tag: str, **attributes: str) -> ElementTree.Element:
@@ -260,9 +274,9 @@ class _Builder(ElementTree.TreeBuilder):
 def _drawn_shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str | None, np.ndarray]]:
     """Yield the shapes of a drawing in their order: element, role (that of the element or of an enclosing group), and
     matrix (2, 3) from its units to metres, with y up."""
-    waiting: list[tuple[ElementTree.Element, str | None, np.ndarray]] = [(root, None, _matrix_to_metres(root))]
-    while waiting:
-        element, role, to = waiting.pop()
+    stack: list[tuple[ElementTree.Element, str | None, np.ndarray]] = [(root, None, _matrix_to_metres(root))]
+    while stack:
+        element, role, matrix = stack.pop()
         tag = tag_of(element)
         if (
             tag in _INVISIBLE_TAGS
@@ -274,22 +288,26 @@ def _drawn_shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Eleme
             raise ValueError(
                 f"there is {describe_element(element)} in the drawing; unlink clones and embedded drawings first."
             )
-        called = {element.get("id", ""), element.get(_INKSCAPE_LABEL, ""), *element.get("class", "").split()}
-        role = next((name for name in _GROUP_NAMES if name in {one.upper() for one in called}), role)
+        names = {element.get("id", ""), element.get(_INKSCAPE_LABEL, ""), *element.get("class", "").split()}
+        role = next((name for name in _GROUP_NAMES if name in {text.upper() for text in names}), role)
         if "transform" in element.attrib:
-            to = compose_transforms(to, transform_of(element))
-            if not (np.abs(to) < LARGEST).all():
+            matrix = compose_transforms(matrix, transform_of(element))
+            if not (np.abs(matrix) < LARGEST).all():
                 raise ValueError(f"transforms about {describe_element(element)} are too large for a drawing.")
         if tag in _GROUP_TAGS:
-            waiting += [(child, role, to) for child in reversed(element)]
+            stack += [(child, role, matrix) for child in reversed(element)]
         else:
-            yield element, role, to
+            yield element, role, matrix
 
 
 def _matrix_to_metres(root: ElementTree.Element) -> np.ndarray:
     """Matrix (2, 3) from the units of the drawing to metres, with y up. Raises `ValueError` if the drawing does not
     state its size."""
-    box = [number_of(root, "viewBox", part) for part in re.split(r"[\s,]+", root.get("viewBox", "").strip()) if part]
+    box = [
+        number_of(root, "viewBox", number_text)
+        for number_text in re.split(r"[\s,]+", root.get("viewBox", "").strip())
+        if number_text
+    ]
     scales = []
     for name, inside in (("width", box[2:3]), ("height", box[3:4])):
         size = re.fullmatch(rf"({NUMBER})\s*({'|'.join(_UNITS)})", root.get(name, "").strip())
@@ -324,23 +342,22 @@ def _outline_of_shapes(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> D
     return Polygon(loops[0], loops[1:])
 
 
-def _single_closed_outline(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain | None:
+def _single_closed_outline(shapes: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain | None:
     """Outline of a drawing without a group OUTLINE: its only closed shape with straight sides; None if it has no shape
     with straight sides."""
-    found, complaints = [], []
-    for one, to in drawn:
-        if tag_of(one) in _STRAIGHT_SHAPES:
+    closed_shapes, errors = [], []
+    for element, matrix in shapes:
+        if tag_of(element) in _STRAIGHT_SHAPES:
             try:
-                loops_of(one)
-                found.append((one, to))
+                loops_of(element)
+                closed_shapes.append((element, matrix))
             except ValueError as error:
-                complaints.append(error)
-    if len(found) > 1:
+                errors.append(error)
+    if len(closed_shapes) > 1:
         raise ValueError(
-            f"there are {len(found)} closed shapes, {describe_element(found[0][0])} the first; put the skin's into a "
-            "group "
-            "OUTLINE."
+            f"there are {len(closed_shapes)} closed shapes, {describe_element(closed_shapes[0][0])} the first; put "
+            "the skin's into a group OUTLINE."
         )
-    if not found and complaints:
-        raise complaints[0]
-    return _outline_of_shapes(found) if found else None
+    if not closed_shapes and errors:
+        raise errors[0]
+    return _outline_of_shapes(closed_shapes) if closed_shapes else None

@@ -102,15 +102,15 @@ def from_matrices(
     if not large_currents:
         _check_currents(drive, "from_matrices")
     shape = (drive.shape[0], measurement.shape[0])
-    chosen = np.ones(shape, dtype=bool) if select is None else np.asarray(select)
-    if chosen.shape != shape or chosen.dtype != bool:
+    selected = np.ones(shape, dtype=bool) if select is None else np.asarray(select)
+    if selected.shape != shape or selected.dtype != bool:
         raise ValueError(
-            f"from_matrices: select has shape {chosen.shape} of {chosen.dtype}; give booleans of shape "
+            f"from_matrices: select has shape {selected.shape} of {selected.dtype}; give booleans of shape "
             f"{shape}, one per drive (rows) and measurement pattern (columns)."
         )
-    if not chosen.any():
+    if not selected.any():
         raise ValueError("from_matrices: select chooses no channel. Set at least one entry to True.")
-    drive_index, measurement_index = np.nonzero(chosen)
+    drive_index, measurement_index = np.nonzero(selected)
     return Protocol(drive, measurement, drive_index, measurement_index, name)
 
 
@@ -247,14 +247,14 @@ def haar(
     ```
     """
     count = check_count(num_electrodes, "haar", 2)
-    parts, drives = [np.arange(count)], []
-    while parts:
-        part = parts.pop(0)
-        first, second = np.array_split(part, 2)
+    groups, drives = [np.arange(count)], []
+    while groups:
+        group = groups.pop(0)
+        first, second = np.array_split(group, 2)
         pattern = np.zeros(count)
         pattern[first], pattern[second] = len(second), -len(first)
         drives.append(pattern / len(first))  # the first half is at least as large as the second
-        parts += [half for half in (first, second) if len(half) > 1]
+        groups += [half for half in (first, second) if len(half) > 1]
     drive = np.array(drives)
     return _all_combinations("haar", drive / np.abs(drive).max(axis=1, keepdims=True), measurement, reference, current)
 
@@ -292,35 +292,36 @@ def optimal(
     protocol = optimal(transfer, number=5)
     ```
     """
-    first = _check_transfer("transfer", transfer)
-    count = len(first)
+    first_transfer = _check_transfer("transfer", transfer)
+    count = len(first_transfer)
     check_current(current, "optimal")
-    most = count - 1 if number is None else check_count(number, "optimal: number", 1)
+    max_drives = count - 1 if number is None else check_count(number, "optimal: number", 1)
     # Project to an orthonormal basis of the currents that sum to zero.
     basis = scipy.linalg.null_space(np.ones((1, count)))
-    dissipated = basis.T @ first @ basis
+    dissipated = basis.T @ first_transfer @ basis
     change = dissipated
     if other is not None:
-        second = _check_transfer("other", other)
-        if second.shape != first.shape:
+        second_transfer = _check_transfer("other", other)
+        if second_transfer.shape != first_transfer.shape:
             raise ValueError(
-                f"other: its shape is {second.shape}, and that of transfer {first.shape}; give one body's."
+                f"other: its shape is {second_transfer.shape}, and that of transfer {first_transfer.shape}; give one "
+                "body's."
             )
-        change = dissipated - basis.T @ second @ basis
+        change = dissipated - basis.T @ second_transfer @ basis
     if np.linalg.norm(change) <= _MIN_DISTINGUISHABILITY * np.linalg.norm(dissipated):
         raise ValueError("other: it equals transfer, and no current distinguishes them.")
     if power is None:
         values, directions = _sort_descending(np.linalg.eigh(change @ change))
     else:
         directions, values = _drives_for_power(dissipated, change, power, other is None)
-    keep = values > _MIN_DISTINGUISHABILITY * values[0]
-    drive = (basis @ directions[:, keep][:, :most]).T
+    is_distinguishing = values > _MIN_DISTINGUISHABILITY * values[0]
+    drive = (basis @ directions[:, is_distinguishing][:, :max_drives]).T
     # The sign of an eigenvector is arbitrary: make its largest component positive.
     drive *= np.sign(drive[np.arange(len(drive)), np.abs(drive).argmax(axis=1)])[:, None]
     if power is None:
         drive /= np.abs(drive).max(axis=1, keepdims=True)
         return _all_combinations("optimal", drive, measurement, reference, current)
-    drive *= np.sqrt(power / np.einsum("si,ij,sj->s", drive, first, drive))[:, None]
+    drive *= np.sqrt(power / np.einsum("si,ij,sj->s", drive, first_transfer, drive))[:, None]
     check_amplitude(float(np.abs(drive).max()), "optimal: power")
     return _all_combinations("optimal for a given power", drive, measurement, reference, 1.0)
 

@@ -170,8 +170,8 @@ def skip(
     protocol = skip(16, 4)
     ```
     """
-    where = "adjacent" if skipped == 0 else "skip"
-    count = check_count(num_electrodes, where, 4)
+    function_name = "adjacent" if skipped == 0 else "skip"
+    count = check_count(num_electrodes, function_name, 4)
     measurement_skipped = skipped if measurement_skipped is None else measurement_skipped
     for value, name in ((skipped, "skipped"), (measurement_skipped, "measurement_skipped")):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value <= count - 2:
@@ -182,7 +182,7 @@ def skip(
     if measurement_skipped != skipped:
         kind += f", skip-{measurement_skipped} measurement"
     drive, measurement = ring_pairs(count, skipped + 1), ring_pairs(count, measurement_skipped + 1)
-    return CrossedPairs(where, count, drive, measurement).protocol(
+    return CrossedPairs(function_name, count, drive, measurement).protocol(
         f"{kind}, {count} electrodes",
         current=current,
         driven_electrodes=driven_electrodes,
@@ -352,15 +352,15 @@ def two_terminal(
     check_current(current, "two_terminal")
     if pairs is None:
         pairs = np.array([(i, j) for i in range(count) for j in range(i + 1, count)])
-    chosen = check_pairs(pairs, count, "two_terminal")
-    patterns = pair_patterns(chosen, count)
-    channels = np.arange(len(chosen))
+    checked_pairs = check_pairs(pairs, count, "two_terminal")
+    patterns = pair_patterns(checked_pairs, count)
+    channels = np.arange(len(checked_pairs))
     return Protocol(
         drive=current * patterns,
         measurement=patterns,
         drive_index=channels,
         measurement_index=channels,
-        name=f"two-terminal, {len(chosen)} pairs, {count} electrodes",
+        name=f"two-terminal, {len(checked_pairs)} pairs, {count} electrodes",
     )
 
 

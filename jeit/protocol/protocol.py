@@ -26,30 +26,30 @@ def check_patterns(patterns, pattern_kind: str) -> None:
     if not has_values(patterns):
         return
     values = np.asarray(patterns)
-    bad = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
-    if bad.size:
+    invalid_rows = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
+    if invalid_rows.size:
         raise ValueError(
-            f"Protocol: {pattern_kind} pattern {bad[0]} contains NaN or infinity. Leave missing electrodes out of "
-            "the patterns with 0, and mask their channels."
+            f"Protocol: {pattern_kind} pattern {invalid_rows[0]} contains NaN or infinity. Leave missing electrodes "
+            "out of the patterns with 0, and mask their channels."
         )
-    size = np.max(np.abs(values), axis=1)
-    bad = np.flatnonzero(size == 0)
-    if bad.size:
+    max_weights = np.max(np.abs(values), axis=1)
+    invalid_rows = np.flatnonzero(max_weights == 0)
+    if invalid_rows.size:
         raise ValueError(
-            f"Protocol: {pattern_kind} pattern {bad[0]} is all zero: it drives or measures nothing. Remove it "
-            f"({bad.size} such rows)."
+            f"Protocol: {pattern_kind} pattern {invalid_rows[0]} is all zero: it drives or measures nothing. Remove it "
+            f"({invalid_rows.size} such rows)."
         )
-    total = np.abs(values.sum(axis=1)) / size
-    bad = np.flatnonzero(total > 1e-9)
-    if bad.size:
+    relative_sums = np.abs(values.sum(axis=1)) / max_weights
+    invalid_rows = np.flatnonzero(relative_sums > 1e-9)
+    if invalid_rows.size:
         reason = (
             "current that goes in must come out"
             if pattern_kind == "drive"
             else "only differences of potential can be measured; subtract a reference electrode"
         )
         raise ValueError(
-            f"Protocol: {pattern_kind} pattern {bad[0]} sums to {values[bad[0]].sum():.6g}, not to zero ({reason}). "
-            "If the matrix has one row per electrode, transpose it."
+            f"Protocol: {pattern_kind} pattern {invalid_rows[0]} sums to {values[invalid_rows[0]].sum():.6g}, not to "
+            f"zero ({reason}). If the matrix has one row per electrode, transpose it."
         )
 
 
@@ -127,11 +127,11 @@ def check_pairs(pairs, num_electrodes: int, argument_name: str) -> np.ndarray:
             f"{values.dtype}."
         )
     electrode_indices(values.ravel(), num_electrodes)
-    same = np.flatnonzero(values[:, 0] == values[:, 1])
-    if same.size:
+    equal_pairs = np.flatnonzero(values[:, 0] == values[:, 1])
+    if equal_pairs.size:
         raise ValueError(
-            f"{argument_name}: pair {same[0]} is electrode {values[same[0], 0]} with itself. Use two different "
-            "electrodes."
+            f"{argument_name}: pair {equal_pairs[0]} is electrode {values[equal_pairs[0], 0]} with itself. Use two "
+            "different electrodes."
         )
     return values
 
@@ -250,9 +250,9 @@ class Protocol(Module):
 
         Raises `ValueError` for an index that is not an electrode.
         """
-        chosen = electrode_indices(electrodes, self.num_electrodes)
-        driven = np.any(np.asarray(self.drive)[:, chosen] != 0, axis=1)
-        measured = np.any(np.asarray(self.measurement)[:, chosen] != 0, axis=1)
+        indices = electrode_indices(electrodes, self.num_electrodes)
+        driven = np.any(np.asarray(self.drive)[:, indices] != 0, axis=1)
+        measured = np.any(np.asarray(self.measurement)[:, indices] != 0, axis=1)
         return np.logical_or(driven[np.asarray(self.drive_index)], measured[np.asarray(self.measurement_index)])
 
     def mask_without(self, electrodes: int | Sequence[int]) -> Bool[np.ndarray, " M"]:
@@ -308,19 +308,24 @@ class Protocol(Module):
         assumed to be measured one by one with independent noise, even if the pairs form a ring, and are not counted.
         """
         rows = np.asarray(self.measurement)
-        kept = np.arange(self.num_measurements) if channels is None else np.asarray(channels)
-        drive, reading = np.asarray(self.drive_index)[kept], np.asarray(self.measurement_index)[kept]
+        used_channels = np.arange(self.num_measurements) if channels is None else np.asarray(channels)
+        drive, measurement = (
+            np.asarray(self.drive_index)[used_channels],
+            np.asarray(self.measurement_index)[used_channels],
+        )
         if not (np.count_nonzero(rows, axis=1) > 2).any():
             return 0
-        repeated, known = 0, {}
-        for one in np.unique(drive):
-            read = np.sort(reading[drive == one])
-            key = read.tobytes()
-            if key not in known:
-                several = (np.count_nonzero(rows[read], axis=1) > 2).any()
-                known[key] = len(read) - int(np.linalg.matrix_rank(rows[read], tol=1e-9)) if several else 0
-            repeated += known[key]
-        return repeated
+        num_repeated, repeats_of_rows = 0, {}
+        for drive_number in np.unique(drive):
+            drive_rows = np.sort(measurement[drive == drive_number])
+            key = drive_rows.tobytes()
+            if key not in repeats_of_rows:
+                has_combinations = (np.count_nonzero(rows[drive_rows], axis=1) > 2).any()
+                repeats_of_rows[key] = (
+                    len(drive_rows) - int(np.linalg.matrix_rank(rows[drive_rows], tol=1e-9)) if has_combinations else 0
+                )
+            num_repeated += repeats_of_rows[key]
+        return num_repeated
 
     def reciprocal_pairs(self) -> tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]]:
         """Pairs of channels whose voltages are proportional by reciprocity, and the ratios of their voltages.

@@ -63,23 +63,23 @@ def transfer_between_drives(
 
     - `transfer` (F, S, S), watts: `drive[i] @ S @ drive[j]` in entry (i, j), combined from the channels measured while
       drive j flows. For example, a skip-1 drive pattern measured by adjacent pairs is the sum of two of them.
-    - `known` (S, S): whether the measurement patterns of drive j span drive i.
+    - `is_known` (S, S): whether the measurement patterns of drive j span drive i.
     - `noise` (S, S), watts: standard deviation of `transfer`.
     """
     num_drives = drive.shape[0]
     transfer = np.zeros((voltages.shape[0], num_drives, num_drives), dtype=voltages.dtype)
-    known = np.zeros((num_drives, num_drives), dtype=bool)
+    is_known = np.zeros((num_drives, num_drives), dtype=bool)
     noise = np.zeros((num_drives, num_drives))
     deviation = np.ones(len(mask)) if deviation is None else deviation
-    size = np.linalg.norm(drive, axis=1)
-    for flowing in range(num_drives):
-        channels = np.flatnonzero((drive_index == flowing) & mask)
+    drive_norms = np.linalg.norm(drive, axis=1)
+    for drive_number in range(num_drives):
+        channels = np.flatnonzero((drive_index == drive_number) & mask)
         if channels.size == 0:
             continue
         rows, scale = measurement[measurement_index[channels]], deviation[channels]
         # Among all combinations of channels that equal a drive, choose the one with the least noise.
         combination = drive @ np.linalg.pinv(rows / scale[:, None], rcond=1e-10) / scale
-        known[:, flowing] = np.linalg.norm(combination @ rows - drive, axis=1) <= 1e-8 * size
-        transfer[:, :, flowing] = voltages[:, channels] @ combination.T
-        noise[:, flowing] = np.linalg.norm(combination * scale, axis=1)
-    return transfer, known, noise
+        is_known[:, drive_number] = np.linalg.norm(combination @ rows - drive, axis=1) <= 1e-8 * drive_norms
+        transfer[:, :, drive_number] = voltages[:, channels] @ combination.T
+        noise[:, drive_number] = np.linalg.norm(combination * scale, axis=1)
+    return transfer, is_known, noise

@@ -192,7 +192,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "relative_to_difference": noise.relative,
             "method": noise.method,
         },
-        "unlike_electrodes": result.unlike_electrodes,
+        "unlike_electrodes": {electrode + 1: ratio for electrode, ratio in result.unlike_electrodes.items()},
         "wiring": {"fault": result.wiring.fault or None, "misfit": result.wiring.described},
         "quality": {
             "relative_difference": quality.difference,

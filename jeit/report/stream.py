@@ -11,9 +11,9 @@ from jaxtyping import Float
 
 from jeit.arguments import describe, is_number
 from jeit.files import clear_unfinished, whole_files, written_whole
+from jeit.image.inclusions import StrongestRegion
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.streaming.stream import FrameImage, FrameStatus
-from jeit.mesh import centroids
 from jeit.report.folder import results_folder
 from jeit.report.growing import GrowingRows, GrowingTable, Sample, reporting_partial_results
 from jeit.report.series import FILM_FRAMES, check_film, write_film
@@ -125,7 +125,7 @@ class _StreamSummary:
     def __init__(self, calibration: Calibration):
         self.calibration = calibration
         mesh, self.background = calibration.model.mesh, float(calibration.conductivity)
-        self._centre = np.asarray(centroids(mesh))[:, :2]
+        self._strongest = StrongestRegion(mesh)
         self._empty_image = np.full(mesh.num_cells, np.nan, np.float32)
         self.latency, self.counts, self.first_reason = Sample(), {}, ""
         self.refused, self.first_imaged, self.largest = [], -1, 0.0
@@ -136,12 +136,12 @@ class _StreamSummary:
         if frame_image.conductivity is None:
             self.first_reason = self.first_reason or frame_image.reason
             self.refused += [frame_image.number] if len(self.refused) < _MAX_NAMED else []
-            return _table_row(frame_image, self._centre, self.background), self._empty_image
+            return _table_row(frame_image, self._strongest, self.background), self._empty_image
         self.first_imaged = frame_image.number if self.first_imaged < 0 else self.first_imaged
         self.latency.append(frame_image.latency)
         image = frame_image.conductivity.astype(np.float32)
         self.largest = max(self.largest, float(np.abs(image - np.float32(self.background)).max()))
-        return _table_row(frame_image, self._centre, self.background), image
+        return _table_row(frame_image, self._strongest, self.background), image
 
     @property
     def limit(self) -> float:
@@ -206,7 +206,7 @@ class _StreamPictures:
         return [f"frame {number}" if self.rate is None else f"{number / self.rate:.2f} s" for number in numbers]
 
 
-def _table_row(frame_image: FrameImage, centre, background: float) -> list[object]:
+def _table_row(frame_image: FrameImage, strongest: StrongestRegion, background: float) -> list[object]:
     """Values of a frame for the table."""
     latency_text = f"{1e3 * frame_image.latency:.3f}"
     if frame_image.conductivity is None:
@@ -222,8 +222,6 @@ def _table_row(frame_image: FrameImage, centre, background: float) -> list[objec
             "",
             frame_image.reason,
         ]
-    change = frame_image.conductivity - background
-    peak = int(np.argmax(np.abs(change)))
     misfit = "" if np.isnan(frame_image.misfit) else f"{frame_image.misfit:.4g}"
     first_values = [
         frame_image.number,
@@ -235,4 +233,5 @@ def _table_row(frame_image: FrameImage, centre, background: float) -> list[objec
     ]
     if frame_image.status == FrameStatus.UNCHANGED:
         return [*first_values, "", "", "", frame_image.reason]
-    return [*first_values, *(f"{value:.5f}" for value in centre[peak]), f"{change[peak]:.5g}", frame_image.reason]
+    centroid, peak = strongest(frame_image.conductivity - background)
+    return [*first_values, *(f"{value:.5f}" for value in centroid[:2]), f"{peak:.5g}", frame_image.reason]

@@ -21,7 +21,7 @@ from jeit.touch.contacts import Contact, ImageNoise, find_contacts
 from jeit.touch.contacts.finder import AbstractFinder
 
 # Minimum number of different loads; minimum number of touches with each.
-_LEVELS, _REPEATS = 3, 3
+_MIN_LOADS, _MIN_REPETITIONS = 3, 3
 # Fractions of the maximum response between which rise and fall times are measured.
 _RISE_START, _RISE_END = 0.1, 0.9
 
@@ -52,7 +52,7 @@ class ContactArea(NamedTuple):
 
 
 def weber_ratio(load: ArrayLike, response: ArrayLike) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Weber's ratio at each of k loads: the smallest relative change of load that can be detected.
+    """Compute Weber's ratio at each of k loads: the smallest relative change of load that can be detected.
 
     A change of load is detected if it changes the response by one standard deviation (d′ = 1). So the ratio is the
     standard deviation of the response, divided by the slope of the response against the load, and by the load. It is
@@ -63,17 +63,17 @@ def weber_ratio(load: ArrayLike, response: ArrayLike) -> tuple[Float[np.ndarray,
     load, response = _check_pair("load", load, "response", response)
     if (load <= 0).any():
         raise ValueError("load must be positive, in newtons.")
-    levels, which, count = np.unique(load, return_inverse=True, return_counts=True)
-    if len(levels) < _LEVELS or count.min() < _REPEATS:
+    loads, load_indices, counts = np.unique(load, return_inverse=True, return_counts=True)
+    if len(loads) < _MIN_LOADS or counts.min() < _MIN_REPETITIONS:
         raise ValueError(
-            f"load: give {_LEVELS} loads or more, each {_REPEATS} times or more; there are {len(levels)}, one of them "
-            f"{count.min()} times."
+            f"load: give {_MIN_LOADS} loads or more, each {_MIN_REPETITIONS} times or more; there are {len(loads)}, "
+            f"one of them {counts.min()} times."
         )
-    mean = np.bincount(which, response) / count
-    deviation = np.sqrt(np.bincount(which, (response - mean[which]) ** 2) / (count - 1))
-    slope = np.gradient(mean, levels) * (1.0 if mean[-1] >= mean[0] else -1.0)
+    means = np.bincount(load_indices, response) / counts
+    deviations = np.sqrt(np.bincount(load_indices, (response - means[load_indices]) ** 2) / (counts - 1))
+    slopes = np.gradient(means, loads) * (1.0 if means[-1] >= means[0] else -1.0)
     with np.errstate(divide="ignore"):
-        return levels, np.where(slope > 0, deviation / (np.maximum(slope, 0.0) * levels), np.inf)
+        return loads, np.where(slopes > 0, deviations / (np.maximum(slopes, 0.0) * loads), np.inf)
 
 
 def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
@@ -85,12 +85,12 @@ def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
     found = real_array("found", found, "metres, as many as places, NaN where nothing was found")
     if place.ndim != 2 or place.shape != found.shape or not np.isfinite(place).all():
         raise ValueError(f"place and found must be (n, 2) or (n, 3); they have shapes {place.shape}, {found.shape}.")
-    off = np.linalg.norm(found - place, axis=1)
-    there = np.isfinite(off)
-    if not there.any():
+    errors = np.linalg.norm(found - place, axis=1)
+    is_found = np.isfinite(errors)
+    if not is_found.any():
         raise ValueError("found: every row is NaN; no touch was found.")
-    off = off[there]
-    return Localisation(float(off.mean()), float(off.std()), float(off.max()), float(1 - there.mean()))
+    errors = errors[is_found]
+    return Localisation(float(errors.mean()), float(errors.std()), float(errors.max()), float(1 - is_found.mean()))
 
 
 def least_detected(amount: ArrayLike, detected: ArrayLike) -> float:
@@ -107,15 +107,15 @@ def least_detected(amount: ArrayLike, detected: ArrayLike) -> float:
     if detected.dtype.kind != "b":
         raise ValueError(f"detected must be true or false for each trial; it is {detected.dtype}.")
     amount, detected = _check_pair("amount", amount, "detected", detected.astype(float))
-    levels, which, count = np.unique(amount, return_inverse=True, return_counts=True)
-    share = isotonic_regression(np.bincount(which, detected) / count, weights=count).x
-    above = int(np.argmax(share >= 0.5))
-    if share[above] < 0.5:
+    amounts, amount_indices, counts = np.unique(amount, return_inverse=True, return_counts=True)
+    shares = isotonic_regression(np.bincount(amount_indices, detected) / counts, weights=counts).x
+    first_above = int(np.argmax(shares >= 0.5))
+    if shares[first_above] < 0.5:
         return float("inf")
-    if not above:
-        return float(levels[0])
-    part = (0.5 - share[above - 1]) / (share[above] - share[above - 1])
-    return float(levels[above - 1] + part * (levels[above] - levels[above - 1]))
+    if not first_above:
+        return float(amounts[0])
+    fraction = (0.5 - shares[first_above - 1]) / (shares[first_above] - shares[first_above - 1])
+    return float(amounts[first_above - 1] + fraction * (amounts[first_above] - amounts[first_above - 1]))
 
 
 def contact_area(area: ArrayLike, found: ArrayLike) -> ContactArea:
@@ -127,8 +127,8 @@ def contact_area(area: ArrayLike, found: ArrayLike) -> ContactArea:
     if len(area) < 2 or (area == area[0]).all():
         raise ValueError("area: give two different areas, or more.")
     gain, least = np.polyfit(area, found, 1)
-    alike = found.std() > 0
-    return ContactArea(float(gain), float(least), float(np.corrcoef(area, found)[0, 1]) if alike else 0.0)
+    has_variation = found.std() > 0
+    return ContactArea(float(gain), float(least), float(np.corrcoef(area, found)[0, 1]) if has_variation else 0.0)
 
 
 def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, float]:
@@ -142,41 +142,47 @@ def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, floa
     seconds, response = _check_pair("seconds", seconds, "response", response)
     if (np.diff(seconds) <= 0).any():
         raise ValueError("seconds must increase from frame to frame.")
-    size = float(response.max())
-    if size <= 0:
+    max_response = float(response.max())
+    if max_response <= 0:
         raise ValueError(
             "response is nowhere positive; give the response to a touch, with the sign that makes it positive."
         )
-    begun, done = (int(np.argmax(response >= share * size)) for share in (_RISE_START, _RISE_END))
-    last = len(response) - 1 - int(np.argmax(response[::-1] >= _RISE_END * size))
-    after = response[last:] < _RISE_START * size
-    gone = float(seconds[last + int(np.argmax(after))] - seconds[last]) if after.any() else float("inf")
-    return float(seconds[done] - seconds[begun]), gone
+    rise_start, rise_end = (int(np.argmax(response >= share * max_response)) for share in (_RISE_START, _RISE_END))
+    fall_start = len(response) - 1 - int(np.argmax(response[::-1] >= _RISE_END * max_response))
+    is_low = response[fall_start:] < _RISE_START * max_response
+    fall_time = (
+        float(seconds[fall_start + int(np.argmax(is_low))] - seconds[fall_start]) if is_low.any() else float("inf")
+    )
+    return float(seconds[rise_end] - seconds[rise_start]), fall_time
 
 
 def _check_pair(
     first_name: str, first: ArrayLike, second_name: str, second: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray]:
     """Convert two arrays to numbers, and check that both are (n,) and finite."""
-    left, right = real_array(first_name, first, "numbers (n,)"), real_array(second_name, second, "numbers (n,)")
-    if left.ndim != 1 or left.shape != right.shape or not left.size:
+    first_values, second_values = (
+        real_array(first_name, first, "numbers (n,)"),
+        real_array(second_name, second, "numbers (n,)"),
+    )
+    if first_values.ndim != 1 or first_values.shape != second_values.shape or not first_values.size:
         raise ValueError(
-            f"{first_name} and {second_name} must be (n,), as many; they have shapes {left.shape}, {right.shape}."
+            f"{first_name} and {second_name} must be (n,), as many; they have shapes {first_values.shape}, "
+            f"{second_values.shape}."
         )
-    for name, values in ((first_name, left), (second_name, right)):
+    for name, values in ((first_name, first_values), (second_name, second_values)):
         if not np.isfinite(values).all():
             raise ValueError(f"{name} has NaN or infinite values.")
-    return left, right
+    return first_values, second_values
 
 
 # Number of untouched frames; number of repetitions of each load and of each area; number of places; number of trials of
 # each separation.
-_UNTOUCHED, _PRESSED_TIMES, _PLACES, _TRIALS = 50, 8, 40, 8
+_NUM_UNTOUCHED_FRAMES, _NUM_REPETITIONS, _NUM_PLACES, _NUM_TRIALS = 50, 8, 40, 8
 # Loads at which Weber's ratio is measured, relative to the given load; distances between the centres of two discs,
 # relative to the given diameter; diameters of discs under the same pressure, relative to the given diameter.
-_LOADS = np.geomspace(0.25, 4.0, 7)
-_SEPARATIONS = np.array([1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0])
-_DIAMETERS = np.array([1.0, 1.5, 2.0, 3.0, 4.0])
+_RELATIVE_LOADS = np.geomspace(0.25, 4.0, 7)
+_RELATIVE_SEPARATIONS = np.array([1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0])
+_RELATIVE_DIAMETERS = np.array([1.0, 1.5, 2.0, 3.0, 4.0])
 
 
 class DiscTouch(NamedTuple):
@@ -269,9 +275,9 @@ def touch_attributes(
     if centre.shape != (2,):
         raise ValueError(f"middle must be (x, y) in metres; it has shape {centre.shape}.")
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    report = progress or (lambda said: None)
+    report = progress or (lambda message: None)
     report("untouched frames")
-    untouched = _check_frames(press([[] for _ in range(_UNTOUCHED)]), _UNTOUCHED, linear)
+    untouched = _check_frames(press([[] for _ in range(_NUM_UNTOUCHED_FRAMES)]), _NUM_UNTOUCHED_FRAMES, linear)
     reference, noise = untouched.mean(axis=0), ImageNoise.of_frames(linear, untouched)
 
     def find_in_frames(frames: np.ndarray) -> list[list[Contact]]:
@@ -281,37 +287,54 @@ def touch_attributes(
         return find_in_frames(_check_frames(press(touches), len(touches), linear))
 
     report("Weber ratio")
-    loads = np.repeat(load * _LOADS, _PRESSED_TIMES)
-    levels, weber = weber_ratio(
-        loads, [_strongest_peak(one) for one in press_and_find([[DiscTouch(centre, n, diameter)] for n in loads])]
+    loads = np.repeat(load * _RELATIVE_LOADS, _NUM_REPETITIONS)
+    loads_applied, weber = weber_ratio(
+        loads,
+        [
+            _strongest_peak(contacts)
+            for contacts in press_and_find([[DiscTouch(centre, disc_load, diameter)] for disc_load in loads])
+        ],
     )
     report("localisation")
-    places = centre + (within * np.sqrt(random.uniform(size=_PLACES)))[:, None] * _random_directions(random, _PLACES)
-    found = press_and_find([[DiscTouch(place, load, diameter)] for place in places])
-    localisation = point_localisation(places, np.array([_strongest_centroid(one) for one in found]))
+    places = centre + (within * np.sqrt(random.uniform(size=_NUM_PLACES)))[:, None] * _random_directions(
+        random, _NUM_PLACES
+    )
+    contacts_of_touches = press_and_find([[DiscTouch(place, load, diameter)] for place in places])
+    localisation = point_localisation(
+        places, np.array([_strongest_centroid(contacts) for contacts in contacts_of_touches])
+    )
     report("two points")
-    apart = np.repeat(_SEPARATIONS * diameter, _TRIALS)
-    half = apart[:, None] / 2 * _random_directions(random, len(apart))
-    found = press_and_find([[DiscTouch(centre + way * one, load, diameter) for way in (-1, 1)] for one in half])
-    two_points = least_detected(apart, np.array([len(one) > 1 for one in found]))
+    separations = np.repeat(_RELATIVE_SEPARATIONS * diameter, _NUM_TRIALS)
+    half_separations = separations[:, None] / 2 * _random_directions(random, len(separations))
+    contacts_of_touches = press_and_find(
+        [[DiscTouch(centre + sign * offset, load, diameter) for sign in (-1, 1)] for offset in half_separations]
+    )
+    two_points = least_detected(separations, np.array([len(contacts) > 1 for contacts in contacts_of_touches]))
     report("contact area")
-    wide = np.repeat(_DIAMETERS, _PRESSED_TIMES)
-    found = press_and_find([[DiscTouch(centre, load * one**2, one * diameter)] for one in wide])
-    area = contact_area(np.pi / 4 * (wide * diameter) ** 2, [one[0].area if one else 0.0 for one in found])
+    relative_diameters = np.repeat(_RELATIVE_DIAMETERS, _NUM_REPETITIONS)
+    contacts_of_touches = press_and_find(
+        [[DiscTouch(centre, load * ratio**2, ratio * diameter)] for ratio in relative_diameters]
+    )
+    area = contact_area(
+        np.pi / 4 * (relative_diameters * diameter) ** 2,
+        [contacts[0].area if contacts else 0.0 for contacts in contacts_of_touches],
+    )
     rise = fall = None
     if recording is not None:
         report("times")
         seconds = real_array("recording", recording[0], "seconds (T,), and frames (T, M)")
         frames = _check_frames(recording[1], len(np.atleast_1d(seconds)), linear)
-        rise, fall = response_times(seconds, [_strongest_peak(one) for one in find_in_frames(frames)])
-    return TouchAttributes(levels, weber, localisation, two_points, area, rise, fall)
+        rise, fall = response_times(seconds, [_strongest_peak(contacts) for contacts in find_in_frames(frames)])
+    return TouchAttributes(loads_applied, weber, localisation, two_points, area, rise, fall)
 
 
 def _check_frames(frames_given, num_touches: int, linear: LinearReconstruction) -> Float[np.ndarray, "n M"]:
     """Convert frames to an array. Raises `ValueError` unless there is one for each touch, finite, with M channels."""
-    frames, wanted = real_array("frames", frames_given, "volts (n, M)"), (num_touches, linear.num_measurements)
-    if frames.shape != wanted or not np.isfinite(frames).all():
-        raise ValueError(f"frames must be finite volts {wanted}, one for each touch; they have shape {frames.shape}.")
+    frames, required_shape = real_array("frames", frames_given, "volts (n, M)"), (num_touches, linear.num_measurements)
+    if frames.shape != required_shape or not np.isfinite(frames).all():
+        raise ValueError(
+            f"frames must be finite volts {required_shape}, one for each touch; they have shape {frames.shape}."
+        )
     return frames
 
 
@@ -322,12 +345,12 @@ def _random_directions(random: np.random.Generator, count: int) -> Float[np.ndar
 
 
 def _strongest_peak(contacts: list[Contact]) -> float:
-    """Magnitude of the peak of the strongest contact; 0 without a contact."""
+    """Return the magnitude of the peak of the strongest contact; 0 without a contact."""
     return abs(contacts[0].peak) if contacts else 0.0
 
 
 def _strongest_centroid(contacts: list[Contact]) -> np.ndarray:
-    """Centroid (2,) of the strongest contact, metres; NaN without a contact."""
+    """Return the centroid (2,) of the strongest contact, metres; NaN without a contact."""
     return contacts[0].centroid if contacts else np.full(2, np.nan)
 
 

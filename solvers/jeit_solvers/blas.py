@@ -66,25 +66,48 @@ def eliminate(panel: np.ndarray, schur: np.ndarray) -> bool:
     on return [Lᵀ, L⁻¹ B] with A = L Lᵀ. `schur` (b, b): Bᵀ A⁻¹ B is subtracted from its upper triangle. Complex
     matrices are symmetric, and transposes are not conjugated.
     """
-    pivots, border = len(panel), panel.shape[1] - len(panel)
-    kind, stride = _ROUTINES_OF_DTYPE[panel.dtype], _row_stride(panel)
+    num_pivots, num_border = len(panel), panel.shape[1] - len(panel)
+    routines, stride = _ROUTINES_OF_DTYPE[panel.dtype], _row_stride(panel)
     if panel.dtype == complex:
-        square: Any = np.triu(panel[:, :pivots])
+        square: Any = np.triu(panel[:, :num_pivots])
         square += np.triu(square, 1).T
-        panel[:, :pivots] = inverse_cholesky(square[None])[0] @ square
+        panel[:, :num_pivots] = inverse_cholesky(square[None])[0] @ square
     else:
         info = ctypes.c_int(0)
-        _potrf(b"L", _c_integer(pivots), panel.ctypes.data, stride, ctypes.byref(info))
+        _potrf(b"L", _c_integer(num_pivots), panel.ctypes.data, stride, ctypes.byref(info))
         if info.value:
             return False
     if not np.isfinite(np.diagonal(panel)).all():
         return False
-    if border:
-        right, one = panel.ctypes.data + pivots * panel.itemsize, kind.plus_one.ctypes.data
-        count, wide = _c_integer(pivots), _c_integer(border)
-        kind.triangle(b"R", b"L", b"T", b"N", wide, count, one, panel.ctypes.data, stride, right, stride)
-        minus = kind.minus_one.ctypes.data
-        kind.square(b"L", b"N", wide, count, minus, right, stride, one, schur.ctypes.data, _row_stride(schur))
+    if num_border:
+        border_address, plus_one = panel.ctypes.data + num_pivots * panel.itemsize, routines.plus_one.ctypes.data
+        pivot_count, border_count = _c_integer(num_pivots), _c_integer(num_border)
+        routines.triangle(
+            b"R",
+            b"L",
+            b"T",
+            b"N",
+            border_count,
+            pivot_count,
+            plus_one,
+            panel.ctypes.data,
+            stride,
+            border_address,
+            stride,
+        )
+        minus_one = routines.minus_one.ctypes.data
+        routines.square(
+            b"L",
+            b"N",
+            border_count,
+            pivot_count,
+            minus_one,
+            border_address,
+            stride,
+            plus_one,
+            schur.ctypes.data,
+            _row_stride(schur),
+        )
     return True
 
 
@@ -93,9 +116,19 @@ def solve_triangle(panel: np.ndarray, vectors: np.ndarray, *, transposed: bool) 
     returns it."""
     if not vectors.size:
         return
-    kind, which = _ROUTINES_OF_DTYPE[panel.dtype], b"N" if transposed else b"T"
-    count, number = _c_integer(len(panel)), _c_integer(vectors.shape[1])
-    one, triangle, stride = kind.plus_one.ctypes.data, panel.ctypes.data, _row_stride(panel)
-    kind.triangle(
-        b"R", b"L", which, b"N", number, count, one, triangle, stride, vectors.ctypes.data, _row_stride(vectors)
+    routines, transposition = _ROUTINES_OF_DTYPE[panel.dtype], b"N" if transposed else b"T"
+    pivot_count, num_vectors = _c_integer(len(panel)), _c_integer(vectors.shape[1])
+    plus_one, panel_address, stride = routines.plus_one.ctypes.data, panel.ctypes.data, _row_stride(panel)
+    routines.triangle(
+        b"R",
+        b"L",
+        transposition,
+        b"N",
+        num_vectors,
+        pivot_count,
+        plus_one,
+        panel_address,
+        stride,
+        vectors.ctypes.data,
+        _row_stride(vectors),
     )

@@ -103,15 +103,15 @@ def _check_count(name: str, count: int) -> None:
 @partial(jax.jit, static_argnums=(3, 4))
 def _kmeans(points, key, stop: tuple[Any, Any], num_clusters: int, restarts: int) -> KMeans:
     # Labels have no derivative. Means for constant labels have one, which needs no loop.
-    find = in_turn(partial(_best_restart, num_clusters, restarts))
-    best = find(jax.lax.stop_gradient(points), key, stop)
-    centres = _cluster_means(points, best.labels, best.centres)
+    find_best = in_turn(partial(_best_restart, num_clusters, restarts))
+    best_state = find_best(jax.lax.stop_gradient(points), key, stop)
+    centres = _cluster_means(points, best_state.labels, best_state.centres)
     return KMeans(
         centres=centres,
-        labels=best.labels,
-        inertia=jnp.sum((points - centres[best.labels]) ** 2),
-        steps=best.steps,
-        converged=best.settled,
+        labels=best_state.labels,
+        inertia=jnp.sum((points - centres[best_state.labels]) ** 2),
+        steps=best_state.steps,
+        converged=best_state.settled,
     )
 
 
@@ -127,8 +127,9 @@ class _State(Module):
 
 
 def _best_restart(num_clusters: int, restarts: int, points, key, stop) -> _State:
-    middle = jnp.mean(points, axis=0)
-    centred = points - middle
+    """Result of the restart with the smallest inertia. `stop`: maximum number of steps, and tolerance."""
+    mean = jnp.mean(points, axis=0)
+    centred = points - mean
     squares = jnp.sum(centred**2, axis=1)
     # All starts take the same number of steps, so they run side by side, and the points pass through memory once for
     # all of them. The number of later iterations differs, so these run one after the other, and none waits for the
@@ -137,8 +138,8 @@ def _best_restart(num_clusters: int, restarts: int, points, key, stop) -> _State
     starts = jax.vmap(lambda draws: _kmeans_plus_plus(centred, squares, draws))(draws)
     descend = in_turn(_lloyd)
     ends = jax.vmap(lambda start: descend(start, centred, squares, stop))(starts)
-    best = jax.tree.map(lambda array: array[jnp.argmin(ends.inertia)], ends)
-    return eqx.tree_at(lambda state: state.centres, best, best.centres + middle)
+    best_end = jax.tree.map(lambda array: array[jnp.argmin(ends.inertia)], ends)
+    return eqx.tree_at(lambda state: state.centres, best_end, best_end.centres + mean)
 
 
 def _num_candidates(num_clusters: int) -> int:
@@ -150,21 +151,23 @@ def _kmeans_plus_plus(points, squares, draws: Float[Array, "k trials"]) -> Float
     """Greedy k-means++: a few points are drawn with weights equal to their squared distance to the nearest centre, and
     the next centre is the drawn point that lowers the sum of these squares most. `draws`: random numbers from 0 to
     1."""
-    last = len(points) - 1
+    last_index = len(points) - 1
 
-    def distance(index):
+    def squared_distances(index):
         return jnp.maximum(squares[index][:, None] - 2 * points[index] @ points.T + squares, 0)
 
-    def add(nearest, draws):
-        running = jnp.cumsum(nearest)
-        drawn = jnp.searchsorted(running, draws * running[-1], side="right", method="compare_all")
-        drawn = jnp.minimum(drawn, last)
-        lowered = jnp.minimum(nearest, distance(drawn))
-        best = jnp.argmin(jnp.sum(lowered, axis=1))
-        return lowered[best], drawn[best]
+    def add_centre(nearest_distances, draws):
+        cumulative_weights = jnp.cumsum(nearest_distances)
+        candidates = jnp.searchsorted(
+            cumulative_weights, draws * cumulative_weights[-1], side="right", method="compare_all"
+        )
+        candidates = jnp.minimum(candidates, last_index)
+        lowered_distances = jnp.minimum(nearest_distances, squared_distances(candidates))
+        best_index = jnp.argmin(jnp.sum(lowered_distances, axis=1))
+        return lowered_distances[best_index], candidates[best_index]
 
-    first = jnp.minimum((draws[0, :1] * len(points)).astype(int), last)
-    _, others = jax.lax.scan(add, distance(first)[0], draws[1:])
+    first = jnp.minimum((draws[0, :1] * len(points)).astype(int), last_index)
+    _, others = jax.lax.scan(add_centre, squared_distances(first)[0], draws[1:])
     return points[jnp.concatenate([first, others])]
 
 
@@ -173,7 +176,7 @@ def _lloyd(start, points, squares, stop) -> _State:
     of steps, and tolerance."""
     num_clusters = len(start)
     max_steps, tolerance = stop
-    part = -(-num_clusters // 3)
+    max_moved = -(-num_clusters // 3)
 
     def score(centres):
         """Squared distances to the points, minus the squared norms of the points."""
@@ -182,20 +185,20 @@ def _lloyd(start, points, squares, stop) -> _State:
     def score_moved(scores, centres, moved):
         """Scores of the centres that moved; the others keep their scores, as most do after a few steps."""
 
-        def some():
-            index = jnp.nonzero(moved, size=part, fill_value=num_clusters)[0]
+        def score_some():
+            index = jnp.nonzero(moved, size=max_moved, fill_value=num_clusters)[0]
             return scores.at[index].set(score(jnp.take(centres, index, axis=0, mode="clip")), mode="drop")
 
-        return jax.lax.cond(jnp.sum(moved) <= part, some, lambda: score(centres))
+        return jax.lax.cond(jnp.sum(moved) <= max_moved, score_some, lambda: score(centres))
 
     def assign(scores):
         """Labels, distances and inertia for the first of the nearest centres. A minimum is many times faster than
         jnp.argmin on a CPU."""
-        least = jnp.min(scores, axis=0)
-        row = jnp.arange(num_clusters)[:, None]
-        labels = jnp.min(jnp.where(scores == least, row, num_clusters - 1), axis=0)
-        distance = jnp.maximum(least + squares, 0)
-        return labels, distance, jnp.sum(distance)
+        min_scores = jnp.min(scores, axis=0)
+        rows = jnp.arange(num_clusters)[:, None]
+        labels = jnp.min(jnp.where(scores == min_scores, rows, num_clusters - 1), axis=0)
+        distances = jnp.maximum(min_scores + squares, 0)
+        return labels, distances, jnp.sum(distances)
 
     def step(loop):
         state, scores = loop
@@ -207,25 +210,25 @@ def _lloyd(start, points, squares, stop) -> _State:
         )
         centres = _cluster_means(points, labels, state.centres)
         scores = score_moved(scores, centres, jnp.any(centres != state.centres, axis=1))
-        labels, distance, inertia = assign(scores)
+        labels, distances, inertia = assign(scores)
         settled = jnp.all(labels == state.labels) | (state.inertia - inertia <= tolerance * state.inertia)
-        return _State(centres, labels, distance, inertia, state.steps + 1, settled), scores
+        return _State(centres, labels, distances, inertia, state.steps + 1, settled), scores
 
-    def go_on(loop):
+    def is_unfinished(loop):
         return ~loop[0].settled & (loop[0].steps < max_steps)
 
     scores = score(start)
-    first = _State(start, *assign(scores), jnp.zeros((), int), jnp.zeros((), bool))
-    return jax.lax.while_loop(go_on, step, (first, scores))[0]
+    first_state = _State(start, *assign(scores), jnp.zeros((), int), jnp.zeros((), bool))
+    return jax.lax.while_loop(is_unfinished, step, (first_state, scores))[0]
 
 
 def _fill_empty_clusters(labels, distance, counts) -> Int[Array, " n"]:
     """Labels after moving the points farthest from their centres, farthest first, to the empty clusters in order."""
-    empty = counts == 0
-    spare = jnp.where(counts[labels] > 1, distance, -1)
-    farthest = jax.lax.top_k(spare, len(counts))[1]
-    taken = jnp.where(empty, farthest[jnp.cumsum(empty) - 1], len(labels))
-    return labels.at[taken].set(jnp.arange(len(counts)), mode="drop")
+    is_empty = counts == 0
+    spare_distances = jnp.where(counts[labels] > 1, distance, -1)
+    farthest = jax.lax.top_k(spare_distances, len(counts))[1]
+    moved_points = jnp.where(is_empty, farthest[jnp.cumsum(is_empty) - 1], len(labels))
+    return labels.at[moved_points].set(jnp.arange(len(counts)), mode="drop")
 
 
 def _cluster_sizes(labels, num_clusters: int) -> Int[Array, " k"]:

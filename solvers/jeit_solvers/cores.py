@@ -25,7 +25,7 @@ import threadpoolctl
 from jaxtyping import Array, Int
 
 # Maximum number of threads that work in NumPy at once: each needs its own memory, and all share the memory bandwidth.
-_MOST_THREADS = 4
+_MAX_THREADS = 4
 # Prefix of the names of the threads of `on_cores`, by which calls from inside a part are recognised.
 _THREAD_NAME = "jeit-core"
 
@@ -69,13 +69,15 @@ def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], num_parts: i
     squares = over_cores(lambda indices: indices.ravel() ** 2, 10, 5)
     ```
     """
-    groups = -(-num_parts // group_size)
-    cores = min(number_of_cores(), groups)
-    groups = -(-groups // cores)
-    parts = np.minimum(np.arange(cores * groups * group_size), num_parts - 1).reshape(cores, groups, group_size)
-    with ThreadPoolExecutor(cores) as pool:
-        results = list(pool.map(lambda part: jax.block_until_ready(function(part)), parts))
-    return results[0] if cores == 1 else jnp.concatenate(results)
+    num_groups = -(-num_parts // group_size)
+    num_cores = min(number_of_cores(), num_groups)
+    num_groups = -(-num_groups // num_cores)
+    part_groups = np.minimum(np.arange(num_cores * num_groups * group_size), num_parts - 1).reshape(
+        num_cores, num_groups, group_size
+    )
+    with ThreadPoolExecutor(num_cores) as pool:
+        results = list(pool.map(lambda part: jax.block_until_ready(function(part)), part_groups))
+    return results[0] if num_cores == 1 else jnp.concatenate(results)
 
 
 def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
@@ -98,33 +100,33 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
     ```
     """
 
-    def quietly(part: Any) -> None:
+    def apply_quietly(part: Any) -> None:
         with np.errstate(all="ignore"):  # every thread has its own error state
             function(part)
 
-    inside = threading.current_thread().name.startswith(_THREAD_NAME)
-    if len(parts) <= 1 or inside or not _pool_lock(os.getpid()).acquire(blocking=False):
+    is_nested = threading.current_thread().name.startswith(_THREAD_NAME)
+    if len(parts) <= 1 or is_nested or not _pool_lock(os.getpid()).acquire(blocking=False):
         for part in parts:
-            quietly(part)
+            apply_quietly(part)
         return
     try:
         with one_thread_of_blas():
-            list(_thread_pool(os.getpid()).map(quietly, parts))
+            list(_thread_pool(os.getpid()).map(apply_quietly, parts))
     finally:
         _pool_lock(os.getpid()).release()
 
 
 def parts_for_cores(number: int) -> list[slice]:
     """The indices 0 … `number` - 1 split into slices of about equal size, one for each core."""
-    ends = np.linspace(0, number, min(number_of_cores(), _MOST_THREADS, number) + 1).astype(int).tolist()
-    return [slice(*both) for both in itertools.pairwise(ends)]
+    ends = np.linspace(0, number, min(number_of_cores(), _MAX_THREADS, number) + 1).astype(int).tolist()
+    return [slice(start, stop) for start, stop in itertools.pairwise(ends)]
 
 
 @functools.cache
 def _thread_pool(process: int) -> ThreadPoolExecutor:
     """Thread pool of a process (a forked process needs a new one). The pool is kept, because memory allocated and freed
     by new threads, about a hundred megabytes, is not returned each time."""
-    return ThreadPoolExecutor(min(number_of_cores(), _MOST_THREADS), _THREAD_NAME)
+    return ThreadPoolExecutor(min(number_of_cores(), _MAX_THREADS), _THREAD_NAME)
 
 
 @functools.cache

@@ -13,9 +13,12 @@ from jaxtyping import Array, Float, Inexact
 
 from jeit_solvers.engines import host, namespace
 
+# Sizes of the smallest blocks of the recursion, without and with LAPACK.
 _BLOCK, _LAPACK_BLOCK = 8, 128
-_LARGEST_RECURSIVE = 128
-_LARGE_BATCH = 16
+# Maximum size of compiled matrices that are inverted by recursion.
+_MAX_RECURSIVE_SIZE = 128
+# Batches of more matrices than this use unrolled code.
+_MIN_UNROLLED_BATCH = 16
 
 
 def inverse_cholesky(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
@@ -27,7 +30,7 @@ def inverse_cholesky(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "b
     """
     if isinstance(matrices, np.ndarray):
         return _inverse_cholesky_recursive(matrices)
-    if matrices.shape[-1] > _LARGEST_RECURSIVE:
+    if matrices.shape[-1] > _MAX_RECURSIVE_SIZE:
         return _inverse_cholesky_by_block_rows(matrices)
     return _inverse_cholesky_recursive(matrices)
 
@@ -141,25 +144,27 @@ def _inverse_cholesky_recursive(matrices: Inexact[Array, "batch s s"]) -> Inexac
     four times faster than LAPACK's inverse of a triangle. The smallest blocks use unrolled code in large batches, and
     in small batches a loop over short vectors, with larger blocks the fewer matrices there are."""
     batch, size, _ = matrices.shape
-    on_host = isinstance(matrices, np.ndarray)
-    by_lapack = on_host and not np.iscomplexobj(matrices)
-    block = _LAPACK_BLOCK if by_lapack else _BLOCK if batch > 4 else 2 * _BLOCK
+    is_numpy = isinstance(matrices, np.ndarray)
+    uses_lapack = is_numpy and not np.iscomplexobj(matrices)
+    block = _LAPACK_BLOCK if uses_lapack else _BLOCK if batch > 4 else 2 * _BLOCK
     if size <= block:
-        if by_lapack:
+        if uses_lapack:
             return _inverse_cholesky_lapack(matrices)
         return (
             _inverse_cholesky_unrolled(matrices)
-            if batch > _LARGE_BATCH or on_host
+            if batch > _MIN_UNROLLED_BATCH or is_numpy
             else _inverse_cholesky_by_rows(matrices)
         )
-    half = block * -(-size // (2 * block))
-    first = _inverse_cholesky_recursive(matrices[:, :half, :half])
-    lower = matrices[:, half:, :half] @ _transposed(first)
-    second = _inverse_cholesky_recursive(matrices[:, half:, half:] - lower @ _transposed(lower))
-    corner = -(second @ (lower @ first))
+    first_size = block * -(-size // (2 * block))
+    first_inverse = _inverse_cholesky_recursive(matrices[:, :first_size, :first_size])
+    lower = matrices[:, first_size:, :first_size] @ _transposed(first_inverse)
+    second_inverse = _inverse_cholesky_recursive(matrices[:, first_size:, first_size:] - lower @ _transposed(lower))
+    lower_left = -(second_inverse @ (lower @ first_inverse))
     xp = namespace(matrices)
-    top = xp.concatenate([first, xp.zeros((*first.shape[:-1], size - half), matrices.dtype)], axis=-1)
-    return xp.concatenate([top, xp.concatenate([corner, second], axis=-1)], axis=-2)
+    upper_rows = xp.concatenate(
+        [first_inverse, xp.zeros((*first_inverse.shape[:-1], size - first_size), matrices.dtype)], axis=-1
+    )
+    return xp.concatenate([upper_rows, xp.concatenate([lower_left, second_inverse], axis=-1)], axis=-2)
 
 
 def _inverse_cholesky_unrolled(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
@@ -183,14 +188,14 @@ def _inverse_cholesky_by_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[
     identity = jnp.broadcast_to(jnp.eye(size, dtype=matrices.dtype), matrices.shape)
     augmented = jnp.concatenate([matrices, identity], axis=-1)
 
-    def next_row(done, k):
-        weights = _transposed(jax.lax.dynamic_index_in_dim(done, k, axis=2))
-        row = jax.lax.dynamic_index_in_dim(augmented, k, axis=1) - weights @ done
+    def next_row(finished_rows, k):
+        weights = _transposed(jax.lax.dynamic_index_in_dim(finished_rows, k, axis=2))
+        row = jax.lax.dynamic_index_in_dim(augmented, k, axis=1) - weights @ finished_rows
         row = row * _inverse_square_root(jax.lax.dynamic_slice_in_dim(row, k, 1, axis=2))
-        return jax.lax.dynamic_update_slice_in_dim(done, row, k, axis=1), None
+        return jax.lax.dynamic_update_slice_in_dim(finished_rows, row, k, axis=1), None
 
-    done, _ = jax.lax.scan(next_row, jnp.zeros_like(augmented), jnp.arange(size))
-    return done[..., size:]
+    finished_rows, _ = jax.lax.scan(next_row, jnp.zeros_like(augmented), jnp.arange(size))
+    return finished_rows[..., size:]
 
 
 def _inverse_cholesky_by_block_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
@@ -205,14 +210,14 @@ def _inverse_cholesky_by_block_rows(matrices: Inexact[Array, "batch s s"]) -> In
         matrices = matrices + jnp.asarray(np.diag(np.arange(size + padding) >= size), dtype)
     identity = jnp.eye(size + padding, dtype=dtype)
 
-    def next_rows(inverse, number):
-        start = number * block
+    def next_rows(inverse, block_index):
+        start = block_index * block
         rows = jax.lax.dynamic_slice_in_dim(matrices, start, block, axis=1)
         lower = rows @ _transposed(inverse)
         pivot = jax.lax.dynamic_slice_in_dim(rows, start, block, axis=2) - lower @ _transposed(lower)
         remainder = jax.lax.dynamic_slice_in_dim(identity, start, block, axis=0) - lower @ inverse
-        new = _inverse_cholesky_recursive(pivot) @ remainder
-        return jax.lax.dynamic_update_slice_in_dim(inverse, new, start, axis=1), None
+        new_rows = _inverse_cholesky_recursive(pivot) @ remainder
+        return jax.lax.dynamic_update_slice_in_dim(inverse, new_rows, start, axis=1), None
 
     inverse, _ = jax.lax.scan(next_rows, jnp.zeros_like(matrices), jnp.arange((size + padding) // block))
     return inverse[:, :size, :size]
@@ -249,14 +254,14 @@ def ridge_model(
     """
     if not isinstance(jacobian, np.ndarray):
         jacobian = jax.lax.optimization_barrier(jacobian)
-    weighted = precision @ residual
-    cost = 0.5 * (residual @ weighted + point @ point)
+    weighted_residual = precision @ residual
+    cost = 0.5 * (residual @ weighted_residual + point @ point)
 
     def step(damping):
         direction = ridge_step(jacobian, residual, point, covariance, precision, 1 + damping)
-        across = jacobian @ direction
-        slope = weighted @ across + point @ direction
-        return direction, slope, across @ precision @ across + direction @ direction
+        data_change = jacobian @ direction
+        slope = weighted_residual @ data_change + point @ direction
+        return direction, slope, data_change @ precision @ data_change + direction @ direction
 
     return cost, step
 
@@ -289,13 +294,13 @@ def ridge_step(
     change = ridge_step(jnp.eye(5), jnp.ones(5), jnp.zeros(5), jnp.eye(5), jnp.eye(5))
     ```
     """
-    rows, columns = jacobian.shape
-    if columns <= rows:
-        weighted = jacobian.T @ precision
-        identity = np.eye(columns, dtype=jacobian.dtype)
-        return -solve_definite(weighted @ jacobian + ridge * identity, weighted @ residual + point)
-    inner = solve_definite(jacobian @ jacobian.T + ridge * covariance, residual - jacobian @ point / ridge)
-    return -point / ridge - inner @ jacobian
+    num_data, num_unknowns = jacobian.shape
+    if num_unknowns <= num_data:
+        weighted_transpose = jacobian.T @ precision
+        identity = np.eye(num_unknowns, dtype=jacobian.dtype)
+        return -solve_definite(weighted_transpose @ jacobian + ridge * identity, weighted_transpose @ residual + point)
+    dual_solution = solve_definite(jacobian @ jacobian.T + ridge * covariance, residual - jacobian @ point / ridge)
+    return -point / ridge - dual_solution @ jacobian
 
 
 def solve_definite(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> Float[Array, " n"]:

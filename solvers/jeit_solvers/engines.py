@@ -76,13 +76,13 @@ def differentiable_batches(function: Callable[..., Any], batch_rule: Callable[..
         directions = jax.tree.leaves(tangents, is_leaf=_is_zero_tangent)
         moving = [number for number, direction in enumerate(directions) if not _is_zero_tangent(direction)]
 
-        def of_what_moves(*values):
+        def restricted(*values):
             merged = list(leaves)
             for number, value in zip(moving, values, strict=True):
                 merged[number] = value
             return function(*jax.tree.unflatten(structure, merged))
 
-        return jax.jvp(of_what_moves, [leaves[i] for i in moving], [directions[i] for i in moving])
+        return jax.jvp(restricted, [leaves[i] for i in moving], [directions[i] for i in moving])
 
     return differentiable
 
@@ -98,20 +98,22 @@ def one_by_one(
     del axis_size
     leaves, structure = jax.tree.flatten(arguments)
     flags = jax.tree.leaves(batched)
-    chosen = [leaf for leaf, flag in zip(leaves, flags, strict=True) if flag]
-    shared = [leaf for leaf, flag in zip(leaves, flags, strict=True) if not flag]
+    batched_leaves = [leaf for leaf, flag in zip(leaves, flags, strict=True) if flag]
+    shared_leaves = [leaf for leaf, flag in zip(leaves, flags, strict=True) if not flag]
 
-    def call(function, own, common):
-        own, common = iter(own), iter(common)
-        return function(*jax.tree.unflatten(structure, [next(own) if flag else next(common) for flag in flags]))
+    def call(function, own_values, constants):
+        own_values, constants = iter(own_values), iter(constants)
+        return function(
+            *jax.tree.unflatten(structure, [next(own_values) if flag else next(constants) for flag in flags])
+        )
 
-    def one_after_the_other(chosen, shared):
-        return jax.lax.map(lambda own: call(batchable, own, shared), chosen)
+    def call_in_turn(batched_leaves, shared_leaves):
+        return jax.lax.map(lambda own_values: call(batchable, own_values, shared_leaves), batched_leaves)
 
-    def together(chosen, shared):
-        return jax.vmap(lambda own: call(plain, own, shared))(chosen)
+    def call_together(batched_leaves, shared_leaves):
+        return jax.vmap(lambda own_values: call(plain, own_values, shared_leaves))(batched_leaves)
 
-    return jax.lax.platform_dependent(chosen, shared, cpu=one_after_the_other, default=together)
+    return jax.lax.platform_dependent(batched_leaves, shared_leaves, cpu=call_in_turn, default=call_together)
 
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -176,10 +178,10 @@ def empty_for_jax(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
 def product_for_jax(left: Inexact[np.ndarray, "*f k"], right: Inexact[np.ndarray, "k m"]) -> Inexact[Array, "*f m"]:
     """Multiply two NumPy matrices and return the product as a JAX array. A large product is computed in memory that JAX
     can use without a copy, because a copy would take longer than the product."""
-    shape, kind = (*left.shape[:-1], right.shape[1]), np.result_type(left, right)
-    if math.prod(shape) * kind.itemsize < _MIN_SHARED_BYTES:
+    shape, dtype = (*left.shape[:-1], right.shape[1]), np.result_type(left, right)
+    if math.prod(shape) * dtype.itemsize < _MIN_SHARED_BYTES:
         return _to_jax(left @ right)
-    return jax.device_put(np.matmul(left, right, out=empty_for_jax(shape, kind)))
+    return jax.device_put(np.matmul(left, right, out=empty_for_jax(shape, dtype)))
 
 
 @jax.jit
@@ -216,11 +218,11 @@ def either_engine(function: _Function) -> _Function:
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        given = jax.tree.leaves((arguments, named))
-        if not has_values(given):
+        leaves = jax.tree.leaves((arguments, named))
+        if not has_values(leaves):
             return compiled(*arguments, **named)
         result = at_once(function, *arguments, **named)
-        return result if namespace(given) is np else on_device(result)
+        return result if namespace(leaves) is np else on_device(result)
 
     return call  # pyright: ignore[reportReturnType]
 
@@ -235,8 +237,8 @@ def values_at_once(function: _Function) -> _Function:
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        given = arguments, named
-        if namespace(given) is np or not has_values(given):
+        arguments_and_keywords = arguments, named
+        if namespace(arguments_and_keywords) is np or not has_values(arguments_and_keywords):
             return function(*arguments, **named)
         return on_device(at_once(function, *arguments, **named))
 
@@ -249,25 +251,25 @@ class Recent:
 
     def __init__(self, make: Callable[..., Any], size: int = 4):
         self._make, self._size = make, size
-        self._kept: list[tuple[tuple[Any, ...], list[Any], Any, Any]] = []
+        self._cached: list[tuple[tuple[Any, ...], list[Any], Any, Any]] = []
 
     def __call__(self, *trees: Any) -> Any:
         """Return the result of `make` for these arguments, computed now or taken from the cache."""
-        kept = self._kept[::-1]
-        for known, _, _, result in kept:
-            if _identical(known, trees):
+        cached = self._cached[::-1]
+        for cached_key, _, _, result in cached:
+            if _identical(cached_key, trees):
                 return result
         leaves, structure = jax.tree.flatten(trees)
-        for _, known, kind, result in kept:
-            if _identical(known, leaves) and kind == structure:  # structures take far longer to compare
+        for _, cached_key, treedef, result in cached:
+            if _identical(cached_key, leaves) and treedef == structure:  # structures take far longer to compare
                 return result
         result = self._make(*trees)
-        self._kept = [*self._kept, (trees, leaves, structure, result)][-self._size :]
+        self._cached = [*self._cached, (trees, leaves, structure, result)][-self._size :]
         return result
 
 
-def _identical(some: Sequence[Any], others: Sequence[Any]) -> bool:
-    return len(some) == len(others) and all(one is other for one, other in zip(some, others, strict=True))
+def _identical(first: Sequence[Any], second: Sequence[Any]) -> bool:
+    return len(first) == len(second) and all(left is right for left, right in zip(first, second, strict=True))
 
 
 def undifferentiated(values: Any) -> Any:
@@ -299,10 +301,10 @@ def scan(body: Callable[[Any, Any], tuple[Any, Any]], state: Any, elements: Any,
     `jax.lax.scan` for JAX's arrays; in NumPy at least one element is needed."""
     if namespace(state, elements) is jnp:
         return jax.lax.scan(body, state, elements, reverse=reverse)
-    given: Any = [None] * len(jax.tree.leaves(elements)[0])
-    for k in sorted(range(len(given)), reverse=reverse):
-        state, given[k] = body(state, jax.tree.map(lambda array, k=k: array[k], elements))
-    return state, jax.tree.map(lambda *parts: np.stack(parts), *given)
+    outputs: Any = [None] * len(jax.tree.leaves(elements)[0])
+    for k in sorted(range(len(outputs)), reverse=reverse):
+        state, outputs[k] = body(state, jax.tree.map(lambda array, k=k: array[k], elements))
+    return state, jax.tree.map(lambda *rows: np.stack(rows), *outputs)
 
 
 def complex_slope(function: Callable[[Any], Any], x: Any, row_index: int) -> Any:
@@ -312,10 +314,12 @@ def complex_slope(function: Callable[[Any], Any], x: Any, row_index: int) -> Any
 
 
 def _complex_step(function, x, row: int) -> tuple[Any, Any]:
-    ahead = x.astype(complex)
-    ahead[row] += 1j * _COMPLEX_STEP
-    found = function(ahead)
-    return jax.tree.map(np.real, found), jax.tree.map(lambda part: np.imag(part) / _COMPLEX_STEP, found)
+    shifted = x.astype(complex)
+    shifted[row] += 1j * _COMPLEX_STEP
+    complex_values = function(shifted)
+    return jax.tree.map(np.real, complex_values), jax.tree.map(
+        lambda values: np.imag(values) / _COMPLEX_STEP, complex_values
+    )
 
 
 def slopes(function: Callable[[Any], Any], x: Any) -> tuple[Any, list[Any]]:
@@ -326,10 +330,10 @@ def slopes(function: Callable[[Any], Any], x: Any) -> tuple[Any, list[Any]]:
     function is analytic. JAX uses forward differentiation.
     """
     if isinstance(x, np.ndarray):
-        ahead = [_complex_step(function, x, row) for row in range(len(x))]
-        return ahead[0][0], [slope for _, slope in ahead]
-    value, push = jax.linearize(function, x)
-    return value, [push(direction) for direction in jnp.eye(len(x))[:, :, None] * jnp.ones_like(x)]
+        values_and_slopes = [_complex_step(function, x, row) for row in range(len(x))]
+        return values_and_slopes[0][0], [slope for _, slope in values_and_slopes]
+    value, derivative = jax.linearize(function, x)
+    return value, [derivative(direction) for direction in jnp.eye(len(x))[:, :, None] * jnp.ones_like(x)]
 
 
 def gather(values: Shaped[Array, "n *k"], index: Int[Array, "*i"]) -> Shaped[Array, "..."]:
@@ -344,9 +348,9 @@ def gather_or_zero(values: Shaped[Array, "n *k"], index: Int[Array, "*i"]) -> Sh
     if isinstance(values, np.ndarray):
         if not len(values):
             return host.zeros((*np.shape(index), *values.shape[1:]), values.dtype)
-        found = np.take(values, index, axis=0, mode="clip")  # avoids a copy of all rows with a row of zeros appended
-        found[np.asarray(index) == len(values)] = 0
-        return host.asarray(found)
+        rows = np.take(values, index, axis=0, mode="clip")  # avoids a copy of all rows with a row of zeros appended
+        rows[np.asarray(index) == len(values)] = 0
+        return host.asarray(rows)
     return values.at[index].get(mode="fill", fill_value=0)
 
 
@@ -365,9 +369,9 @@ def sum_into(shape: tuple[int, ...], index: Any, values: Inexact[Array, "*i"]) -
 def set_at(total: Shaped[Array, "*n"], index: Any, values: Any) -> Shaped[Array, "*n"]:
     """`total` with the entries at `index` replaced by `values`; in JAX's arrays, indices beyond the end are ignored."""
     if isinstance(total, np.ndarray):
-        changed: Any = np.array(total)
-        changed[index] = values
-        return changed
+        replaced: Any = np.array(total)
+        replaced[index] = values
+        return replaced
     return total.at[index].set(values, mode="drop")
 
 
@@ -428,15 +432,18 @@ def _lower_numpy_call(context: Any, *arguments: Any, function: Callable[..., Any
 
 
 def _batch_numpy_call(arguments: Sequence[Any], axes: Sequence[Any], **parameters: Any) -> tuple[Any, int]:
-    moved = [jnp.moveaxis(one, axis, 0) for one, axis in zip(arguments, axes, strict=True) if axis is not None]
+    batches = [
+        jnp.moveaxis(argument, axis, 0) for argument, axis in zip(arguments, axes, strict=True) if axis is not None
+    ]
 
-    def one(given: list[Any]) -> Any:
-        own = iter(given)
+    def call_for_element(element_arguments: list[Any]) -> Any:
+        elements = iter(element_arguments)
         return _numpy_call.bind(
-            *(one if axis is None else next(own) for one, axis in zip(arguments, axes, strict=True)), **parameters
+            *(argument if axis is None else next(elements) for argument, axis in zip(arguments, axes, strict=True)),
+            **parameters,
         )
 
-    return jax.lax.map(one, moved), 0
+    return jax.lax.map(call_for_element, batches), 0
 
 
 mlir.register_lowering(_numpy_call, _lower_numpy_call)

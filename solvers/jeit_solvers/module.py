@@ -23,17 +23,17 @@ class Module(eqx.Module):
     if not TYPE_CHECKING:
 
         def __getattribute__(self, name: str) -> Any:
-            found = object.__getattribute__(self, name)
-            if type(found) is not MethodType or found.__self__ is not self or name.startswith("__"):
-                return found
-            known = _BOUND.get(found.__func__)
-            if known is None:
+            attribute = object.__getattribute__(self, name)
+            if type(attribute) is not MethodType or attribute.__self__ is not self or name.startswith("__"):
+                return attribute
+            cached = _BOUND.get(attribute.__func__)
+            if cached is None:
                 bound = super().__getattribute__(name)
                 attributes = dict(getattr(bound, "__dict__", {}))
                 if attributes.pop("__self__", None) is self:
-                    _BOUND[found.__func__] = type(bound), attributes
+                    _BOUND[attribute.__func__] = type(bound), attributes
                 return bound
-            kind, attributes = known
-            bound = object.__new__(kind)
+            method_type, attributes = cached
+            bound = object.__new__(method_type)
             bound.__dict__.update(attributes, __self__=self)
             return bound

@@ -50,7 +50,7 @@ NEEDED = [
 ]
 NOTHING_NEEDED = {
     *("calibrate-microphones", "choose", "demo", "describe", "info"),
-    *("reconstruct", "series", "stream", "touch health", "view"),
+    *("reconstruct", "series", "stream", "touch contacts", "touch health", "view"),
 }
 
 

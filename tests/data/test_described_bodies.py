@@ -192,7 +192,8 @@ WRONG = {
         {"shape": "cylinder", "raduis": 0.05, "height": 0.04},
         {**{key: value for key, value in STRIP.items() if key != "contact_impedance"}, "height": 0.04, "impedance": 1},
         r"geometry\.radius is missing; .* geometry\.raduis is no key of a cylinder .*'radius'\?\).*"
-        r" electrodes\.contact_impedance is missing; give it\. (Wrong too: )?electrodes\.impedance",
+        r" electrodes\.contact_impedance is missing; give it; if it is not known, write 1e-3 .*\."
+        r" (Wrong too: )?electrodes\.impedance",
     ),
     "wide": (
         CYLINDER,

@@ -170,6 +170,23 @@ def test_an_incomplete_last_line_is_left_out(frames, tmp_path):
         assert any("cut off" in note for note in found.notes)
 
 
+@pytest.mark.parametrize("line", [1, 2, 4])
+def test_a_missing_line_of_a_wrapped_frame_is_reported(line, frames, tmp_path):
+    """Of the one frame of 40 channels in five lines, 32 numbers remain; 20 of them are not read as another protocol."""
+    values, _ = voltages_of(frames[:1], False, "rotating", "all")
+    path = written(tmp_path / "a.txt", values, wrap=8)
+    lines = path.read_text("utf-8").splitlines()
+    path.write_text("\n".join(lines[:line] + lines[line + 1 :]))
+    with pytest.raises(ValueError, match="32 numbers, 8 fewer than a frame has: is a line missing"):
+        read(path)
+
+
+def test_another_number_of_electrodes_is_suggested(frames, tmp_path):
+    path = written(tmp_path / "a.txt", np.ones((1, 208)), wrap=13)
+    with pytest.raises(ValueError, match="208 numbers are what 16 electrodes give with adjacent pairs"):
+        read(path)
+
+
 def test_spreadsheet_exports(frames, tmp_path):
     values, _ = voltages_of(frames, False, "rotating", "all")
     rows = [";".join(f'"{one:.9e}"'.replace(".", ",") for one in frame) for frame in values]

@@ -41,7 +41,7 @@ def test_changes_equal_those_of_each_call(skin):
     assert resting is not None
     found = resting.changes(touched)
     assert np.abs(found - right).max() < 1e-12 * np.abs(right).max()
-    assert np.allclose(resting.rest, skin.model.voltages(skin.model_conductivity), rtol=1e-12)
+    assert np.allclose(resting.voltages, skin.model.voltages(skin.model_conductivity), rtol=1e-12)
 
 
 @pytest.mark.slow

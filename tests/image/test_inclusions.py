@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.image import Inclusion, find_inclusions
+from jeit.image.inclusions import StrongestRegion
 from jeit.mesh import Mesh, Refine, box, centroids, disk, rectangle
 
 MESH = disk(0.1, num_points=1500)
@@ -47,6 +48,22 @@ def test_weak_peaks_and_specks_are_artefacts():
 
 def test_a_zero_image_has_no_inclusions():
     assert find_inclusions(MESH, np.zeros(MESH.num_cells)) == []
+
+
+def test_the_strongest_region_is_that_of_the_strongest_inclusion():
+    """Of either sign, beside a weaker body and a spike at the peak, in a sheet and a solid."""
+    strongest = StrongestRegion(MESH)
+    for sign in (1, -1):
+        image = sign * (bump(0.04, 0.02) + 0.6 * bump(-0.05, -0.01)) - 0.8 * sign * bump(0.0, -0.05)
+        place, peak = strongest(image)
+        np.testing.assert_allclose(place, find_inclusions(MESH, image)[0].centroid, atol=1e-3)
+        assert peak == pytest.approx(sign, rel=0.05)
+    place, _ = strongest(bump(0.04, 0.02) + 0.8 * bump(0.052, 0.02, width=0.003))
+    assert np.linalg.norm(place - [0.04, 0.02]) < 0.006
+    solid = box(0.2, 0.2, 0.2, num_points=2000)
+    place, _ = StrongestRegion(solid)(ball(solid, [0.02, 0.0, 0.1], 0.05).astype(float))
+    np.testing.assert_allclose(place, [0.02, 0.0, 0.1], atol=4e-3)
+    assert np.isfinite(strongest(np.zeros(MESH.num_cells))[0]).all()
 
 
 def ball(mesh, middle, radius):

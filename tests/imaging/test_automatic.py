@@ -1,5 +1,6 @@
 """The default method: a linear image where that is sound, otherwise a nonlinear reconstruction, and what it detects."""
 
+import dataclasses
 import functools
 from contextlib import nullcontext
 from dataclasses import replace
@@ -14,7 +15,7 @@ from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import find_inclusions
 from jeit.imaging import ImagingSettings, automatic, calibration, prepare_difference
-from jeit.imaging.automatic import unsound
+from jeit.imaging.automatic import linear_image_fault
 from jeit.imaging.method import METHODS
 from jeit.inverse import Gaussian, calibrate, reconstruct
 from jeit.inverse.uncertainty import image_noise
@@ -138,7 +139,7 @@ def test_noise_damps_images_which_then_are_not_sound():
     relative = [one.quality.difference_noise.relative for one in (sound, noisy)]
     assert relative[0] < 0.3 < relative[1]
     faults = [
-        unsound(prepare_difference(*pair, num_points=450), one.change)
+        linear_image_fault(prepare_difference(*pair, num_points=450), one.change)
         for pair, one in zip(pairs, (sound, noisy), strict=True)
     ]
     assert faults[0] == ""
@@ -208,6 +209,21 @@ def test_reasons_to_doubt_an_image_are_reported():
     stiff = image(20.0, method="gauss-newton", hyperparameter=1e3)
     assert "standard deviations: bodies may be missing" in stiff.doubts[-1]
     assert report_image(stiff)["doubts"] == list(stiff.doubts)
+
+
+def test_exchanged_files_and_lengths_in_another_unit_are_doubted():
+    """Of a tank whose reference contains a strong body, and of one that is described a hundred times too large."""
+    assert image(20.0).doubts == ()
+    exchanged = image_difference(frame(), frame(20.0, seed=1), ImagingSettings(method="one-step", **FEW))
+    assert any("are the two exchanged?" in doubt for doubt in exchanged.doubts)
+
+    def enlarged(measurement):
+        electrodes = BoundaryElectrodes(ring(100 * RADIUS, 16), 0.005, 0.05)
+        return dataclasses.replace(measurement, electrodes=electrodes, domain=Disk(100 * RADIUS))
+
+    large = [enlarged(measurement) for measurement in (frame(1.05, seed=1), frame())]
+    result = image_difference(*large, ImagingSettings(method="one-step", hyperparameter=1.0, **FEW))
+    assert any("are all lengths in metres?" in doubt for doubt in result.doubts)
 
 
 def test_one_step_is_kept_where_gauss_newton_fails(monkeypatch):

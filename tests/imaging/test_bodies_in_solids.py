@@ -125,7 +125,7 @@ def test_bodies_are_searched_in_solids_where_data_can_determine_them(monkeypatch
 
     monkeypatch.setitem(automatic.METHODS, "gauss-newton", SimpleNamespace(image=image, hyperparameter=5.0))
     data, change = prepared(dimension, strongest, noise)
-    assert automatic._bodies_in_solid(data, method.Asked("gaussian"), change) is None
+    assert automatic._bodies_in_solid(data, method.MethodOptions("gaussian"), change) is None
     assert bool(asked) == looks
 
 
@@ -151,11 +151,11 @@ def test_bodies_are_searched_in_solids_where_data_can_determine_them(monkeypatch
 )
 def test_thin_data_and_impossible_units_are_doubted(background, dimension, left, volts, expected):
     used = np.arange(10) < 10 * left
-    frame = SimpleNamespace(mask=used[None], voltages=np.full((1, 10), volts), notes=())
+    frame = SimpleNamespace(mask=used[None], voltages=np.full((1, 10), volts), notes=(), electrodes=None, domain=None)
     image: Any = SimpleNamespace(
         measurement=frame,
         reference=frame,
-        calibration=SimpleNamespace(conductivity=background),
+        calibration=SimpleNamespace(conductivity=background, misfit=0.0),
         mesh=SimpleNamespace(dimension=dimension),
     )
     doubts = difference._doubts_of_data(image)
@@ -170,14 +170,14 @@ def test_thin_data_and_impossible_units_are_doubted(background, dimension, left,
 def test_a_requested_prior_is_that_of_the_image(monkeypatch, prior, fault):
     data, change = prepared(3, 0.1, 0.1)
     data.difference = change
-    monkeypatch.setattr(automatic, "unsound", lambda *_: fault)
+    monkeypatch.setattr(automatic, "linear_image_fault", lambda *_: fault)
     monkeypatch.setattr(automatic, "Reconstruction", SimpleNamespace)
     fitted = SimpleNamespace(bodies=(1,), misfit=0.5, conductivity=change, finer=None)
     monkeypatch.setattr(automatic, "shapes_in", lambda *_: fitted)
     for name in ("one-step", "gauss-newton"):
         made = SimpleNamespace(image=lambda *_: (SimpleNamespace(misfit=1.0), change), hyperparameter=5.0)
         monkeypatch.setitem(automatic.METHODS, name, made)
-    chosen = automatic.image_automatically(data, method.Asked(prior))
+    chosen = automatic.image_automatically(data, method.MethodOptions(prior))
     assert chosen.method == ("shapes" if prior == "gaussian" else "gauss-newton" if fault else "one-step")
 
 
@@ -188,16 +188,16 @@ def test_the_fit_is_named_for_the_kind_of_body(monkeypatch, dimension, edges, st
     data, change = prepared(dimension, strongest, 0.1)
     data.difference, data.calibration.conductivity = change, BATH
     data.mask = np.ones(2, bool)
-    monkeypatch.setattr(automatic, "unsound", lambda *_: "it is strong" if strongest == 1 else "")
+    monkeypatch.setattr(automatic, "linear_image_fault", lambda *_: "it is strong" if strongest == 1 else "")
     monkeypatch.setattr(automatic, "Reconstruction", SimpleNamespace)
     fitted = SimpleNamespace(bodies=(1,), misfit=0.5, conductivity=change, finer=None)
     monkeypatch.setattr(automatic, "shapes_in", lambda *_: fitted)
     for name in ("one-step", "gauss-newton"):
         made = SimpleNamespace(image=lambda *_: (SimpleNamespace(misfit=1.0), change), hyperparameter=5.0)
         monkeypatch.setitem(automatic.METHODS, name, made)
-    chosen = automatic.image_automatically(data, method.Asked("gaussian"))
+    chosen = automatic.image_automatically(data, method.MethodOptions("gaussian"))
     if dimension == 3 or strongest == 1:
-        assert f"{edges} " in chosen.why
+        assert f"{edges} " in chosen.reason
     else:
         assert chosen.method == "one-step"
 
@@ -211,7 +211,7 @@ def test_settings_of_bodies_reach_their_search(monkeypatch, dimension):
     monkeypatch.setattr(method, "find_inclusions", lambda *_, **__: [])
     monkeypatch.setattr(method, "reconstruct_shapes", lambda *_, **searched: searched)
     smooth: Any = SimpleNamespace(conductivity=np.ones(2))
-    searched: Any = method.shapes_in(data, smooth, method.Asked("gaussian", kinds="columns", progress=print))
+    searched: Any = method.shapes_in(data, smooth, method.MethodOptions("gaussian", kinds="columns", progress=print))
     assert searched["progress"] is print
     assert (searched["prior"] is None) if dimension == 2 else (searched["prior"].kinds == "columns")
 
@@ -261,8 +261,10 @@ def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_an
         alternatives=(body(False, np.log(6)), None),
         alternative_deviations=(0.5, np.nan),
     )
-    calibration = SimpleNamespace(conductivity=BATH)
-    frame = SimpleNamespace(mask=np.ones((1, 2), bool), voltages=np.ones((1, 2)), notes=())
+    calibration = SimpleNamespace(conductivity=BATH, misfit=0.0)
+    frame = SimpleNamespace(
+        mask=np.ones((1, 2), bool), voltages=np.ones((1, 2)), notes=(), electrodes=None, domain=None
+    )
     whole = SimpleNamespace(measurement=frame, reference=frame, mesh=SimpleNamespace(dimension=3))
     image: Any = SimpleNamespace(shapes=shapes, reconstruction=shapes, calibration=calibration, **vars(whole))
     own = Quantities(2.0, (1.7, 2.3), 3e-5, (2e-5, None), 1.5e-5, (1.4e-5, 1.6e-5))

@@ -42,7 +42,7 @@ def ellipsoids(coarse):
 def test_derivatives_equal_finite_differences(ellipsoids, coarse):
     rng = np.random.default_rng(0)
     point = ellipsoids.of_radii([0.03, 0.02, 0.03]) + 0.3 * rng.normal(size=31)
-    ellipsoids, point = ellipsoids.otherwise([2], point)
+    ellipsoids, point = ellipsoids.with_other_kind([2], point)
     along, step = rng.normal(size=31), 1e-6
     here = ellipsoids.image(point)
     ahead, behind = ellipsoids.image(point + step * along), ellipsoids.image(point - step * along)
@@ -58,7 +58,7 @@ def test_bodies_of_one_material_have_the_contrast_of_the_first(ellipsoids, coars
     rng = np.random.default_rng(4)
     point = ellipsoids.of_radii([0.03, 0.02, 0.03]) + 0.3 * rng.normal(size=31)
     same, point = ellipsoids.of_one_material(1, point)
-    assert same.alike.tolist() == [True, False, True]
+    assert same.same_material.tolist() == [True, False, True]
     assert [same.body(k, point).alike for k in range(3)] == [True, False, True]
     moved = point + rng.normal(size=31)
     bodies = [same.body(k, moved) for k in range(3)]
@@ -79,7 +79,7 @@ def test_bodies_keep_their_effect_when_they_become_one_material(ellipsoids):
     """The effect is volume times (ρ - 1) / (ρ + 2), of a column (ρ - 1) / (ρ + 1)."""
     point = ellipsoids.of_radii([0.02, 0.02, 0.02])
     point[[5, 25]] = 0.6, -0.6  # contrasts of the first and the last
-    ellipsoids, point = ellipsoids.otherwise([2], point)
+    ellipsoids, point = ellipsoids.with_other_kind([2], point)
     same, after = ellipsoids.of_one_material(1, point)
     for k, ends in ((0, 2), (2, 1)):
         effect = []
@@ -94,7 +94,7 @@ def test_the_kind_of_bodies_can_be_given(coarse):
     with pytest.raises(ValueError, match=r"kinds must be one of either, ellipsoids, columns; .* mean 'columns'"):
         EllipsoidPrior(kinds="colums")
     bodies = Ellipsoids.create(coarse.mesh, EllipsoidPrior(kinds="columns"), [[0.0, 0.0, 0.05]], [1])
-    columns, point = bodies.otherwise([0], bodies.of_radii([RADIUS]))
+    columns, point = bodies.with_other_kind([0], bodies.of_radii([RADIUS]))
     assert columns.odds == 0
     problem: Any = None
     assert search._alternative_fits(problem, Fit(bodies, point, 1.0, ROWS)) is None  # pyright: ignore
@@ -112,10 +112,10 @@ def test_the_deviation_of_a_common_contrast_includes_that_of_separate_ones(ellip
         """Separate contrasts are `worse`, have three times the deviation, and the last is twice the common one."""
 
         def surprise(self, fit):
-            return fit.bodies.odds + (0.0 if fit.bodies.alike.any() else worse)
+            return fit.bodies.odds + (0.0 if fit.bodies.same_material.any() else worse)
 
         def deviations(self, fit):
-            return np.full(len(fit.coefficients), 0.1 if fit.bodies.alike.any() else 0.3)
+            return np.full(len(fit.coefficients), 0.1 if fit.bodies.same_material.any() else 0.3)
 
     problem: Any = Evidence()
     moved = point.copy()
@@ -147,7 +147,7 @@ def test_a_column_extends_through_the_whole_height(ellipsoids):
     point = ellipsoids.of_radii([0.02, 0.02, 0.02])
     point[[4, 6, 7, 8, 9]] = [1.0, 0.8, 0.5, -0.6, 0.3]  # radius and stretches of the first body
     before = ellipsoids.body(0, point).volume
-    columns, point = ellipsoids.otherwise([0], point)
+    columns, point = ellipsoids.with_other_kind([0], point)
     body = columns.body(0, point)
     assert body.column
     np.testing.assert_allclose(body.volume, before, rtol=0.03)
@@ -166,9 +166,9 @@ def test_a_column_extends_through_the_whole_height(ellipsoids):
 
 def test_a_column_becomes_an_ellipsoid_of_its_volume(ellipsoids):
     point = ellipsoids.of_radii([0.02, 0.02, 0.02])
-    columns, upright = ellipsoids.otherwise([0, 1], point)
-    again, back = columns.otherwise([0, 1], upright)
-    assert again.other.tolist() == [False] * 3
+    columns, upright = ellipsoids.with_other_kind([0, 1], point)
+    again, back = columns.with_other_kind([0, 1], upright)
+    assert again.is_other_kind.tolist() == [False] * 3
     np.testing.assert_allclose(again.body(0, back).volume, ellipsoids.body(0, point).volume, rtol=0.05)
     np.testing.assert_allclose(columns.odds, -2 * np.log(EllipsoidPrior().odds_for_columns))
 
@@ -185,8 +185,8 @@ def test_a_ball_over_the_wall_ends_there(coarse):
 def test_a_ball_is_distinguished_from_a_ghost(coarse, fine, monkeypatch):
     """One mesh fewer than by default, and coarser ones. test_fitted_ellipsoids.py tests a resistive ball with the
     default meshes."""
-    monkeypatch.setattr(search, "_MOST_MESHES", 2)
-    monkeypatch.setattr(search, "_EDGES", ((0.7,), (0.5,)))
+    monkeypatch.setattr(search, "_MAX_REFINEMENTS", 2)
+    monkeypatch.setattr(search, "_EDGE_LENGTHS", ((0.7,), (0.5,)))
     ratio = 4.0
     cut_along, held, rest = fine
     change = np.asarray(cut_along.voltages(BATH * np.where(held, ratio, 1.0))) - rest
@@ -226,11 +226,11 @@ def test_displayed_values_on_the_surface_are_half_of_the_contrast(coarse):
     """Cells that are half covered have half the contrast, whatever it is: an isosurface there is the body's surface."""
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
     coefficients = balls.of_radii([RADIUS])
-    _, share, _ = balls.covered(0, balls.rows(coefficients)[0])
-    contrast, shown = balls.body(0, coefficients).contrast, balls.shown(coefficients)
+    _, share, _ = balls.coverage(0, balls.rows(coefficients)[0])
+    contrast, shown = balls.body(0, coefficients).contrast, balls.display_image(coefficients)
     np.testing.assert_allclose(shown.sum(), share.sum() * contrast)
     assert shown.max() <= contrast * (1 + 1e-9)
-    drifted = balls.shown(coefficients + np.eye(len(coefficients))[0])
+    drifted = balls.display_image(coefficients + np.eye(len(coefficients))[0])
     np.testing.assert_allclose(drifted - shown, EllipsoidPrior().drift)
 
 
@@ -238,7 +238,7 @@ def test_displayed_values_on_the_surface_are_half_of_the_contrast(coarse):
 @pytest.mark.parametrize(("worse", "decided"), [(3.0, False), (5.0, True)])
 def test_an_alternative_kind_depends_on_the_data_alone_and_has_its_own_deviation(coarse, worse, decided, column):
     bodies = Ellipsoids.create(coarse.mesh, EllipsoidPrior(odds_for_columns=1e6), [[0.0, 0.0, 0.05]], [1])
-    bodies, coefficients = bodies.otherwise([0] if column else [], bodies.of_radii([RADIUS]))
+    bodies, coefficients = bodies.with_other_kind([0] if column else [], bodies.of_radii([RADIUS]))
 
     class Evidence:
         """The other kind is `worse` and has twice the deviation."""
@@ -247,10 +247,10 @@ def test_an_alternative_kind_depends_on_the_data_alone_and_has_its_own_deviation
             return Fit(bodies, coefficients, 1.0, ROWS)
 
         def surprise(self, fit):
-            return fit.bodies.odds + (0.0 if fit.bodies.other[0] == column else worse)
+            return fit.bodies.odds + (0.0 if fit.bodies.is_other_kind[0] == column else worse)
 
         def deviations(self, fit):
-            return np.full(len(fit.coefficients), 0.1 if fit.bodies.other[0] == column else 0.2)
+            return np.full(len(fit.coefficients), 0.1 if fit.bodies.is_other_kind[0] == column else 0.2)
 
     problem: Any = Evidence()
     fitted = Fit(bodies, coefficients, 1.0, ROWS)
@@ -304,7 +304,7 @@ def test_on_a_finer_mesh_a_ball_changes_voltages_as_on_one_cut_along_it(coarse, 
     assert coarse.mesh.num_points < there.problem.model.mesh.num_points < 3 * coarse.mesh.num_points
     change = there.change(coarse.protocol, there.bodies.image(fit.coefficients).image, 0.0)
     assert np.linalg.norm(change - wanted) < 0.08 * np.linalg.norm(wanted)
-    np.testing.assert_allclose(there.problem.linearise(np.zeros(1), there.bodies.only([]))[0], 0, atol=1e-6)
+    np.testing.assert_allclose(there.problem.linearise(np.zeros(1), there.bodies.subset([]))[0], 0, atol=1e-6)
 
 
 def test_plates_and_discs_stay_where_they_are_on_a_finer_mesh():
@@ -351,17 +351,17 @@ def test_bodies_have_moved_if_their_surfaces_have(ellipsoids):
         little, far = before.copy(), before.copy()
         little[coefficient] += 0.02
         far[coefficient] += 2.0
-        assert not ellipsoids.moved(before, ellipsoids, little)
-        assert ellipsoids.moved(before, ellipsoids, far)
+        assert not ellipsoids.left_refined_cells(before, ellipsoids, little)
+        assert ellipsoids.left_refined_cells(before, ellipsoids, far)
     stronger = before.copy()
     stronger[5] += 2.0
-    assert not ellipsoids.moved(before, ellipsoids, stronger)
-    assert ellipsoids.moved(before, ellipsoids.only([0, 1]), before[:-10])
-    columns, upright = ellipsoids.otherwise([0], before)
-    assert ellipsoids.moved(before, columns, upright)
+    assert not ellipsoids.left_refined_cells(before, ellipsoids, stronger)
+    assert ellipsoids.left_refined_cells(before, ellipsoids.subset([0, 1]), before[:-10])
+    columns, upright = ellipsoids.with_other_kind([0], before)
+    assert ellipsoids.left_refined_cells(before, columns, upright)
     upright, risen = upright.copy(), upright.copy()
     risen[3] += 2.0  # parameters that a column does not use
-    assert not columns.moved(upright, columns, risen)
+    assert not columns.left_refined_cells(upright, columns, risen)
 
 
 def test_only_starts_required_by_the_data_are_used(coarse, fine):
@@ -381,7 +381,7 @@ def test_certain_bodies_are_fitted_together_before_others_are_tried(coarse):
     fitted = []
 
     class Recorded:
-        def settled(self, bodies, coefficients, level, steps):
+        def fit_level(self, bodies, coefficients, level, steps):
             fitted.append((list(bodies.sign), coefficients))
             return level, Fit(bodies, coefficients, 1.0, ROWS), 0.0  # no other is more probable
 

@@ -28,7 +28,7 @@ def few():
 @pytest.fixture
 def one_mesh(monkeypatch):
     """Use one finer mesh where the result does not depend on their number."""
-    monkeypatch.setattr(search, "_MOST_MESHES", 1)
+    monkeypatch.setattr(search, "_MAX_REFINEMENTS", 1)
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ def test_a_smooth_field_does_not_distort_bodies(coarse, bath, ball, monkeypatch)
     start = [(1, BALL + 0.005, 0.025)]
     beside = reconstruct_shapes(coarse, frame, BATH, start=start, noise=noise, smooth=smooth)
     with monkeypatch.context() as fewer:  # one finer mesh; with more, a body is displaced as well
-        fewer.setattr(search, "_MOST_MESHES", 1)
+        fewer.setattr(search, "_MAX_REFINEMENTS", 1)
         alone = reconstruct_shapes(coarse, frame, BATH, start=start, noise=noise)
     assert max(np.linalg.norm(body.centroid - BALL) for body in alone.bodies) > 0.02
     (body,) = beside.bodies

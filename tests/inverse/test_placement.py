@@ -105,7 +105,7 @@ def test_the_background_is_fitted_to_channels_far_from_the_drives(tank):
 def test_positions_that_increase_the_relative_misfit_are_rejected(tank, monkeypatch):
     """Even if they explain the small voltages."""
     _, voltages = tank
-    monkeypatch.setattr(calibration, "_WORSE", 1e-3)
+    monkeypatch.setattr(calibration, "_MAX_MISFIT_RATIO", 1e-3)
     prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=1500)
     assert prepared.calibration.shift is None
     assert prepared.calibration.model_error is not None

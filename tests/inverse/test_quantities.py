@@ -14,7 +14,7 @@ from jeit.inverse.channels import Data
 from jeit.inverse.placement import ModelError
 from jeit.inverse.shapes import Accuracy, StarPrior, ellipsoid, reconstruct_shapes
 from jeit.inverse.shapes.problem import ShapeProblem, SmoothField
-from jeit.inverse.shapes.quantities import _HeldFits, _summary
+from jeit.inverse.shapes.quantities import _FixedContrastFit, _summary
 from jeit.inverse.shapes.search import _FitSetting
 from jeit.mesh import centroids, measures
 
@@ -48,7 +48,7 @@ def test_quantities_of_a_fitted_body_and_wider_intervals_by_model_errors(monkeyp
 
     The data are of the same mesh, so that the error of the mesh is set to zero.
     """
-    monkeypatch.setitem(ellipsoid._BY_THE_MESH, 2, 1e-9)
+    monkeypatch.setitem(ellipsoid._MESH_DEVIATION, 2, 1e-9)
     model = ForwardModel(DISK.mesh(num_points=500), DESCRIBED, PROTOCOL)
     middle, radius = np.asarray(centroids(model.mesh)), 0.025
     inside = np.linalg.norm(middle - [0.02, 0.035], axis=1) < radius
@@ -81,7 +81,7 @@ def test_errors_of_the_mesh_and_of_the_size_widen_intervals(monkeypatch):
     options = {"start": [(1, (0.02, 0.03), 0.02)], "noise": noise, "prior": StarPrior(modes=1)}
     found = {}
     for mesh, size, strength in ((1e-9, 1e-9, 0.0), (0.3, 1e-9, 0.0), (1e-9, 0.05, 0.0), (1e-9, 1e-9, 0.1)):
-        monkeypatch.setitem(ellipsoid._BY_THE_MESH, 2, mesh)
+        monkeypatch.setitem(ellipsoid._MESH_DEVIATION, 2, mesh)
         accuracy = Accuracy(noise, None, size, strength)
         (one,) = reconstruct_shapes(model, voltages, SIGMA, accuracy=accuracy, **options).bodies
         low, high = one.quantities.change_interval
@@ -132,8 +132,8 @@ def test_quantities_in_a_tank_that_differs_from_its_description(change, radius):
         assert not value > high + reach
 
 
-def held(contrast, unlikely, area=1e-3):
-    return _HeldFits(float(np.log(contrast)), unlikely, float(np.log(area)), 0.05)
+def held(contrast, negative_log_likelihood, area=1e-3):
+    return _FixedContrastFit(float(np.log(contrast)), negative_log_likelihood, float(np.log(area)), 0.05)
 
 
 def test_summary_of_a_likelihood():

@@ -49,7 +49,7 @@ def test_derivatives_equal_finite_differences(model):
     stars = Stars.create(model.mesh, StarPrior(), [[0.01, 0.02], [-0.01, 0.0], [0.01, -0.02]], [1, -1, 1])
     rng = np.random.default_rng(0)
     point = stars.of_radii([0.03, 0.02, 0.03]) + 0.2 * rng.normal(size=1 + 3 * stars.prior.size)
-    stars, point = stars.otherwise([2], point)
+    stars, point = stars.with_other_kind([2], point)
     along = rng.normal(size=point.shape)
     here, step = stars.image(point), 1e-6
     ahead, behind = stars.image(point + step * along), stars.image(point - step * along)

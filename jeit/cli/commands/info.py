@@ -25,6 +25,7 @@ def info(
     """Say what DATA holds: frames, electrodes, protocol, noise, and what was assumed or masked."""
     from jeit.arguments import counted, percent
     from jeit.cli.console import pairs, plain_console, scaled
+    from jeit.data.imageable import MOST_IMPOSSIBLE_SIGNS
     from jeit.report import report_measurement
 
     measurement = read_file("DATA", data, format, description, key=key)
@@ -46,6 +47,8 @@ def info(
         ("noise", noise_text or "not known"),
         ("impossible signs", percent(content["impossible_signs"])),
     ]
+    if (content["impossible_signs"] or 0) > MOST_IMPOSSIBLE_SIGNS:
+        rows.append(("doubt", "so many impossible signs are those of noise: frames with them are not imaged"))
     rows.append(("wiring", content["wiring"] or "not known: the file does not say where electrodes are"))
     rows += [("note", note) for note in content["notes"]]
     plain_console().print(pairs(measurement.name, rows))

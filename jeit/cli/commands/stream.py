@@ -90,10 +90,10 @@ def stream(
 ) -> None:
     """Image every frame of DATA as it comes; bad frames are refused with the reason, and the stream goes on.
 
-    Writes frames.csv line by line (x, y and peak of the strongest change, metres and S), and at the end images.npz with
-    `conductivity` (frames, cells), NaN for frames that were refused, `points`, `cells` and `background`; frames.png,
-    some frames on one colour scale; and a film. If all were refused, the exit status is 1. With --method network, how
-    deep a skin is indented: frames.csv, depth.npz, depth.png and report.json.
+    Writes frames.csv line by line (x, y, the centroid of the region around the strongest change, metres, and its peak,
+    S), and at the end images.npz with `conductivity` (frames, cells), NaN for frames that were refused, `points`,
+    `cells` and `background`; frames.png, some frames on one colour scale; and a film. If all were refused, the exit
+    status is 1. With --method network, how deep a skin is indented: frames.csv, depth.npz, depth.png and report.json.
     """
     if method == NETWORK or model is not None:
         unused = {
@@ -174,6 +174,9 @@ def stream(
             measured = measured if settings.as_is else mask_spikes(measured, reference_measurement)
             frames, num_frames = frames_of(measured), measured.num_frames
             rate = measured.frame_rate if rate is None else rate
+        notes = (*measured.notes, *reference_measurement.notes, *([calibration.note] if calibration.note else []))
+        for note in () if quiet else dict.fromkeys(notes):
+            console.print(f"  note: {note}", soft_wrap=True, markup=False)
         with naming_options({"rate": "--rate"}), Steps(console, quiet=quiet) as step:
             step("image")
             frame_counter = FrameCounter(step, num_frames)

@@ -334,10 +334,13 @@ def _wrapped_frames(text: Text, counts: Sequence[int]) -> tuple[int, int] | None
         if any(count in shape or count + 1 in shape for count in counts):
             return None
     candidates = []
-    for count in counts:
-        num_frames = int(line_ends[-1]) // count
+    for index, count in enumerate(counts):
+        num_frames, num_left_over = divmod(int(line_ends[-1]), count)
+        # Numbers left over from frames of another length than the described one mean that a line is missing.
+        if index and num_left_over:
+            continue
         if num_frames and text.lengths[0] < count and np.isin(count * np.arange(1, num_frames + 1), line_ends).all():
-            candidates.append((count, int(line_ends[-1]) - num_frames * count))
+            candidates.append((count, num_left_over))
     # Prefer a number of channels that leaves no numbers over.
     return min(candidates, key=lambda candidate: candidate[1] > 0, default=None)
 

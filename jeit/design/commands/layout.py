@@ -13,6 +13,7 @@ from jeit.design.commands import skins
 from jeit.design.commands.layout_optimise import optimise
 
 if TYPE_CHECKING:
+    from jeit.design import Skin
     from jeit.design.comparison import LayoutComparison
 
 layout = typer.Typer(name="layout", help="Compare and optimise layouts of electrodes.")
@@ -99,18 +100,18 @@ def compare(
     check_at_least({"--pairs": (pairs, 0), "--taxels": (taxels, 1), "--seed": (seed, 0)})
     if not 0 <= margin < float("inf"):
         raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
-    both = [skins.read_with_outline(name, width, height) for name in (first, second)]
+    layouts = [skins.read_with_outline(name, width, height) for name in (first, second)]
     make_folder(output, _FILES)
     console = plain_console()
     with naming_options(_OPTION_NAMES), Steps(console, quiet=quiet) as step:
-        check_same_outline(*both)
+        check_same_outline(*layouts)
         step("mesh")
-        protocols = [skin_protocol(one, num_pairs=pairs) for one in both]
+        protocols = [skin_protocol(compared_layout, num_pairs=pairs) for compared_layout in layouts]
         material = {"thickness": 1e-3 * thickness, "conductivity": conductivity}
-        made = skins_of(both, protocols, **material, cell_size=1e-3 * cell)
+        skins_to_compare = skins_of(layouts, protocols, **material, cell_size=1e-3 * cell)
         result = compare_layouts(
-            made[0],
-            made[1],
+            skins_to_compare[0],
+            skins_to_compare[1],
             margin=1e-3 * margin,
             places=places,
             contrast=contrast,
@@ -125,21 +126,43 @@ def compare(
         say_written(console, output / "report.json", "comparison.png")
 
 
+def _model_text(skin: "Skin") -> str:
+    """The kind of model that a skin has, in words."""
+    thickness = f"{1e3 * float(skin.thickness):g} mm thick"
+    return f"a layer {thickness}" if skin.model.mesh.dimension == 3 else f"a sheet, {thickness}"
+
+
 def _print_comparison(console, result: "LayoutComparison") -> None:
     from rich.table import Table
 
     from jeit.design.reports.layouts import distinct_names
 
     figures = result.figures
-    table = Table("", *distinct_names([one["layout"] for one in figures]), box=None, padding=(0, 2, 0, 0))
+    table = Table(
+        "", *distinct_names([layout_figures["layout"] for layout_figures in figures]), box=None, padding=(0, 2, 0, 0)
+    )
     for column in table.columns[1:]:
         column.justify = "right"
     for name, key, factor in _QUANTITIES:
-        table.add_row(name, *(f"{factor * one[key]:.3g}" for one in figures))
+        table.add_row(name, *(f"{factor * layout_figures[key]:.3g}" for layout_figures in figures))
         if key == "taxel_count":
-            for part in ("mean", "std", "max"):
-                table.add_row(f"taxel area, {part} / cm²", *(f"{one['taxel_area_cm2'][part]:.3g}" for one in figures))
+            for statistic in ("mean", "std", "max"):
+                table.add_row(
+                    f"taxel area, {statistic} / cm²",
+                    *(f"{layout_figures['taxel_area_cm2'][statistic]:.3g}" for layout_figures in figures),
+                )
     console.print()
     console.print(table)
-    console.print("blind spot: less sensitive than the other layout's least sensitive place", style="dim")
+    skin = result.skins[0]
+    pairs = " and ".join(f"{one.model.protocol.num_measurements}" for one in result.skins)
+    notes = [
+        f"{_model_text(skin)}; two-terminal measurements: {pairs}",
+        f"touched at {result.places} × {result.places} places, {1e3 * result.margin:g} mm or more from the edge, to "
+        f"{result.contrast:g} times its conductivity",
+        "blind spot: less sensitive than the other layout's least sensitive place",
+    ]
+    if len({one.model.protocol.num_measurements for one in result.skins}) > 1:
+        notes.append("sensitivities are norms over all measurements: more measurements alone make them larger")
+    for note in notes:
+        console.print(note, style="dim", highlight=False, soft_wrap=True)
     console.print()

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 RESULTS = ("layout.csv", "layout.svg", "travel.png", "report.json")
 # Minimum and maximum number of nodes of the mesh used in the optimisation: enough to form cells, and few enough for the
 # final mesh, which has four times as many.
-_LEAST_NODES, _MOST_NODES = 4, 250_000
+_MIN_NODES, _MAX_NODES = 4, 250_000
 # Printed quantities: key in the report, name and unit, and factor that converts the reported value to that unit.
 _QUANTITIES = (
     ("worst_sensitivity_V", "least sensitivity / mV", 1e3),
@@ -27,7 +27,7 @@ _QUANTITIES = (
     ("mean_variance", "mean variance", 1.0),
     ("log_information_nats", "log information / nats", 1.0),
     ("largest_variance", "largest variance", 1.0),
-    ("mean_localisation_error_m", "mean localisation error / mm", 1e3),
+    ("mean_localisation_error_m", "mean bound of the place / mm", 1e3),
 )
 
 
@@ -81,20 +81,22 @@ def optimise(
     check_at_least({"--starts": (starts, 1), "--steps": (steps, 1), "--seed": (seed, 0)})
     if not 0 <= minimum_spacing < float("inf"):
         raise ValueError(f"--minimum-spacing-mm must not be negative; it is {minimum_spacing:g}.")
-    check_within("--num-points", num_points, _LEAST_NODES, _MOST_NODES)
+    check_within("--num-points", num_points, _MIN_NODES, _MAX_NODES)
     start = skins.read_with_outline(layout, width, height)
-    free = [_parse_region(text, start.known_outline) for text in keep_out or ()]
+    keep_out_domains = [_parse_region(text, start.known_outline) for text in keep_out or ()]
     make_folder(output, RESULTS)
-    space = DesignSpace(minimum_spacing=1e-3 * minimum_spacing, keep_out=free, symmetry=symmetry, sizes=sizes)
-    search = {"noise": noise, "steps": steps, "starts": starts, "seed": seed, "num_points": num_points}
+    space = DesignSpace(
+        minimum_spacing=1e-3 * minimum_spacing, keep_out=keep_out_domains, symmetry=symmetry, sizes=sizes
+    )
+    search_options = {"noise": noise, "steps": steps, "starts": starts, "seed": seed, "num_points": num_points}
     material = {"thickness": 1e-3 * thickness, "conductivity": conductivity, "contact_impedance": contact_impedance}
     console = plain_console()
 
-    def say(done: int, values) -> None:
-        step.report(f"step {done} of at most {steps}, best score {values.max():.3f}")
+    def report_step(step_number: int, values) -> None:
+        step.report(f"step {step_number} of at most {steps}, best score {values.max():.3f}")
 
     with Steps(console, quiet=quiet) as step:
-        result = improve_layout(start, space, **search, **material, progress=step, callback=say)
+        result = improve_layout(start, space, **search_options, **material, progress=step, callback=report_step)
         step("write")
         write_improved_layout(result, output)
     if not quiet:
@@ -107,14 +109,21 @@ def _print_improvement(console, result: "ImprovedLayout") -> None:
     from jeit.design.reports import report_improved_layout
 
     report = report_improved_layout(result)
-    both = [(name, factor, report["start"][key], report["optimised"][key]) for key, name, factor in _QUANTITIES]
+    quantities = [(name, factor, report["start"][key], report["optimised"][key]) for key, name, factor in _QUANTITIES]
     rows = [
         (name, f"{factor * before:.3g} → {factor * after:.3g}")
-        for name, factor, before, after in both
+        for name, factor, before, after in quantities
         if before is not None and after is not None
     ]
     console.print(pairs(result.start.name, rows))
     console.print(f"  {report['status']}: {report['reason']}", soft_wrap=True)
+    console.print(
+        "  on a sheet that is touched everywhere, with all two-terminal pairs: 'jeit layout compare' computes figures "
+        "of a layer\n  the bound of the place is the error that noise alone causes",
+        style="dim",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def _parse_region(text: str, outline: "Domain") -> "Disk | Rectangle":
@@ -122,7 +131,7 @@ def _parse_region(text: str, outline: "Domain") -> "Disk | Rectangle":
     from jeit.mesh import Disk, Rectangle
 
     try:
-        numbers = [1e-3 * float(part) for part in text.split(",")]
+        numbers = [1e-3 * float(number_text) for number_text in text.split(",")]
     except ValueError:
         numbers = []
     if len(numbers) not in (3, 4) or not all(abs(number) < float("inf") for number in numbers):
@@ -142,5 +151,5 @@ def _parse_region(text: str, outline: "Domain") -> "Disk | Rectangle":
             f"--keep-out {text} lies off the skin, which spans {1e3 * x_min:g} to {1e3 * x_max:g} mm by "
             f"{1e3 * y_min:g} to {1e3 * y_max:g} mm."
         )
-    middle = ((low_x + high_x) / 2, (low_y + high_y) / 2)
-    return Disk(numbers[2], middle) if len(numbers) == 3 else Rectangle(high_x - low_x, high_y - low_y, middle)
+    centre = ((low_x + high_x) / 2, (low_y + high_y) / 2)
+    return Disk(numbers[2], centre) if len(numbers) == 3 else Rectangle(high_x - low_x, high_y - low_y, centre)

@@ -25,11 +25,12 @@ Height = Annotated[float, typer.Option("--height-mm", help="Of the skin, centred
 Thickness = Annotated[float, typer.Option("--thickness-mm", help="Of the skin, millimetres.")]
 Conductivity = Annotated[float, typer.Option("--conductivity", help="Of the skin, siemens per metre.")]
 # Range of conductivities in S/m: from below deionised water to above silver.
-_LEAST_CONDUCTIVITY, _MOST_CONDUCTIVITY = 1e-9, 1e9
+_MIN_CONDUCTIVITY, _MAX_CONDUCTIVITY = 1e-9, 1e9
 
 
 def read_with_outline(name: str, width: float, height: float) -> "Layout":
-    """A layout with its skin, by name or from a file; the skin is width × height (mm) where neither says it.
+    """Read a layout with the outline of its skin, by name or from a file. If neither gives an outline, it is a
+    rectangle of `width` × `height` (mm).
 
     Raises `ValueError` for fewer than three electrodes.
     """
@@ -37,29 +38,30 @@ def read_with_outline(name: str, width: float, height: float) -> "Layout":
     from jeit.layout.layout import LARGEST, SMALLEST
     from jeit.mesh import Rectangle
 
-    def given() -> Rectangle:
+    def outline_from_options() -> Rectangle:
         for option, side in (("--width-mm", width), ("--height-mm", height)):
             check_within(option, side, 1e3 * SMALLEST, 1e3 * LARGEST, "mm")
         return Rectangle(1e-3 * width, 1e-3 * height)
 
     with naming_options({"name": "layout", "path": "layout"}):
         if not Path(name).suffix:
-            found = named_layout(name) if name.startswith("park-") else named_layout(name, given())
+            layout = named_layout(name) if name.startswith("park-") else named_layout(name, outline_from_options())
         else:
-            found = read_layout(name)
-            if found.outline is None:
-                found = read_layout(name, outline=given())
-    if found.num_electrodes < 3:
-        raise ValueError(f"'{found.name}' has {found.num_electrodes} electrodes; give a layout of three or more.")
-    return found
+            layout = read_layout(name)
+            if layout.outline is None:
+                layout = read_layout(name, outline=outline_from_options())
+    if layout.num_electrodes < 3:
+        raise ValueError(f"'{layout.name}' has {layout.num_electrodes} electrodes; give a layout of three or more.")
+    return layout
 
 
 def check_layer(thickness: float, conductivity: float) -> None:
-    """Raise `ValueError` unless --thickness-mm is more than a touch is deep and --conductivity one that a skin has."""
+    """Raise `ValueError` unless --thickness-mm is more than the depth of a touch, and --conductivity is within the
+    range of conductivities of skins."""
     from jeit.design.defaults import DEPTH
 
     if not 1e3 * DEPTH < thickness < float("inf"):
         raise ValueError(
             f"--thickness-mm must be more than the {1e3 * DEPTH:g} mm that a touch is deep; it is {thickness:g}."
         )
-    check_within("--conductivity", conductivity, _LEAST_CONDUCTIVITY, _MOST_CONDUCTIVITY, "S/m")
+    check_within("--conductivity", conductivity, _MIN_CONDUCTIVITY, _MAX_CONDUCTIVITY, "S/m")

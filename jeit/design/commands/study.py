@@ -85,9 +85,9 @@ def report(file: File, output: Output = None, page: Page = None) -> None:
     from jeit.design.reports import write_study_report
 
     sweep, store = _read_study_and_path(file, output)
-    where = _report_path(file, store, page)
-    write_study_report(sweep, store, where)
-    typer.echo(f"Written: {where}")
+    report_path = _report_path(file, store, page)
+    write_study_report(sweep, store, report_path)
+    typer.echo(f"Written: {report_path}")
 
 
 def _read_study_and_path(file: Path, output: Path | None) -> "tuple[Study, Path]":
@@ -99,13 +99,14 @@ def _read_study_and_path(file: Path, output: Path | None) -> "tuple[Study, Path]
 
 
 def _report_path(file: Path, store: Path, page: Path | None) -> Path:
-    """Where the report goes. Raises `ValueError` for a folder that is not there, and where something else would go."""
-    where = page or file.with_suffix(".html")
-    if not where.parent.is_dir():
-        raise ValueError(f"--page {where}: there is no folder {where.parent}; make it first.")
-    if where.resolve() in (file.resolve(), store.resolve()):
-        raise ValueError(f"--page {where}: that is the study itself; choose another name.")
-    return where
+    """Path of the report. Raises `ValueError` if its folder does not exist, and if it is the path of the study file or
+    of its store."""
+    report_path = page or file.with_suffix(".html")
+    if not report_path.parent.is_dir():
+        raise ValueError(f"--page {report_path}: there is no folder {report_path.parent}; make it first.")
+    if report_path.resolve() in (file.resolve(), store.resolve()):
+        raise ValueError(f"--page {report_path}: that is the study itself; choose another name.")
+    return report_path
 
 
 def _run_with_progress(
@@ -121,11 +122,13 @@ def _run_with_progress(
     from jeit.design.reports import write_study_report
     from jeit.design.study import run_study
 
-    where = _report_path(file, store, page)
+    report_path = _report_path(file, store, page)
     need_extra("cluster", "a study")  # before the progress bar starts
     console = plain_console()
-    done, left = (TextColumn(f"{{{said}}}", markup=False) for said in ("task.description", "task.fields[left]"))
-    columns = (done, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), left)
+    task_column, time_column = (
+        TextColumn(f"{{{field}}}", markup=False) for field in ("task.description", "task.fields[left]")
+    )
+    columns = (task_column, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), time_column)
     try:
         with ExitStack() as stack:
             client = None if scheduler is None else stack.enter_context(connected(scheduler))
@@ -137,18 +140,18 @@ def _run_with_progress(
                 bar.update(task, completed=now.points, left=left)
 
             run_study(sweep, store, client=client, progress=show)
-        write_study_report(sweep, store, where)
+        write_study_report(sweep, store, report_path)
     except KeyboardInterrupt:
         if not store.exists():
             raise
-        other = "" if store == file.with_suffix(".zarr") else f" --output {store}"
-        raise StoppedError(f"stopped; 'jeit study resume {file}{other}' goes on with it.") from None
+        output_option = "" if store == file.with_suffix(".zarr") else f" --output {store}"
+        raise StoppedError(f"stopped; 'jeit study resume {file}{output_option}' goes on with it.") from None
     if not quiet:
-        say_written(console, store, str(where))
+        say_written(console, store, str(report_path))
 
 
 def connected(scheduler: str):
-    """A client of the dask scheduler at this address. Raises `ValueError` where none answers."""
+    """Connect to the dask scheduler at the address `scheduler`. Raises `ValueError` if there is no answer."""
     from jeit.arguments.extras import optional
 
     try:
@@ -158,7 +161,7 @@ def connected(scheduler: str):
 
 
 def _format_duration(seconds: float) -> str:
-    """As hours, minutes and seconds: 1:02:03."""
+    """Format a duration as hours, minutes and seconds, such as "1:02:03"."""
     minutes, second = divmod(round(seconds), 60)
     hours, minute = divmod(minutes, 60)
     return f"{hours}:{minute:02}:{second:02}" if hours else f"{minute}:{second:02}"

@@ -36,14 +36,16 @@ class Constraints(Module):
     def check_room(self, radii) -> None:
         """Raise `ValueError` if discs of `radii` (L,), metres, are more than the densest packing of circles allows."""
         x_min, x_max, y_min, y_max = self.outline.extent
-        least = float(np.min(radii))
-        apart = max(self.minimum_spacing, 2 * least)
-        # Circles of radius apart / 2 around the centres do not overlap, and extend beyond the region of the centres by
-        # that radius.
-        room = (x_max - x_min - 2 * least + apart) * (y_max - y_min - 2 * least + apart)
-        if len(radii) * apart**2 > 2 / np.sqrt(3) * room:
+        min_radius = float(np.min(radii))
+        min_distance = max(self.minimum_spacing, 2 * min_radius)
+        # Circles around the centres with half of `min_distance` as the radius do not overlap, and extend beyond the
+        # region of the centres by that radius.
+        available_area = (x_max - x_min - 2 * min_radius + min_distance) * (
+            y_max - y_min - 2 * min_radius + min_distance
+        )
+        if len(radii) * min_distance**2 > 2 / np.sqrt(3) * available_area:
             raise ValueError(
-                f"minimum_spacing: {len(radii)} electrodes {1e3 * apart:.3g} mm apart do not fit the outline, "
+                f"minimum_spacing: {len(radii)} electrodes {1e3 * min_distance:.3g} mm apart do not fit the outline, "
                 f"{1e3 * (x_max - x_min):.3g} × {1e3 * (y_max - y_min):.3g} mm; give less, or fewer electrodes."
             )
 
@@ -55,12 +57,12 @@ class Constraints(Module):
     def shortfalls(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> dict[str, Float[Array, " q"]]:
         """Violations, metres, by the name of the constraint: "minimum_spacing", "outline" and "keep_out"."""
         first, second = np.triu_indices(len(radii), 1)
-        distance = jnp.sqrt(jnp.sum((centres[first] - centres[second]) ** 2, axis=1) + 1e-24)
-        outside = [radii + domain.signed_distance(centres) for domain in self.keep_out]
+        distances = jnp.sqrt(jnp.sum((centres[first] - centres[second]) ** 2, axis=1) + 1e-24)
+        keep_out_violations = [radii + domain.signed_distance(centres) for domain in self.keep_out]
         return {
-            "minimum_spacing": jnp.maximum(self.minimum_spacing, radii[first] + radii[second]) - distance,
+            "minimum_spacing": jnp.maximum(self.minimum_spacing, radii[first] + radii[second]) - distances,
             "outline": radii - self.outline.signed_distance(centres),
-            "keep_out": jnp.concatenate(outside) if outside else jnp.zeros(0),
+            "keep_out": jnp.concatenate(keep_out_violations) if keep_out_violations else jnp.zeros(0),
         }
 
 
@@ -113,10 +115,10 @@ class DesignSpace(Module):
             check_kind("outline", outline, Domain, "an outline, such as Rectangle(0.2, 0.2)")
         if not is_number(minimum_spacing):
             raise ValueError(f"minimum_spacing must be a length in metres; it is {describe(minimum_spacing)}.")
-        wanted = "a list of domains, such as [Disk(0.01, (0.02, 0.0))]"
-        check_kind("keep_out", keep_out, Sequence, wanted)
-        for one in keep_out:
-            check_kind("keep_out", one, Domain, wanted)
+        requirement = "a list of domains, such as [Disk(0.01, (0.02, 0.0))]"
+        check_kind("keep_out", keep_out, Sequence, requirement)
+        for domain in keep_out:
+            check_kind("keep_out", domain, Domain, requirement)
         self.outline, self.minimum_spacing, self.keep_out = outline, float(minimum_spacing), tuple(keep_out)
         self.symmetry, self.sizes = symmetry, sizes
         self.contact_impedance, self.thickness = contact_impedance, thickness
@@ -168,15 +170,15 @@ class Record:
 
     def __init__(self, callback: Callable[[int, Float[np.ndarray, " S"]], None] | None = None):
         self.variables: list[np.ndarray] = []
-        self.values: list[np.ndarray] = []
+        self.scores: list[np.ndarray] = []
         self._callback = callback
 
-    def add(self, variables, values) -> None:
+    def add(self, variables, scores) -> None:
         """Add the variables and the scores after a step."""
         self.variables.append(np.array(variables))
-        self.values.append(np.array(values))
+        self.scores.append(np.array(scores))
         if self._callback is not None:
-            self._callback(len(self.values) - 1, self.values[-1])
+            self._callback(len(self.scores) - 1, self.scores[-1])
 
 
 def descend(
@@ -188,18 +190,18 @@ def descend(
     `cost`: function of the variables (S, v) that returns the costs (S,), the scores (S,) for the `record`, and the
     gradient (S, v) of the costs.
     """
-    last = {}
+    last_evaluation = {}
 
-    def value_and_slope(variables):
-        value, score, slope = cost(variables)
-        last.update(variables=np.asarray(variables), score=np.asarray(score))
-        return jnp.sum(value), slope
+    def value_and_gradient(variables):
+        costs, scores, gradients = cost(variables)
+        last_evaluation.update(variables=np.asarray(variables), score=np.asarray(scores))
+        return jnp.sum(costs), gradients
 
-    def after_step(variables):
-        same = np.array_equal(last["variables"], variables)
-        record.add(variables, last["score"] if same else cost(variables)[1])
+    def record_step(variables):
+        is_last_evaluation = np.array_equal(last_evaluation["variables"], variables)
+        record.add(variables, last_evaluation["score"] if is_last_evaluation else cost(variables)[1])
 
-    found, _, status = scipy_lbfgsb(
-        value_and_slope, variables, 0.0, 1.0, tolerance=tolerance, max_steps=steps, callback=after_step
+    final_variables, _, status = scipy_lbfgsb(
+        value_and_gradient, variables, 0.0, 1.0, tolerance=tolerance, max_steps=steps, callback=record_step
     )
-    return jnp.asarray(found), status
+    return jnp.asarray(final_variables), status

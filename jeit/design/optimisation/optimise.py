@@ -35,7 +35,7 @@ _MAX_OVERHANG = 0.01
 # Minimum relative improvement of the score for a layout to count as better.
 _MIN_IMPROVEMENT = 1e-9
 # Number of random positions drawn for a start; the first ones inside the allowed region are used.
-_NUM_DRAWS = 20_000
+_NUM_DRAWN_POSITIONS = 20_000
 
 
 class Optimisation(Module):
@@ -110,33 +110,37 @@ def optimise_layout(
     constraints = space.constraints(skin)
     variables = space.variables(skin, constraints, objective.touches.depth)
     _check_outline(constraints.outline, skin)
-    begin = np.stack([variables.start, *_random_starts(variables, constraints, starts - 1, key)])
+    initial_variables = np.stack([variables.start, *_random_starts(variables, constraints, starts - 1, key)])
     # The given layout is used unchanged, unless it violates the symmetry or the constraints.
-    begin = _make_feasible(variables, constraints, jnp.asarray(np.array(begin)))
-    given = objective.scores_of_varied(skin, varied_of(skin))
-    start_value = float(objective.score(given))
+    initial_variables = _make_feasible(variables, constraints, jnp.asarray(np.array(initial_variables)))
+    initial_scores = objective.scores_of_varied(skin, varied_of(skin))
+    start_value = float(objective.score(initial_scores))
     if not np.isfinite(start_value):
         raise ValueError("score is not finite for the layout given; does some touch change no voltage?")
     search = _LayoutSearch(skin, objective, constraints, variables)
-    ended, record, status = search.run(jnp.asarray(np.array(begin)), steps, callback)
-    ends = jax.tree.map(np.asarray, _varied(variables, ended))
-    values = np.asarray(search.cost(ended, 0.0)[1])
-    lacking = np.array([_largest_violation(constraints, *one) for one in zip(ends.centres, ends.radii, strict=True)])
-    best, status, reason = search.judge(ends, values, lacking, start_value, status)
-    found, scores = skin.layout, given
+    final_variables, record, status = search.run(jnp.asarray(np.array(initial_variables)), steps, callback)
+    final_parameters = jax.tree.map(np.asarray, _varied(variables, final_variables))
+    values = np.asarray(search.cost(final_variables, 0.0)[1])
+    centres_and_radii = zip(final_parameters.centres, final_parameters.radii, strict=True)
+    violations = np.array([_largest_violation(constraints, centres, radii) for centres, radii in centres_and_radii])
+    best, status, reason = search.choose_best(final_parameters, values, violations, start_value, status)
+    final_layout, scores = skin.layout, initial_scores
     if best is not None:
-        end = Varied(*(part[best] for part in ends))
-        found, scores = search.named(end, space.contact_impedance is not None), objective.scores_of_varied(skin, end)
+        best_parameters = Varied(*(values_of_starts[best] for values_of_starts in final_parameters))
+        final_layout = search.create_layout(best_parameters, space.contact_impedance is not None)
+        scores = objective.scores_of_varied(skin, best_parameters)
     return Optimisation(
-        layout=found,
+        layout=final_layout,
         scores=scores,
         value=start_value if best is None else float(values[best]),
         start_value=start_value,
-        **ends._asdict(),
+        **final_parameters._asdict(),
         values=values,
-        shortfall=np.maximum(lacking, 0),
-        history=np.stack(record.values, axis=1),
-        snapshots=np.stack([np.asarray(_varied(variables, one).centres) for one in record.variables], axis=1),
+        shortfall=np.maximum(violations, 0),
+        history=np.stack(record.scores, axis=1),
+        snapshots=np.stack(
+            [np.asarray(_varied(variables, step_variables).centres) for step_variables in record.variables], axis=1
+        ),
         best=best,
         status=status,
         reason=reason,
@@ -151,82 +155,94 @@ class _LayoutSearch(Module):
     constraints: Constraints
     variables: Variables
 
-    def cost(self, values, weight):
+    def cost(self, variables, penalty_weight):
         """Penalised cost of each start (S,), its score (S,) and the gradient of the cost (S, v)."""
-        return _penalised_cost(values, jnp.asarray(weight), self)
+        return _penalised_cost(variables, jnp.asarray(penalty_weight), self)
 
-    def run(self, begin: Float[Array, "S v"], steps: int, callback) -> tuple[Float[Array, "S v"], Record, str]:
+    def run(
+        self, initial_variables: Float[Array, "S v"], steps: int, callback
+    ) -> tuple[Float[Array, "S v"], Record, str]:
         """Run the optimisation. Returns the final variables of the starts, their history, and the status of the last
         stage."""
         record = Record(callback)
-        values, status, done = begin, "step limit", 0
-        record.add(values, self.cost(values, _PENALTY_STAGES[0][0])[1])
-        for weight, share in _PENALTY_STAGES:
-            budget = round(share * steps) - done
-            done += budget
-            if budget:
-                values, status = descend(partial(self.cost, weight=weight), values, budget, record)
-        return _make_feasible(self.variables, self.constraints, values), record, status
+        variables, status, num_steps_done = initial_variables, "step limit", 0
+        record.add(variables, self.cost(variables, _PENALTY_STAGES[0][0])[1])
+        for weight, end_fraction in _PENALTY_STAGES:
+            num_steps = round(end_fraction * steps) - num_steps_done
+            num_steps_done += num_steps
+            if num_steps:
+                variables, status = descend(partial(self.cost, penalty_weight=weight), variables, num_steps, record)
+        return _make_feasible(self.variables, self.constraints, variables), record, status
 
-    def judge(self, ends: Varied, values, lacking, start_value: float, status: str) -> tuple[int | None, str, str]:
+    def choose_best(
+        self, parameters: Varied, values, violations, start_value: float, status: str
+    ) -> tuple[int | None, str, str]:
         """Choose the best start. Returns its index, or None if none is better than the given layout, the status, and
         the reason."""
         layout = self.skin.layout
-        good = (lacking <= 0) & np.isfinite(values)
-        fits = self.variables.holds(varied_of(self.skin))
-        fits = fits and _largest_violation(self.constraints, layout.centres, layout.diameters / 2) <= 1e-9
-        if not good.any():
-            nearest = int(lacking.argmin())
-            parts = self.constraints.shortfalls(jnp.asarray(ends.centres[nearest]), jnp.asarray(ends.radii[nearest]))
-            worst = max(parts, key=lambda name: float(jnp.max(parts[name], initial=-jnp.inf)))
-            least = 1e3 * lacking.min()
-            reason = f"no start satisfies the constraints: {worst}= lacks {least:.3g} mm at best; ask for less."
+        is_valid = (violations <= 0) & np.isfinite(values)
+        is_initial_valid = self.variables.represents(varied_of(self.skin))
+        is_initial_valid = (
+            is_initial_valid and _largest_violation(self.constraints, layout.centres, layout.diameters / 2) <= 1e-9
+        )
+        if not is_valid.any():
+            nearest_start = int(violations.argmin())
+            violations_by_name = self.constraints.shortfalls(
+                jnp.asarray(parameters.centres[nearest_start]), jnp.asarray(parameters.radii[nearest_start])
+            )
+            worst_name = max(
+                violations_by_name, key=lambda name: float(jnp.max(violations_by_name[name], initial=-jnp.inf))
+            )
+            min_violation = 1e3 * violations.min()
+            reason = (
+                f"no start satisfies the constraints: {worst_name}= lacks {min_violation:.3g} mm at best; ask for less."
+            )
             return None, "infeasible", reason
-        best = int(np.where(good, values, -np.inf).argmax())
-        if fits and values[best] <= start_value + _MIN_IMPROVEMENT * abs(start_value):
+        best = int(np.where(is_valid, values, -np.inf).argmax())
+        if is_initial_valid and values[best] <= start_value + _MIN_IMPROVEMENT * abs(start_value):
             return None, status, "no start is better than the layout given."
-        reason = f"start {best + 1} of {len(values)} is best; the constraints are satisfied by {good.sum()}."
-        if not fits:
+        reason = f"start {best + 1} of {len(values)} is best; the constraints are satisfied by {is_valid.sum()}."
+        if not is_initial_valid:
             reason += (
                 " The layout given does not satisfy what is asked, and was changed until it did before the first step."
             )
         return best, status, reason
 
-    def named(self, end: Varied, contacts: bool) -> Layout:
-        """The layout with the final parameters `end`. If `contacts`, the contact impedances were varied and are taken
-        from `end` too."""
+    def create_layout(self, parameters: Varied, varies_contacts: bool) -> Layout:
+        """Create the layout with the final `parameters`. If `varies_contacts`, the contact impedances were varied, and
+        are those of `parameters` too."""
         layout = self.skin.layout
         return Layout(
-            end.centres,
-            2 * end.radii,
-            contact_impedance=end.contact_impedance if contacts else layout.contact_impedance,
+            parameters.centres,
+            2 * parameters.radii,
+            contact_impedance=parameters.contact_impedance if varies_contacts else layout.contact_impedance,
             outline=self.constraints.outline,
             labels=layout.labels,
             name=f"{layout.name}, optimised",
         )
 
 
-def _random_starts(variables: Variables, constraints: Constraints, count: int, key) -> list[np.ndarray]:
-    """Draw the variables of `count` random layouts, with positions uniform in the outline and outside the keep-out
-    domains."""
-    starts, number = [], variables.num_generators
-    for one in jax.random.split(key, count) if count else ():
-        drawn = jax.random.uniform(one, (_NUM_DRAWS, 2))
-        place = drawn * variables.size + variables.low
-        free = constraints.outline.contains(place)
+def _random_starts(variables: Variables, constraints: Constraints, num_layouts: int, key) -> list[np.ndarray]:
+    """Draw the variables of `num_layouts` random layouts, with positions uniform in the outline and outside the
+    keep-out domains."""
+    layouts_variables, num_generators = [], variables.num_generators
+    for layout_key in jax.random.split(key, num_layouts) if num_layouts else ():
+        unit_positions = jax.random.uniform(layout_key, (_NUM_DRAWN_POSITIONS, 2))
+        positions = unit_positions * variables.size + variables.low
+        is_allowed = constraints.outline.contains(positions)
         for domain in constraints.keep_out:
-            free &= ~domain.contains(place)
-        usable = np.asarray(drawn)[np.asarray(free)]
-        if len(usable) < number:
+            is_allowed &= ~domain.contains(positions)
+        allowed_positions = np.asarray(unit_positions)[np.asarray(is_allowed)]
+        if len(allowed_positions) < num_generators:
             raise ValueError("keep_out: it leaves no room for the electrodes inside the outline; give less.")
-        rest = variables.start[2 * number :]
-        starts.append(np.concatenate([usable[:number].ravel(), rest]))
-    return starts
+        other_variables = variables.start[2 * num_generators :]
+        layouts_variables.append(np.concatenate([allowed_positions[:num_generators].ravel(), other_variables]))
+    return layouts_variables
 
 
-def _penalty(variables: Variables, constraints: Constraints, values, spare=0.0) -> Float[Array, ""]:
-    shortfall = constraints.shortfall(*variables.varied(values)[:2]) + spare
-    return jnp.sum((jnp.maximum(shortfall, 0) / variables.pitch) ** 2)
+def _penalty(variables: Variables, constraints: Constraints, variable_values, margin=0.0) -> Float[Array, ""]:
+    violations = constraints.shortfall(*variables.varied(variable_values)[:2]) + margin
+    return jnp.sum((jnp.maximum(violations, 0) / variables.pitch) ** 2)
 
 
 def _largest_violation(constraints: Constraints, centres, radii) -> float:
@@ -234,44 +250,46 @@ def _largest_violation(constraints: Constraints, centres, radii) -> float:
     return float(jnp.max(constraints.shortfall(jnp.asarray(centres), jnp.asarray(radii))))
 
 
-def _make_feasible(variables: Variables, constraints: Constraints, values):
+def _make_feasible(variables: Variables, constraints: Constraints, start_variables):
     """Move the starts (S, v) until they satisfy the constraints, as far as minimisation of the penalty succeeds."""
 
-    def cost(values):
-        value, slope = _penalty_and_gradient(values, variables, constraints)
-        return value, -value, slope
+    def cost(start_variables):
+        penalties, gradients = _penalty_and_gradient(start_variables, variables, constraints)
+        return penalties, -penalties, gradients
 
-    return descend(cost, values, 500, Record(), tolerance=0.0)[0]
+    return descend(cost, start_variables, 500, Record(), tolerance=0.0)[0]
 
 
 @eqx.filter_jit
-def _penalty_and_gradient(values, variables: Variables, constraints: Constraints):
+def _penalty_and_gradient(all_variables, variables: Variables, constraints: Constraints):
     """Penalty of each start (S,) and its gradient (S, v), scaled by a large factor so that the minimisation ends at
     zero and not near it."""
-    return jax.vmap(jax.value_and_grad(lambda own: 1e6 * _penalty(variables, constraints, own, _CONSTRAINT_MARGIN)))(
-        values
-    )
+    return jax.vmap(
+        jax.value_and_grad(
+            lambda start_variables: 1e6 * _penalty(variables, constraints, start_variables, _CONSTRAINT_MARGIN)
+        )
+    )(all_variables)
 
 
 @eqx.filter_jit
-def _penalised_cost(values, weight, search: _LayoutSearch):
+def _penalised_cost(all_variables, penalty_weight, search: _LayoutSearch):
     variables, constraints, objective = search.variables, search.constraints, search.objective
 
-    def one(own):
-        end = variables.varied(own)
+    def cost_and_score(start_variables):
+        parameters = variables.varied(start_variables)
         # The score is undefined for an electrode outside the skin, so it is evaluated at the nearest point of the skin.
-        end_inside = end._replace(centres=constraints.outline.nearest(end.centres))
-        value = objective.score(objective.scores_of_varied(search.skin, end_inside))
-        return weight * _penalty(variables, constraints, own) - value, value
+        clipped_parameters = parameters._replace(centres=constraints.outline.nearest(parameters.centres))
+        score = objective.score(objective.scores_of_varied(search.skin, clipped_parameters))
+        return penalty_weight * _penalty(variables, constraints, start_variables) - score, score
 
     # Starts are evaluated one after the other, since the Jacobian of a single start fills the cache.
-    (cost, value), slope = jax.lax.map(jax.value_and_grad(one, has_aux=True), values)
-    return cost, value, slope
+    (cost, score), gradient = jax.lax.map(jax.value_and_grad(cost_and_score, has_aux=True), all_variables)
+    return cost, score, gradient
 
 
 @eqx.filter_jit
-def _varied(variables: Variables, values) -> Varied:
-    return jax.vmap(variables.varied)(values)
+def _varied(variables: Variables, all_variables) -> Varied:
+    return jax.vmap(variables.varied)(all_variables)
 
 
 def _check_arguments(skin: Skin, objective: Objective, space: DesignSpace, steps: int, starts: int, key) -> None:
@@ -295,7 +313,7 @@ def _check_arguments(skin: Skin, objective: Objective, space: DesignSpace, steps
 def _check_outline(outline: Domain, skin: Skin) -> None:
     low_x, high_x, low_y, high_y = outline.extent
     points = np.asarray(skin.model.mesh.points)
-    off = max(*(points.min(axis=0) - (low_x, low_y)), *((high_x, high_y) - points.max(axis=0)))
+    overhang = max(*(points.min(axis=0) - (low_x, low_y)), *((high_x, high_y) - points.max(axis=0)))
     # The mesh of a disk is a polygon inside it.
-    if off > _MAX_OVERHANG * max(high_x - low_x, high_y - low_y):
-        raise ValueError(f"outline: it reaches {1e3 * off:.3g} mm beyond the model's mesh; give the skin's own.")
+    if overhang > _MAX_OVERHANG * max(high_x - low_x, high_y - low_y):
+        raise ValueError(f"outline: it reaches {1e3 * overhang:.3g} mm beyond the model's mesh; give the skin's own.")

@@ -25,7 +25,7 @@ from jeit_solvers.engines import as_array
 from jeit_solvers.module import Module
 
 # Maximum and minimum step length, as fractions of the mean spacing of the electrodes.
-_LONGEST, _SHORTEST = 0.3, 1e-3
+_MAX_STEP_FRACTION, _MIN_STEP_FRACTION = 0.3, 1e-3
 
 
 class SurfaceOptimisation(Module):
@@ -78,64 +78,69 @@ def optimise_surface_layout(
         raise ValueError("skin must be a curved sheet: Skin.create(surface_layout, num_layers=0); see optimise_layout.")
     if not isinstance(steps, int) or steps < 1:
         raise ValueError(f"steps must be a whole number from 1; it is {describe(steps)}.")
-    for name, length in (("minimum_spacing", minimum_spacing), ("margin", margin)):
-        if not is_number(length) or length < 0:
-            raise ValueError(f"{name} must be in metres, not negative; it is {describe(length)}.")
+    for name, distance in (("minimum_spacing", minimum_spacing), ("margin", margin)):
+        if not is_number(distance) or distance < 0:
+            raise ValueError(f"{name} must be in metres, not negative; it is {describe(distance)}.")
     surface, radii = Triangles.of(layout.surface), np.asarray(layout.diameters) / 2
-    apart = np.maximum(minimum_spacing, radii[:, None] + radii)
-    np.fill_diagonal(apart, 0.0)
-    value_and_slope = _cost(skin, objective)
-    position = np.asarray(layout.centres)
-    value, slope = value_and_slope(position)
-    pitch = float(np.sqrt(surface.areas.sum() / len(position)))
-    length, history, snapshots = _LONGEST * pitch, [value], [position]
+    min_distances = np.maximum(minimum_spacing, radii[:, None] + radii)
+    np.fill_diagonal(min_distances, 0.0)
+    score_and_gradient = _score_function(skin, objective)
+    positions = np.asarray(layout.centres)
+    score, gradient = score_and_gradient(positions)
+    pitch = float(np.sqrt(surface.areas.sum() / len(positions)))
+    step_length, history, snapshots = _MAX_STEP_FRACTION * pitch, [score], [positions]
     for step in range(steps):
-        normal = surface.normals_at(surface.nearest(position))
-        along = slope - (slope * normal).sum(axis=1, keepdims=True) * normal
-        steepest = np.linalg.norm(along, axis=1).max()
-        moved = None
-        while steepest > 0 and length > _SHORTEST * pitch:
-            tried = surface.nearest(position + length / steepest * along).points
-            if _is_feasible(tried, apart, surface, radii + margin):
-                new, new_slope = value_and_slope(tried)
-                if new > value:
-                    moved = tried, new, new_slope
+        normals = surface.normals_at(surface.nearest(positions))
+        tangential_gradient = gradient - (gradient * normals).sum(axis=1, keepdims=True) * normals
+        max_gradient = np.linalg.norm(tangential_gradient, axis=1).max()
+        accepted_step = None
+        while max_gradient > 0 and step_length > _MIN_STEP_FRACTION * pitch:
+            candidate_positions = surface.nearest(positions + step_length / max_gradient * tangential_gradient).points
+            if _is_feasible(candidate_positions, min_distances, surface, radii + margin):
+                candidate_score, candidate_gradient = score_and_gradient(candidate_positions)
+                if candidate_score > score:
+                    accepted_step = candidate_positions, candidate_score, candidate_gradient
                     break
-            length /= 2
-        if moved is None:
+            step_length /= 2
+        if accepted_step is None:
             break
-        position, value, slope = moved
-        length = min(1.5 * length, _LONGEST * pitch)
-        history.append(value)
-        snapshots.append(position)
+        positions, score, gradient = accepted_step
+        step_length = min(1.5 * step_length, _MAX_STEP_FRACTION * pitch)
+        history.append(score)
+        snapshots.append(positions)
         if callback is not None:
-            callback(step, value)
+            callback(step, score)
     options = {"contact_impedance": layout.contact_impedance, "outward": layout.outward, "labels": layout.labels}
-    found = SurfaceLayout(position, layout.diameters, layout.surface, name=layout.name, **options)
-    return SurfaceOptimisation(found, value, history[0], np.array(history), np.array(snapshots))
+    final_layout = SurfaceLayout(positions, layout.diameters, layout.surface, name=layout.name, **options)
+    return SurfaceOptimisation(final_layout, score, history[0], np.array(history), np.array(snapshots))
 
 
-def surface_scores(skin: Skin, objective: Objective, position: Float[Array, "L 3"]) -> Scores:
-    """Compute all scores of a curved sheet with its electrodes moved to `position` (L, 3), metres; differentiable with
+def surface_scores(skin: Skin, objective: Objective, positions: Float[Array, "L 3"]) -> Scores:
+    """Compute all scores of a curved sheet with its electrodes moved to `positions` (L, 3), metres; differentiable with
     respect to the positions."""
     discs = skin.model.electrodes
     assert isinstance(discs, SurfaceDiscs)
-    model = skin.model.with_electrodes(SurfaceDiscs(position, discs.radius, discs.contact_impedance))
-    return objective.scores(eqx.tree_at(lambda one: one.model, skin, model))
+    model = skin.model.with_electrodes(SurfaceDiscs(positions, discs.radius, discs.contact_impedance))
+    return objective.scores(eqx.tree_at(lambda skin_to_change: skin_to_change.model, skin, model))
 
 
-def _cost(skin: Skin, objective: Objective):
-    compiled = jax.jit(jax.value_and_grad(lambda place: objective.score(surface_scores(skin, objective, place))))
+def _score_function(skin: Skin, objective: Objective):
+    """Return a compiled function of the positions (L, 3) that computes the score and its gradient (L, 3)."""
+    compiled_score = jax.jit(
+        jax.value_and_grad(lambda score_positions: objective.score(surface_scores(skin, objective, score_positions)))
+    )
 
-    def value_and_slope(position):
-        value, slope = compiled(as_array(position))
-        return float(value), np.asarray(slope)
+    def score_and_gradient(positions):
+        score, gradient = compiled_score(as_array(positions))
+        return float(score), np.asarray(gradient)
 
-    return value_and_slope
+    return score_and_gradient
 
 
-def _is_feasible(position, apart, surface: Triangles, room) -> bool:
-    """Whether the centres are at least `apart` metres from each other, in a straight line, and at least `room` metres
-    from the edge."""
-    distance = np.linalg.norm(position[:, None] - position, axis=-1)
-    return bool((distance >= apart).all() and (surface.distance_to_border(position) >= room).all())
+def _is_feasible(positions, min_distances, surface: Triangles, min_edge_distances) -> bool:
+    """Whether the straight distances between the centres (L, 3) are at least `min_distances` (L, L), and their
+    distances from the edge at least `min_edge_distances` (L,), all in metres."""
+    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    return bool(
+        (distances >= min_distances).all() and (surface.distance_to_border(positions) >= min_edge_distances).all()
+    )

@@ -42,27 +42,27 @@ class Varied(NamedTuple):
 
 
 class Range(Module):
-    """Logarithmic scale for k positive values between `least` (k,) and `least` · exp(`span`)."""
+    """Logarithmic scale for k positive values between `lower` (k,) and `lower` · exp(`span`)."""
 
-    least: Float[np.ndarray, " k"]
+    lower: Float[np.ndarray, " k"]
     span: Float[np.ndarray, " k"]
 
     @classmethod
-    def create(cls, name: str, ends, start, unit: str) -> "Range":
-        """Create the range from its two `ends`, the same for all k values of `start` (k,). Raises `ValueError` for
-        invalid ends."""
-        least, most = ends if np.shape(ends) == (2,) else (0.0, 0.0)
-        if not 0 < least < most < np.inf:
-            raise ValueError(f"{name} must be two values in {unit}, the smaller one first; it is {ends!r}.")
-        return cls(np.full(np.shape(start), least), np.full(np.shape(start), np.log(most / least)))
+    def create(cls, name: str, limits, initial_values, unit: str) -> "Range":
+        """Create the range from its two `limits`, the same for all k values of `initial_values` (k,).
+        Raises `ValueError` for invalid limits."""
+        lower, upper = limits if np.shape(limits) == (2,) else (0.0, 0.0)
+        if not 0 < lower < upper < np.inf:
+            raise ValueError(f"{name} must be two values in {unit}, the smaller one first; it is {limits!r}.")
+        return cls(np.full(np.shape(initial_values), lower), np.full(np.shape(initial_values), np.log(upper / lower)))
 
     def variables(self, values) -> Float[np.ndarray, " k"]:
         """Variables between 0 and 1 that correspond to `values`; values outside the range are clipped to it."""
-        return np.minimum(np.maximum(np.log(np.asarray(values) / self.least) / self.span, 0), 1)
+        return np.minimum(np.maximum(np.log(np.asarray(values) / self.lower) / self.span, 0), 1)
 
     def values(self, variables) -> Float[Array, " k"]:
         """Values that correspond to variables between 0 and 1."""
-        return jnp.asarray(self.least) * jnp.exp(self.span * variables)
+        return jnp.asarray(self.lower) * jnp.exp(self.span * variables)
 
 
 class Variables(Module):
@@ -72,8 +72,9 @@ class Variables(Module):
     **Fields**
 
     - `low`, `size` (2,): lower left corner and side lengths of the bounding box of the centres, metres.
-    - `images` (k, 2, 2): matrices of the symmetry; `order` (L,): index of the image that each electrode is.
-    - `given`: the initial parameters; `start`: the variables that correspond to them.
+    - `images` (k, 2, 2): matrices of the symmetry; `order` (L,): index of each electrode among the images of the
+      generators.
+    - `initial`: the initial parameters; `start`: the variables that correspond to them.
     - `sizes` (G), `contacts` (G), `thickness` (1): ranges of the radii, contact impedances and thickness; None if these
       are not varied.
     - `pitch`: mean spacing of the electrodes, metres: the side of a square with the area available to each.
@@ -83,7 +84,7 @@ class Variables(Module):
     size: np.ndarray
     images: np.ndarray
     order: np.ndarray
-    given: Varied
+    initial: Varied
     sizes: Range | None
     contacts: Range | None
     thickness: Range | None
@@ -92,56 +93,62 @@ class Variables(Module):
 
     @classmethod
     def create(
-        cls, outline: Domain, given: Varied, *, symmetry=None, sizes=False, contacts=None, thickness=None
+        cls, outline: Domain, initial: Varied, *, symmetry=None, sizes=False, contacts=None, thickness=None
     ) -> "Variables":
-        """Create the variables from the `given` parameters. Raises `ValueError` for settings that contradict them."""
+        """Create the variables from the `initial` parameters. Raises `ValueError` for settings that contradict them."""
         if symmetry is not None:
             check_name("symmetry", symmetry, filter(None, _IMAGES), ", or None")
-        centres, radii = np.asarray(given.centres), np.asarray(given.radii)
+        centres, radii = np.asarray(initial.centres), np.asarray(initial.radii)
         images = np.array(_IMAGES[symmetry], float).reshape(-1, 2, 2)
         x_min, x_max, y_min, y_max = outline.extent
         if symmetry == "rotate-4" and not np.isclose(x_max - x_min, y_max - y_min):
             raise ValueError("symmetry: a quarter turn maps only a square onto itself, and the outline's box is none.")
-        middle = np.array([x_min + x_max, y_min + y_max]) / 2
-        first = _is_in_first_part(centres - middle, symmetry)
-        _check_shares(first.sum(), len(images), len(centres), symmetry)
+        box_centre = np.array([x_min + x_max, y_min + y_max]) / 2
+        is_generator = _is_in_first_sector(centres - box_centre, symmetry)
+        _check_symmetric_counts(is_generator.sum(), len(images), len(centres), symmetry)
         size_range = contact_range = None
         if sizes is True:
-            size_range = Range(radii[first] / 2, np.full(first.sum(), np.log(4.0)))
+            size_range = Range(radii[is_generator] / 2, np.full(is_generator.sum(), np.log(4.0)))
         elif sizes is not False:
-            diameters = Range.create("sizes", sizes, radii[first], "metres")
-            size_range = Range(diameters.least / 2, diameters.span)
+            diameters = Range.create("sizes", sizes, radii[is_generator], "metres")
+            size_range = Range(diameters.lower / 2, diameters.span)
         if contacts is not None:
-            contact_range = Range.create("contact_impedance", contacts, radii[first], "ohm·m²")
+            contact_range = Range.create("contact_impedance", contacts, radii[is_generator], "ohm·m²")
         thickness_range = None if thickness is None else Range.create("thickness", thickness, np.ones(1), "metres")
-        room = radii.min() if size_range is None else size_range.least.min()
-        low, size = np.array([x_min, y_min]) + room, np.array([x_max - x_min, y_max - y_min]) - 2 * room
+        min_radius = radii.min() if size_range is None else size_range.lower.min()
+        low, size = np.array([x_min, y_min]) + min_radius, np.array([x_max - x_min, y_max - y_min]) - 2 * min_radius
         if (size <= 0).any():
             name = "outline: it" if size_range is None else "sizes: the outline"
             raise ValueError(f"{name} is smaller than an electrode; give millimetres divided by 1000.")
-        every = (np.einsum("kij,gj->kgi", images, centres[first] - middle) + middle).reshape(-1, 2)
-        # Images are assigned to electrodes such that the sum of their distances is minimal.
-        order = scipy.optimize.linear_sum_assignment(np.linalg.norm(centres[:, None] - every, axis=-1))[1]
-        start = [np.clip((centres[first] - low) / size, 0, 1).ravel()]
-        if size_range is not None:
-            start.append(size_range.variables(radii[first]))
-        if contact_range is not None:
-            start.append(contact_range.variables(np.asarray(given.contact_impedance)[first]))
-        if thickness_range is not None:
-            start.append(thickness_range.variables(np.asarray(given.thickness)[None]))
-        radii, impedance = (
-            jnp.tile(jnp.asarray(values)[first], len(images))[order] for values in (radii, given.contact_impedance)
+        image_positions = (np.einsum("kij,gj->kgi", images, centres[is_generator] - box_centre) + box_centre).reshape(
+            -1, 2
         )
-        repeated = Varied(given.centres, radii, impedance, given.thickness)
+        # Images are assigned to electrodes such that the sum of their distances is minimal.
+        order = scipy.optimize.linear_sum_assignment(np.linalg.norm(centres[:, None] - image_positions, axis=-1))[1]
+        start = [np.clip((centres[is_generator] - low) / size, 0, 1).ravel()]
+        if size_range is not None:
+            start.append(size_range.variables(radii[is_generator]))
+        if contact_range is not None:
+            start.append(contact_range.variables(np.asarray(initial.contact_impedance)[is_generator]))
+        if thickness_range is not None:
+            start.append(thickness_range.variables(np.asarray(initial.thickness)[None]))
+        radii, impedance = (
+            jnp.tile(jnp.asarray(values)[is_generator], len(images))[order]
+            for values in (radii, initial.contact_impedance)
+        )
+        symmetric_parameters = Varied(initial.centres, radii, impedance, initial.thickness)
         pitch = float(np.sqrt(np.prod(size) / len(order)))
         ranges = size_range, contact_range, thickness_range
-        return cls(low, size, images, order, repeated, *ranges, np.concatenate(start), pitch)
+        return cls(low, size, images, order, symmetric_parameters, *ranges, np.concatenate(start), pitch)
 
-    def holds(self, varied: Varied) -> bool:
+    def represents(self, varied: Varied) -> bool:
         """Whether the start represents `varied` exactly: True if `varied` has the symmetry and lies in the ranges."""
-        found = self.varied(jnp.asarray(self.start))
-        same = (np.allclose(one, other, rtol=1e-6, atol=0) for one, other in zip(found[1:], varied[1:], strict=True))
-        return bool(np.allclose(found.centres, varied.centres, atol=1e-6)) and all(same)
+        represented = self.varied(jnp.asarray(self.start))
+        are_equal = (
+            np.allclose(represented_values, given_values, rtol=1e-6, atol=0)
+            for represented_values, given_values in zip(represented[1:], varied[1:], strict=True)
+        )
+        return bool(np.allclose(represented.centres, varied.centres, atol=1e-6)) and all(are_equal)
 
     @property
     def num_generators(self) -> int:
@@ -152,49 +159,59 @@ class Variables(Module):
     def smallest(self) -> Float[np.ndarray, " L"]:
         """Minimum radii (L,) of the electrodes, metres."""
         if self.sizes is None:
-            return np.asarray(self.given.radii)
-        return np.tile(self.sizes.least, len(self.images))[self.order]
+            return np.asarray(self.initial.radii)
+        return np.tile(self.sizes.lower, len(self.images))[self.order]
 
     def varied(self, variables: Float[Array, " v"]) -> Varied:
         """Parameters that correspond to the variables."""
-        number = self.num_generators
-        place, rest = variables[: 2 * number].reshape(number, 2) * self.size - self.size / 2, variables[2 * number :]
-        centres = jnp.einsum("kij,gj->kgi", self.images, place).reshape(-1, 2) + self.low + self.size / 2
-        _, radii, contact_impedance, thickness = self.given
+        num_generators = self.num_generators
+        offsets, remaining_variables = (
+            variables[: 2 * num_generators].reshape(num_generators, 2) * self.size - self.size / 2,
+            variables[2 * num_generators :],
+        )
+        centres = jnp.einsum("kij,gj->kgi", self.images, offsets).reshape(-1, 2) + self.low + self.size / 2
+        _, radii, contact_impedance, thickness = self.initial
         if self.sizes is not None:
-            radii, rest = self._repeated(self.sizes.values(rest[:number])), rest[number:]
+            radii, remaining_variables = (
+                self._values_of_images(self.sizes.values(remaining_variables[:num_generators])),
+                remaining_variables[num_generators:],
+            )
         if self.contacts is not None:
-            contact_impedance, rest = self._repeated(self.contacts.values(rest[:number])), rest[number:]
+            contact_impedance, remaining_variables = (
+                self._values_of_images(self.contacts.values(remaining_variables[:num_generators])),
+                remaining_variables[num_generators:],
+            )
         if self.thickness is not None:
-            thickness = self.thickness.values(rest)[0]
+            thickness = self.thickness.values(remaining_variables)[0]
         return Varied(centres[self.order], radii, contact_impedance, thickness)
 
-    def _repeated(self, values: Float[Array, " G"]) -> Float[Array, " L"]:
+    def _values_of_images(self, values: Float[Array, " G"]) -> Float[Array, " L"]:
+        """Repeat the values (G,) of the generators for all electrodes (L,)."""
         return jnp.tile(values, len(self.images))[self.order]
 
 
-def _is_in_first_part(offset: np.ndarray, symmetry: str | None) -> np.ndarray:
-    x, y = offset.T
+def _is_in_first_sector(offsets: np.ndarray, symmetry: str | None) -> np.ndarray:
+    x, y = offsets.T
     if symmetry == "mirror-x":
         return x < 0
     if symmetry in ("mirror-y", "rotate-2"):
         return y < 0
-    return (x > 0) & (y >= 0) if symmetry == "rotate-4" else np.ones(len(offset), bool)
+    return (x > 0) & (y >= 0) if symmetry == "rotate-4" else np.ones(len(offsets), bool)
 
 
-def _check_shares(number: int, parts: int, total: int, symmetry: str | None) -> None:
-    if number * parts == total:
+def _check_symmetric_counts(num_first: int, num_sectors: int, num_electrodes: int, symmetry: str | None) -> None:
+    if num_first * num_sectors == num_electrodes:
         return
-    if total % parts:
+    if num_electrodes % num_sectors:
         advice = (
-            f"{total} electrodes cannot be shared equally among {parts} parts; add or remove {total % parts}, or "
-            "choose another symmetry."
+            f"{num_electrodes} electrodes cannot be shared equally among {num_sectors} parts; add or remove "
+            f"{num_electrodes % num_sectors}, or choose another symmetry."
         )
     else:
         advice = "give a layout with the same number in each."
     raise ValueError(
-        f"symmetry: {number} of {total} electrodes are in the first of {parts} parts of the skin for '{symmetry}'; "
-        f"{advice}"
+        f"symmetry: {num_first} of {num_electrodes} electrodes are in the first of {num_sectors} parts of the skin "
+        f"for '{symmetry}'; {advice}"
     )
 
 

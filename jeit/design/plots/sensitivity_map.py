@@ -59,9 +59,15 @@ def plot_sensitivity_map(
     corner = np.asarray(grid.places[0]) - np.array([grid.columns[0], grid.rows[0]]) * np.array(grid.pitch)
     corner = corner - np.array(grid.pitch) / 2
     extent = (corner[0], corner[0] + columns * grid.pitch[0], corner[1], corner[1] + rows * grid.pitch[1])
-    top = float(np.max(np.asarray(theta.values))) if limit is None else limit
+    max_sensitivity = float(np.max(np.asarray(theta.values))) if limit is None else limit
     image = ax.imshow(
-        1e3 * theta.image(), origin="lower", extent=extent, cmap=SEQUENTIAL, vmin=0, vmax=1e3 * top, aspect="equal"
+        1e3 * theta.image(),
+        origin="lower",
+        extent=extent,
+        cmap=SEQUENTIAL,
+        vmin=0,
+        vmax=1e3 * max_sensitivity,
+        aspect="equal",
     )
     draw_colour_bar(ax, image, "Sensitivity (mV)")
     if electrodes is not None:
@@ -100,12 +106,14 @@ def plot_sensitivity_histograms(
     for name, sensitivity in maps.items():
         _check_is_sensitivity_map(f"maps['{name}']", sensitivity)
     ax = axes_or_new(ax)
-    top = max(float(np.max(np.asarray(sensitivity.values))) for sensitivity in maps.values())
-    edges = np.linspace(0, top, bins + 1)
+    max_sensitivity = max(float(np.max(np.asarray(sensitivity.values))) for sensitivity in maps.values())
+    edges = np.linspace(0, max_sensitivity, bins + 1)
     for colour, (name, sensitivity) in zip(_COLOURS, maps.items(), strict=False):
         ax.stairs(100 * sensitivity.histogram(edges)[0], 1e3 * edges, color=colour, label=name, linewidth=1.4)
-    first, sensitivity = next(iter(maps.items()))
-    ax.axvline(1e3 * float(sensitivity.minimum), color=SOFT, linewidth=1, linestyle="--", label=f"least of {first}")
+    first_name, sensitivity = next(iter(maps.items()))
+    ax.axvline(
+        1e3 * float(sensitivity.minimum), color=SOFT, linewidth=1, linestyle="--", label=f"least of {first_name}"
+    )
     ax.set_xlabel("Sensitivity (mV)", color=INK)
     ax.set_ylabel("Share of the area (%)", color=INK)
     soften_axes(ax)

@@ -106,9 +106,9 @@ def plot_taxel_areas(
     layouts = dict(taxels) if isinstance(taxels, Mapping) else {"taxels": taxels}
     if not 1 <= len(layouts) <= len(_COLOURS):
         raise ValueError(f"taxels are of {len(layouts)} layouts; give 1 to {len(_COLOURS)}, {{name: taxels}}.")
-    for one in layouts.values():
-        _check_single(one)
-    areas = {name: 1e4 * np.asarray(one.areas) for name, one in layouts.items()}
+    for layout_taxels in layouts.values():
+        _check_single(layout_taxels)
+    areas = {name: 1e4 * np.asarray(layout_taxels.areas) for name, layout_taxels in layouts.items()}
     edges = np.linspace(0, max(area.max() for area in areas.values()) or 1.0, bins + 1)
     ax = axes_or_new(ax, (5.8, 3.8))
     for (name, area), colour in zip(areas.items(), _COLOURS, strict=False):
@@ -140,9 +140,11 @@ def plot_similarity(
     batches of layouts.
     """
     _check_single(taxels)
-    number = len(taxels.similarity)
-    if not isinstance(index, (int, np.integer)) or not 0 <= index < number:
-        raise ValueError(f"index must be from 0 to {number - 1}, of one of the {number} taxels; it is {index!r}.")
+    num_taxels = len(taxels.similarity)
+    if not isinstance(index, (int, np.integer)) or not 0 <= index < num_taxels:
+        raise ValueError(
+            f"index must be from 0 to {num_taxels - 1}, of one of the {num_taxels} taxels; it is {index!r}."
+        )
     ax = axes_or_new(ax)
     cells = _draw_cells(ax, taxels, np.asarray(taxels.similarity[index]), colour_map="magma")
     # Negative similarities are drawn as 0.
@@ -166,16 +168,16 @@ def _check_single(taxels: Taxels) -> None:
 def _cell_sides(taxels: Taxels) -> tuple[np.ndarray, np.ndarray]:
     """Width and height (n,) of the drawn cells, metres: the spacings of the grid, or squares of the given area if the
     positions form no grid."""
-    gaps = [np.diff(np.unique(axis.round(9))) for axis in np.asarray(taxels.places).T]
-    square = np.sqrt(np.asarray(taxels.cell_area))
-    if all(len(gap) and np.allclose(gap, gap[0], rtol=1e-3) for gap in gaps):
-        return np.full_like(square, gaps[0][0]), np.full_like(square, gaps[1][0])
-    return square, square
+    spacings_by_axis = [np.diff(np.unique(axis.round(9))) for axis in np.asarray(taxels.places).T]
+    square_sides = np.sqrt(np.asarray(taxels.cell_area))
+    if all(len(spacings) and np.allclose(spacings, spacings[0], rtol=1e-3) for spacings in spacings_by_axis):
+        return np.full_like(square_sides, spacings_by_axis[0][0]), np.full_like(square_sides, spacings_by_axis[1][0])
+    return square_sides, square_sides
 
 
 def _draw_cells(ax: Axes, taxels: Taxels, values: np.ndarray, *, colour_map: str) -> PolyCollection:
-    half = np.stack(_cell_sides(taxels), axis=1)[:, None] / 2
-    corners = np.asarray(taxels.places)[:, None] + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    half_sizes = np.stack(_cell_sides(taxels), axis=1)[:, None] / 2
+    corners = np.asarray(taxels.places)[:, None] + half_sizes * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     # Edges in the colour of the cell hide the gaps between cells.
     cells = PolyCollection(list(corners), array=values, cmap=colormaps[colour_map], edgecolors="face", linewidth=0.4)
     ax.add_collection(cells)
@@ -183,17 +185,18 @@ def _draw_cells(ax: Axes, taxels: Taxels, values: np.ndarray, *, colour_map: str
 
 
 def _map_colours(taxels: Taxels) -> np.ndarray:
-    """Index of the colour (k,) of each cluster: the first colour of the palette that none of its neighbours has."""
-    labels, count = np.asarray(taxels.labels), len(taxels.similarity)
-    first, second = labels[_triangulate(taxels).edges].T
-    neighbours = np.zeros((count, count), bool)
-    neighbours[first, second] = neighbours[second, first] = True
-    np.fill_diagonal(neighbours, False)
-    chosen = np.full(count, -1)
-    for index in range(count):
-        free = np.setdiff1d(np.arange(count), chosen[neighbours[index]])
-        chosen[index] = free[0] % colormaps[_PALETTE].N
-    return chosen
+    """Indices (k,) of the colours of the clusters: for each one the first colour of the palette that none of its
+    neighbours has."""
+    labels, num_taxels = np.asarray(taxels.labels), len(taxels.similarity)
+    first_labels, second_labels = labels[_triangulate(taxels).edges].T
+    are_neighbours = np.zeros((num_taxels, num_taxels), bool)
+    are_neighbours[first_labels, second_labels] = are_neighbours[second_labels, first_labels] = True
+    np.fill_diagonal(are_neighbours, False)
+    colours = np.full(num_taxels, -1)
+    for index in range(num_taxels):
+        free_colours = np.setdiff1d(np.arange(num_taxels), colours[are_neighbours[index]])
+        colours[index] = free_colours[0] % colormaps[_PALETTE].N
+    return colours
 
 
 def _triangulate(taxels: Taxels) -> Triangulation:
@@ -202,21 +205,21 @@ def _triangulate(taxels: Taxels) -> Triangulation:
 
 def _draw_outlines(ax: Axes, taxels: Taxels, indices: Iterable[int], *, colour: str, width: float) -> None:
     triangles = _triangulate(taxels)
-    for surface in np.asarray(taxels.similarity)[list(indices)]:
-        if surface.min() < taxels.threshold <= surface.max():
-            ax.tricontour(triangles, surface, levels=[taxels.threshold], colors=[colour], linewidths=width)
+    for similarities in np.asarray(taxels.similarity)[list(indices)]:
+        if similarities.min() < taxels.threshold <= similarities.max():
+            ax.tricontour(triangles, similarities, levels=[taxels.threshold], colors=[colour], linewidths=width)
 
 
 def _finish_axes(ax: Axes, taxels: Taxels, electrodes: ArrayLike | None, title: str | None) -> None:
     if electrodes is not None:
-        position = np.asarray(electrodes, float)
-        if position.ndim != 2 or position.shape[1] not in (2, 3):
-            raise ValueError(f"electrodes has shape {position.shape}; give positions (L, 2) or (L, 3) in metres.")
+        positions = np.asarray(electrodes, float)
+        if positions.ndim != 2 or positions.shape[1] not in (2, 3):
+            raise ValueError(f"electrodes has shape {positions.shape}; give positions (L, 2) or (L, 3) in metres.")
         style = {"markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": INK, "markeredgewidth": 0.8}
-        ax.plot(*position[:, :2].T, marker="o", linestyle="none", **style)
-    half = np.stack(_cell_sides(taxels), axis=1) / 2
+        ax.plot(*positions[:, :2].T, marker="o", linestyle="none", **style)
+    half_sizes = np.stack(_cell_sides(taxels), axis=1) / 2
     places = np.asarray(taxels.places)
-    extent = extent_of(np.concatenate([places - half, places + half]))
+    extent = extent_of(np.concatenate([places - half_sizes, places + half_sizes]))
     hide_axes(ax, extent, numbered=False)
     draw_scale_bar(ax, extent)
     ax.set_title(title or "")

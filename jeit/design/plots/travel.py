@@ -49,11 +49,13 @@ def plot_travel(
     ```
     """
     check_kind("optimisation", optimisation, Optimisation, "an Optimisation, as of optimise_layout")
-    number = len(optimisation.centres)
-    if not isinstance(start, (int, np.integer)) or not 0 <= start < number:
-        raise ValueError(f"start must be from 0 to {number - 1}, of one of the {number} starts; it is {start!r}.")
-    ends, radii = optimisation.centres[start], optimisation.radii[start]
-    ways = np.concatenate([optimisation.snapshots[start], ends[None]])
+    num_starts = len(optimisation.centres)
+    if not isinstance(start, (int, np.integer)) or not 0 <= start < num_starts:
+        raise ValueError(
+            f"start must be from 0 to {num_starts - 1}, of one of the {num_starts} starts; it is {start!r}."
+        )
+    final_centres, radii = optimisation.centres[start], optimisation.radii[start]
+    paths = np.concatenate([optimisation.snapshots[start], final_centres[None]])
     ax = axes_or_new(ax)
     outline = flat_layout(optimisation.layout).outline
     if outline is not None:
@@ -63,18 +65,18 @@ def plot_travel(
         draw_scale_bar(ax, extent)
     for domain in keep_out:
         ax.add_patch(PathPatch(outline_path(domain), **_KEEP_OUT_STYLE))
-    began = [Circle((x, y), r) for (x, y), r in zip(ways[0], radii, strict=True)]
-    ended = [Circle((x, y), r) for (x, y), r in zip(ends, radii, strict=True)]
-    ax.add_collection(PatchCollection(began, facecolor="none", edgecolor=SOFT, linewidth=1.0, zorder=3))
-    ax.add_collection(LineCollection(list(ways.swapaxes(0, 1)), colors=SOFT, linewidths=1.2, zorder=3))
-    ax.add_collection(PatchCollection(ended, facecolor=METAL, edgecolor=INK, linewidth=0.6, zorder=4))
-    _draw_legend(ax, kept_free=bool(keep_out))
-    travelled = np.linalg.norm(ends - ways[0], axis=1)
-    ax.set_title(f"Moved {1e3 * travelled.mean():.0f} mm on average" if title is None else title, color=INK)
+    initial_discs = [Circle((x, y), r) for (x, y), r in zip(paths[0], radii, strict=True)]
+    final_discs = [Circle((x, y), r) for (x, y), r in zip(final_centres, radii, strict=True)]
+    ax.add_collection(PatchCollection(initial_discs, facecolor="none", edgecolor=SOFT, linewidth=1.0, zorder=3))
+    ax.add_collection(LineCollection(list(paths.swapaxes(0, 1)), colors=SOFT, linewidths=1.2, zorder=3))
+    ax.add_collection(PatchCollection(final_discs, facecolor=METAL, edgecolor=INK, linewidth=0.6, zorder=4))
+    _draw_legend(ax, has_keep_out=bool(keep_out))
+    distances = np.linalg.norm(final_centres - paths[0], axis=1)
+    ax.set_title(f"Moved {1e3 * distances.mean():.0f} mm on average" if title is None else title, color=INK)
     return ax
 
 
-def _draw_legend(ax: Axes, *, kept_free: bool) -> None:
+def _draw_legend(ax: Axes, *, has_keep_out: bool) -> None:
     """Draw a legend below the plot, beside the scale bar."""
     disc = {"marker": "o", "markersize": 8, "linestyle": "none"}
     handles: list[Artist] = [
@@ -82,7 +84,7 @@ def _draw_legend(ax: Axes, *, kept_free: bool) -> None:
         Line2D([], [], color=SOFT, linewidth=1.2, label="way, step by step"),
         Line2D([], [], markerfacecolor=METAL, markeredgecolor=INK, markeredgewidth=0.6, label="where it ended", **disc),
     ]
-    if kept_free:
+    if has_keep_out:
         handles.append(Patch(facecolor="none", edgecolor=SOFT, hatch="////", label="kept free"))
     style = {"frameon": False, "fontsize": 9, "labelcolor": INK, "borderaxespad": 0.2, "columnspacing": 1.2}
     ax.legend(handles=handles, loc="lower right", ncols=2, **style)

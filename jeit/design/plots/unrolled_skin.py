@@ -70,47 +70,60 @@ def plot_unrolled(
     check_scale(scale)
     ax = axes_or_new(ax, (7.4, 5.2))
     points = unrolled.points
-    flat = Triangulation(points[:, 0], points[:, 1], unrolled.cells)
+    triangulation = Triangulation(points[:, 0], points[:, 1], unrolled.cells)
     if values is not None:
-        image = _check_values(unrolled, values)
-        colours = scale.of(image, "S")
-        per_cell = len(image) == len(unrolled.cells)
+        checked_values = _check_values(unrolled, values)
+        scaled_colours = scale.of(checked_values, "S")
+        per_cell = len(checked_values) == len(unrolled.cells)
         style: dict[str, Any] = {"shading": "gouraud"}
         if per_cell:
             style = {"shading": "flat", "edgecolors": "face", "linewidth": 0.5}
-        drawn = ax.tripcolor(
-            flat, colours.factor * (image if per_cell else image[unrolled.nodes]), **style, **colours.keywords
+        mesh_image = ax.tripcolor(
+            triangulation,
+            scaled_colours.factor * (checked_values if per_cell else checked_values[unrolled.nodes]),
+            **style,
+            **scaled_colours.keywords,
         )
-        colours.draw_bar(ax, drawn)
+        scaled_colours.draw_bar(ax, mesh_image)
     _draw_edges(ax, unrolled)
     if electrodes is not None:
         _draw_electrodes(ax, unrolled, electrodes)
     for (name, places), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
-        at = unrolled.flat(np.atleast_2d(np.asarray(places, float)))
-        ax.plot(at[:, 0], at[:, 1], "o", color=colour, markersize=5, markeredgecolor="white", label=name, zorder=5)
+        flat_positions = unrolled.flat(np.atleast_2d(np.asarray(places, float)))
+        ax.plot(
+            flat_positions[:, 0],
+            flat_positions[:, 1],
+            "o",
+            color=colour,
+            markersize=5,
+            markeredgecolor="white",
+            label=name,
+            zorder=5,
+        )
     extent = extent_of(points)
     hide_axes(ax, extent, numbered=False)
     draw_scale_bar(ax, extent)
     if marks:
         ax.legend(loc="lower right", frameon=False, labelcolor=INK, ncols=len(marks), borderaxespad=0)
     if unrolled.mean_distortion > _MIN_STATED_DISTORTION:
-        mean, most = 100 * unrolled.mean_distortion, 100 * unrolled.distortion
-        text = f"lengths off by {mean:.2g} % on average, {most:.2g} % at most"
-        ax.text(0.5, 0.02, text, transform=ax.transAxes, ha="center", color=SOFT, fontsize=8)
+        mean_percent, max_percent = 100 * unrolled.mean_distortion, 100 * unrolled.distortion
+        distortion_text = f"lengths off by {mean_percent:.2g} % on average, {max_percent:.2g} % at most"
+        ax.text(0.5, 0.02, distortion_text, transform=ax.transAxes, ha="center", color=SOFT, fontsize=8)
     if title:
         ax.set_title(title)
     return ax
 
 
 def _check_values(unrolled: Unrolled, values: ArrayLike) -> np.ndarray:
-    image, sizes = np.asarray(values), (len(unrolled.cells), len(unrolled.surface.points))
-    if image.shape not in ((sizes[0],), (sizes[1],)):
+    checked_values, num_values = np.asarray(values), (len(unrolled.cells), len(unrolled.surface.points))
+    if checked_values.shape not in ((num_values[0],), (num_values[1],)):
         raise ValueError(
-            f"values has shape {image.shape}; give one for each of the {sizes[0]} triangles or the {sizes[1]} nodes."
+            f"values has shape {checked_values.shape}; give one for each of the {num_values[0]} triangles or the "
+            f"{num_values[1]} nodes."
         )
-    if np.iscomplexobj(image):
+    if np.iscomplexobj(checked_values):
         raise ValueError("values are complex; draw their real or imaginary part.")
-    return image
+    return checked_values
 
 
 def _draw_edges(ax: Axes, unrolled: Unrolled) -> None:
@@ -119,13 +132,17 @@ def _draw_edges(ax: Axes, unrolled: Unrolled) -> None:
 
 
 def _draw_electrodes(ax: Axes, unrolled: Unrolled, electrodes) -> None:
-    kinds = (SurfaceLayout, SurfaceDiscs, FaceDiscs)
-    check_kind("electrodes", electrodes, kinds, "those of a curved skin: its layout, or skin.model.electrodes")
+    electrode_classes = (SurfaceLayout, SurfaceDiscs, FaceDiscs)
+    check_kind(
+        "electrodes", electrodes, electrode_classes, "those of a curved skin: its layout, or skin.model.electrodes"
+    )
     if isinstance(electrodes, SurfaceLayout):
         centres, radii, names = electrodes.centres, electrodes.diameters / 2, electrodes.labels
     else:
         centres, radii = electrodes.position, electrodes.radius
         names = [str(k + 1) for k in range(electrodes.num_electrodes)]
-    for place, radius, name in zip(unrolled.flat(centres), np.asarray(radii), names, strict=True):
-        ax.add_patch(Circle(tuple(place), float(radius), facecolor="#ffffffa0", edgecolor=INK, linewidth=0.8, zorder=3))
-        ax.annotate(name, tuple(place), ha="center", va="center", fontsize=6, color=INK, zorder=4)
+    for flat_centre, radius, name in zip(unrolled.flat(centres), np.asarray(radii), names, strict=True):
+        ax.add_patch(
+            Circle(tuple(flat_centre), float(radius), facecolor="#ffffffa0", edgecolor=INK, linewidth=0.8, zorder=3)
+        )
+        ax.annotate(name, tuple(flat_centre), ha="center", va="center", fontsize=6, color=INK, zorder=4)

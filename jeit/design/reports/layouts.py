@@ -33,9 +33,9 @@ def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> Non
     write_layout_comparison(comparison, "out")
     ```
     """
-    with results(folder, ("comparison.png", "report.json")) as made:
-        write_json(report_layout_comparison(result), made / "report.json")
-        draw_layout_comparison(result).savefig(made / "comparison.png", dpi=130)
+    with results(folder, ("comparison.png", "report.json")) as temporary_folder:
+        write_json(report_layout_comparison(result), temporary_folder / "report.json")
+        draw_layout_comparison(result).savefig(temporary_folder / "comparison.png", dpi=130)
 
 
 def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:
@@ -72,31 +72,37 @@ def draw_layout_comparison(result: LayoutComparison):
     figure = Figure(figsize=(14.4, 8.8), layout="constrained")
     figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12)
     axes = figure.subplots(2, 3, width_ratios=(1.1, 1.1, 1))
-    both = result.responses
-    highest = max(float(one.sensitivity.values.max()) for one in both)
-    largest = max(float(one.taxels.max_area) for one in both)
-    names = distinct_names([_shorten_name(one.layout.name) for one in both])
-    for row, name, one in zip(axes, names, both, strict=True):
-        centres, outline = one.layout.centres, flat_layout(one.layout).known_outline
+    responses = result.responses
+    max_sensitivity = max(float(response.sensitivity.values.max()) for response in responses)
+    max_area = max(float(response.taxels.max_area) for response in responses)
+    names = distinct_names([_shorten_name(response.layout.name) for response in responses])
+    for row_axes, name, response in zip(axes, names, responses, strict=True):
+        centres, outline = response.layout.centres, flat_layout(response.layout).known_outline
         plot_sensitivity_map(
-            one.sensitivity, electrodes=centres, limit=highest, title=f"{name}: sensitivity", ax=row[0]
+            response.sensitivity,
+            electrodes=centres,
+            limit=max_sensitivity,
+            title=f"{name}: sensitivity",
+            ax=row_axes[0],
         )
-        plot_taxels(one.taxels, electrodes=centres, limit=largest, title=f"{name}: taxels", ax=row[1])
+        plot_taxels(response.taxels, electrodes=centres, limit=max_area, title=f"{name}: taxels", ax=row_axes[1])
         # The taxel map places its scale bar for the touched part only; replace it by one for the whole skin, which both
         # maps show.
-        for bar in (row[1].lines[-1], row[1].texts[-1]):
-            bar.remove()
-        draw_scale_bar(row[1], outline.extent)
-        for ax in row[:2]:
+        for scale_bar_part in (row_axes[1].lines[-1], row_axes[1].texts[-1]):
+            scale_bar_part.remove()
+        draw_scale_bar(row_axes[1], outline.extent)
+        for ax in row_axes[:2]:
             ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=INK, linewidth=0.9))
             hide_axes(ax, outline.extent, numbered=False)
-    plot_sensitivity_histograms({name: one.sensitivity for name, one in zip(names, both, strict=True)}, ax=axes[0, 2])
-    plot_taxel_areas({name: one.taxels for name, one in zip(names, both, strict=True)}, ax=axes[1, 2])
+    plot_sensitivity_histograms(
+        {name: response.sensitivity for name, response in zip(names, responses, strict=True)}, ax=axes[0, 2]
+    )
+    plot_taxel_areas({name: response.taxels for name, response in zip(names, responses, strict=True)}, ax=axes[1, 2])
     disc: dict[str, Any] = {"marker": "o", "linestyle": "none", "markerfacecolor": "white", "markeredgecolor": INK}
     handles: list[Artist] = [Line2D([], [], label="electrode", **disc)]
     if result.margin > 0:
-        untouched = f"not touched: {1e3 * result.margin:.3g} mm wide"
-        handles.append(Patch(facecolor="white", edgecolor=INK, linewidth=0.9, label=untouched))
+        margin_label = f"not touched: {1e3 * result.margin:.3g} mm wide"
+        handles.append(Patch(facecolor="white", edgecolor=INK, linewidth=0.9, label=margin_label))
     figure.legend(handles=handles, loc="outside lower left", ncols=2, frameon=False)
     return figure
 
@@ -128,11 +134,11 @@ def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:
     write_improved_layout(improved, "out")
     ```
     """
-    with results(folder, ("layout.csv", "layout.svg", "travel.png", "report.json")) as made:
-        write_layout(result.layout, made / "layout.csv")
-        write_layout(result.layout, made / "layout.svg")
-        draw_improved_layout(result).savefig(made / "travel.png", dpi=150)
-        write_json(report_improved_layout(result), made / "report.json")
+    with results(folder, ("layout.csv", "layout.svg", "travel.png", "report.json")) as temporary_folder:
+        write_layout(result.layout, temporary_folder / "layout.csv")
+        write_layout(result.layout, temporary_folder / "layout.svg")
+        draw_improved_layout(result).savefig(temporary_folder / "travel.png", dpi=150)
+        write_json(report_improved_layout(result), temporary_folder / "report.json")
 
 
 def draw_improved_layout(result: ImprovedLayout):
@@ -142,23 +148,23 @@ def draw_improved_layout(result: ImprovedLayout):
     from jeit.design.plots import plot_travel
 
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
-    found = result.optimisation
-    plot_travel(found, found.best or 0, keep_out=result.space.keep_out, ax=figure.subplots())
+    optimisation = result.optimisation
+    plot_travel(optimisation, optimisation.best or 0, keep_out=result.space.keep_out, ax=figure.subplots())
     return figure
 
 
 def report_improved_layout(result: ImprovedLayout) -> dict[str, Any]:
     """Result of the optimisation, scores of the given ("start") and the optimised layout ("optimised") on the finer
     mesh, and the options, as plain numbers and strings; None for values that are not finite."""
-    found, skin, space = result.optimisation, result.skin, result.space
+    optimisation, skin, space = result.optimisation, result.skin, result.space
     content = {
         "layout": result.start.name,
-        "status": found.status,
-        "reason": found.reason,
+        "status": optimisation.status,
+        "reason": optimisation.reason,
         "start": _score_figures(result.before),
         "optimised": _score_figures(result.after),
-        "starts": found.values,
-        "steps": found.history.shape[1] - 1,
+        "starts": optimisation.values,
+        "steps": optimisation.history.shape[1] - 1,
         "seed": result.seed,
         "options": {
             "thickness_mm": 1e3 * skin.thickness,

@@ -50,10 +50,16 @@ def draw_scatter(data):
 
     figure = Figure(figsize=(7.5, 4.2), layout="constrained")
     axes = figure.subplots()
-    least, mean = data.sensitivity.min("place"), data.sensitivity.mean("place")
+    min_sensitivities, mean_sensitivities = data.sensitivity.min("place"), data.sensitivity.mean("place")
     for layout in dict.fromkeys(data.layout.values.tolist()):
-        these = data.layout.values == layout
-        axes.plot(1e3 * least[these], 1e3 * mean[these], "o", label=_escape_for_matplotlib(layout), alpha=0.8)
+        has_layout = data.layout.values == layout
+        axes.plot(
+            1e3 * min_sensitivities[has_layout],
+            1e3 * mean_sensitivities[has_layout],
+            "o",
+            label=_escape_for_matplotlib(layout),
+            alpha=0.8,
+        )
     axes.set(xlabel="Least sensitivity (mV)", ylabel="Mean sensitivity (mV)", xscale="log", yscale="log")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(LogLocator(subs=_TICKS))
@@ -86,17 +92,29 @@ def draw_scores(data):
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(2.8 * columns + 1.8, 2.2 * rows + 0.3), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    point = np.arange(data.sizes["point"])
+    point_numbers = np.arange(data.sizes["point"])
     for axes, name in zip(panels, names, strict=False):
         values, unit = values_and_unit(data, name)
-        for number, layout in enumerate(dict.fromkeys(data.layout.values.tolist())):
-            these = data.layout.values == layout
-            finite, infinite = these & np.isfinite(values), these & np.isinf(values)
+        for layout_index, layout in enumerate(dict.fromkeys(data.layout.values.tolist())):
+            has_layout = data.layout.values == layout
+            is_finite, is_infinite = has_layout & np.isfinite(values), has_layout & np.isinf(values)
             axes.plot(
-                point[finite], values[finite], "o", ms=4, color=f"C{number}", label=_escape_for_matplotlib(layout)
+                point_numbers[is_finite],
+                values[is_finite],
+                "o",
+                ms=4,
+                color=f"C{layout_index}",
+                label=_escape_for_matplotlib(layout),
             )
-            top = np.ones(infinite.sum())
-            axes.plot(point[infinite], top, "^", ms=5, color=f"C{number}", transform=axes.get_xaxis_transform())
+            ones = np.ones(is_infinite.sum())
+            axes.plot(
+                point_numbers[is_infinite],
+                ones,
+                "^",
+                ms=5,
+                color=f"C{layout_index}",
+                transform=axes.get_xaxis_transform(),
+            )
         axes.set_title(_TITLES.get(name, name.replace("_", " ")) + ("" if unit == "1" else f" ({unit})"), fontsize=9)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.tick_params(labelsize=7)
@@ -113,8 +131,8 @@ def map_points(data) -> np.ndarray:
     """Indices of the finished points whose maps are drawn in the report: all of them, or an evenly spaced selection if
     there are more than the report shows."""
     finished = np.flatnonzero(data.finished.values)
-    chosen = np.linspace(0, len(finished) - 1, min(len(finished), _MAX_MAPS)).round().astype(int)
-    return finished[chosen]
+    selected_positions = np.linspace(0, len(finished) - 1, min(len(finished), _MAX_MAPS)).round().astype(int)
+    return finished[selected_positions]
 
 
 def draw_maps(study: Study, data):
@@ -125,38 +143,38 @@ def draw_maps(study: Study, data):
     from matplotlib.ticker import LogLocator
 
     grid = study_grid(study)
-    numbers = map_points(data)
+    point_indices = map_points(data)
     titles = point_titles(study)
-    values = 1e3 * data.sensitivity.values[numbers]
-    positive = values[values > 0]
-    scale = LogNorm(positive.min(), positive.max())
-    columns = min(_NUM_COLUMNS, len(numbers))
-    rows = -(-len(numbers) // columns)
+    values = 1e3 * data.sensitivity.values[point_indices]
+    positive_values = values[values > 0]
+    scale = LogNorm(positive_values.min(), positive_values.max())
+    columns = min(_NUM_COLUMNS, len(point_indices))
+    rows = -(-len(point_indices) // columns)
     height = 2.4 + 0.15 * max(title.count("\n") for title in titles)
     figure = Figure(figsize=(max(2.6 * columns, 4.0) + 0.8, height * rows + 0.3), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    view = (
+    map_drawing = (
         _UnrolledMaps(study.outline, grid) if isinstance(study.outline, Triangles) else _FlatMaps(study.outline, grid)
     )
     image = None
-    for axes, number, map_values in zip(panels, numbers, values, strict=False):
-        layout = study.points[number].layout
-        image = view.draw(axes, map_values, norm=scale, cmap="magma")
+    for axes, point_index, map_values in zip(panels, point_indices, values, strict=False):
+        layout = study.points[point_index].layout
+        image = map_drawing.draw(axes, map_values, norm=scale, cmap="magma")
         diameter = 1e3 * np.asarray(layout.diameters)
         circles = EllipseCollection(
             diameter,
             diameter,
             np.zeros_like(diameter),
             units="xy",
-            offsets=1e3 * view.places(layout.centres),
+            offsets=1e3 * map_drawing.places(layout.centres),
             offset_transform=axes.transData,
             facecolors="none",
             edgecolors="c",
         )
         axes.add_collection(circles)
-        axes.set_title(titles[number], fontsize=8)
+        axes.set_title(titles[point_index], fontsize=8)
         axes.tick_params(labelsize=7)
-    for axes in panels[len(numbers) :]:
+    for axes in panels[len(point_indices) :]:
         axes.set_axis_off()
     assert image is not None
     figure.colorbar(
@@ -188,16 +206,18 @@ class _UnrolledMaps:
     is nearest along the surface."""
 
     def __init__(self, outline: Triangles, grid: TouchGrid):
-        fine = outline
-        while len(fine.points) < _MIN_MAP_NODES:
-            fine = fine.finer()
-        self.flat = unroll(fine)
-        self.owners = Geodesics.create(fine).owners(grid.places)[0][self.flat.nodes]
+        fine_surface = outline
+        while len(fine_surface.points) < _MIN_MAP_NODES:
+            fine_surface = fine_surface.finer()
+        self.flat = unroll(fine_surface)
+        self.nearest_places = Geodesics.create(fine_surface).owners(grid.places)[0][self.flat.nodes]
 
     def draw(self, axes, values, **style):
         axes.set_aspect("equal")
         x, y = 1e3 * self.flat.points.T
-        return axes.tripcolor(x, y, self.flat.cells, np.asarray(values)[self.owners], shading="gouraud", **style)
+        return axes.tripcolor(
+            x, y, self.flat.cells, np.asarray(values)[self.nearest_places], shading="gouraud", **style
+        )
 
     def places(self, centres) -> np.ndarray:
         return self.flat.flat(np.asarray(centres))
@@ -209,10 +229,10 @@ def point_titles(study: Study) -> list[str]:
     coordinates = [point.coordinates for point in study.points]
     varying = [name for name in _LABELS if len({values[name] for values in coordinates}) > 1]
     titles = []
-    for number, values in enumerate(coordinates):
+    for point_index, values in enumerate(coordinates):
         labels = [_parameter_text(name, values[name]) for name in varying]
-        lines = [", ".join(labels[start : start + 2]) for start in range(0, len(labels), 2)]
-        titles.append("\n".join([f"{number}: {_escape_for_matplotlib(str(values['layout']))}", *lines]))
+        label_lines = [", ".join(labels[start : start + 2]) for start in range(0, len(labels), 2)]
+        titles.append("\n".join([f"{point_index}: {_escape_for_matplotlib(str(values['layout']))}", *label_lines]))
     return titles
 
 
@@ -261,8 +281,11 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
     if not data.finished.values.any():
         raise ValueError(f"{store}: no chunk of the study is finished, so there is nothing to report; resume it.")
     progress = study_progress(study, store)
-    made_by, now = Store(study, store, create=False).versions, {name: metadata.version(name) for name in _PACKAGES}
-    parts = [
+    store_versions, current_versions = (
+        Store(study, store, create=False).versions,
+        {name: metadata.version(name) for name in _PACKAGES},
+    )
+    page_parts = [
         f"<h1>{escape(study.name)}</h1>",
         f"<p>{progress.points} of {progress.all_points} points finished, in {progress.chunks} of {progress.all_chunks} "
         f"chunks. Sensitivity: ‖Δv‖₂ of all channels to one touch, {'exact' if study.exact else 'linearised'}, on "
@@ -288,13 +311,13 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
         f"<pre>{escape(study.text)}</pre>",
         f"<p>Fingerprint {study.fingerprint}</p>",
         "<h2>Versions</h2>",
-        f"<p>Computed with {_versions_text(made_by)}.</p>",
-        f"<p>Reported with {_versions_text(now)}, Python {platform.python_version()}, "
+        f"<p>Computed with {_versions_text(store_versions)}.</p>",
+        f"<p>Reported with {_versions_text(current_versions)}, Python {platform.python_version()}, "
         f"{escape(platform.platform())}.</p>",
     ]
     page = (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(study.name)}</title>'
-        f"<style>{_STYLE}</style></head>\n<body>\n" + "\n".join(parts) + "\n</body></html>\n"
+        f"<style>{_STYLE}</style></head>\n<body>\n" + "\n".join(page_parts) + "\n</body></html>\n"
     )
     path = Path(path)
     temporary = path.with_name(f".{path.name}.tmp")
@@ -319,14 +342,22 @@ def _figure_html(figure: Any, caption: str) -> str:
 
 def _points_table(study: Study, data) -> str:
     """HTML table with a row for every point: the swept parameters, then the scores."""
-    swept = list(study.points[0].coordinates)
-    found = {name: values_and_unit(data, name) for name in stored_score_names(data)}
-    heads = ["point", *swept, *(name if unit == "1" else f"{name} / {unit}" for name, (_, unit) in found.items())]
-    lines = ["".join(f'<th class="{"text" if head in _TEXT else "number"}">{escape(head)}</th>' for head in heads)]
-    columns = [data[name].values.tolist() for name in swept] + [values.tolist() for values, _ in found.values()]
-    for number, row in enumerate(zip(*columns, strict=True)):
-        lines.append("".join(_cell_text(value) for value in (number, *row)))
-    return '<div class="wide"><table>' + "\n".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
+    swept_names = list(study.points[0].coordinates)
+    values_and_units = {name: values_and_unit(data, name) for name in stored_score_names(data)}
+    column_titles = [
+        "point",
+        *swept_names,
+        *(name if unit == "1" else f"{name} / {unit}" for name, (_, unit) in values_and_units.items()),
+    ]
+    row_texts = [
+        "".join(f'<th class="{"text" if title in _TEXT else "number"}">{escape(title)}</th>' for title in column_titles)
+    ]
+    columns = [data[name].values.tolist() for name in swept_names] + [
+        values.tolist() for values, _ in values_and_units.values()
+    ]
+    for point_index, row in enumerate(zip(*columns, strict=True)):
+        row_texts.append("".join(_cell_text(value) for value in (point_index, *row)))
+    return '<div class="wide"><table>' + "\n".join(f"<tr>{row_text}</tr>" for row_text in row_texts) + "</table></div>"
 
 
 def _cell_text(value) -> str:

@@ -21,7 +21,7 @@ _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 # Typical extent of a skin, metres, from which the likely unit of a file is determined.
 _TYPICAL_EXTENT = 0.15
 # Side of an equilateral triangle divided by the square root of its area.
-_SIDE_RANGE = 2 / 3**0.25
+_SIDE_TO_ROOT_AREA = 2 / 3**0.25
 
 
 def described_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
@@ -47,11 +47,11 @@ def _check_unit(table: SurfaceTable, surface: Mesh) -> None:
     extent = float(np.ptp(np.asarray(surface.points), axis=0).max())
     if not isinstance(table, ScanTable) or SMALLEST <= extent <= LARGEST:
         return
-    across = {unit: extent * one / _UNITS[table.unit] for unit, one in _UNITS.items()}
-    likely = min(across, key=lambda unit: abs(np.log(across[unit] / _TYPICAL_EXTENT)))
+    extents_by_unit = {unit: extent * scale / _UNITS[table.unit] for unit, scale in _UNITS.items()}
+    likely_unit = min(extents_by_unit, key=lambda unit: abs(np.log(extents_by_unit[unit] / _TYPICAL_EXTENT)))
     hint = (
-        f'give "{likely}", in which it is {_length_text(across[likely])}'
-        if likely != table.unit
+        f'give "{likely_unit}", in which it is {_length_text(extents_by_unit[likely_unit])}'
+        if likely_unit != table.unit
         else "is it the right file?"
     )
     raise ValueError(f'surface.unit: in "{table.unit}" the skin would be {_length_text(extent)} across; {hint}.')
@@ -63,15 +63,15 @@ def _length_text(metres: float) -> str:
 
 def surface_identity(table: SurfaceTable, folder: Path) -> str:
     """Text that identifies a surface: its table, with a file replaced by the hash of its content."""
-    kept = table.model_dump()
-    if "file" in kept:
-        kept["file"] = hashlib.sha256((folder / kept["file"]).read_bytes()).hexdigest()
-    return json.dumps(kept, default=np.ndarray.tolist)
+    values = table.model_dump()
+    if "file" in values:
+        values["file"] = hashlib.sha256((folder / values["file"]).read_bytes()).hexdigest()
+    return json.dumps(values, default=np.ndarray.tolist)
 
 
 def typical_cell(surface: Mesh) -> float:
     """Typical cell size of a surface, metres: side of an equilateral triangle with the mean area of its triangles."""
-    return _SIDE_RANGE * float(np.sqrt(np.mean(np.asarray(measures(surface)))))
+    return _SIDE_TO_ROOT_AREA * float(np.sqrt(np.mean(np.asarray(measures(surface)))))
 
 
 def _create_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
@@ -81,7 +81,7 @@ def _create_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh
         case tables.TubeTable():
             return tube(1e-3 * table.radius_mm, 1e-3 * table.height_mm, cell_size=cell_size)
         case tables.ForearmTable():
-            wrist, elbow = ((1e-3 * np.broadcast_to(one, 2)).tolist() for one in (table.wrist_mm, table.elbow_mm))
+            wrist, elbow = ((1e-3 * np.broadcast_to(radii, 2)).tolist() for radii in (table.wrist_mm, table.elbow_mm))
             return forearm(1e-3 * table.length_mm, wrist, elbow, cell_size=cell_size)
         case tables.SphereTable():
             return sphere(1e-3 * table.radius_mm, cell_size=cell_size)

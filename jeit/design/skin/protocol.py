@@ -40,21 +40,21 @@ def skin_protocol(
         if num_pairs:
             raise ValueError(f"num_pairs is {num_pairs}, and only 'two-terminal' has pairs, not {name!r}.")
         return {"adjacent": adjacent, "opposite": opposite}[name](layout.num_electrodes, current=current)
-    number = number_of_pairs(layout, num_pairs)
+    checked_num_pairs = number_of_pairs(layout, num_pairs)
     pairs = np.column_stack(np.triu_indices(layout.num_electrodes, 1))
-    if number < len(pairs):
-        pairs = pairs[np.sort(nearest_pairs(layout.centres, number, lengths=layout.lengths()))]
+    if checked_num_pairs < len(pairs):
+        pairs = pairs[np.sort(nearest_pairs(layout.centres, checked_num_pairs, lengths=layout.lengths()))]
     return two_terminal(layout.num_electrodes, pairs, current=current)
 
 
 def number_of_pairs(layout: Layout | SurfaceLayout, num_pairs: int | None) -> int:
     """Number of measured pairs, as in `skin_protocol`. Raises `ValueError` for more pairs than exist."""
-    pairs = layout.num_electrodes * (layout.num_electrodes - 1) // 2
+    num_all_pairs = layout.num_electrodes * (layout.num_electrodes - 1) // 2
     if num_pairs is None:
-        return min(NUM_PAIRS, pairs)
-    if not 0 <= num_pairs <= pairs:
+        return min(NUM_PAIRS, num_all_pairs)
+    if not 0 <= num_pairs <= num_all_pairs:
         raise ValueError(
-            f"num_pairs is {num_pairs}; '{layout.name}' has {layout.num_electrodes} electrodes, and they make {pairs} "
-            "pairs; give so many or fewer."
+            f"num_pairs is {num_pairs}; '{layout.name}' has {layout.num_electrodes} electrodes, and they make "
+            f"{num_all_pairs} pairs; give so many or fewer."
         )
-    return num_pairs or pairs
+    return num_pairs or num_all_pairs

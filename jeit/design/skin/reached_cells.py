@@ -13,20 +13,20 @@ from jeit.mesh.geodesic import Geodesics, Triangles
 
 # Maximum distance of positions from the surface of a curved skin, relative to its thickness, or to the size of the
 # cells of a sheet.
-_MAX_OFF_SURFACE = 0.5
+_MAX_RELATIVE_DISTANCE = 0.5
 
 
 class ReachedCells(NamedTuple):
     """Cells within reach of n touches.
 
-    **Fields**: `near`: indices of the cells of each touch; `distance`: distances of their centroids from the position
-    of the touch along the surface, metres; `below` (m,): depth of the centroid of every cell of the mesh below the
-    surface, metres; `thickness`: thickness of a layer, metres, None for a sheet.
+    **Fields**: `cells`: indices of the cells of each touch; `distances`: distances of their centroids from the position
+    of the touch along the surface, metres; `centroid_depths` (m,): depth of the centroid of every cell of the mesh
+    below the surface, metres; `thickness`: thickness of a layer, metres, None for a sheet.
     """
 
-    near: list[Int[np.ndarray, " c"]]
-    distance: list[Float[np.ndarray, " c"]]
-    below: Float[np.ndarray, " m"]
+    cells: list[Int[np.ndarray, " c"]]
+    distances: list[Float[np.ndarray, " c"]]
+    centroid_depths: Float[np.ndarray, " m"]
     thickness: float | None
 
 
@@ -49,45 +49,60 @@ def reached_cells(
     In a flat layer, depth is measured from its top, at the maximum z; in a shell, from its `face` along the inward
     normal. Raises `ValueError` for positions that are not on a curved surface.
     """
-    middle = np.asarray(centroids(mesh))
+    cell_centroids = np.asarray(centroids(mesh))
     if is_curved(mesh):
-        return _reached_on_surface(mesh, middle, places, radius, max_depth, face)
-    below, thickness = np.zeros(len(middle)), None
+        return _reached_cells_on_surface(mesh, cell_centroids, places, radius, max_depth, face)
+    centroid_depths, thickness = np.zeros(len(cell_centroids)), None
     if mesh.dimension == 3:
-        height = np.asarray(mesh.points)[:, 2]
-        below, thickness = height.max() - middle[:, 2], float(np.ptp(height))
-    candidates = np.flatnonzero(below < max_depth)
-    found = KDTree(middle[candidates, :2]).query_ball_point(places, radius, return_sorted=True)
-    near = [candidates[np.asarray(index, int)] for index in found]
-    distance = [np.linalg.norm(middle[own, :2] - place, axis=-1) for own, place in zip(near, places, strict=True)]
-    return ReachedCells(near, distance, below, thickness)
+        heights = np.asarray(mesh.points)[:, 2]
+        centroid_depths, thickness = heights.max() - cell_centroids[:, 2], float(np.ptp(heights))
+    candidates = np.flatnonzero(centroid_depths < max_depth)
+    candidate_indices = KDTree(cell_centroids[candidates, :2]).query_ball_point(places, radius, return_sorted=True)
+    cells = [candidates[np.asarray(indices, int)] for indices in candidate_indices]
+    distances = [
+        np.linalg.norm(cell_centroids[touch_cells, :2] - place, axis=-1)
+        for touch_cells, place in zip(cells, places, strict=True)
+    ]
+    return ReachedCells(cells, distances, centroid_depths, thickness)
 
 
-def _reached_on_surface(mesh: Mesh, centroids, places, radius: float, max_depth: float, face: str) -> ReachedCells:
+def _reached_cells_on_surface(
+    mesh: Mesh, centroids, places, radius: float, max_depth: float, face: str
+) -> ReachedCells:
     surface = touched_surface(mesh, face)
     thickness = None if mesh.is_surface else shell_thickness(mesh)
-    allowed = _MAX_OFF_SURFACE * (np.sqrt(surface.areas.max()) if thickness is None else thickness)
-    off = surface.nearest(places).away
-    lost = np.flatnonzero(off > allowed)
-    if lost.size:
+    max_distance = _MAX_RELATIVE_DISTANCE * (np.sqrt(surface.areas.max()) if thickness is None else thickness)
+    surface_distances = surface.nearest(places).away
+    invalid_places = np.flatnonzero(surface_distances > max_distance)
+    if invalid_places.size:
         raise ValueError(
-            f"places: {lost.size} of {len(places)} lie off the skin's surface, the first, at "
-            f"{millimetre_text(places[lost[0]])} "
-            f"mm, by {1e3 * off[lost[0]]:.3g} mm; give places on the touched face, in metres, such as "
-            "touch_grid(skin.outline).places."
+            f"places: {invalid_places.size} of {len(places)} lie off the skin's surface, the first, at "
+            f"{millimetre_text(places[invalid_places[0]])} "
+            f"mm, by {1e3 * surface_distances[invalid_places[0]]:.3g} mm; give places on the touched face, in metres, "
+            "such as touch_grid(skin.outline).places."
         )
-    at = surface.nearest(centroids)
-    below = np.zeros(len(centroids)) if mesh.is_surface else at.away
-    candidates = np.flatnonzero(below < max_depth)
-    feet = type(at)(at.triangle[candidates], at.weights[candidates], at.points[candidates], at.away[candidates])
-    found = Geodesics.create(surface).near(places, feet, radius)
-    return ReachedCells([candidates[index] for index, _ in found], [length for _, length in found], below, thickness)
+    nearest_points = surface.nearest(centroids)
+    centroid_depths = np.zeros(len(centroids)) if mesh.is_surface else nearest_points.away
+    candidates = np.flatnonzero(centroid_depths < max_depth)
+    candidate_points = type(nearest_points)(
+        nearest_points.triangle[candidates],
+        nearest_points.weights[candidates],
+        nearest_points.points[candidates],
+        nearest_points.away[candidates],
+    )
+    indices_and_lengths = Geodesics.create(surface).near(places, candidate_points, radius)
+    return ReachedCells(
+        [candidates[indices] for indices, _ in indices_and_lengths],
+        [lengths for _, lengths in indices_and_lengths],
+        centroid_depths,
+        thickness,
+    )
 
 
 def shell_thickness(mesh: Mesh) -> float:
     """Thickness of a shell, metres: the median distance of the nodes of its inner face from its outer face."""
-    inner = Triangles.of(mesh, "inner").points
-    return float(np.median(Triangles.of(mesh, "outer").nearest(inner).away))
+    inner_points = Triangles.of(mesh, "inner").points
+    return float(np.median(Triangles.of(mesh, "outer").nearest(inner_points).away))
 
 
 def millimetre_text(place) -> str:

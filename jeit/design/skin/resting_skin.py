@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jeit.design.skin.touched_cells import TouchedCells, touched_nodes
-from jeit.design.skin.voltage_changes import EXACT_AT_ONCE, cell_stiffness, changes_between, check_found
+from jeit.design.skin.voltage_changes import EXACT_AT_ONCE, cell_stiffness, changes_between, check_finite_changes
 from jeit.forward import ForwardModel
 from jeit.forward.model import channel_voltages, check_model, evaluate, solved_system_of
 from jeit.forward.system import cell_conductivity, check_conductivity
@@ -28,7 +28,7 @@ class RestingSkin(Module):
 
     **Fields**
 
-    - `model`: its forward model; `rest` (M,): its voltages, volts.
+    - `model`: its forward model; `voltages` (M,): its voltages, volts.
     - `element` (m, q, q): contribution of each cell to the system matrix.
     - `strips`: the nodes that may be touched, ordered in strips across the skin.
     - `fields` (p, L): potentials at these nodes for unit currents into the electrodes; `inverse`: entries of the
@@ -36,7 +36,7 @@ class RestingSkin(Module):
     """
 
     model: ForwardModel
-    rest: Float[Array, " M"]
+    voltages: Float[Array, " M"]
     element: Float[Array, "m q q"]
     strips: Strips
     fields: Float[Array, "p L"]
@@ -58,46 +58,48 @@ class RestingSkin(Module):
         if 8 * float(strips.num_strips * strips.selected_per_strip) ** 2 > max_bytes:
             return None
         solved = evaluate(model, solved_system_of, conductivity)
-        rest = channel_voltages(model.protocol, solved.impedance())
-        known = fields_and_inverse(solved, strips, max(strips.num_strips - 1, 1))
-        return cls(model, rest, cell_stiffness(model, conductivity), strips, *known)
+        voltages = channel_voltages(model.protocol, solved.impedance())
+        skin_fields_and_inverse = fields_and_inverse(solved, strips, max(strips.num_strips - 1, 1))
+        return cls(model, voltages, cell_stiffness(model, conductivity), strips, *skin_fields_and_inverse)
 
     def changes(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
         """Compute the exact voltage changes (n, M) due to n single touches, volts, as `touch_changes` does. Raises
         `RuntimeError` as `touch_changes` does."""
-        at = touched_nodes(self.model, touched, self.strips)
-        cells, change = np.asarray(touched.cells), np.asarray(touched.change)
-        used = np.count_nonzero(change, axis=1)
+        touched_at = touched_nodes(self.model, touched, self.strips)
+        cells, relative_changes = np.asarray(touched.cells), np.asarray(touched.change)
+        num_changed_cells = np.count_nonzero(relative_changes, axis=1)
         sizes = np.stack(
             [
-                _padded_size((at.nodes < at.nodes[:, -1:]).sum(axis=1) + 1, _NODE_SIZE_RATIO),
-                _padded_size(used, _CELL_SIZE_RATIO),
+                _padded_size((touched_at.nodes < touched_at.nodes[:, -1:]).sum(axis=1) + 1, _NODE_SIZE_RATIO),
+                _padded_size(num_changed_cells, _CELL_SIZE_RATIO),
             ],
             axis=1,
         )
-        found = np.zeros((len(cells), self.model.protocol.num_measurements))
-        known = self.fields, self.inverse
-        for size in np.unique(sizes[used > 0], axis=0):
-            alike = np.flatnonzero((sizes == size).all(axis=1) & (used > 0))
-            nodes = _pad_rows(at.nodes, size[0], "edge")
-            arrays = (_pad_rows(one, size[1], "constant") for one in (cells, change, at.corners))
-            cells_of, change_of, corners = arrays
-            for some in np.split(alike, range(_TOUCHES_PER_CALL, len(alike), _TOUCHES_PER_CALL)):
-                rows = some[np.minimum(np.arange(_TOUCHES_PER_CALL), len(some) - 1)]
-                touches = on_device((cells_of[rows], change_of[rows], nodes[rows], corners[rows]))
-                work = partial(changes_between, self.model.protocol, self.element, known, touches)
-                found[some] = np.asarray(over_cores(work, _TOUCHES_PER_CALL, EXACT_AT_ONCE))[: len(some)]
-        check_found(found, np.asarray(touched.places))
-        return found
+        voltage_changes = np.zeros((len(cells), self.model.protocol.num_measurements))
+        skin_fields_and_inverse = self.fields, self.inverse
+        for size in np.unique(sizes[num_changed_cells > 0], axis=0):
+            touches_of_size = np.flatnonzero((sizes == size).all(axis=1) & (num_changed_cells > 0))
+            padded_nodes = _pad_rows(touched_at.nodes, size[0], "edge")
+            arrays = (_pad_rows(array, size[1], "constant") for array in (cells, relative_changes, touched_at.corners))
+            padded_cells, padded_changes, padded_corners = arrays
+            for chunk in np.split(touches_of_size, range(_TOUCHES_PER_CALL, len(touches_of_size), _TOUCHES_PER_CALL)):
+                rows = chunk[np.minimum(np.arange(_TOUCHES_PER_CALL), len(chunk) - 1)]
+                touches = on_device(
+                    (padded_cells[rows], padded_changes[rows], padded_nodes[rows], padded_corners[rows])
+                )
+                work = partial(changes_between, self.model.protocol, self.element, skin_fields_and_inverse, touches)
+                voltage_changes[chunk] = np.asarray(over_cores(work, _TOUCHES_PER_CALL, EXACT_AT_ONCE))[: len(chunk)]
+        check_finite_changes(voltage_changes, np.asarray(touched.places))
+        return voltage_changes
 
 
 def _padded_size(count, ratio: float):
     """Round a count up to the next of a series of multiples of 16, each about `ratio` times the previous one."""
-    power = np.ceil(np.log(np.maximum(count, 16) / 16) / np.log(ratio) - 1e-9)
-    return (np.ceil(ratio**power - 1e-9) * 16).astype(int)
+    exponent = np.ceil(np.log(np.maximum(count, 16) / 16) / np.log(ratio) - 1e-9)
+    return (np.ceil(ratio**exponent - 1e-9) * 16).astype(int)
 
 
 def _pad_rows(rows: np.ndarray, length: int, mode) -> np.ndarray:
     """Truncate or pad rows (n, k, …) to `length` entries."""
-    missing = max(length - rows.shape[1], 0)
-    return np.pad(rows[:, :length], [(0, 0), (0, missing), *[(0, 0)] * (rows.ndim - 2)], mode)
+    num_missing = max(length - rows.shape[1], 0)
+    return np.pad(rows[:, :length], [(0, 0), (0, num_missing), *[(0, 0)] * (rows.ndim - 2)], mode)

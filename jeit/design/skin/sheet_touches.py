@@ -38,21 +38,23 @@ class SheetTouches(Module):
     def at_thickness(self, thickness) -> "SheetTouches":
         """The same touches on a layer of another `thickness`, metres; the conductivity changes are proportional to
         depth / thickness."""
-        share = self.thickness / thickness
-        touched = eqx.tree_at(lambda one: one.change, self.touched, self.touched.change * share)
-        return SheetTouches(touched, self.slope * share, jnp.asarray(thickness), self.depth)
+        depth_ratio = self.thickness / thickness
+        touched = eqx.tree_at(
+            lambda cells_to_change: cells_to_change.change, self.touched, self.touched.change * depth_ratio
+        )
+        return SheetTouches(touched, self.slope * depth_ratio, jnp.asarray(thickness), self.depth)
 
     def weights(self, conductivity: Float[Array, " m"]) -> tuple[Float[Array, "n m"], Float[Array, "2 n m"]]:
         """Change of the conductivity of every cell by every touch (n, m), siemens, and its derivatives with respect to
         the two coordinates of the position (2, n, m), siemens per metre."""
         cells = self.touched.cells
-        index = np.arange(len(cells))[:, None], cells
+        indices = np.arange(len(cells))[:, None], cells
 
-        def spread(change):
-            return sum_into((len(cells), len(conductivity)), index, change * gather(conductivity, cells))
+        def cell_changes(relative_change):
+            return sum_into((len(cells), len(conductivity)), indices, relative_change * gather(conductivity, cells))
 
-        slopes = [spread(self.slope[..., axis]) for axis in range(2)]
-        return spread(self.touched.change), namespace(conductivity).stack(slopes)
+        position_slopes = [cell_changes(self.slope[..., axis]) for axis in range(2)]
+        return cell_changes(self.touched.change), namespace(conductivity).stack(position_slopes)
 
 
 def sheet_touches(
@@ -67,33 +69,40 @@ def sheet_touches(
         raise ValueError(f"mesh is {mesh.dimension}-D; these touches are of the equivalent sheet, with a 2-D mesh.")
     touched = touched_cells(mesh, indentation, places, thickness=thickness, contrast=contrast)
 
-    def change(place, middle):
+    def relative_change(place, centroid):
         # The square root has no derivative at 0; adding a nanometre does not change the depth noticeably.
-        distance = jnp.sqrt(jnp.sum((place - middle) ** 2) + 1e-18)
+        distance = jnp.sqrt(jnp.sum((place - centroid) ** 2) + 1e-18)
         return (contrast - 1) * indentation.depth_at(distance) / thickness
 
-    middles, origin = centroids(mesh)[touched.cells], touched.places
+    cell_centroids, origins = centroids(mesh)[touched.cells], touched.places
     if mesh.is_surface:
-        middles, origin = _flatten_centroids(mesh, touched, indentation.reach), jnp.zeros_like(origin[:, :2])
-    slope = jax.jit(jax.vmap(jax.vmap(jax.grad(change), (None, 0))))(origin, middles)
-    slope = jnp.where(touched.change[..., None] != 0, slope, 0.0)
-    return SheetTouches(touched, slope, jnp.asarray(thickness, float), float(indentation.depth_at(host.zeros(()))))
+        cell_centroids, origins = _flatten_centroids(mesh, touched, indentation.reach), jnp.zeros_like(origins[:, :2])
+    slopes = jax.jit(jax.vmap(jax.vmap(jax.grad(relative_change), (None, 0))))(origins, cell_centroids)
+    slopes = jnp.where(touched.change[..., None] != 0, slopes, 0.0)
+    return SheetTouches(touched, slopes, jnp.asarray(thickness, float), float(indentation.depth_at(host.zeros(()))))
 
 
 def _flatten_centroids(mesh: Mesh, touched: TouchedCells, reach: float) -> Float[np.ndarray, "n c 2"]:
     """Map the centroids of touched cells to the tangent plane at the position of their touch, keeping the distance
     along the surface: coordinates (n, c, 2) relative to that position, metres."""
     surface, places, cells = Triangles.of(mesh), np.asarray(touched.places), np.asarray(touched.cells)
-    middles = np.asarray(centroids(mesh))
-    normal = surface.normals_at(surface.nearest(places))
-    aside = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    first = np.cross(aside, normal)
-    first = first / np.linalg.norm(first, axis=1, keepdims=True)
-    frame = np.stack([first, np.cross(normal, first)], axis=1)
-    flat = np.einsum("nid,ncd->nci", frame, middles[cells] - places[:, None])
-    length, known = np.zeros(cells.shape), np.zeros(mesh.num_cells)
-    for row, (index, own) in enumerate(Geodesics.create(surface).near(places, surface.nearest(middles), reach)):
-        known[index] = own
-        length[row] = known[cells[row]]
-    straight = np.linalg.norm(flat, axis=-1)
-    return flat * np.where(straight > 0, length / np.where(straight > 0, straight, 1.0), 1.0)[..., None]
+    cell_centroids = np.asarray(centroids(mesh))
+    normals = surface.normals_at(surface.nearest(places))
+    reference_axes = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    first_tangents = np.cross(reference_axes, normals)
+    first_tangents = first_tangents / np.linalg.norm(first_tangents, axis=1, keepdims=True)
+    tangent_frames = np.stack([first_tangents, np.cross(normals, first_tangents)], axis=1)
+    flat_centroids = np.einsum("nid,ncd->nci", tangent_frames, cell_centroids[cells] - places[:, None])
+    lengths, cell_lengths = np.zeros(cells.shape), np.zeros(mesh.num_cells)
+    for row, (cell_indices, touch_lengths) in enumerate(
+        Geodesics.create(surface).near(places, surface.nearest(cell_centroids), reach)
+    ):
+        cell_lengths[cell_indices] = touch_lengths
+        lengths[row] = cell_lengths[cells[row]]
+    straight_distances = np.linalg.norm(flat_centroids, axis=-1)
+    return (
+        flat_centroids
+        * np.where(straight_distances > 0, lengths / np.where(straight_distances > 0, straight_distances, 1.0), 1.0)[
+            ..., None
+        ]
+    )

@@ -86,12 +86,12 @@ class Skin(Module):
     ):
         """Raises `ValueError` for a model with electrodes of another class or number, and for an invalid thickness or
         conductivity."""
-        sheet = SurfaceDiscs if isinstance(layout, SurfaceLayout) else SheetDiscs
-        wanted = FaceDiscs if num_layers else sheet
-        if not isinstance(model.electrodes, wanted):
+        sheet_class = SurfaceDiscs if isinstance(layout, SurfaceLayout) else SheetDiscs
+        electrode_class = FaceDiscs if num_layers else sheet_class
+        if not isinstance(model.electrodes, electrode_class):
             raise ValueError(
                 f"model has {type(model.electrodes).__name__}; a {'layer' if num_layers else 'sheet'} has "
-                f"{wanted.__name__}, such as those of Skin.create."
+                f"{electrode_class.__name__}, such as those of Skin.create."
             )
         if model.electrodes.num_electrodes != layout.num_electrodes:
             raise ValueError(
@@ -101,8 +101,8 @@ class Skin(Module):
         check_metres("thickness", thickness)
         self.layout, self.model, self.thickness = layout, model, thickness
         self.num_layers, self.cell_size = num_layers, cell_size
-        checked = check_conductivity(model.mesh, conductivity)
-        self.conductivity = jnp.asarray(conductivity, checked.dtype)
+        checked_conductivity = check_conductivity(model.mesh, conductivity)
+        self.conductivity = jnp.asarray(conductivity, checked_conductivity.dtype)
 
     def __repr__(self) -> str:
         return brief(
@@ -158,11 +158,11 @@ class Skin(Module):
         if cell_size is not None:
             check_cell_size("cell_size", cell_size, layout, float(outline.area), num_layers)
         electrodes = skin_electrodes(layout, num_layers, contact_impedance)
-        plane = outline.mesh(num_points=num_points, cell_size=cell_size)
-        mesh = layer(plane, thickness, num_layers) if num_layers else plane
+        plane_mesh = outline.mesh(num_points=num_points, cell_size=cell_size)
+        mesh = layer(plane_mesh, thickness, num_layers) if num_layers else plane_mesh
         _check_electrodes(layout, electrodes, mesh, cell_size, num_points)
         model = ForwardModel(mesh, electrodes, skin_protocol(layout) if protocol is None else protocol)
-        layout = eqx.tree_at(lambda one: one.outline, layout, outline)
+        layout = eqx.tree_at(lambda layout_to_change: layout_to_change.outline, layout, outline)
         options = {"num_layers": num_layers, "cell_size": cell_size}
         return cls(layout, model, thickness=thickness, conductivity=conductivity, **options)
 
@@ -202,7 +202,11 @@ class Skin(Module):
             outline = layout.known_outline
             check_cell_size("cell_size", self.cell_size, layout, float(outline.area), self.num_layers)
             _check_electrodes(layout, electrodes, mesh, self.cell_size, None)
-        return eqx.tree_at(lambda one: (one.layout, one.model), self, (layout, self.model.with_electrodes(electrodes)))
+        return eqx.tree_at(
+            lambda skin_to_change: (skin_to_change.layout, skin_to_change.model),
+            self,
+            (layout, self.model.with_electrodes(electrodes)),
+        )
 
     def touched_cells(
         self, places: ArrayLike, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
@@ -218,19 +222,20 @@ class Skin(Module):
             return touched_cells(
                 self.model.mesh, indentation, places, thickness=float(self.thickness), contrast=contrast
             )
-        deepest = float(indentation.depth_at(host.zeros(())))
-        most = _MAX_LAYER_RATIO * self.num_layers * deepest
-        said = (
-            f"thickness is {1e3 * self.thickness:g} mm; give more than the {1e3 * deepest:g} mm that a touch is deep, "
-            f"and no more than {1e3 * most:g} mm, where {self.num_layers} layers of cells become too coarse for it"
+        max_depth = float(indentation.depth_at(host.zeros(())))
+        max_thickness = _MAX_LAYER_RATIO * self.num_layers * max_depth
+        thickness_text = (
+            f"thickness is {1e3 * self.thickness:g} mm; give more than the {1e3 * max_depth:g} mm that a touch is "
+            f"deep, and no more than {1e3 * max_thickness:g} mm, where {self.num_layers} layers of cells become too "
+            "coarse for it"
         )
-        if deepest >= self.thickness:
-            raise ValueError(f"{said}.")
+        if max_depth >= self.thickness:
+            raise ValueError(f"{thickness_text}.")
         try:
             return touched_cells(self.model.mesh, indentation, places, contrast=contrast, face=self.touched_face)
         except ValueError as error:
-            if self.thickness > most:
-                raise ValueError(f"{said}: {error}") from None
+            if self.thickness > max_thickness:
+                raise ValueError(f"{thickness_text}: {error}") from None
             raise
 
     def sheet_touches(
@@ -251,30 +256,40 @@ def skins_of(layouts: Sequence[Layout | SurfaceLayout], protocols: Sequence[Prot
     """Create skins from layouts and their protocols, with `options` of `Skin.create`, and raise errors as it does.
     Consecutive layouts with the same outline and number of electrodes share one mesh and the symbolic factorisation of
     its system matrix."""
-    made: list[Skin] = []
+    skins: list[Skin] = []
     for layout, protocol in zip(layouts, protocols, strict=True):
-        if made and _can_share_mesh(made[-1], layout):
-            moved = made[-1].with_layout(layout, options.get("contact_impedance"))
-            made.append(eqx.tree_at(lambda one: one.model, moved, moved.model.with_protocol(protocol)))
+        if skins and _can_share_mesh(skins[-1], layout):
+            skin_with_layout = skins[-1].with_layout(layout, options.get("contact_impedance"))
+            skins.append(
+                eqx.tree_at(
+                    lambda skin_to_change: skin_to_change.model,
+                    skin_with_layout,
+                    skin_with_layout.model.with_protocol(protocol),
+                )
+            )
         else:
-            made.append(Skin.create(layout, protocol=protocol, **options))
-    return made
+            skins.append(Skin.create(layout, protocol=protocol, **options))
+    return skins
 
 
 def _can_share_mesh(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
     """Whether the mesh of a skin can be used for another layout."""
     if isinstance(layout, SurfaceLayout):
-        own = skin.layout
-        if not isinstance(own, SurfaceLayout) or own.outward != layout.outward or not _have_same_number(skin, layout):
+        skin_layout = skin.layout
+        if (
+            not isinstance(skin_layout, SurfaceLayout)
+            or skin_layout.outward != layout.outward
+            or not _have_equal_num_electrodes(skin, layout)
+        ):
             return False
-        return bool(eqx.tree_equal(own.surface, layout.surface))
+        return bool(eqx.tree_equal(skin_layout.surface, layout.surface))
     if isinstance(skin.layout, SurfaceLayout):
         return False
-    same = eqx.tree_equal(skin.outline, plain_outline(layout.known_outline))
-    return bool(same) and _have_same_number(skin, layout)
+    have_same_outline = eqx.tree_equal(skin.outline, plain_outline(layout.known_outline))
+    return bool(have_same_outline) and _have_equal_num_electrodes(skin, layout)
 
 
-def _have_same_number(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
+def _have_equal_num_electrodes(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
     return layout.num_electrodes == skin.layout.num_electrodes
 
 
@@ -341,15 +356,15 @@ def _check_electrodes(layout: Layout, electrodes, mesh: Mesh, cell_size: float |
     try:
         electrodes.check(mesh)
     except ValueError:
-        across = f"{1e3 * smallest_diameter(layout):.3g} mm across"
+        diameter_text = f"{1e3 * smallest_diameter(layout):.3g} mm across"
         if num_points is not None:
-            said = f"num_points {num_points} makes cells too coarse for electrodes {across}; give more."
+            message = f"num_points {num_points} makes cells too coarse for electrodes {diameter_text}; give more."
         else:
-            said = (
-                f"cell_size is {1e3 * (cell_size or 0):g} mm, too large: electrodes of '{layout.name}' are {across}; "
-                "give less."
+            message = (
+                f"cell_size is {1e3 * (cell_size or 0):g} mm, too large: electrodes of '{layout.name}' are "
+                f"{diameter_text}; give less."
             )
-        raise ValueError(said) from None
+        raise ValueError(message) from None
 
 
 def check_cell_size(
@@ -362,20 +377,21 @@ def check_cell_size(
     cells, 0 for a sheet.
     """
     check_metres(name, cell_size)
-    smallest = smallest_diameter(layout)
-    most = _MAX_CELL_RATIO * smallest
-    if cell_size > (1 + 1e-9) * most:
-        end = f"; {IN_MILLIMETRES}" if cell_size**2 > area else "."
+    min_diameter = smallest_diameter(layout)
+    max_size = _MAX_CELL_RATIO * min_diameter
+    if cell_size > (1 + 1e-9) * max_size:
+        unit_hint = f"; {IN_MILLIMETRES}" if cell_size**2 > area else "."
         raise ValueError(
-            f"{name} is {1e3 * cell_size:g} mm; give no more than {1e3 * most:.3g} mm, as electrodes of "
-            f"'{layout.name}' are {1e3 * smallest:.3g} mm across{end}"
+            f"{name} is {1e3 * cell_size:g} mm; give no more than {1e3 * max_size:.3g} mm, as electrodes of "
+            f"'{layout.name}' are {1e3 * min_diameter:.3g} mm across{unit_hint}"
         )
-    plane = _NODES_PER_CELL_AREA * area * (num_layers + 1)
-    number = plane / cell_size**2
-    if number > MOST_POINTS:
-        least = 1.05e3 * math.sqrt(plane / MOST_POINTS)
+    scaled_area = _NODES_PER_CELL_AREA * area * (num_layers + 1)
+    num_nodes = scaled_area / cell_size**2
+    if num_nodes > MOST_POINTS:
+        min_size_mm = 1.05e3 * math.sqrt(scaled_area / MOST_POINTS)
         raise ValueError(
-            f"{name} is {1e3 * cell_size:g} mm, which makes about {number:.2g} nodes; give {least:.2g} mm or more."
+            f"{name} is {1e3 * cell_size:g} mm, which makes about {num_nodes:.2g} nodes; give {min_size_mm:.2g} mm or "
+            "more."
         )
 
 

@@ -12,7 +12,7 @@ from jeit.design import defaults
 from jeit.design.skin.described_surface import described_surface
 from jeit.design.skin.protocol import ProtocolName, skin_protocol
 from jeit.design.skin.skin import Skin
-from jeit.design.skin.surface_tables import SURFACE, SurfaceTable, check_of_curved
+from jeit.design.skin.surface_tables import SURFACE, SurfaceTable, check_keys_of_surface
 from jeit.design.study.layouts import curved_layout, study_layout
 from jeit.files import MOST_ELECTRODES, check_memory, read_toml
 from jeit.files.schema import Number, Table, Word
@@ -77,8 +77,8 @@ class SkinTable(Table):
     mesh: CellsTable = CellsTable()
 
     @model_validator(mode="after")
-    def _of_curved(self) -> "SkinTable":
-        check_of_curved(self.surface, self.skin, self.mesh)
+    def _check_keys_of_surface(self) -> "SkinTable":
+        check_keys_of_surface(self.surface, self.skin, self.mesh)
         return self
 
 

@@ -91,11 +91,13 @@ SURFACE = OneOf(
 )
 
 
-def check_of_curved(surface: SurfaceTable | None, skin: Table, mesh: Table) -> None:
+def check_keys_of_surface(surface: SurfaceTable | None, skin: Table, mesh: Table) -> None:
     """Raise an error for keys of the tables `skin` and `mesh` that have no effect on a skin with this surface."""
     if surface is None:
         return
-    if sides := {"width_mm", "height_mm"} & skin.model_fields_set:
-        raise fault("has no effect: the table surface says how large the skin is; leave it out.", f"skin.{min(sides)}")
+    if size_keys := {"width_mm", "height_mm"} & skin.model_fields_set:
+        raise fault(
+            "has no effect: the table surface says how large the skin is; leave it out.", f"skin.{min(size_keys)}"
+        )
     if isinstance(surface, ScanTable) and surface.has_cells and "cell_mm" in mesh.model_fields_set:
         raise fault("has no effect: cells are the triangles of surface.file; leave it out.", "mesh.cell_mm")

@@ -56,20 +56,31 @@ class SurfaceGrid(TouchGrid):
         """Spread `number` positions evenly over a surface, at least `margin` metres from its edge. Raises `ValueError`
         if the margin leaves no room."""
         places = spread(surface, number, margin=margin)
-        kept = surface.node_areas * (surface.distance_to_border(surface.points) >= margin)
-        each = float(kept.sum()) / number
-        flat = np.zeros(number, int), np.arange(number)
-        return cls(places, *flat, (1, number), (each**0.5, each**0.5), np.full(number, each))
+        allowed_areas = surface.node_areas * (surface.distance_to_border(surface.points) >= margin)
+        area_per_place = float(allowed_areas.sum()) / number
+        rows_and_columns = np.zeros(number, int), np.arange(number)
+        return cls(
+            places,
+            *rows_and_columns,
+            (1, number),
+            (area_per_place**0.5, area_per_place**0.5),
+            np.full(number, area_per_place),
+        )
 
     def on(self, surface: Triangles, face: Triangles) -> "SurfaceGrid":
         """Map the positions from `surface` to another surface `face` with the same triangulation: the nearest point of
         `surface` is mapped to the point with the same coordinates within the same triangle. Areas are scaled
         accordingly."""
-        at = surface.nearest(self.places)
-        areas = self.areas * at.of_nodes(surface, face.node_areas / surface.node_areas)
-        each = float(areas.mean())
+        nearest_points = surface.nearest(self.places)
+        areas = self.areas * nearest_points.of_nodes(surface, face.node_areas / surface.node_areas)
+        mean_area = float(areas.mean())
         return SurfaceGrid(
-            at.of_nodes(surface, face.points), self.rows, self.columns, self.shape, (each**0.5, each**0.5), areas
+            nearest_points.of_nodes(surface, face.points),
+            self.rows,
+            self.columns,
+            self.shape,
+            (mean_area**0.5, mean_area**0.5),
+            areas,
         )
 
     def raster(self, values) -> Float[np.ndarray, "rows columns"]:
@@ -111,9 +122,9 @@ def touch_grid(outline: Domain | Triangles, columns: int = PLACES, rows: int = P
     width, height = (high_x - low_x) / columns, (high_y - low_y) / rows
     x, y = low_x + width * (np.arange(columns) + 0.5), low_y + height * (np.arange(rows) + 0.5)
     places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    inside = np.asarray(outline.contains(places))
-    row, column = np.divmod(np.flatnonzero(inside), columns)
-    return TouchGrid(places[inside], row, column, (rows, columns), (float(width), float(height)))
+    is_inside = np.asarray(outline.contains(places))
+    row_indices, column_indices = np.divmod(np.flatnonzero(is_inside), columns)
+    return TouchGrid(places[is_inside], row_indices, column_indices, (rows, columns), (float(width), float(height)))
 
 
 def touches_away_from_the_edge(
@@ -140,11 +151,13 @@ def touches_away_from_the_edge(
     if isinstance(outline, Triangles):
         return SurfaceGrid.spread(outline, columns * rows, margin)
     grid = touch_grid(outline, columns, rows)
-    offsets = margin * np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 2 * np.pi, 16, endpoint=False)])
-    kept = np.all([np.asarray(outline.contains(grid.places + offset)) for offset in offsets], axis=0)
-    if not kept.any():
+    offsets = margin * np.array(
+        [[np.cos(angle), np.sin(angle)] for angle in np.linspace(0, 2 * np.pi, 16, endpoint=False)]
+    )
+    is_allowed = np.all([np.asarray(outline.contains(grid.places + offset)) for offset in offsets], axis=0)
+    if not is_allowed.any():
         raise ValueError(f"margin is {1e3 * margin:g} mm: no place of the skin is so far from its edge; give less.")
-    return TouchGrid(grid.places[kept], grid.rows[kept], grid.columns[kept], grid.shape, grid.pitch)
+    return TouchGrid(grid.places[is_allowed], grid.rows[is_allowed], grid.columns[is_allowed], grid.shape, grid.pitch)
 
 
 def check_grid(grid: TouchGrid) -> None:
@@ -155,14 +168,16 @@ def check_grid(grid: TouchGrid) -> None:
 def check_places(places, dimension: int = 2) -> Float[np.ndarray, "n d"]:
     """Convert positions (n, `dimension`), metres, to an array. Raises `ValueError` for anything else, such as a whole
     `TouchGrid`, and for values that are not finite."""
-    wanted = f"places must be (n, {dimension}), one or more, in metres, such as touch_grid(skin.outline).places"
+    requirement = f"places must be (n, {dimension}), one or more, in metres, such as touch_grid(skin.outline).places"
     try:
-        found = np.asarray(places, float)
+        positions = np.asarray(places, float)
     except (TypeError, ValueError):
-        raise ValueError(f"{wanted}; it is {describe(places)}.") from None
-    if found.ndim != 2 or found.shape[1] != dimension or not len(found):
-        raise ValueError(f"{wanted}; they have shape {found.shape}.")
-    lost = np.flatnonzero(~np.isfinite(found).all(axis=1))
-    if lost.size:
-        raise ValueError(f"places: {lost.size} of {len(found)} are not finite, the first is number {lost[0]}.")
-    return found
+        raise ValueError(f"{requirement}; it is {describe(places)}.") from None
+    if positions.ndim != 2 or positions.shape[1] != dimension or not len(positions):
+        raise ValueError(f"{requirement}; they have shape {positions.shape}.")
+    invalid_rows = np.flatnonzero(~np.isfinite(positions).all(axis=1))
+    if invalid_rows.size:
+        raise ValueError(
+            f"places: {invalid_rows.size} of {len(positions)} are not finite, the first is number {invalid_rows[0]}."
+        )
+    return positions

@@ -69,52 +69,55 @@ def touched_cells(
     places = check_places(places, 3 if is_curved(mesh) else 2)
     check_kind("indentation", indentation, AbstractIndentation, "an indentation, such as Bell() or Hemisphere()")
     _check_values(contrast, edge)
-    layer = mesh.dimension == 3
-    deepest = float(indentation.depth_at(host.zeros(())))
-    if layer and thickness is not None:
+    is_layer = mesh.dimension == 3
+    max_depth = float(indentation.depth_at(host.zeros(())))
+    if is_layer and thickness is not None:
         raise ValueError("thickness is for sheets; that of a layer is in its mesh.")
-    if not layer and (thickness is None or not 0 < thickness < np.inf):
+    if not is_layer and (thickness is None or not 0 < thickness < np.inf):
         raise ValueError(f"thickness must be given for a sheet, in metres, positive; it is {thickness!r}.")
-    reached = reached_cells(mesh, places, indentation.reach, deepest + edge if layer else np.inf, face)
-    thickness = reached.thickness if layer else thickness
+    reached = reached_cells(mesh, places, indentation.reach, max_depth + edge if is_layer else np.inf, face)
+    thickness = reached.thickness if is_layer else thickness
     assert thickness is not None
-    if deepest >= thickness:
+    if max_depth >= thickness:
         raise ValueError(
-            f"the indentation is {1e3 * deepest:.3g} mm deep, and the skin {1e3 * thickness:.3g} mm thick; press less."
+            f"the indentation is {1e3 * max_depth:.3g} mm deep, and the skin {1e3 * thickness:.3g} mm thick; press "
+            "less."
         )
-    cells, there = pad_rows(reached.near)
-    distance = np.full(cells.shape, np.inf)
-    distance[there] = np.concatenate(reached.distance)
-    depth, below = np.asarray(indentation.depth_at(as_array(distance))), reached.below
-    if not layer:
-        share = depth / thickness
+    cells, is_entry = pad_rows(reached.cells)
+    distances = np.full(cells.shape, np.inf)
+    distances[is_entry] = np.concatenate(reached.distances)
+    depths, centroid_depths = np.asarray(indentation.depth_at(as_array(distances))), reached.centroid_depths
+    if not is_layer:
+        fractions = depths / thickness
     elif edge:
-        share = np.asarray(smooth_step(jnp.asarray((depth - below[cells]) / edge)))
+        fractions = np.asarray(smooth_step(jnp.asarray((depths - centroid_depths[cells]) / edge)))
     else:
-        share = (depth > below[cells]).astype(float)
-    changed = there & (share > 0)
-    empty = np.flatnonzero(~changed.any(axis=1))
-    if empty.size:
+        fractions = (depths > centroid_depths[cells]).astype(float)
+    is_changed = is_entry & (fractions > 0)
+    empty_touches = np.flatnonzero(~is_changed.any(axis=1))
+    if empty_touches.size:
         raise ValueError(
-            f"{empty.size} of {len(places)} touches change no cell, the first at {millimetre_text(places[empty[0]])} "
-            "mm: they lie "
+            f"{empty_touches.size} of {len(places)} touches change no cell, the first at "
+            f"{millimetre_text(places[empty_touches[0]])} mm: they lie "
             "off the skin (places are in metres), or its cells are too coarse for so shallow an indentation; refine "
             "the mesh, in a layer upwards."
         )
-    kept, there = pad_rows([one[used] for one, used in zip(cells, changed, strict=True)])
-    change = np.zeros(kept.shape)
-    change[there] = (contrast - 1) * share[changed]
-    return TouchedCells(as_array(places), as_array(kept), as_array(change), mesh.num_cells)
+    changed_cells, is_entry = pad_rows(
+        [touch_cells[is_used] for touch_cells, is_used in zip(cells, is_changed, strict=True)]
+    )
+    changes = np.zeros(changed_cells.shape)
+    changes[is_entry] = (contrast - 1) * fractions[is_changed]
+    return TouchedCells(as_array(places), as_array(changed_cells), as_array(changes), mesh.num_cells)
 
 
 def pad_rows(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Join rows of integers of different lengths to one array, padded with zeros. Returns the array and a mask of the
     entries that are not padding."""
-    length = np.array([len(row) for row in rows])
-    there = np.arange(max(length.max(), 1)) < length[:, None]
-    pad_rows = np.zeros(there.shape, np.int32)
-    pad_rows[there] = np.concatenate(rows)
-    return pad_rows, there
+    lengths = np.array([len(row) for row in rows])
+    is_entry = np.arange(max(lengths.max(), 1)) < lengths[:, None]
+    padded = np.zeros(is_entry.shape, np.int32)
+    padded[is_entry] = np.concatenate(rows)
+    return padded, is_entry
 
 
 def _check_values(contrast: float, edge: float) -> None:
@@ -151,38 +154,38 @@ class TouchedNodes(Module):
 def touched_nodes(model: ForwardModel, touches: TouchedCells, strips: Strips | None = None) -> TouchedNodes:
     """Find the nodes of the cells that touches change. `strips`: order of a set of nodes that contains these; by
     default it is created for these nodes only."""
-    mesh, cells, real = model.mesh, np.asarray(touches.cells), np.asarray(touches.change) != 0
-    touched = np.zeros(mesh.num_points, bool)
-    touched[np.asarray(mesh.cells)[cells[real]]] = True
+    mesh, cells, is_changed = model.mesh, np.asarray(touches.cells), np.asarray(touches.change) != 0
+    is_touched = np.zeros(mesh.num_points, bool)
+    is_touched[np.asarray(mesh.cells)[cells[is_changed]]] = True
     if strips is None:
-        strips = Strips.create(model.system.pattern, np.asarray(mesh.points), touched)
-    nowhere = strips.num_strips * strips.selected_per_strip  # one entry for all untouched nodes
-    place = np.where(touched, strips.place, nowhere).astype(np.int32)[np.asarray(mesh.cells)]
-    corners, found = np.zeros((*cells.shape, mesh.cells.shape[1]), np.int32), []
+        strips = Strips.create(model.system.pattern, np.asarray(mesh.points), is_touched)
+    untouched_index = strips.num_strips * strips.selected_per_strip  # one entry for all untouched nodes
+    node_indices = np.where(is_touched, strips.place, untouched_index).astype(np.int32)[np.asarray(mesh.cells)]
+    corners, chunk_results = np.zeros((*cells.shape, mesh.cells.shape[1]), np.int32), []
     for start in range(0, len(cells), _TOUCHES_AT_ONCE):
-        some = slice(start, start + _TOUCHES_AT_ONCE)
-        places = np.where(real[some, :, None], place[cells[some]], nowhere)
-        corners[some], (touch, number, node) = _number_nodes(places, nowhere)
-        found.append((start + touch, number, node))
-    corners[~real] = 0
-    touch, number, node = (np.concatenate(part) for part in zip(*found, strict=True))
+        chunk = slice(start, start + _TOUCHES_AT_ONCE)
+        chunk_nodes = np.where(is_changed[chunk, :, None], node_indices[cells[chunk]], untouched_index)
+        corners[chunk], (touch, number, node) = _number_nodes(chunk_nodes, untouched_index)
+        chunk_results.append((start + touch, number, node))
+    corners[~is_changed] = 0
+    touch, number, node = (np.concatenate(arrays) for arrays in zip(*chunk_results, strict=True))
     nodes = np.zeros((len(cells), -(-(number.max(initial=0) + 1) // _PADDING_MULTIPLE) * _PADDING_MULTIPLE), np.int32)
     nodes[touch, number] = node
-    final = np.minimum(np.arange(nodes.shape[1]), np.bincount(touch, minlength=len(cells))[:, None] - 1)
-    return TouchedNodes(strips, np.take_along_axis(nodes, final, axis=1), corners)
+    entry_indices = np.minimum(np.arange(nodes.shape[1]), np.bincount(touch, minlength=len(cells))[:, None] - 1)
+    return TouchedNodes(strips, np.take_along_axis(nodes, entry_indices, axis=1), corners)
 
 
-def _number_nodes(places: Int[np.ndarray, "b c q"], no_node: int):
-    """Number the distinct places of each of b touches from 0, without the place `no_node`. Returns the number of every
-    entry of `places` (b, c, q), and touch, number and place of every distinct place."""
-    first = (no_node + 1) * np.arange(len(places), dtype=np.int32)
-    keys = places + first[:, None, None]
-    reached = np.zeros(len(places) * (no_node + 1), bool)
-    reached[keys] = True
-    reached[first + no_node] = False
-    distinct = np.flatnonzero(reached)
-    touch, place = np.divmod(distinct, no_node + 1)
-    number = np.arange(len(distinct)) - np.searchsorted(distinct, first)[touch]
-    numbers = np.zeros(len(reached), np.int32)
-    numbers[distinct] = number
-    return numbers[keys], (touch, number, place)
+def _number_nodes(nodes: Int[np.ndarray, "b c q"], no_node: int):
+    """Number the distinct nodes of each of b touches from 0, except for the index `no_node`, which marks padding.
+    Returns the number of every entry of `nodes` (b, c, q), and the touch, number and index of every distinct node."""
+    first_keys = (no_node + 1) * np.arange(len(nodes), dtype=np.int32)
+    keys = nodes + first_keys[:, None, None]
+    is_used = np.zeros(len(nodes) * (no_node + 1), bool)
+    is_used[keys] = True
+    is_used[first_keys + no_node] = False
+    distinct_keys = np.flatnonzero(is_used)
+    touch, node = np.divmod(distinct_keys, no_node + 1)
+    local_number = np.arange(len(distinct_keys)) - np.searchsorted(distinct_keys, first_keys)[touch]
+    numbers_of_keys = np.zeros(len(is_used), np.int32)
+    numbers_of_keys[distinct_keys] = local_number
+    return numbers_of_keys[keys], (touch, local_number, node)

@@ -81,40 +81,39 @@ def touch_changes(
 @jax.jit
 def _linear_changes(model: ForwardModel, conductivity, touched: TouchedCells):
     jacobian = model.jacobian(conductivity).T  # (m, M)
-    changed = touched.change * conductivity[touched.cells]
+    conductivity_changes = touched.change * conductivity[touched.cells]
 
-    def some(index):
-        return jnp.einsum("bc,bcm->bm", changed[index], jacobian[touched.cells[index]])
+    def chunk_changes(indices):
+        return jnp.einsum("bc,bcm->bm", conductivity_changes[indices], jacobian[touched.cells[indices]])
 
-    number = len(changed)
-    index = jnp.minimum(jnp.arange(-(-number // _LINEAR_AT_ONCE) * _LINEAR_AT_ONCE), number - 1).reshape(
+    num_touches = len(conductivity_changes)
+    indices = jnp.minimum(jnp.arange(-(-num_touches // _LINEAR_AT_ONCE) * _LINEAR_AT_ONCE), num_touches - 1).reshape(
         -1, _LINEAR_AT_ONCE
     )
-    return _join_chunks(jax.lax.map(some, index))[:number]
+    return _join_chunks(jax.lax.map(chunk_changes, indices))[:num_touches]
 
 
 def _exact_changes(model: ForwardModel, conductivity, touched: TouchedCells):
     touched_at = touched_nodes(model, touched)
     max_distance = -(-touched_at.strips.max_strip_distance(touched_at.nodes) // _STRIP_MULTIPLE) * _STRIP_MULTIPLE
-    solved = evaluate(model, solved_system_of, conductivity)
-    fields_and_inverse_of_skin = fields_and_inverse(solved, touched_at.strips, max_distance)
+    solved_system = evaluate(model, solved_system_of, conductivity)
+    fields_and_inverse_of_skin = fields_and_inverse(solved_system, touched_at.strips, max_distance)
     touches = on_device((touched.cells, touched.change, touched_at.nodes, touched_at.corners))
-    number, element = len(touched.cells), cell_stiffness(model, conductivity)
-    work = partial(changes_between, model.protocol, element, fields_and_inverse_of_skin, touches)
-    found = over_cores(work, number, EXACT_AT_ONCE)[:number]
-    check_found(found, np.asarray(touched.places))
-    return found
+    num_touches, element_matrices = len(touched.cells), cell_stiffness(model, conductivity)
+    compute_changes = partial(changes_between, model.protocol, element_matrices, fields_and_inverse_of_skin, touches)
+    changes = over_cores(compute_changes, num_touches, EXACT_AT_ONCE)[:num_touches]
+    check_finite_changes(changes, np.asarray(touched.places))
+    return changes
 
 
-def check_found(changes, places: Float[np.ndarray, "n d"]) -> None:
+def check_finite_changes(changes, places: Float[np.ndarray, "n d"]) -> None:
     """Raise `RuntimeError` if the changes due to any of the touches at `places`, metres, are not finite."""
-    lost = np.flatnonzero(~np.isfinite(np.asarray(changes)).all(axis=1))
-    if lost.size:
+    failed_touches = np.flatnonzero(~np.isfinite(np.asarray(changes)).all(axis=1))
+    if failed_touches.size:
         raise RuntimeError(
-            f"the changes by {lost.size} of {len(places)} touches were not found in {_MAX_STEPS} steps, the first at "
-            f"{millimetre_text(places[lost[0]])} mm; does it cut an electrode off, or are conductivities many orders "
-            "of "
-            "magnitude apart?"
+            f"the changes by {failed_touches.size} of {len(places)} touches were not found in {_MAX_STEPS} steps, the "
+            f"first at {millimetre_text(places[failed_touches[0]])} mm; does it cut an electrode off, or are "
+            "conductivities many orders of magnitude apart?"
         )
 
 
@@ -131,16 +130,18 @@ def changes_between(protocol: Protocol, element_matrices, fields_and_inverse, to
     `element_matrices`: from `cell_stiffness`; `fields_and_inverse`: from `fields_and_inverse`; `touches`: cells and
     changes of all touches, from `TouchedCells`, and their nodes and corners, from `touched_nodes`."""
     fields, inverse = fields_and_inverse
-    select = jax.vmap(lambda change: select_channels(protocol, change))
+    voltages_of = jax.vmap(lambda relative_change: select_channels(protocol, relative_change))
 
-    def some(index):
-        cells, change, nodes, corners = (array[index] for array in touches)
-        blocks = element_matrices[cells] * change[..., None, None]
-        return select(
-            _impedance_changes(blocks, corners, inverse.blocks(nodes), fields[nodes], _weakening_factor(change))
+    def chunk_changes(index):
+        cells, relative_change, nodes, corners = (array[index] for array in touches)
+        blocks = element_matrices[cells] * relative_change[..., None, None]
+        return voltages_of(
+            _impedance_changes(
+                blocks, corners, inverse.blocks(nodes), fields[nodes], _weakening_factor(relative_change)
+            )
         )
 
-    return _join_chunks(jax.lax.map(some, index))
+    return _join_chunks(jax.lax.map(chunk_changes, index))
 
 
 def _join_chunks(chunks: Float[Array, "c s *m"]) -> Float[Array, "cs *m"]:
@@ -149,9 +150,13 @@ def _join_chunks(chunks: Float[Array, "c s *m"]) -> Float[Array, "cs *m"]:
 
 def _weakening_factor(change: Float[Array, "b c"]) -> Float[Array, " b"]:
     """Largest factor (b,) by which each touch lowers the energy of a field."""
-    remaining = 1 + change
+    remaining_conductivity = 1 + change
     return jnp.clip(
-        jnp.where(remaining > 0, 1 / jnp.where(remaining > 0, remaining, 1.0), _INSULATING_FACTOR).max(axis=1),
+        jnp.where(
+            remaining_conductivity > 0,
+            1 / jnp.where(remaining_conductivity > 0, remaining_conductivity, 1.0),
+            _INSULATING_FACTOR,
+        ).max(axis=1),
         1,
         _MAX_FACTOR,
     )
@@ -168,45 +173,56 @@ def _impedance_changes(blocks, corners, inverse, fields, weakening_factor):
     is the residual of Y.
     """
     touch = jnp.arange(len(fields))[:, None, None]
-    size = fields.shape[1]
-    touch_matrix = jnp.zeros((len(fields), size, size))
+    num_nodes = fields.shape[1]
+    touch_matrix = jnp.zeros((len(fields), num_nodes, num_nodes))
     touch_matrix = touch_matrix.at[touch[..., None], corners[..., :, None], corners[..., None, :]].add(blocks)
     right_hand_side = touch_matrix @ fields
 
     def step(state):
-        solution, residual, scaled_residual, direction, scaled, energy, ratio, number = state
+        solution, residual, scaled_residual, direction, scaled_direction, energy, ratio, num_steps = state
         direction = scaled_residual + ratio * direction
         # G⁻¹ times the direction, without a solve: the same combination of the residuals.
-        scaled = residual + ratio * scaled
-        product = scaled + touch_matrix @ direction
-        curvature = jnp.sum(direction * product, axis=1, keepdims=True)
+        scaled_direction = residual + ratio * scaled_direction
+        system_product = scaled_direction + touch_matrix @ direction
+        curvature = jnp.sum(direction * system_product, axis=1, keepdims=True)
         # Converged touches are not changed any more, since their residual and curvature are rounding errors.
-        going = (energy > enough) & (curvature > 0)
-        length = jnp.where(going, energy / jnp.where(going, curvature, 1.0), 0.0)
-        solution, residual = solution + length * direction, residual - length * product
+        is_active = (energy > max_energy) & (curvature > 0)
+        step_length = jnp.where(is_active, energy / jnp.where(is_active, curvature, 1.0), 0.0)
+        solution, residual = solution + step_length * direction, residual - step_length * system_product
         scaled_residual = inverse @ residual
-        new = jnp.sum(residual * scaled_residual, axis=1, keepdims=True)
-        ratio = jnp.where(going, new / jnp.where(going, energy, 1.0), 0.0)
-        return solution, residual, scaled_residual, direction, scaled, new, ratio, number + 1
+        new_energy = jnp.sum(residual * scaled_residual, axis=1, keepdims=True)
+        ratio = jnp.where(is_active, new_energy / jnp.where(is_active, energy, 1.0), 0.0)
+        return solution, residual, scaled_residual, direction, scaled_direction, new_energy, ratio, num_steps + 1
 
-    def unfinished(state):
-        *_, energy, _, number = state
-        return (number < _MAX_STEPS) & jnp.any(energy > enough)
+    def is_unfinished(state):
+        *_, energy, _, num_steps = state
+        return (num_steps < _MAX_STEPS) & jnp.any(energy > max_energy)
 
-    scaled_load, blank = inverse @ right_hand_side, jnp.zeros_like(right_hand_side)
-    first = jnp.sum(right_hand_side * scaled_load, axis=1, keepdims=True)
-    # The remaining error is at most the energy Rᵀ G R times the factor `weakened`. The voltages change by at least
+    scaled_load, zeros = inverse @ right_hand_side, jnp.zeros_like(right_hand_side)
+    initial_energy = jnp.sum(right_hand_side * scaled_load, axis=1, keepdims=True)
+    # The remaining error is at most the energy Rᵀ G R times `weakening_factor`. The voltages change by at least
     # Fᵀ D F due to insulators, and by at least the square of this divided by the energy of the load due to conductors.
     linear = jnp.abs(jnp.sum(fields * right_hand_side, axis=1, keepdims=True))
-    voltages = jnp.minimum(linear, linear**2 / jnp.where(first > 0, first, 1.0))
-    enough = _TOLERANCE * jnp.maximum(voltages, _MIN_RELATIVE_VOLTAGE * first) / weakening_factor[:, None, None]
-    start = blank, right_hand_side, scaled_load, blank, blank, first, jnp.zeros_like(first), jnp.zeros((), int)
-    solution, residual, scaled_residual, *_, energy, _, _ = jax.lax.while_loop(unfinished, step, start)
+    voltages = jnp.minimum(linear, linear**2 / jnp.where(initial_energy > 0, initial_energy, 1.0))
+    max_energy = (
+        _TOLERANCE * jnp.maximum(voltages, _MIN_RELATIVE_VOLTAGE * initial_energy) / weakening_factor[:, None, None]
+    )
+    initial_state = (
+        zeros,
+        right_hand_side,
+        scaled_load,
+        zeros,
+        zeros,
+        initial_energy,
+        jnp.zeros_like(initial_energy),
+        jnp.zeros((), int),
+    )
+    solution, residual, scaled_residual, *_, energy, _, _ = jax.lax.while_loop(is_unfinished, step, initial_state)
     change = _transpose(solution) @ (right_hand_side + residual) + _transpose(residual) @ scaled_residual
     change -= _transpose(fields) @ right_hand_side
     # Voltages that are so small compared with the load consist of its rounding errors.
-    is_rounding = jnp.sum(voltages, axis=(1, 2)) < _MIN_RELATIVE_VOLTAGE * jnp.sum(first, axis=(1, 2))
-    converged = jnp.all(energy <= enough, axis=(1, 2)) & ~is_rounding
+    is_rounding = jnp.sum(voltages, axis=(1, 2)) < _MIN_RELATIVE_VOLTAGE * jnp.sum(initial_energy, axis=(1, 2))
+    converged = jnp.all(energy <= max_energy, axis=(1, 2)) & ~is_rounding
     return jnp.where(converged[:, None, None], (change + _transpose(change)) / 2, jnp.nan)
 
 
@@ -217,6 +233,6 @@ def _transpose(matrices):
 def _unpack_symmetric(packed: Float[Array, "p m"], size: int) -> Float[Array, "m q q"]:
     """Unpack symmetric matrices (m, q, q) from their lower triangles (p, m)."""
     rows, columns = np.tril_indices(size)
-    place = np.zeros((size, size), int)
-    place[rows, columns] = place[columns, rows] = np.arange(len(rows))
-    return jnp.moveaxis(packed[place], -1, 0)
+    packed_indices = np.zeros((size, size), int)
+    packed_indices[rows, columns] = packed_indices[columns, rows] = np.arange(len(rows))
+    return jnp.moveaxis(packed[packed_indices], -1, 0)

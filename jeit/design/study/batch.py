@@ -64,32 +64,32 @@ class _PointData(Module):
 def check_points(study: Study) -> None:
     """Check all points of a study by creating their skins, touches and electrodes. Raises `ValueError` for a mesh that
     is too coarse."""
-    seen = set()
+    checked_keys = set()
     for index in itertools.chain.from_iterable(study.chunks):  # grouped by shape
         point = study.points[index]
         key = (id(point.layout), point.shape)
-        if key in seen:
+        if key in checked_keys:
             continue
-        seen.add(key)
+        checked_keys.add(key)
         layers = f" and mesh.layers = {point.layers}" if point.layers else ""
-        where = f"mesh.cell_mm = {1e3 * point.cell_size:g}{layers}"
+        location = f"mesh.cell_mm = {1e3 * point.cell_size:g}{layers}"
         if isinstance(point.layout, SurfaceLayout):
             try:
                 _first_skin(study, point.shape)
             except ValueError as error:
-                raise ValueError(f"skin.thickness_mm = {1e3 * point.thickness:g}, {where}: {error}") from None
+                raise ValueError(f"skin.thickness_mm = {1e3 * point.thickness:g}, {location}: {error}") from None
         try:
             _first_skin(study, point.shape).with_layout(point.layout)
         except ValueError:
-            smallest = 1e3 * smallest_diameter(point.layout)
+            min_diameter = 1e3 * smallest_diameter(point.layout)
             raise ValueError(
-                f"{where}: too coarse for electrodes of {point.layout.name!r}, {smallest:.3g} mm across; make cells "
-                "smaller."
+                f"{location}: too coarse for electrodes of {point.layout.name!r}, {min_diameter:.3g} mm across; make "
+                "cells smaller."
             ) from None
         try:
             _shared_data(study, point.shape)
         except ValueError as error:
-            raise ValueError(f"{where}: {error}") from None
+            raise ValueError(f"{location}: {error}") from None
 
 
 def solve_chunk(study: Study, number: int, solved: Callable[[int], None] | None = None) -> dict[str, np.ndarray]:
@@ -108,11 +108,14 @@ def solve_chunk(study: Study, number: int, solved: Callable[[int], None] | None 
         )
     else:
         devices = jax.devices()
-        same = sum(point.shape == points[0].shape for point in study.points)
-        size = -(-min(study.chunk_points, same) // len(devices)) * len(devices)
-        varied = [_point_data(point, study.current) for point in points]
+        num_equal_shapes = sum(point.shape == points[0].shape for point in study.points)
+        size = -(-min(study.chunk_points, num_equal_shapes) // len(devices)) * len(devices)
+        point_data = [_point_data(point, study.current) for point in points]
         results = _solve_batch(
-            shared, _stack_trees(varied + varied[-1:] * (size - len(varied))), **options, num_devices=len(devices)
+            shared,
+            _stack_trees(point_data + point_data[-1:] * (size - len(point_data))),
+            **options,
+            num_devices=len(devices),
         )
     return {name: np.asarray(values)[: len(points)] for name, values in results.items()}
 
@@ -141,9 +144,9 @@ def _first_skin(study: Study, shape: Shape) -> Skin:
 def _shared_data(study: Study, shape: Shape) -> _SharedData:
     skin, grid, touches, prior, lengths = _first_skin(study, shape), study_grid(study), None, None, None
     if isinstance(grid, SurfaceGrid) and isinstance(skin.layout, SurfaceLayout):
-        touched_face = touched_surface(skin.model.mesh, skin.touched_face)
-        if not eqx.tree_equal(touched_face, study.outline):
-            grid = grid.on(Triangles.of(skin.layout.surface), touched_face)
+        face_surface = touched_surface(skin.model.mesh, skin.touched_face)
+        if not eqx.tree_equal(face_surface, study.outline):
+            grid = grid.on(Triangles.of(skin.layout.surface), face_surface)
     if set(OPTIMALITY) & set(study.scores):
         touches = skin.sheet_touches(grid.places, study.indentation, contrast=study.contrast)
         touched = touches.touched
@@ -173,66 +176,72 @@ def _stack_trees(trees):
 @partial(jax.jit, static_argnames=("scores", "num_taxels", "threshold", "num_devices"))
 def _solve_batch(
     shared: _SharedData,
-    varied: _PointData,
+    point_data: _PointData,
     *,
     scores: tuple[str, ...],
     num_taxels: int,
     threshold: float,
     num_devices: int,
 ) -> dict[str, Array]:
-    def one(shared: _SharedData, varied: _PointData) -> dict[str, Array]:
-        model, touched = _model_and_touched_cells(shared, varied)
-        changes = touch_changes(model, varied.conductivity, touched, linear=True)
-        return _compute_results(shared, varied, changes, scores=scores, num_taxels=num_taxels, threshold=threshold)
+    def solve_point(shared: _SharedData, point_data: _PointData) -> dict[str, Array]:
+        model, touched = _model_and_touched_cells(shared, point_data)
+        changes = touch_changes(model, point_data.conductivity, touched, linear=True)
+        return _compute_results(shared, point_data, changes, scores=scores, num_taxels=num_taxels, threshold=threshold)
 
-    batch = jax.vmap(one, in_axes=(None, 0))
+    batch = jax.vmap(solve_point, in_axes=(None, 0))
     if num_devices == 1:
-        return batch(shared, varied)
+        return batch(shared, point_data)
     devices = Devices(np.array(jax.devices()), ("point",))
-    split = PartitionSpec("point")
-    return jax.shard_map(batch, mesh=devices, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False)(
-        shared, varied
-    )
+    point_sharding = PartitionSpec("point")
+    return jax.shard_map(
+        batch, mesh=devices, in_specs=(PartitionSpec(), point_sharding), out_specs=point_sharding, check_vma=False
+    )(shared, point_data)
 
 
 def _solve_exactly(
-    shared: _SharedData, varied: list[_PointData], options: dict, solved: Callable[[int], None] | None
+    shared: _SharedData, all_point_data: list[_PointData], options: dict, solved: Callable[[int], None] | None
 ) -> Iterator[dict[str, Array]]:
-    """Yield the results of each skin, with exact maps; `solved` as in `solve_chunk`."""
-    for number, one in enumerate(varied, 1):
-        model, touched = _model_and_touched_cells(shared, one)
-        yield _compute_results(shared, one, touch_changes(model, one.conductivity, touched), **options)
-        if solved is not None and number < len(varied):
-            solved(number)
+    """Yield the results of each skin, with exact maps; the callback `solved` is called as in `solve_chunk`."""
+    for num_solved, point_data in enumerate(all_point_data, 1):
+        model, touched = _model_and_touched_cells(shared, point_data)
+        yield _compute_results(shared, point_data, touch_changes(model, point_data.conductivity, touched), **options)
+        if solved is not None and num_solved < len(all_point_data):
+            solved(num_solved)
 
 
-def _model_and_touched_cells(shared: _SharedData, varied: _PointData) -> tuple[ForwardModel, TouchedCells]:
+def _model_and_touched_cells(shared: _SharedData, point_data: _PointData) -> tuple[ForwardModel, TouchedCells]:
     """The forward model of a skin, and its touched cells."""
-    model = shared.model.with_electrodes(varied.electrodes).with_protocol(varied.protocol)
+    model = shared.model.with_electrodes(point_data.electrodes).with_protocol(point_data.protocol)
     touched = eqx.tree_at(
         # The change of a sheet is proportional to depth / thickness; layers of one shape have the same thickness.
-        lambda all: all.change,
+        lambda cells_to_change: cells_to_change.change,
         shared.touched,
-        replace_fn=lambda change: change * (shared.thickness / varied.thickness),
+        replace_fn=lambda change: change * (shared.thickness / point_data.thickness),
     )
     return model, touched
 
 
 @partial(jax.jit, static_argnames=("scores", "num_taxels", "threshold"))
 def _compute_results(
-    shared: _SharedData, varied: _PointData, changes: Float[Array, "n M"], *, scores, num_taxels: int, threshold: float
+    shared: _SharedData,
+    point_data: _PointData,
+    changes: Float[Array, "n M"],
+    *,
+    scores,
+    num_taxels: int,
+    threshold: float,
 ) -> dict[str, Array]:
     """Compute the results of one skin from the voltage changes due to its touches, volts."""
-    found = SensitivityMap(shared.grid, changes)
-    results = {"sensitivity": found.values}
+    sensitivity = SensitivityMap(shared.grid, changes)
+    results = {"sensitivity": sensitivity.values}
     for name in ("minimum", "mean", "uniformity"):
         if name in scores:
-            results[name] = getattr(found, name)
+            results[name] = getattr(sensitivity, name)
     if "blind_spot" in scores:
-        results["blind_spot"] = found.blind_spot(varied.noise * jnp.sqrt(1.0 * found.changes.shape[-1]))
+        results["blind_spot"] = sensitivity.blind_spot(point_data.noise * jnp.sqrt(1.0 * sensitivity.changes.shape[-1]))
     if "taxels" in scores:
         taxels = find_taxels(
-            found.changes,
+            sensitivity.changes,
             shared.grid.places,
             shared.grid.cell_area,
             num_taxels=num_taxels,
@@ -244,28 +253,28 @@ def _compute_results(
         results["taxel_area_std"] = 1e4 * taxels.std_area
         results["taxel_area_max"] = 1e4 * taxels.max_area
     if shared.touches is not None and shared.prior is not None:
-        results |= _optimality_scores(shared, varied, shared.touches, shared.prior, scores)
+        results |= _optimality_scores(shared, point_data, shared.touches, shared.prior, scores)
     return results
 
 
 def _optimality_scores(
-    shared: _SharedData, varied: _PointData, touches: SheetTouches, prior: TouchPrior, scores: tuple[str, ...]
+    shared: _SharedData, point_data: _PointData, touches: SheetTouches, prior: TouchPrior, scores: tuple[str, ...]
 ) -> dict[str, Array]:
     """Compute the optimality scores from linearised changes. In a batch, the Jacobian has been computed already, and
     XLA reuses it."""
-    model, _ = _model_and_touched_cells(shared, varied)
-    touches = touches.at_thickness(varied.thickness)
-    found = layout_scores(model, varied.conductivity, touches, prior=prior, noise=varied.noise)
+    model, _ = _model_and_touched_cells(shared, point_data)
+    touches = touches.at_thickness(point_data.thickness)
+    layout_score_values = layout_scores(model, point_data.conductivity, touches, prior=prior, noise=point_data.noise)
     results = {}
     if "information" in scores:
-        results["information"] = found.log_information
+        results["information"] = layout_score_values.log_information
     for name in ("mean_variance", "largest_variance"):
         if name in scores:
-            results[name] = getattr(found, name)
+            results[name] = getattr(layout_score_values, name)
     if "localisation_error" in scores:
         # Mean and maximum are infinite if any position cannot be determined; `localisation_lost` is the fraction of the
         # area where this is the case.
-        results["localisation_error_mean"] = 1e3 * jnp.mean(found.localisation_error)
-        results["localisation_error_max"] = 1e3 * jnp.max(found.localisation_error)
-        results["localisation_lost"] = jnp.mean(jnp.isinf(found.localisation_error))
+        results["localisation_error_mean"] = 1e3 * jnp.mean(layout_score_values.localisation_error)
+        results["localisation_error_max"] = 1e3 * jnp.max(layout_score_values.localisation_error)
+        results["localisation_lost"] = jnp.mean(jnp.isinf(layout_score_values.localisation_error))
     return results

@@ -59,30 +59,30 @@ class Contents(NamedTuple):
 def study_contents(study: Study) -> Contents:
     """Contents of the store of a study. Each row of an array belongs to one point and is stored in a separate file."""
     coordinates = [point.coordinates for point in study.points]
-    along = {name: [values[name] for values in coordinates] for name in coordinates[0]}
+    parameter_values = {name: [values[name] for values in coordinates] for name in coordinates[0]}
     arrays = _result_arrays(study)
     axes = ("x_mm", "y_mm", "z_mm") if study.surface else ("x_mm", "y_mm")
 
     def fill_zarr_group(zarr_group: Any) -> None:
         grid = study_grid(study)
-        for name, values in along.items():
+        for name, values in parameter_values.items():
             _write_array(zarr_group, name, "point", values)
         for axis, values in enumerate(np.asarray(grid.places).T):
             _write_array(zarr_group, axes[axis], "place", np.round(1e3 * values, 9).tolist())
-        number, places = len(study.points), len(grid.places)
+        num_points, num_places = len(study.points), len(grid.places)
         for name, (unit, meaning) in arrays.items():
-            wide = name == "sensitivity"
+            has_place_axis = name == "sensitivity"
             zarr_group.create_array(
                 name,
-                shape=(number, places) if wide else (number,),
-                chunks=(1, places) if wide else (1,),
+                shape=(num_points, num_places) if has_place_axis else (num_points,),
+                chunks=(1, num_places) if has_place_axis else (1,),
                 dtype="float64",
                 fill_value=np.nan,
-                dimension_names=("point", "place") if wide else ("point",),
+                dimension_names=("point", "place") if has_place_axis else ("point",),
                 attributes={"units": unit, "long_name": meaning},
             )
 
-    attributes = {"coordinates": " ".join([*along, *axes]), "name": study.name, "study": study.text}
+    attributes = {"coordinates": " ".join([*parameter_values, *axes]), "name": study.name, "study": study.text}
     return Contents(
         "study", "'jeit study run'", study.fingerprint, study.chunks, [*arrays], attributes, fill_zarr_group
     )
@@ -91,16 +91,16 @@ def study_contents(study: Study) -> Contents:
 def _result_arrays(study: Study) -> dict[str, tuple[str, str]]:
     """Unit and description of every result of `study`."""
     arrays = {"sensitivity": ("V", "sensitivity ‖Δv‖ to a touch")}
-    for score, some in _SCORE_ARRAYS.items():
+    for score, score_arrays in _SCORE_ARRAYS.items():
         if score in study.scores:
-            arrays |= some
+            arrays |= score_arrays
     return arrays
 
 
 def _write_array(zarr_group, name: str, dimension: str, values: list) -> None:
-    text = isinstance(values[0], str)
-    array = np.array(values, dtype=object if text else None)
-    written = zarr_group.create_array(
-        name, shape=array.shape, chunks=array.shape, dtype=str if text else array.dtype, dimension_names=(dimension,)
+    is_text = isinstance(values[0], str)
+    array = np.array(values, dtype=object if is_text else None)
+    zarr_array = zarr_group.create_array(
+        name, shape=array.shape, chunks=array.shape, dtype=str if is_text else array.dtype, dimension_names=(dimension,)
     )
-    written[:] = array
+    zarr_array[:] = array

@@ -41,22 +41,28 @@ def curved_layout(
         impedance = contact_impedance
     else:
         impedance = CONTACT_IMPEDANCE if layout.contact_impedance is None else layout.contact_impedance
-    size = layout.diameters if math.isnan(diameter) else diameter
+    diameters = layout.diameters if math.isnan(diameter) else diameter
     return SurfaceLayout(
-        layout.centres, size, surface, contact_impedance=impedance, outward=outward, labels=layout.labels, name=name
+        layout.centres,
+        diameters,
+        surface,
+        contact_impedance=impedance,
+        outward=outward,
+        labels=layout.labels,
+        name=name,
     )
 
 
 def _create_curved(name: str, folder: Path, surface: Mesh, outward: bool, diameter: float) -> SurfaceLayout:
     if is_layout_file(name):
         return read_surface_layout(folder / name, surface, outward=outward)
-    made = re.fullmatch(r"inner-(\d{1,4})", name)
-    if made is None:
+    name_match = re.fullmatch(r"inner-(\d{1,4})", name)
+    if name_match is None:
         raise ValueError("a curved skin has inner-N, spread evenly along it, or a .csv file with x_mm, y_mm and z_mm.")
-    number = int(made[1])
-    check_number(number)
-    size = DIAMETER if math.isnan(diameter) else diameter
-    return SurfaceLayout.spread(surface, number, np.full(number, size), outward=outward, name=name)
+    num_electrodes = int(name_match[1])
+    check_num_electrodes(num_electrodes)
+    diameters = DIAMETER if math.isnan(diameter) else diameter
+    return SurfaceLayout.spread(surface, num_electrodes, np.full(num_electrodes, diameters), outward=outward, name=name)
 
 
 _SUFFIXES = (".csv", ".dxf", ".svg")
@@ -79,10 +85,10 @@ def study_layout(
     centres = np.asarray(layout.centres)
     check_spacing(layout, np.linalg.norm(centres[:, None] - centres, axis=-1), minimum_gap)
     if not math.isnan(contact_impedance):
-        impedance = contact_impedance
+        impedances = contact_impedance
     else:
-        impedance = CONTACT_IMPEDANCE if layout.contact_impedance is None else layout.contact_impedance
-    return Layout(layout.centres, layout.diameters, contact_impedance=impedance, outline=outline, name=name)
+        impedances = CONTACT_IMPEDANCE if layout.contact_impedance is None else layout.contact_impedance
+    return Layout(layout.centres, layout.diameters, contact_impedance=impedances, outline=outline, name=name)
 
 
 def is_layout_file(name: str) -> bool:
@@ -93,7 +99,7 @@ def is_layout_file(name: str) -> bool:
 def _create_flat(name: str, folder: Path, outline: Rectangle, diameter: float) -> Layout:
     if not is_layout_file(name):
         layout = named_layout(name, outline, diameter=DIAMETER if math.isnan(diameter) else diameter)
-        check_number(layout.num_electrodes)
+        check_num_electrodes(layout.num_electrodes)
         return layout
     layout = read_layout(folder / name, outline=outline)
     if not same_outline(layout.outline, outline):
@@ -103,11 +109,11 @@ def _create_flat(name: str, folder: Path, outline: Rectangle, diameter: float) -
             f"study's is a rectangle of {1e3 * outline.width:g} × {1e3 * outline.height:g} mm about the origin; change "
             "skin.width_mm and skin.height_mm, or the layout."
         )
-    size = layout.diameters if math.isnan(diameter) else diameter
-    return Layout(layout.centres, size, contact_impedance=layout.contact_impedance, outline=outline, name=name)
+    diameters = layout.diameters if math.isnan(diameter) else diameter
+    return Layout(layout.centres, diameters, contact_impedance=layout.contact_impedance, outline=outline, name=name)
 
 
-def check_number(number: int) -> None:
+def check_num_electrodes(number: int) -> None:
     """Raise `ValueError` unless the number of electrodes is allowed in a study."""
     if not 4 <= number <= 1024:
         raise ValueError(f"it has {number} electrodes; give 4 to 1024.")
@@ -117,10 +123,10 @@ def check_spacing(layout: Layout | SurfaceLayout, lengths: Float[np.ndarray, "L 
     """Raise `ValueError` for gaps below `minimum_gap` between electrodes; `lengths`: distances of their centres,
     metres."""
     radii = np.asarray(layout.diameters) / 2
-    gap = lengths - radii[:, None] - radii
-    np.fill_diagonal(gap, np.inf)
-    if gap.min() < minimum_gap - 1e-9:
+    gaps = lengths - radii[:, None] - radii
+    np.fill_diagonal(gaps, np.inf)
+    if gaps.min() < minimum_gap - 1e-9:
         raise ValueError(
             f"electrodes.minimum_gap_mm is {1e3 * minimum_gap:g}, and electrodes of {layout.name!r} are "
-            f"{1e3 * gap.min():.3g} mm apart: an impossible spacing; ask for less, or for fewer or smaller electrodes."
+            f"{1e3 * gaps.min():.3g} mm apart: an impossible spacing; ask for less, or for fewer or smaller electrodes."
         )

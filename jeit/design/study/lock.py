@@ -128,14 +128,14 @@ def _is_on_this_machine(owner: dict) -> bool:
 
 def _refusal_message(owner: dict, lock_path: Path, store_path: Path, contents: str) -> str:
     owner_text = f"process {describe(owner['pid'])}" if "pid" in owner else "another process"
-    since = f" since {describe(owner['since']).strip(chr(39))}" if "since" in owner else ""
+    since_text = f" since {describe(owner['since']).strip(chr(39))}" if "since" in owner else ""
     if not owner or (_is_on_this_machine(owner) and fcntl is not None):
         owner_text = "this process" if owner.get("pid") == os.getpid() else owner_text
         remedy = f"wait until it ends, or stop it, then resume the {contents}."
-        return f"{store_path} is being written by {owner_text}{since}; {remedy}"
-    where = "this machine" if _is_on_this_machine(owner) else describe(owner.get("host"))
+        return f"{store_path} is being written by {owner_text}{since_text}; {remedy}"
+    machine = "this machine" if _is_on_this_machine(owner) else describe(owner.get("host"))
     return (
-        f"{store_path} is being written by {owner_text} on {where}{since}, or was when that was killed: from here "
-        f"this cannot be seen. Where it still runs, wait; where it "
-        f"does not, delete {lock_path} and resume the {contents}."
+        f"{store_path} is being written by {owner_text} on {machine}{since_text}, or was when that was killed: from "
+        f"here this cannot be seen. Where it still runs, wait; where it does not, delete {lock_path} and resume the "
+        f"{contents}."
     )

@@ -34,33 +34,37 @@ class Progress(NamedTuple):
 
 class ProgressReporter:
     """Reports the progress of work in `chunks` by calling `progress`, and estimates the remaining time from the points
-    finished since its creation. `done`: numbers of the chunks that were finished before."""
+    finished since its creation. `finished_chunks`: numbers of the chunks that were finished before."""
 
-    def __init__(self, chunks: Sequence[Sequence[int]], done: set[int], progress: Callable[[Progress], None] | None):
-        self._chunks, self._done, self._progress = chunks, set(done), progress
-        self._all = sum(len(chunk) for chunk in chunks)
-        self._first, self._start = self._points(), time.monotonic()
-        self._report(self._first, None)
+    def __init__(
+        self, chunks: Sequence[Sequence[int]], finished_chunks: set[int], progress: Callable[[Progress], None] | None
+    ):
+        self._chunks, self._finished_chunks, self._progress = chunks, set(finished_chunks), progress
+        self._num_points = sum(len(chunk) for chunk in chunks)
+        self._initial_points, self._start_time = self._num_finished_points(), time.monotonic()
+        self._report(self._initial_points, None)
 
     def finished(self, number: int) -> None:
         """Report a finished chunk."""
-        self._done.add(number)
-        self._reckon(self._points())
+        self._finished_chunks.add(number)
+        self._estimate_and_report(self._num_finished_points())
 
     def solved(self, points: int) -> None:
         """Report the number of finished points of the current chunk."""
-        self._reckon(self._points() + points)
+        self._estimate_and_report(self._num_finished_points() + points)
 
-    def _reckon(self, points: int) -> None:
-        pace = (time.monotonic() - self._start) / (points - self._first)
-        self._report(points, pace * (self._all - points))
+    def _estimate_and_report(self, points: int) -> None:
+        seconds_per_point = (time.monotonic() - self._start_time) / (points - self._initial_points)
+        self._report(points, seconds_per_point * (self._num_points - points))
 
-    def _points(self) -> int:
-        return sum(len(self._chunks[number]) for number in self._done)
+    def _num_finished_points(self) -> int:
+        return sum(len(self._chunks[number]) for number in self._finished_chunks)
 
     def _report(self, points: int, seconds_left: float | None) -> None:
         if self._progress is not None:
-            self._progress(Progress(points, self._all, len(self._done), len(self._chunks), seconds_left))
+            self._progress(
+                Progress(points, self._num_points, len(self._finished_chunks), len(self._chunks), seconds_left)
+            )
 
 
 _Result = TypeVar("_Result")
@@ -76,14 +80,14 @@ def over_cluster(
     # would be lost in this case, and sending it with every chunk would transfer a layer of 70 MB a thousand times.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sending large graph")
-        sent = client.submit(_return_unchanged, work, pure=False)
-    futures = {client.submit(solve, sent, number, pure=False, retries=2): number for number in numbers}
+        work_future = client.submit(_return_unchanged, work, pure=False)
+    futures = {client.submit(solve, work_future, number, pure=False, retries=2): number for number in numbers}
     try:
         for future, results in distributed.as_completed(futures, with_results=True):
             yield futures[future], results
             future.release()
     finally:
-        client.cancel([sent, *futures])
+        client.cancel([work_future, *futures])
 
 
 def _return_unchanged(work: Any) -> Any:
@@ -122,10 +126,10 @@ def run_study(
     need_extra("cluster", "a study")
     check_points(study)
     with writing(study, path) as store:
-        done = set(store.sound())
-        left = [number for number in range(len(study.chunks)) if number not in done]
-        report = ProgressReporter(study.chunks, done, progress)
-        for number, results in _solve_chunks(study, left, client, report.solved):
+        finished_chunks = set(store.sound())
+        remaining_chunks = [number for number in range(len(study.chunks)) if number not in finished_chunks]
+        report = ProgressReporter(study.chunks, finished_chunks, progress)
+        for number, results in _solve_chunks(study, remaining_chunks, client, report.solved):
             store.write(number, results)
             report.finished(number)
     return open_results(study, path)
@@ -149,9 +153,9 @@ def study_progress(study: Study, path: str | Path) -> Progress:
     print(study_progress(study, "study.zarr"))
     ```
     """
-    finished = Store(study, path, create=False).sound()
-    points = sum(len(study.chunks[number]) for number in finished)
-    return Progress(points, len(study.points), len(finished), len(study.chunks), None)
+    finished_chunks = Store(study, path, create=False).sound()
+    points = sum(len(study.chunks[number]) for number in finished_chunks)
+    return Progress(points, len(study.points), len(finished_chunks), len(study.chunks), None)
 
 
 def _solve_chunks(

@@ -31,7 +31,7 @@ from jeit.protocol import Protocol
 if TYPE_CHECKING:
     from jeit.design.study.study_tables import StudyTable
 
-Maker = Callable[[str, float, float, float], Layout | SurfaceLayout]
+LayoutFactory = Callable[[str, float, float, float], Layout | SurfaceLayout]
 """Function that creates a layout from name, diameter, contact impedance and minimum gap, as `study_layout` does."""
 
 # Version of the results: increase it if the same study would give different results.
@@ -145,16 +145,18 @@ class Study:
         shapes: dict[tuple, list[int]] = {}
         for number, point in enumerate(self.points):
             shapes.setdefault(point.shape, []).append(number)
-        most = self.chunk_points
+        max_points = self.chunk_points
         return tuple(
-            tuple(same[start : start + most]) for same in shapes.values() for start in range(0, len(same), most)
+            tuple(point_numbers[start : start + max_points])
+            for point_numbers in shapes.values()
+            for start in range(0, len(point_numbers), max_points)
         )
 
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 hash of everything that determines the results; comments and the name of the study do not."""
-        of_skin = [self.surface] if isinstance(self.outline, Triangles) else [*map(float, self.outline.extent)]
-        content = [_VERSION, *of_skin, type(self.indentation).__name__]
+        outline_values = [self.surface] if isinstance(self.outline, Triangles) else [*map(float, self.outline.extent)]
+        content = [_VERSION, *outline_values, type(self.indentation).__name__]
         content += [*map(float, vars(self.indentation).values()), self.columns, self.rows, self.current]
         content += [self.contrast, self.exact, *self.scores, self.num_taxels, self.threshold, self.correlation]
         content += [self.seed, self.chunk_points]
@@ -249,37 +251,37 @@ def _study_from_table(text: str, table: StudyTable, folder: Path) -> Study:
     _check_touches(table)
     layers = table.mesh.layers if skin.model == "layer" else 0
     electrodes = table.electrodes
-    gap = 1e-3 * electrodes.minimum_gap_mm
-    cells, outline, makers = _surface_meshes(table, folder)
+    minimum_gap = 1e-3 * electrodes.minimum_gap_mm
+    cell_sizes, outline, layout_factories = _surface_meshes(table, folder)
     # Every layout is created once for each mesh; on flat skins, a single one serves all meshes.
     layouts = [
-        [make(name, diameter, impedance, gap) for make in makers]
+        [create_layout(name, diameter, impedance, minimum_gap) for create_layout in layout_factories]
         for name, diameter, impedance in itertools.product(
             electrodes.layouts, _to_metres(electrodes.diameter_mm), electrodes.contact_impedance_ohm_m2
         )
     ]
-    for on_meshes in layouts:
-        for layout in on_meshes:
+    for layouts_on_meshes in layouts:
+        for layout in layouts_on_meshes:
             _check_layout(layout, outline, layers, table)
     points = tuple(
         Point(
-            on_meshes[k % len(on_meshes)],
+            layouts_on_meshes[mesh_index % len(layouts_on_meshes)],
             thickness,
             conductivity,
             protocol,
-            _num_pairs(on_meshes[0], protocol, pairs),
+            _num_pairs(layouts_on_meshes[0], protocol, pairs),
             noise,
-            cells[k],
+            cell_sizes[mesh_index],
             layers,
         )
-        for on_meshes, thickness, conductivity, protocol, pairs, noise, k in itertools.product(
+        for layouts_on_meshes, thickness, conductivity, protocol, pairs, noise, mesh_index in itertools.product(
             layouts,
             _to_metres(skin.thickness_mm),
             skin.conductivity_S_per_m,
             measurement.protocol,
             measurement.pairs or [None],
             measurement.noise_V,
-            range(len(cells)),
+            range(len(cell_sizes)),
         )
     )
     return Study(
@@ -304,9 +306,11 @@ def _study_from_table(text: str, table: StudyTable, folder: Path) -> Study:
 
 
 def _create_indentation(table: StudyTable) -> AbstractIndentation:
-    touch, thinnest = table.touch, min(table.skin.thickness_mm)
-    if touch.depth_mm >= thinnest:
-        raise ValueError(f"touch.depth_mm is {touch.depth_mm:g}, and the skin {thinnest:g} mm thick; press less.")
+    touch, min_thickness_mm = table.touch, min(table.skin.thickness_mm)
+    if touch.depth_mm >= min_thickness_mm:
+        raise ValueError(
+            f"touch.depth_mm is {touch.depth_mm:g}, and the skin {min_thickness_mm:g} mm thick; press less."
+        )
     if touch.contrast == 1:
         raise ValueError(
             "touch.contrast is 1, which changes nothing; take 0 for an insulator, above 1 for a conductor."
@@ -323,48 +327,51 @@ def _create_indentation(table: StudyTable) -> AbstractIndentation:
 
 def _check_touches(table: StudyTable) -> None:
     """Check that there are enough touches for the scores, and that results and computations fit disk and memory."""
-    scores, touches = table.scores, table.touch.columns * table.touch.rows
-    of_sheets = [score for score in OPTIMALITY if score in scores.wanted]
-    stored = 8.0 * table.num_points * touches
-    if stored > _MAX_STORE_BYTES:
+    scores, num_touches = table.scores, table.touch.columns * table.touch.rows
+    sheet_scores = [score for score in OPTIMALITY if score in scores.wanted]
+    num_bytes = 8.0 * table.num_points * num_touches
+    if num_bytes > _MAX_STORE_BYTES:
         raise ValueError(
-            f"touch.columns × touch.rows × {table.num_points:,} points are {stored / 1e9:.3g} GB of results, more than "
-            f"the {_MAX_STORE_BYTES / 1e9:g} GB of a study; ask for fewer, or split the study."
+            f"touch.columns × touch.rows × {table.num_points:,} points are {num_bytes / 1e9:.3g} GB of results, more "
+            f"than the {_MAX_STORE_BYTES / 1e9:g} GB of a study; ask for fewer, or split the study."
         )
     if "taxels" in scores.wanted:
-        if scores.num_taxels > touches:
+        if scores.num_taxels > num_touches:
             raise ValueError(
-                f"scores.num_taxels is {scores.num_taxels}, and there are {touches} touches; ask for fewer."
+                f"scores.num_taxels is {scores.num_taxels}, and there are {num_touches} touches; ask for fewer."
             )
-        check_memory("scores.num_taxels × touch.columns × touch.rows", 8.0 * scores.num_taxels * touches)
-    if not of_sheets:
+        check_memory("scores.num_taxels × touch.columns × touch.rows", 8.0 * scores.num_taxels * num_touches)
+    if not sheet_scores:
         return
     if table.skin.model == "layer":
         raise ValueError(
-            f"scores.wanted has {', '.join(of_sheets)}, known for sheets only, and skin.model is 'layer'; leave them "
-            "out, or take 'sheet'."
+            f"scores.wanted has {', '.join(sheet_scores)}, known for sheets only, and skin.model is 'layer'; leave "
+            "them out, or take 'sheet'."
         )
     # Memory for the covariance matrix of all touches and for its eigendecomposition.
-    check_memory(f"scores.wanted = {of_sheets[0]!r} of {touches:,} touches (columns × rows)", 24.0 * touches**2)
+    check_memory(
+        f"scores.wanted = {sheet_scores[0]!r} of {num_touches:,} touches (columns × rows)", 24.0 * num_touches**2
+    )
 
 
 def _check_layout(
     layout: Layout | SurfaceLayout, outline: Rectangle | Triangles, layers: int, table: StudyTable
 ) -> None:
     """Check that a layout can be measured and meshed for all values of the swept parameters."""
-    widest, thickest = 1e3 * longer_side(outline), max(table.skin.thickness_mm)
-    if thickest > widest:
-        raise ValueError(f"skin.thickness_mm is {thickest:g}, more than the skin is wide: {widest:g} mm.")
+    width_mm, max_thickness_mm = 1e3 * longer_side(outline), max(table.skin.thickness_mm)
+    if max_thickness_mm > width_mm:
+        raise ValueError(f"skin.thickness_mm is {max_thickness_mm:g}, more than the skin is wide: {width_mm:g} mm.")
     touches = table.touch.columns * table.touch.rows
     for protocol in table.measurement.protocol:
         for pairs in table.measurement.pairs or [None]:
-            number = _num_pairs(layout, protocol, pairs)
-            _check_measurement(layout, protocol, number)
+            num_pairs = _num_pairs(layout, protocol, pairs)
+            _check_measurement(layout, protocol, num_pairs)
             if protocol == "two-terminal":
-                patterns = number or _num_all_pairs(layout)
-                size = 8.0 * patterns * (4 * layout.num_electrodes + touches)
+                num_measurements = num_pairs or _num_all_pairs(layout)
+                num_bytes = 8.0 * num_measurements * (4 * layout.num_electrodes + touches)
                 check_memory(
-                    f"measurement.pairs: {patterns:,} of {layout.name!r}, touched at {touches:,} places,", size
+                    f"measurement.pairs: {num_measurements:,} of {layout.name!r}, touched at {touches:,} places,",
+                    num_bytes,
                 )
     if isinstance(outline, Triangles) and "cell_mm" not in table.mesh.model_fields_set:
         return
@@ -386,14 +393,15 @@ def _num_all_pairs(layout: Layout | SurfaceLayout) -> int:
 
 def _check_measurement(layout: Layout | SurfaceLayout, protocol: str, pairs: int) -> None:
     """Check that a layout has enough electrodes for its protocol and number of pairs."""
-    name, number, fewest = layout.name, layout.num_electrodes, _MIN_ELECTRODES[protocol]
-    if number < fewest:
+    name, num_electrodes, min_electrodes = layout.name, layout.num_electrodes, _MIN_ELECTRODES[protocol]
+    if num_electrodes < min_electrodes:
         raise ValueError(
-            f"measurement.protocol: {name!r} has {number} electrodes, and {protocol!r} needs {fewest} at least."
+            f"measurement.protocol: {name!r} has {num_electrodes} electrodes, and {protocol!r} needs {min_electrodes} "
+            "at least."
         )
-    if protocol == "opposite" and number % 2:
+    if protocol == "opposite" and num_electrodes % 2:
         raise ValueError(
-            f"measurement.protocol: {name!r} has {number} electrodes, and 'opposite' needs an even number."
+            f"measurement.protocol: {name!r} has {num_electrodes} electrodes, and 'opposite' needs an even number."
         )
     if pairs and protocol != "two-terminal":
         raise ValueError(
@@ -403,8 +411,7 @@ def _check_measurement(layout: Layout | SurfaceLayout, protocol: str, pairs: int
     if pairs > _num_all_pairs(layout):
         raise ValueError(
             f"measurement.pairs is {pairs}, and {name!r} has {_num_all_pairs(layout)} pairs of electrodes; ask for "
-            "fewer, "
-            "or for 0: all."
+            "fewer, or for 0: all."
         )
 
 
@@ -418,21 +425,23 @@ def _without_rounding(value) -> float:
     return float(f"{float(value):.12g}")
 
 
-def _surface_meshes(table: StudyTable, folder: Path) -> tuple[list[float], Rectangle | Triangles, Sequence[Maker]]:
+def _surface_meshes(
+    table: StudyTable, folder: Path
+) -> tuple[list[float], Rectangle | Triangles, Sequence[LayoutFactory]]:
     """Returns the cell sizes, metres; the outline, or for curved skins the surface for the first cell size; and the
     functions that create layouts: a single one for flat skins, and one for each cell size for curved skins."""
     from jeit.design.skin.surface_tables import ScanTable  # imported already when the table was read
 
-    cells = [1e-3 * size for size in table.mesh.cell_mm]
-    described = table.surface
-    if described is None:
+    cell_sizes = [1e-3 * size for size in table.mesh.cell_mm]
+    surface_table = table.surface
+    if surface_table is None:
         outline = Rectangle(1e-3 * table.skin.width_mm, 1e-3 * table.skin.height_mm)
-        return cells, outline, [lambda name, *sizes: study_layout(name, folder, outline, *sizes)]
-    surfaces = [described_surface(described, folder, size) for size in cells]
-    if isinstance(described, ScanTable) and described.has_cells:
-        cells = [typical_cell(surfaces[0])]
+        return cell_sizes, outline, [lambda name, *sizes: study_layout(name, folder, outline, *sizes)]
+    surfaces = [described_surface(surface_table, folder, size) for size in cell_sizes]
+    if isinstance(surface_table, ScanTable) and surface_table.has_cells:
+        cell_sizes = [typical_cell(surfaces[0])]
 
-    def on(surface: Mesh) -> Maker:
-        return lambda name, *sizes: curved_layout(name, folder, surface, described.outward, *sizes)
+    def layout_factory(surface: Mesh) -> LayoutFactory:
+        return lambda name, *sizes: curved_layout(name, folder, surface, surface_table.outward, *sizes)
 
-    return cells, Triangles.of(surfaces[0]), [on(surface) for surface in surfaces]
+    return cell_sizes, Triangles.of(surfaces[0]), [layout_factory(surface) for surface in surfaces]

@@ -43,7 +43,7 @@ _NUMBER_TYPES = tuple(f"{kind}{bits}" for kind in ("int", "uint", "float") for b
 _ALLOWED_TYPES = frozenset({"bool", "string", *_NUMBER_TYPES})
 _FORMAT_2_FILES = (".zarray", ".zattrs", ".zgroup", ".zmetadata")
 _METADATA_FILE = "zarr.json"
-_UNREADABLE_TEXT = f"has a {_METADATA_FILE} that is no JSON object, or nested too deep"
+_UNREADABLE_METADATA = f"has a {_METADATA_FILE} that is no JSON object, or nested too deep"
 
 
 class ArrayShape(NamedTuple):
@@ -60,17 +60,17 @@ def find_danger(path: Path) -> str | None:
     `OSError` for files that cannot be read."""
     for folder, folders, files in os.walk(path):
         for name in [*folders, *files]:
-            place = Path(folder, name)
-            if place.is_symlink():
-                return f"'{place.relative_to(path)}' is a link to another place"
+            entry = Path(folder, name)
+            if entry.is_symlink():
+                return f"'{entry.relative_to(path)}' is a link to another place"
             if name in _FORMAT_2_FILES:
-                return f"'{place.relative_to(path)}' is of Zarr's format 2, which jeit does not write"
+                return f"'{entry.relative_to(path)}' is of Zarr's format 2, which jeit does not write"
     for file in path.rglob(_METADATA_FILE):
         content = _read_bytes(file)  # a file that Zarr cannot read is damaged, but not dangerous
-        for where, node in [] if content is None else _metadata_nodes(content, str(file.relative_to(path))):
+        for location, node in [] if content is None else _metadata_nodes(content, str(file.relative_to(path))):
             reason = _find_node_danger(node)
             if reason:
-                return f"{where} {reason}"
+                return f"{location} {reason}"
     return None
 
 
@@ -79,22 +79,24 @@ def find_damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
     Raises `OSError` for files that cannot be read."""
     content = _read_bytes(path / _METADATA_FILE)
     if content is None:
-        return _UNREADABLE_TEXT
-    found = {folder.name for folder in path.iterdir() if folder.is_dir()}
-    if found != set(expected):
-        return f"its arrays are not those of its contents: {_short_text(found ^ set(expected))}"
+        return _UNREADABLE_METADATA
+    array_names = {folder.name for folder in path.iterdir() if folder.is_dir()}
+    if array_names != set(expected):
+        return f"its arrays are not those of its contents: {_short_text(array_names ^ set(expected))}"
     if content.get("zarr_format") != 3 or content.get("node_type") != "group":
         return "it is no group of Zarr's format 3"
     consolidated = content.get("consolidated_metadata")
-    named = consolidated.get("metadata") if isinstance(consolidated, dict) else None
-    if not isinstance(named, dict) or set(named) != set(expected):
+    consolidated_nodes = consolidated.get("metadata") if isinstance(consolidated, dict) else None
+    if not isinstance(consolidated_nodes, dict) or set(consolidated_nodes) != set(expected):
         return "it does not name the arrays of its contents"
     for name, array in expected.items():
         if [*(path / name).rglob(_METADATA_FILE)] != [path / name / _METADATA_FILE]:
             return f"array '{name}' has not one {_METADATA_FILE}"
-        own = _read_bytes(path / name / _METADATA_FILE)
+        array_node = _read_bytes(path / name / _METADATA_FILE)
         reason = (
-            _UNREADABLE_TEXT if own is None else _find_node_damage(named[name], array) or _find_node_damage(own, array)
+            _UNREADABLE_METADATA
+            if array_node is None
+            else _find_node_damage(consolidated_nodes[name], array) or _find_node_damage(array_node, array)
         )
         reason = reason or _chunk_damage(path / name, array)
         if reason:
@@ -105,13 +107,13 @@ def find_damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
 def _chunk_damage(folder: Path, array: ArrayShape) -> str | None:
     """Description of the first chunk whose unpacked size is unknown or larger than a chunk of the array can be; None if
     there is none."""
-    most = _MAX_TEXT_CHUNK if array.data_type == "string" else 8 * math.prod(array.chunks) + _MAX_CHUNK_OVERHEAD
+    max_bytes = _MAX_TEXT_CHUNK if array.data_type == "string" else 8 * math.prod(array.chunks) + _MAX_CHUNK_OVERHEAD
     for file in folder.rglob("*"):
         if file.is_file() and file.name != _METADATA_FILE:
-            with file.open("rb") as opened:
-                size = _unpacked_size(opened.read(18), file.stat().st_size)
-            if size is None or size > most:
-                return f"has a chunk, '{file.relative_to(folder)}', of {size or 'unknown'} bytes, more than {most}"
+            with file.open("rb") as chunk_file:
+                size = _unpacked_size(chunk_file.read(18), file.stat().st_size)
+            if size is None or size > max_bytes:
+                return f"has a chunk, '{file.relative_to(folder)}', of {size or 'unknown'} bytes, more than {max_bytes}"
     return None
 
 
@@ -119,25 +121,25 @@ def _unpacked_size(beginning: bytes, size: int) -> int | None:
     """Unpacked size in bytes of a chunk, from its `beginning` and its `size` on disk: as stated in a zstd frame (RFC
     8878) or a blosc header, otherwise `size` itself. None if a frame does not state it."""
     if beginning.startswith(b"\x28\xb5\x2f\xfd") and len(beginning) > 5:
-        about = beginning[4]
-        single = about >> 5 & 1
-        start = 5 + (1 - single) + (0, 1, 2, 4)[about & 3]
-        length = (single, 2, 4, 8)[about >> 6]
-        number = int.from_bytes(beginning[start : start + length], "little")
-        return number + (256 if length == 2 else 0) if length else None
+        descriptor = beginning[4]
+        is_single_segment = descriptor >> 5 & 1
+        size_start = 5 + (1 - is_single_segment) + (0, 1, 2, 4)[descriptor & 3]
+        num_size_bytes = (is_single_segment, 2, 4, 8)[descriptor >> 6]
+        content_size = int.from_bytes(beginning[size_start : size_start + num_size_bytes], "little")
+        return content_size + (256 if num_size_bytes == 2 else 0) if num_size_bytes else None
     if beginning[:1] == b"\x02" and len(beginning) >= 16:
         return max(size, int.from_bytes(beginning[4:8], "little"))
     return size
 
 
-def _metadata_nodes(content: Any, where: str) -> Iterator[tuple[str, Any]]:
+def _metadata_nodes(content: Any, location: str) -> Iterator[tuple[str, Any]]:
     """Yield the location and the metadata of every group and array that `content` describes, including consolidated
     metadata at any depth."""
-    yield f"'{where}'", content
+    yield f"'{location}'", content
     consolidated = content.get("consolidated_metadata") if isinstance(content, dict) else None
-    inner = consolidated.get("metadata") if isinstance(consolidated, dict) else None
-    for name, node in (inner if isinstance(inner, dict) else {}).items():
-        yield from _metadata_nodes(node, f"{where}: {name}")
+    nested_nodes = consolidated.get("metadata") if isinstance(consolidated, dict) else None
+    for name, node in (nested_nodes if isinstance(nested_nodes, dict) else {}).items():
+        yield from _metadata_nodes(node, f"{location}: {name}")
 
 
 def _find_node_danger(node: Any) -> str | None:
@@ -152,8 +154,10 @@ def _find_node_danger(node: Any) -> str | None:
         return f"holds neither numbers nor text but {_short_text([data_type])}"
     codecs = node.get("codecs", [])
     names = [codec.get("name") if isinstance(codec, dict) else codec for codec in _as_list(codecs)]
-    strange = [name for name in names if not (isinstance(name, str) and name in CODECS)]
-    return f"asks for {_short_text(strange)}, and not only for codecs that pack bytes" if strange else None
+    unknown_codecs = [name for name in names if not (isinstance(name, str) and name in CODECS)]
+    return (
+        f"asks for {_short_text(unknown_codecs)}, and not only for codecs that pack bytes" if unknown_codecs else None
+    )
 
 
 def _find_node_damage(node: Any, expected: ArrayShape) -> str | None:
@@ -189,7 +193,7 @@ def _short_text(values: Any) -> str:
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
 _TASK = "a store of results"
-_A_PATH = "that of the store, such as 'results.zarr'"
+_PATH_DESCRIPTION = "that of the store, such as 'results.zarr'"
 
 
 class OtherContents(ValueError):
@@ -209,7 +213,7 @@ class Store:
         `ImportError` without the extra `cluster`, and `OSError` if the store cannot be written."""
         zarr = optional("zarr", _TASK)
         self.contents = work if isinstance(work, Contents) else study_contents(work)
-        check_kind("path", path, (str, os.PathLike), _A_PATH)
+        check_kind("path", path, (str, os.PathLike), _PATH_DESCRIPTION)
         self.path, kind = Path(path), self.contents.kind
         if not self.path.exists():
             if not create:
@@ -235,7 +239,7 @@ class Store:
         try:
             self._group = zarr.open_group(str(self.path), mode="r+" if create else "r", zarr_format=3)
         except (OSError, ValueError, TypeError, KeyError) as error:
-            raise self._damaged(error) from None
+            raise self._damage_error(error) from None
 
     @property
     def versions(self) -> dict[str, str]:
@@ -258,21 +262,21 @@ class Store:
                 self.write_array(name, self.contents.chunks[number], values)
             self._mark(number, _checksum(results))
         except OSError as error:
-            kept = f"{len(self.finished())} of {len(self.contents.chunks)} chunks are finished and kept"
+            progress_text = f"{len(self.finished())} of {len(self.contents.chunks)} chunks are finished and kept"
             raise OSError(
                 error.errno,
-                f"{error.strerror}: a chunk could not be written; {kept}. Mend that, then resume the "
+                f"{error.strerror}: a chunk could not be written; {progress_text}. Mend that, then resume the "
                 f"{self.contents.kind}",
                 str(self.path),
             ) from error
 
     def write_array(self, name: str, points: Sequence[int], values: np.ndarray) -> None:
         """Write `values` (k, …) of the array `name` for k points."""
-        array, first = self._group[name], 0
+        array, first_row = self._group[name], 0
         for rows in _consecutive_runs(points):
-            last = first + rows.stop - rows.start
-            array[rows] = values[first:last]  # pyright: ignore[reportIndexIssue]
-            first = last
+            last_row = first_row + rows.stop - rows.start
+            array[rows] = values[first_row:last_row]  # pyright: ignore[reportIndexIssue]
+            first_row = last_row
 
     def _mark(self, number: int, checksum: str) -> None:
         content = _read_json(self.path)
@@ -305,18 +309,18 @@ class Store:
     def _check(self, expected: Mapping[str, ArrayShape]) -> None:
         """Check the metadata of the store before Zarr opens it. Raises `ValueError` if it is dangerous or damaged."""
         try:
-            reason = find_danger(self.path)
-            wrong = None if reason else find_damage(self.path, expected)
+            danger = find_danger(self.path)
+            damage = None if danger else find_damage(self.path, expected)
         except OSError as error:
-            raise self._damaged(error) from None
-        if reason:
+            raise self._damage_error(error) from None
+        if danger:
             raise ValueError(
-                f"{self.path} is not opened, because it might run code or write elsewhere: {reason}. No "
+                f"{self.path} is not opened, because it might run code or write elsewhere: {danger}. No "
                 f"{self.contents.kind} that jeit wrote is like that. Delete it if it came from somebody else, and run "
                 f"the {self.contents.kind} yourself, to another place."
             )
-        if wrong:
-            raise self._damaged(wrong)
+        if damage:
+            raise self._damage_error(damage)
 
     def _attributes(self) -> dict:
         """Read the attributes of the store; empty if the path is not a store. Raises `ValueError` if they cannot be
@@ -327,18 +331,18 @@ class Store:
         except (FileNotFoundError, NotADirectoryError):
             return {}
         except (OSError, ValueError) as error:
-            raise self._damaged(error) from None
+            raise self._damage_error(error) from None
         attributes = content.get("attributes") if isinstance(content, dict) else None
         if not isinstance(attributes, dict) or "finished" not in attributes:
             return {}
         if not all(isinstance(attributes.get(name), dict) for name in ("finished", "versions")):
-            raise self._damaged("what it says of finished chunks makes no sense")
+            raise self._damage_error("what it says of finished chunks makes no sense")
         return attributes
 
-    def _damaged(self, reason: object) -> ValueError:
-        said = " ".join(str(reason).split()).rstrip(".")
+    def _damage_error(self, reason: object) -> ValueError:
+        reason_text = " ".join(str(reason).split()).rstrip(".")
         return ValueError(
-            f"{self.path / 'zarr.json'} cannot be read ({said}): the store is damaged, and does not say what is "
+            f"{self.path / 'zarr.json'} cannot be read ({reason_text}): the store is damaged, and does not say what is "
             f"finished. Put that file back from a copy; or move the store away and run the {self.contents.kind} again."
         )
 
@@ -351,14 +355,14 @@ def writing(work: Study | Contents, path: str | Path) -> Iterator[Store]:
     Temporary files of killed runs are removed. Raises errors as `Store` does, and `ValueError` if another process
     writes the store.
     """
-    check_kind("path", path, (str, os.PathLike), _A_PATH)
+    check_kind("path", path, (str, os.PathLike), _PATH_DESCRIPTION)
     contents = work if isinstance(work, Contents) else study_contents(work)
     path = Path(path)
     with locked(path, contents.kind):
         _remove_temporary_stores(path)
         store = Store(contents, path)
-        for left in path.rglob("*.partial"):  # temporary files of Zarr
-            left.unlink(missing_ok=True)
+        for partial_file in path.rglob("*.partial"):  # temporary files of Zarr
+            partial_file.unlink(missing_ok=True)
         yield store
 
 
@@ -385,17 +389,17 @@ def open_results(study: Study, path: str | Path):
     """
     xarray = optional("xarray", _TASK)
     store = Store(study, path, create=False)
-    done = np.zeros(len(study.points), bool)
+    is_finished = np.zeros(len(study.points), bool)
     for number in store.sound():
-        done[list(study.chunks[number])] = True
+        is_finished[list(study.chunks[number])] = True
     variables = {}
-    with store.open_dataset() as found:
-        for name, variable in found.data_vars.items():
+    with store.open_dataset() as dataset:
+        for name, variable in dataset.data_vars.items():
             values = np.full(variable.shape, np.nan)
-            values[done] = variable[np.flatnonzero(done)]
+            values[is_finished] = variable[np.flatnonzero(is_finished)]
             variables[name] = (variable.dims, values, variable.attrs)
-        coordinates = {name: coordinate.load() for name, coordinate in found.coords.items()}
-        return xarray.Dataset(variables, {**coordinates, "finished": ("point", done)}, found.attrs)
+        coordinates = {name: coordinate.load() for name, coordinate in dataset.coords.items()}
+        return xarray.Dataset(variables, {**coordinates, "finished": ("point", is_finished)}, dataset.attrs)
 
 
 def _store_shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]:
@@ -410,9 +414,9 @@ def _store_shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]
 
 def _consecutive_runs(points: Sequence[int]) -> list[slice]:
     """Group consecutive numbers of points to slices."""
-    places = np.asarray(points)
-    ends = np.flatnonzero(np.diff(places) != 1) + 1
-    return [slice(int(run[0]), int(run[-1]) + 1) for run in np.split(places, ends)]
+    point_numbers = np.asarray(points)
+    ends = np.flatnonzero(np.diff(point_numbers) != 1) + 1
+    return [slice(int(run[0]), int(run[-1]) + 1) for run in np.split(point_numbers, ends)]
 
 
 def _create_store(zarr: ModuleType, contents: Contents, path: Path) -> None:
@@ -438,12 +442,12 @@ def _create_store(zarr: ModuleType, contents: Contents, path: Path) -> None:
 
 def _remove_temporary_stores(path: Path) -> None:
     """Remove temporary files beside the store that killed runs have left."""
-    for left in path.parent.glob(f".{glob.escape(path.name)}.*"):
-        pid, _, kind = left.name.removeprefix(f".{path.name}.").partition(".")
+    for temporary_path in path.parent.glob(f".{glob.escape(path.name)}.*"):
+        pid, _, kind = temporary_path.name.removeprefix(f".{path.name}.").partition(".")
         if pid.isdecimal() and kind == "new":
-            shutil.rmtree(left, ignore_errors=True)
+            shutil.rmtree(temporary_path, ignore_errors=True)
         elif pid.isdecimal() and kind == "tmp":
-            left.unlink(missing_ok=True)
+            temporary_path.unlink(missing_ok=True)
 
 
 def _checksum(results: Mapping[str, np.ndarray]) -> str:

@@ -21,7 +21,7 @@ from jeit.design.skin.skin_file import (
     SIDE,
     THICKNESS,
 )
-from jeit.design.skin.surface_tables import SURFACE, SurfaceTable, check_of_curved
+from jeit.design.skin.surface_tables import SURFACE, SurfaceTable, check_keys_of_surface
 from jeit.files.schema import Number, Several, Table, Word, fault
 
 # Maximum numbers of layouts and of points: they are created before anything runs and take milliseconds and kilobytes
@@ -110,54 +110,55 @@ class StudyTable(Table):
     @property
     def num_layouts(self) -> int:
         """Number of layouts, including the combinations with diameters and contact impedances."""
-        one = self.electrodes
-        return math.prod(map(len, (one.layouts, one.diameter_mm, one.contact_impedance_ohm_m2)))
+        electrodes = self.electrodes
+        return math.prod(map(len, (electrodes.layouts, electrodes.diameter_mm, electrodes.contact_impedance_ohm_m2)))
 
     @property
     def num_points(self) -> int:
         """Number of points, that is of all combinations of swept values."""
         skin, measurement = self.skin, self.measurement
-        of_points = (measurement.protocol, measurement.pairs or [0], measurement.noise_V, self.mesh.cell_mm)
-        return self.num_layouts * math.prod(map(len, (skin.thickness_mm, skin.conductivity_S_per_m, *of_points)))
+        other_lists = (measurement.protocol, measurement.pairs or [0], measurement.noise_V, self.mesh.cell_mm)
+        return self.num_layouts * math.prod(map(len, (skin.thickness_mm, skin.conductivity_S_per_m, *other_lists)))
 
-    def at(self, where: str) -> Any:
+    def value_of(self, key: str) -> Any:
         """Value of a key, given by its dotted name such as "mesh.layers"."""
-        section, name = where.split(".")
+        section, name = key.split(".")
         return getattr(getattr(self, section), name)
 
     @model_validator(mode="after")
-    def _all_of_it_matters(self) -> "StudyTable":
-        for where, (other, words) in _NEEDS.items():
-            section, name = where.split(".")
-            there = self.at(other) if isinstance(self.at(other), list) else [self.at(other)]
-            if name in getattr(self, section).model_fields_set and not set(words) & set(there):
+    def _check_required_values(self) -> "StudyTable":
+        for key, (required_key, required_values) in _REQUIRED_VALUES.items():
+            section, name = key.split(".")
+            value = self.value_of(required_key)
+            values = value if isinstance(value, list) else [value]
+            if name in getattr(self, section).model_fields_set and not set(required_values) & set(values):
                 raise fault(
-                    f"has no effect: it applies where {other} is {' or '.join(map(repr, words))}, and that is "
-                    f"{', '.join(map(repr, there))}; leave it out, or change the other.",
-                    where,
+                    f"has no effect: it applies where {required_key} is {' or '.join(map(repr, required_values))}, "
+                    f"and that is {', '.join(map(repr, values))}; leave it out, or change the other.",
+                    key,
                 )
         return self
 
     @model_validator(mode="after")
-    def _of_curved(self) -> "StudyTable":
-        check_of_curved(self.surface, self.skin, self.mesh)
+    def _check_keys_of_surface(self) -> "StudyTable":
+        check_keys_of_surface(self.surface, self.skin, self.mesh)
         sides = {"width_mm", "height_mm"} & self.skin.model_fields_set
         if len(sides) == 1:
             raise fault("is given alone; give both skin.width_mm and skin.height_mm.", f"skin.{sides.pop()}")
         return self
 
     @model_validator(mode="after")
-    def _few_enough(self) -> "StudyTable":
-        layouts, points = self.num_layouts, self.num_points
-        if layouts > _MAX_LAYOUTS:
+    def _check_num_points(self) -> "StudyTable":
+        num_layouts, num_points = self.num_layouts, self.num_points
+        if num_layouts > _MAX_LAYOUTS:
             raise fault(
-                f"makes {layouts:,} layouts with diameters and contact impedances, more than the {_MAX_LAYOUTS:,} of "
-                "a study; split it into several.",
+                f"makes {num_layouts:,} layouts with diameters and contact impedances, more than the {_MAX_LAYOUTS:,} "
+                "of a study; split it into several.",
                 "electrodes.layouts",
             )
-        if points > _MAX_POINTS:
+        if num_points > _MAX_POINTS:
             raise fault(
-                f"makes {points:,} points with the other lists, more than the {_MAX_POINTS:,} of a study; split it "
+                f"makes {num_points:,} points with the other lists, more than the {_MAX_POINTS:,} of a study; split it "
                 "into several.",
                 "electrodes.layouts",
             )
@@ -165,7 +166,7 @@ class StudyTable(Table):
 
 
 # Keys that have an effect only if another key has one of the given values.
-_NEEDS: dict[str, tuple[str, tuple[str, ...]]] = {
+_REQUIRED_VALUES: dict[str, tuple[str, tuple[str, ...]]] = {
     "mesh.layers": ("skin.model", ("layer",)),
     "touch.deviation_mm": ("touch.indentation", ("bell",)),
     "touch.diameter_mm": ("touch.indentation", ("hemisphere",)),

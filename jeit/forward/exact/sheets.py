@@ -291,15 +291,15 @@ def sleeve_sheet_impedance(
     (L,) above its lower end in metres; sheet `conductivity` in siemens. The diagonal is set to zero, where the
     potential is infinite.
     """
-    around = angles[:, None] - angles
+    angle_difference = angles[:, None] - angles
     z, source = heights[:, None], heights
-    number = int(np.ceil(_IMAGE_CUTOFF * radius / (2 * height))) + 1
-    potential = np.zeros(around.shape)
-    for k in range(-number, number + 1):
-        for apart in (z - source + 2 * k * height, z + source + 2 * k * height):
-            decay = np.exp(-np.abs(apart) / radius)
-            inside = 1 - 2 * decay * np.cos(around) + decay**2
-            potential -= np.log(np.where(inside > 0, inside, 1.0)) / 2
+    num_images = int(np.ceil(_IMAGE_CUTOFF * radius / (2 * height))) + 1
+    potential = np.zeros(angle_difference.shape)
+    for k in range(-num_images, num_images + 1):
+        for axial_distance in (z - source + 2 * k * height, z + source + 2 * k * height):
+            decay = np.exp(-np.abs(axial_distance) / radius)
+            squared_distance = 1 - 2 * decay * np.cos(angle_difference) + decay**2
+            potential -= np.log(np.where(squared_distance > 0, squared_distance, 1.0)) / 2
     rod = (z**2 + source**2) / (2 * height) - np.maximum(z, source)
     potential += rod / radius
     np.fill_diagonal(potential, 0.0)

@@ -63,22 +63,25 @@ def face_patch_impedance(
     """
     a, b, c = size
     wave = [np.arange(number) * np.pi / side for number, side in zip(num_modes, (a, b), strict=True)]
-    across, along = (
+    modes_x, modes_y = (
         np.sinc(k * width / 2 / np.pi) * np.cos(k * positions[:, axis, None])
         for axis, (k, width) in enumerate(zip(wave, patch, strict=True))
     )
     kappa = np.hypot(wave[0][:, None], wave[1])
     kappa[0, 0] = 1.0
-    doubled = np.outer(*(np.where(k > 0, 2, 1) for k in wave))
-    decay = np.exp(-kappa * c)
-    same, other = (1 + decay**2) / (1 - decay**2) / kappa, 2 * decay / (1 - decay**2) / kappa
-    same[0, 0], other[0, 0] = 0.0, -c / 2
-    together = np.equal.outer(positions[:, 2] > c / 2, positions[:, 2] > c / 2)
-    near, far = (
-        np.einsum("lp,kp,pq,lq,kq->lk", across, across, doubled * mode, along, along, optimize=True)
-        for mode in (same, other)
+    mode_weights = np.outer(*(np.where(k > 0, 2, 1) for k in wave))
+    decay_factor = np.exp(-kappa * c)
+    same_face_modes, opposite_face_modes = (
+        (1 + decay_factor**2) / (1 - decay_factor**2) / kappa,
+        2 * decay_factor / (1 - decay_factor**2) / kappa,
     )
-    return np.where(together, near, far) / (a * b * conductivity)
+    same_face_modes[0, 0], opposite_face_modes[0, 0] = 0.0, -c / 2
+    is_same_face = np.equal.outer(positions[:, 2] > c / 2, positions[:, 2] > c / 2)
+    same_face, opposite_face = (
+        np.einsum("lp,kp,pq,lq,kq->lk", modes_x, modes_x, mode_weights * mode, modes_y, modes_y, optimize=True)
+        for mode in (same_face_modes, opposite_face_modes)
+    )
+    return np.where(is_same_face, same_face, opposite_face) / (a * b * conductivity)
 
 
 @dataclass(frozen=True)
@@ -96,18 +99,18 @@ class ConductingCylinder:
         mode."""
         order = np.arange(num_around)[:, None]
         ratio = self.inner_radius / self.radius
-        found = np.zeros((num_around, num_along))
+        response = np.zeros((num_around, num_along))
         power = ratio ** (2.0 * order[1:, 0])
-        found[1:, 0] = self.radius / order[1:, 0] * (1 + power) / (1 - power)
+        response[1:, 0] = self.radius / order[1:, 0] * (1 + power) / (1 - power)
         wave = np.arange(1, num_along) * np.pi / self.height
         outer = _Bessel(num_around, wave * self.radius)
-        found[:, 1:] = 1 / (wave * outer.growth)
+        response[:, 1:] = 1 / (wave * outer.growth)
         if self.inner_radius > 0:
             inner = _Bessel(num_around, wave * self.inner_radius)
             # Ratio of the K_n term of F to its I_n term at R₂.
             share = inner.growth / inner.decay * np.exp(inner.log_i - inner.log_k + outer.log_k - outer.log_i)
-            found[:, 1:] *= (1 + share) / (1 - share * outer.decay / outer.growth)
-        return found
+            response[:, 1:] *= (1 + share) / (1 - share * outer.decay / outer.growth)
+        return response
 
 
 def wall_patch_impedance(

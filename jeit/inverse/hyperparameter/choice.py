@@ -58,8 +58,8 @@ class Choice(Module):
     def given(cls, hyperparameter: ArrayLike) -> "Choice":
         """Create from a given number."""
         value = as_array(hyperparameter, float)
-        nothing = as_array(np.zeros(0))
-        return cls(value, as_array(np.reshape(value, 1)), nothing, nothing, nothing, "given")
+        empty_curve = as_array(np.zeros(0))
+        return cls(value, as_array(np.reshape(value, 1)), empty_curve, empty_curve, empty_curve, "given")
 
     @classmethod
     def among(

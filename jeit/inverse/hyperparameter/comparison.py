@@ -86,8 +86,8 @@ def compare_rules(
     report("linearise")
     linear = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
     data = linear.whiten(difference)
-    chosen = {}
+    choices = {}
     for name, rule in rules.items():
         report(name)
-        chosen[name] = choose(linear.spectrum, rule, data, model.mesh)
-    return chosen
+        choices[name] = choose(linear.spectrum, rule, data, model.mesh)
+    return choices

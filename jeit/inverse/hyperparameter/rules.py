@@ -64,10 +64,15 @@ def best_resolution(
             f"{signal_to_noise} and {num_targets}."
         )
     candidates = spectrum.candidates()[::4]
-    radius = blur_radius(spectrum, mesh, spread_cells(mesh, num_targets), candidates, signal_to_noise=signal_to_noise)
-    mean = radius.mean(axis=1)
+    radii = blur_radius(spectrum, mesh, spread_cells(mesh, num_targets), candidates, signal_to_noise=signal_to_noise)
+    mean_radius = radii.mean(axis=1)
     return Choice.among(
-        "best-resolution", candidates, int(np.argmin(mean)), mean, spectrum.curves(data, candidates), target=None
+        "best-resolution",
+        candidates,
+        int(np.argmin(mean_radius)),
+        mean_radius,
+        spectrum.curves(data, candidates),
+        target=None,
     )
 
 
@@ -88,67 +93,72 @@ def blur_radius(
     strength s in cell t with image p = R_λJ_t and noise variance (RRᵀ)_ii, cell i belongs to the set with probability
     Φ(s (p_i - p_t/2) / √(RRᵀ)_ii).
     """
-    area = np.asarray(measures(mesh))
+    cell_areas = np.asarray(measures(mesh))
     eigenvalues, modes = np.asarray(spectrum.eigenvalues), np.asarray(spectrum.modes())
     signals = np.asarray(spectrum.directions) @ np.asarray(spectrum.reduced)[:, targets]
-    size = np.linalg.norm(signals, axis=0)
-    strength = signal_to_noise * np.sqrt(len(signals)) / np.maximum(size, np.finfo(float).tiny)
+    signal_norms = np.linalg.norm(signals, axis=0)
+    strength = signal_to_noise * np.sqrt(len(signals)) / np.maximum(signal_norms, np.finfo(float).tiny)
     components = adjoint(np.asarray(spectrum.basis)) @ signals
     # Data in the range of the null space are imaged independently of λ.
-    free = np.asarray(spectrum.null_space) @ np.linalg.pinv(np.asarray(spectrum.seen))
-    fixed, fixed_variance = free @ signals, np.sum(abs(free) ** 2, axis=1)
+    null_space_weights = np.asarray(spectrum.null_space) @ np.linalg.pinv(np.asarray(spectrum.seen))
+    null_space_images, null_space_variance = null_space_weights @ signals, np.sum(abs(null_space_weights) ** 2, axis=1)
     damping = 1 / (eigenvalues + np.asarray(candidates)[:, None] ** 2)
-    variance = damping**2 @ (abs(modes) ** 2).T + fixed_variance
-    covered = np.empty((len(candidates), len(targets)))
-    for k in range(len(candidates)):
-        image = np.real(modes @ (damping[k][:, None] * components) + fixed)
-        above = image - image[targets, np.arange(len(targets))] / 2
-        covered[k] = area @ ndtr(strength * above / np.sqrt(variance[k])[:, None])
-    return (covered / area.sum()) ** (1 / mesh.dimension)
+    variance = damping**2 @ (abs(modes) ** 2).T + null_space_variance
+    expected_areas = np.empty((len(candidates), len(targets)))
+    for candidate_index in range(len(candidates)):
+        image = np.real(modes @ (damping[candidate_index][:, None] * components) + null_space_images)
+        excess = image - image[targets, np.arange(len(targets))] / 2
+        expected_areas[candidate_index] = cell_areas @ ndtr(
+            strength * excess / np.sqrt(variance[candidate_index])[:, None]
+        )
+    return (expected_areas / cell_areas.sum()) ** (1 / mesh.dimension)
 
 
 def spread_cells(mesh: Mesh, num_cells: int) -> Int[np.ndarray, " T"]:
     """About `num_cells` cells spread evenly through the body: the cells nearest to the points of a regular lattice."""
-    centre, size = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
-    low, high = np.asarray(mesh.points).min(axis=0), np.asarray(mesh.points).max(axis=0)
-    spacing = (size.sum() / num_cells) ** (1 / mesh.dimension)
-    counts = np.maximum(np.round((high - low) / spacing).astype(int), 1)
-    steps = [a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low, high, counts, strict=True)]
-    lattice = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, mesh.space_dimension)
-    distance, nearest = (np.asarray(found) for found in KDTree(centre).query(lattice))
+    centres, cell_measures = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
+    lower_corner, upper_corner = np.asarray(mesh.points).min(axis=0), np.asarray(mesh.points).max(axis=0)
+    spacing = (cell_measures.sum() / num_cells) ** (1 / mesh.dimension)
+    counts = np.maximum(np.round((upper_corner - lower_corner) / spacing).astype(int), 1)
+    coordinates = [
+        start + (np.arange(num_steps) + 0.5) * (stop - start) / num_steps
+        for start, stop, num_steps in zip(lower_corner, upper_corner, counts, strict=True)
+    ]
+    lattice = np.stack(np.meshgrid(*coordinates, indexing="ij"), axis=-1).reshape(-1, mesh.space_dimension)
+    distances, nearest = (np.asarray(result) for result in KDTree(centres).query(lattice))
     # A surface in space passes between lattice points, so points up to half a spacing away count.
-    inside = distance <= (spacing / 2 if mesh.is_surface else size[nearest] ** (1 / mesh.dimension))
+    inside = distances <= (spacing / 2 if mesh.is_surface else cell_measures[nearest] ** (1 / mesh.dimension))
     return np.unique(nearest[inside] if inside.any() else nearest)
 
 
-def greit_noise_figure(target: float, eigenvalues, signal, level: float, painted, measure) -> float:
+def greit_noise_figure(target: float, eigenvalues, signal, data_ratio: float, image_modes, measure) -> float:
     """Smallest λ at which GREIT's noise figure is `target`. Raises `ValueError` if there is none.
 
     The noise figure is the signal-to-noise ratio of the data divided by that of the image, for one target (Adler et
     al., Physiol. Meas. 30, S35, 2009); in contrast, `noise_figure` draws signals from the prior.
 
-    With the eigendecomposition YYᵀ = VΛVᵀ, the image of data y is XYᵀV (Λ + λ²)⁻¹ Vᵀy. `signal`: Vᵀy; `painted`: XYᵀV;
-    `level`: signal-to-noise ratio of the data; `measure`: areas of the cells. White noise of unit variance in the data
-    gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².
+    With the eigendecomposition YYᵀ = VΛVᵀ, the image of data y is XYᵀV (Λ + λ²)⁻¹ Vᵀy. `signal`: Vᵀy; `image_modes`:
+    XYᵀV; `data_ratio`: signal-to-noise ratio of the data; `measure`: areas of the cells. White noise of unit variance
+    in the data gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².
     """
     weight = measure / measure.sum()
-    gain = weight @ painted**2
+    noise_gain = weight @ image_modes**2
 
     def excess(log_hyperparameter) -> float:
-        filtered = 1 / (eigenvalues + np.exp(2 * log_hyperparameter))
-        noise, image = np.sqrt(gain @ filtered**2), weight @ np.abs(painted @ (signal * filtered))
-        return float(np.log(level * noise / image / target))
+        filter_values = 1 / (eigenvalues + np.exp(2 * log_hyperparameter))
+        noise, image = np.sqrt(noise_gain @ filter_values**2), weight @ np.abs(image_modes @ (signal * filter_values))
+        return float(np.log(data_ratio * noise / image / target))
 
     grid = np.log(np.sqrt(eigenvalues.max()) * np.logspace(-6, 1, 71))
-    values = np.array([excess(value) for value in grid])
-    below = np.flatnonzero(values <= 0)
-    if below.size == 0 or below[0] == 0:
-        low, high = target * np.exp([values.min(), values.max()])
+    excesses = np.array([excess(grid_point) for grid_point in grid])
+    below_target = np.flatnonzero(excesses <= 0)
+    if below_target.size == 0 or below_target[0] == 0:
+        min_figure, max_figure = target * np.exp([excesses.min(), excesses.max()])
         raise ValueError(
-            f"noise_figure: no hyperparameter gives {target:g}; here it lies between {low:.3g} and {high:.3g}. A "
-            "larger radius brings it down; a larger noise_figure takes a noisier image."
+            f"noise_figure: no hyperparameter gives {target:g}; here it lies between {min_figure:.3g} and "
+            f"{max_figure:.3g}. A larger radius brings it down; a larger noise_figure takes a noisier image."
         )
-    bracket = (grid[below[0] - 1], grid[below[0]])
+    bracket = (grid[below_target[0] - 1], grid[below_target[0]])
     return float(np.exp(scipy.optimize.root_scalar(excess, bracket=bracket, rtol=1e-10).root))
 
 
@@ -174,8 +184,8 @@ def generalised_cross_validation(spectrum: Spectrum, data: ArrayLike | None, mes
     candidates, data = spectrum.candidates(), _check_data(data, "gcv")
     residual, penalty = spectrum.curves(data, candidates)
     # Repeated readings have filter 1 but leave no residual, so they are subtracted from both counts.
-    number = len(data) - spectrum.repeated
-    score = number * residual**2 / (_filters(spectrum, candidates).sum(axis=1) - spectrum.repeated) ** 2
+    num_independent = len(data) - spectrum.repeated
+    score = num_independent * residual**2 / (_filters(spectrum, candidates).sum(axis=1) - spectrum.repeated) ** 2
     return Choice.among("gcv", candidates, int(np.argmin(score)), score, (residual, penalty))
 
 
@@ -204,16 +214,18 @@ def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = 
     """
     candidates, data = spectrum.candidates(), _check_data(data, "discrepancy")
     components = abs(adjoint(np.asarray(spectrum.basis)) @ data)
-    freedom = spectrum.freedom * (2 if np.iscomplexobj(data) else 1)
+    degrees_of_freedom = spectrum.freedom * (2 if np.iscomplexobj(data) else 1)
     residual, penalty = spectrum.curves(data, candidates)
-    criterion = residual / np.sqrt(freedom)
-    inside = np.flatnonzero(criterion <= noise)
-    index = inside[-1] if inside.size else 0
+    criterion = residual / np.sqrt(degrees_of_freedom)
+    allowed_indices = np.flatnonzero(criterion <= noise)
+    index = allowed_indices[-1] if allowed_indices.size else 0
     between = None
-    if inside.size and index + 1 < len(candidates):
+    if allowed_indices.size and index + 1 < len(candidates):
 
         def excess(log_value) -> float:
-            return float(np.sqrt(((_filters(spectrum, np.exp(log_value)) * components) ** 2).sum() / freedom) - noise)
+            return float(
+                np.sqrt(((_filters(spectrum, np.exp(log_value)) * components) ** 2).sum() / degrees_of_freedom) - noise
+            )
 
         between = np.exp(scipy.optimize.root_scalar(excess, bracket=np.log(candidates[index : index + 2])).root)
     return Choice.among(
@@ -239,9 +251,9 @@ def l_curve(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None
     """
     candidates, data = spectrum.candidates(), _check_data(data, "l-curve")
     residual, penalty = spectrum.curves(data, candidates)
-    bend = _curvature(spectrum, data, candidates)
-    bend = np.where(np.isfinite(bend), bend, np.min(bend[np.isfinite(bend)], initial=0))
-    return Choice.among("l-curve", candidates, int(np.argmax(bend)), bend, (residual, penalty))
+    curvature = _curvature(spectrum, data, candidates)
+    curvature = np.where(np.isfinite(curvature), curvature, np.min(curvature[np.isfinite(curvature)], initial=0))
+    return Choice.among("l-curve", candidates, int(np.argmax(curvature)), curvature, (residual, penalty))
 
 
 def noise_figure(
@@ -270,9 +282,9 @@ def noise_figure(
     candidates = spectrum.candidates()
     eigenvalues = np.asarray(spectrum.eigenvalues)
     gain = spectrum.squared_modes()
-    passed = gain / (eigenvalues + candidates[:, None] ** 2) ** 2
-    image = passed @ eigenvalues / passed.sum(axis=1)
-    figure = np.sqrt(eigenvalues.sum() / spectrum.freedom / image)
+    noise_weights = gain / (eigenvalues + candidates[:, None] ** 2) ** 2
+    image_ratio = noise_weights @ eigenvalues / noise_weights.sum(axis=1)
+    figure = np.sqrt(eigenvalues.sum() / spectrum.freedom / image_ratio)
     return Choice.among(
         "noise-figure",
         candidates,
@@ -317,8 +329,8 @@ def choose(spectrum: Any, hyperparameter: float | str | Rule | Choice, data, mes
 
 def _check_problem(problem, name: str) -> None:
     """Raise `ValueError` for a traced problem, because a rule needs its values."""
-    instead = "give a number, such as the one that jeit.inverse.choose_hyperparameter finds outside"
-    check_has_values("hyperparameter: the problem", problem, f"the rule '{name}' looks at", instead)
+    advice = "give a number, such as the one that jeit.inverse.choose_hyperparameter finds outside"
+    check_has_values("hyperparameter: the problem", problem, f"the rule '{name}' looks at", advice)
 
 
 def _filters(spectrum: Spectrum, candidates) -> Float[np.ndarray, "K r"]:
@@ -328,30 +340,36 @@ def _filters(spectrum: Spectrum, candidates) -> Float[np.ndarray, "K r"]:
 
 def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
     """Curvature of the L-curve with parameter t = log λ, computed with df/dt = 2f(1 - f) for the filter f."""
-    left, eigenvalues = _filters(spectrum, candidates), np.asarray(spectrum.eigenvalues)
-    squared = abs(adjoint(np.asarray(spectrum.basis)) @ data) ** 2
-    image = squared * eigenvalues / (eigenvalues + candidates[:, None] ** 2) ** 2  # its sum is the penalty
-    rest = squared * left**2  # its sum is ‖r‖²
+    filters, eigenvalues = _filters(spectrum, candidates), np.asarray(spectrum.eigenvalues)
+    squared_components = abs(adjoint(np.asarray(spectrum.basis)) @ data) ** 2
+    penalty_terms = (
+        squared_components * eigenvalues / (eigenvalues + candidates[:, None] ** 2) ** 2
+    )  # its sum is the penalty
+    residual_terms = squared_components * filters**2  # its sum is ‖r‖²
     # The derivatives with respect to t are 4 rest (1 - f) and -4 image f.
-    first = _second_log_derivative(rest, 4 * (1 - left), 8 * (1 - left) * (2 - 3 * left))
-    second = _second_log_derivative(image, -4 * left, -8 * left * (1 - 3 * left))
+    residual_derivatives = _second_log_derivative(
+        residual_terms, 4 * (1 - filters), 8 * (1 - filters) * (2 - 3 * filters)
+    )
+    penalty_derivatives = _second_log_derivative(penalty_terms, -4 * filters, -8 * filters * (1 - 3 * filters))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return (first[0] * second[1] - second[0] * first[1]) / (first[0] ** 2 + second[0] ** 2) ** 1.5
+        return (residual_derivatives[0] * penalty_derivatives[1] - penalty_derivatives[0] * residual_derivatives[1]) / (
+            residual_derivatives[0] ** 2 + penalty_derivatives[0] ** 2
+        ) ** 1.5
 
 
-def _second_log_derivative(terms, once, twice):
+def _second_log_derivative(terms, first_factors, second_factors):
     """First and second derivative of ½ log Σ terms, where the derivatives of the terms are terms · once and
     terms · twice."""
     total = terms.sum(axis=1)
-    slope = (terms * once).sum(axis=1) / total
-    return slope / 2, ((terms * twice).sum(axis=1) / total - slope**2) / 2
+    slope = (terms * first_factors).sum(axis=1) / total
+    return slope / 2, ((terms * second_factors).sum(axis=1) / total - slope**2) / 2
 
 
 def _check_data(data, rule: str) -> Float[np.ndarray, " M"]:
     if data is None:
         raise ValueError(f"The rule '{rule}' looks at the data: give difference, the change of voltages to be imaged.")
-    instead = "give a number as hyperparameter, such as the one that the rule finds outside"
-    check_has_values("difference (voltages)", data, f"the rule '{rule}' looks at", instead)
+    advice = "give a number as hyperparameter, such as the one that the rule finds outside"
+    check_has_values("difference (voltages)", data, f"the rule '{rule}' looks at", advice)
     values = np.asarray(data)
     if not (np.isfinite(values).all() and values.any()):
         raise ValueError(f"The rule '{rule}' looks at the data, and they are all zero, NaN or infinite: give others.")

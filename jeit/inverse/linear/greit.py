@@ -84,10 +84,10 @@ def greit(
     ```
     """
     check_model(model)
-    instead = (
+    advice = (
         "work it out once outside: its image() is what JAX transforms; or take one_step, which can be differentiated"
     )
-    check_has_values("model, conductivity or noise", (model, conductivity, noise), "GREIT is trained on", instead)
+    check_has_values("model, conductivity or noise", (model, conductivity, noise), "GREIT is trained on", advice)
     mesh = model.mesh
     check_flat(mesh, "GREIT's targets")
     radius = float(model.electrodes.num_electrodes**-0.5) if radius is None else radius
@@ -97,31 +97,41 @@ def greit(
         raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
     if np.shape(conductivity) not in ((), (mesh.num_cells,)):
         raise ValueError("conductivity: give one number, or one value per cell: the image has a value per cell.")
-    measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
-    body_radius, middle = _ball_radius(float(measure.sum()), mesh.dimension), measure @ centre / measure.sum()
-    position, covered = _place_targets(mesh, middle, target_radius * body_radius, num_targets)
-    desired = _desired_images(mesh, position, covered.T @ measure, radius * body_radius)
+    cell_measures, cell_centres = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
+    body_radius, body_centre = (
+        _ball_radius(float(cell_measures.sum()), mesh.dimension),
+        cell_measures @ cell_centres / cell_measures.sum(),
+    )
+    positions, coverage = _place_targets(mesh, body_centre, target_radius * body_radius, num_targets)
+    desired_images = _desired_images(mesh, positions, coverage.T @ cell_measures, radius * body_radius)
     # Responses are computed for the directions in which a body can change the data; they are fewer than the channels.
     directions = data_directions(model.protocol, channels, root_weight)
-    weighted = directions.T * np.asarray(root_weight)  # (r, K)
-    response, shares = np.zeros((len(weighted), len(position))), covered.tocsr()
-    for cells, block in combined_blocks(model, conductivity, channels, weighted):
-        response += (shares[cells].T @ block.T).T / np.sqrt(len(position))
-    eigenvalues, vectors = np.linalg.eigh(response @ response.T)
+    weighted_directions = directions.T * np.asarray(root_weight)  # (r, K)
+    responses, cell_coverage = np.zeros((len(weighted_directions), len(positions))), coverage.tocsr()
+    for cells, block in combined_blocks(model, conductivity, channels, weighted_directions):
+        responses += (cell_coverage[cells].T @ block.T).T / np.sqrt(len(positions))
+    eigenvalues, vectors = np.linalg.eigh(responses @ responses.T)
     eigenvalues = np.maximum(eigenvalues, 0)
-    painted = desired @ (response.T @ vectors) / np.sqrt(len(position))
+    image_modes = desired_images @ (responses.T @ vectors) / np.sqrt(len(positions))
     if isinstance(hyperparameter, str):
-        central = response[:, np.argmin(np.linalg.norm(position - middle, axis=1))]
-        level = float(np.abs(directions @ central).mean())
-        some = slice(None, None, max(1, len(measure) // _NUM_MEAN_CELLS))
-        signal = vectors.T @ central
-        chosen = greit_noise_figure(noise_figure, eigenvalues, signal, level, painted[some], measure[some])
+        central_response = responses[:, np.argmin(np.linalg.norm(positions - body_centre, axis=1))]
+        data_ratio = float(np.abs(directions @ central_response).mean())
+        sampled_cells = slice(None, None, max(1, len(cell_measures) // _NUM_MEAN_CELLS))
+        signal_components = vectors.T @ central_response
+        chosen_hyperparameter = greit_noise_figure(
+            noise_figure,
+            eigenvalues,
+            signal_components,
+            data_ratio,
+            image_modes[sampled_cells],
+            cell_measures[sampled_cells],
+        )
     else:
-        chosen = float(hyperparameter)
+        chosen_hyperparameter = float(hyperparameter)
     weights = np.zeros((len(eigenvalues), model.protocol.num_measurements))
-    weights[:, channels] = (vectors / (eigenvalues + chosen**2)).T @ directions.T * root_weight
+    weights[:, channels] = (vectors / (eigenvalues + chosen_hyperparameter**2)).T @ directions.T * root_weight
     rule = "noise-figure" if isinstance(hyperparameter, str) else "given"
-    return LinearReconstruction.of_factors(model, (painted, weights), chosen, rule, "GREIT")
+    return LinearReconstruction.of_factors(model, (image_modes, weights), chosen_hyperparameter, rule, "GREIT")
 
 
 def _ball_radius(measure: float, dimension: int) -> float:
@@ -136,47 +146,60 @@ def _ball_measure(radius: float, dimension: int) -> float:
 
 def _place_targets(mesh: Mesh, middle, radius: float, num_targets: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
     """Centres (K, d) of the targets that lie in the body, and the fraction (m, K) of every cell that each covers."""
-    measure, points = np.asarray(measures(mesh)), np.asarray(mesh.points)
-    low, high = points.min(axis=0), points.max(axis=0)
+    cell_measures, points = np.asarray(measures(mesh)), np.asarray(mesh.points)
+    lower_corner, upper_corner = points.min(axis=0), points.max(axis=0)
     if mesh.dimension == 2:
-        spacing = np.sqrt(2 / np.sqrt(3) * measure.sum() / num_targets)
-        grid = _hexagonal_lattice(low, high, middle, spacing)
+        spacing = np.sqrt(2 / np.sqrt(3) * cell_measures.sum() / num_targets)
+        grid = _hexagonal_lattice(lower_corner, upper_corner, middle, spacing)
     else:
-        spacing = np.cbrt(measure.sum() / num_targets)
-        grid = _cubic_lattice(low, high, middle, spacing)
-    tree, parts = KDTree(grid), []
-    for samples, cell, share in _sample_points(mesh, radius / _SAMPLES_PER_RADIUS[mesh.dimension]):
+        spacing = np.cbrt(cell_measures.sum() / num_targets)
+        grid = _cubic_lattice(lower_corner, upper_corner, middle, spacing)
+    tree, entry_groups = KDTree(grid), []
+    for samples, sample_cells, sample_shares in _sample_points(mesh, radius / _SAMPLES_PER_RADIUS[mesh.dimension]):
         if mesh.dimension == 3:
-            place = (samples - middle) / spacing
-            place -= np.rint(place)  # offset from the nearest centre; only part of the points lie within a ball
-            near = np.flatnonzero(np.einsum("qi,qi->q", place, place) < (_SEARCH_RADII * radius / spacing) ** 2)
-            samples, cell, share = samples[near], cell[near], share[near]
+            offsets = (samples - middle) / spacing
+            offsets -= np.rint(offsets)  # offset from the nearest centre; only part of the points lie within a ball
+            near_indices = np.flatnonzero(
+                np.einsum("qi,qi->q", offsets, offsets) < (_SEARCH_RADII * radius / spacing) ** 2
+            )
+            samples, sample_cells, sample_shares = (
+                samples[near_indices],
+                sample_cells[near_indices],
+                sample_shares[near_indices],
+            )
         pairs = tree.sparse_distance_matrix(KDTree(samples), radius, output_type="ndarray")
-        parts.append((share[pairs["j"]], cell[pairs["j"]], pairs["i"]))
-    shares, cells, targets = (np.concatenate(part) for part in zip(*parts, strict=True))
-    covered = scipy.sparse.coo_array((shares, (cells, targets)), shape=(mesh.num_cells, len(grid))).tocsc()
-    inside = np.flatnonzero(covered.T @ measure > _MIN_INSIDE_FRACTION * _ball_measure(radius, mesh.dimension))
-    if inside.size == 0:
+        entry_groups.append((sample_shares[pairs["j"]], sample_cells[pairs["j"]], pairs["i"]))
+    shares, cells, targets = (np.concatenate(entries) for entries in zip(*entry_groups, strict=True))
+    coverage = scipy.sparse.coo_array((shares, (cells, targets)), shape=(mesh.num_cells, len(grid))).tocsc()
+    targets_inside = np.flatnonzero(
+        coverage.T @ cell_measures > _MIN_INSIDE_FRACTION * _ball_measure(radius, mesh.dimension)
+    )
+    if targets_inside.size == 0:
         raise ValueError(
             f"target_radius: no {'disc' if mesh.dimension == 2 else 'ball'} of {1e3 * radius:.3g} mm radius fits into "
             "this body; give a smaller one, or more targets."
         )
-    return grid[inside], covered[:, inside]
+    return grid[targets_inside], coverage[:, targets_inside]
 
 
-def _hexagonal_lattice(low, high, middle, spacing: float) -> np.ndarray:
-    """Points (k, 2) of a hexagonal grid with a point at `middle` that covers the box from `low` to `high`."""
-    step = spacing * np.array([1, np.sqrt(0.75)])
-    (first, bottom), (last, top) = np.floor((low - middle) / step) - 1, np.ceil((high - middle) / step) + 1
+def _hexagonal_lattice(lower_corner, upper_corner, centre, spacing: float) -> np.ndarray:
+    """Points (k, 2) of a hexagonal grid with a point at `centre` that covers the box from `lower_corner` to
+    `upper_corner`."""
+    steps = spacing * np.array([1, np.sqrt(0.75)])
+    (first, bottom), (last, top) = (
+        np.floor((lower_corner - centre) / steps) - 1,
+        np.ceil((upper_corner - centre) / steps) + 1,
+    )
     row, column = np.meshgrid(np.arange(bottom, top + 1), np.arange(first, last + 1), indexing="ij")
-    return middle + step * np.stack([column + row % 2 / 2, row], axis=-1).reshape(-1, 2)
+    return centre + steps * np.stack([column + row % 2 / 2, row], axis=-1).reshape(-1, 2)
 
 
-def _cubic_lattice(low, high, middle, spacing: float) -> np.ndarray:
-    """Points (k, 3) of a cubic grid with a point at `middle` that covers the box from `low` to `high`."""
-    first, last = np.floor((low - middle) / spacing) - 1, np.ceil((high - middle) / spacing) + 1
+def _cubic_lattice(lower_corner, upper_corner, centre, spacing: float) -> np.ndarray:
+    """Points (k, 3) of a cubic grid with a point at `centre` that covers the box from `lower_corner` to
+    `upper_corner`."""
+    first, last = np.floor((lower_corner - centre) / spacing) - 1, np.ceil((upper_corner - centre) / spacing) + 1
     steps = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
-    return middle + spacing * np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    return centre + spacing * np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _sample_points(mesh: Mesh, spacing: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -188,38 +211,44 @@ def _sample_points(mesh: Mesh, spacing: float) -> Iterator[tuple[np.ndarray, np.
     Tetrahedra are treated likewise.
     """
     corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
-    count = corners.shape[1]
-    longest = np.max(
-        [np.linalg.norm(corners[:, i] - corners[:, j], axis=1) for i, j in combinations(range(count), 2)], 0
+    num_corners = corners.shape[1]
+    longest_sides = np.max(
+        [np.linalg.norm(corners[:, i] - corners[:, j], axis=1) for i, j in combinations(range(num_corners), 2)], 0
     )
-    cuts = np.maximum(np.ceil(longest / spacing), 1).astype(int)
-    for number in np.unique(cuts):
-        steps = np.stack(np.meshgrid(*[np.arange(number)] * (count - 1)), axis=-1).reshape(-1, count - 1)
-        steps = steps[steps.sum(axis=1) < number]
-        barycentric = (np.column_stack([steps, number - 1 - steps.sum(axis=1)]) + 1 / count) / number
-        alike = np.flatnonzero(cuts == number)
-        for cells in np.array_split(alike, -(-alike.size * len(steps) // _SAMPLES_AT_ONCE)):
+    num_parts = np.maximum(np.ceil(longest_sides / spacing), 1).astype(int)
+    for parts_per_side in np.unique(num_parts):
+        steps = np.stack(np.meshgrid(*[np.arange(parts_per_side)] * (num_corners - 1)), axis=-1).reshape(
+            -1, num_corners - 1
+        )
+        steps = steps[steps.sum(axis=1) < parts_per_side]
+        barycentric = (
+            np.column_stack([steps, parts_per_side - 1 - steps.sum(axis=1)]) + 1 / num_corners
+        ) / parts_per_side
+        cell_indices = np.flatnonzero(num_parts == parts_per_side)
+        for cells in np.array_split(cell_indices, -(-cell_indices.size * len(steps) // _SAMPLES_AT_ONCE)):
             samples = (barycentric @ corners[cells]).reshape(-1, corners.shape[2])
             yield samples, np.repeat(cells, len(steps)), np.full(len(samples), 1 / len(steps))
 
 
-def _desired_images(mesh: Mesh, position, area, radius: float) -> scipy.sparse.csc_array:
-    """Desired images X (m, K): a disc around each position, with half its height at `radius` and the integral `area`
-    (K,) over the body."""
-    measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
-    pairs = KDTree(centre).sparse_distance_matrix(
-        KDTree(position), (1 + _EDGE_HALF_WIDTH) * radius, output_type="ndarray"
+def _desired_images(mesh: Mesh, positions, integrals, radius: float) -> scipy.sparse.csc_array:
+    """Desired images X (m, K): a disc around each position, with half its height at `radius` and the integral
+    `integrals` (K,) over the body."""
+    cell_measures, cell_centres = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
+    pairs = KDTree(cell_centres).sparse_distance_matrix(
+        KDTree(positions), (1 + _EDGE_HALF_WIDTH) * radius, output_type="ndarray"
     )
     ramp = np.clip((pairs["v"] / radius - 1) / _EDGE_HALF_WIDTH, -1, 1)
-    height = (1 - np.sin(0.5 * np.pi * ramp)) / 2
-    disc = scipy.sparse.coo_array((height, (pairs["i"], pairs["j"])), shape=(len(centre), len(position))).tocsc()
-    total = disc.T @ measure
-    if not (total > 0.01 * _ball_measure(radius, mesh.dimension)).all():
+    heights = (1 - np.sin(0.5 * np.pi * ramp)) / 2
+    discs = scipy.sparse.coo_array(
+        (heights, (pairs["i"], pairs["j"])), shape=(len(cell_centres), len(positions))
+    ).tocsc()
+    disc_integrals = discs.T @ cell_measures
+    if not (disc_integrals > 0.01 * _ball_measure(radius, mesh.dimension)).all():
         raise ValueError(
             f"radius: a desired image of {1e3 * radius:.3g} mm radius is lost between the cells of this mesh; give a "
             "larger radius, or a finer mesh."
         )
-    return disc @ scipy.sparse.diags_array(area / total)
+    return discs @ scipy.sparse.diags_array(integrals / disc_integrals)
 
 
 def _check_options(radius, target_radius, num_targets, hyperparameter, noise_figure) -> None:

@@ -88,17 +88,26 @@ class LinearReconstruction:
         """Create from images (m, r) and weights (r, M), whose product is the reconstruction matrix. The product is
         formed only if it is smaller than the factors."""
         images, weights = factors
-        some = images[
-            :: max(1, len(images) // _NUM_SAMPLED_CELLS)
-        ]  # channels are proportional in every cell or in none
-        first, second, ratio = _proportional_channels(model, some @ weights)
-        tied = (weights.T[first] + ratio[:, None] * weights.T[second]) / (1 + ratio**2)[:, None]
-        rows, mixing = (images.T, tied) if len(first) > images.shape[1] else (tied @ images.T, None)
-        places = as_array(first), as_array(second), as_array(ratio)
-        number = weights.shape[1]
-        mixed = None if mixing is None else as_array(mixing)
-        given = as_array(rows), as_array(hyperparameter, float), number, rule, method, choice, mixed
-        return cls(model.mesh, *places, *given)
+        # Channels are proportional in every cell or in none, so a sample of the cells suffices.
+        sampled_images = images[:: max(1, len(images) // _NUM_SAMPLED_CELLS)]
+        first, second, ratio = _proportional_channels(model, sampled_images @ weights)
+        combined_weights = (weights.T[first] + ratio[:, None] * weights.T[second]) / (1 + ratio**2)[:, None]
+        rows, mixing = (
+            (images.T, combined_weights) if len(first) > images.shape[1] else (combined_weights @ images.T, None)
+        )
+        channel_pairs = as_array(first), as_array(second), as_array(ratio)
+        num_measurements = weights.shape[1]
+        device_mixing = None if mixing is None else as_array(mixing)
+        reconstruction_fields = (
+            as_array(rows),
+            as_array(hyperparameter, float),
+            num_measurements,
+            rule,
+            method,
+            choice,
+            device_mixing,
+        )
+        return cls(model.mesh, *channel_pairs, *reconstruction_fields)
 
     @classmethod
     def create(
@@ -113,15 +122,21 @@ class LinearReconstruction:
         """Create from a full reconstruction matrix (m, M)."""
         if not has_values(model.protocol, matrix, hyperparameter):
             # It is unknown which columns of a traced matrix are proportional, so no channels are combined.
-            every, nothing = jnp.arange(matrix.shape[1]), jnp.zeros(matrix.shape[1])
-            given = every, every, nothing, jnp.asarray(matrix).T, jnp.asarray(hyperparameter, float)
-            return cls(model.mesh, *given, matrix.shape[1], rule, method, choice)
+            all_channels, zero_ratios = jnp.arange(matrix.shape[1]), jnp.zeros(matrix.shape[1])
+            traced_fields = (
+                all_channels,
+                all_channels,
+                zero_ratios,
+                jnp.asarray(matrix).T,
+                jnp.asarray(hyperparameter, float),
+            )
+            return cls(model.mesh, *traced_fields, matrix.shape[1], rule, method, choice)
         matrix = np.asarray(matrix)
         first, second, ratio = _proportional_channels(model, matrix)
         # The weighted mean of two proportional columns is used: for small λ their rounding errors are large and
         # opposite.
-        tied = matrix.T[first] + ratio[:, None] * matrix.T[second]
-        weights = tied / (1 + ratio**2)[:, None]
+        summed_columns = matrix.T[first] + ratio[:, None] * matrix.T[second]
+        weights = summed_columns / (1 + ratio**2)[:, None]
         return cls(
             model.mesh,
             as_array(first),
@@ -154,26 +169,26 @@ class LinearReconstruction:
                 f"difference has shape {shape}; this reconstruction takes ({self.num_measurements},) volts, or "
                 f"(frames, {self.num_measurements})."
             )
-        if not has_values(difference, self._parts):
-            return jax.jit(_image_product)(self._parts, difference)
+        if not has_values(difference, self._product_arrays):
+            return jax.jit(_image_product)(self._product_arrays, difference)
         voltages = np.asarray(difference)
         if voltages.dtype.kind not in "iufc":
             raise ValueError(f"difference is {voltages.dtype}; give numbers, in volts.")
         if not np.isfinite(voltages).all():
             raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
-        first, second, ratio, mixing, weights = self._parts
+        first, second, ratio, mixing, weights = self._product_arrays
         combined = _combine_channels(voltages, first, second, ratio, mixing)
         return on_device(combined @ weights) if is_forked() else product_for_jax(combined, weights)
 
     @functools.cached_property
-    def _parts(self) -> tuple[Any, ...]:
+    def _product_arrays(self) -> tuple[Any, ...]:
         """Arrays used by `image`, converted to NumPy once, because a conversion takes as long as the product."""
-        parts = (self.first, self.second, self.ratio, self.mixing, self.weights)
-        return on_host(parts) if has_values(parts) else parts
+        arrays = (self.first, self.second, self.ratio, self.mixing, self.weights)
+        return on_host(arrays) if has_values(arrays) else arrays
 
 
-def _image_product(parts, difference) -> Any:
-    *channels, weights = parts
+def _image_product(arrays, difference) -> Any:
+    *channels, weights = arrays
     return _combine_channels(difference, *channels) @ weights
 
 
@@ -185,20 +200,20 @@ def _combine_channels(difference, first, second, ratio, mixing) -> Any:
 def _proportional_channels(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Channels `first` and `second` to add before the product, and the `ratio` of their columns: reciprocal pairs with
     proportional columns, and all other channels alone, with ratio 0."""
-    size = np.linalg.norm(matrix, axis=0)
-    alone = size > 0
+    column_norms = np.linalg.norm(matrix, axis=0)
+    is_single = column_norms > 0
     pairs, _ = model.protocol.reciprocal_pairs()
     pairs = np.asarray(pairs).reshape(-1, 2)
-    first, second = pairs[(size[pairs] > 0).all(axis=1)].T
-    ratio = np.einsum("ij,ij->j", matrix[:, first].conj(), matrix[:, second]).real / size[first] ** 2
-    tied = np.abs(matrix[:, second] - ratio * matrix[:, first]).max(axis=0) < 1e-9 * np.abs(matrix).max()
-    first, second, ratio = first[tied], second[tied], ratio[tied]
-    alone[first] = alone[second] = False
-    single = np.flatnonzero(alone)
+    first, second = pairs[(column_norms[pairs] > 0).all(axis=1)].T
+    ratio = np.einsum("ij,ij->j", matrix[:, first].conj(), matrix[:, second]).real / column_norms[first] ** 2
+    is_proportional = np.abs(matrix[:, second] - ratio * matrix[:, first]).max(axis=0) < 1e-9 * np.abs(matrix).max()
+    first, second, ratio = first[is_proportional], second[is_proportional], ratio[is_proportional]
+    is_single[first] = is_single[second] = False
+    single_channels = np.flatnonzero(is_single)
     return (
-        np.concatenate([first, single]),
-        np.concatenate([second, single]),
-        np.concatenate([ratio, np.zeros(len(single))]),
+        np.concatenate([first, single_channels]),
+        np.concatenate([second, single_channels]),
+        np.concatenate([ratio, np.zeros(len(single_channels))]),
     )
 
 
@@ -253,12 +268,12 @@ def one_step(
             "volts and S/m (2-D: S)?"
         )
     method = f"one-step, {type(linear.prior).__name__} prior"
-    found = choice.hyperparameter, choice.rule, method, choice
+    result_fields = choice.hyperparameter, choice.rule, method, choice
     if isinstance(linear.spectrum, Spectrum) and has_values(choice.hyperparameter):
         factors = linear.factors(choice.hyperparameter)
         del linear  # frees memory, which would not hold both for a large body
-        return LinearReconstruction.of_factors(model, factors, *found)
-    return LinearReconstruction.create(model, linear.matrix(choice.hyperparameter), *found)
+        return LinearReconstruction.of_factors(model, factors, *result_fields)
+    return LinearReconstruction.create(model, linear.matrix(choice.hyperparameter), *result_fields)
 
 
 def back_projection(
@@ -294,10 +309,10 @@ def back_projection(
     ```
     """
     check_model(model)
-    instead = (
+    advice = (
         "work it out once outside: its image() is what JAX transforms; or take one_step, which can be differentiated"
     )
-    check_has_values("model or conductivity", (model, conductivity), "its bands are drawn from", instead)
+    check_has_values("model or conductivity", (model, conductivity), "its bands are drawn from", advice)
     protocol = model.protocol
     used = np.ones(protocol.num_measurements, bool) if mask is None else np.asarray(mask, bool)
     if used.shape != (protocol.num_measurements,) or not used.any():
@@ -309,25 +324,29 @@ def back_projection(
             "Use one_step, which takes any protocol."
         )
     voltages, jacobian = map(np.asarray, model.voltages_and_jacobian(conductivity))
-    nodal = np.asarray(model.potentials(conductivity))
+    node_potentials = np.asarray(model.potentials(conductivity))
     cells = np.asarray(model.mesh.cells)
-    potential = nodal[:, cells].mean(axis=2)  # (S, m)
-    electrode = np.asarray(protocol.drive @ model.transfer_impedance(conductivity))  # (S, L)
+    cell_potentials = node_potentials[:, cells].mean(axis=2)  # (S, m)
+    electrode_potentials = np.asarray(protocol.drive @ model.transfer_impedance(conductivity))  # (S, L)
     first, second = (measurement > 0).argmax(axis=1), (measurement < 0).argmax(axis=1)
     drive, pair = np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)
-    ends = np.stack([electrode[drive, first[pair]], electrode[drive, second[pair]]])
-    band = (potential[drive] >= ends.min(axis=0)[:, None]) & (potential[drive] < ends.max(axis=0)[:, None])
-    band = (band & used[:, None]).T.astype(float)  # (m, M)
-    reached = np.maximum(band.sum(axis=1), 1)
+    band_limits = np.stack([electrode_potentials[drive, first[pair]], electrode_potentials[drive, second[pair]]])
+    in_band = (cell_potentials[drive] >= band_limits.min(axis=0)[:, None]) & (
+        cell_potentials[drive] < band_limits.max(axis=0)[:, None]
+    )
+    in_band = (in_band & used[:, None]).T.astype(float)  # (m, M)
+    num_bands = np.maximum(in_band.sum(axis=1), 1)
     # Scale: a uniform relative change δ of conductivity changes every voltage by the relative amount -δ.
     scale = np.broadcast_to(np.asarray(conductivity, float), (model.mesh.num_cells,))
-    smear = -(scale / reached)[:, None] * band / np.where(used & (voltages != 0), voltages, np.inf)
+    projection = -(scale / num_bands)[:, None] * in_band / np.where(used & (voltages != 0), voltages, np.inf)
     if not filtered:
-        return LinearReconstruction.create(model, smear, np.nan, "none", "back-projection")
-    kept = np.flatnonzero(used)
-    seen = jacobian[kept] @ smear[:, kept]
-    damping = (hyperparameter * np.linalg.norm(seen, 2)) ** 2
-    matrix = np.zeros_like(smear)
-    filter_matrix = np.linalg.solve(seen.T @ seen + damping * np.eye(len(kept)), seen.T)
-    matrix[:, kept] = smear[:, kept] @ filter_matrix
+        return LinearReconstruction.create(model, projection, np.nan, "none", "back-projection")
+    used_channels = np.flatnonzero(used)
+    projected_jacobian = jacobian[used_channels] @ projection[:, used_channels]
+    damping = (hyperparameter * np.linalg.norm(projected_jacobian, 2)) ** 2
+    matrix = np.zeros_like(projection)
+    filter_matrix = np.linalg.solve(
+        projected_jacobian.T @ projected_jacobian + damping * np.eye(len(used_channels)), projected_jacobian.T
+    )
+    matrix[:, used_channels] = projection[:, used_channels] @ filter_matrix
     return LinearReconstruction.create(model, matrix, hyperparameter, "given", "filtered back-projection")

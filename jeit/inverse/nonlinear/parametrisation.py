@@ -92,9 +92,9 @@ class ContactImpedance(AbstractUnknown):
 class ElectrodePosition(AbstractUnknown):
     """Displacement of electrodes from their positions in the model, in metres.
 
-    Electrodes on the boundary have one value each, along the boundary and positive counter-clockwise; others have two:
-    discs in a sheet x and y, discs and patches on a solid horizontal and upward. The first of all electrodes come
-    before the second.
+    Electrodes on the boundary have one value each, along the boundary and positive counter-clockwise. Others have two:
+    x and y for discs in a sheet, horizontal and upward for discs and patches on a solid. The first values of all
+    electrodes come before the second values.
 
     **Arguments:**
 
@@ -130,10 +130,12 @@ class ElectrodePosition(AbstractUnknown):
 
     def apply(self, model, estimate, values):
         """Model with displaced electrodes, and the unchanged image."""
-        shift = jnp.einsum("al,lad->ld", values.reshape(self.direction.shape[1], -1), self.direction)
+        displacements = jnp.einsum("al,lad->ld", values.reshape(self.direction.shape[1], -1), self.direction)
         electrodes: Any = model.electrodes
-        moved = eqx.tree_at(lambda e: e.position, electrodes, electrodes.position + shift)
-        return model.with_electrodes(moved), estimate
+        moved_electrodes = eqx.tree_at(
+            lambda electrodes_to_move: electrodes_to_move.position, electrodes, electrodes.position + displacements
+        )
+        return model.with_electrodes(moved_electrodes), estimate
 
 
 class Background(AbstractUnknown):
@@ -187,7 +189,7 @@ class Scale(AbstractUnknown):
     def apply(self, model, estimate, values):
         """Model with all currents multiplied by exp(value), and the unchanged image."""
         drive = model.protocol.drive * self.quantity(model, values)[0]
-        return eqx.tree_at(lambda m: m.protocol.drive, model, drive), estimate
+        return eqx.tree_at(lambda scaled_model: scaled_model.protocol.drive, model, drive), estimate
 
     def quantity(self, model, values):
         """Factor exp(value)."""
@@ -316,15 +318,15 @@ class Bounded(AbstractLink):
 
     def slope(self, estimate):
         """Derivative of the logistic function, largest halfway between the bounds."""
-        share = _logistic(estimate)
-        return (self.upper - self.lower) * share * (1 - share)
+        fraction = _logistic(estimate)
+        return (self.upper - self.lower) * fraction * (1 - fraction)
 
     def estimate(self, conductivity):
         """Logit of (σ - lower) / (upper - lower). Raises `ValueError` for σ outside the bounds."""
         _check_inside(conductivity, self.lower, self.upper)
-        share = (conductivity - self.lower) / (self.upper - self.lower)
-        xp = namespace(share)
-        return xp.log(share) - xp.log1p(-share)
+        fraction = (conductivity - self.lower) / (self.upper - self.lower)
+        xp = namespace(fraction)
+        return xp.log(fraction) - xp.log1p(-fraction)
 
     def ends(self, lower, upper, reference):
         """Not available, because the link has bounds of its own. Raises `ValueError`."""
@@ -347,7 +349,7 @@ def _check_inside(conductivity, lower, upper) -> None:
 
 
 def _as_tuple(unknowns) -> tuple[AbstractUnknown, ...]:
-    if not isinstance(unknowns, Sequence) or not all(isinstance(one, AbstractUnknown) for one in unknowns):
+    if not isinstance(unknowns, Sequence) or not all(isinstance(unknown, AbstractUnknown) for unknown in unknowns):
         raise ValueError(
             f"unknowns must be a list of those in jeit.inverse.nonlinear, such as [Scale()]; it is {unknowns!r}."
         )
@@ -397,10 +399,14 @@ class Parametrisation(Module):
 
     def __check_init__(self):
         check_kind("link", self.link, AbstractLink, "one of those in jeit.inverse.nonlinear, such as Log()")
-        values = np.asarray((0.0, np.inf) if self.bounds is None or not has_values(self.bounds) else self.bounds)
-        if values.shape != (2,) or values.dtype.kind not in "iuf" or not 0 <= values[0] < values[1]:
+        bound_values = np.asarray((0.0, np.inf) if self.bounds is None or not has_values(self.bounds) else self.bounds)
+        if (
+            bound_values.shape != (2,)
+            or bound_values.dtype.kind not in "iuf"
+            or not 0 <= bound_values[0] < bound_values[1]
+        ):
             raise ValueError(f"bounds: give two numbers, 0 ≤ lower < upper, S/m (2-D: S); they are {self.bounds!r}.")
-        names = [type(one).__name__ for one in self.unknowns]
+        names = [type(unknown).__name__ for unknown in self.unknowns]
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"unknowns: {name} is there more than once.")
@@ -408,10 +414,10 @@ class Parametrisation(Module):
             raise ValueError(f"informative must lie between 0 and 1; it is {self.informative}.")
 
     def check_model(self, model: ForwardModel) -> None:
-        """Raises `ValueError` if an unknown was made for another model."""
-        for one in self.unknowns:
-            if not one.fits(model):
-                name = type(one).__name__
+        """Raise `ValueError` if an unknown was made for another model."""
+        for unknown in self.unknowns:
+            if not unknown.fits(model):
+                name = type(unknown).__name__
                 raise ValueError(f"unknowns: this {name} was made for another model; make it with the one given here.")
 
     def regions_of(self, mesh: Mesh) -> Regions | None:
@@ -427,8 +433,13 @@ class Parametrisation(Module):
         reference = self.link.estimate(background)
         if has_values(self.bounds):
             lower, upper = float(lower), float(upper)
-        ends = self.link.ends(lower, upper, reference)
-        if has_values(reference, ends) and not ((reference >= ends[0]) & (reference <= ends[1])).all():
+        scaled_bounds = self.link.ends(lower, upper, reference)
+        if (
+            has_values(reference, scaled_bounds)
+            and not ((reference >= scaled_bounds[0]) & (reference <= scaled_bounds[1])).all()
+        ):
             raise ValueError(f"background must lie between the bounds, {lower:g} and {upper:g}.")
-        free = jnp.full(sum(one.size for one in self.unknowns), jnp.inf)
-        return jnp.concatenate([ends[0] - reference, -free]), jnp.concatenate([ends[1] - reference, free])
+        no_bounds = jnp.full(sum(unknown.size for unknown in self.unknowns), jnp.inf)
+        return jnp.concatenate([scaled_bounds[0] - reference, -no_bounds]), jnp.concatenate(
+            [scaled_bounds[1] - reference, no_bounds]
+        )

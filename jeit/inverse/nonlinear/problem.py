@@ -48,13 +48,16 @@ _BOUND_TOLERANCE = 1e-12
 def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"], np.ndarray]:
     """Voltages (M,) with zeros in channels that the mask leaves out, and the mask as booleans.
 
-    Raises `ValueError` for invalid voltages or masks. Values of traced voltages are not checked.
+    Raises `ValueError` for invalid voltages or masks. The values of traced voltages are not checked.
     """
     check_model(model)
     check_mask(mask)
     voltages = _as_float_array(voltages)
     if voltages.dtype.kind == "c":
-        raise ValueError("voltages are complex; reconstruct from their real part or magnitude.")
+        raise ValueError(
+            "voltages are complex, and this method takes real ones: image their change by one_step, repeatedly for an "
+            "absolute image. Real parts and magnitudes alone give biased conductivities."
+        )
     if voltages.dtype.kind not in "biuf":
         raise ValueError(f"voltages are {voltages.dtype}; give real numbers, in volts.")
     shape = (model.protocol.num_measurements,)
@@ -88,22 +91,27 @@ def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
             f"{background.dtype} of shape {background.shape}."
         )
     values = np.asarray(background) if has_values(background) else np.ones(())
-    if (wrong := values[~((values > 0) & np.isfinite(values))]).size:
+    if (invalid_values := values[~((values > 0) & np.isfinite(values))]).size:
         raise ValueError(
-            f"background must be positive and finite everywhere, S/m (2-D: S); {describe(wrong[0])} is not."
+            f"background must be positive and finite everywhere, S/m (2-D: S); {describe(invalid_values[0])} is not."
         )
     return namespace(background).broadcast_to(background.astype(float), (model.mesh.num_cells,))
 
 
 def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[Array, " M"]:
     """Standard deviation of every channel in volts, 1 in channels left out; raises `ValueError` for invalid noise."""
-    given = np.zeros(()) if noise is None else _as_float_array(noise)
-    if given.shape not in ((), measured.shape) or given.dtype.kind not in "iuf":
+    standard_deviation = np.zeros(()) if noise is None else _as_float_array(noise)
+    if standard_deviation.shape not in ((), measured.shape) or standard_deviation.dtype.kind not in "iuf":
         raise ValueError(
-            f"noise is {given.dtype} of shape {given.shape}; give one real number, or one for each channel."
+            f"noise is {standard_deviation.dtype} of shape {standard_deviation.shape}; give one real number, or one "
+            "for each channel."
         )
-    xp = namespace(given, measured)
-    deviation = relative_noise(measured, xp.asarray(used)) if noise is None else xp.broadcast_to(given, measured.shape)
+    xp = namespace(standard_deviation, measured)
+    deviation = (
+        relative_noise(measured, xp.asarray(used))
+        if noise is None
+        else xp.broadcast_to(standard_deviation, measured.shape)
+    )
     if has_values(deviation) and not (np.isfinite(deviation)[used] & (np.asarray(deviation)[used] > 0)).all():
         raise ValueError("noise must be positive and finite for every channel in use.")
     return xp.where(used, deviation, 1)
@@ -141,16 +149,18 @@ def independent_data(
     `deviation` (M,): standard deviation of the noise, volts. `at_once`: whether to return NumPy arrays if the model
     supports it.
     """
-    kept = np.flatnonzero(used)
-    observed = model if used.all() else model.with_protocol(model.protocol.subset(kept))
-    channels = IndependentChannels.create(observed.protocol)
-    small = observed
-    if has_values(observed.protocol):
-        small = observed.with_protocol(observed.protocol.subset(np.asarray(channels.index)))
+    used_indices = np.flatnonzero(used)
+    observed_model = model if used.all() else model.with_protocol(model.protocol.subset(used_indices))
+    channels = IndependentChannels.create(observed_model.protocol)
+    independent_model = observed_model
+    if has_values(observed_model.protocol):
+        independent_model = observed_model.with_protocol(observed_model.protocol.subset(np.asarray(channels.index)))
     # For a solid body, compiled programs would hold several copies of the Jacobian.
-    if at_once and (model.at_once or model.mesh.dimension == 3) and has_values(small):
-        small, channels = on_host((small, channels))  # and so is everything computed from them
-    return small, channels.weigh(deviation[kept]).combine(measured[kept])
+    if at_once and (model.at_once or model.mesh.dimension == 3) and has_values(independent_model):
+        independent_model, channels = on_host(
+            (independent_model, channels)
+        )  # so that everything computed from them is in NumPy
+    return independent_model, channels.weigh(deviation[used_indices]).combine(measured[used_indices])
 
 
 def keep_informed_shapes(inversion: Inversion, min_signal: float, persistence: float = 0.0) -> Inversion:
@@ -160,12 +170,16 @@ def keep_informed_shapes(inversion: Inversion, min_signal: float, persistence: f
     `persistence`: fraction of the last image that is expected in the next one; the variances of the shapes are those
     before a frame in the steady state of the Kalman filter.
     """
-    squares, rows = (np.asarray(values) for values in _singular_values(inversion))
-    kept = squares > max(min_signal**2, 1e-12 * squares[-1])
-    size = np.sqrt(_expected_variance(squares[kept], persistence) / squares[kept])
-    shapes = host.asarray(jax.vmap(inversion.basis.expand)(jnp.asarray(size[:, None] * rows[kept])).T, np.float32)
-    chosen = eqx.tree_at(lambda i: i.basis, inversion, DenseBasis(shapes))
-    return chosen if namespace(inversion) is np else on_device(chosen)
+    squared_singular_values, scaled_right_vectors = (np.asarray(values) for values in _singular_values(inversion))
+    is_informed = squared_singular_values > max(min_signal**2, 1e-12 * squared_singular_values[-1])
+    scale = np.sqrt(
+        _expected_variance(squared_singular_values[is_informed], persistence) / squared_singular_values[is_informed]
+    )
+    shapes = host.asarray(
+        jax.vmap(inversion.basis.expand)(jnp.asarray(scale[:, None] * scaled_right_vectors[is_informed])).T, np.float32
+    )
+    informed_inversion = eqx.tree_at(lambda problem: problem.basis, inversion, DenseBasis(shapes))
+    return informed_inversion if namespace(inversion) is np else on_device(informed_inversion)
 
 
 @either_engine
@@ -175,17 +189,21 @@ def _singular_values(inversion: Inversion):
     xp = namespace(inversion)
     start = xp.zeros(inversion.num_coefficients)
     rows = inversion.data.whiten(inversion.linearise(start)[1])[:, : inversion.basis.num_coefficients]
-    squares, left = symmetric_eigen(rows @ rows.T)
-    return squares, left.T @ rows
+    squared_values, left_vectors = symmetric_eigen(rows @ rows.T)
+    return squared_values, left_vectors.T @ rows
 
 
 def _expected_variance(strength, persistence: float):
     """Steady-state variance p of a coefficient before a frame, p = a² p / (1 + s p) + 1 - a², where a is the
     persistence and s the `strength` of the data, the squared singular value."""
-    fresh = 1 - persistence**2
-    half = fresh * (1 - strength) / 2
-    root = np.sqrt(half**2 + strength * fresh)
-    return np.where(half > 0, fresh / (half + root), (root - half) / strength)
+    innovation_variance = 1 - persistence**2
+    half_linear_term = innovation_variance * (1 - strength) / 2
+    discriminant_root = np.sqrt(half_linear_term**2 + strength * innovation_variance)
+    return np.where(
+        half_linear_term > 0,
+        innovation_variance / (half_linear_term + discriminant_root),
+        (discriminant_root - half_linear_term) / strength,
+    )
 
 
 class Inversion(Module):
@@ -207,8 +225,8 @@ class Inversion(Module):
     @property
     def runs_at_once(self) -> bool:
         """Whether the problem can be solved in NumPy: nothing is traced and there are no unknowns."""
-        in_pieces = self.model.at_once or namespace(self.model) is np
-        return in_pieces and not self.unknowns and has_values(self)
+        runs_uncompiled = self.model.at_once or namespace(self.model) is np
+        return runs_uncompiled and not self.unknowns and has_values(self)
 
     @property
     def num_coefficients(self) -> int:
@@ -221,7 +239,7 @@ class Inversion(Module):
 
     def estimate(self, coefficients: Float[Array, " n"]) -> Float[Array, " m"]:
         """Image x per cell, on the link's scale."""
-        return self._situation(*self._parts(coefficients))[1]
+        return self._model_and_image(*self._split_coefficients(coefficients))[1]
 
     def applied(self, model: ForwardModel, coefficients: Float[Array, " n"]) -> ForwardModel:
         """`model` with the estimated unknowns, such as contact impedances or electrode positions."""
@@ -231,11 +249,11 @@ class Inversion(Module):
 
     def values(self, coefficients: Float[Array, " n"]) -> tuple[Float[Array, " k"], ...]:
         """Estimated values of every unknown, as used by `AbstractUnknown.apply`."""
-        return self._parts(coefficients)[1]
+        return self._split_coefficients(coefficients)[1]
 
     def voltages(self, coefficients: Float[Array, " n"]) -> Float[Array, " r"]:
         """Predicted voltages of the independent channels, volts."""
-        return self._predict(*self._parts(coefficients))
+        return self._predict(*self._split_coefficients(coefficients))
 
     def residual(self, coefficients: Float[Array, " n"]) -> Float[Array, " r"]:
         """Residual w (v(σ) - ŷ), whose covariance is `data.covariance`."""
@@ -243,8 +261,8 @@ class Inversion(Module):
 
     def linearise(self, coefficients: Float[Array, " n"]) -> tuple[Float[Array, " r"], Float[Array, "r n"]]:
         """Residual, and its Jacobian with respect to the coefficients."""
-        shapes, values = self._parts(coefficients)
-        model, estimate = self._situation(shapes, values)
+        shapes, values = self._split_coefficients(coefficients)
+        model, estimate = self._model_and_image(shapes, values)
         conductivity = self.link.conductivity(estimate)
         if namespace(model, conductivity, self.basis) is np:
             fields, impedance = evaluate(model, fields_and_impedance_of, conductivity)
@@ -256,8 +274,8 @@ class Inversion(Module):
             jacobian = self.basis.restrict(jacobian * self.link.slope(estimate))
         columns = [jacobian]
         if self.unknowns:
-            along = jax.jacfwd(lambda values: self._predict(shapes, values))(values)
-            columns += [block * unknown.deviation for block, unknown in zip(along, self.unknowns, strict=True)]
+            unknown_blocks = jax.jacfwd(lambda values: self._predict(shapes, values))(values)
+            columns += [block * unknown.deviation for block, unknown in zip(unknown_blocks, self.unknowns, strict=True)]
         weight, xp = self.data.weight, namespace(voltages, jacobian)
         # A factorisation may succeed although some conductivities are negative; NaN makes a descent reject the point.
         residual = xp.where((conductivity > 0).all(), weight * (voltages - self.data.voltages), xp.nan)
@@ -277,15 +295,15 @@ class Inversion(Module):
         residual, jacobian = self.linearise(coefficients)
         return self.penalty.model(residual, jacobian, coefficients, self.data)
 
-    def _parts(self, coefficients):
+    def _split_coefficients(self, coefficients):
         """Coefficients of the image, and values of every unknown."""
-        values, start = [], self.basis.num_coefficients
+        values, first_index = [], self.basis.num_coefficients
         for unknown in self.unknowns:
-            values.append(unknown.deviation * coefficients[start : start + unknown.size])
-            start += unknown.size
+            values.append(unknown.deviation * coefficients[first_index : first_index + unknown.size])
+            first_index += unknown.size
         return coefficients[: self.basis.num_coefficients], tuple(values)
 
-    def _situation(self, shapes, values) -> tuple[ForwardModel, Float[Array, " m"]]:
+    def _model_and_image(self, shapes, values) -> tuple[ForwardModel, Float[Array, " m"]]:
         """Model changed by the unknowns, and the image x."""
         model, estimate = self.model, self.reference + self.basis.expand(shapes)
         for unknown, value in zip(self.unknowns, values, strict=True):
@@ -293,7 +311,7 @@ class Inversion(Module):
         return model, estimate
 
     def _predict(self, shapes, values):
-        model, estimate = self._situation(shapes, values)
+        model, estimate = self._model_and_image(shapes, values)
         return evaluate(model, voltages_of, self.link.conductivity(estimate))
 
 
@@ -304,40 +322,48 @@ def as_solution(coefficients: Float[Array, " n"], inversion: Inversion, box: Any
     each."""
     if box is None:
         return as_minimum(coefficients, (inversion, None, None), _free_gradient, _preconditioner)
-    slope = jax.grad(inversion.cost)(coefficients)
+    gradient = jax.grad(inversion.cost)(coefficients)
     # -1 at the lower bound, 1 at the upper one, 0 where a coefficient is free.
-    near = [_BOUND_TOLERANCE * jnp.maximum(1, jnp.abs(end)) for end in box]
-    side = 1 * ((coefficients >= box[1] - near[1]) & (slope < 0)) - ((coefficients <= box[0] + near[0]) & (slope > 0))
-    point = as_minimum(jnp.where(side == 0, coefficients, 0), (inversion, box, side), _free_gradient, _preconditioner)
-    return _with_bounds(point, box, side)
+    tolerances = [_BOUND_TOLERANCE * jnp.maximum(1, jnp.abs(bound)) for bound in box]
+    active_bounds = 1 * ((coefficients >= box[1] - tolerances[1]) & (gradient < 0)) - (
+        (coefficients <= box[0] + tolerances[0]) & (gradient > 0)
+    )
+    point = as_minimum(
+        jnp.where(active_bounds == 0, coefficients, 0), (inversion, box, active_bounds), _free_gradient, _preconditioner
+    )
+    return _with_bounds(point, box, active_bounds)
 
 
-def _with_bounds(point, box, side):
+def _with_bounds(point, box, active_bounds):
     """Coefficients with free values from `point` and the others at their bounds."""
-    return point if box is None else jnp.where(side < 0, box[0], jnp.where(side > 0, box[1], point))
+    return point if box is None else jnp.where(active_bounds < 0, box[0], jnp.where(active_bounds > 0, box[1], point))
 
 
 def _free_gradient(point, problem):
     """Gradient of the objective with respect to the free coefficients. The entries of the others equal `point`, so that
     a zero of this function has zeros there; `_with_bounds` inserts their bounds."""
-    inversion, box, side = problem
-    slope = jax.grad(inversion.cost)(_with_bounds(point, box, side))
-    return slope if box is None else jnp.where(side == 0, slope, point)
+    inversion, box, active_bounds = problem
+    gradient = jax.grad(inversion.cost)(_with_bounds(point, box, active_bounds))
+    return gradient if box is None else jnp.where(active_bounds == 0, gradient, point)
 
 
 def _preconditioner(point, problem):
     """Function that multiplies with the inverse of the Gauss-Newton matrix JᵀGJ + P of the free coefficients, where P
     is the penalty's Hessian. Woodbury's identity gives P⁻¹ - P⁻¹Jᵀ(JP⁻¹Jᵀ + G⁻¹)⁻¹JP⁻¹."""
-    inversion, box, side = problem
-    coefficients = _with_bounds(point, box, side)
-    free = jnp.ones(point.shape, bool) if box is None else side == 0
-    jacobian = jnp.where(free, inversion.linearise(coefficients)[1], 0)
-    product = inversion.penalty.inverse_hessian(coefficients, free, jacobian.T)
-    outer = jacobian @ product
-    inner = symmetric_inverse((outer + outer.T) / 2 + inversion.data.covariance)
+    inversion, box, active_bounds = problem
+    coefficients = _with_bounds(point, box, active_bounds)
+    is_free = jnp.ones(point.shape, bool) if box is None else active_bounds == 0
+    jacobian = jnp.where(is_free, inversion.linearise(coefficients)[1], 0)
+    covariance_product = inversion.penalty.inverse_hessian(coefficients, is_free, jacobian.T)
+    data_covariance = jacobian @ covariance_product
+    inverse_data_covariance = symmetric_inverse((data_covariance + data_covariance.T) / 2 + inversion.data.covariance)
 
     def apply(vector):
-        own = inversion.penalty.inverse_hessian(coefficients, free, jnp.where(free, vector, 0)[:, None])[:, 0]
-        return jnp.where(free, own - product @ (inner @ (jacobian @ own)), vector)
+        prior_part = inversion.penalty.inverse_hessian(coefficients, is_free, jnp.where(is_free, vector, 0)[:, None])[
+            :, 0
+        ]
+        return jnp.where(
+            is_free, prior_part - covariance_product @ (inverse_data_covariance @ (jacobian @ prior_part)), vector
+        )
 
     return apply

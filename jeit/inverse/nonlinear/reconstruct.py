@@ -108,8 +108,8 @@ class Reconstruction(Module):
         """
         model, values = self.inversion.model, self.inversion.values(self.coefficients)
         return {
-            type(one).__name__: one.quantity(model, value)
-            for one, value in zip(self.inversion.unknowns, values, strict=True)
+            type(unknown).__name__: unknown.quantity(model, value)
+            for unknown, value in zip(self.inversion.unknowns, values, strict=True)
         }
 
 
@@ -172,47 +172,51 @@ def reconstruct(
     solver = _solver_for(solver, prior, parametrisation)
     box = parametrisation.box(background) if solver.keeps_bounds else None
     _check_protocol(model, used)
-    plain = not (parametrisation.unknowns or solver.keeps_bounds or solver.needs_squares)
-    small, data = independent_data(model, measured, used, deviation, at_once=plain)
+    may_use_numpy = not (parametrisation.unknowns or solver.keeps_bounds or solver.needs_squares)
+    independent_model, data = independent_data(model, measured, used, deviation, at_once=may_use_numpy)
     inversion, choice = pose(
-        small, data, background, prior, hyperparameter, parametrisation, per_cell=solver.keeps_bounds
+        independent_model, data, background, prior, hyperparameter, parametrisation, per_cell=solver.keeps_bounds
     )
     if parametrisation.informative and inversion.penalty.is_standard_normal:
-        instead = "leave it out, and take all shapes"
-        check_has_values("informative: the problem", inversion, "shapes that the data support come from", instead)
+        advice = "leave it out, and take all shapes"
+        check_has_values("informative: the problem", inversion, "shapes that the data support come from", advice)
         inversion = keep_informed_shapes(inversion, parametrisation.informative)
-    first = (
+    start_coefficients = (
         as_array(np.zeros(inversion.num_coefficients))
         if start is None
         else _start_coefficients(start, inversion, choice)
     )
-    found = solver.minimise(inversion, first, box)
-    coefficients, status, reason = found.coefficients, found.status, found.reason
-    fitted, conductivity = inversion.applied(model, coefficients), _conductivity(inversion, coefficients)
-    predicted = evaluate(fitted, voltages_of, conductivity)
+    solution = solver.minimise(inversion, start_coefficients, box)
+    coefficients, status, reason = solution.coefficients, solution.status, solution.reason
+    fitted_model, conductivity = inversion.applied(model, coefficients), _conductivity(inversion, coefficients)
+    predicted = evaluate(fitted_model, voltages_of, conductivity)
     xp = jnp if not has_values(predicted, measured, deviation) else np
-    kept = np.flatnonzero(used)
-    excess = ((xp.asarray(predicted) - xp.asarray(measured)) / xp.asarray(deviation))[kept]
+    used_indices = np.flatnonzero(used)
+    normalised_residual = ((xp.asarray(predicted) - xp.asarray(measured)) / xp.asarray(deviation))[used_indices]
     if xp is jnp or not isinstance(status, Status):
-        broken = ~(jnp.isfinite(conductivity).all() & jnp.isfinite(excess).all())
-        number = status.number if isinstance(status, Status) else status
-        outcome = jnp.where(broken, Status.FAILED.number, number)
-    elif not (np.isfinite(conductivity).all() and np.isfinite(excess).all()):
+        is_invalid = ~(jnp.isfinite(conductivity).all() & jnp.isfinite(normalised_residual).all())
+        status_number = status.number if isinstance(status, Status) else status
+        outcome = jnp.where(is_invalid, Status.FAILED.number, status_number)
+    elif not (np.isfinite(conductivity).all() and np.isfinite(normalised_residual).all()):
         outcome = Status.FAILED.number
         reason = "Conductivity or voltages are NaN; give better data, more noise or a greater λ."
     else:
         outcome = status.number
-        reason += "" if status == Status.CONVERGED else _mismatch_reason(model, measured[kept], background, kept)
+        reason += (
+            ""
+            if status == Status.CONVERGED
+            else _mismatch_reason(model, measured[used_indices], background, used_indices)
+        )
     return Reconstruction(
         conductivity=conductivity,
         voltages=predicted,
-        misfit=as_array(xp.sqrt(xp.mean(excess**2))),
-        costs=found.costs + inversion.data.rest / 2,
+        misfit=as_array(xp.sqrt(xp.mean(normalised_residual**2))),
+        costs=solution.costs + inversion.data.rest / 2,
         coefficients=coefficients,
         inversion=on_device(inversion),
-        model=fitted,
+        model=fitted_model,
         choice=choice,
-        iterations=found.iterations,
+        iterations=solution.iterations,
         outcome=outcome,
         reason=reason,
     )
@@ -220,18 +224,18 @@ def reconstruct(
 
 def _check_protocol(model: ForwardModel, used) -> None:
     if not used.all():
-        instead = "close over the model, and put into it what varies, such as model.with_electrodes(electrodes)"
-        check_has_values("model: its protocol", model.protocol, "to leave out the channels of a mask takes", instead)
+        advice = "close over the model, and put into it what varies, such as model.with_electrodes(electrodes)"
+        check_has_values("model: its protocol", model.protocol, "to leave out the channels of a mask takes", advice)
 
 
 def _solver_for(solver, prior: AbstractPrior, parametrisation: Parametrisation) -> AbstractSolver:
     """The given solver, or the default for the problem. Raises `ValueError` if the solver does not suit the problem."""
-    bounded = parametrisation.bounds is not None
+    has_bounds = parametrisation.bounds is not None
     if solver is None:
-        return LBFGSB() if bounded else GaussNewton()
+        return LBFGSB() if has_bounds else GaussNewton()
     solver = as_solver(solver)
-    if bounded and not solver.keeps_bounds:
-        names = " or ".join(name for name, one in SOLVERS.items() if one().keeps_bounds)
+    if has_bounds and not solver.keeps_bounds:
+        names = " or ".join(name for name, solver_type in SOLVERS.items() if solver_type().keeps_bounds)
         raise ValueError(
             f"bounds: {solver.name} knows none; use {names}, or leave the solver out, or take link=Bounded(lower, "
             "upper) in place of bounds."
@@ -259,21 +263,27 @@ def pose(
     """
     mesh, link = model.mesh, parametrisation.link
     reference, regions = link.estimate(background), parametrisation.regions_of(mesh)
-    asked = prior.default_hyperparameter if hyperparameter is None else hyperparameter
-    is_rule = isinstance(asked, str) or callable(asked)
+    requested_hyperparameter = prior.default_hyperparameter if hyperparameter is None else hyperparameter
+    is_rule = isinstance(requested_hyperparameter, str) or callable(requested_hyperparameter)
     if prior.is_quadratic:
-        predicted, seen, known = _whitened_jacobian(model, data, background, link.slope(reference))
+        predicted, whitened_jacobian, whitening_data = _whitened_jacobian(
+            model, data, background, link.slope(reference)
+        )
         spectrum = difference = None
         if is_rule:
-            spectrum = Spectrum.create(seen, prior.covariance_product(mesh, seen), prior.null_space(mesh))
-            difference = known.whiten(known.weight * (known.voltages - predicted))
-        choice = choose(spectrum, asked, difference, mesh)
+            spectrum = Spectrum.create(
+                whitened_jacobian, prior.covariance_product(mesh, whitened_jacobian), prior.null_space(mesh)
+            )
+            difference = whitening_data.whiten(whitening_data.weight * (whitening_data.voltages - predicted))
+        choice = choose(spectrum, requested_hyperparameter, difference, mesh)
     elif is_rule:
-        raise ValueError(f"hyperparameter: total variation takes a number, not the rule {asked!r}.")
+        raise ValueError(f"hyperparameter: total variation takes a number, not the rule {requested_hyperparameter!r}.")
     else:
-        seen, choice = None, choose(None, asked, None)
+        whitened_jacobian, choice = None, choose(None, requested_hyperparameter, None)
     weight = float(choice.hyperparameter) if has_values(choice.hyperparameter) else choice.hyperparameter
-    basis, penalty = prior.penalty(mesh, reference, weight, jacobian=seen, regions=regions, per_cell=per_cell)
+    basis, penalty = prior.penalty(
+        mesh, reference, weight, jacobian=whitened_jacobian, regions=regions, per_cell=per_cell
+    )
     inversion = Inversion(model, data, link, reference, basis, penalty, parametrisation.unknowns)
     return inversion if namespace(model) is np else on_device(inversion), choice
 
@@ -284,14 +294,14 @@ def _whitened_jacobian(model: ForwardModel, data: Data, background, slope):
     if not has_values(model, data, background, slope):
         voltages, jacobian = model.voltages_and_jacobian(background)
         return voltages, data.whiten(data.weight[:, None] * jacobian * slope), data
-    known, slope = on_host((data, slope))
+    host_data, slope = on_host((data, slope))
     fields, impedance = on_host(evaluate(model, fields_and_impedance_of, check_conductivity(model.mesh, background)))
     mesh, protocol = on_host((model.mesh, model.protocol))
-    weights = known.whiten(np.diag(known.weight))
-    seen: Any = np.empty((len(weights), mesh.num_cells))
+    weights = host_data.whiten(np.diag(host_data.weight))
+    whitened_jacobian: Any = np.empty((len(weights), mesh.num_cells))
     for cells, block in jacobian_blocks(mesh, protocol, fields):
-        seen[:, cells] = weights @ (block * slope[cells])
-    return channel_voltages(protocol, impedance), seen, known
+        whitened_jacobian[:, cells] = weights @ (block * slope[cells])
+    return channel_voltages(protocol, impedance), whitened_jacobian, host_data
 
 
 def _start_coefficients(start, inversion: Inversion, choice: Choice) -> Float[Array, " n"]:
@@ -304,24 +314,26 @@ def _start_coefficients(start, inversion: Inversion, choice: Choice) -> Float[Ar
             f"start has {start.coefficients.size} coefficients of another kind of problem; this one has "
             f"{inversion.num_coefficients}. Give a reconstruction of the same model, prior and link."
         )
-    size = inversion.basis.num_coefficients
+    num_coefficients = inversion.basis.num_coefficients
     scale = choice.hyperparameter / start.choice.hyperparameter if inversion.penalty.is_standard_normal else 1.0
-    return start.coefficients.at[:size].multiply(scale)
+    return start.coefficients.at[:num_coefficients].multiply(scale)
 
 
 def _have_same_unknowns(first: Inversion, second: Inversion) -> bool:
     """Whether the coefficients of two problems have the same meaning."""
 
-    def kinds(inversion):
-        return [type(part) for part in (inversion.link, inversion.basis, inversion.penalty, *inversion.unknowns)]
+    def component_types(inversion):
+        return [
+            type(component) for component in (inversion.link, inversion.basis, inversion.penalty, *inversion.unknowns)
+        ]
 
-    return kinds(first) == kinds(second)
+    return component_types(first) == component_types(second)
 
 
-def _mismatch_reason(model: ForwardModel, measured, background, kept) -> str:
+def _mismatch_reason(model: ForwardModel, measured, background, used_indices) -> str:
     """Hint at wrong units or polarity if measured voltages and those of the background differ in size or sign."""
-    expected = model.voltages(background)[kept]
-    ratio = float(jnp.vdot(measured, expected) / jnp.vdot(expected, expected))
+    background_voltages = model.voltages(background)[used_indices]
+    ratio = float(jnp.vdot(measured, background_voltages) / jnp.vdot(background_voltages, background_voltages))
     if 0.1 < ratio < 10:
         return ""
     return f" The voltages are {ratio:.2g} times those of the background; are they in volts, and their signs right?"

@@ -119,11 +119,11 @@ class GaussNewton(AbstractSolver):
 
     def for_frames(self, max_steps=None, rtol=None):
         """The solver, with these settings as defaults."""
-        return GaussNewton(_first_given(self.max_steps, max_steps), _first_given(self.rtol, rtol))
+        return GaussNewton(_or_default(self.max_steps, max_steps), _or_default(self.rtol, rtol))
 
     def descent(self, max_steps, rtol):
         """Descent without damping."""
-        return _descent_for(_first_given(self.max_steps, max_steps), _first_given(self.rtol, rtol))
+        return _descent_for(_or_default(self.max_steps, max_steps), _or_default(self.rtol, rtol))
 
 
 class LevenbergMarquardt(AbstractSolver):
@@ -155,11 +155,11 @@ class LevenbergMarquardt(AbstractSolver):
 
     def for_frames(self, max_steps=None, rtol=None):
         """The solver, with these settings as defaults."""
-        return LevenbergMarquardt(_first_given(self.max_steps, max_steps), _first_given(self.rtol, rtol), self.damping)
+        return LevenbergMarquardt(_or_default(self.max_steps, max_steps), _or_default(self.rtol, rtol), self.damping)
 
     def descent(self, max_steps, rtol):
         """Descent with damping."""
-        return _descent_for(_first_given(self.max_steps, max_steps), _first_given(self.rtol, rtol), self.damping)
+        return _descent_for(_or_default(self.max_steps, max_steps), _or_default(self.rtol, rtol), self.damping)
 
 
 class LBFGSB(AbstractSolver):
@@ -244,10 +244,10 @@ class LeastSquares(AbstractSolver):
     def minimise(self, inversion, start, box):
         """Minimise the residuals of data and prior together."""
         if not has_values(inversion, start):
-            problem, first = undifferentiated((inversion, start))
-            solution = _least_squares(problem, first, self.solver, self.max_steps, {})
-            number = ended_number(solution.result)
-            return _traced_solution(inversion, start, solution.value, solution.stats["num_steps"], number)
+            frozen_problem, frozen_start = undifferentiated((inversion, start))
+            solution = _least_squares(frozen_problem, frozen_start, self.solver, self.max_steps, {})
+            status_number = ended_number(solution.result)
+            return _traced_solution(inversion, start, solution.value, solution.stats["num_steps"], status_number)
         solution = _least_squares(inversion, start, self.solver, self.max_steps, {})
         costs = jnp.stack([_cost_at(inversion, start), _cost_at(inversion, solution.value)])
         status, iterations = ended(solution.result), int(solution.stats["num_steps"])
@@ -283,14 +283,14 @@ class OneStep(AbstractSolver):
 
 
 SOLVERS: dict[str, type[AbstractSolver]] = {
-    one.name: one for one in (OneStep, GaussNewton, LevenbergMarquardt, LBFGSB, ProjectedGradient)
+    kind.name: kind for kind in (OneStep, GaussNewton, LevenbergMarquardt, LBFGSB, ProjectedGradient)
 }
 """Solvers by name."""
 
 
 def frame_solvers() -> tuple[str, ...]:
     """Names of the solvers that image a frame in a bounded time, for an `Imager`."""
-    return tuple(name for name, one in SOLVERS.items() if one.for_frames is not AbstractSolver.for_frames)
+    return tuple(name for name, kind in SOLVERS.items() if kind.for_frames is not AbstractSolver.for_frames)
 
 
 def as_solver(
@@ -298,24 +298,24 @@ def as_solver(
 ) -> AbstractSolver:
     """Convert a name in `SOLVERS` or a least-squares solver of optimistix to a solver; solvers are returned unchanged.
     Raises `ValueError` for anything else, and lists the solvers for frames if `frames`, else for reconstructions."""
-    names = frame_solvers() if frames else tuple(name for name, one in SOLVERS.items() if not one().is_linear)
+    names = frame_solvers() if frames else tuple(name for name, kind in SOLVERS.items() if not kind().is_linear)
     if isinstance(solver, str):
         if solver not in SOLVERS:
             check_name("solver", solver, names)
         return SOLVERS[solver]()
     if isinstance(solver, optx.AbstractLeastSquaresSolver):
         return LeastSquares(solver)
-    wanted = f"one of jeit.inverse.nonlinear, such as GaussNewton(), a name ({', '.join(names)}), or optimistix's"
-    check_kind("solver", solver, AbstractSolver, f"{wanted} least squares")
+    expected = f"one of jeit.inverse.nonlinear, such as GaussNewton(), a name ({', '.join(names)}), or optimistix's"
+    check_kind("solver", solver, AbstractSolver, f"{expected} least squares")
     return solver
 
 
 def counted_iterations(iterations: int, shortened: int = 0) -> str:
     """Numbers of iterations and of shortened steps, in words."""
-    said = counted(iterations, "iteration")
+    iteration_count = counted(iterations, "iteration")
     if not shortened:
-        return said
-    return f"{said} and {counted(shortened, 'step')} that led too far"
+        return iteration_count
+    return f"{iteration_count} and {counted(shortened, 'step')} that led too far"
 
 
 def _reason(status: Status, iterations: int, shortened: int = 0) -> str:
@@ -339,7 +339,7 @@ def _check_settings(max_steps, tolerance, name: str = "rtol") -> None:
         check_tolerance(name, tolerance)
 
 
-def _first_given(setting: _Setting | None, default: _Setting) -> _Setting:
+def _or_default(setting: _Setting | None, default: _Setting) -> _Setting:
     return default if setting is None else setting
 
 
@@ -361,8 +361,8 @@ def _run_descent(descent: Descent, inversion: Inversion, start) -> Solution:
         point = as_array(point)
         status = Status.CONVERGED if state.converged else Status.STALLED if state.stuck else Status.STEP_LIMIT
     elif not has_values(inversion, start):
-        problem, first = undifferentiated((inversion, start))
-        solution = _least_squares(problem, first, descent, descent.history, {"expand": expand})
+        problem, frozen_start = undifferentiated((inversion, start))
+        solution = _least_squares(problem, frozen_start, descent, descent.history, {"expand": expand})
         iterations = jnp.maximum(solution.state.num_accepted - 1, 0)
         return _traced_solution(inversion, start, solution.value, iterations, ended_number(solution.result))
     else:
@@ -386,17 +386,19 @@ def _minimise_in_box(minimise, inversion: Inversion, start, box, max_steps: int,
     start = jnp.clip(start, *box)
     lower, upper = box
     if not has_values(inversion, start, box):
-        problem, first, *ends = undifferentiated((inversion, start, lower, upper))
-        found = minimise_between(problem, first, ends[0], ends[1], minimise, int(max_steps), float(tolerance))
-        status = jnp.where(found.converged, Status.CONVERGED.number, Status.STEP_LIMIT.number)
-        return _traced_solution(inversion, start, found.x, found.steps, status, box)
-    found = minimise_between(inversion, start, lower, upper, minimise, int(max_steps), float(tolerance))
-    costs = jnp.stack([_cost_at(inversion, start), _cost_at(inversion, found.x)])
-    if found.converged:
+        problem, frozen_start, *bounds = undifferentiated((inversion, start, lower, upper))
+        minimum = minimise_between(
+            problem, frozen_start, bounds[0], bounds[1], minimise, int(max_steps), float(tolerance)
+        )
+        status = jnp.where(minimum.converged, Status.CONVERGED.number, Status.STEP_LIMIT.number)
+        return _traced_solution(inversion, start, minimum.x, minimum.steps, status, box)
+    minimum = minimise_between(inversion, start, lower, upper, minimise, int(max_steps), float(tolerance))
+    costs = jnp.stack([_cost_at(inversion, start), _cost_at(inversion, minimum.x)])
+    if minimum.converged:
         reason = "No step between the bounds would change the image much."
-        return Solution(found.x, int(found.steps), costs, Status.CONVERGED, reason)
-    iterations = int(found.steps)
-    return Solution(found.x, iterations, costs, Status.STEP_LIMIT, _reason(Status.STEP_LIMIT, iterations))
+        return Solution(minimum.x, int(minimum.steps), costs, Status.CONVERGED, reason)
+    iterations = int(minimum.steps)
+    return Solution(minimum.x, iterations, costs, Status.STEP_LIMIT, _reason(Status.STEP_LIMIT, iterations))
 
 
 @eqx.filter_jit
@@ -417,16 +419,16 @@ def minimise_between(
     # Coefficients are scaled to similar curvature, because the number of steps depends on the conditioning.
     _, jacobian = inversion.linearise(start)
     scale = jax.lax.rsqrt(jnp.sum(jacobian**2, axis=0) + inversion.penalty.diagonal(start))
-    unit = inversion.cost(start)
-    found = minimise(
-        lambda scaled: inversion.cost(scale * scaled) / unit,
+    start_cost = inversion.cost(start)
+    minimum = minimise(
+        lambda scaled_coefficients: inversion.cost(scale * scaled_coefficients) / start_cost,
         start / scale,
         lower / scale,
         upper / scale,
         max_steps=max_steps,
         tolerance=tolerance,
     )
-    return BoundedMinimum(scale * found.x, found.steps, found.converged)
+    return BoundedMinimum(scale * minimum.x, minimum.steps, minimum.converged)
 
 
 @eqx.filter_jit

@@ -40,11 +40,11 @@ class AbstractBasis(Module):
 
     def restrict_blocks(self, blocks: Iterable[tuple[slice, Any]]) -> Any:
         """Product with S of rows (M, m) given as blocks of cells, in NumPy; a new array (M, n)."""
-        cells, columns = zip(*blocks, strict=True)
-        whole: Any = np.empty((len(columns[0]), cells[-1].stop), columns[0].dtype)
-        for where, block in zip(cells, columns, strict=True):
-            whole[:, where] = block
-        return np.array(self.restrict(whole))
+        cell_slices, column_blocks = zip(*blocks, strict=True)
+        rows: Any = np.empty((len(column_blocks[0]), cell_slices[-1].stop), column_blocks[0].dtype)
+        for block_cells, block in zip(cell_slices, column_blocks, strict=True):
+            rows[:, block_cells] = block
+        return np.array(self.restrict(rows))
 
     @abc.abstractmethod
     def variance(self) -> Float[Array, " m"]:
@@ -79,12 +79,12 @@ class DiagonalBasis(AbstractBasis):
 
     def restrict_blocks(self, blocks):
         """Columns multiplied by the deviations."""
-        found: list[np.ndarray] = []
+        products: list[np.ndarray] = []
         for cells, block in blocks:
-            if not found:
-                found.append(np.empty((len(block), len(self.deviation)), block.dtype))
-            np.multiply(block, self.deviation[cells], out=found[0][:, cells])
-        return found[0]
+            if not products:
+                products.append(np.empty((len(block), len(self.deviation)), block.dtype))
+            np.multiply(block, self.deviation[cells], out=products[0][:, cells])
+        return products[0]
 
     def variance(self):
         """Squares of the deviations."""
@@ -141,14 +141,14 @@ class DenseBasis(AbstractBasis):
     def variance(self):
         """Sum of the squared shapes, plus the variance left out."""
         xp = namespace(self)
-        within = xp.einsum("mn,mn->m", self.shapes, self.shapes)
-        return within if self.left_out is None else within + self.left_out
+        shape_variance = xp.einsum("mn,mn->m", self.shapes, self.shapes)
+        return shape_variance if self.left_out is None else shape_variance + self.left_out
 
     def scaled(self, factor):
         """Basis with the matrix multiplied by a number."""
-        kind = self.shapes.dtype
+        number_type = self.shapes.dtype
         left_out = None if self.left_out is None else self.left_out * factor**2
-        return DenseBasis((self.shapes * factor).astype(kind), left_out)
+        return DenseBasis((self.shapes * factor).astype(number_type), left_out)
 
     def pooled(self, regions):
         """Basis of the shapes averaged over every region."""
@@ -176,22 +176,24 @@ class NodalBasis(AbstractBasis):
 
     def restrict(self, rows):
         """Distribute each column in equal parts over the nodes of its cell."""
-        parts = rows.T / self.cells.shape[1]
+        corner_values = rows.T / self.cells.shape[1]
         shape = self.number, len(rows)
-        corners = [sum_into(shape, self.cells[:, k], parts) for k in range(self.cells.shape[1])]
-        return functools.reduce(operator.add, corners).T
+        corner_sums = [sum_into(shape, self.cells[:, corner], corner_values) for corner in range(self.cells.shape[1])]
+        return functools.reduce(operator.add, corner_sums).T
 
     def restrict_blocks(self, blocks):
         """Like `restrict`, for rows given as blocks of cells."""
         total: Any = np.zeros(0)
-        count = self.cells.shape[1]
+        nodes_per_cell = self.cells.shape[1]
         for cells, block in blocks:
             total = total if total.size else np.zeros((self.number, len(block)), block.dtype)
-            nodes, corners = np.unique(np.asarray(self.cells[cells]), return_inverse=True)
-            ends = np.arange(0, corners.size + 1, count)
-            shape = len(ends) - 1, len(nodes)
-            means = scipy.sparse.csr_array((np.full(corners.size, 1 / count), corners.ravel(), ends), shape=shape)
-            total[nodes] += means.T @ block.T
+            nodes, corner_nodes = np.unique(np.asarray(self.cells[cells]), return_inverse=True)
+            row_starts = np.arange(0, corner_nodes.size + 1, nodes_per_cell)
+            shape = len(row_starts) - 1, len(nodes)
+            mean_matrix = scipy.sparse.csr_array(
+                (np.full(corner_nodes.size, 1 / nodes_per_cell), corner_nodes.ravel(), row_starts), shape=shape
+            )
+            total[nodes] += mean_matrix.T @ block.T
         return np.ascontiguousarray(total.T)
 
     def variance(self):
@@ -243,21 +245,21 @@ class Regions(Module):
 
     def total(self, values: Float[Array, "m *k"]) -> Float[Array, "p *k"]:
         """Sum of the cells' values over each region."""
-        where = namespace(self.label).where(self.label < 0, self.number, self.label)
-        return sum_into((self.number + 1, *values.shape[1:]), where, values)[:-1]
+        target_regions = namespace(self.label).where(self.label < 0, self.number, self.label)
+        return sum_into((self.number + 1, *values.shape[1:]), target_regions, values)[:-1]
 
     def mean(self, values: Float[Array, "m *k"]) -> Float[Array, "p *k"]:
         """Mean of the cells' values over each region, weighted by area (3-D: volume)."""
         xp = namespace(self, values)
-        total = self.spread(self.total(self.measure))  # zero where the image is held fixed
-        weight = xp.where(self.label < 0, 0, self.measure / xp.where(self.label < 0, 1, total))
+        region_measures = self.spread(self.total(self.measure))  # zero where the image is held fixed
+        weight = xp.where(self.label < 0, 0, self.measure / xp.where(self.label < 0, 1, region_measures))
         return self.total(values * xp.expand_dims(weight, tuple(range(1, values.ndim))))
 
     def spread(self, values: Float[Array, "p *k"]) -> Float[Array, "m *k"]:
         """Value of its region for each cell; zero where the image is held fixed."""
         xp = namespace(self, values)
-        fixed = xp.expand_dims(self.label < 0, tuple(range(1, values.ndim)))
-        return xp.where(fixed, 0, values[xp.maximum(self.label, 0)])
+        is_fixed = xp.expand_dims(self.label < 0, tuple(range(1, values.ndim)))
+        return xp.where(is_fixed, 0, values[xp.maximum(self.label, 0)])
 
 
 def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
@@ -278,14 +280,17 @@ def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
     coarse = Parametrisation(regions=pixels(mesh, (16, 16)))
     ```
     """
-    sides = np.asarray(shape)
-    if sides.shape != (2,) or sides.dtype.kind not in "iu" or sides.min() < 1:
+    grid_shape = np.asarray(shape)
+    if grid_shape.shape != (2,) or grid_shape.dtype.kind not in "iu" or grid_shape.min() < 1:
         raise ValueError(f"shape must be (rows, columns), both whole numbers from 1; it is {shape}.")
-    centre = np.asarray(centroids(mesh))[:, :2]
-    low, high = centre.min(axis=0), centre.max(axis=0)
-    place = np.minimum((centre - low) / (high - low) * [shape[1], shape[0]], np.array([shape[1], shape[0]]) - 1)
-    number = place.astype(int) @ [1, shape[1]]
-    return np.unique(number, return_inverse=True)[1]
+    centres = np.asarray(centroids(mesh))[:, :2]
+    lower_corner, upper_corner = centres.min(axis=0), centres.max(axis=0)
+    grid_positions = np.minimum(
+        (centres - lower_corner) / (upper_corner - lower_corner) * [shape[1], shape[0]],
+        np.array([shape[1], shape[0]]) - 1,
+    )
+    pixel_numbers = grid_positions.astype(int) @ [1, shape[1]]
+    return np.unique(pixel_numbers, return_inverse=True)[1]
 
 
 class RegionBasis(AbstractBasis):

@@ -32,17 +32,17 @@ def pivoted_cholesky(
 
     `tolerance`: fraction of the trace of Γ that may be left out.
     """
-    left = np.array(diagonal, float)
-    enough = tolerance * left.sum()
-    shapes = np.zeros((min(max_rank, left.size), left.size))
+    residual_diagonal = np.array(diagonal, float)
+    allowed_residual = tolerance * residual_diagonal.sum()
+    shapes = np.zeros((min(max_rank, residual_diagonal.size), residual_diagonal.size))
     for rank in range(shapes.shape[0]):
-        if left.sum() <= enough:
+        if residual_diagonal.sum() <= allowed_residual:
             return shapes[:rank].T
-        pivot = int(np.argmax(left >= _EQUAL_DIAGONAL * left.max()))
+        pivot = int(np.argmax(residual_diagonal >= _EQUAL_DIAGONAL * residual_diagonal.max()))
         row = column(pivot) - shapes[:rank, pivot] @ shapes[:rank]
-        shapes[rank] = row / np.sqrt(left[pivot])
-        left = np.maximum(left - shapes[rank] ** 2, 0)
-        left[pivot] = 0
+        shapes[rank] = row / np.sqrt(residual_diagonal[pivot])
+        residual_diagonal = np.maximum(residual_diagonal - shapes[rank] ** 2, 0)
+        residual_diagonal[pivot] = 0
     return shapes.T
 
 
@@ -52,14 +52,16 @@ def traced_pivoted_cholesky(scaled: Float[Array, "m d"], *, tolerance: float, ma
 
     The derivative is that of Γ[:, P] L⁻ᵀ with Γ[P, P] = L Lᵀ for fixed pivots P: exact except where the pivots change.
     """
-    size = min(max_rank, len(scaled))
-    pivots, rank = _pivots(jax.lax.stop_gradient(scaled), tolerance, size)
-    needed = jnp.arange(size) < rank
-    chosen = scaled[pivots]
-    columns = jnp.where(needed, jnp.exp(-_squared_distances(scaled, chosen)), 0)
-    inner = jnp.exp(-_squared_distances(chosen, chosen))
-    lower = jnp.linalg.cholesky(jnp.where(needed & needed[:, None], inner, jnp.eye(size)))
-    return jax.scipy.linalg.solve_triangular(lower, columns.T, lower=True).T
+    num_columns = min(max_rank, len(scaled))
+    pivots, rank = _pivots(jax.lax.stop_gradient(scaled), tolerance, num_columns)
+    is_needed = jnp.arange(num_columns) < rank
+    pivot_points = scaled[pivots]
+    columns = jnp.where(is_needed, jnp.exp(-_squared_distances(scaled, pivot_points)), 0)
+    pivot_covariance = jnp.exp(-_squared_distances(pivot_points, pivot_points))
+    lower_factor = jnp.linalg.cholesky(
+        jnp.where(is_needed & is_needed[:, None], pivot_covariance, jnp.eye(num_columns))
+    )
+    return jax.scipy.linalg.solve_triangular(lower_factor, columns.T, lower=True).T
 
 
 def _squared_distances(points, other_points):
@@ -68,22 +70,22 @@ def _squared_distances(points, other_points):
 
 def _pivots(scaled, tolerance: float, max_rank: int):
     """Indices (size,) of the pivots, and how many of them are needed."""
-    enough = tolerance * len(scaled)
+    allowed_residual = tolerance * len(scaled)
 
-    def go_on(state):
-        rank, _, _, left = state
-        return (rank < max_rank) & (left.sum() > enough)
+    def is_incomplete(state):
+        rank, _, _, residual_diagonal = state
+        return (rank < max_rank) & (residual_diagonal.sum() > allowed_residual)
 
-    def add(state):
-        rank, pivots, shapes, left = state
-        pivot = jnp.argmax(left >= _EQUAL_DIAGONAL * left.max())
+    def add_pivot(state):
+        rank, pivots, shapes, residual_diagonal = state
+        pivot = jnp.argmax(residual_diagonal >= _EQUAL_DIAGONAL * residual_diagonal.max())
         row = jnp.exp(-((scaled - scaled[pivot]) ** 2).sum(axis=1)) - shapes[:, pivot] @ shapes
-        row = row / jnp.sqrt(left[pivot])
-        left = jnp.maximum(left - row**2, 0).at[pivot].set(0)
-        return rank + 1, pivots.at[rank].set(pivot), shapes.at[rank].set(row), left
+        row = row / jnp.sqrt(residual_diagonal[pivot])
+        residual_diagonal = jnp.maximum(residual_diagonal - row**2, 0).at[pivot].set(0)
+        return rank + 1, pivots.at[rank].set(pivot), shapes.at[rank].set(row), residual_diagonal
 
-    nothing = 0, jnp.zeros(max_rank, int), jnp.zeros((max_rank, len(scaled))), jnp.ones(len(scaled))
-    rank, pivots, _, _ = jax.lax.while_loop(go_on, add, nothing)
+    initial_state = 0, jnp.zeros(max_rank, int), jnp.zeros((max_rank, len(scaled))), jnp.ones(len(scaled))
+    rank, pivots, _, _ = jax.lax.while_loop(is_incomplete, add_pivot, initial_state)
     return pivots, rank
 
 
@@ -103,15 +105,17 @@ class GriddedGaussian:
 
     def __init__(self, places: Float[np.ndarray, "m d"], length: float):
         spacing = length / _GRID_POINTS_PER_LENGTH
-        low = places.min(axis=0) - 1.5 * spacing
-        self._shape = tuple(int(count) for count in np.ceil((places.max(axis=0) - low) / spacing) + 2)
-        steps = [np.arange(count) for count in self._shape]
-        self._along = [np.exp(-((one[:, None] - one) ** 2) / (2 * _GRID_POINTS_PER_LENGTH**2)) for one in steps]
-        place = (places - low) / spacing
-        self._interpolation = _cubic_interpolation(place, self._shape)
-        weights, nodes = _cubic_weights(place), np.arange(_CUBIC)
-        between = np.exp(-((nodes[:, None] - nodes) ** 2) / (2 * _GRID_POINTS_PER_LENGTH**2))
-        self.variance = np.prod(np.einsum("mdi,ij,mdj->md", weights, between, weights), axis=1)
+        lower_corner = places.min(axis=0) - 1.5 * spacing
+        self._shape = tuple(int(count) for count in np.ceil((places.max(axis=0) - lower_corner) / spacing) + 2)
+        grid_indices = [np.arange(count) for count in self._shape]
+        self._axis_covariances = [
+            np.exp(-((indices[:, None] - indices) ** 2) / (2 * _GRID_POINTS_PER_LENGTH**2)) for indices in grid_indices
+        ]
+        grid_positions = (places - lower_corner) / spacing
+        self._interpolation = _cubic_interpolation(grid_positions, self._shape)
+        weights, nodes = _cubic_weights(grid_positions), np.arange(_CUBIC)
+        grid_covariance = np.exp(-((nodes[:, None] - nodes) ** 2) / (2 * _GRID_POINTS_PER_LENGTH**2))
+        self.variance = np.prod(np.einsum("mdi,ij,mdj->md", weights, grid_covariance, weights), axis=1)
 
     @staticmethod
     def suits(places: Float[np.ndarray, "m d"], length: float) -> bool:
@@ -121,29 +125,31 @@ class GriddedGaussian:
 
     def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
         """Γ times columns."""
-        found = np.empty(columns.shape)
+        products = np.empty(columns.shape)
         for start in range(0, columns.shape[1], _COLUMNS_AT_ONCE):
-            some = slice(start, start + _COLUMNS_AT_ONCE)
-            grid = (self._interpolation.T @ columns[:, some]).reshape(*self._shape, -1)
-            for axis, along in enumerate(self._along):
-                grid = np.moveaxis(np.tensordot(along, grid, axes=(1, axis)), 0, axis)
-            found[:, some] = self._interpolation @ grid.reshape(int(np.prod(self._shape)), -1)
-        return found
+            column_range = slice(start, start + _COLUMNS_AT_ONCE)
+            grid = (self._interpolation.T @ columns[:, column_range]).reshape(*self._shape, -1)
+            for axis, axis_covariance in enumerate(self._axis_covariances):
+                grid = np.moveaxis(np.tensordot(axis_covariance, grid, axes=(1, axis)), 0, axis)
+            products[:, column_range] = self._interpolation @ grid.reshape(int(np.prod(self._shape)), -1)
+        return products
 
 
 def _cubic_weights(place: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"]:
     """Weights of cubic Lagrange interpolation from the two grid points on either side, along every axis."""
-    t = place - np.floor(place) + 1
+    offset = place - np.floor(place) + 1
     nodes = np.arange(_CUBIC)
-    return np.stack([np.prod([(t - j) / (i - j) for j in nodes if j != i], axis=0) for i in nodes], axis=-1)
+    return np.stack([np.prod([(offset - j) / (i - j) for j in nodes if j != i], axis=0) for i in nodes], axis=-1)
 
 
 def _cubic_interpolation(place: Float[np.ndarray, "m d"], shape: tuple[int, ...]) -> scipy.sparse.csr_array:
     """Sparse matrix (m, grid points) that interpolates from the grid to points `place`, in units of the spacing."""
-    first, nodes, along = np.floor(place).astype(int) - 1, np.arange(_CUBIC), _cubic_weights(place)
+    first_nodes, nodes, axis_weights = np.floor(place).astype(int) - 1, np.arange(_CUBIC), _cubic_weights(place)
     weight, index = np.ones((len(place), 1)), np.zeros((len(place), 1), int)
-    for axis, count in enumerate(shape):
-        weight = (weight[:, :, None] * along[:, axis, None, :]).reshape(len(place), -1)
-        index = (index[:, :, None] * count + (first[:, axis, None] + nodes)[:, None, :]).reshape(len(place), -1)
-    ends = np.arange(0, weight.size + 1, weight.shape[1])
-    return scipy.sparse.csr_array((weight.ravel(), index.ravel(), ends), shape=(len(place), int(np.prod(shape))))
+    for axis, axis_size in enumerate(shape):
+        weight = (weight[:, :, None] * axis_weights[:, axis, None, :]).reshape(len(place), -1)
+        index = (index[:, :, None] * axis_size + (first_nodes[:, axis, None] + nodes)[:, None, :]).reshape(
+            len(place), -1
+        )
+    row_starts = np.arange(0, weight.size + 1, weight.shape[1])
+    return scipy.sparse.csr_array((weight.ravel(), index.ravel(), row_starts), shape=(len(place), int(np.prod(shape))))

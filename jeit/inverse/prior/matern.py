@@ -28,7 +28,7 @@ from jeit.mesh import Mesh, gradients, measures
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, host, on_host
 
-# Length scale of the Robin condition at the wall, in units of 1/κ.
+# Length of the Robin condition at the wall, in units of 1/κ.
 _ROBIN_COEFFICIENT = 1.42
 # Number of nodes up to which variances are computed exactly; number of random fields from which they are estimated on
 # larger meshes.
@@ -88,9 +88,9 @@ class Matern(AbstractPrior):
         return informed_shapes(np.asarray(jacobian), field.product, field.variance())
 
     def _field(self, mesh: Mesh, jacobian) -> "_MaternField":
-        instead = "take Gaussian(length), which can be differentiated"
+        advice = "take Gaussian(length), which can be differentiated"
         check_has_values(
-            "model, or the prior's length", (mesh, jacobian, self.length), "a Matérn field is made", instead
+            "model, or the prior's length", (mesh, jacobian, self.length), "a Matérn field is made", advice
         )
         return _MaternField.create(mesh, float(self.length))
 
@@ -113,31 +113,31 @@ class _MaternField(NamedTuple):
     def create(cls, mesh: Mesh, length: float) -> "_MaternField":
         system = NodalSystem.create(mesh)
         mesh = system.mesh
-        count, size = mesh.cells.shape[1], mesh.num_points
-        decay = (1.0 if mesh.dimension == 3 else np.sqrt(2)) / length
-        slope, measure = np.asarray(gradients(mesh)), np.asarray(measures(mesh))
-        stiffness = np.einsum("mid,mjd,m->mij", slope, slope, measure)
-        mass = np.bincount(mesh.cells.ravel(), np.repeat(measure / count, count), size)
-        wall = np.asarray(facet_measures(mesh)) / mesh.dimension
-        rim = np.bincount(mesh.facets.ravel(), np.repeat(wall, mesh.dimension), size)
-        solve = system.inverse(system.assemble(stiffness, decay**2 * mass + decay / _ROBIN_COEFFICIENT * rim))
+        nodes_per_cell, num_nodes = mesh.cells.shape[1], mesh.num_points
+        kappa = (1.0 if mesh.dimension == 3 else np.sqrt(2)) / length
+        basis_gradients, cell_measures = np.asarray(gradients(mesh)), np.asarray(measures(mesh))
+        stiffness = np.einsum("mid,mjd,m->mij", basis_gradients, basis_gradients, cell_measures)
+        mass = np.bincount(mesh.cells.ravel(), np.repeat(cell_measures / nodes_per_cell, nodes_per_cell), num_nodes)
+        wall_measures = np.asarray(facet_measures(mesh)) / mesh.dimension
+        wall_masses = np.bincount(mesh.facets.ravel(), np.repeat(wall_measures, mesh.dimension), num_nodes)
+        solve = system.inverse(system.assemble(stiffness, kappa**2 * mass + kappa / _ROBIN_COEFFICIENT * wall_masses))
         fields = _covariance_factor(solve, mass)
         scale = 1 / np.sqrt(np.einsum("nk,nk->n", fields, fields))
         return cls(system.means, solve, mass, scale, scale[:, None] * fields)
 
     def variance(self) -> Float[np.ndarray, " m"]:
         """Variance of the cells."""
-        some = np.array_split(self.fields, max(1, self.fields.shape[1] // _COLUMNS_AT_ONCE), axis=1)
-        return np.sum([((self.means @ part) ** 2).sum(axis=1) for part in some], axis=0)
+        field_blocks = np.array_split(self.fields, max(1, self.fields.shape[1] // _COLUMNS_AT_ONCE), axis=1)
+        return np.sum([((self.means @ fields) ** 2).sum(axis=1) for fields in field_blocks], axis=0)
 
     def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
         """Γ times columns."""
 
-        def some(column_slice: Any) -> Any:
-            within = self.scale[:, None] * (self.means.T @ column_slice)
-            return self.means @ (self.scale[:, None] * self.solve(self.mass[:, None] * self.solve(within)))
+        def multiply_block(column_slice: Any) -> Any:
+            nodal_columns = self.scale[:, None] * (self.means.T @ column_slice)
+            return self.means @ (self.scale[:, None] * self.solve(self.mass[:, None] * self.solve(nodal_columns)))
 
-        return by_columns(some, columns, len(columns))
+        return by_columns(multiply_block, columns, len(columns))
 
     def shapes(self) -> Float[np.ndarray, "m n"]:
         """S with Γ = S Sᵀ."""

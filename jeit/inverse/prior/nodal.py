@@ -49,12 +49,14 @@ class NodalSystem(NamedTuple):
     def create(cls, mesh: Mesh) -> "NodalSystem":
         """Create for a mesh whose arrays are not traced."""
         mesh = on_host(mesh)
-        cells, count = np.asarray(mesh.cells), mesh.cells.shape[1]
+        cells, nodes_per_cell = np.asarray(mesh.cells), mesh.cells.shape[1]
         pattern = SparsityPattern.from_elements([cells], size=mesh.num_points)
         fronts = find_fronts(pattern, np.asarray(mesh.points))
-        ends = np.arange(0, cells.size + 1, count)
+        row_starts = np.arange(0, cells.size + 1, nodes_per_cell)
         shape = mesh.num_cells, mesh.num_points
-        means = scipy.sparse.csr_array((np.full(cells.size, 1 / count), cells.ravel(), ends), shape=shape)
+        means = scipy.sparse.csr_array(
+            (np.full(cells.size, 1 / nodes_per_cell), cells.ravel(), row_starts), shape=shape
+        )
         return cls(mesh, on_host(pattern), fronts, means)
 
     def assemble(
@@ -62,8 +64,8 @@ class NodalSystem(NamedTuple):
     ) -> Float[np.ndarray, " e"]:
         """Assemble the element matrices `elements` (m, k, k) and add `diagonal` (n,); entries in the pattern's
         order."""
-        given: Any = elements
-        values = np.array(self.pattern.assemble(given))
+        element_matrices: Any = elements
+        values = np.array(self.pattern.assemble(element_matrices))
         values[: self.pattern.size] += diagonal
         return values
 
@@ -90,10 +92,10 @@ def factorise_matrix(plan: FactorisationPlan, fronts: Fronts, values: Any) -> Fa
         return FactorisedMatrix(
             lambda columns: solve(plan, factor, columns), lambda columns: half_solve(plan, factor, columns)
         )
-    mine = factorise_fronts(fronts, values)
+    host_factor = factorise_fronts(fronts, values)
     return FactorisedMatrix(
-        lambda columns: by_columns(mine.solve, columns, len(columns)),
-        lambda columns: by_columns(mine.half_solve, columns, len(columns)),
+        lambda columns: by_columns(host_factor.solve, columns, len(columns)),
+        lambda columns: by_columns(host_factor.half_solve, columns, len(columns)),
     )
 
 
@@ -107,12 +109,12 @@ def solve_columns(plan: FactorisationPlan, factor: Factor, columns: Any) -> Any:
 def by_columns(function: Callable[[Any], Any], columns: Any, rows: int, at_once: int = _COLUMNS_BY_FRONTS) -> Any:
     """Apply `function` to blocks of `at_once` columns of a NumPy array (n, k), in parallel on all cores; returns
     (rows, k). `function` may itself call `by_columns` with all columns it is given."""
-    number = columns.shape[1]
-    found = np.empty((rows, number), columns.dtype)
+    num_columns = columns.shape[1]
+    result = np.empty((rows, num_columns), columns.dtype)
 
-    def some(start: int) -> None:
-        part = np.ascontiguousarray(columns[:, start : start + at_once])
-        found[:, start : start + at_once] = function(part)
+    def apply_to_block(start: int) -> None:
+        block = np.ascontiguousarray(columns[:, start : start + at_once])
+        result[:, start : start + at_once] = function(block)
 
-    on_cores(some, range(0, number, at_once))
-    return found
+    on_cores(apply_to_block, range(0, num_columns, at_once))
+    return result

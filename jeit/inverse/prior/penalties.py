@@ -118,26 +118,26 @@ class QuadraticForm(AbstractPenalty):
 
     def cost(self, coefficients):
         """½ cᵀQc."""
-        image, rest = coefficients[: self.size], coefficients[self.size :]
-        return 0.5 * (jnp.sum(self.value * image[self.row] * image[self.column]) + rest @ rest)
+        image, unknowns = coefficients[: self.size], coefficients[self.size :]
+        return 0.5 * (jnp.sum(self.value * image[self.row] * image[self.column]) + unknowns @ unknowns)
 
     def diagonal(self, coefficients):
         """Diagonal of Q."""
-        own = jnp.zeros(self.size).at[self.row].add(jnp.where(self.row == self.column, self.value, 0))
-        return jnp.concatenate([own, jnp.ones(coefficients.size - self.size)])
+        diagonal = jnp.zeros(self.size).at[self.row].add(jnp.where(self.row == self.column, self.value, 0))
+        return jnp.concatenate([diagonal, jnp.ones(coefficients.size - self.size)])
 
     def inverse_hessian(self, coefficients, free, columns):
         """Inverse of Q plus a small multiple of the identity; a dense matrix unless Q is diagonal."""
-        image, rest = columns[: self.size], columns[self.size :]
+        image_columns, unknown_columns = columns[: self.size], columns[self.size :]
         if self.is_diagonal:
-            return jnp.concatenate([image / self.value[:, None], rest])
-        mine = free[: self.size]
-        entry = jnp.where(mine[self.row] & mine[self.column], self.value, 0)
-        dense = jnp.zeros((self.size, self.size)).at[self.row, self.column].add(entry)
+            return jnp.concatenate([image_columns / self.value[:, None], unknown_columns])
+        is_free_cell = free[: self.size]
+        entries = jnp.where(is_free_cell[self.row] & is_free_cell[self.column], self.value, 0)
+        dense = jnp.zeros((self.size, self.size)).at[self.row, self.column].add(entries)
         scale = jnp.max(jnp.abs(self.value))
-        dense = dense + jnp.diag(jnp.where(mine, _DIAGONAL_SHIFT * scale, scale))
-        solved = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(dense), image)
-        return jnp.concatenate([jnp.where(mine[:, None], solved, 0), rest])
+        dense = dense + jnp.diag(jnp.where(is_free_cell, _DIAGONAL_SHIFT * scale, scale))
+        solved = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(dense), image_columns)
+        return jnp.concatenate([jnp.where(is_free_cell[:, None], solved, 0), unknown_columns])
 
     def model(self, residual, jacobian, coefficients, data):
         """Not available: the bounded solvers use gradients, not quadratic models. Raises `ValueError`."""
@@ -195,8 +195,8 @@ class SparseNormal(AbstractNormal):
     def covariance_product(self, columns):
         """Q⁻¹ times columns, by sparse solves."""
         size = self.plan.size
-        solved = solve_columns(self.plan, self.factor, columns[:size])
-        return namespace(columns, solved).concatenate([solved, columns[size:]])
+        image_columns = solve_columns(self.plan, self.factor, columns[:size])
+        return namespace(columns, image_columns).concatenate([image_columns, columns[size:]])
 
     def variance(self, basis):
         """Variance of the cells, from those entries of Q⁻¹ that lie in the sparsity pattern of Q."""
@@ -204,8 +204,8 @@ class SparseNormal(AbstractNormal):
         if isinstance(basis, DiagonalBasis):
             return basis.deviation**2 * entries[: self.plan.size]
         assert isinstance(basis, NodalBasis)
-        between, (row, column) = self.pattern.entries_between(entries), np.tril_indices(basis.cells.shape[1])
-        return host.where(row == column, 1.0, 2.0) @ between / basis.cells.shape[1] ** 2
+        block_entries, (row, column) = self.pattern.entries_between(entries), np.tril_indices(basis.cells.shape[1])
+        return host.where(row == column, 1.0, 2.0) @ block_entries / basis.cells.shape[1] ** 2
 
     def num_draws(self, num_coefficients):
         """Number of draws: one for each pivot of the factor, padding included, and one for each further unknown."""
@@ -213,6 +213,6 @@ class SparseNormal(AbstractNormal):
 
     def drawn(self, numbers):
         """Samples, computed with one triangular factor of Q."""
-        number = self.plan.num_pivots
-        image = inverse_root(self.plan, self.factor, numbers[:number])
-        return namespace(numbers, image).concatenate([image, numbers[number:]])
+        num_pivots = self.plan.num_pivots
+        image = inverse_root(self.plan, self.factor, numbers[:num_pivots])
+        return namespace(numbers, image).concatenate([image, numbers[num_pivots:]])

@@ -107,8 +107,8 @@ class AbstractPrior(Module):
         """
         assert jacobian is not None  # a quadratic prior may depend on it
         if not per_cell:
-            many = mesh.num_cells > _LARGE_MESH_CELLS and has_values(mesh, jacobian, self)
-            basis = (self.informed_basis if many else self.basis)(mesh, jacobian).scaled(1 / hyperparameter)
+            is_large = mesh.num_cells > _LARGE_MESH_CELLS and has_values(mesh, jacobian, self)
+            basis = (self.informed_basis if is_large else self.basis)(mesh, jacobian).scaled(1 / hyperparameter)
             return basis if regions is None else basis.pooled(regions), Ridge()
         if regions is not None:
             raise ValueError("regions: bounded solvers take every cell; use link=Bounded(lower, upper) instead.")
@@ -125,8 +125,8 @@ class AbstractPrior(Module):
 
     def entries(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> tuple[Any, Any, Any]:
         """Rows, columns and values of the nonzero entries of Q, (k,) each."""
-        found = scipy.sparse.coo_array(self.precision(mesh, jacobian))
-        return found.row, found.col, found.data
+        matrix = scipy.sparse.coo_array(self.precision(mesh, jacobian))
+        return matrix.row, matrix.col, matrix.data
 
     @abc.abstractmethod
     def basis(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> AbstractBasis:
@@ -223,8 +223,8 @@ class Laplace(AbstractPrior):
             return host.asarray(_node_covariance_product(mesh, np.asarray(jacobian).T, 0.0))
         pairs, _ = interior_facets(mesh)
         pattern, plan = on_host(cell_factorisation(mesh, [pairs, np.zeros((1, 1), int)]))
-        link = host.broadcast_to(np.array([[2.0, -2.0], [-2.0, 2.0]]), (len(pairs), 2, 2))
-        factor = factorise(plan, pattern.assemble(link, np.full((1, 1, 1), 2.0)))
+        link_matrices = host.broadcast_to(np.array([[2.0, -2.0], [-2.0, 2.0]]), (len(pairs), 2, 2))
+        factor = factorise(plan, pattern.assemble(link_matrices, np.full((1, 1, 1), 2.0)))
         columns = on_host(jacobian).T
         if not np.iscomplexobj(columns):
             return solve(plan, factor, columns)
@@ -234,8 +234,8 @@ class Laplace(AbstractPrior):
         """Precision matrix Q, twice the graph Laplacian."""
         check_cells(mesh)
         pairs, _ = interior_facets(mesh)
-        size = mesh.num_cells
-        links = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(size, size))
+        num_cells = mesh.num_cells
+        links = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(num_cells, num_cells))
         adjacency = (links + links.T).tocsr()
         return 2 * (scipy.sparse.diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency).tocsr()
 
@@ -251,8 +251,8 @@ class Laplace(AbstractPrior):
         `basis`."""
         if mesh.dimension != 3:
             return self.basis(mesh, jacobian)
-        free = partial(_node_covariance_product, mesh, freedom=_DIAGONAL_TERM)
-        return informed_shapes(np.asarray(jacobian), free, None)
+        covariance_product = partial(_node_covariance_product, mesh, freedom=_DIAGONAL_TERM)
+        return informed_shapes(np.asarray(jacobian), covariance_product, None)
 
     def null_space(self, mesh):
         """Constant image (m, 1)."""
@@ -284,16 +284,18 @@ class Gaussian(AbstractPrior):
 
     def covariance_product(self, mesh, jacobian):
         """Γ Jᵀ, computed in blocks of rows so that the dense Γ is never stored; on a grid if there are many cells."""
-        scaled = centroids(mesh) / (np.sqrt(2) * self.length)
-        if not has_values(scaled, jacobian):
-            return _traced_product(jnp.asarray(scaled), jnp.asarray(jacobian))
+        scaled_centres = centroids(mesh) / (np.sqrt(2) * self.length)
+        if not has_values(scaled_centres, jacobian):
+            return _traced_product(jnp.asarray(scaled_centres), jnp.asarray(jacobian))
         if mesh.num_cells > _LARGE_MESH_CELLS and GriddedGaussian.suits(
-            places := np.asarray(centroids(mesh)), float(self.length)
+            centres := np.asarray(centroids(mesh)), float(self.length)
         ):
-            return host.asarray(GriddedGaussian(places, float(self.length)).product(np.asarray(jacobian).T))
-        scaled = np.asarray(scaled)
-        rows = np.split(scaled, np.arange(_ROWS_AT_ONCE, len(scaled), _ROWS_AT_ONCE))
-        return host.concatenate([np.exp(-cdist(row, scaled, "sqeuclidean")) @ np.asarray(jacobian).T for row in rows])
+            return host.asarray(GriddedGaussian(centres, float(self.length)).product(np.asarray(jacobian).T))
+        scaled_centres = np.asarray(scaled_centres)
+        rows = np.split(scaled_centres, np.arange(_ROWS_AT_ONCE, len(scaled_centres), _ROWS_AT_ONCE))
+        return host.concatenate(
+            [np.exp(-cdist(row, scaled_centres, "sqeuclidean")) @ np.asarray(jacobian).T for row in rows]
+        )
 
     def basis(self, mesh, jacobian):
         """Shapes that represent all but a thousandth of the variance: fewer than cells if `length` spans many cells.
@@ -302,24 +304,26 @@ class Gaussian(AbstractPrior):
         """
         centres = centroids(mesh)
         if not has_values(centres, self.length):
-            scaled = jnp.asarray(centres) / (np.sqrt(2) * self.length)
-            return DenseBasis(traced_pivoted_cholesky(scaled, tolerance=_OMITTED_VARIANCE, max_rank=_MAX_SHAPES))
+            scaled_centres = jnp.asarray(centres) / (np.sqrt(2) * self.length)
+            return DenseBasis(
+                traced_pivoted_cholesky(scaled_centres, tolerance=_OMITTED_VARIANCE, max_rank=_MAX_SHAPES)
+            )
         centres = np.asarray(centres)
 
         def column(cell):
             return np.exp(-np.sum((centres - centres[cell]) ** 2, axis=1) / (2 * self.length**2))
 
-        ones = np.ones(len(centres))
+        unit_variances = np.ones(len(centres))
         return DenseBasis(
-            host.asarray(pivoted_cholesky(ones, column, tolerance=_OMITTED_VARIANCE, max_rank=_MAX_SHAPES))
+            host.asarray(pivoted_cholesky(unit_variances, column, tolerance=_OMITTED_VARIANCE, max_rank=_MAX_SHAPES))
         )
 
     def informed_basis(self, mesh, jacobian):
         """Informed shapes (`informed_shapes`), computed on a grid; `basis` if the grid would be too large."""
-        places = np.asarray(centroids(mesh))
-        if not GriddedGaussian.suits(places, float(self.length)):
+        centres = np.asarray(centroids(mesh))
+        if not GriddedGaussian.suits(centres, float(self.length)):
             return self.basis(mesh, jacobian)
-        grid = GriddedGaussian(places, float(self.length))
+        grid = GriddedGaussian(centres, float(self.length))
         return informed_shapes(np.asarray(jacobian), grid.product, grid.variance)
 
     def precision(self, mesh, jacobian):
@@ -341,14 +345,14 @@ def informed_shapes(
     which changes an image by a relative 1e-6.
     """
     product = np.asarray(covariance(jacobian.T))
-    inner = jacobian @ product
-    size, vectors = np.linalg.eigh((inner + inner.T) / 2)
-    kept = size > _MIN_SIGNAL * size[-1]
-    shapes = (product @ (vectors[:, kept] / np.sqrt(size[kept]))).astype(np.float32)
+    data_covariance = jacobian @ product
+    eigenvalues, vectors = np.linalg.eigh((data_covariance + data_covariance.T) / 2)
+    is_resolved = eigenvalues > _MIN_SIGNAL * eigenvalues[-1]
+    shapes = (product @ (vectors[:, is_resolved] / np.sqrt(eigenvalues[is_resolved]))).astype(np.float32)
     if variance is None:
         return DenseBasis(host.asarray(shapes))
-    seen = np.einsum("mn,mn->m", shapes, shapes)
-    return DenseBasis(host.asarray(shapes), host.asarray(np.maximum(variance - seen, 0)))
+    shape_variance = np.einsum("mn,mn->m", shapes, shapes)
+    return DenseBasis(host.asarray(shapes), host.asarray(np.maximum(variance - shape_variance, 0)))
 
 
 def _node_covariance_product(mesh: Mesh, columns: Float[np.ndarray, "m k"], freedom: float) -> Float[np.ndarray, "m k"]:
@@ -361,27 +365,29 @@ def _node_covariance_product(mesh: Mesh, columns: Float[np.ndarray, "m k"], free
         diagonal[0] += 2
     values = np.full(system.pattern.num_entries, -2.0)
     values[: len(diagonal)] = diagonal
-    means, solved = system.means, system.inverse(values)
-    return by_columns(lambda part: means @ solved(means.T @ part), columns, mesh.num_cells)
+    means, solve_system = system.means, system.inverse(values)
+    return by_columns(lambda block: means @ solve_system(means.T @ block), columns, mesh.num_cells)
 
 
 @jax.jit
-def _traced_product(scaled, jacobian):
+def _traced_product(scaled_centres, jacobian):
     """Γ Jᵀ from cell centres divided by √2 length, in blocks of rows, which derivatives recompute to save memory."""
 
     @jax.checkpoint
-    def rows(block):
-        return jnp.exp(-((block[:, None] - scaled) ** 2).sum(axis=-1)) @ jacobian.T
+    def covariance_rows(block):
+        return jnp.exp(-((block[:, None] - scaled_centres) ** 2).sum(axis=-1)) @ jacobian.T
 
-    missing = -len(scaled) % _ROWS_AT_ONCE
-    blocks = jnp.pad(scaled, ((0, missing), (0, 0))).reshape(-1, _ROWS_AT_ONCE, scaled.shape[1])
-    return jax.lax.map(rows, blocks).reshape(-1, len(jacobian))[: len(scaled)]
+    num_padding_rows = -len(scaled_centres) % _ROWS_AT_ONCE
+    blocks = jnp.pad(scaled_centres, ((0, num_padding_rows), (0, 0))).reshape(
+        -1, _ROWS_AT_ONCE, scaled_centres.shape[1]
+    )
+    return jax.lax.map(covariance_rows, blocks).reshape(-1, len(jacobian))[: len(scaled_centres)]
 
 
 def check_cells(mesh: Mesh) -> None:
     """Raise `ValueError` if the mesh's cells are traced, because the prior must know which cells are neighbours."""
-    instead = "close over the mesh, and put into it what varies: eqx.tree_at(lambda m: m.points, mesh, points)"
-    check_has_values("mesh: its cells", mesh.cells, "the prior's neighbours are found from", instead)
+    advice = "close over the mesh, and put into it what varies: eqx.tree_at(lambda m: m.points, mesh, points)"
+    check_has_values("mesh: its cells", mesh.cells, "the prior's neighbours are found from", advice)
 
 
 def cell_factorisation(mesh: Mesh, groups) -> tuple[SparsityPattern, FactorisationPlan]:

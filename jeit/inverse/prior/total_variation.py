@@ -73,18 +73,18 @@ class NodalTotalVariation(AbstractPenalty):
         cells, size = np.asarray(mesh.cells), mesh.num_points
         pattern = SparsityPattern.from_elements([cells], size=size)
         points = np.asarray(mesh.points)
-        volume, extent = np.asarray(measures(mesh)), np.ptp(points, axis=0).max()
-        share = np.repeat(volume[:, None] / cells.shape[1], cells.shape[1], axis=1)
-        total = np.bincount(cells.ravel(), share.ravel(), size)
+        volume, body_size = np.asarray(measures(mesh)), np.ptp(points, axis=0).max()
+        node_shares = np.repeat(volume[:, None] / cells.shape[1], cells.shape[1], axis=1)
+        node_volumes = np.bincount(cells.ravel(), node_shares.ravel(), size)
         xp = namespace(reference)
-        onto_nodes = sum_into((size,), cells, xp.asarray(reference)[:, None] * share) / total
+        nodal_reference = sum_into((size,), cells, xp.asarray(reference)[:, None] * node_shares) / node_volumes
         energy = cls(
             cells=host.asarray(cells),
             slope=host.asarray(np.asarray(gradients(mesh))),
-            weight=hyperparameter * host.asarray(volume / extent ** (mesh.dimension - 1)),
+            weight=hyperparameter * host.asarray(volume / body_size ** (mesh.dimension - 1)),
             steepness=smoothing / host.asarray(np.cbrt(volume)),
-            pull=hyperparameter * host.asarray(pull * total / total.sum()),
-            reference=onto_nodes,
+            pull=hyperparameter * host.asarray(pull * node_volumes / node_volumes.sum()),
+            reference=nodal_reference,
             pattern=pattern,
             plan=analyse(pattern, points),
             fronts=find_fronts(pattern, points),
@@ -99,43 +99,45 @@ class NodalTotalVariation(AbstractPenalty):
 
     def cost(self, coefficients):
         """Value of the penalty."""
-        image, rest = self._parts(coefficients)
-        edges = (self.weight * self._height(image)).sum()
-        return edges + 0.5 * (self.pull * image**2).sum() + 0.5 * rest @ rest
+        image, unknowns = self._split_coefficients(coefficients)
+        edges = (self.weight * self._smoothed_height(image)).sum()
+        return edges + 0.5 * (self.pull * image**2).sum() + 0.5 * unknowns @ unknowns
 
     def diagonal(self, coefficients):
         """Diagonal of the quadratic form that touches the energy at c."""
-        image, rest = self._parts(coefficients)
-        own = (self.slope**2).sum(axis=-1) * (self.weight / self._height(image))[:, None]
-        return jnp.concatenate([self.pull + sum_into(self.pull.shape, self.cells, own), jnp.ones_like(rest)])
+        image, unknowns = self._split_coefficients(coefficients)
+        node_stiffness = (self.slope**2).sum(axis=-1) * (self.weight / self._smoothed_height(image))[:, None]
+        return jnp.concatenate(
+            [self.pull + sum_into(self.pull.shape, self.cells, node_stiffness), jnp.ones_like(unknowns)]
+        )
 
     def inverse_hessian(self, coefficients, free, columns):
         """Approximate inverse of the energy's Hessian; its stiffness is the Hessian's along the gradient, which
         vanishes where the gradient is large."""
-        image, _ = self._parts(coefficients)
+        image, _ = self._split_coefficients(coefficients)
         size = self.pull.shape[0]
-        mine = free[:size]
-        bend = self.weight * self.steepness**2 / self._height(image) ** 3
-        within = gather(mine, self.cells)
-        elements = self._elements(bend) * (within[:, :, None] & within[:, None, :])
-        factor = factorise(self.plan, self._matrix(elements, jnp.where(mine, self.pull, 1)))
-        solved = solve(self.plan, factor, columns[:size])
-        return jnp.concatenate([solved, columns[size:]])
+        is_free_node = free[:size]
+        curvature = self.weight * self.steepness**2 / self._smoothed_height(image) ** 3
+        has_free_corner = gather(is_free_node, self.cells)
+        elements = self._elements(curvature) * (has_free_corner[:, :, None] & has_free_corner[:, None, :])
+        factor = factorise(self.plan, self._matrix(elements, jnp.where(is_free_node, self.pull, 1)))
+        image_columns = solve(self.plan, factor, columns[:size])
+        return jnp.concatenate([image_columns, columns[size:]])
 
     def normal(self, coefficients):
         """Normal distribution whose precision is the quadratic form that touches the energy at c, as in
         `TotalVariationPenalty.normal`."""
-        image, _ = self._parts(coefficients)
-        values = self._matrix(self._elements(self.weight / self._height(image)), self.pull)
+        image, _ = self._split_coefficients(coefficients)
+        values = self._matrix(self._elements(self.weight / self._smoothed_height(image)), self.pull)
         return SparseNormal(self.pattern, self.plan, factorise(self.plan, values))
 
     def model(self, residual, jacobian, coefficients, data):
         """Objective and step: Gauss-Newton for the data, lagged diffusivity for the energy, in data space, as in
         `TotalVariationPenalty.model`."""
-        image, rest = self._parts(coefficients)
-        weighted = data.precision @ residual
-        cost = 0.5 * residual @ weighted + self.cost(coefficients)
-        stiffness = self.weight / self._height(image)
+        image, unknowns = self._split_coefficients(coefficients)
+        weighted_residual = data.precision @ residual
+        cost = 0.5 * residual @ weighted_residual + self.cost(coefficients)
+        stiffness = self.weight / self._smoothed_height(image)
         size = image.shape[0]
 
         def step(damping):
@@ -145,20 +147,22 @@ class NodalTotalVariation(AbstractPenalty):
             factor = factorise_matrix(self.plan, self.fronts, self._matrix(self._elements(stiffness), self.pull))
             columns = xp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1)
             # Products with Γ are formed from half solves; the direction takes one more full solve.
-            half = factor.half_solve(columns)
-            products = half.T @ half
-            further = jacobian[:, size:]
-            outer = (products[:-1, :-1] + further @ further.T) / (1 + damping)
-            descent = (products[:-1, -1] + further @ rest) / (1 + damping)
-            inner = solve_definite(outer + data.covariance, residual - descent)
-            image_direction = factor.solve((gradient + inner @ jacobian[:, :size])[:, None])[:, 0]
-            direction = -xp.concatenate([image_direction, rest + inner @ further]) / (1 + damping)
-            across = jacobian @ direction
-            own, other = self._parts(direction)
-            slope = weighted @ across + gradient @ own + rest @ other
-            bend = (stiffness * (self._gradient(own) ** 2).sum(axis=1)).sum()
-            bend = bend + (self.pull * own**2).sum() + other @ other
-            return direction, slope, across @ data.precision @ across + bend
+            half_solution = factor.half_solve(columns)
+            products = half_solution.T @ half_solution
+            unknown_columns = jacobian[:, size:]
+            data_covariance = (products[:-1, :-1] + unknown_columns @ unknown_columns.T) / (1 + damping)
+            descent = (products[:-1, -1] + unknown_columns @ unknowns) / (1 + damping)
+            dual_residual = solve_definite(data_covariance + data.covariance, residual - descent)
+            image_direction = factor.solve((gradient + dual_residual @ jacobian[:, :size])[:, None])[:, 0]
+            direction = -xp.concatenate([image_direction, unknowns + dual_residual @ unknown_columns]) / (1 + damping)
+            data_change = jacobian @ direction
+            image_change, unknown_change = self._split_coefficients(direction)
+            slope = weighted_residual @ data_change + gradient @ image_change + unknowns @ unknown_change
+            penalty_curvature = (stiffness * (self._gradient(image_change) ** 2).sum(axis=1)).sum()
+            penalty_curvature = (
+                penalty_curvature + (self.pull * image_change**2).sum() + unknown_change @ unknown_change
+            )
+            return direction, slope, data_change @ data.precision @ data_change + penalty_curvature
 
         return cost, step
 
@@ -180,11 +184,13 @@ class NodalTotalVariation(AbstractPenalty):
         """Adjoint of `_gradient`."""
         return sum_into(self.pull.shape, self.cells, (self.slope * flux[:, None]).sum(axis=-1))
 
-    def _parts(self, coefficients):
+    def _split_coefficients(self, coefficients):
+        """Coefficients of the image, and those of further unknowns."""
         size = self.pull.shape[0]
         return coefficients[:size], coefficients[size:]
 
-    def _height(self, image):
+    def _smoothed_height(self, image):
+        """√(|∇x|² + steepness²) per cell."""
         squared = (self._gradient(self.reference + image) ** 2).sum(axis=1)
         return namespace(self, image).sqrt(squared + self.steepness**2)
 
@@ -253,18 +259,18 @@ class TotalVariation(AbstractPrior):
         points = on_host(mesh.points)
         xp = namespace(points, hyperparameter, self.smoothing)
         corners = points[nodes]
-        size = (points.max(axis=0) - points.min(axis=0)).max()
+        body_size = (points.max(axis=0) - points.min(axis=0)).max()
         if mesh.dimension == 2:
-            length = xp.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
+            facet_sizes = xp.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
         else:
-            cross = xp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            length = xp.linalg.norm(cross, axis=1) / 2
+            normals = xp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            facet_sizes = xp.linalg.norm(normals, axis=1) / 2
         pattern, plan = cell_factorisation(mesh, [pairs, np.arange(mesh.num_cells)[:, None]])
-        area = on_host(measures(mesh))
+        cell_measures = on_host(measures(mesh))
         penalty = TotalVariationPenalty(
             pairs=host.asarray(pairs),
-            weight=hyperparameter * length / size ** (mesh.dimension - 1),
-            level=hyperparameter * _BACKGROUND_WEIGHT * area / area.sum(),
+            weight=hyperparameter * facet_sizes / body_size ** (mesh.dimension - 1),
+            level=hyperparameter * _BACKGROUND_WEIGHT * cell_measures / cell_measures.sum(),
             smoothing=xp.asarray(self.smoothing),
             reference=reference,
             pattern=pattern,
@@ -274,10 +280,10 @@ class TotalVariation(AbstractPrior):
         return DiagonalBasis(host.ones(mesh.num_cells)), penalty
 
 
-def _raise_not_quadratic(what: str) -> NoReturn:
+def _raise_not_quadratic(missing_quantity: str) -> NoReturn:
     raise ValueError(
-        f"prior: total variation has no {what}, so there is no linear image with it; take reconstruct, or an Imager "
-        "with gauss-newton or levenberg-marquardt, or another prior."
+        f"prior: total variation has no {missing_quantity}, so there is no linear image with it; take reconstruct, "
+        "or an Imager with gauss-newton or levenberg-marquardt, or another prior."
     )
 
 
@@ -308,38 +314,44 @@ class TotalVariationPenalty(AbstractPenalty):
 
     def cost(self, coefficients):
         """Value of the penalty."""
-        image, rest = self._parts(coefficients)
-        edges = (self.weight * self._height(image)).sum()
-        return edges + 0.5 * (self.level * image**2).sum() + 0.5 * rest @ rest
+        image, unknowns = self._split_coefficients(coefficients)
+        edges = (self.weight * self._smoothed_height(image)).sum()
+        return edges + 0.5 * (self.level * image**2).sum() + 0.5 * unknowns @ unknowns
 
     def diagonal(self, coefficients):
         """Diagonal of the quadratic form that touches the energy at c."""
-        image, rest = self._parts(coefficients)
-        stiffness = self.weight / self._height(image)
-        own = self.level.at[self.pairs[:, 0]].add(stiffness).at[self.pairs[:, 1]].add(stiffness)
-        return jnp.concatenate([own, jnp.ones_like(rest)])
+        image, unknowns = self._split_coefficients(coefficients)
+        stiffness = self.weight / self._smoothed_height(image)
+        cell_stiffness = self.level.at[self.pairs[:, 0]].add(stiffness).at[self.pairs[:, 1]].add(stiffness)
+        return jnp.concatenate([cell_stiffness, jnp.ones_like(unknowns)])
 
     def inverse_hessian(self, coefficients, free, columns):
         """Approximate inverse of the energy's Hessian, whose weights are β² / (d² + β²) times those of the touching
         quadratic form and vanish across large jumps."""
-        image, _ = self._parts(coefficients)
-        mine = free[: self.level.shape[0]]
-        bend = self.weight * self.smoothing**2 / self._height(image) ** 3
-        both = mine[self.pairs[:, 0]], mine[self.pairs[:, 1]]
-        own, across = [jnp.where(one, bend, 0) for one in both], jnp.where(both[0] & both[1], -bend, 0)
-        link = jnp.stack([jnp.stack([own[0], across], axis=-1), jnp.stack([across, own[1]], axis=-1)], axis=-2)
-        level = jnp.where(mine, self.level, 1)
-        factor = factorise(self.plan, self.pattern.assemble(link, level[:, None, None]))
-        image_columns, other = columns[: len(mine)], columns[len(mine) :]
-        return jnp.concatenate([solve(self.plan, factor, image_columns), other])
+        image, _ = self._split_coefficients(coefficients)
+        is_free_cell = free[: self.level.shape[0]]
+        curvature = self.weight * self.smoothing**2 / self._smoothed_height(image) ** 3
+        facet_is_free = is_free_cell[self.pairs[:, 0]], is_free_cell[self.pairs[:, 1]]
+        diagonal_entries, coupling = (
+            [jnp.where(is_free, curvature, 0) for is_free in facet_is_free],
+            jnp.where(facet_is_free[0] & facet_is_free[1], -curvature, 0),
+        )
+        facet_matrices = jnp.stack(
+            [jnp.stack([diagonal_entries[0], coupling], axis=-1), jnp.stack([coupling, diagonal_entries[1]], axis=-1)],
+            axis=-2,
+        )
+        level = jnp.where(is_free_cell, self.level, 1)
+        factor = factorise(self.plan, self.pattern.assemble(facet_matrices, level[:, None, None]))
+        image_columns, unknown_columns = columns[: len(is_free_cell)], columns[len(is_free_cell) :]
+        return jnp.concatenate([solve(self.plan, factor, image_columns), unknown_columns])
 
     def normal(self, coefficients):
         """Normal distribution whose precision is the quadratic form that touches the energy at c. Each jump is normal
         with variance √(d² + β²) / weight, as if position and height of the edges were known. None with bounds."""
         if self.between_bounds:
             return None
-        image, _ = self._parts(coefficients)
-        return SparseNormal(self.pattern, self.plan, self._factor(self.weight / self._height(image)))
+        image, _ = self._split_coefficients(coefficients)
+        return SparseNormal(self.pattern, self.plan, self._factor(self.weight / self._smoothed_height(image)))
 
     def model(self, residual, jacobian, coefficients, data):
         """Objective and step: Gauss-Newton for the data, lagged diffusivity for the energy, in data space.
@@ -347,10 +359,10 @@ class TotalVariationPenalty(AbstractPenalty):
         The step is δ = -Γg - ΓJᵀ (JΓJᵀ + C)⁻¹ (r - JΓg), with the matrix Q of the touching quadratic form,
         Γ = Q⁻¹ / (1 + damping), and the gradient g of the energy.
         """
-        image, rest = self._parts(coefficients)
-        weighted = data.precision @ residual
-        cost = 0.5 * residual @ weighted + self.cost(coefficients)
-        stiffness = self.weight / self._height(image)
+        image, unknowns = self._split_coefficients(coefficients)
+        weighted_residual = data.precision @ residual
+        cost = 0.5 * residual @ weighted_residual + self.cost(coefficients)
+        stiffness = self.weight / self._smoothed_height(image)
 
         def step(damping):
             xp = namespace(self, jacobian)
@@ -358,16 +370,20 @@ class TotalVariationPenalty(AbstractPenalty):
             gradient = self.level * image
             gradient = gradient + self._divergence(flux)
             size = image.shape[0]
-            solved = self._solve(stiffness, xp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1))
-            product = xp.concatenate([solved[:, :-1], jacobian[:, size:].T]) / (1 + damping)
-            descent = xp.concatenate([solved[:, -1], rest]) / (1 + damping)
-            inner = solve_definite(jacobian @ product + data.covariance, residual - jacobian @ descent)
-            direction = -descent - product @ inner
-            across = jacobian @ direction
-            own, other = self._parts(direction)
-            slope = weighted @ across + gradient @ own + rest @ other
-            bend = (stiffness * self._jump(own) ** 2).sum() + (self.level * own**2).sum() + other @ other
-            return direction, slope, across @ data.precision @ across + bend
+            solutions = self._solve(stiffness, xp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1))
+            product = xp.concatenate([solutions[:, :-1], jacobian[:, size:].T]) / (1 + damping)
+            descent = xp.concatenate([solutions[:, -1], unknowns]) / (1 + damping)
+            dual_residual = solve_definite(jacobian @ product + data.covariance, residual - jacobian @ descent)
+            direction = -descent - product @ dual_residual
+            data_change = jacobian @ direction
+            image_change, unknown_change = self._split_coefficients(direction)
+            slope = weighted_residual @ data_change + gradient @ image_change + unknowns @ unknown_change
+            penalty_curvature = (
+                (stiffness * self._jump(image_change) ** 2).sum()
+                + (self.level * image_change**2).sum()
+                + unknown_change @ unknown_change
+            )
+            return direction, slope, data_change @ data.precision @ data_change + penalty_curvature
 
         return cost, step
 
@@ -377,19 +393,23 @@ class TotalVariationPenalty(AbstractPenalty):
 
     def _factor(self, stiffness) -> Factor:
         """Factorise Q for weights `stiffness` of the squared jumps."""
-        link = stiffness[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])
-        return factorise(self.plan, self.pattern.assemble(link, self.level[:, None, None]))
+        facet_matrices = stiffness[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        return factorise(self.plan, self.pattern.assemble(facet_matrices, self.level[:, None, None]))
 
     def _divergence(self, flux):
+        """Adjoint of `_jump`."""
         first, second = self.pairs[:, 0], self.pairs[:, 1]
         return sum_into(self.level.shape, first, flux) - sum_into(self.level.shape, second, flux)
 
-    def _parts(self, coefficients):
+    def _split_coefficients(self, coefficients):
+        """Coefficients of the image, and those of further unknowns."""
         size = self.level.shape[0]
         return coefficients[:size], coefficients[size:]
 
     def _jump(self, image):
+        """Difference of the image across each facet."""
         return image[self.pairs[:, 0]] - image[self.pairs[:, 1]]
 
-    def _height(self, image):
+    def _smoothed_height(self, image):
+        """√(d² + β²) per facet."""
         return namespace(self, image).sqrt(self._jump(self.reference + image) ** 2 + self.smoothing**2)

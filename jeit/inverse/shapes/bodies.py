@@ -21,7 +21,7 @@ from jeit.arguments import describe, is_number
 from jeit.arguments.checks import Interval
 
 # Fields of `Bodies` that hold one value per body, except `start`.
-_OF_EACH = ("sign", "other", "alike", "held")
+_FIELDS_PER_BODY = ("sign", "is_other_kind", "same_material", "fixed_contrast")
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,10 @@ class BodyPrior(abc.ABC):
 
 @dataclass(frozen=True)
 class Quantities:
-    """What the data determine of a body: posterior medians, and 68 % intervals, None at an end that is left open.
+    """Properties of a body that the data determine: posterior medians, and 68 % intervals, with None for an open end.
 
     **Fields**: `change`, `change_interval`: change of conductivity relative to the background; `measure`,
-    `measure_interval`: area, m², or volume, m³; `strength`, `strength_interval`: that times (ρ - 1) / (ρ + n - 1),
+    `measure_interval`: area, m², or volume, m³; `strength`, `strength_interval`: `measure` times (ρ - 1) / (ρ + n - 1),
     where ρ is the conductivity relative to the background and n the number of axes along which the body is bounded (2
     in a sheet and for a column, else 3), negative for resistive bodies.
 
@@ -110,7 +110,7 @@ class Quantities:
 
 
 TINY = 1e-30
-"""Least measure, m² or m³, of a body that has left the domain."""
+"""Minimum measure, m² or m³; that of a body that has left the domain."""
 
 
 def polarisation(contrast, axes: int):
@@ -152,10 +152,10 @@ class Bodies(abc.ABC):
 
     **Fields**: `prior`: prior of every body; `weight` (m,): measure of each cell as a fraction of the domain; `span`:
     longest side of the domain, metres; `start` (k, d): starting centres, metres; `sign` (k,): +1 for bodies more
-    conductive than the bath, -1 for less; `other` (k,): whether a body is of the form's other kind (weak for stars, a
-    column for ellipsoids); `alike` (k,): whether a body is of the same material as all other `alike` bodies of its
-    sign. Bodies of the same material share the contrast coefficient of the first; those of the others have no effect;
-    `held` (k,): contrast at which a body is held, whatever its coefficient, NaN where it is estimated.
+    conductive than the bath, -1 for less; `is_other_kind` (k,): whether a body is of the form's other kind (weak for
+    stars, a column for ellipsoids); `same_material` (k,): whether a body is of the same material as all other such
+    bodies of its sign: they share the contrast coefficient of the first, and those of the others have no effect;
+    `fixed_contrast` (k,): contrast at which a body is held, whatever its coefficient, NaN where it is estimated.
     """
 
     prior: Any
@@ -163,9 +163,9 @@ class Bodies(abc.ABC):
     span: float
     start: Float[np.ndarray, "k d"]
     sign: Float[np.ndarray, " k"]
-    other: Bool[np.ndarray, " k"]
-    alike: Bool[np.ndarray, " k"]
-    held: Float[np.ndarray, " k"]
+    is_other_kind: Bool[np.ndarray, " k"]
+    same_material: Bool[np.ndarray, " k"]
+    fixed_contrast: Float[np.ndarray, " k"]
 
     @property
     @abc.abstractmethod
@@ -178,8 +178,10 @@ class Bodies(abc.ABC):
         """Number of axes along which splitting a body in two is tried, the longest first."""
 
     @abc.abstractmethod
-    def otherwise(self, some: Any, coefficients: Float[np.ndarray, " n"]) -> tuple[Self, Float[np.ndarray, " n"]]:
-        """The bodies with those of indices `some` changed to the other kind, with nearly the same effect on the
+    def with_other_kind(
+        self, indices: Any, coefficients: Float[np.ndarray, " n"]
+    ) -> tuple[Self, Float[np.ndarray, " n"]]:
+        """The bodies with those of `indices` changed to the other kind, with nearly the same effect on the
         voltages; and their coefficients."""
 
     @abc.abstractmethod
@@ -188,7 +190,7 @@ class Bodies(abc.ABC):
         derivatives with respect to `share` and `contrast`."""
 
     @abc.abstractmethod
-    def covered(self, k: int, row: Float[np.ndarray, " q"]) -> Covered:
+    def coverage(self, k: int, row: Float[np.ndarray, " q"]) -> Covered:
         """Coverage of cells by body k, whose coefficients are `row`."""
 
     @abc.abstractmethod
@@ -211,10 +213,10 @@ class Bodies(abc.ABC):
     @property
     def first(self) -> Int[np.ndarray, " k"]:
         """For each body, index of the body whose contrast coefficient it uses: itself, or the first of its material."""
-        order, first = np.arange(len(self.sign)), np.arange(len(self.sign))
-        for one in (self.alike & (self.sign == sign) for sign in (-1, 1)):
-            first[one] = order[one].min(initial=len(order))
-        return first
+        order, owner = np.arange(len(self.sign)), np.arange(len(self.sign))
+        for group in (self.same_material & (self.sign == sign) for sign in (-1, 1)):
+            owner[group] = order[group].min(initial=len(order))
+        return owner
 
     def rows(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "k q"]:
         """Coefficients of every body, one row each, with shared contrasts filled in."""
@@ -222,15 +224,15 @@ class Bodies(abc.ABC):
         rows[:, self.dimension + 1] = rows[self.first, self.dimension + 1]
         return rows
 
-    def by_coefficients(self, by_rows: Float[np.ndarray, "r n"]) -> Float[np.ndarray, "r n"]:
+    def by_coefficients(self, row_derivatives: Float[np.ndarray, "r n"]) -> Float[np.ndarray, "r n"]:
         """Convert derivatives with respect to the drift and the rows of `rows` to those with respect to the
         coefficients, in which bodies of the same material share a contrast."""
-        by_rows, order = by_rows.copy(), np.arange(len(self.sign))
-        contrast = 1 + order * self.prior.size + self.dimension + 1
+        row_derivatives, order = row_derivatives.copy(), np.arange(len(self.sign))
+        contrast_columns = 1 + order * self.prior.size + self.dimension + 1
         for k in order[self.first != order]:
-            by_rows[:, contrast[self.first[k]]] += by_rows[:, contrast[k]]
-            by_rows[:, contrast[k]] = 0
-        return by_rows
+            row_derivatives[:, contrast_columns[self.first[k]]] += row_derivatives[:, contrast_columns[k]]
+            row_derivatives[:, contrast_columns[k]] = 0
+        return row_derivatives
 
     def of_radii(self, radii) -> Float[np.ndarray, " n"]:
         """Coefficients of disks or balls at the starting centres; `radii` in metres."""
@@ -249,22 +251,22 @@ class Bodies(abc.ABC):
 
     def contrast(self, k: int, row: Float[np.ndarray, " q"]) -> tuple[float, float]:
         """Contrast of body k in log σ, without its sign, and its derivative with respect to the coefficient."""
-        if np.isfinite(self.held[k]):
-            return float(self.held[k]), 0.0
-        return self.prior.contrast_of(row[self.dimension + 1], bool(self.other[k]))
+        if np.isfinite(self.fixed_contrast[k]):
+            return float(self.fixed_contrast[k]), 0.0
+        return self.prior.contrast_of(row[self.dimension + 1], bool(self.is_other_kind[k]))
 
-    def shown(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    def display_image(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
         """log σ/σ₀ (m,) for display."""
         return self.image(coefficients).image
 
-    def only(self, some) -> Self:
-        """The bodies with indices `some`."""
-        some = np.asarray(some, int)
-        return replace(self, **{name: getattr(self, name)[some] for name in ("start", *_OF_EACH)})
+    def subset(self, indices) -> Self:
+        """The bodies of `indices`."""
+        indices = np.asarray(indices, int)
+        return replace(self, **{name: getattr(self, name)[indices] for name in ("start", *_FIELDS_PER_BODY)})
 
     def without(self, k: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
         """All bodies except body k, and their coefficients."""
-        others = self.only(np.delete(np.arange(len(self.sign)), k))
+        others = self.subset(np.delete(np.arange(len(self.sign)), k))
         return others, np.append(coefficients[0], np.delete(self.rows(coefficients), k, axis=0))
 
     def split(self, k: int, coefficients, number: int) -> tuple[Self, Float[np.ndarray, " n"]]:
@@ -273,50 +275,52 @@ class Bodies(abc.ABC):
         Returns the bodies, the two new ones last, and their coefficients.
         """
         others, remaining = self.without(k, coefficients)
-        row, d = self.rows(coefficients)[k], self.dimension
-        half = np.zeros(self.prior.size)
-        half[d : d + 2] = row[d : d + 2]
-        half[d] -= np.log(2) / d / self.prior.radius_spread
-        step = np.exp(self.log_radius(half)) * self.axis(k, row, number)
-        if d == 3:
-            step = step * 2 ** (-1 / 3)  # somewhat farther out than the centroids of the two halves
-        middle = self.centre(k, row)
-        start = np.concatenate([others.start, [middle + step, middle - step]])
-        each = {name: np.append(getattr(others, name), [getattr(self, name)[k]] * 2) for name in _OF_EACH}
-        return replace(self, start=start, **each), np.concatenate([remaining, half, half])
+        row, dimension = self.rows(coefficients)[k], self.dimension
+        half_row = np.zeros(self.prior.size)
+        half_row[dimension : dimension + 2] = row[dimension : dimension + 2]
+        half_row[dimension] -= np.log(2) / dimension / self.prior.radius_spread
+        offset = np.exp(self.log_radius(half_row)) * self.axis(k, row, number)
+        if dimension == 3:
+            offset = offset * 2 ** (-1 / 3)  # somewhat farther out than the centroids of the two halves
+        centre = self.centre(k, row)
+        start = np.concatenate([others.start, [centre + offset, centre - offset]])
+        other_fields = {
+            name: np.append(getattr(others, name), [getattr(self, name)[k]] * 2) for name in _FIELDS_PER_BODY
+        }
+        return replace(self, start=start, **other_fields), np.concatenate([remaining, half_row, half_row])
 
     def with_modes(self, modes: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
         """The bodies with another number of modes, and their coefficients; added modes start at zero."""
-        new = replace(self, prior=replace(self.prior, modes=modes))
-        rows = np.zeros((len(self.sign), new.prior.size))
-        kept = min(new.prior.size, self.prior.size)
-        rows[:, :kept] = self.rows(coefficients)[:, :kept]
-        return new, np.append(coefficients[0], rows)
+        new_bodies = replace(self, prior=replace(self.prior, modes=modes))
+        rows = np.zeros((len(self.sign), new_bodies.prior.size))
+        num_shared = min(new_bodies.prior.size, self.prior.size)
+        rows[:, :num_shared] = self.rows(coefficients)[:, :num_shared]
+        return new_bodies, np.append(coefficients[0], rows)
 
     def image(self, coefficients) -> BodyImage:
         """log σ/σ₀ per cell, the overlaps of the bodies, and the derivatives of both."""
-        size, d = len(self.weight), self.dimension
+        num_cells, dimension = len(self.weight), self.dimension
         rows = self.rows(coefficients)
-        parts = [self.covered(k, row) for k, row in enumerate(rows)]
-        drift, everywhere = np.full((size, 1), self.prior.drift), None
+        coverages = [self.coverage(k, row) for k, row in enumerate(rows)]
+        drift, all_cells = np.full((num_cells, 1), self.prior.drift), None
         image = coefficients[0] * drift[:, 0]
-        slopes: list[tuple[Any, Any]] = [(everywhere, drift)]
-        shares = np.zeros((len(parts), size))
-        for k, (cells, share, slope) in enumerate(parts):
-            contrast, contrast_slope = (self.sign[k] * one for one in self.contrast(k, rows[k]))
-            mixed, by_share, by_contrast = self.mixture(share, contrast)
-            image[cells] += mixed
-            change = by_share[:, None] * slope
-            change[:, d + 1] = by_contrast * contrast_slope
-            slopes.append((cells, change))
-            shares[k, cells] = share
+        slopes: list[tuple[Any, Any]] = [(all_cells, drift)]
+        cell_shares = np.zeros((len(coverages), num_cells))
+        for k, (cells, share, slope) in enumerate(coverages):
+            contrast, contrast_slope = (self.sign[k] * value for value in self.contrast(k, rows[k]))
+            body_image, share_slope, mixture_slope = self.mixture(share, contrast)
+            image[cells] += body_image
+            body_slope = share_slope[:, None] * slope
+            body_slope[:, dimension + 1] = mixture_slope * contrast_slope
+            slopes.append((cells, body_slope))
+            cell_shares[k, cells] = share
         overlap, overlap_slope = [], []
-        weighed = self.weight * shares
-        for j, k in itertools.combinations(range(len(parts)), 2):
-            by_row = np.zeros((len(parts), self.prior.size))
-            for one, other in ((j, k), (k, j)):
-                cells, _, slope = parts[one]
-                by_row[one] = weighed[other, cells] @ slope
-            overlap.append(weighed[j] @ shares[k])
-            overlap_slope.append(np.append(0, by_row))
+        weighted_shares = self.weight * cell_shares
+        for j, k in itertools.combinations(range(len(coverages)), 2):
+            row_slopes = np.zeros((len(coverages), self.prior.size))
+            for body, other_body in ((j, k), (k, j)):
+                cells, _, slope = coverages[body]
+                row_slopes[body] = weighted_shares[other_body, cells] @ slope
+            overlap.append(weighted_shares[j] @ cell_shares[k])
+            overlap_slope.append(np.append(0, row_slopes))
         return BodyImage(image, slopes, np.array(overlap), np.reshape(overlap_slope, (-1, len(coefficients))))

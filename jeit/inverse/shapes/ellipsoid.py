@@ -27,28 +27,29 @@ _UNDECIDED_ODDS, _STEPS, _COARSE_TOLERANCE = 4.0, 8, 1e-2
 # times the bath's conductivity are estimated as 3.87, 3.59 and 3.31 times as conductive if edges on their surfaces are
 # 0.7, 0.5 and 0.35 of the radius, and as 3.1 to 3.2 times if they are 0.25 of it. Disks of four times the conductivity
 # of a sheet are estimated as 4.0 to 4.2 times on meshes of 2,000 to 8,000 nodes.
-_BY_THE_MESH = {2: 0.03, 3: 0.1}
+_MESH_DEVIATION = {2: 0.03, 3: 0.1}
 
 
-def contrast_deviations(problem: ShapeProblem, fitted: Fit, each: Fit | None = None) -> list[float]:
+def contrast_deviations(problem: ShapeProblem, fitted: Fit, free_fit: Fit | None = None) -> list[float]:
     """Standard deviations of the contrasts of bodies, in log σ: those that the problem explains, and `unmodelled`."""
-    return np.hypot(_contrasts(problem, fitted)[1], unmodelled_deviations(problem, fitted, each)).tolist()
+    return np.hypot(_contrasts(problem, fitted)[1], unmodelled_deviations(problem, fitted, free_fit)).tolist()
 
 
-def unmodelled_deviations(problem: ShapeProblem, fitted: Fit, each: Fit | None = None) -> Float[np.ndarray, " k"]:
+def unmodelled_deviations(problem: ShapeProblem, fitted: Fit, free_fit: Fit | None = None) -> Float[np.ndarray, " k"]:
     """Standard deviations of the contrasts of bodies, in log σ, that Laplace's approximation of the problem lacks: that
     of the mesh, and that of the materials.
 
-    `each`: fit in which every body has its own material. If the data do not rule it out, its contrasts are included.
+    `free_fit`: fit with a material for each body. If the data do not rule it out, its contrasts are included.
     """
-    variance = np.full(len(fitted.bodies.sign), _BY_THE_MESH[fitted.bodies.dimension] ** 2)
+    variance = np.full(len(fitted.bodies.sign), _MESH_DEVIATION[fitted.bodies.dimension] ** 2)
     if (
-        each
-        and problem.surprise(each) - each.bodies.odds < problem.surprise(fitted) - fitted.bodies.odds + _UNDECIDED_ODDS
+        free_fit
+        and problem.surprise(free_fit) - free_fit.bodies.odds
+        < problem.surprise(fitted) - fitted.bodies.odds + _UNDECIDED_ODDS
     ):
         contrast, deviation = _contrasts(problem, fitted)
-        own, its = _contrasts(problem, each)
-        variance += np.maximum((np.abs(own - contrast) + its) ** 2 - deviation**2, 0)
+        free_contrast, free_deviation = _contrasts(problem, free_fit)
+        variance += np.maximum((np.abs(free_contrast - contrast) + free_deviation) ** 2 - deviation**2, 0)
     return np.sqrt(variance)
 
 
@@ -63,24 +64,24 @@ def _contrasts(problem: ShapeProblem, fitted: Fit) -> tuple[Float[np.ndarray, " 
 def alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | None, float]]:
     """For each body, the body of the other kind (ellipsoid or column) that explains the data about as well, and the
     standard deviation of its contrast; None and NaN if there is none. The prior odds of the kinds are ignored."""
-    bodies, number = fitted.bodies, len(fitted.bodies.sign)
-    if not number or bodies.prior.is_of_one_kind or not isinstance(bodies, Ellipsoids):
-        return [(None, np.nan)] * number
-    most, found = problem.surprise(fitted) - bodies.odds + _UNDECIDED_ODDS, []
-    for k in range(number):
-        other = problem.fit(*bodies.otherwise([k], fitted.coefficients), _STEPS, _COARSE_TOLERANCE)
-        if problem.surprise(other) - other.bodies.odds < most:
-            found.append((other.bodies.body(k, other.coefficients), contrast_deviations(problem, other)[k]))
+    bodies, num_bodies = fitted.bodies, len(fitted.bodies.sign)
+    if not num_bodies or bodies.prior.is_of_one_kind or not isinstance(bodies, Ellipsoids):
+        return [(None, np.nan)] * num_bodies
+    max_surprise, pairs = problem.surprise(fitted) - bodies.odds + _UNDECIDED_ODDS, []
+    for k in range(num_bodies):
+        other_fit = problem.fit(*bodies.with_other_kind([k], fitted.coefficients), _STEPS, _COARSE_TOLERANCE)
+        if problem.surprise(other_fit) - other_fit.bodies.odds < max_surprise:
+            pairs.append((other_fit.bodies.body(k, other_fit.coefficients), contrast_deviations(problem, other_fit)[k]))
         else:
-            found.append((None, np.nan))
-    return found
+            pairs.append((None, np.nan))
+    return pairs
 
 
 KINDS = ("either", "ellipsoids", "columns")
 """Kinds of bodies that a solid may contain: ellipsoids, columns through its whole height, or either."""
 
 # Barycentric weights of the twenty points at which a cell is sampled; each represents an equal part of the cell.
-_SAMPLES = np.array([[2 * n + 1 for n in one] for one in np.ndindex(4, 4, 4, 4) if sum(one) == 3]) / 10
+_SAMPLES = np.array([[2 * n + 1 for n in indices] for indices in np.ndindex(4, 4, 4, 4) if sum(indices) == 3]) / 10
 # Width of the blur of a surface, in units of the cell size: large enough for the coverage to be differentiable, but
 # small, because blurred bodies are estimated too small and too strong.
 _BLUR = 0.1
@@ -91,7 +92,7 @@ _BLUR = 0.1
 _POWERS = {1: -1.0, -1: 0.5}
 # Distance from a surface within which cells are refined, in units of the shortest half axis; lower limit of that half
 # axis, in units of the geometric mean of the three.
-_BAND, _LEAST_AXIS = 0.1, 0.6
+_BAND, _MIN_AXIS_RATIO = 0.1, 0.6
 # Distance from a surface, in widths of the blur, beyond which the covered share of a cell is less than 1e-8.
 _REACH = 20
 # Orthonormal basis of the symmetric matrices S of zero trace.
@@ -161,8 +162,8 @@ class EllipsoidPrior(BodyPrior):
     def deviation(self, span: float) -> Float[np.ndarray, " q"]:
         """Prior standard deviations of a body's parameters, 1 for its contrast; `span`: longest side of the domain,
         metres."""
-        first = [self.place * span] * 3 + [self.radius_spread, 1.0]
-        return np.concatenate([first, np.full(self.size - 5, self.roughness)])
+        deviations = [self.place * span] * 3 + [self.radius_spread, 1.0]
+        return np.concatenate([deviations, np.full(self.size - 5, self.roughness)])
 
     def contrast_of(self, coefficient: float, other: bool) -> tuple[float, float]:
         """Contrast in log σ, without its sign, and its derivative with respect to the coefficient; the same for both
@@ -218,10 +219,10 @@ class Ellipsoid(Module):
     def with_quantities(self, known: Quantities) -> Ellipsoid:
         """The body with its quantities; its volume and contrast become the medians."""
         scale = (known.measure / max(self.volume, TINY)) ** (1 / self.bounded_axes)
-        upright = self.column & (np.abs(self.axes[:, 2]) > 0.5 * np.linalg.norm(self.axes, axis=1))
+        is_upright = self.column & (np.abs(self.axes[:, 2]) > 0.5 * np.linalg.norm(self.axes, axis=1))
         return replace(
             self,
-            axes=self.axes * np.where(upright, 1.0, scale)[:, None],
+            axes=self.axes * np.where(is_upright, 1.0, scale)[:, None],
             volume=known.measure,
             contrast=float(np.abs(np.log1p(known.change))),
             quantities=known,
@@ -229,11 +230,11 @@ class Ellipsoid(Module):
 
     def holds(self, points: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
         """Whether each of `points`, in metres, lies inside the body."""
-        length = (self.axes**2).sum(axis=1)
-        along = (points - self.centre) @ self.axes.T / length
+        squared_lengths = (self.axes**2).sum(axis=1)
+        relative_position = (points - self.centre) @ self.axes.T / squared_lengths
         if self.column:
-            along = along[..., np.abs(self.axes[:, 2]) < 0.5 * np.sqrt(length)]
-        return (along**2).sum(axis=-1) < 1
+            relative_position = relative_position[..., np.abs(self.axes[:, 2]) < 0.5 * np.sqrt(squared_lengths)]
+        return (relative_position**2).sum(axis=-1) < 1
 
 
 @dataclass(frozen=True)
@@ -253,27 +254,27 @@ class Ellipsoids(Bodies):
     def create(cls, mesh: Mesh, prior: BodyPrior, start, sign) -> Ellipsoids:
         """Create ellipsoids for a mesh, with starting centres `start` (k, 3), metres."""
         points, volume = np.asarray(mesh.points), np.asarray(measures(mesh))
-        sampled = points.T[:, np.asarray(mesh.cells)] @ _SAMPLES.T
+        samples = points.T[:, np.asarray(mesh.cells)] @ _SAMPLES.T
         start, total = np.reshape(np.asarray(start, float), (-1, 3)), float(volume.sum())
-        sign, no = np.asarray(sign, float), np.zeros(len(start), bool)
-        free = np.full(len(start), np.nan)
+        sign, false = np.asarray(sign, float), np.zeros(len(start), bool)
+        nans = np.full(len(start), np.nan)
         span, ends = float(np.ptp(points, axis=0).max()), (float(points[:, 2].min()), float(points[:, 2].max()))
         return cls(
-            prior, volume / total, span, start, sign, no, no, free, sampled, _BLUR * np.cbrt(volume), total, ends
+            prior, volume / total, span, start, sign, false, false, nans, samples, _BLUR * np.cbrt(volume), total, ends
         )
 
     def bounded_axes(self, k: int) -> int:
         """2 for a column, else 3."""
-        return 2 if self.other[k] else 3
+        return 2 if self.is_other_kind[k] else 3
 
     @property
     def odds(self) -> float:
         """Logarithm of the prior odds against the bodies' kinds and materials; negative for columns and for bodies
         that share a material, which are likelier a priori."""
-        materials = len(set(self.sign[self.first != np.arange(len(self.sign))]))
-        columns = 0 if self.prior.is_of_one_kind else self.other.sum()
-        prior = np.log([self.prior.odds_for_columns, self.prior.odds_for_one_material])
-        return -float(prior @ [columns, materials])
+        num_shared_materials = len(set(self.sign[self.first != np.arange(len(self.sign))]))
+        num_columns = 0 if self.prior.is_of_one_kind else self.is_other_kind.sum()
+        log_odds = np.log([self.prior.odds_for_columns, self.prior.odds_for_one_material])
+        return -float(log_odds @ [num_columns, num_shared_materials])
 
     @property
     def num_splits(self) -> int:
@@ -281,154 +282,152 @@ class Ellipsoids(Bodies):
         takes tens of forward solves."""
         return 1
 
-    def otherwise(self, some, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
-        """The bodies with those of indices `some` changed from ellipsoid to column or back, at the same volume; and
-        their coefficients. Stretches that the new kind does not have are set to zero."""
-        rows, other = self.rows(coefficients), self.other.copy()
-        for k in some:
+    def with_other_kind(self, indices, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
+        """The bodies, those of `indices` changed from ellipsoid to column or back at the same volume, and their
+        coefficients. Stretches that the new kind does not have are set to zero."""
+        rows, is_column = self.rows(coefficients), self.is_other_kind.copy()
+        for k in indices:
             volume = max(self.body(k, coefficients).volume, 1e-6 * self.total) / np.pi
-            radius = np.cbrt(3 / 4 * volume) if other[k] else np.sqrt(volume / (self.ends[1] - self.ends[0]))
+            radius = np.cbrt(3 / 4 * volume) if is_column[k] else np.sqrt(volume / (self.ends[1] - self.ends[0]))
             rows[k, 3] = np.log(radius / (self.prior.radius * self.span)) / self.prior.radius_spread
-            rows[k, 2], other[k] = 0, not other[k]
+            rows[k, 2], is_column[k] = 0, not is_column[k]
             rows[k, 5:] *= _LEVEL[: self.prior.size - 5]
-        return replace(self, other=other), np.append(coefficients[0], rows)
+        return replace(self, is_other_kind=is_column), np.append(coefficients[0], rows)
 
     def of_one_material(self, sign: int, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
-        """The bodies with all those of a sign made of one material, and their coefficients.
-
-        The contrast coefficient becomes the mean. Radii are adjusted to keep the strengths.
-        """
-        rows, some, contrast = self.rows(coefficients), np.flatnonzero(self.sign == sign), self.dimension + 1
-        before = rows[:, contrast].copy()
-        rows[some, contrast] = before[some].mean()
-        for k in some.tolist():
-            after, past = (
-                polarisation(sign * self.prior.contrast_of(one, False)[0], self.bounded_axes(k))
-                for one in (rows[k, contrast], before[k])
+        """The bodies with all those of a sign made of one material, with the mean contrast coefficient and with radii
+        that keep the strengths; and their coefficients."""
+        rows, members, column = self.rows(coefficients), np.flatnonzero(self.sign == sign), self.dimension + 1
+        old_coefficients = rows[:, column].copy()
+        rows[members, column] = old_coefficients[members].mean()
+        for k in members.tolist():
+            new_strength, old_strength = (
+                polarisation(sign * self.prior.contrast_of(coefficient, False)[0], self.bounded_axes(k))
+                for coefficient in (rows[k, column], old_coefficients[k])
             )
-            rows[k, 3] += np.log(past / after) / self.bounded_axes(k) / self.prior.radius_spread
-        return replace(self, alike=self.alike | (self.sign == sign)), np.append(coefficients[0], rows)
+            rows[k, 3] += np.log(old_strength / new_strength) / self.bounded_axes(k) / self.prior.radius_spread
+        return replace(self, same_material=self.same_material | (self.sign == sign)), np.append(coefficients[0], rows)
 
     def mixture(self, share, contrast):
         """log(1 + share (exp(p contrast) - 1)) / p, the power mean of body and bath: harmonic (p = -1) for a conductive
         body, p = 1/2 for a resistive one. Also its derivatives with respect to `share` and `contrast`."""
         power = _POWERS[1 if contrast > 0 else -1]
         rise = np.expm1(power * contrast)
-        mean = 1 + share * rise
-        return np.log(mean) / power, rise / (power * mean), share * (1 + rise) / mean
+        power_mean = 1 + share * rise
+        return np.log(power_mean) / power, rise / (power * power_mean), share * (1 + rise) / power_mean
 
-    def shown(self, coefficients) -> Float[np.ndarray, " m"]:
+    def display_image(self, coefficients) -> Float[np.ndarray, " m"]:
         """log σ/σ₀ (m,) for display. Partly covered cells have the geometric mean of body and bath, so the value is
         halfway between them on the surface; the voltages are computed with `mixture` instead."""
         image = np.full(len(self.weight), coefficients[0] * self.prior.drift)
         for k, row in enumerate(self.rows(coefficients)):
-            cells, share, _ = self.covered(k, row)
+            cells, share, _ = self.coverage(k, row)
             image[cells] += share * self.sign[k] * self.contrast(k, row)[0]
         return image
 
     def on(self, mesh: Mesh) -> Ellipsoids:
         """The bodies on another mesh of the same domain."""
-        there = Ellipsoids.create(mesh, self.prior, self.start, self.sign)
-        return replace(there, other=self.other, alike=self.alike, span=self.span)
+        bodies = Ellipsoids.create(mesh, self.prior, self.start, self.sign)
+        return replace(bodies, is_other_kind=self.is_other_kind, same_material=self.same_material, span=self.span)
 
     def edges(self, coefficients, edge: float, corners: Float[np.ndarray, "m 4 3"]) -> Float[np.ndarray, " m"]:
         """Maximum edge length in metres of cells with these `corners`: `edge` times the shortest half axis at the
         surface of a body, infinite elsewhere."""
-        longest = np.full(len(corners), np.inf)
+        max_lengths = np.full(len(corners), np.inf)
         for k, row in enumerate(self.rows(coefficients)):
-            form, offset = self._form(k, row), (corners - self.centre(k, row)) * self._axes_of(k)
-            least = self._least_axis(form)
+            matrix, offset = self._shape_matrix(k, row), (corners - self.centre(k, row)) * self._axes_of(k)
+            shortest_axis = self._min_axis(matrix)
             distance = np.linalg.norm(offset, axis=2)
-            reach = np.linalg.norm(offset @ np.linalg.inv(form), axis=2)
-            outside = distance - distance / np.maximum(reach, 1e-9)
-            low, high = outside.min(axis=1), outside.max(axis=1)
-            holds = distance.min(axis=1) < high - low  # the corners surround a body that is smaller than a cell
-            near = ((low < _BAND * least) | holds) & (high > -_BAND * least)
-            longest[near] = np.minimum(longest[near], edge * least)
-        return longest
+            scaled_distance = np.linalg.norm(offset @ np.linalg.inv(matrix), axis=2)
+            distance_outside = distance - distance / np.maximum(scaled_distance, 1e-9)
+            nearest, farthest = distance_outside.min(axis=1), distance_outside.max(axis=1)
+            encloses = distance.min(axis=1) < farthest - nearest  # the corners surround a body smaller than a cell
+            is_near = ((nearest < _BAND * shortest_axis) | encloses) & (farthest > -_BAND * shortest_axis)
+            max_lengths[is_near] = np.minimum(max_lengths[is_near], edge * shortest_axis)
+        return max_lengths
 
-    def moved(self, coefficients, others: Bodies, after) -> bool:
-        """Whether, between `coefficients` and the coefficients `after` of the bodies `others`, a surface has left the
-        cells that were refined for it, a body was removed, or a body changed kind."""
-        if not np.array_equal(self.other, others.other):
+    def left_refined_cells(self, coefficients, others: Bodies, new_coefficients) -> bool:
+        """Whether, between `coefficients` and the coefficients `new_coefficients` of the bodies `others`, a surface
+        has left the cells that were refined for it, a body was removed, or a body changed kind."""
+        if not np.array_equal(self.is_other_kind, others.is_other_kind):
             return True
-        for k, (row, other) in enumerate(zip(self.rows(coefficients), others.rows(after), strict=True)):
-            shift = np.linalg.norm((self.centre(k, row) - others.centre(k, other)) * self._axes_of(k))
-            form = self._form(k, row)
-            if shift + np.linalg.norm(form - self._form(k, other), 2) > 2 * _BAND * self._least_axis(form):
+        for k, (row, new_row) in enumerate(zip(self.rows(coefficients), others.rows(new_coefficients), strict=True)):
+            shift = np.linalg.norm((self.centre(k, row) - others.centre(k, new_row)) * self._axes_of(k))
+            matrix = self._shape_matrix(k, row)
+            if shift + np.linalg.norm(matrix - self._shape_matrix(k, new_row), 2) > 2 * _BAND * self._min_axis(matrix):
                 return True
         return False
 
     def _axes_of(self, k: int) -> Float[np.ndarray, "3"]:
         """1 for the axes along which body k is bounded: x, y and, unless it is a column, z; else 0."""
-        return np.array([1.0, 1.0, 0.0 if self.other[k] else 1.0])
+        return np.array([1.0, 1.0, 0.0 if self.is_other_kind[k] else 1.0])
 
-    def _form(self, k: int, row) -> Float[np.ndarray, "3 3"]:
+    def _shape_matrix(self, k: int, row) -> Float[np.ndarray, "3 3"]:
         """Matrix r exp(S), metres, which maps the unit ball to the body."""
         log_stretch, direction = np.linalg.eigh(self._stretch(k, row))
         return (direction * np.exp(self.log_radius(row) + log_stretch)) @ direction.T
 
     @staticmethod
-    def _least_axis(form: Float[np.ndarray, "3 3"]) -> float:
-        """Shortest half axis in metres, at least `_LEAST_AXIS` times the geometric mean of the three."""
-        axes = np.linalg.eigvalsh(form)
-        return float(max(axes[0], _LEAST_AXIS * np.cbrt(axes.prod())))
+    def _min_axis(matrix: Float[np.ndarray, "3 3"]) -> float:
+        """Shortest half axis in metres, at least `_MIN_AXIS_RATIO` times the geometric mean of the three."""
+        axes = np.linalg.eigvalsh(matrix)
+        return float(max(axes[0], _MIN_AXIS_RATIO * np.cbrt(axes.prod())))
 
     def axis(self, k: int, row, number: int):
         """Unit vector along axis `number` of body k, counted from the longest; for a column, of its cross-section."""
-        form = self._form(k, row) * self._axes_of(k)
-        return np.linalg.eigh(form)[1][:, 2 - number]
+        matrix = self._shape_matrix(k, row) * self._axes_of(k)
+        return np.linalg.eigh(matrix)[1][:, 2 - number]
 
     def body(self, k: int, coefficients, rise: float = np.nan) -> Ellipsoid:
         """Description of body k; volume and centroid are those of the part inside the domain."""
         row = self.rows(coefficients)[k]
-        cells, share, _ = self.covered(k, row)
-        within = share * self.weight[cells]
-        centre, volume = self.centre(k, row), float(within.sum()) * self.total
-        centroid = self.points[:, cells].mean(axis=2) @ within / within.sum() if volume > 0 else centre
-        form, column = self._form(k, row), bool(self.other[k])
-        if column:
-            form[2, 2], centre[2] = (self.ends[1] - self.ends[0]) / 2, sum(self.ends) / 2
-        length, direction = np.linalg.eigh(form)
-        contrast, axes = float(self.contrast(k, row)[0]), (length * direction).T[::-1]
-        alike = int((self.first == self.first[k]).sum()) > 1
-        return Ellipsoid(int(self.sign[k]), centre, axes, volume, centroid, contrast, column, alike, float(rise))
+        cells, share, _ = self.coverage(k, row)
+        fractions = share * self.weight[cells]
+        centre, volume = self.centre(k, row), float(fractions.sum()) * self.total
+        centroid = self.points[:, cells].mean(axis=2) @ fractions / fractions.sum() if volume > 0 else centre
+        matrix, is_column = self._shape_matrix(k, row), bool(self.is_other_kind[k])
+        if is_column:
+            matrix[2, 2], centre[2] = (self.ends[1] - self.ends[0]) / 2, sum(self.ends) / 2
+        half_lengths, direction = np.linalg.eigh(matrix)
+        contrast, axes = float(self.contrast(k, row)[0]), (half_lengths * direction).T[::-1]
+        is_alike = int((self.first == self.first[k]).sum()) > 1
+        return Ellipsoid(int(self.sign[k]), centre, axes, volume, centroid, contrast, is_column, is_alike, float(rise))
 
-    def covered(self, k: int, row) -> Covered:
+    def coverage(self, k: int, row) -> Covered:
         """Coverage of cells by body k, whose coefficients are `row`."""
         log_stretch, direction = np.linalg.eigh(self._stretch(k, row))
-        squeeze = (direction * np.exp(-log_stretch)) @ direction.T
+        inverse_stretch = (direction * np.exp(-log_stretch)) @ direction.T
         centre, radius = self.centre(k, row), np.exp(min(self.log_radius(row), np.log(10 * self.span)))
-        farthest, axes = radius * np.exp(log_stretch[-1]), self._axes_of(k)
-        reached = _lengths((self.points[:, :, 0] - centre[:, None]) * axes[:, None]) < farthest + _REACH * self.width
-        cells = np.flatnonzero(reached)
+        extent, axes = radius * np.exp(log_stretch[-1]), self._axes_of(k)
+        is_near = _lengths((self.points[:, :, 0] - centre[:, None]) * axes[:, None]) < extent + _REACH * self.width
+        cells = np.flatnonzero(is_near)
         offset = (self.points[:, cells] - centre[:, None, None]) * axes[:, None, None]
         distance, width = _lengths(offset), self.width[cells, None]
-        if (at_centre := distance == 0).any():
-            offset[:, at_centre] = 1e-9 * self.span
+        if (is_at_centre := distance == 0).any():
+            offset[:, is_at_centre] = 1e-9 * self.span
             distance = _lengths(offset)
-        round_offset = np.tensordot(squeeze, offset, 1)
-        reach = _lengths(round_offset)
+        round_offset = np.tensordot(inverse_stretch, offset, 1)
+        scaled_distance = _lengths(round_offset)
         # On the ray from the centre, the surface is at the distance radius · distance / reach.
-        surface = radius * distance / reach
-        # The blur of a convex surface adds more volume than it removes. Reducing the surface by `excess` compensates.
+        surface = radius * distance / scaled_distance
+        # The blur of a convex surface adds more volume than it removes. Moving it inwards by `excess` compensates.
         excess = (np.pi * width) ** 2 * (axes.sum() - 1) / (6 * surface)
         inside = 0.5 * (1 + np.tanh(0.5 * (surface - excess - distance) / width))
-        edge = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(surface - excess - distance)
-        grown = surface + excess  # d(surface - excess) / d log surface
-        by_round_offset = -edge * grown / reach**2 * round_offset
-        by_offset = edge * (grown - distance) / distance**2 * offset
-        by_centre = -(by_offset.sum(axis=2) + squeeze @ by_round_offset.sum(axis=2)).T
-        outer = np.einsum("ics,jcs->cij", by_round_offset, offset)
-        stretches = (self._squeeze_slopes(log_stretch, direction) * self._mask(k)[:, None, None])[: self.prior.size - 5]
-        form = outer.reshape(len(cells), 9) @ stretches.reshape(-1, 9).T
-        columns = [by_centre, (edge * grown).sum(axis=1)[:, None], np.zeros((len(cells), 1)), form]
-        slope = np.concatenate(columns, axis=1) * self.prior.deviation(self.span)
-        return Covered(cells, inside.mean(axis=1), slope)
+        share_slope = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(surface - excess - distance)
+        growth = surface + excess  # d(surface - excess) / d log surface
+        round_offset_slope = -share_slope * growth / scaled_distance**2 * round_offset
+        offset_slope = share_slope * (growth - distance) / distance**2 * offset
+        centre_slope = -(offset_slope.sum(axis=2) + inverse_stretch @ round_offset_slope.sum(axis=2)).T
+        outer_products = np.einsum("ics,jcs->cij", round_offset_slope, offset)
+        stretches = (self._stretch_slopes(log_stretch, direction) * self._mask(k)[:, None, None])[: self.prior.size - 5]
+        form_slope = outer_products.reshape(len(cells), 9) @ stretches.reshape(-1, 9).T
+        columns = [centre_slope, (share_slope * growth).sum(axis=1)[:, None], np.zeros((len(cells), 1)), form_slope]
+        slopes = np.concatenate(columns, axis=1) * self.prior.deviation(self.span)
+        return Covered(cells, inside.mean(axis=1), slopes)
 
     def _mask(self, k: int) -> Float[np.ndarray, "5"]:
         """1 for the elements of the basis of S along which body k may be stretched, else 0."""
-        return _LEVEL if self.other[k] else np.ones(5)
+        return _LEVEL if self.is_other_kind[k] else np.ones(5)
 
     def _stretch(self, k: int, row) -> Float[np.ndarray, "3 3"]:
         """Log stretch S of body k."""
@@ -436,14 +435,14 @@ class Ellipsoids(Bodies):
         return np.tensordot(values, _STRETCHES[: len(values)], 1) if len(values) else np.zeros((3, 3))
 
     @staticmethod
-    def _squeeze_slopes(log_stretch, direction) -> Float[np.ndarray, "5 3 3"]:
+    def _stretch_slopes(log_stretch, direction) -> Float[np.ndarray, "5 3 3"]:
         """Derivatives of exp(-S) with respect to the coefficients of S in its basis."""
-        apart = log_stretch[:, None] - log_stretch
-        middle = (log_stretch[:, None] + log_stretch) / 2
+        differences = log_stretch[:, None] - log_stretch
+        means = (log_stretch[:, None] + log_stretch) / 2
         # (exp(-a) - exp(-b)) / (a - b) = -exp(-(a + b) / 2) sinh(h) / h with h = (a - b) / 2.
-        half = np.where(np.abs(apart) > 1e-12, apart / 2, 1)
-        divided = -np.exp(-middle) * np.where(np.abs(apart) > 1e-12, np.sinh(half) / half, 1)
-        return direction @ ((direction.T @ _STRETCHES @ direction) * divided) @ direction.T
+        halves = np.where(np.abs(differences) > 1e-12, differences / 2, 1)
+        quotients = -np.exp(-means) * np.where(np.abs(differences) > 1e-12, np.sinh(halves) / halves, 1)
+        return direction @ ((direction.T @ _STRETCHES @ direction) * quotients) @ direction.T
 
 
 def _lengths(vectors: Float[np.ndarray, "3 *n"]) -> Float[np.ndarray, "*n"]:

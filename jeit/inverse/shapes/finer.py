@@ -2,8 +2,8 @@
 
 A mesh that suffices for a smooth image resolves a body of a few cells badly. The error of the voltages is proportional
 to the edge length on the surface, differs between channels, and resembles the effect of another body. Bodies that were
-found are therefore fitted again on a mesh that is bisected at their surfaces. The rest of the problem,
-including the voltages of the background, is unchanged.
+found are therefore fitted again on a mesh that is bisected at their surfaces. The rest of the problem, including the
+voltages of the background, is unchanged.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class FinerModel(NamedTuple):
         """Change of the voltages of `protocol`, in volts, due to the `image` of bodies (f,) and a `field`, (m,) on the
         given mesh or 0, both in log σ."""
         model, background = self.problem.model.with_protocol(protocol), self.problem.background
-        after = self.conductivity(image, field)
-        return solved_fields(model, after).voltages - solved_fields(model, background).voltages
+        conductivity = self.conductivity(image, field)
+        return solved_fields(model, conductivity).voltages - solved_fields(model, background).voltages
 
     def conductivity(self, image: Float[np.ndarray, " f"], field: Any) -> Float[np.ndarray, " f"]:
         """Conductivity of the refined cells, S/m, for the `image` of bodies (f,) and a `field`, (m,) on the given mesh
@@ -63,24 +63,28 @@ def refine_at_surfaces(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) 
     """
     bodies, model = fit.bodies, problem.model
     assert isinstance(bodies, Ellipsoids)
-    tagged, names = _tag_electrodes(model.mesh, model.electrodes)
-    mesh, cell = bisect_with_parents(tagged, partial(bodies.edges, fit.coefficients, edges[0]))
+    tagged_mesh, names = _tag_electrodes(model.mesh, model.electrodes)
+    mesh, parent_cells = bisect_with_parents(tagged_mesh, partial(bodies.edges, fit.coefficients, edges[0]))
     for edge in edges[1:]:
-        if mesh.num_points < _MAX_NODES * tagged.num_points:
+        if mesh.num_points < _MAX_NODES * tagged_mesh.num_points:
             break
-        mesh, cell = bisect_with_parents(tagged, partial(bodies.edges, fit.coefficients, edge))
-    there = on_host(ForwardModel(mesh, _electrodes_on(mesh, model.electrodes, iter(names)), model.protocol))
-    background = problem.background[cell]
-    moved = solved_fields(there, background).voltages - solved_fields(model, problem.background).voltages
-    data = eqx.tree_at(lambda data: data.voltages, problem.data, np.asarray(problem.data.voltages) + moved)
-    return FinerModel(ShapeProblem(there, data, background), bodies.on(mesh), cell)
+        mesh, parent_cells = bisect_with_parents(tagged_mesh, partial(bodies.edges, fit.coefficients, edge))
+    refined_model = on_host(ForwardModel(mesh, _electrodes_on(mesh, model.electrodes, iter(names)), model.protocol))
+    background = problem.background[parent_cells]
+    voltage_change = (
+        solved_fields(refined_model, background).voltages - solved_fields(model, problem.background).voltages
+    )
+    data = eqx.tree_at(lambda data: data.voltages, problem.data, np.asarray(problem.data.voltages) + voltage_change)
+    return FinerModel(ShapeProblem(refined_model, data, background), bodies.on(mesh), parent_cells)
 
 
 def _tag_electrodes(mesh: Mesh, electrodes: AbstractElectrodes) -> tuple[Mesh, list[str]]:
     """The mesh with the facets that each electrode covers as tags, which bisection preserves; and the tags' names."""
     parts = electrodes.parts if isinstance(electrodes, CombinedElectrodes) else (electrodes,)
-    covers = [column for part in parts if isinstance(part, FacetElectrodes) for column in np.asarray(part.covers).T]
-    tags: dict[str, Any] = {str(k): np.flatnonzero(column) for k, column in enumerate(covers)}
+    covered_facets = [
+        column for part in parts if isinstance(part, FacetElectrodes) for column in np.asarray(part.covers).T
+    ]
+    tags: dict[str, Any] = {str(index): np.flatnonzero(column) for index, column in enumerate(covered_facets)}
     return replace(mesh, tags=tags), list(tags)
 
 

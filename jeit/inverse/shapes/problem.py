@@ -47,19 +47,19 @@ class SmoothField:
     """Smooth conductivity field beside the bodies, as a normal random field.
 
     **Fields**: `image`: a smooth reconstruction from the same channels, whose basis the field has; `jacobian` (r, n):
-    derivatives of the channels of `alone` with respect to the field's coefficients of unit variance, at the background;
-    `scale` (m,): derivative of log σ with respect to the link's variable; `alone`: the problem of bodies without the
-    field.
+    derivatives of the channels of `bodies_problem` with respect to the field's coefficients of unit variance, at the
+    background; `scale` (m,): derivative of log σ with respect to the link's variable; `bodies_problem`: the problem of
+    bodies without the field.
     """
 
     image: Reconstruction
     jacobian: Float[np.ndarray, "r n"]
     scale: Float[np.ndarray, " m"]
-    alone: ShapeProblem
+    bodies_problem: ShapeProblem
 
     @classmethod
-    def create(cls, image: Reconstruction, alone: ShapeProblem) -> SmoothField:
-        """Create a field from a smooth reconstruction `image`, for the problem of bodies `alone`.
+    def create(cls, image: Reconstruction, bodies_problem: ShapeProblem) -> SmoothField:
+        """Create a field from a smooth reconstruction `image`, for the problem of bodies `bodies_problem`.
 
         Raises `ValueError` unless `image` is a reconstruction of the same cells and channels with a smooth prior.
         """
@@ -67,36 +67,36 @@ class SmoothField:
         inversion = image.inversion
         if not inversion.penalty.is_standard_normal or inversion.unknowns:
             raise ValueError("smooth: give an image by a smooth prior, with no bounds and no further unknowns.")
-        there = (len(inversion.data.weight), len(inversion.reference))
-        if there != (wanted := (len(alone.data.weight), len(alone.background))):
+        image_sizes = (len(inversion.data.weight), len(inversion.reference))
+        if image_sizes != (problem_sizes := (len(bodies_problem.data.weight), len(bodies_problem.background))):
             raise ValueError(
-                f"smooth is an image of {there[0]} independent channels and {there[1]} cells, and the data of bodies "
-                f"have {wanted[0]} and {wanted[1]}; give one by the same model and mask."
+                f"smooth is an image of {image_sizes[0]} independent channels and {image_sizes[1]} cells, and the "
+                f"data of bodies have {problem_sizes[0]} and {problem_sizes[1]}; give one by the same model and mask."
             )
         image = on_host(image)
-        none: Any = np.zeros_like(image.coefficients)
-        _, weighted = image.inversion.linearise(none)
-        relative = np.asarray(alone.data.weight) / image.inversion.data.weight
-        scale = np.asarray(inversion.link.slope(inversion.reference)) / alone.background
-        return cls(image, relative[:, None] * weighted, scale, alone)
+        zero_coefficients: Any = np.zeros_like(image.coefficients)
+        _, weighted_jacobian = image.inversion.linearise(zero_coefficients)
+        weight_ratio = np.asarray(bodies_problem.data.weight) / image.inversion.data.weight
+        scale = np.asarray(inversion.link.slope(inversion.reference)) / bodies_problem.background
+        return cls(image, weight_ratio[:, None] * weighted_jacobian, scale, bodies_problem)
 
-    def beside(self, level: float) -> ShapeProblem:
+    def problem_at(self, level: float) -> ShapeProblem:
         """The problem of bodies with the field of this level as additional noise."""
-        return self.alone.with_errors(level * self.jacobian)
+        return self.bodies_problem.with_errors(level * self.jacobian)
 
-    def likeliest(self, fit: Fit) -> float:
+    def likeliest_level(self, fit: Fit) -> float:
         """Level with the largest evidence, given the voltages that the bodies do not explain."""
         residual = self._residual(fit)
 
         def surprise(level: float) -> float:
-            problem = self.beside(level)
-            return 0.5 * float(residual @ problem.data.precision @ residual) + problem.uncertainty
+            problem = self.problem_at(level)
+            return 0.5 * float(residual @ problem.data.precision @ residual) + problem.half_log_determinant
 
         return min(_LEVELS, key=surprise)
 
     def estimate(self, level: float, fit: Fit) -> Float[np.ndarray, " m"]:
         """Posterior mean of level · field (m,), in log σ/σ₀, given the voltages that the bodies do not explain."""
-        precision = self.beside(level).data.precision
+        precision = self.problem_at(level).data.precision
         coefficients: Any = -(level**2) * self.jacobian.T @ (precision @ self._residual(fit))
         return self.scale * np.asarray(self.image.inversion.basis.expand(coefficients))
 
@@ -135,8 +135,8 @@ class ShapeProblem:
         """The problem with further errors of the data: `rows` of the weighted voltages, for coefficients of unit
         variance."""
         covariance = np.asarray(self.data.covariance) + rows @ rows.T
-        changed = (covariance, np.linalg.inv(covariance))
-        return replace(self, data=eqx.tree_at(lambda data: (data.covariance, data.precision), self.data, changed))
+        new_matrices = (covariance, np.linalg.inv(covariance))
+        return replace(self, data=eqx.tree_at(lambda data: (data.covariance, data.precision), self.data, new_matrices))
 
     def linearise(self, coefficients: Float[np.ndarray, " n"], bodies: Bodies) -> tuple[Any, Any, Any, Any]:
         """Residual (r + p,), a function that returns its Jacobian (r + p, n), its covariance and its precision
@@ -146,28 +146,28 @@ class ShapeProblem:
         fields = solved_fields(self.model, conductivity)
         weight = np.asarray(self.data.weight)
         # The penalty of overlap is an additional datum of unit variance for every pair of bodies.
-        apart, more = bodies.prior.apart, np.eye(len(overlap))
+        overlap_weight, pair_identity = bodies.prior.apart, np.eye(len(overlap))
 
         def jacobian():
-            there = [conductivity if cells is None else conductivity[cells] for cells, _ in slopes]
+            cell_conductivities = [conductivity if cells is None else conductivity[cells] for cells, _ in slopes]
             changes = [
-                ConductivityChange(cells, one[:, None] * slope)
-                for one, (cells, slope) in zip(there, slopes, strict=True)
+                ConductivityChange(cells, values[:, None] * slope)
+                for values, (cells, slope) in zip(cell_conductivities, slopes, strict=True)
             ]
             voltages = bodies.by_coefficients(fields.derivatives(changes))
-            return np.concatenate([weight[:, None] * voltages, apart * overlap_slope])
+            return np.concatenate([weight[:, None] * voltages, overlap_weight * overlap_slope])
 
         return (
-            np.concatenate([weight * (fields.voltages - self.data.voltages), apart * overlap]),
+            np.concatenate([weight * (fields.voltages - self.data.voltages), overlap_weight * overlap]),
             jacobian,
-            scipy.linalg.block_diag(self.data.covariance, more),
-            scipy.linalg.block_diag(self.data.precision, more),
+            scipy.linalg.block_diag(self.data.covariance, pair_identity),
+            scipy.linalg.block_diag(self.data.precision, pair_identity),
         )
 
     def fit(self, bodies: Bodies, start: Float[np.ndarray, " n"], max_steps: int, rtol: float | None = None) -> Fit:
         """Minimise the cost from `start` by the Levenberg-Marquardt method, in at most `max_steps` steps."""
-        unknown = np.full((len(self.data.voltages), 1 + len(start)), np.nan)
-        accepted: list[Any] = [unknown[:, 0], unknown[:, 1:]]
+        undefined_rows = np.full((len(self.data.voltages), 1 + len(start)), np.nan)
+        accepted: list[Any] = [undefined_rows[:, 0], undefined_rows[:, 1:]]
 
         def expand(coefficients, bodies) -> QuadraticModel:
             residual, jacobian, covariance, precision = self.linearise(coefficients, bodies)
@@ -185,7 +185,7 @@ class ShapeProblem:
         return Fit(bodies, coefficients, float(state.cost), (accepted[0], accepted[1]))
 
     @property
-    def uncertainty(self) -> float:
+    def half_log_determinant(self) -> float:
         """Contribution of the data's covariance to -log evidence: half the logarithm of its determinant."""
         return 0.5 * float(np.linalg.slogdet(np.asarray(self.data.covariance))[1])
 
@@ -200,6 +200,6 @@ class ShapeProblem:
     def _hessian(self, fit: Fit) -> Float[np.ndarray, "n n"]:
         """Hessian H at the minimum of the cost."""
         _, rows = fit.rows
-        channels = len(self.data.voltages)
-        weighed = np.concatenate([self.data.precision @ rows[:channels], rows[channels:]])
-        return np.eye(len(fit.coefficients)) + rows.T @ weighed
+        num_channels = len(self.data.voltages)
+        weighted_rows = np.concatenate([self.data.precision @ rows[:num_channels], rows[num_channels:]])
+        return np.eye(len(fit.coefficients)) + rows.T @ weighted_rows

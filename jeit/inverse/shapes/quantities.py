@@ -26,18 +26,18 @@ from jeit.inverse.shapes.bodies import TINY, Bodies, Quantities, polarisation
 from jeit.inverse.shapes.ellipsoid import Ellipsoid
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 
-# Median and spread of the logarithm of the contrast before the data, and bounds of that logarithm: 4.5 is 90 times.
+# Prior median of the contrast, and standard deviation and bounds of its logarithm; a contrast of 4.5 is a factor of 90.
 _MEDIAN_LOG_CONTRAST, _LOG_CONTRAST_DEVIATION, _LOG_CONTRAST_BOUNDS = (
     0.9,
     1.2,
     (float(np.log(0.03)), float(np.log(4.5))),
 )
-# Steps of the first fit; first step along the logarithm of the contrast, at least and at most; and the factor by which
-# the next is longer.
-_STEPS, _STEP, _STEP_GROWTH = 8, (0.02, 0.35), 1.6
-# In sheets and in solids, where each step takes a second: steps of each fit and its tolerance; and the drop of the log
-# posterior at which the exploration ends.
-_EFFORT, _LOG_POSTERIOR_DROP = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0}
+# Maximum number of steps of the first fit; minimum and maximum of the first step along the logarithm of the contrast;
+# and the factor by which each step is longer than the last.
+_STEPS, _FIRST_STEP_LIMITS, _STEP_GROWTH = 8, (0.02, 0.35), 1.6
+# By dimension of the mesh: maximum number of steps of each fit and its tolerance, and the drop of the log posterior at
+# which the exploration ends. A step in a solid takes a second.
+_FIT_LIMITS, _LOG_POSTERIOR_DROP = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0}
 # Rise of the -log likelihood at an end of the grid below which the data leave that end open.
 _OPEN_END_RISE = 1.0
 # Probabilities of the ends of an interval, and numbers of contrasts and of normal deviates of the posterior's sample.
@@ -45,7 +45,7 @@ _INTERVAL_PROBABILITIES, _NUM_CONTRASTS, _NUM_NORMAL_DEVIATES = (0.16, 0.84), 24
 
 
 class Accuracy(NamedTuple):
-    """How accurately a difference of two frames is known. **Fields**: `noise` (M,): standard deviation of the channels,
+    """Accuracy of a difference of two frames. **Fields**: `noise` (M,): standard deviation of the channels,
     volts, of all errors but those of `model_error`, the unknown part of electrode positions and contact impedances,
     if any; relative standard deviations `size`, of the lengths of the described domain, and `strength`, of all
     strengths, from errors of the background and the fields.
@@ -99,12 +99,12 @@ def _interval_hull(interval: Interval, values: Sequence[float]) -> Interval:
     return None if low is None else min(low, *values), None if high is None else max(high, *values)
 
 
-class _HeldFits(NamedTuple):
-    """A fit with a contrast held: `log_contrast`; `unlikely`: -log likelihood, with all other coefficients integrated
-    out; `log_measure` and its standard `deviation`."""
+class _FixedContrastFit(NamedTuple):
+    """A fit with a contrast held: `log_contrast`; `negative_log_likelihood`: -log likelihood, with all other
+    coefficients integrated out; `log_measure` and its standard `deviation`."""
 
     log_contrast: float
-    unlikely: float
+    negative_log_likelihood: float
     log_measure: float
     deviation: float
 
@@ -117,53 +117,74 @@ def quantify(problem: ShapeProblem, fit: Fit, k: int, unmodelled: float, accurac
     """
     bodies = fit.bodies
     contrast, slope = bodies.contrast(k, bodies.rows(fit.coefficients)[k])
-    first = float(np.clip(np.log(contrast), *_LOG_CONTRAST_BOUNDS))
-    deviation = problem.deviations(fit)[_size_coefficient(bodies, k)[1]] * abs(slope) / contrast
-    middle, start = _fits_with_held_quantity(problem, bodies, fit.coefficients, k, np.log(contrast), first, accuracy)
-    known, enough = [middle], _LOG_POSTERIOR_DROP[bodies.dimension]
-    for way in (-1, 1):
-        at, coefficients, step = first, start, float(np.clip(deviation, *_STEP))
+    first_log_contrast = float(np.clip(np.log(contrast), *_LOG_CONTRAST_BOUNDS))
+    deviation = problem.deviations(fit)[_radius_and_contrast_index(bodies, k)[1]] * abs(slope) / contrast
+    middle_fit, middle_coefficients = _fit_with_fixed_contrast(
+        problem, bodies, fit.coefficients, k, np.log(contrast), first_log_contrast, accuracy
+    )
+    fixed_fits, max_drop = [middle_fit], _LOG_POSTERIOR_DROP[bodies.dimension]
+    for direction in (-1, 1):
+        log_contrast, coefficients, step = (
+            first_log_contrast,
+            middle_coefficients,
+            float(np.clip(deviation, *_FIRST_STEP_LIMITS)),
+        )
         while (
-            known[-1 if way > 0 else 0].unlikely + _contrast_prior(at)
-            < min(map(_negative_log_evidence, known)) + enough
+            fixed_fits[-1 if direction > 0 else 0].negative_log_likelihood + _contrast_prior(log_contrast)
+            < min(map(_negative_log_evidence, fixed_fits)) + max_drop
         ):
-            before, at = at, float(np.clip(at + way * step, *_LOG_CONTRAST_BOUNDS))
-            if at == before:
+            last_log_contrast, log_contrast = (
+                log_contrast,
+                float(np.clip(log_contrast + direction * step, *_LOG_CONTRAST_BOUNDS)),
+            )
+            if log_contrast == last_log_contrast:
                 break
-            one, coefficients = _fits_with_held_quantity(problem, bodies, coefficients, k, before, at, accuracy)
-            known.insert(len(known) if way > 0 else 0, one)
+            fixed_fit, coefficients = _fit_with_fixed_contrast(
+                problem, bodies, coefficients, k, last_log_contrast, log_contrast, accuracy
+            )
+            fixed_fits.insert(len(fixed_fits) if direction > 0 else 0, fixed_fit)
             step *= _STEP_GROWTH
-    return _summary(int(bodies.sign[k]), bodies.bounded_axes(k), unmodelled, known)
+    return _summary(int(bodies.sign[k]), bodies.bounded_axes(k), unmodelled, fixed_fits)
 
 
-def _size_coefficient(bodies: Bodies, k: int) -> tuple[int, int]:
+def _radius_and_contrast_index(bodies: Bodies, k: int) -> tuple[int, int]:
     """Indices of the log radius of body k, and of its contrast, among the coefficients."""
-    d, size = bodies.dimension, bodies.prior.size
-    return 1 + k * size + d, 1 + int(bodies.first[k]) * size + d + 1
+    dimension, size = bodies.dimension, bodies.prior.size
+    return 1 + k * size + dimension, 1 + int(bodies.first[k]) * size + dimension + 1
 
 
-def _fits_with_held_quantity(
-    problem: ShapeProblem, bodies: Bodies, coefficients, k: int, before: float, at: float, accuracy: Accuracy
+def _fit_with_fixed_contrast(
+    problem: ShapeProblem,
+    bodies: Bodies,
+    coefficients,
+    k: int,
+    last_log_contrast: float,
+    log_contrast: float,
+    accuracy: Accuracy,
 ):
-    """The fit with the log contrast of body k, and of all others of its material, held at `at`, started from one of
-    `before` with equal strengths; and its coefficients."""
-    start, alike, sign = coefficients.copy(), bodies.first == bodies.first[k], bodies.sign[k]
-    for one in np.flatnonzero(alike).tolist():
-        axes = bodies.bounded_axes(one)
-        ratio = polarisation(sign * np.exp(before), axes) / polarisation(sign * np.exp(at), axes)
-        start[_size_coefficient(bodies, one)[0]] += np.log(ratio) / axes / bodies.prior.radius_spread
-    start[_size_coefficient(bodies, k)[1]] = 0.0
-    held = np.where(alike, np.exp(at), bodies.held)
-    found = problem.fit(replace(bodies, held=held), start, *_EFFORT[bodies.dimension])
-    deviation = bodies.prior.radius_spread * float(problem.deviations(found)[_size_coefficient(bodies, k)[0]])
+    """The fit with the log contrast of body k, and of all others of its material, held at `log_contrast`, started from
+    one of `last_log_contrast` with equal strengths; and its coefficients."""
+    start, same_material, sign = coefficients.copy(), bodies.first == bodies.first[k], bodies.sign[k]
+    for body_index in np.flatnonzero(same_material).tolist():
+        axes = bodies.bounded_axes(body_index)
+        ratio = polarisation(sign * np.exp(last_log_contrast), axes) / polarisation(sign * np.exp(log_contrast), axes)
+        start[_radius_and_contrast_index(bodies, body_index)[0]] += np.log(ratio) / axes / bodies.prior.radius_spread
+    start[_radius_and_contrast_index(bodies, k)[1]] = 0.0
+    fixed_contrast = np.where(same_material, np.exp(log_contrast), bodies.fixed_contrast)
+    fixed_fit = problem.fit(replace(bodies, fixed_contrast=fixed_contrast), start, *_FIT_LIMITS[bodies.dimension])
+    deviation = bodies.prior.radius_spread * float(
+        problem.deviations(fixed_fit)[_radius_and_contrast_index(bodies, k)[0]]
+    )
     deviation = float(np.hypot(bodies.bounded_axes(k) * np.hypot(deviation, accuracy.size), accuracy.strength))
-    measure = found.bodies.body(k, found.coefficients).measure
-    return _HeldFits(at, problem.surprise(found), float(np.log(max(measure, TINY))), deviation), found.coefficients
+    measure = fixed_fit.bodies.body(k, fixed_fit.coefficients).measure
+    return _FixedContrastFit(
+        log_contrast, problem.surprise(fixed_fit), float(np.log(max(measure, TINY))), deviation
+    ), fixed_fit.coefficients
 
 
-def _negative_log_evidence(one: _HeldFits) -> float:
+def _negative_log_evidence(fixed_fit: _FixedContrastFit) -> float:
     """-log posterior of a held contrast, per unit of its logarithm, up to a constant."""
-    return one.unlikely + _contrast_prior(one.log_contrast)
+    return fixed_fit.negative_log_likelihood + _contrast_prior(fixed_fit.log_contrast)
 
 
 def _contrast_prior(log_contrast):
@@ -171,35 +192,43 @@ def _contrast_prior(log_contrast):
     return 0.5 * ((log_contrast - np.log(_MEDIAN_LOG_CONTRAST)) / _LOG_CONTRAST_DEVIATION) ** 2
 
 
-def _summary(sign: int, axes: int, unmodelled: float, known: Sequence[_HeldFits]) -> Quantities:
+def _summary(sign: int, axes: int, unmodelled: float, fixed_fits: Sequence[_FixedContrastFit]) -> Quantities:
     """Medians and intervals of the posterior, interpolated between the contrasts that were held and convolved with a
     normal distribution of the deviation `unmodelled`; `axes`: number of axes along which the body is bounded."""
-    place, unlikely, log_measure, spread = np.array(known).T
-    dense = np.linspace(place[0], place[-1], _NUM_CONTRASTS)
-    likely, measure, deviation = (PchipInterpolator(place, one)(dense) for one in (unlikely, log_measure, spread))
-    surprise = likely + _contrast_prior(dense)
-    weight = np.exp(surprise.min() - surprise)
-    normal = ndtri((np.arange(_NUM_NORMAL_DEVIATES) + 0.5) / _NUM_NORMAL_DEVIATES)
-    strength = polarisation(sign * np.exp(dense), axes)[:, None] * np.exp(
-        measure[:, None] + deviation[:, None] * normal
+    log_contrasts, negative_log_likelihoods, log_measure, deviations = np.array(fixed_fits).T
+    grid = np.linspace(log_contrasts[0], log_contrasts[-1], _NUM_CONTRASTS)
+    grid_negative_log_likelihoods, grid_log_measures, grid_deviations = (
+        PchipInterpolator(log_contrasts, values)(grid) for values in (negative_log_likelihoods, log_measure, deviations)
     )
-    contrast = np.clip(np.exp(dense)[:, None] + unmodelled * normal, *np.exp(_LOG_CONTRAST_BOUNDS))
+    surprise = grid_negative_log_likelihoods + _contrast_prior(grid)
+    weight = np.exp(surprise.min() - surprise)
+    normal_deviates = ndtri((np.arange(_NUM_NORMAL_DEVIATES) + 0.5) / _NUM_NORMAL_DEVIATES)
+    strength = polarisation(sign * np.exp(grid), axes)[:, None] * np.exp(
+        grid_log_measures[:, None] + grid_deviations[:, None] * normal_deviates
+    )
+    contrast = np.clip(np.exp(grid)[:, None] + unmodelled * normal_deviates, *np.exp(_LOG_CONTRAST_BOUNDS))
     measures = strength[:, None] / polarisation(sign * contrast, axes)[..., None]
-    least = unlikely.min()
-    strong = place[-1] == _LOG_CONTRAST_BOUNDS[1] and unlikely[-1] < least + _OPEN_END_RISE
-    weak = place[0] == _LOG_CONTRAST_BOUNDS[0] and unlikely[0] < least + _OPEN_END_RISE
+    min_negative_log_likelihood = negative_log_likelihoods.min()
+    is_open_above = (
+        log_contrasts[-1] == _LOG_CONTRAST_BOUNDS[1]
+        and negative_log_likelihoods[-1] < min_negative_log_likelihood + _OPEN_END_RISE
+    )
+    is_open_below = (
+        log_contrasts[0] == _LOG_CONTRAST_BOUNDS[0]
+        and negative_log_likelihoods[0] < min_negative_log_likelihood + _OPEN_END_RISE
+    )
     # The contrast decides which end of the measure is open: the stronger, the smaller.
-    changes = [float(np.expm1(sign * one)) for one in _quantiles(contrast, weight)]
-    ends: list[float | None] = [None if weak else changes[0], None if strong else changes[2]]
-    least_measure, middle_measure, most_measure = _quantiles(measures, weight)
-    weakest, middle_strength, strongest = _quantiles(strength, weight)
+    changes = [float(np.expm1(sign * values)) for values in _quantiles(contrast, weight)]
+    change_limits: list[float | None] = [None if is_open_below else changes[0], None if is_open_above else changes[2]]
+    min_measure, median_measure, max_measure = _quantiles(measures, weight)
+    min_strength, median_strength, max_strength = _quantiles(strength, weight)
     return Quantities(
         changes[1],
-        (ends[0], ends[1]) if sign > 0 else (ends[1], ends[0]),
-        middle_measure,
-        (None if strong else least_measure, None if weak else most_measure),
-        middle_strength,
-        (weakest, strongest),
+        (change_limits[0], change_limits[1]) if sign > 0 else (change_limits[1], change_limits[0]),
+        median_measure,
+        (None if is_open_above else min_measure, None if is_open_below else max_measure),
+        median_strength,
+        (min_strength, max_strength),
     )
 
 
@@ -208,7 +237,9 @@ def _quantiles(values: Float[np.ndarray, "g *s"], weight: Float[np.ndarray, " g"
     first axis have its `weight`."""
     weight = np.repeat(weight, values[0].size)
     values, order = values.ravel(), np.argsort(values, axis=None)
-    share = np.cumsum(weight[order])
-    share = (share - weight[order] / 2) / share[-1]
-    low, middle, high = np.interp([_INTERVAL_PROBABILITIES[0], 0.5, _INTERVAL_PROBABILITIES[1]], share, values[order])
-    return float(low), float(middle), float(high)
+    cumulative_weights = np.cumsum(weight[order])
+    cumulative_weights = (cumulative_weights - weight[order] / 2) / cumulative_weights[-1]
+    low, median, high = np.interp(
+        [_INTERVAL_PROBABILITIES[0], 0.5, _INTERVAL_PROBABILITIES[1]], cumulative_weights, values[order]
+    )
+    return float(low), float(median), float(high)

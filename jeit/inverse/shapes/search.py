@@ -37,18 +37,18 @@ if TYPE_CHECKING:
 
 # Minimum factor by which the objective must rise when a body is left out and the others are fitted again.
 LEAST_RISE = 1.4
-_FIRST_STEPS, _STEPS, _STEPS_WITHOUT, _STEPS_TRIED = 15, 40, 8, 6
+_FIRST_STEPS, _STEPS, _REMOVAL_STEPS, _TRIAL_STEPS = 15, 40, 8, 6
 _COARSE_TOLERANCE = 1e-2
 # Number of starts in a row that the data do not support, after which the remaining, weaker ones are not tried.
 _MAX_UNSUPPORTED = 2
 # Factor by which the objective rises without a body, above which the body is beyond doubt.
 _CERTAIN_RISE = 10.0
 # Maximum number of changes of the number or kind of bodies.
-_MOST_CHANGES = 10
+_MAX_CHANGES = 10
 # Maximum number of times that the mesh is refined at the bodies, which move as a result. Edge lengths on their
 # surfaces, in units of the shortest half axis, that are tried in turn: in the first refinement, when there may still be
 # ghosts among the bodies, and in later ones.
-_MOST_MESHES, _EDGES = 3, ((0.7,), (0.25, 0.35, 0.5, 0.7))
+_MAX_REFINEMENTS, _EDGE_LENGTHS = 3, ((0.7,), (0.25, 0.35, 0.5, 0.7))
 # Minimum gain of log evidence for accepting the richer of two descriptions of the bodies.
 _MIN_EVIDENCE_GAIN = 2.0
 
@@ -175,67 +175,72 @@ def reconstruct_shapes(
     check_flat(model.mesh, "star shapes")
     background = np.asarray(check_background(model, background))
     deviation = check_noise(noise, measured, used)
-    form, kind = (Stars, StarPrior) if model.mesh.dimension == 2 else (Ellipsoids, EllipsoidPrior)
-    prior = kind() if prior is None else prior
-    check_kind("prior", prior, kind, f"one of bodies of that dimension, such as {kind.__name__}(modes=2)")
+    form, prior_type = (Stars, StarPrior) if model.mesh.dimension == 2 else (Ellipsoids, EllipsoidPrior)
+    prior = prior_type() if prior is None else prior
+    check_kind("prior", prior, prior_type, f"one of bodies of that dimension, such as {prior_type.__name__}(modes=2)")
     if not (is_number(least_rise) and least_rise >= 1):
         raise ValueError(f"least_rise must be a number from 1; it is {describe(least_rise)}.")
     sign, centre, radius = _check_start(start, model.mesh.dimension)
-    small, data = independent_data(model, measured, used, deviation, at_once=True)
-    solid = model.mesh.dimension == 3
-    problem = ShapeProblem(small, data, background, _COARSE_TOLERANCE if solid else ShapeProblem.rtol)
+    independent_model, data = independent_data(model, measured, used, deviation, at_once=True)
+    is_solid = model.mesh.dimension == 3
+    problem = ShapeProblem(independent_model, data, background, _COARSE_TOLERANCE if is_solid else ShapeProblem.rtol)
     bodies = form.create(model.mesh, prior, centre, sign)
     coefficients = bodies.of_radii(radius)
     if isinstance(prior, EllipsoidPrior) and prior.kinds == "columns":
-        bodies, coefficients = bodies.otherwise(range(len(radius)), coefficients)
+        bodies, coefficients = bodies.with_other_kind(range(len(radius)), coefficients)
     setting = _FitSetting(problem, None if smooth is None else SmoothField.create(smooth, problem))
     level, report = 0.0, progress or (lambda stage: None)
     report("bodies")
     if smooth is not None:
-        level, balls, _ = _add_bodies(setting, *bodies.with_modes(1, coefficients))
-        bodies, coefficients = balls.bodies.with_modes(prior.modes, balls.coefficients)
+        level, ball_fit, _ = _add_bodies(setting, *bodies.with_modes(1, coefficients))
+        bodies, coefficients = ball_fit.bodies.with_modes(prior.modes, ball_fit.coefficients)
         problem = setting.problem(level)
     fitted = problem.fit(*_grow_bodies(problem, bodies, coefficients, _FIRST_STEPS), _STEPS)
-    found = _remove_unsupported(problem, fitted, (), least_rise)
+    result = _remove_unsupported(problem, fitted, (), least_rise)
     report("bodies, how many")
-    best, there = _SearchState(setting, level, _improve_fit(problem, found, least_rise)), None
-    if solid:
-        best, there = _refine_meshes(best, least_rise, report)
+    state, finer_model = _SearchState(setting, level, _improve_fit(problem, result, least_rise)), None
+    if is_solid:
+        state, finer_model = _refine_meshes(state, least_rise, report)
         report("bodies, of which kind")
-    (setting, level, (each, rises, doubtful)), beside = best, best.setting.beside
+    (setting, level, (free_fit, rises, doubtful)), smooth_field = state, state.setting.smooth_field
     problem = setting.problem(level)
-    fitted = _with_common_contrast(problem, each)
+    fitted = _with_common_contrast(problem, free_fit)
     bodies, coefficients = fitted.bodies, fitted.coefficients
-    field = 0.0 if beside is None else beside.estimate(level, fitted)
-    drawn = bodies.on(model.mesh) if isinstance(bodies, Ellipsoids) else bodies
-    conductivity = background * np.exp(drawn.shown(coefficients) + field)
-    predicted, image = np.asarray(model.voltages(conductivity if there is None else background)), None
-    if there is not None:
-        predicted = predicted + there.change(model.protocol, bodies.image(coefficients).image, field)
-        image = FinerImage(there.problem.model, as_array(there.conductivity(bodies.shown(coefficients), field)))
-    others, deviations = alternatives(problem, fitted), contrast_deviations(problem, fitted, each)
-    excess = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
+    field = 0.0 if smooth_field is None else smooth_field.estimate(level, fitted)
+    mesh_bodies = bodies.on(model.mesh) if isinstance(bodies, Ellipsoids) else bodies
+    conductivity = background * np.exp(mesh_bodies.display_image(coefficients) + field)
+    predicted, image = np.asarray(model.voltages(conductivity if finer_model is None else background)), None
+    if finer_model is not None:
+        predicted = predicted + finer_model.change(model.protocol, bodies.image(coefficients).image, field)
+        image = FinerImage(
+            finer_model.problem.model, as_array(finer_model.conductivity(bodies.display_image(coefficients), field))
+        )
+    alternates, deviations = alternatives(problem, fitted), contrast_deviations(problem, fitted, free_fit)
+    normalised_residual = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
     order = np.argsort(-np.asarray(rises), kind="stable")
     found_bodies = [bodies.body(int(k), coefficients, rises[k]) for k in order]
     if accuracy is not None:
         report("bodies, how large and how strong")
-        exact = independent_data(model, measured, used, accuracy.noise, at_once=True)[1]
-        moved = setting.alone.data.voltages - data.voltages  # by the finer mesh
-        exact = eqx.tree_at(lambda one: one.voltages, exact, exact.voltages + moved)
-        unmodelled = unmodelled_deviations(problem, fitted, each)
-        known = with_quantities(setting.weighted(exact).problem(level), fitted, accuracy, unmodelled, order)
-        known = [include_deviation(one, others[k][0], others[k][1]) for one, k in zip(known, order, strict=True)]
-        found_bodies = [body.with_quantities(one) for body, one in zip(found_bodies, known, strict=True)]
+        exact_data = independent_data(model, measured, used, accuracy.noise, at_once=True)[1]
+        mesh_correction = setting.bodies_problem.data.voltages - data.voltages  # by the finer mesh
+        exact_data = eqx.tree_at(lambda data: data.voltages, exact_data, exact_data.voltages + mesh_correction)
+        unmodelled = unmodelled_deviations(problem, fitted, free_fit)
+        quantities = with_quantities(setting.weighted(exact_data).problem(level), fitted, accuracy, unmodelled, order)
+        quantities = [
+            include_deviation(values, alternates[k][0], alternates[k][1])
+            for values, k in zip(quantities, order, strict=True)
+        ]
+        found_bodies = [body.with_quantities(values) for body, values in zip(found_bodies, quantities, strict=True)]
     return ShapeReconstruction(
         bodies=tuple(found_bodies),
         conductivity=as_array(conductivity),
         voltages=as_array(predicted),
-        misfit=as_array(np.sqrt(np.mean(excess**2))),
+        misfit=as_array(np.sqrt(np.mean(normalised_residual**2))),
         drift=float(np.expm1(prior.drift * coefficients[0])),
         doubtful=doubtful,
         contrast_deviations=tuple(deviations[k] for k in order),
-        alternatives=tuple(others[k][0] for k in order),
-        alternative_deviations=tuple(others[k][1] for k in order),
+        alternatives=tuple(alternates[k][0] for k in order),
+        alternative_deviations=tuple(alternates[k][1] for k in order),
         finer=image,
     )
 
@@ -243,12 +248,12 @@ def reconstruct_shapes(
 def _check_start(start, dimension: int):
     """Signs (k,), centres (k, d) and radii (k,) from `start`. Raises `ValueError` for invalid starts."""
     try:
-        sign = np.array([one[0] for one in start], float)
-        centre = np.array([one[1] for one in start], float).reshape(-1, dimension)
-        radius = np.array([one[2] for one in start], float)
+        sign = np.array([body[0] for body in start], float)
+        centre = np.array([body[1] for body in start], float).reshape(-1, dimension)
+        radius = np.array([body[2] for body in start], float)
     except (TypeError, ValueError, IndexError) as error:
-        place = "x, y, z"[: 3 * dimension - 2]
-        raise ValueError(f"start: give (sign, ({place}), radius), metres, for every body.") from error
+        coordinates = "x, y, z"[: 3 * dimension - 2]
+        raise ValueError(f"start: give (sign, ({coordinates}), radius), metres, for every body.") from error
     if not (np.isin(sign, (-1, 1)).all() and np.isfinite(centre).all() and (radius > 0).all()):
         raise ValueError("start: signs are +1 or -1, centres finite and radii positive, metres.")
     return sign, centre, radius
@@ -256,33 +261,37 @@ def _check_start(start, dimension: int):
 
 def _grow_bodies(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int):
     """Fit the bodies as disks or balls, and return them with all their modes, and their coefficients."""
-    found = problem.fit(*bodies.with_modes(1, coefficients), steps, _COARSE_TOLERANCE)
-    return found.bodies.with_modes(bodies.prior.modes, found.coefficients)
+    ball_fit = problem.fit(*bodies.with_modes(1, coefficients), steps, _COARSE_TOLERANCE)
+    return ball_fit.bodies.with_modes(bodies.prior.modes, ball_fit.coefficients)
 
 
 class _FitSetting(NamedTuple):
-    """Setting in which bodies are fitted: the problem of bodies `alone`, and the smooth field `beside` them or None."""
+    """Setting in which bodies are fitted: the problem of bodies without a field, and the smooth field or None."""
 
-    alone: ShapeProblem
-    beside: SmoothField | None
+    bodies_problem: ShapeProblem
+    smooth_field: SmoothField | None
 
     def problem(self, level: float) -> ShapeProblem:
         """The problem of bodies, with the smooth field of this level if there is a field."""
-        return self.alone if self.beside is None else self.beside.beside(level)
+        return self.bodies_problem if self.smooth_field is None else self.smooth_field.problem_at(level)
 
-    def on(self, alone: ShapeProblem) -> _FitSetting:
-        """The setting with the problem `alone` on another mesh."""
-        return _FitSetting(alone, self.beside and replace(self.beside, alone=alone))
+    def on(self, bodies_problem: ShapeProblem) -> _FitSetting:
+        """The setting with the problem `bodies_problem` on another mesh."""
+        return _FitSetting(
+            bodies_problem, self.smooth_field and replace(self.smooth_field, bodies_problem=bodies_problem)
+        )
 
     def weighted(self, data: Data) -> _FitSetting:
         """The setting with other weights and errors of the data."""
-        alone, beside = replace(self.alone, data=data), self.beside
-        if beside is not None:
-            relative = np.asarray(data.weight) / np.asarray(self.alone.data.weight)
-            beside = replace(beside, jacobian=relative[:, None] * beside.jacobian, alone=alone)
-        return _FitSetting(alone, beside)
+        bodies_problem, smooth_field = replace(self.bodies_problem, data=data), self.smooth_field
+        if smooth_field is not None:
+            weight_ratio = np.asarray(data.weight) / np.asarray(self.bodies_problem.data.weight)
+            smooth_field = replace(
+                smooth_field, jacobian=weight_ratio[:, None] * smooth_field.jacobian, bodies_problem=bodies_problem
+            )
+        return _FitSetting(bodies_problem, smooth_field)
 
-    def settled(self, bodies: Bodies, coefficients, level: float, steps: int) -> tuple[float, Fit, float]:
+    def fit_level(self, bodies: Bodies, coefficients, level: float, steps: int) -> tuple[float, Fit, float]:
         """Alternate between fitting the bodies and lowering the field's level, until the level is the likeliest.
 
         Returns the level, the fit and -log evidence. The level decreases from `level`, because bodies fitted with too
@@ -290,31 +299,31 @@ class _FitSetting(NamedTuple):
         """
         while True:
             problem = self.problem(level)
-            fit = problem.fit(bodies, coefficients, steps, _COARSE_TOLERANCE)
-            likeliest = level if self.beside is None else self.beside.likeliest(fit)
-            if likeliest >= level:
-                return level, fit, problem.surprise(fit) + problem.uncertainty
-            level, coefficients = likeliest, fit.coefficients
+            fitted = problem.fit(bodies, coefficients, steps, _COARSE_TOLERANCE)
+            best_level = level if self.smooth_field is None else self.smooth_field.likeliest_level(fitted)
+            if best_level >= level:
+                return level, fitted, problem.surprise(fitted) + problem.half_log_determinant
+            level, coefficients = best_level, fitted.coefficients
 
 
-def _add_bodies(setting: _FitSetting, bodies: Bodies, coefficients, sure: int = 0) -> tuple[float, Fit, list[int]]:
+def _add_bodies(setting: _FitSetting, bodies: Bodies, coefficients, num_sure: int = 0) -> tuple[float, Fit, list[int]]:
     """Add bodies in their order to a smooth field, and keep each that the data support besides those before it.
 
-    Returns the level of the field, the fit, and the indices of the bodies kept. The first `sure` bodies are beyond
-    doubt and are fitted together: either of two bodies fitted alone would settle between them and not return.
+    Returns the level of the field, the fit, and the indices of the bodies kept. The first `num_sure` bodies are
+    beyond doubt and are fitted together: either of two bodies fitted alone would settle between them and not return.
     """
     rows = bodies.rows(coefficients)
-    chosen, refused = list(range(sure)), 0
-    start = np.append(coefficients[0], rows[:sure])
-    level, fit, least = setting.settled(bodies.only(chosen), start, 1.0, _FIRST_STEPS)
-    for k in range(sure, len(rows)):
+    supported, num_refused = list(range(num_sure)), 0
+    start = np.append(coefficients[0], rows[:num_sure])
+    level, fit, min_surprise = setting.fit_level(bodies.subset(supported), start, 1.0, _FIRST_STEPS)
+    for k in range(num_sure, len(rows)):
         start = np.append(fit.coefficients, rows[k])
-        tried, one, surprise = setting.settled(bodies.only([*chosen, k]), start, level, _FIRST_STEPS)
-        if surprise + _MIN_EVIDENCE_GAIN <= least:
-            level, fit, least, chosen, refused = tried, one, surprise, [*chosen, k], 0
-        elif (refused := refused + 1) == _MAX_UNSUPPORTED:
+        new_level, new_fit, surprise = setting.fit_level(bodies.subset([*supported, k]), start, level, _FIRST_STEPS)
+        if surprise + _MIN_EVIDENCE_GAIN <= min_surprise:
+            level, fit, min_surprise, supported, num_refused = new_level, new_fit, surprise, [*supported, k], 0
+        elif (num_refused := num_refused + 1) == _MAX_UNSUPPORTED:
             break
-    return level, fit, chosen
+    return level, fit, supported
 
 
 class _SearchResult(NamedTuple):
@@ -342,35 +351,39 @@ def _refine_meshes(
     """
     from jeit.inverse.shapes.finer import refine_at_surfaces
 
-    given, there = state.setting, None
-    for again in range(_MOST_MESHES):
-        _, level, (before, rises, doubtful) = state
-        if not len(before.bodies.sign):
+    base_setting, finer_model = state.setting, None
+    for refinement in range(_MAX_REFINEMENTS):
+        _, level, (last_fit, rises, doubtful) = state
+        if not len(last_fit.bodies.sign):
             break
-        report(f"bodies, finer mesh {again + 1}")
-        there = refine_at_surfaces(given.alone, before, _EDGES[again > 0])
-        setting, bodies, coefficients = given.on(there.problem), there.bodies, before.coefficients
-        missed = np.array(rises) * before.cost
-        if again:
-            level, fit, _ = setting.settled(bodies, coefficients, level, _STEPS)
+        report(f"bodies, finer mesh {refinement + 1}")
+        finer_model = refine_at_surfaces(base_setting.bodies_problem, last_fit, _EDGE_LENGTHS[refinement > 0])
+        setting, bodies, coefficients = (
+            base_setting.on(finer_model.problem),
+            finer_model.bodies,
+            last_fit.coefficients,
+        )
+        costs = np.array(rises) * last_fit.cost
+        if refinement:
+            level, fit, _ = setting.fit_level(bodies, coefficients, level, _STEPS)
         else:
-            order = np.argsort(-missed)
+            order = np.argsort(-costs)
             start = np.append(coefficients[0], bodies.rows(coefficients)[order])
-            sure = int((missed > _CERTAIN_RISE * before.cost).sum())
-            level, fit, some = _add_bodies(setting, bodies.only(order), start, sure)
-            left = np.setdiff1d(np.arange(len(order)), some)
-            doubtful = (*doubtful, *(bodies.body(k, coefficients, rises[k]) for k in order[left]))
-            missed = missed[order[some]]
-            coefficients = np.append(coefficients[0], bodies.rows(coefficients)[order[some]])
+            num_sure = int((costs > _CERTAIN_RISE * last_fit.cost).sum())
+            level, fit, supported = _add_bodies(setting, bodies.subset(order), start, num_sure)
+            unsupported = np.setdiff1d(np.arange(len(order)), supported)
+            doubtful = (*doubtful, *(bodies.body(k, coefficients, rises[k]) for k in order[unsupported]))
+            costs = costs[order[supported]]
+            coefficients = np.append(coefficients[0], bodies.rows(coefficients)[order[supported]])
         problem = setting.problem(level)
         fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
-        found = _remove_unsupported(problem, fit, doubtful, least_rise, missed)
-        if again < _MOST_MESHES - 1 and (other := _alternative_fits(problem, found.fit)):
-            found = _remove_unsupported(problem, other, found.doubtful, least_rise)
-        state, after = _SearchState(setting, level, found), found.fit
-        if again and not bodies.moved(coefficients, after.bodies, after.coefficients):
+        result = _remove_unsupported(problem, fit, doubtful, least_rise, costs)
+        if refinement < _MAX_REFINEMENTS - 1 and (other_fit := _alternative_fits(problem, result.fit)):
+            result = _remove_unsupported(problem, other_fit, result.doubtful, least_rise)
+        state, new_fit = _SearchState(setting, level, result), result.fit
+        if refinement and not bodies.left_refined_cells(coefficients, new_fit.bodies, new_fit.coefficients):
             break
-    return state, there
+    return state, finer_model
 
 
 def _remove_unsupported(
@@ -378,59 +391,59 @@ def _remove_unsupported(
     fitted: Fit,
     doubtful: Sequence[Body],
     least_rise: float,
-    known: Float[np.ndarray, " k"] | None = None,
+    min_costs: Float[np.ndarray, " k"] | None = None,
 ) -> _SearchResult:
     """Remove bodies without which the others, fitted again, explain the data about as well; one at a time, starting
     with the body whose absence raises the cost least.
 
-    `known`: lower limit of the cost without each body, if known.
+    `min_costs`: lower limit of the cost without each body, if known.
     """
-    doubtful, missed = list(doubtful), np.zeros(len(fitted.bodies.sign)) if known is None else known.copy()
+    doubtful, costs = list(doubtful), np.zeros(len(fitted.bodies.sign)) if min_costs is None else min_costs.copy()
     while True:
         bodies, coefficients, cost, _ = fitted
         # After a ghost is removed, leaving out another body raises the cost at least as much as before, so costs
         # computed earlier are lower limits.
-        beyond_doubt = max(_CERTAIN_RISE * cost, problem.surprise(fitted) + _MIN_EVIDENCE_GAIN)
-        unsure, others = np.flatnonzero(missed <= beyond_doubt).tolist(), {}
-        for k in unsure:
-            others[k] = problem.fit(*bodies.without(k, coefficients), _STEPS_WITHOUT, 2 * _COARSE_TOLERANCE)
-            missed[k] = others[k].cost
-        least = min(others, key=lambda k: missed[k], default=None)
-        if least is None or (missed[least] >= least_rise * cost and _is_supported(problem, others[least], fitted)):
-            return _SearchResult(fitted, list(missed / cost), tuple(doubtful))
-        doubtful.append(bodies.body(least, coefficients, float(missed[least]) / cost))
-        missed = np.delete(missed, least)
-        fitted = problem.fit(others[least].bodies, others[least].coefficients, _STEPS)
+        certain_cost = max(_CERTAIN_RISE * cost, problem.surprise(fitted) + _MIN_EVIDENCE_GAIN)
+        uncertain, fits = np.flatnonzero(costs <= certain_cost).tolist(), {}
+        for k in uncertain:
+            fits[k] = problem.fit(*bodies.without(k, coefficients), _REMOVAL_STEPS, 2 * _COARSE_TOLERANCE)
+            costs[k] = fits[k].cost
+        weakest = min(fits, key=lambda k: costs[k], default=None)
+        if weakest is None or (costs[weakest] >= least_rise * cost and _is_supported(problem, fits[weakest], fitted)):
+            return _SearchResult(fitted, list(costs / cost), tuple(doubtful))
+        doubtful.append(bodies.body(weakest, coefficients, float(costs[weakest]) / cost))
+        costs = np.delete(costs, weakest)
+        fitted = problem.fit(fits[weakest].bodies, fits[weakest].coefficients, _STEPS)
 
 
 def _split_bodies(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
     """The bodies with one of them split in two; None if the data do not support the split."""
     bodies, coefficients, cost, _ = fitted
-    tried = [
-        _grow_bodies(problem, *bodies.split(k, coefficients, number), _STEPS_TRIED)
+    starts = [
+        _grow_bodies(problem, *bodies.split(k, coefficients, number), _TRIAL_STEPS)
         for k in range(len(bodies.sign))
         for number in range(bodies.num_splits)
     ]
-    found = _best_fit(problem, fitted, tried)
-    return found if found and cost >= least_rise * found.cost and _is_supported(problem, fitted, found) else None
+    split = _best_fit(problem, fitted, starts)
+    return split if split and cost >= least_rise * split.cost and _is_supported(problem, fitted, split) else None
 
 
 def _alternative_fits(problem: ShapeProblem, fitted: Fit) -> Fit | None:
     """The bodies with one or all of them changed to the other kind, weak stars or columns; None if the data do not
     support the change."""
-    plain = np.flatnonzero(~fitted.bodies.other & (not fitted.bodies.prior.is_of_one_kind))
-    some = [[k] for k in plain] + [plain] * (len(plain) > 1)
-    found = _best_fit(problem, fitted, [fitted.bodies.otherwise(one, fitted.coefficients) for one in some])
-    return found if found and _is_supported(problem, fitted, found) else None
+    first_kind = np.flatnonzero(~fitted.bodies.is_other_kind & (not fitted.bodies.prior.is_of_one_kind))
+    groups = [[k] for k in first_kind] + [first_kind] * (len(first_kind) > 1)
+    change = _best_fit(problem, fitted, [fitted.bodies.with_other_kind(group, fitted.coefficients) for group in groups])
+    return change if change and _is_supported(problem, fitted, change) else None
 
 
 def _with_common_contrast(problem: ShapeProblem, fitted: Fit) -> Fit:
     """The ellipsoids, with one material for all bodies of a sign where that is likelier than a material for each."""
     for sign in (1, -1):
         bodies = fitted.bodies
-        if isinstance(bodies, Ellipsoids) and ((bodies.sign == sign) & ~bodies.alike).sum() > 1:
-            alike = problem.fit(*bodies.of_one_material(sign, fitted.coefficients), _STEPS)
-            fitted = min(fitted, alike, key=problem.surprise)
+        if isinstance(bodies, Ellipsoids) and ((bodies.sign == sign) & ~bodies.same_material).sum() > 1:
+            common_fit = problem.fit(*bodies.of_one_material(sign, fitted.coefficients), _STEPS)
+            fitted = min(fitted, common_fit, key=problem.surprise)
     return fitted
 
 
@@ -439,33 +452,33 @@ def _best_fit(
 ) -> Fit | None:
     """Make a few steps from each of several starts, and fit the best of them to convergence. None if its cost is more
     than `_CERTAIN_RISE` times that of `fitted`."""
-    tried = [problem.fit(*one, _STEPS_TRIED, _COARSE_TOLERANCE) for one in starts]
-    best = min(tried, key=lambda one: one.cost, default=None)
-    if best is None or best.cost > _CERTAIN_RISE * fitted.cost:
+    trial_fits = [problem.fit(*start, _TRIAL_STEPS, _COARSE_TOLERANCE) for start in starts]
+    best_trial = min(trial_fits, key=lambda trial: trial.cost, default=None)
+    if best_trial is None or best_trial.cost > _CERTAIN_RISE * fitted.cost:
         return None
-    return problem.fit(best.bodies, best.coefficients, _STEPS)
+    return problem.fit(best_trial.bodies, best_trial.coefficients, _STEPS)
 
 
-def _is_supported(problem: ShapeProblem, simple: Fit, other: Fit) -> bool:
-    """Whether the evidence for `other` exceeds that for `simple` by the margin."""
-    return problem.surprise(other) + _MIN_EVIDENCE_GAIN <= problem.surprise(simple)
+def _is_supported(problem: ShapeProblem, simple_fit: Fit, other_fit: Fit) -> bool:
+    """Whether the evidence for `other_fit` exceeds that for `simple_fit` by the margin."""
+    return problem.surprise(other_fit) + _MIN_EVIDENCE_GAIN <= problem.surprise(simple_fit)
 
 
-def _improve_fit(problem: ShapeProblem, found: _SearchResult, least_rise: float) -> _SearchResult:
+def _improve_fit(problem: ShapeProblem, result: _SearchResult, least_rise: float) -> _SearchResult:
     """Search for better bodies, starting once with a split and once with a change of kind; the likelier result, or
-    `found` if neither change is supported."""
-    changes = [_split_bodies(problem, found.fit, least_rise), _alternative_fits(problem, found.fit)]
-    ways = [_search_until_stable(problem, found, one, least_rise) for one in changes if one is not None] or [found]
-    return min(ways, key=lambda one: problem.surprise(one.fit))
+    `result` if neither change is supported."""
+    changes = [_split_bodies(problem, result.fit, least_rise), _alternative_fits(problem, result.fit)]
+    results = [_search_until_stable(problem, result, fit, least_rise) for fit in changes if fit is not None] or [result]
+    return min(results, key=lambda candidate: problem.surprise(candidate.fit))
 
 
-def _search_until_stable(problem: ShapeProblem, found: _SearchResult, changed: Fit, least_rise: float) -> _SearchResult:
-    """Search onwards from the bodies `changed`: remove ghosts, then split a body or, if no split is supported, change
-    a kind, until no change is supported."""
-    for _ in range(_MOST_CHANGES):
-        found = _remove_unsupported(problem, changed, found.doubtful, least_rise)
-        change = _split_bodies(problem, found.fit, least_rise) or _alternative_fits(problem, found.fit)
-        if change is None:
+def _search_until_stable(problem: ShapeProblem, result: _SearchResult, start: Fit, least_rise: float) -> _SearchResult:
+    """Search onwards from the bodies `start`: remove ghosts, then split a body or, if no split is supported,
+    change a kind, until no change is supported."""
+    for _ in range(_MAX_CHANGES):
+        result = _remove_unsupported(problem, start, result.doubtful, least_rise)
+        next_fit = _split_bodies(problem, result.fit, least_rise) or _alternative_fits(problem, result.fit)
+        if next_fit is None:
             break
-        changed = change
-    return found
+        start = next_fit
+    return result

@@ -23,7 +23,7 @@ _SAMPLES = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2.5, 2.5, 1], [2.5, 1, 2.
 _BLUR = 0.2
 # Distance from an outline, in widths of the blur, beyond which the covered share of a cell is less than 1e-12.
 _REACH = 30
-_OUTLINE = 128
+_NUM_OUTLINE_POINTS = 128
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ class StarPrior(BodyPrior):
     def deviation(self, span: float) -> Float[np.ndarray, " q"]:
         """Prior standard deviations of a body's parameters, 1 for its contrast; `span`: longest side of the domain,
         metres."""
-        mode = self.roughness * 2 / np.arange(2, self.modes + 1)
-        first = [self.place * span, self.place * span, self.radius_spread, 1.0]
-        return np.concatenate([first, np.repeat(mode, 2)])
+        mode_deviations = self.roughness * 2 / np.arange(2, self.modes + 1)
+        deviations = [self.place * span, self.place * span, self.radius_spread, 1.0]
+        return np.concatenate([deviations, np.repeat(mode_deviations, 2)])
 
     def contrast_of(self, coefficient: float, other: bool) -> tuple[float, float]:
         """Contrast in log σ, without its sign, of a body that is weak if `other`; and its derivative with respect to
@@ -137,19 +137,23 @@ class Star(Module):
 
     def holds(self, points: Float[np.ndarray, "*n 2"]) -> Bool[np.ndarray, "*n"]:
         """Whether each of `points`, in metres, lies inside the body."""
-        corner, offset = self._from_centre(self.outline), self._from_centre(points)
-        angle = np.unwrap(np.angle(corner))
-        turn = angle[0] + (np.angle(offset) - angle[0]) % (2 * np.pi)
-        reach = np.interp(turn, np.append(angle, angle[0] + 2 * np.pi), np.abs(np.append(corner, corner[0])))
-        return np.abs(offset) < reach
+        corners, offsets = self._from_centre(self.outline), self._from_centre(points)
+        corner_angles = np.unwrap(np.angle(corners))
+        direction_angles = corner_angles[0] + (np.angle(offsets) - corner_angles[0]) % (2 * np.pi)
+        outline_distances = np.interp(
+            direction_angles,
+            np.append(corner_angles, corner_angles[0] + 2 * np.pi),
+            np.abs(np.append(corners, corners[0])),
+        )
+        return np.abs(offsets) < outline_distances
 
     def _from_centre(self, points) -> Complex[np.ndarray, "*n"]:
         return (points[..., 0] - self.centre[0]) + 1j * (points[..., 1] - self.centre[1])
 
     def _moments(self):
         x, y = self.outline.T
-        cross = x * np.roll(y, -1) - np.roll(x, -1) * y
-        return cross.sum() / 2, (self.outline + np.roll(self.outline, -1, axis=0)).T @ cross / 6
+        cross_products = x * np.roll(y, -1) - np.roll(x, -1) * y
+        return cross_products.sum() / 2, (self.outline + np.roll(self.outline, -1, axis=0)).T @ cross_products / 6
 
 
 class _StarValues(NamedTuple):
@@ -181,36 +185,38 @@ class Stars(Bodies):
         area = np.asarray(measures(mesh))
         start = np.reshape(np.asarray(start, float), (-1, 2))
         width, weight = _BLUR * np.sqrt(area), area / area.sum()
-        sign, no = np.asarray(sign, float), np.zeros(len(start), bool)
-        free = np.full(len(start), np.nan)
-        return cls(prior, weight, span, start, sign, no, no, free, corners @ _SAMPLES.T, width, edges)
+        sign, all_false = np.asarray(sign, float), np.zeros(len(start), bool)
+        not_fixed = np.full(len(start), np.nan)
+        return cls(
+            prior, weight, span, start, sign, all_false, all_false, not_fixed, corners @ _SAMPLES.T, width, edges
+        )
 
     @property
     def odds(self) -> float:
         """Logarithm of the prior odds against weak bodies."""
-        return float(self.other.sum() * np.log(self.prior.odds_against_weak))
+        return float(self.is_other_kind.sum() * np.log(self.prior.odds_against_weak))
 
     @property
     def num_splits(self) -> int:
         """2: both axes."""
         return 2
 
-    def otherwise(self, some, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
-        """The stars with those of indices `some` made weak and enlarged to keep their effect on the electric field;
+    def with_other_kind(self, indices, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
+        """The stars, those of `indices` made weak and enlarged to keep their effect on the electric field;
         and their coefficients."""
-        rows, weak = self.rows(coefficients), self.other.copy()
-        for k in some:
+        rows, is_weak = self.rows(coefficients), self.is_other_kind.copy()
+        for k in indices:
             strength = np.tanh(self.contrast(k, rows[k])[0] / 2) / np.tanh(self.prior.weak_contrast / 2)
             rows[k, 2] += np.log(strength) / 2 / self.prior.radius_spread
-            rows[k, 3], weak[k] = 0, True
-        return replace(self, other=weak), np.append(coefficients[0], rows)
+            rows[k, 3], is_weak[k] = 0, True
+        return replace(self, is_other_kind=is_weak), np.append(coefficients[0], rows)
 
     def mixture(self, share, contrast):
         """2 artanh(share · tanh(contrast / 2)), Maxwell Garnett's formula: a partly covered cell has `share` times the
         effect of a covered cell on the electric field. Also its derivatives with respect to `share` and `contrast`."""
         strength = np.tanh(contrast / 2)
-        steep = 1 / (1 - (share * strength) ** 2)
-        return 2 * np.arctanh(share * strength), 2 * strength * steep, steep * share * (1 - strength**2)
+        artanh_slope = 1 / (1 - (share * strength) ** 2)
+        return 2 * np.arctanh(share * strength), 2 * strength * artanh_slope, artanh_slope * share * (1 - strength**2)
 
     def axis(self, k: int, row, number: int):
         """Unit vector along the longer axis of star k (`number` 0) or across it (1); along x or y for a disk."""
@@ -222,20 +228,22 @@ class Stars(Bodies):
         """Star k, with its outline clipped to the domain."""
         row = self.rows(coefficients)[k]
         centre, log_radius, waves = self._values(k, row)
-        direction = np.exp(2j * np.pi * np.arange(_OUTLINE) / _OUTLINE)
-        reach = np.exp(log_radius + self._wave(waves, direction)[0])
-        to_edge, inside = _first_crossing(centre, direction, self.edges)
-        cells, share, _ = self.covered(k, row)
-        if not inside and (covered := share * self.weight[cells]).sum() > 0:
-            outline = centre + direction * reach
-            centre = covered @ self.points[cells].mean(axis=1) / covered.sum()
-            reach, _ = _first_crossing(centre, direction, np.stack([outline, np.roll(outline, -1)], axis=1))
-            to_edge, _ = _first_crossing(centre, direction, self.edges)
-        outline = centre + direction * np.minimum(reach, to_edge)
-        pair = np.stack([outline.real, outline.imag], axis=1)
-        middle = np.array([centre.real, centre.imag])
+        direction = np.exp(2j * np.pi * np.arange(_NUM_OUTLINE_POINTS) / _NUM_OUTLINE_POINTS)
+        outline_distances = np.exp(log_radius + self._wave(waves, direction)[0])
+        edge_distances, is_inside = _first_crossing_distances(centre, direction, self.edges)
+        cells, share, _ = self.coverage(k, row)
+        if not is_inside and (covered_fractions := share * self.weight[cells]).sum() > 0:
+            outline = centre + direction * outline_distances
+            centre = covered_fractions @ self.points[cells].mean(axis=1) / covered_fractions.sum()
+            outline_distances, _ = _first_crossing_distances(
+                centre, direction, np.stack([outline, np.roll(outline, -1)], axis=1)
+            )
+            edge_distances, _ = _first_crossing_distances(centre, direction, self.edges)
+        outline = centre + direction * np.minimum(outline_distances, edge_distances)
+        outline_points = np.stack([outline.real, outline.imag], axis=1)
+        centre_point = np.array([centre.real, centre.imag])
         contrast = float(self.contrast(k, row)[0])
-        return Star(int(self.sign[k]), middle, pair, contrast, bool(self.other[k]), float(rise))
+        return Star(int(self.sign[k]), centre_point, outline_points, contrast, bool(self.is_other_kind[k]), float(rise))
 
     def _values(self, k: int, row) -> _StarValues:
         values = self.prior.deviation(self.span)[4:] * row[4:]
@@ -244,45 +252,48 @@ class Stars(Bodies):
     def _wave(self, waves, direction):
         """Σ (aₙ cos nθ + bₙ sin nθ) and its derivative with respect to θ, for `direction` exp iθ; and the powers
         exp inθ, n = 2 … N."""
-        number = np.arange(2, self.prior.modes + 1)
+        mode_numbers = np.arange(2, self.prior.modes + 1)
         repeated = np.broadcast_to(direction, (self.prior.modes, *direction.shape))
         powers = np.cumprod(repeated, axis=0, dtype=complex)[1:]
-        sums = np.tensordot(np.stack([waves, 1j * number * waves]), powers, 1)
+        sums = np.tensordot(np.stack([waves, 1j * mode_numbers * waves]), powers, 1)
         return sums[0].real, sums[1].real, powers
 
-    def covered(self, k: int, row) -> Covered:
+    def coverage(self, k: int, row) -> Covered:
         """Coverage of cells by star k, whose coefficients are `row`."""
         centre, log_radius, waves = self._values(k, row)
         # Upper limit of the distance of the outline from the centre. The star does not cover cells that lie farther
         # outside than `_REACH` times the width of its blurred edge.
-        farthest = np.exp(np.minimum(log_radius + np.abs(waves).sum(), np.log(10 * self.span)))
-        cells = np.flatnonzero(np.abs(self.points[:, 0] - centre) < farthest + _REACH * self.width)
+        max_distance = np.exp(np.minimum(log_radius + np.abs(waves).sum(), np.log(10 * self.span)))
+        cells = np.flatnonzero(np.abs(self.points[:, 0] - centre) < max_distance + _REACH * self.width)
         offset, width = self.points[cells] - centre, self.width[cells, None]
         distance = np.maximum(np.abs(offset), 1e-9 * self.span)
         direction = offset / distance
         wave, slope, powers = self._wave(waves, direction)
         radius = np.exp(np.minimum(log_radius + wave, np.log(10 * self.span)))
         inside = 0.5 * (1 + np.tanh(0.5 * (radius - distance) / width))
-        edge = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(r - distance)
+        share_slope = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(r - distance)
         # If the centre moves by dz, the distance decreases by Re(dz/u) and θ by Im(dz/u) / distance; u is `direction`.
-        towards = (edge * (1 - 1j * radius * slope / distance) * direction).sum(axis=1)
-        along = edge * radius
-        modes = np.einsum("ms,nms->mn", along, powers)
+        centre_slopes = (share_slope * (1 - 1j * radius * slope / distance) * direction).sum(axis=1)
+        radius_slopes = share_slope * radius
+        mode_slopes = np.einsum("ms,nms->mn", radius_slopes, powers)
         share = inside.mean(axis=1)
-        columns = [towards.real, towards.imag, along.sum(axis=1), np.zeros_like(share)]
-        columns += [part for mode in modes.T for part in (mode.real, mode.imag)]
+        columns = [centre_slopes.real, centre_slopes.imag, radius_slopes.sum(axis=1), np.zeros_like(share)]
+        columns += [part for mode in mode_slopes.T for part in (mode.real, mode.imag)]
         return Covered(cells, share, np.stack(columns, axis=1) * self.prior.deviation(self.span))
 
 
-def _first_crossing(centre: complex, direction, edges) -> tuple[Float[np.ndarray, " k"], bool]:
+def _first_crossing_distances(centre: complex, direction, edges) -> tuple[Float[np.ndarray, " k"], bool]:
     """Distance from `centre` at which the ray in each `direction` (k,) first crosses `edges` (b, 2), infinite if it
     does not; and whether the closed line formed by the edges encloses `centre`."""
-    start, along = edges[:, 0] - centre, edges[:, 1] - edges[:, 0]
+    edge_starts, edge_vectors = edges[:, 0] - centre, edges[:, 1] - edges[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        across = _cross_products(direction[:, None], along)
-        distance, share = _cross_products(start, along) / across, _cross_products(start, direction[:, None]) / across
-    crossed = (distance > 0) & (share >= 0) & (share < 1)
-    return np.where(crossed, distance, np.inf).min(axis=1), bool((crossed.sum(axis=1) % 2).mean() > 0.5)
+        denominators = _cross_products(direction[:, None], edge_vectors)
+        distance, edge_fraction = (
+            _cross_products(edge_starts, edge_vectors) / denominators,
+            _cross_products(edge_starts, direction[:, None]) / denominators,
+        )
+    is_crossed = (distance > 0) & (edge_fraction >= 0) & (edge_fraction < 1)
+    return np.where(is_crossed, distance, np.inf).min(axis=1), bool((is_crossed.sum(axis=1) % 2).mean() > 0.5)
 
 
 def _cross_products(first, second):

@@ -149,20 +149,26 @@ class Imager(Module):
         Kaipio, Karjalainen, Somersalo and Vauhkonen, Ann. N. Y. Acad. Sci. 873 (1999) 430-439.
         """
         check_memory(memory)
-        chosen = as_solver(GaussNewton() if solver is None else solver, frames=True).for_frames(FRAME_STEPS, _RTOL)
+        frame_solver = as_solver(GaussNewton() if solver is None else solver, frames=True).for_frames(
+            FRAME_STEPS, _RTOL
+        )
         prior = smooth_prior(float(np.ptp(np.asarray(model.mesh.points), axis=0).max())) if prior is None else prior
         check_prior(prior)
         parametrisation = as_parametrisation(parametrisation)
-        _check_combination(chosen, prior, parametrisation, memory)
+        _check_combination(frame_solver, prior, parametrisation, memory)
         background = check_background(model, background)
         predicted = model.voltages(background)
         frame, used = check_frame(model, predicted if reference is None else reference, mask)
         _check_reference(np.asarray(frame)[used], np.asarray(predicted)[used])
         deviation = check_noise(noise, frame, used)
         channels = IndependentChannels.create(model.protocol)
-        small = model.with_protocol(model.protocol.subset(np.asarray(channels.index)))
+        independent_model = model.with_protocol(model.protocol.subset(np.asarray(channels.index)))
         inversion, _ = pose(
-            eqx.tree_at(lambda m: m.electrodes, small, IntegratedElectrodes(model.electrodes, model.mesh)),
+            eqx.tree_at(
+                lambda forward_model: forward_model.electrodes,
+                independent_model,
+                IntegratedElectrodes(model.electrodes, model.mesh),
+            ),
             channels.weigh(_masked_noise(deviation, used)).combine(predicted),
             background,
             prior,
@@ -170,9 +176,9 @@ class Imager(Module):
             parametrisation,
         )
         persistence = float(np.exp(-1 / memory)) if memory > 0 else 0.0
-        least = _MIN_SIGNAL if parametrisation.informative is None else parametrisation.informative
-        if (least > 0 or memory > 0) and inversion.penalty.is_standard_normal:
-            inversion = keep_informed_shapes(inversion, least, persistence)
+        min_signal = _MIN_SIGNAL if parametrisation.informative is None else parametrisation.informative
+        if (min_signal > 0 or memory > 0) and inversion.penalty.is_standard_normal:
+            inversion = keep_informed_shapes(inversion, min_signal, persistence)
         return cls(
             channels=channels,
             inversion=inversion,
@@ -180,9 +186,11 @@ class Imager(Module):
             mask=as_array(used),
             expected=jnp.where(used, frame, predicted),
             offset=jnp.where(used, predicted - frame, 0),
-            touching=jnp.asarray([model.protocol.channels_touching(k) for k in range(model.protocol.num_electrodes)]),
+            touching=jnp.asarray(
+                [model.protocol.channels_touching(electrode) for electrode in range(model.protocol.num_electrodes)]
+            ),
             tied=jax.tree.map(as_array, model.protocol.reciprocal_pairs()),
-            solver=chosen,
+            solver=frame_solver,
             persistence=persistence,
         )
 
@@ -198,14 +206,15 @@ class Imager(Module):
             raise ValueError(
                 f"reference has shape {frame.shape}; give ({used.size},), a frame of the undisturbed body."
             )
-        if (missing := np.flatnonzero(used & ~np.isfinite(frame))).size:
+        if (missing_channels := np.flatnonzero(used & ~np.isfinite(frame))).size:
             raise ValueError(
-                f"reference has no reading of {counted(missing.size, 'channel')} in use, the first number {missing[0]}."
+                f"reference has no reading of {counted(missing_channels.size, 'channel')} in use, the first number "
+                f"{missing_channels[0]}."
             )
         predicted = np.asarray(self.expected) + np.asarray(self.offset)
         _check_reference(frame[used], predicted[used])
-        changed = as_array(np.where(used, frame, predicted)), as_array(np.where(used, predicted - frame, 0))
-        return eqx.tree_at(lambda one: (one.expected, one.offset), self, changed)
+        new_fields = as_array(np.where(used, frame, predicted)), as_array(np.where(used, predicted - frame, 0))
+        return eqx.tree_at(lambda imager: (imager.expected, imager.offset), self, new_fields)
 
     @property
     def start(self) -> Float[Array, " n"]:
@@ -240,8 +249,8 @@ def _check_combination(solver: AbstractSolver, prior: AbstractPrior, parametrisa
         raise ValueError("memory: total variation has no covariance to carry on; take another prior, or memory 0.")
     if solver.is_linear and not prior.is_quadratic:
         raise ValueError("prior: total variation is not linear; take solver 'gauss-newton', or another prior.")
-    for name, given in (("bounds", parametrisation.bounds), ("unknowns", parametrisation.unknowns)):
-        if given:
+    for name, value in (("bounds", parametrisation.bounds), ("unknowns", parametrisation.unknowns)):
+        if value:
             raise ValueError(f"{name}: an Imager takes none, for its time a frame is bounded; take reconstruct.")
 
 
@@ -263,29 +272,31 @@ def _masked_noise(noise, used) -> Float[Array, " M"]:
 @functools.partial(jax.jit, static_argnames="persistence")
 def _compute_linear_map(inversion: Inversion, weighing: Weighing, offset, persistence: float) -> LinearMap:
     start = jnp.zeros(inversion.num_coefficients)
-    posed = eqx.tree_at(lambda i: i.data, inversion, weighing.combine(offset))
-    residual, jacobian = posed.linearise(start)
-    lower = jnp.linalg.cholesky(jacobian @ jacobian.T + posed.data.covariance)
-    gain = jax.scipy.linalg.cho_solve((lower, True), jacobian).T
+    problem = eqx.tree_at(lambda inverse_problem: inverse_problem.data, inversion, weighing.combine(offset))
+    residual, jacobian = problem.linearise(start)
+    lower_factor = jnp.linalg.cholesky(jacobian @ jacobian.T + problem.data.covariance)
+    gain = jax.scipy.linalg.cho_solve((lower_factor, True), jacobian).T
     if inversion.num_coefficients <= len(residual):
         shapes = jnp.eye(inversion.num_coefficients)
-        carry = persistence * (shapes - gain @ jacobian)
+        carry_matrix = persistence * (shapes - gain @ jacobian)
     else:  # not reached with a memory, because there are then no more shapes than data
         shapes, gain = gain.T, jnp.eye(len(residual))
-        carry = jnp.zeros_like(gain)
+        carry_matrix = jnp.zeros_like(gain)
     matrix = jax.vmap(inversion.basis.expand)(shapes).T * inversion.link.slope(inversion.reference)[:, None]
-    level = inversion.link.conductivity(inversion.reference) - matrix @ (gain @ residual)
-    return LinearMap(matrix, gain @ (weighing.weight[:, None] * weighing.estimator), level, carry)
+    constant_image = inversion.link.conductivity(inversion.reference) - matrix @ (gain @ residual)
+    return LinearMap(matrix, gain @ (weighing.weight[:, None] * weighing.estimator), constant_image, carry_matrix)
 
 
 @jax.jit
 def _estimate_frame(imager: Imager, frame, weighing: Weighing, start) -> FrameEstimate:
     data = weighing.combine(frame + imager.offset)
-    inversion = eqx.tree_at(lambda i: i.data, imager.inversion, data)
+    inversion = eqx.tree_at(lambda inverse_problem: inverse_problem.data, imager.inversion, data)
     expected = jnp.zeros_like(start)
     if imager.persistence > 0:  # the prior mean moves, and the coefficients are relative to it
         expected, start = start, expected
-        inversion = eqx.tree_at(lambda i: i.reference, inversion, inversion.estimate(expected))
+        inversion = eqx.tree_at(
+            lambda inverse_problem: inverse_problem.reference, inversion, inversion.estimate(expected)
+        )
     descent = imager.solver.descent(FRAME_STEPS, _RTOL)
     solution = optx.least_squares(
         residual, descent, start, inversion, options={"expand": expand}, max_steps=imager.steps, throw=False
@@ -293,14 +304,14 @@ def _estimate_frame(imager: Imager, frame, weighing: Weighing, start) -> FrameEs
     # The point reached by the last step has not been evaluated; its cost takes voltages but no Jacobian.
     state = solution.state
     cost = inversion.cost(state.trial)
-    better = cost < state.cost
-    coefficients = jnp.where(better, state.trial, solution.value)
-    penalty, least = inversion.penalty.cost(coefficients), jnp.where(better, cost, state.cost)
-    squares = 2 * (least - penalty) + data.rest
+    is_trial_better = cost < state.cost
+    coefficients = jnp.where(is_trial_better, state.trial, solution.value)
+    penalty, min_cost = inversion.penalty.cost(coefficients), jnp.where(is_trial_better, cost, state.cost)
+    squared_misfit = 2 * (min_cost - penalty) + data.rest
     return FrameEstimate(
         conductivity=inversion.conductivity(coefficients),
         coefficients=expected + coefficients,
-        misfit=jnp.sqrt(squares / jnp.sum(weighing.noise <= jnp.max(imager.noise))),
-        iterations=state.num_accepted - 1 + better,
-        converged=state.converged | (least <= descent.atol),  # no step can lower the cost by more than its value
+        misfit=jnp.sqrt(squared_misfit / jnp.sum(weighing.noise <= jnp.max(imager.noise))),
+        iterations=state.num_accepted - 1 + is_trial_better,
+        converged=state.converged | (min_cost <= descent.atol),  # no step can lower the cost by more than its value
     )

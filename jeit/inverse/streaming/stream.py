@@ -77,9 +77,9 @@ class FrameCheck:
         self.mask, self.expected, self.touching = mask, expected, touching
         self.first, self.second = tied[0].T
         self.ratio = tied[1]
-        self.trust = 1 / np.hypot(noise[self.first], noise[self.second] / self.ratio)
-        self.size = np.linalg.norm(expected[mask])
-        self.ordinary = (_SUSPECT_FACTOR * self.size) ** 2
+        self.pair_weights = 1 / np.hypot(noise[self.first], noise[self.second] / self.ratio)
+        self.expected_norm = np.linalg.norm(expected[mask])
+        self.max_ordinary_square = (_SUSPECT_FACTOR * self.expected_norm) ** 2
 
     @np.errstate(over="ignore")  # a frame whose square overflows is treated as faulty
     def __call__(self, frame):
@@ -92,100 +92,137 @@ class FrameCheck:
     def _reason_unchanged(self, values, usable) -> str:
         """Sentence that says that a frame differs from an undisturbed one by noise only; empty if it does not."""
         change = np.where(usable, values - self.expected, 0)
-        if np.linalg.norm(change) <= _EQUAL_TOLERANCE * self.size:
+        if np.linalg.norm(change) <= _EQUAL_TOLERANCE * self.expected_norm:
             return "It equals an undisturbed frame."
-        both = usable[self.first] & usable[self.second]
-        if np.count_nonzero(both) < _MIN_PAIRS:
+        pair_is_usable = usable[self.first] & usable[self.second]
+        if np.count_nonzero(pair_is_usable) < _MIN_PAIRS:
             return ""
-        one, other = (self.trust * change[self.first])[both], (self.trust * change[self.second] / self.ratio)[both]
-        alike = 2 * (one @ other) / (one @ one + other @ other)
-        if alike * np.sqrt(len(one)) > _CORRELATION_THRESHOLD:
+        first_changes, second_changes = (
+            (self.pair_weights * change[self.first])[pair_is_usable],
+            (self.pair_weights * change[self.second] / self.ratio)[pair_is_usable],
+        )
+        correlation = (
+            2 * (first_changes @ second_changes) / (first_changes @ first_changes + second_changes @ second_changes)
+        )
+        if correlation * np.sqrt(len(first_changes)) > _CORRELATION_THRESHOLD:
             return ""
         return "Nothing but noise: reciprocal channels change alike as by chance."
 
     def _inspect(self, frame):
-        none = np.zeros_like(self.mask)
+        no_channels = np.zeros_like(self.mask)
         if np.ma.isMaskedArray(frame):
             frame = np.ma.filled(frame.astype(float), np.nan)
         try:
             values = np.asarray(frame)
         except ValueError:
-            return none, none, FrameStatus.REFUSED, f"The frame is ragged, not {self.mask.size} real voltages."
+            return (
+                no_channels,
+                no_channels,
+                FrameStatus.REFUSED,
+                f"The frame is ragged, not {self.mask.size} real voltages.",
+            )
         if values.dtype.kind in "US":
-            return values, none, FrameStatus.REFUSED, f"The frame is text, not {self.mask.size} real voltages."
+            return values, no_channels, FrameStatus.REFUSED, f"The frame is text, not {self.mask.size} real voltages."
         if values.shape != self.mask.shape or values.dtype.kind not in "iuf":
             reason = f"The frame is {values.dtype} of shape {values.shape}, not {self.mask.size} real voltages."
-            return values, none, FrameStatus.REFUSED, reason
+            return values, no_channels, FrameStatus.REFUSED, reason
         change = (values - self.expected)[self.mask]
-        if change @ change < self.ordinary:  # False for frames with NaN and for frames of zeros
+        if change @ change < self.max_ordinary_square:  # False for frames with NaN and for frames of zeros
             return values, self.mask, FrameStatus.IMAGED, ""
         finite = np.isfinite(values)
         usable = self.mask if finite.all() else self.mask & finite
-        count = np.count_nonzero(usable)
-        if count < _MIN_CHANNELS * np.count_nonzero(self.mask):
+        num_usable = np.count_nonzero(usable)
+        if num_usable < _MIN_CHANNELS * np.count_nonzero(self.mask):
             return (
                 values,
                 usable,
                 FrameStatus.REFUSED,
-                f"Only {count} of {np.count_nonzero(self.mask)} channels can be used.",
+                f"Only {num_usable} of {np.count_nonzero(self.mask)} channels can be used.",
             )
         if not values[usable].any():
-            return values, none, FrameStatus.REFUSED, "All channels read zero; the current source has failed."
+            return values, no_channels, FrameStatus.REFUSED, "All channels read zero; the current source has failed."
         difference = np.where(usable, values - self.expected, 0)
-        relative = np.linalg.norm(difference) / self.size
-        if relative > _SUSPECT_FACTOR:
-            usable, reason = self._without_dead_electrode(difference, usable)
+        relative_change = np.linalg.norm(difference) / self.expected_norm
+        if relative_change > _SUSPECT_FACTOR:
+            usable, reason = self._remove_dead_electrode(difference, usable)
             if reason:
                 return values, usable, FrameStatus.PARTIAL, reason
-            if (rail := self._at_rail(values, usable)).any():
-                return self._without_saturated(values, difference, usable, rail)
-            if relative > _LARGEST_DIFFERENCE:
-                reason = f"It differs by {relative:.0%} from an undisturbed frame: another sensor's, or a fault."
-                return values, none, FrameStatus.REFUSED, reason
-        if count < np.count_nonzero(self.mask):
-            missing = int(np.count_nonzero(self.mask) - count)
-            reason = f"Left out: {counted(missing, 'channel')} without a reading."
+            if (is_saturated := self._saturated_channels(values, usable)).any():
+                return self._remove_saturated_channels(values, difference, usable, is_saturated)
+            if relative_change > _LARGEST_DIFFERENCE:
+                reason = f"It differs by {relative_change:.0%} from an undisturbed frame: another sensor's, or a fault."
+                return values, no_channels, FrameStatus.REFUSED, reason
+        if num_usable < np.count_nonzero(self.mask):
+            num_missing = int(np.count_nonzero(self.mask) - num_usable)
+            reason = f"Left out: {counted(num_missing, 'channel')} without a reading."
             return values, usable, FrameStatus.PARTIAL, reason
         return values, usable, FrameStatus.IMAGED, ""
 
-    def _without_dead_electrode(self, difference, usable):
+    def _remove_dead_electrode(self, difference, usable):
         """Usable channels without those of a dead electrode, and a sentence; all usable channels and an empty string if
         no electrode is dead."""
-        total = np.linalg.norm(difference)
-        left = np.array([np.linalg.norm(difference[usable & ~touching]) for touching in self.touching])
+        total_change = np.linalg.norm(difference)
+        remaining_changes = np.array([np.linalg.norm(difference[usable & ~touching]) for touching in self.touching])
         # An electrode whose removal leaves too few channels, such as a common reference, cannot be left out.
-        left[(usable & ~self.touching).sum(axis=1) < _MIN_CHANNELS * self.mask.sum()] = np.inf
-        electrode = int(np.argmin(left))
-        if not np.isfinite(left[electrode]):
+        remaining_changes[(usable & ~self.touching).sum(axis=1) < _MIN_CHANNELS * self.mask.sum()] = np.inf
+        electrode = int(np.argmin(remaining_changes))
+        if not np.isfinite(remaining_changes[electrode]):
             return usable, ""
-        own, rest = usable & self.touching[electrode], usable & ~self.touching[electrode]
-        read = own & (self.expected != 0)
-        lost = read.any() and np.median(np.abs(difference[read]) / np.abs(self.expected[read])) > _MIN_DEAD_CHANGE
-        explained = left[electrode] <= min(_MAX_REMAINING_SHARE * total, _LARGEST_DIFFERENCE * self.size)
-        if not (lost and explained):
+        electrode_channels, other_channels = usable & self.touching[electrode], usable & ~self.touching[electrode]
+        expected_channels = electrode_channels & (self.expected != 0)
+        is_dead = (
+            expected_channels.any()
+            and np.median(np.abs(difference[expected_channels]) / np.abs(self.expected[expected_channels]))
+            > _MIN_DEAD_CHANGE
+        )
+        explains_change = remaining_changes[electrode] <= min(
+            _MAX_REMAINING_SHARE * total_change, _LARGEST_DIFFERENCE * self.expected_norm
+        )
+        if not (is_dead and explains_change):
             return usable, ""
-        return rest, f"Electrode {electrode + 1} seems to be dead; its channels are left out."
+        return other_channels, f"Electrode {electrode + 1} seems to be dead; its channels are left out."
 
-    def _at_rail(self, values, usable):
+    def _saturated_channels(self, values, usable):
         """Channels (M,) at which the amplifier is saturated."""
-        far = np.abs(values - self.expected) > _SUSPECT_FACTOR * np.abs(self.expected)
-        rail = np.zeros_like(usable)
-        for end in (values[usable].max(), values[usable].min()):
-            same = usable & (values == end)
-            if np.count_nonzero(same) < _MIN_SATURATED or not end:
+        is_far = np.abs(values - self.expected) > _SUSPECT_FACTOR * np.abs(self.expected)
+        is_saturated = np.zeros_like(usable)
+        for extreme in (values[usable].max(), values[usable].min()):
+            at_extreme = usable & (values == extreme)
+            if np.count_nonzero(at_extreme) < _MIN_SATURATED or not extreme:
                 continue
             # Channels that are equal by symmetry, as in simulated frames, are also equal in the undisturbed frame.
-            if far[same].all() and np.ptp(self.expected[same]) > _EQUAL_EXPECTED * np.abs(self.expected[same]).max():
-                rail |= same
-        return rail
+            if (
+                is_far[at_extreme].all()
+                and np.ptp(self.expected[at_extreme]) > _EQUAL_EXPECTED * np.abs(self.expected[at_extreme]).max()
+            ):
+                is_saturated |= at_extreme
+        return is_saturated
 
-    def _without_saturated(self, values, difference, usable, rail):
-        rest, channels = usable & ~rail, counted(int(np.count_nonzero(rail)), "channel")
-        if np.count_nonzero(rest) < _MIN_CHANNELS * np.count_nonzero(self.mask):
-            return values, rest, FrameStatus.REFUSED, f"Saturated: {channels} at the ends of the range."
-        if np.linalg.norm(difference[rest]) > _LARGEST_DIFFERENCE * self.size:
-            return values, rest, FrameStatus.REFUSED, f"Saturated: {channels}, and the others are far off too."
-        return values, rest, FrameStatus.PARTIAL, f"Left out: {channels} at the ends of the range, saturated."
+    def _remove_saturated_channels(self, values, difference, usable, is_saturated):
+        remaining_channels, channel_count = (
+            usable & ~is_saturated,
+            counted(int(np.count_nonzero(is_saturated)), "channel"),
+        )
+        if np.count_nonzero(remaining_channels) < _MIN_CHANNELS * np.count_nonzero(self.mask):
+            return (
+                values,
+                remaining_channels,
+                FrameStatus.REFUSED,
+                f"Saturated: {channel_count} at the ends of the range.",
+            )
+        if np.linalg.norm(difference[remaining_channels]) > _LARGEST_DIFFERENCE * self.expected_norm:
+            return (
+                values,
+                remaining_channels,
+                FrameStatus.REFUSED,
+                f"Saturated: {channel_count}, and the others are far off too.",
+            )
+        return (
+            values,
+            remaining_channels,
+            FrameStatus.PARTIAL,
+            f"Left out: {channel_count} at the ends of the range, saturated.",
+        )
 
 
 class FrameImage(Module):
@@ -281,10 +318,10 @@ class StreamState:
     def __init__(self, imager: Imager):
         self.imager = imager
         self.mask = np.asarray(imager.mask)
-        self.unmasked = bool(self.mask.all())
+        self.is_unmasked = bool(self.mask.all())
         self.expected = np.asarray(imager.expected)
-        touching, tied, noise = jax.tree.map(np.asarray, (imager.touching, imager.tied, imager.noise))
-        self.check = FrameCheck(self.mask, self.expected, touching, tied, noise)
+        touching, reciprocal_pairs, noise = jax.tree.map(np.asarray, (imager.touching, imager.tied, imager.noise))
+        self.check = FrameCheck(self.mask, self.expected, touching, reciprocal_pairs, noise)
         self.coefficients = np.asarray(imager.start)
         self.last = self.expected
         self._weigh(self.mask)
@@ -293,26 +330,28 @@ class StreamState:
 
     def image(self, number: int, frame: Any) -> FrameImage:
         """Image of one frame, or the reason why it was refused."""
-        begin = time.perf_counter()
+        start_time = time.perf_counter()
         values, usable, status, reason = self.check(frame)
         if status == FrameStatus.REFUSED:
-            return FrameImage(number, None, status, reason, usable, np.nan, 0, time.perf_counter() - begin)
+            return FrameImage(number, None, status, reason, usable, np.nan, 0, time.perf_counter() - start_time)
         if usable is not self.usable and not np.array_equal(usable, self.usable):
             self._weigh(usable)
-        filled = values if usable is self.mask and self.unmasked else np.where(usable, values, self.last)
-        conductivity, misfit, iterations, converged = self._estimate(filled)
+        filled_frame = values if usable is self.mask and self.is_unmasked else np.where(usable, values, self.last)
+        conductivity, misfit, iterations, converged = self._estimate(filled_frame)
         if not np.isfinite(conductivity).all():
             reason = "The image became NaN; the next frame starts from the background again."
             self.coefficients = np.asarray(self.imager.start)
             return FrameImage(
-                number, None, FrameStatus.REFUSED, reason, usable, np.nan, iterations, time.perf_counter() - begin
+                number, None, FrameStatus.REFUSED, reason, usable, np.nan, iterations, time.perf_counter() - start_time
             )
-        self.last = filled
+        self.last = filled_frame
         if not converged and status in (FrameStatus.IMAGED, FrameStatus.UNCHANGED):
             status = FrameStatus.STEP_LIMIT
-            done = counted_iterations(iterations, self.imager.steps - iterations)
-            reason = f"Stopped after {done}: this frame needs more than a frame is given."
-        return FrameImage(number, conductivity, status, reason, usable, misfit, iterations, time.perf_counter() - begin)
+            iteration_text = counted_iterations(iterations, self.imager.steps - iterations)
+            reason = f"Stopped after {iteration_text}: this frame needs more than a frame is given."
+        return FrameImage(
+            number, conductivity, status, reason, usable, misfit, iterations, time.perf_counter() - start_time
+        )
 
     def _weigh(self, usable) -> None:
         self.usable = usable
@@ -323,17 +362,22 @@ class StreamState:
             # precision suffices; BLAS reads it in half the time in column-major order.
             self.matrix = np.asfortranarray(linear.matrix, np.float32)
             self.estimator = np.asarray(linear.estimator)
-            self.resting = self.estimator @ self.expected
-            self.carry = np.asarray(linear.carry)
-            self.level = np.asarray(linear.level) + np.asarray(linear.matrix) @ self.resting
+            self.expected_weights = self.estimator @ self.expected
+            self.carry_matrix = np.asarray(linear.carry)
+            self.level = np.asarray(linear.level) + np.asarray(linear.matrix) @ self.expected_weights
 
     def _estimate(self, frame):
         """Conductivity, misfit, number of iterations, and whether the image converged."""
         if self.imager.solver.is_linear:
-            weights = self.estimator @ frame - self.resting
+            weights = self.estimator @ frame - self.expected_weights
             if self.imager.persistence > 0:
-                weights = self.coefficients = weights + self.carry @ self.coefficients
+                weights = self.coefficients = weights + self.carry_matrix @ self.coefficients
             return self.level + self.matrix @ weights.astype(np.float32), np.nan, 1, True
-        found = self.imager.estimate(frame, self.weighing, jnp.asarray(self.coefficients))
-        self.coefficients = found.coefficients * (self.imager.persistence or 1.0)
-        return np.asarray(found.conductivity), float(found.misfit), int(found.iterations), bool(found.converged)
+        estimate = self.imager.estimate(frame, self.weighing, jnp.asarray(self.coefficients))
+        self.coefficients = estimate.coefficients * (self.imager.persistence or 1.0)
+        return (
+            np.asarray(estimate.conductivity),
+            float(estimate.misfit),
+            int(estimate.iterations),
+            bool(estimate.converged),
+        )

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jeit.arguments import check_kind
 from jeit.data import Measurement
+from jeit.image.inclusions import StrongestRegion
 from jeit.imaging.stream_preparation import StreamSettings, prepare_imager
 from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
@@ -20,8 +21,9 @@ from jeit.live.views.scene import PixelGrid, scene_of
 class ConductivityView(AbstractView):
     """View of the change of conductivity from that of the undisturbed body: the images of `jeit.inverse.stream`.
 
-    Images are in S/m (2-D: S). A marker stands at the largest change, unless the frame differs from an undisturbed one
-    by noise only. `ConductivityView.prepare` makes the view from a measurement of the undisturbed body.
+    Images are in S/m (2-D: S). A marker stands at the centroid of the strongest change, unless the frame differs from
+    an undisturbed one by noise only. `ConductivityView.prepare` makes the view from a measurement of the undisturbed
+    body.
 
     **Arguments:**
 
@@ -48,7 +50,7 @@ class ConductivityView(AbstractView):
         model = calibration.model
         self.imager, self.background = imager, float(calibration.conductivity)
         self.grid = PixelGrid(model.mesh)
-        self._middle = _middles(model.mesh)
+        self._strongest = StrongestRegion(model.mesh)
         self._state = StreamState(imager)
         plane = model.mesh.dimension == 2
         self.scene = scene_of(
@@ -90,9 +92,9 @@ class ConductivityView(AbstractView):
         change = one.conductivity - self.background
         markers = ()
         if one.status != FrameStatus.UNCHANGED:
-            peak = int(np.abs(change).argmax())
-            x, y = self._middle[peak].tolist()
-            markers = (Marker(x, y, f"{100 * change[peak] / self.background:+.0f} %"),)
+            centroid, peak = self._strongest(change)
+            x, y = centroid[:2].tolist()
+            markers = (Marker(x, y, f"{100 * peak / self.background:+.0f} %"),)
         return one, Picture(self.grid(change), markers, one.status, one.reason)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
@@ -112,8 +114,3 @@ def mean_frame(frames: Float[np.ndarray, "N M"]) -> Float[np.ndarray, " M"]:
     known = np.isfinite(values)
     number = known.sum(axis=0)
     return np.where(number, np.where(known, values, 0).sum(axis=0) / np.maximum(number, 1), np.nan)
-
-
-def _middles(mesh) -> Float[np.ndarray, "m 2"]:
-    """Centroids (m, 2) of the cells as seen from above, metres."""
-    return np.asarray(mesh.points)[np.asarray(mesh.cells)].mean(axis=1)[:, :2]

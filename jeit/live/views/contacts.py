@@ -90,7 +90,7 @@ class ContactsView(AbstractView):
             return picture
         found = self.contacts(one.conductivity - self.images.background)
         self._follow(frame.second, found)
-        tracks = {tuple(touch.place): touch.number for touch in self._tracker.open}
+        tracks = {tuple(touch.position): touch.number for touch in self._tracker.open}
         background = self.images.background
         markers = tuple(
             Marker(
@@ -119,7 +119,7 @@ class ContactsView(AbstractView):
     def _follow(self, second: float, found: list[Contact]) -> None:
         tracker = self._tracker.follow(max(second, self._tracker.time + _STEP), found)
         # Only the last frame of a touch is needed here, whose memory would grow with time.
-        going = tuple(replace(touch, seen=touch.seen[-1:]) for touch in tracker.open)
+        going = tuple(replace(touch, observations=touch.observations[-1:]) for touch in tracker.open)
         self._tracker = replace(tracker, open=going, closed=())
 
 

@@ -14,17 +14,17 @@ if TYPE_CHECKING:
     from jeit.touch.listening import SoundLabels
 
 
-_LOUDNESS = {"auto": None, "counts": True, "ignored": False}
+_LOUDNESS_CHOICES = {"auto": None, "counts": True, "ignored": False}
 
 
-class _NamedByGroup(TyperCommand):
+class _GroupNamedCommand(TyperCommand):
     """Command that help texts and error messages call by the name of its group: `jeit listen`."""
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
         return super().make_context(parent.info_name, args, parent=parent.parent, **extra)
 
 
-class _RecordingFirst(TyperGroup):
+class _DefaultCommandGroup(TyperGroup):
     """Group that runs its first command unless the first argument is --help or the name of another command."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -38,7 +38,7 @@ class _RecordingFirst(TyperGroup):
 
 listen = typer.Typer(
     name="listen",
-    cls=_RecordingFirst,
+    cls=_DefaultCommandGroup,
     help="Classify the sounds in a recording, every 0.1 s; 'listen fit' trains the classifier on labelled clips.",
 )
 
@@ -49,7 +49,7 @@ def _top(context: typer.Context) -> None:
         typer.echo(context.get_help())
 
 
-@listen.command("recording", cls=_NamedByGroup, hidden=True)
+@listen.command("recording", cls=_GroupNamedCommand, hidden=True)
 def classify_recording(
     recording: Annotated[
         Path,
@@ -97,12 +97,12 @@ def classify_recording(
     with Steps(console, quiet=quiet) as step:
         step("read")
         listener = Listener.read(model)
-        known = None if calibration is None else Calibration.load(calibration)
-        sound = read_recording(recording)
-        if not isinstance(sound, Recording):
+        microphone_calibration = None if calibration is None else Calibration.load(calibration)
+        sounds = read_recording(recording)
+        if not isinstance(sounds, Recording):
             raise ValueError(f"{recording.name}: it holds intensities; sounds can be classified only in samples.")
         step("listen")
-        labels = listener.classify(sound, calibration=known)
+        labels = listener.classify(sounds, calibration=microphone_calibration)
         step("write")
         write_sound_labels(labels, output, model=str(model))
     if not quiet:
@@ -166,8 +166,8 @@ def fit(
     from jeit.touch.reports.listener import LISTENER_FILES, summary, write_listener
 
     need_extra("learn", "training a classifier of sounds")
-    if loudness not in _LOUDNESS:
-        raise ValueError(f"--loudness must be one of {', '.join(_LOUDNESS)}; it is '{loudness}'.")
+    if loudness not in _LOUDNESS_CHOICES:
+        raise ValueError(f"--loudness must be one of {', '.join(_LOUDNESS_CHOICES)}; it is '{loudness}'.")
     check_at_least({"--batches": (batches, 1), "--seed": (seed, 0)})
     if batches is not None and method in ("trees", "spectrum", "linear"):
         raise ValueError(f"--batches applies to networks only, not to --method {method}; leave one out.")
@@ -176,29 +176,29 @@ def fit(
     make_folder(output, LISTENER_FILES)
     console = plain_console()
     # Folder of unfinished trainings, deleted at the end.
-    under_way = output / "training"
+    training_folder = output / "training"
     with Steps(console, quiet=quiet) as step:
         step("read")
-        labelled = read_clips(clips, progress=step.report)
+        labelled_clips = read_clips(clips, progress=step.report)
         step("learn")
         with naming_options({"method": "--method", "labels": "FOLDER-BY-CLASS"}):
             listener = Listener.fit(
-                labelled,
+                labelled_clips,
                 method=method,
-                loudness=_LOUDNESS[loudness],
+                loudness=_LOUDNESS_CHOICES[loudness],
                 key=jax.random.key(seed),
                 batches=batches or BATCHES,
-                folder=under_way,
+                folder=training_folder,
                 progress=step.report,
             )
         step("write")
         write_listener(listener, output)
-        shutil.rmtree(under_way, ignore_errors=True)
+        shutil.rmtree(training_folder, ignore_errors=True)
     if quiet:
         return
     channels = counted(listener.channels, "channel")
     rows = [
-        ("clips", f"{counted(len(labelled), 'clip')} of {len(listener.names)} classes, {channels}"),
+        ("clips", f"{counted(len(labelled_clips), 'clip')} of {len(listener.names)} classes, {channels}"),
         ("sound", f"up to {listener.highest:g} Hz"),
         ("loudness", "counts" if listener.loudness else "ignored"),
         ("method", listener.method),
@@ -217,19 +217,21 @@ def _print_summary(console, result: "SoundLabels") -> None:
     from jeit.cli.console import pairs
 
     name, probability = result.whole
-    said = f"{name}, {100 * probability:.0f} %" if name else "nothing"
-    rows = [("windows", str(len(result))), ("as a whole", said), *(("note", note) for note in result.notes)]
+    description = f"{name}, {100 * probability:.0f} %" if name else "nothing"
+    rows = [("windows", str(len(result))), ("as a whole", description), *(("note", note) for note in result.notes)]
     console.print()
     console.print(pairs(result.name, rows))
     console.print()
-    placed = result.position is not None
-    names = ("sound", "from / s", "to / s", "sure / %", *(("x / mm", "y / mm") if placed else ()))
+    has_positions = result.position is not None
+    names = ("sound", "from / s", "to / s", "sure / %", *(("x / mm", "y / mm") if has_positions else ()))
     table = Table(*names, box=None, padding=(0, 2, 0, 0))
     for column in table.columns[1:]:
         column.justify = "right"
     for event in result.events:
-        where = [""] * (2 * placed) if event.place is None else [f"{1e3 * value:z.1f}" for value in event.place[:2]]
-        sure = f"{100 * event.probability:.0f}" if event.name else ""
-        table.add_row(event.name or "quiet", f"{event.start:.2f}", f"{event.end:.2f}", sure, *where)
+        position_cells = (
+            [""] * (2 * has_positions) if event.place is None else [f"{1e3 * value:z.1f}" for value in event.place[:2]]
+        )
+        certainty = f"{100 * event.probability:.0f}" if event.name else ""
+        table.add_row(event.name or "quiet", f"{event.start:.2f}", f"{event.end:.2f}", certainty, *position_cells)
     console.print(table)
     console.print()

@@ -65,8 +65,8 @@ def image_by_network(
         raise ValueError(f"--model is for --method network, not {method or 'the default'}; leave one out.")
     if model is None:
         raise ValueError("--method network needs --model, the folder of 'jeit learn image'.")
-    if idle := [name for name, value in unused_options.items() if value is not None]:
-        raise ValueError(f"--{idle[0]} has no use with --method network; leave it out.")
+    if given_options := [name for name, value in unused_options.items() if value is not None]:
+        raise ValueError(f"--{given_options[0]} has no use with --method network; leave it out.")
     data, reference, kind, description = inputs
     console = plain_console()
     with Stopping() as stopping, Steps(console, quiet=quiet) as step:
@@ -76,42 +76,46 @@ def image_by_network(
         if description is not None and describes_skin(description):
             skin, description = read_described_skin(description), None
         network = read_network(model, skin=skin)
-        plain = skin is not None
-        base = (
+        is_table = skin is not None
+        base_frames = (
             None
             if reference is None
-            else _read_frame_file("--reference", reference, kind, description, network, None, is_table=plain)
+            else _read_frame_file("--reference", reference, kind, description, network, None, is_table=is_table)
         )
-        still = None if base is None else base.frames
+        untouched_frames = None if base_frames is None else base_frames.frames
         if data == "-":
             frames, numbers = parse_frames(sys.stdin), None
         else:
-            one = None if streamed else 0 if frame is None else frame
-            measured = _read_frame_file(
-                "DATA", data, kind, description, network, one, is_table=plain, same_format_as=reference
+            frame_index = None if streamed else 0 if frame is None else frame
+            frame_file = _read_frame_file(
+                "DATA", data, kind, description, network, frame_index, is_table=is_table, same_format_as=reference
             )
-            frames, numbers, still = measured.frames, measured.numbers, measured.reference if still is None else still
-        if still is None:
+            frames, numbers, untouched_frames = (
+                frame_file.frames,
+                frame_file.numbers,
+                frame_file.reference if untouched_frames is None else untouched_frames,
+            )
+        if untouched_frames is None:
             raise ValueError("--reference: give a file of frames of the untouched skin.")
-        rest = resting_frame(still, str(reference or data))
+        reference_frame = resting_frame(untouched_frames, str(reference or data))
         step("image")
-        come = FrameCounter(step, None if numbers is None else len(numbers))
+        counter = FrameCounter(step, None if numbers is None else len(numbers))
 
-        def show(one: "FrameDepth") -> None:
-            come.one_more()
-            if one.depth is None and not quiet:
-                console.print(f"  frame {one.number}: refused. {one.reason}", soft_wrap=True)
+        def show(frame_depth: "FrameDepth") -> None:
+            counter.one_more()
+            if frame_depth.depth is None and not quiet:
+                console.print(f"  frame {frame_depth.number}: refused. {frame_depth.reason}", soft_wrap=True)
 
-        found = stream_depths(network, stopping.until(frames), rest)
+        frame_depths = stream_depths(network, stopping.until(frames), reference_frame)
         if numbers is not None:
-            found = (one._replace(number=int(numbers[one.number])) for one in found)
+            frame_depths = (item._replace(number=int(numbers[item.number])) for item in frame_depths)
         drawing = stopping.before(PICTURES, step)
-        with stopping.ending(come, "frames.csv", "depth.npz"):
-            written = write_depths(found, network, output, name=str(data), progress=show, drawing=drawing)
+        with stopping.ending(counter, "frames.csv", "depth.npz"):
+            summary = write_depths(frame_depths, network, output, name=str(data), progress=show, drawing=drawing)
     if quiet:
         return
-    deepest, latency = written.deepest, 1e3 * np.median(written.latency)
-    console.print(f"\n{counted(written.imaged, 'frame')} imaged, median {latency:.2f} ms each")
+    deepest, latency = summary.deepest, 1e3 * np.median(summary.latency)
+    console.print(f"\n{counted(summary.imaged, 'frame')} imaged, median {latency:.2f} ms each")
     if deepest.depth > network.floor:
         x, y = 1e3 * deepest.middle
         console.print(f"deepest: {1e3 * deepest.depth:.2f} mm at ({x:.1f}, {y:.1f}) mm, in frame {deepest.number}")
@@ -144,11 +148,11 @@ def _read_frame_file(
     from jeit.imaging.stream_preparation import frames_of
     from jeit.touch.networks.measured import check_measured
 
-    described = kind is not None or description is not None or table.find_description(path) is not None
-    if is_table or (table.recognises(path) and not described):
-        beside = None if same_format_as is None or is_table else table.find_description(same_format_as)
-        recording = read_frame_recording(path, None if beside is None else load_description(beside))
-        frames, still = recording.frames, recording.reference
+    has_description = kind is not None or description is not None or table.find_description(path) is not None
+    if is_table or (table.recognises(path) and not has_description):
+        description_file = None if same_format_as is None or is_table else table.find_description(same_format_as)
+        recording = read_frame_recording(path, None if description_file is None else load_description(description_file))
+        frames, untouched_frames = recording.frames, recording.reference
         if frames.shape[1] != network.made_for["channels"]:
             raise ValueError(
                 f"'{path}' has {frames.shape[1]} channels, and the network was trained for "
@@ -159,16 +163,16 @@ def _read_frame_file(
             if not (isinstance(frame, int) and -len(frames) <= frame < len(frames)):
                 raise ValueError(f"--frame must be a number from 0 to {len(frames) - 1}; it is {frame!r}.")
             numbers = numbers[[frame]]
-        return _FrameFile(frames[numbers], numbers, still)
-    measured = read_file(option, path, kind, description)
-    check_measured(network, measured)
-    names, numbers = measured.frame_names, np.arange(measured.num_frames)
-    still = frames_of(measured.frame("reference")) if "reference" in names else None
-    frames = frames_of(measured)
+        return _FrameFile(frames[numbers], numbers, untouched_frames)
+    measurement = read_file(option, path, kind, description)
+    check_measured(network, measurement)
+    names, numbers = measurement.frame_names, np.arange(measurement.num_frames)
+    untouched_frames = frames_of(measurement.frame("reference")) if "reference" in names else None
+    frames = frames_of(measurement)
     if frame is not None:
-        frames = frames_of(measured.frame(frame))
+        frames = frames_of(measurement.frame(frame))
         numbers = numbers[[names.index(frame) if isinstance(frame, str) else frame]]
-    return _FrameFile(frames, numbers, still)
+    return _FrameFile(frames, numbers, untouched_frames)
 
 
 learn = typer.Typer(name="learn", help="Train networks on simulated touches of a described skin.")
@@ -231,11 +235,11 @@ def image(
         step = stack.enter_context(Steps(console, quiet=quiet))
         step("read")
         with naming_options({"path": "skin"}):
-            described = read_described_skin(skin)
+            described_skin = read_described_skin(skin)
         client = None if scheduler is None else stack.enter_context(connected(scheduler))
         step("learn")
         learnt = learn_images(
-            described,
+            described_skin,
             output,
             preset=preset,
             design=design,
@@ -248,15 +252,15 @@ def image(
         write_learnt_images(learnt, output)
     if quiet:
         return
-    place = learnt.standing.place
+    place_errors = learnt.standing.place
     rows = [
         ("network", f"{learnt.network.design}, {learnt.network.made_for['channels']} channels"),
         *(
-            (name, f"{one.reason}, best after {one.course.steps[one.course.best]} batches")
-            for name, one in learnt.courses.items()
+            (name, f"{training.reason}, best after {training.course.steps[training.course.best]} batches")
+            for name, training in learnt.courses.items()
         ),
         ("touches never seen", f"{100 * learnt.standing.explained:.1f} % of squared depth explained"),
-        ("a ball of 15 mm", f"{1e3 * place['mean']:.2f} ± {1e3 * place['sd']:.2f} mm off"),
+        ("a ball of 15 mm", f"{1e3 * place_errors['mean']:.2f} ± {1e3 * place_errors['sd']:.2f} mm off"),
         ("its greatest depth", f"estimated as {learnt.standing.deepest:.2f} of the true one"),
         ("time", ", ".join(f"{name} {seconds:.0f} s" for name, seconds in learnt.seconds.items())),
     ]

@@ -22,7 +22,7 @@ touch.command()(health)
 
 
 # Number of nodes of the mesh for images; contacts are located more finely than its cells.
-_NODES = 400
+_NUM_NODES = 400
 # Frame rate of a recording without times, in frames/s.
 _USUAL_RATE = 10.0
 # Maximum number of touches that are printed.
@@ -177,15 +177,17 @@ def fit(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        recorded = read_presses(presses)
+        recorded_presses = read_presses(presses)
         model = None
         if description is not None:
-            described = load_description(description)
-            model = described.model(presses, num_points=None if isinstance(described.domain, OwnMesh) else _NODES)
+            skin_description = load_description(description)
+            model = skin_description.model(
+                presses, num_points=None if isinstance(skin_description.domain, OwnMesh) else _NUM_NODES
+            )
         step("learn")
         with naming_options({"num_channels": "--channels", "per_session": "--per-session", "model": "--description"}):
             skin = LearntSkin.fit(
-                recorded,
+                recorded_presses,
                 method=method or "auto",
                 model=model,
                 num_channels=channels,
@@ -196,12 +198,12 @@ def fit(
         write_learnt_skin(skin, output)
     if quiet:
         return
-    number, width = recorded.frames.shape
-    rows = [("presses", f"{number} of {width} channels")]
+    num_presses, num_channels = recorded_presses.frames.shape
+    rows = [("presses", f"{num_presses} of {num_channels} channels")]
     for name, standing in skin.standing.items():
         rows += [(f"{name}: method", standing.method), (f"{name}, held out", summary(name, standing))]
     console.print()
-    console.print(pairs(f"Learnt from {recorded.name}", rows))
+    console.print(pairs(f"Learnt from {recorded_presses.name}", rows))
     _print_notes(console, skin.notes)
     say_written(console, output / "skin.skops", "report.json", "learning.png")
 
@@ -228,7 +230,7 @@ def predict(
     ],
     quiet: Quiet = False,
 ) -> None:
-    """Say of each frame where, how hard and by what the skin is touched, and how sure that is."""
+    """Predict for each frame where, how hard and by what the skin is touched, and how certain that is."""
     import numpy as np
 
     from jeit.arguments import counted
@@ -240,20 +242,22 @@ def predict(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        learnt, given = read_skin(skin), read_frames(frames)
+        learnt, arguments = read_skin(skin), read_frames(frames)
         step("predict")
-        touches = learnt.predict(**given)
+        touches = learnt.predict(**arguments)
         step("write")
         write_touches(touches, output, skin=str(skin), name=frames.name)
     if quiet:
         return
-    said = [counted(len(touches), "frame"), f"{int(touches.unlike.sum())} unlike any learnt from"]
+    descriptions = [counted(len(touches), "frame"), f"{int(touches.unlike.sum())} unlike any learnt from"]
     if touches.position is not None and touches.position_std is not None:
-        placed = np.isfinite(touches.position).all(axis=1)
-        said.append(f"{int(placed.sum())} with a place")
-        if placed.any():
-            said[-1] += f", standard deviation {1e3 * np.median(touches.position_std[placed]):.3g} mm (median)"
-    console.print("\n" + "; ".join(said))
+        has_place = np.isfinite(touches.position).all(axis=1)
+        descriptions.append(f"{int(has_place.sum())} with a place")
+        if has_place.any():
+            descriptions[-1] += (
+                f", standard deviation {1e3 * np.median(touches.position_std[has_place]):.3g} mm (median)"
+            )
+    console.print("\n" + "; ".join(descriptions))
     _print_notes(console, touches.notes)
     say_written(console, output / "touches.csv", "report.json", "touches.png")
 

@@ -78,42 +78,50 @@ def health(
         step("read")
         with naming_options({"description": "--skin"}):
             description = None if skin is None else load_description(skin)
-        known, judged = (read_frame_recording(path, description) for path in (healthy, recording))
-        if judged.frames.shape[1] != known.frames.shape[1]:
+        healthy_recording, checked_recording = (
+            read_frame_recording(path, description) for path in (healthy, recording)
+        )
+        if checked_recording.frames.shape[1] != healthy_recording.frames.shape[1]:
             raise ValueError(
-                f"'{recording}' has {judged.frames.shape[1]} channels, and '{healthy}' {known.frames.shape[1]}: give "
-                "both of one skin."
+                f"'{recording}' has {checked_recording.frames.shape[1]} channels, and '{healthy}' "
+                f"{healthy_recording.frames.shape[1]}: give both of one skin."
             )
-        if (judged.seconds is None) != (known.seconds is None) and rate is None:
+        if (checked_recording.seconds is None) != (healthy_recording.seconds is None) and rate is None:
             raise ValueError("--rate: only one of the recordings says when its frames came; give the frames a second.")
         step("learn")
-        sound = learn_health(
-            known, description, sign=-1 if lowers else 1, rate=rate, patience=patience, progress=step.report
+        healthy_state = learn_health(
+            healthy_recording, description, sign=-1 if lowers else 1, rate=rate, patience=patience, progress=step.report
         )
         step("watch")
-        seconds = seconds_of(judged, rate)
-        times = np.arange(len(judged.frames), dtype=float) if seconds is None else seconds
+        seconds = seconds_of(checked_recording, rate)
+        times = np.arange(len(checked_recording.frames), dtype=float) if seconds is None else seconds
         with naming_options({"frames": f"'{recording}'"}):
-            doubts = doubts_of(sound, known, judged.frames)
-        now = sound
-        for first in range(0, len(times), _FRAMES_PER_MESSAGE):
-            step.report(f"{first:,} of {counted(len(times), 'frame')}")
-            now = watch(
-                now, judged.frames[first : first + _FRAMES_PER_MESSAGE], times[first : first + _FRAMES_PER_MESSAGE]
+            doubts = doubts_of(healthy_state, healthy_recording, checked_recording.frames)
+        state = healthy_state
+        for first_frame in range(0, len(times), _FRAMES_PER_MESSAGE):
+            step.report(f"{first_frame:,} of {counted(len(times), 'frame')}")
+            state = watch(
+                state,
+                checked_recording.frames[first_frame : first_frame + _FRAMES_PER_MESSAGE],
+                times[first_frame : first_frame + _FRAMES_PER_MESSAGE],
             )
         step("write")
-        write_health(now, times, judged.frames, output, name=recording.name, timed=seconds is not None, notes=doubts)
+        write_health(
+            state, times, checked_recording.frames, output, name=recording.name, timed=seconds is not None, notes=doubts
+        )
     if quiet:
         return
     unit = "frame" if seconds is None else "s"
-    console.print(f"\n{counted(now.frames, 'frame')}: {counted(len(now.events), 'event')}")
+    console.print(f"\n{counted(state.frames, 'frame')}: {counted(len(state.events), 'event')}")
     for note in doubts:
         console.print(f"  note: {note}", soft_wrap=True)
-    for one in now.events:
-        where = "" if one.electrode is None else f" {one.electrode + 1}"
-        long = "" if one.path is None else f", {1e3 * one.length:.0f} ± {1e3 * one.deviation:.0f} mm long"
-        at = f"{unit} {one.time:.0f}" if seconds is None else f"{one.time:.2f} s"
-        console.print(f"  {at}: {one.kind}{where}{long}, {one.status}. {one.reason}", soft_wrap=True)
-    if (held := now.held) is not None:
-        console.print(f"  held at the end: {held.reason}", soft_wrap=True)
+    for event in state.events:
+        electrode_text = "" if event.electrode is None else f" {event.electrode + 1}"
+        length_text = "" if event.path is None else f", {1e3 * event.length:.0f} ± {1e3 * event.deviation:.0f} mm long"
+        time_text = f"{unit} {event.time:.0f}" if seconds is None else f"{event.time:.2f} s"
+        console.print(
+            f"  {time_text}: {event.kind}{electrode_text}{length_text}, {event.status}. {event.reason}", soft_wrap=True
+        )
+    if (held_event := state.held) is not None:
+        console.print(f"  held at the end: {held_event.reason}", soft_wrap=True)
     say_written(console, output / "events.csv", "report.json", "health.png")

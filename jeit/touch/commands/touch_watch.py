@@ -59,21 +59,21 @@ def gestures(
         step("read")
         with naming_options({"which": "--skin", "description": "--skin"}):
             description = load_description(skin)
-        made = GestureSet.read(recordings)
+        gesture_set = GestureSet.read(recordings)
         step("learn")
-        learnt = learn_gestures(description, made, method=method or "auto", progress=step.report)
+        learnt = learn_gestures(description, gesture_set, method=method or "auto", progress=step.report)
         step("write")
         write_gestures(learnt, output, name=recordings.name)
     if quiet:
         return
     model, standing = learnt.model, learnt.model.standing
-    people = len(set(made.person.tolist()))
-    rows = [("recordings", f"{len(made)}, of {people} {'people' if people > 1 else 'person'}")]
+    people = len(set(gesture_set.person.tolist()))
+    rows = [("recordings", f"{len(gesture_set)}, of {people} {'people' if people > 1 else 'person'}")]
     rows += [("gestures", ", ".join(model.names)), ("classifier", f"{model.method} on {model.form}")]
     if standing is not None:
-        right = standing.held_out == standing.right
-        by = ", ".join(f"{one} {100 * right[standing.right == one].mean():.0f}" for one in model.names)
-        rows.append(("right, held out", f"{100 * right.mean():.1f} % ({by})"))
+        is_right = standing.held_out == standing.right
+        shares = ", ".join(f"{name} {100 * is_right[standing.right == name].mean():.0f}" for name in model.names)
+        rows.append(("right, held out", f"{100 * is_right.mean():.1f} % ({shares})"))
     rows += [("note", note) for note in model.notes]
     console.print()
     console.print(pairs(f"Learnt from {recordings.name}", rows))
@@ -124,9 +124,9 @@ def watch(
 ) -> None:
     """Name touches as they end: when, where, which gesture, and how probable that is.
 
-    Writes events.csv and paths.csv line by line, and at the end report.json and timeline.png. Of standard input a line
-    is printed with the first frame after a touch; where that goes on within 100 ms it is named anew. Ctrl-C and
-    SIGTERM end it, and all is written.
+    Writes events.csv and paths.csv line by line, and at the end report.json and timeline.png. With standard input, a
+    line is printed with the first frame after a touch; if the touch continues within 100 ms, it is named anew. Ctrl-C
+    and SIGTERM end it, and all is written.
     """
     from dataclasses import replace
 
@@ -150,65 +150,71 @@ def watch(
             with naming_options({"description": "--skin"}):
                 description = load_description(skin)
             model = GestureModel.read(gestures)
-            still = None if reference is None else read_frame_recording(reference, description).frames
-            usual = 60.0 if model.reading is None else model.reading.rate
-            live = None
+            untouched_frames = None if reference is None else read_frame_recording(reference, description).frames
+            default_rate = 60.0 if model.reading is None else model.reading.rate
+            live_frames = None
             if stream == "-":
-                live = LiveFrames(parse_frames(sys.stdin), rate, usual)
-                if still is None:
+                live_frames = LiveFrames(parse_frames(sys.stdin), rate, default_rate)
+                if untouched_frames is None:
                     step(f"untouched, for {untouched:g} s")
-                    still = live.untouched(untouched)
-                frames, own = live, live.rate_seen
+                    untouched_frames = live_frames.untouched(untouched)
+                frames, frame_rate = live_frames, live_frames.rate_seen
             else:
-                frames, still, own = _read_recording(Path(stream), description, still, untouched, rate or usual)
+                frames, untouched_frames, frame_rate = _read_recording(
+                    Path(stream), description, untouched_frames, untouched, rate or default_rate
+                )
             step("prepare")
-            images = TouchImages.prepare(description, still, replace(TOUCH_IMAGES, as_is=as_is), progress=step.report)
-            watch = TouchWatch.create(images, model, still, rate=own, patience=patience)
+            images = TouchImages.prepare(
+                description, untouched_frames, replace(TOUCH_IMAGES, as_is=as_is), progress=step.report
+            )
+            watch = TouchWatch.create(images, model, untouched_frames, rate=frame_rate, patience=patience)
         for note in () if quiet else watch.notes:
             console.print(f"  note: {note}", soft_wrap=True)
 
-        if live is not None and not quiet:
+        if live_frames is not None and not quiet:
             console.print("  ready: the skin may be touched")
 
-        def show(one) -> None:
-            if one.note and not quiet:
-                console.print(f"  note: {one.note}", soft_wrap=True)
+        def show(frame) -> None:
+            if frame.note and not quiet:
+                console.print(f"  note: {frame.note}", soft_wrap=True)
             # In a live stream, a touch is printed once it is classified; in a file, once it has ended, with its final
             # prediction.
-            ended = one.ended if stream != "-" else () if one.named is None else (one.named,)
-            for touch in () if quiet else ended:
-                console.print(_touch_line(touch))
+            finished_touches = frame.ended if stream != "-" else () if frame.named is None else (frame.named,)
+            for touch in () if quiet else finished_touches:
+                console.print(_describe_touch(touch))
 
         written = write_watch(watch.follow(stopping.until(frames)), watch, output, name=stream, progress=show)
     if not quiet:
-        _print_summary(console, written, live, output)
+        _print_summary(console, written, live_frames, output)
     if stopping.signal == signal.SIGTERM:
         raise typer.Exit(128 + signal.SIGTERM)
 
 
-def _print_summary(console, written, live, output: Path) -> None:
+def _print_summary(console, written, live_frames, output: Path) -> None:
     """Print a summary of the touches."""
     import numpy as np
 
     from jeit.arguments import counted
     from jeit.cli.console import say_written
 
-    said = ", ".join(f"{number} {status}" for status, number in sorted(written.counts.items()))
-    unlike = sum(one.unlike for one in written.touches)
-    console.print(f"\n{counted(len(written.seconds), 'frame')}: {said}")
-    console.print(f"{counted(len(written.touches), 'touch')}, {unlike} of them unlike any learnt from")
+    frame_counts = ", ".join(f"{number} {status}" for status, number in sorted(written.counts.items()))
+    num_unlike = sum(touch.unlike for touch in written.touches)
+    console.print(f"\n{counted(len(written.seconds), 'frame')}: {frame_counts}")
+    console.print(f"{counted(len(written.touches), 'touch')}, {num_unlike} of them unlike any learnt from")
     if written.latency.size:
-        middle, high = 1e3 * np.quantile(written.latency, (0.5, 0.99))
-        console.print(f"named within {middle:.1f} ms of the frame after (median), 99 % within {high:.1f} ms")
-    if live is not None and live.left_out:
-        console.print(f"{counted(live.left_out, 'frame')} left out that had come before they could be read")
+        median_latency, high_latency = 1e3 * np.quantile(written.latency, (0.5, 0.99))
+        console.print(
+            f"named within {median_latency:.1f} ms of the frame after (median), 99 % within {high_latency:.1f} ms"
+        )
+    if live_frames is not None and live_frames.left_out:
+        console.print(f"{counted(live_frames.left_out, 'frame')} left out that had come before they could be read")
     if written.first_reason:
         console.print(f"first refusal: {written.first_reason}", soft_wrap=True)
     say_written(console, output / "events.csv", "paths.csv", "report.json", "timeline.png")
 
 
 def _read_recording(path: Path, description, untouched, span: float, rate: float):
-    """Frames of a file with their seconds, those of the untouched skin, and the rate."""
+    """Return the frames of a file with their times, the frames of the untouched skin, and the frame rate."""
     import numpy as np
 
     from jeit.data import read_frame_recording
@@ -226,7 +232,7 @@ def _read_recording(path: Path, description, untouched, span: float, rate: float
     return zip(seconds.tolist(), recording.frames, strict=True), untouched, rate
 
 
-def _touch_line(touch) -> str:
+def _describe_touch(touch) -> str:
     course = touch.touch.course
     x, y = 1e3 * course.centroid[int(course.peak.argmax())]
     name = "unlike any" if touch.unlike else f"{touch.gesture:<12}{100 * touch.probability:3.0f} %"

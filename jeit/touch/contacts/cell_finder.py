@@ -15,9 +15,9 @@ from jeit.touch.contacts.finder import AbstractFinder, Contact, check_finder, ch
 from jeit.touch.contacts.image_noise import ImageNoise
 
 # Number of standard deviations beyond which a Gaussian is treated as zero.
-_REACH = 3.0
+_CUTOFF_DEVIATIONS = 3.0
 # Default smoothing length, divided by the square root of the mesh's area.
-_SHARE = 0.03
+_RELATIVE_SMOOTHING = 0.03
 
 
 def gaussian_means(mesh: Mesh, length: float | None) -> sparse.csr_array:
@@ -28,19 +28,19 @@ def gaussian_means(mesh: Mesh, length: float | None) -> sparse.csr_array:
     length is negative, or not less than the square root of the mesh's area.
     """
     centres, areas = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
-    widest = float(np.sqrt(areas.sum()))
-    length = _SHARE * widest if length is None else length
-    if not (is_number(length) and 0 <= length < widest):
+    skin_size = float(np.sqrt(areas.sum()))
+    length = _RELATIVE_SMOOTHING * skin_size if length is None else length
+    if not (is_number(length) and 0 <= length < skin_size):
         raise ValueError(
-            f"smoothing must be metres, zero or more and less than the skin is wide ({widest:.3g} m); it is "
+            f"smoothing must be metres, zero or more and less than the skin is wide ({skin_size:.3g} m); it is "
             f"{describe(length)}."
         )
     if not length:
         return sparse.csr_array(sparse.diags_array(np.ones(len(areas))))
     tree = KDTree(centres)
-    near = tree.sparse_distance_matrix(tree, _REACH * length, output_type="coo_matrix")
-    weight = np.exp(-((near.data / length) ** 2) / 2) * areas[near.col]
-    means = sparse.csr_array((weight, (near.row, near.col)), shape=near.shape)
+    distances = tree.sparse_distance_matrix(tree, _CUTOFF_DEVIATIONS * length, output_type="coo_matrix")
+    weights = np.exp(-((distances.data / length) ** 2) / 2) * areas[distances.col]
+    means = sparse.csr_array((weights, (distances.row, distances.col)), shape=distances.shape)
     return sparse.csr_array(sparse.diags_array(1 / means.sum(axis=1)) @ means)
 
 
@@ -51,21 +51,21 @@ def outline_of_cells(points: Float[np.ndarray, "n d"], cells: Int[np.ndarray, "c
     edges follow one another. Where the set touches itself in a node, the loop may continue either way.
     """
     edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
-    _, which, number = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    onward: dict[int, list[int]] = {}
-    for start, end in edges[number[which] == 1].tolist():
-        onward.setdefault(start, []).append(end)
-    longest: list[int] = []
-    while onward:
-        loop = [next(iter(onward))]
-        while loop[-1] in onward:
-            ends = onward[loop[-1]]
-            last = loop[-1]
-            loop.append(ends.pop())
-            if not ends:
-                del onward[last]
-        longest = max(longest, loop[:-1], key=len)
-    return points[longest]
+    _, edge_numbers, edge_counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    following_nodes: dict[int, list[int]] = {}
+    for start, end in edges[edge_counts[edge_numbers] == 1].tolist():
+        following_nodes.setdefault(start, []).append(end)
+    longest_loop: list[int] = []
+    while following_nodes:
+        loop = [next(iter(following_nodes))]
+        while loop[-1] in following_nodes:
+            next_nodes = following_nodes[loop[-1]]
+            last_node = loop[-1]
+            loop.append(next_nodes.pop())
+            if not next_nodes:
+                del following_nodes[last_node]
+        longest_loop = max(longest_loop, loop[:-1], key=len)
+    return points[longest_loop]
 
 
 class CellFinder(AbstractFinder):
@@ -143,29 +143,29 @@ class CellFinder(AbstractFinder):
 
     def find(self, change, noise):
         """See `find_contacts`."""
-        change, clear = self.above_noise(change, noise)
-        basin = basins(clear, self.shared, floor=0.0, least_prominence=self.least_prominence)
-        peaks = np.unique(basin[basin >= 0])
-        strong = peaks[change[peaks] >= self.least_peak * change[peaks].max(initial=0.0)]
-        return [self._describe_contact(change, noise, peak, basin == peak) for peak in strong.tolist()]
+        change, clear_change = self.above_noise(change, noise)
+        basin_peaks = basins(clear_change, self.shared, floor=0.0, least_prominence=self.least_prominence)
+        peaks = np.unique(basin_peaks[basin_peaks >= 0])
+        strong_peaks = peaks[change[peaks] >= self.least_peak * change[peaks].max(initial=0.0)]
+        return [self._describe_contact(change, noise, peak, basin_peaks == peak) for peak in strong_peaks.tolist()]
 
-    def _describe_contact(self, change: np.ndarray, noise: ImageNoise, peak: int, basin: np.ndarray) -> Contact:
+    def _describe_contact(self, change: np.ndarray, noise: ImageNoise, peak: int, is_in_basin: np.ndarray) -> Contact:
         level = self.level * change[peak]
-        region = np.flatnonzero(basin & (change >= level))
-        area, centre = self.areas[region], self.centres[region]
-        weight = area * (change[region] - level)
-        centroid = weight @ centre / weight.sum()
+        region = np.flatnonzero(is_in_basin & (change >= level))
+        areas, centres = self.areas[region], self.centres[region]
+        weights = areas * (change[region] - level)
+        centroid = weights @ centres / weights.sum()
         # Derivative of the centroid Σ a (v − level v_peak) x / Σ a (v − level v_peak) with respect to the values v.
-        slope = np.zeros(self.centres.shape)
-        slope[region] = area[:, None] * (centre - centroid) / weight.sum()
-        slope[peak] -= self.level * slope[region].sum(axis=0)
+        centroid_derivative = np.zeros(self.centres.shape)
+        centroid_derivative[region] = areas[:, None] * (centres - centroid) / weights.sum()
+        centroid_derivative[peak] -= self.level * centroid_derivative[region].sum(axis=0)
         if self.surface is not None:
             centroid = self.surface.nearest(centroid[None]).points[0]
         return Contact(
             centroid=centroid,
-            area=float(area.sum()),
+            area=float(areas.sum()),
             peak=float(change[peak]),
-            integral=float(area @ change[region]),
+            integral=float(areas @ change[region]),
             contour=outline_of_cells(self.points, self.cells[region]),
-            deviation=noise.distance(self.smoothing.T @ slope),
+            deviation=noise.distance(self.smoothing.T @ centroid_derivative),
         )

@@ -96,9 +96,10 @@ def restore_sign(finder: AbstractFinder, contacts: list[Contact]) -> list[Contac
     """Restore the original sign of contacts found in a change that makes them positive; sort them, strongest first."""
     if finder.sign < 0:
         contacts = [
-            eqx.tree_at(lambda one: (one.peak, one.integral), one, (-one.peak, -one.integral)) for one in contacts
+            eqx.tree_at(lambda contact: (contact.peak, contact.integral), contact, (-contact.peak, -contact.integral))
+            for contact in contacts
         ]
-    return sorted(contacts, key=lambda one: -abs(one.peak))
+    return sorted(contacts, key=lambda contact: -abs(contact.peak))
 
 
 def noise_or_estimate(change: Float[np.ndarray, " m"], noise: ImageNoise | None) -> ImageNoise:

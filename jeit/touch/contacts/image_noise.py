@@ -13,12 +13,12 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit_solvers.module import Module
 
 # Minimum number of frames for estimating the standard deviation.
-_LEAST_FRAMES = 10
-# For normal noise: ratio of the standard deviation to the median absolute value; number of standard deviations within
-# which cells are kept; ratio of the standard deviation of all cells to that of the cells kept.
-_DEVIATION_PER_MEDIAN, _CLIP_AT, _CLIPPED_DEVIATION = 1.4826, 3.0, 1.0136
+_MIN_NUM_FRAMES = 10
+# For normal noise: ratio of the standard deviation to the median absolute value; number of standard deviations beyond
+# which cells are removed; ratio of the standard deviation of all cells to that of the remaining cells.
+_DEVIATION_PER_MEDIAN, _CLIPPING_DEVIATIONS, _CLIPPED_DEVIATION = 1.4826, 3.0, 1.0136
 # Maximum number of rounds of clipping.
-_ROUNDS = 20
+_MAX_ROUNDS = 20
 
 
 class ImageNoise(Module):
@@ -43,13 +43,13 @@ class ImageNoise(Module):
 
         Raises `ValueError` for deviations that are negative or not finite, and a factor for another number of cells.
         """
-        wanted = "an array (m,), one number a cell, zero or more and finite, in the unit of the image"
-        check_kind("deviation", self.deviation, (np.ndarray, jax.Array), wanted)
-        deviation = real_array("deviation", self.deviation, wanted)
+        requirement = "an array (m,), one number a cell, zero or more and finite, in the unit of the image"
+        check_kind("deviation", self.deviation, (np.ndarray, jax.Array), requirement)
+        deviation = real_array("deviation", self.deviation, requirement)
         if deviation.ndim != 1:
-            raise ValueError(f"deviation must be {wanted}; it has shape {deviation.shape}.")
+            raise ValueError(f"deviation must be {requirement}; it has shape {deviation.shape}.")
         if not (np.isfinite(deviation).all() and (deviation >= 0).all()):
-            raise ValueError(f"deviation must be {wanted}; some of it is negative or not finite.")
+            raise ValueError(f"deviation must be {requirement}; some of it is negative or not finite.")
         if self.factor is not None and np.shape(self.factor)[1:] != deviation.shape:
             shape = np.shape(self.factor)
             raise ValueError(f"factor has shape {shape}; give (r, {deviation.size}), a column for each cell.")
@@ -64,24 +64,24 @@ class ImageNoise(Module):
         """
         check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
         frames = real_array("frames", frames, "voltages (n, M)")
-        if frames.ndim != 2 or len(frames) < _LEAST_FRAMES:
+        if frames.ndim != 2 or len(frames) < _MIN_NUM_FRAMES:
             raise ValueError(
                 f"frames has shape {frames.shape}; give (n, {reconstruction.num_measurements}) volts of an untouched "
-                f"skin, {counted(_LEAST_FRAMES, 'frame')} or more."
+                f"skin, {counted(_MIN_NUM_FRAMES, 'frame')} or more."
             )
         if (frames == frames[0]).all():
             raise ValueError("frames are all the same and show no noise. Give what was read, not copies of a frame.")
-        strayed = np.asarray(reconstruction.image(frames - frames.mean(axis=0)))
-        return cls._from_factor(strayed / np.sqrt(len(frames) - 1))
+        noise_images = np.asarray(reconstruction.image(frames - frames.mean(axis=0)))
+        return cls._from_factor(noise_images / np.sqrt(len(frames) - 1))
 
     @classmethod
     def of_images(cls, images: Float[np.ndarray, "n m"]) -> "ImageNoise":
         """Estimate the noise from at least ten images (n, m) of the untouched skin. Raises `ValueError` for fewer
         images, NaN, and images that are all the same."""
         images = real_array("images", images, "changes of conductivity (n, m)")
-        if images.ndim != 2 or len(images) < _LEAST_FRAMES or not np.isfinite(images).all():
+        if images.ndim != 2 or len(images) < _MIN_NUM_FRAMES or not np.isfinite(images).all():
             raise ValueError(
-                f"images has shape {images.shape}; give {counted(_LEAST_FRAMES, 'image')} or more of the untouched "
+                f"images has shape {images.shape}; give {counted(_MIN_NUM_FRAMES, 'image')} or more of the untouched "
                 "skin, (n, m), without NaN."
             )
         if (images == images[0]).all():
@@ -96,13 +96,13 @@ class ImageNoise(Module):
         deviations that are negative, not finite, all zero, or for another number of channels.
         """
         check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
-        number = reconstruction.num_measurements
-        deviation = real_array("deviation", deviation, f"one number, or ({number},), volts")
-        if deviation.shape not in ((), (number,)):
-            raise ValueError(f"deviation has shape {deviation.shape}; give one number, or ({number},), volts.")
+        num_channels = reconstruction.num_measurements
+        deviation = real_array("deviation", deviation, f"one number, or ({num_channels},), volts")
+        if deviation.shape not in ((), (num_channels,)):
+            raise ValueError(f"deviation has shape {deviation.shape}; give one number, or ({num_channels},), volts.")
         if not (np.isfinite(deviation).all() and (deviation >= 0).all() and deviation.any()):
             raise ValueError("deviation must be finite, zero or more, and not zero for all channels, in volts.")
-        return cls._from_factor(np.broadcast_to(deviation, number)[:, None] * np.asarray(reconstruction.matrix).T)
+        return cls._from_factor(np.broadcast_to(deviation, num_channels)[:, None] * np.asarray(reconstruction.matrix).T)
 
     @classmethod
     def of_image(cls, image: Float[np.ndarray, " m"]) -> "ImageNoise":
@@ -147,12 +147,12 @@ def _clipped_deviation(values: Float[np.ndarray, " m"]) -> float:
 
     For clipping, the standard deviation is estimated from the median distance from the median.
     """
-    kept = values
-    for _ in range(_ROUNDS):
-        middle = np.median(kept)
-        spread = _DEVIATION_PER_MEDIAN * np.median(np.abs(kept - middle))
-        within = values[np.abs(values - middle) <= _CLIP_AT * spread]
-        if len(within) == len(kept):
+    remaining_values = values
+    for _ in range(_MAX_ROUNDS):
+        median = np.median(remaining_values)
+        spread = _DEVIATION_PER_MEDIAN * np.median(np.abs(remaining_values - median))
+        values_within = values[np.abs(values - median) <= _CLIPPING_DEVIATIONS * spread]
+        if len(values_within) == len(remaining_values):
             break
-        kept = within
-    return float(_CLIPPED_DEVIATION * kept.std())
+        remaining_values = values_within
+    return float(_CLIPPED_DEVIATION * remaining_values.std())

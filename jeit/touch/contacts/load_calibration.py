@@ -23,11 +23,11 @@ from jeit.touch.contacts.finder import Contact
 from jeit_solvers.module import Module
 
 # Minimum number of contacts: one for each parameter s, b, c and F½, and four degrees of freedom for the scatter.
-_FEWEST = 8
+_MIN_NUM_CONTACTS = 8
 # Maximum ratio of a peak to the saturated peak; near saturation, the load is undetermined.
-_HIGHEST = 0.98
+_MAX_SATURATION = 0.98
 # Divided by the skin's radius: maximum distance of a contact from the middle; minimum width of the widest contact.
-_FARTHEST, _NARROWEST = 10.0, 1e-3
+_MAX_RELATIVE_DISTANCE, _MIN_RELATIVE_WIDTH = 10.0, 1e-3
 
 
 class Load(Module):
@@ -79,49 +79,54 @@ class LoadCalibration(Module):
         check_metres("radius", radius)
         check_kind("contacts", contacts, (list, tuple), "a list of them, one for each load")
         loads = real_array("loads", loads, "newtons, one for each contact")
-        if len(contacts) < _FEWEST or loads.shape != (len(contacts),):
+        if len(contacts) < _MIN_NUM_CONTACTS or loads.shape != (len(contacts),):
             raise ValueError(
-                f"contacts and loads: give {_FEWEST} or more, one load for each; there are {len(contacts)} "
+                f"contacts and loads: give {_MIN_NUM_CONTACTS} or more, one load for each; there are {len(contacts)} "
                 f"contacts, and loads of shape {loads.shape}."
             )
-        for number, contact in enumerate(contacts):
-            check_kind(f"contacts[{number}]", contact, Contact, "a Contact, as of find_contacts")
+        for index, contact in enumerate(contacts):
+            check_kind(f"contacts[{index}]", contact, Contact, "a Contact, as of find_contacts")
         if not (np.isfinite(loads).all() and (loads > 0).all() and np.ptp(loads) > 0):
             raise ValueError("loads must be positive, in newtons, and not all the same.")
-        peaks = np.array([one.peak for one in contacts])
+        peaks = np.array([contact.peak for contact in contacts])
         if abs(np.sign(peaks).sum()) != len(peaks):
             raise ValueError("contacts: their peaks must all be of one sign, and none zero.")
         centre = real_array("centre", centre, "(x, y) in metres")
         if centre.shape != (2,) or not np.isfinite(centre).all():
             raise ValueError(f"centre must be (x, y) in metres, finite; it is {centre.tolist()}.")
-        distance = np.array([np.linalg.norm(one.centroid - centre) for one in contacts]) / radius
-        widest = max(float(np.sqrt(one.area)) for one in contacts)
-        if not (distance.max() < _FARTHEST and widest > _NARROWEST * radius):
-            most = 1e3 * radius * distance.max()
+        distances = np.array([np.linalg.norm(contact.centroid - centre) for contact in contacts]) / radius
+        max_width = max(float(np.sqrt(contact.area)) for contact in contacts)
+        if not (distances.max() < _MAX_RELATIVE_DISTANCE and max_width > _MIN_RELATIVE_WIDTH * radius):
+            max_distance_mm = 1e3 * radius * distances.max()
             raise ValueError(
-                f"radius is {1e3 * radius:g} mm, and contacts lie up to {most:.3g} mm from the centre, and are "
-                f"{1e3 * widest:.2g} mm wide; give the skin's radius, and its centre, in metres."
+                f"radius is {1e3 * radius:g} mm, and contacts lie up to {max_distance_mm:.3g} mm from the centre, and "
+                f"are {1e3 * max_width:.2g} mm wide; give the skin's radius, and its centre, in metres."
             )
-        logarithm = np.log(np.abs(peaks))
-        begin = np.array([logarithm.max(), 0.0, 0.0, np.log(np.median(loads))])
+        log_peaks = np.log(np.abs(peaks))
+        initial_parameters = np.array([log_peaks.max(), 0.0, 0.0, np.log(np.median(loads))])
 
         def residuals(parameters):
-            return _log_peak(parameters, distance, loads) - logarithm
+            return _log_peak(parameters, distances, loads) - log_peaks
 
         # Weak priors, each with the weight of a thousandth of a reading, for parameters that places or loads do not
         # determine.
-        weak = np.sqrt(1e-3) * np.array([0.0, 0.3, 0.3, 0.3])
-        found = least_squares(
-            lambda parameters: np.concatenate([residuals(parameters), weak * (parameters - begin)]), begin
+        prior_weights = np.sqrt(1e-3) * np.array([0.0, 0.3, 0.3, 0.3])
+        optimum = least_squares(
+            lambda parameters: np.concatenate(
+                [residuals(parameters), prior_weights * (parameters - initial_parameters)]
+            ),
+            initial_parameters,
         )
-        if not found.success:
-            raise ValueError(f"contacts and loads: no curve fits them ({found.message}).")
-        scatter = float(np.sqrt((residuals(found.x) ** 2).sum() / (len(loads) - len(begin))))
-        covariance = scatter**2 * np.linalg.inv(found.jac.T @ found.jac)
-        highest = float((loads / (loads + np.exp(found.x[3]))).max())
-        span = float(loads.min()), float(loads.max())
+        if not optimum.success:
+            raise ValueError(f"contacts and loads: no curve fits them ({optimum.message}).")
+        scatter = float(np.sqrt((residuals(optimum.x) ** 2).sum() / (len(loads) - len(initial_parameters))))
+        covariance = scatter**2 * np.linalg.inv(optimum.jac.T @ optimum.jac)
+        highest = float((loads / (loads + np.exp(optimum.x[3]))).max())
+        load_range = float(loads.min()), float(loads.max())
         sign = int(np.sign(peaks[0]))
-        return cls(centre, float(radius), found.x, covariance, sign, scatter, span, float(distance.max()), highest)
+        return cls(
+            centre, float(radius), optimum.x, covariance, sign, scatter, load_range, float(distances.max()), highest
+        )
 
     def load(self, contact: Contact) -> Load:
         """Estimate the load of a contact, newtons, and its standard deviation.
@@ -143,24 +148,24 @@ class LoadCalibration(Module):
                 f"contact is {1e3 * distance * self.radius:.1f} mm from the middle, and calibrated contacts reach "
                 f"{1e3 * self.farthest * self.radius:.1f} mm; calibrate with loads farther out."
             )
-        scale, first, second, half = self.parameters
-        share = abs(contact.peak) / np.exp(scale + first * distance**2 + second * distance**4)
+        log_scale, quadratic, quartic, log_half_load = self.parameters
+        saturation = abs(contact.peak) / np.exp(log_scale + quadratic * distance**2 + quartic * distance**4)
         # A peak less than two standard deviations above the calibrated ones is no evidence of a larger load.
-        if share > min(self.highest * np.exp(2 * self.scatter), max(self.highest, _HIGHEST)):
+        if saturation > min(self.highest * np.exp(2 * self.scatter), max(self.highest, _MAX_SATURATION)):
             raise ValueError(
-                f"contact: its peak {describe(contact.peak)} is {share / self.highest:.2f} times the highest that was "
-                f"calibrated there, by {self.loads[1]:g} N; calibrate with greater loads."
+                f"contact: its peak {describe(contact.peak)} is {saturation / self.highest:.2f} times the highest "
+                f"that was calibrated there, by {self.loads[1]:g} N; calibrate with greater loads."
             )
-        force = float(np.exp(half) * share / (1 - share))
-        # Derivatives of log F with respect to log peak: 1 / (1 − share); with respect to log s, b and c: minus that,
-        # times the derivative of log peak; with respect to log F½: 1.
-        steep = 1 / (1 - share)
-        slope = np.array([-steep, -steep * distance**2, -steep * distance**4, 1.0])
-        variance = slope @ self.covariance @ slope + (steep * self.scatter) ** 2
+        force = float(np.exp(log_half_load) * saturation / (1 - saturation))
+        # Derivatives of log F with respect to log peak: 1 / (1 − saturation); with respect to log s, b and c: minus
+        # that, times the derivative of log peak; with respect to log F½: 1.
+        sensitivity = 1 / (1 - saturation)
+        derivatives = np.array([-sensitivity, -sensitivity * distance**2, -sensitivity * distance**4, 1.0])
+        variance = derivatives @ self.covariance @ derivatives + (sensitivity * self.scatter) ** 2
         return Load(force, force * float(np.sqrt(variance)))
 
 
 def _log_peak(parameters, distance, loads):
-    """Logarithms of the peaks of contacts at distances ρ under loads in newtons."""
-    scale, first, second, half = parameters
-    return scale + first * distance**2 + second * distance**4 + np.log(loads / (loads + np.exp(half)))
+    """Logarithms of the peaks of contacts at the relative distances ρ = `distance` under `loads`, newtons."""
+    log_scale, quadratic, quartic, log_half_load = parameters
+    return log_scale + quadratic * distance**2 + quartic * distance**4 + np.log(loads / (loads + np.exp(log_half_load)))

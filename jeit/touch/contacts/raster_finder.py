@@ -32,9 +32,9 @@ from jeit.touch.contacts.image_noise import ImageNoise
 from jeit_solvers.module import Module
 
 # Width in pixels of the band along a contact's edge in which cells may join or leave the contact.
-_EDGE = 15
+_EDGE_WIDTH = 15
 # Maximum number of pixels along a side: more would need much memory, and no image has as many cells.
-_MOST_PIXELS = 4096
+_MAX_PIXELS = 4096
 
 
 class RasterStages(Module):
@@ -110,11 +110,13 @@ class RasterFinder(AbstractFinder):
         """
         _import_opencv()
         check_finder(mesh, sign, floor)
-        for name, value, least in (("block", block, 3), ("opening", opening, 1)):
-            if not (isinstance(value, int) and value >= least and value % 2):
-                raise ValueError(f"{name} must be an odd number of pixels from {least} up; it is {describe(value)}.")
-        if not (isinstance(pixels, int) and 16 <= pixels <= _MOST_PIXELS):
-            raise ValueError(f"pixels must be a whole number from 16 to {_MOST_PIXELS}; it is {describe(pixels)}.")
+        for name, value, min_width in (("block", block, 3), ("opening", opening, 1)):
+            if not (isinstance(value, int) and value >= min_width and value % 2):
+                raise ValueError(
+                    f"{name} must be an odd number of pixels from {min_width} up; it is {describe(value)}."
+                )
+        if not (isinstance(pixels, int) and 16 <= pixels <= _MAX_PIXELS):
+            raise ValueError(f"pixels must be a whole number from 16 to {_MAX_PIXELS}; it is {describe(pixels)}.")
         if not (is_number(constant) and abs(constant) < 255):
             raise ValueError(f"constant must be grey levels, between −255 and 255; it is {describe(constant)}.")
         self.raster = Raster.create(mesh, shape=(pixels, pixels))
@@ -124,105 +126,123 @@ class RasterFinder(AbstractFinder):
 
     def find(self, change, noise):
         """See `find_contacts`."""
-        _, clear = self.above_noise(change, noise)
-        return self._stages(change, noise).contacts if clear.any() else []
+        _, clear_change = self.above_noise(change, noise)
+        return self._stages(change, noise).contacts if clear_change.any() else []
 
     def stages(self, image: Float[np.ndarray, " m"], noise: ImageNoise | None = None) -> RasterStages:
         """Compute the results of all steps for an image (m,) and its noise; arguments and errors are those of
         `find_contacts`."""
         change = signed_image(self, image)
-        found = self._stages(change, noise_or_estimate(change, noise))
-        own = self.sign * found.region, restore_sign(self, found.contacts)
-        return eqx.tree_at(lambda stages: (stages.region, stages.contacts), found, own)
+        stages = self._stages(change, noise_or_estimate(change, noise))
+        signed_results = self.sign * stages.region, restore_sign(self, stages.contacts)
+        return eqx.tree_at(lambda results: (results.region, results.contacts), stages, signed_results)
 
     def _stages(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> RasterStages:
         """Compute the results of all steps for a `change` (m,) whose sign makes contacts positive."""
         opencv = _import_opencv()
-        cell = np.asarray(self.raster.cell)
-        inside = cell >= 0
-        change, clear = self.above_noise(change, noise)
-        region, clear = np.where(inside, change[cell], np.nan), np.where(inside, clear[cell], 0.0)
-        highest = clear.max()
-        grey = np.rint(255 * clear / (highest or 1.0)).astype(np.uint8)
+        cell_indices = np.asarray(self.raster.cell)
+        is_on_skin = cell_indices >= 0
+        change, clear_change = self.above_noise(change, noise)
+        region, clear_change = (
+            np.where(is_on_skin, change[cell_indices], np.nan),
+            np.where(is_on_skin, clear_change[cell_indices], 0.0),
+        )
+        max_change = clear_change.max()
+        grey = np.rint(255 * clear_change / (max_change or 1.0)).astype(np.uint8)
         # OpenCV keeps pixels above the local mean minus its constant, so that a negative constant is passed. Pixels
         # beside the skin are set to the mean of the skin's pixels nearby: if they were black, the whole rim of the skin
         # would exceed the local mean.
-        size = (self.block, self.block)
-        weight = np.maximum(opencv.GaussianBlur(inside * 1.0, size, 0), 1e-12)
-        near = opencv.GaussianBlur(grey * 1.0, size, 0) / weight
+        block_size = (self.block, self.block)
+        skin_weights = np.maximum(opencv.GaussianBlur(is_on_skin * 1.0, block_size, 0), 1e-12)
+        local_means = opencv.GaussianBlur(grey * 1.0, block_size, 0) / skin_weights
         threshold = opencv.adaptiveThreshold(
-            np.where(inside, grey, near).astype(np.uint8),
+            np.where(is_on_skin, grey, local_means).astype(np.uint8),
             255,
             opencv.ADAPTIVE_THRESH_GAUSSIAN_C,
             opencv.THRESH_BINARY,
             self.block,
             -self.constant,
-        ) * inside.astype(np.uint8)
+        ) * is_on_skin.astype(np.uint8)
         ellipse = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (self.opening, self.opening))
         opened = opencv.morphologyEx(threshold, opencv.MORPH_OPEN, ellipse)
         contours, _ = opencv.findContours(opened, opencv.RETR_EXTERNAL, opencv.CHAIN_APPROX_NONE)
-        stray = self._membership_noise(cell[inside], (grey - near - self.constant)[inside] * highest / 255, noise)
+        membership_noise = self._membership_noise(
+            cell_indices[is_on_skin], (grey - local_means - self.constant)[is_on_skin] * max_change / 255, noise
+        )
         contacts = [
-            self._contact(opencv, region, contour[:, 0], stray, weight, clear > 0, noise) for contour in contours
+            self._contact(opencv, region, contour[:, 0], membership_noise, skin_weights, clear_change > 0, noise)
+            for contour in contours
         ]
-        kept = sorted((one for one in contacts if one is not None), key=lambda one: -one.peak)
-        return RasterStages(region, grey, threshold > 0, opened > 0, kept, self.raster.extent)
+        sorted_contacts = sorted(
+            (contact for contact in contacts if contact is not None), key=lambda contact: -contact.peak
+        )
+        return RasterStages(region, grey, threshold > 0, opened > 0, sorted_contacts, self.raster.extent)
 
     def _contact(
-        self, opencv, region, contour: np.ndarray, stray: tuple, weight, clear, noise: ImageNoise
+        self, opencv, region, contour: np.ndarray, membership_noise: tuple, skin_weights, is_clear, noise: ImageNoise
     ) -> Contact | None:
         """Describe the contact that a contour (k, 2) of columns and rows encloses.
 
-        Returns None if the contour encloses no pixel of the skin. `stray`: see `_membership_noise`; `weight` (rows,
-        columns): weight of the skin's pixels in the local means; `clear` (rows, columns): whether pixels are above the
-        noise floor.
+        Returns None if the contour encloses no pixel of the skin. `membership_noise`: see `_membership_noise`;
+        `skin_weights` (rows, columns): weight of the skin's pixels in the local means; `is_clear` (rows, columns):
+        whether pixels are above the noise floor.
         """
-        filled = np.zeros(region.shape, np.uint8)
-        opencv.drawContours(filled, [contour[:, None]], -1, 1, opencv.FILLED)
-        within = (filled > 0) & np.isfinite(region)
-        if not within.any():
+        filled_contour = np.zeros(region.shape, np.uint8)
+        opencv.drawContours(filled_contour, [contour[:, None]], -1, 1, opencv.FILLED)
+        is_inside = (filled_contour > 0) & np.isfinite(region)
+        if not is_inside.any():
             return None
-        place = self.raster.pixel_centres()
-        centroid, area = place[within].mean(axis=0), float(self.raster.pixel_area * within.sum())
-        (together, alone), size = stray, (self.block, self.block)
+        pixel_centres = self.raster.pixel_centres()
+        centroid, area = pixel_centres[is_inside].mean(axis=0), float(self.raster.pixel_area * is_inside.sum())
+        (value_slopes, independent_deviations), block_size = membership_noise, (self.block, self.block)
         # Cells join and leave a contact only at its edge: everything inside the contour counts, whatever its grey
         # level.
-        ellipse = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (_EDGE, _EDGE))
-        edge = (opencv.dilate(filled, ellipse) > opencv.erode(filled, ellipse)) & np.isfinite(region)
-        cell = np.asarray(self.raster.cell)
-        lever = np.where(edge[..., None], (place - centroid) * self.raster.pixel_area / area, 0.0)
-        follows = np.where(edge, together[cell], 0.0)[..., None] * lever
+        ellipse = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (_EDGE_WIDTH, _EDGE_WIDTH))
+        is_edge = (opencv.dilate(filled_contour, ellipse) > opencv.erode(filled_contour, ellipse)) & np.isfinite(region)
+        cell_indices = np.asarray(self.raster.cell)
+        centroid_shifts = np.where(is_edge[..., None], (pixel_centres - centroid) * self.raster.pixel_area / area, 0.0)
+        dependent_shifts = np.where(is_edge, value_slopes[cell_indices], 0.0)[..., None] * centroid_shifts
         # Noise moves the threshold too, through the local mean of the pixels.
-        spread = opencv.GaussianBlur((follows / weight[..., None]).astype(np.float32), size, 0)
-        slope = self._sum_over_cells(follows - spread * clear[..., None])
-        moved = noise.distance(self.smoothing.T @ slope), np.linalg.norm(alone[:, None] * self._sum_over_cells(lever))
+        mean_shifts = opencv.GaussianBlur(
+            (dependent_shifts / skin_weights[..., None]).astype(np.float32), block_size, 0
+        )
+        centroid_derivative = self._sum_over_cells(dependent_shifts - mean_shifts * is_clear[..., None])
+        displacements = (
+            noise.distance(self.smoothing.T @ centroid_derivative),
+            np.linalg.norm(independent_deviations[:, None] * self._sum_over_cells(centroid_shifts)),
+        )
         column, row = contour.T
-        change = region[within]
+        change = region[is_inside]
         integral = float(self.raster.pixel_area * change.sum())
-        return Contact(centroid, area, float(change.max()), integral, place[row, column], float(np.hypot(*moved)))
+        return Contact(
+            centroid, area, float(change.max()), integral, pixel_centres[row, column], float(np.hypot(*displacements))
+        )
 
     def _sum_over_cells(self, values: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "m 2"]:
         """Sum values of pixels over the pixels of each cell."""
-        cell = np.asarray(self.raster.cell)
-        own, weights = cell[cell >= 0], values[cell >= 0].T
-        return np.stack([np.bincount(own, one, minlength=self.num_cells) for one in weights], axis=-1)
+        cell_indices = np.asarray(self.raster.cell)
+        pixel_cells, pixel_values = cell_indices[cell_indices >= 0], values[cell_indices >= 0].T
+        return np.stack(
+            [np.bincount(pixel_cells, component_values, minlength=self.num_cells) for component_values in pixel_values],
+            axis=-1,
+        )
 
     def _membership_noise(
-        self, cell: np.ndarray, above: np.ndarray, noise: ImageNoise
+        self, cell_indices: np.ndarray, excess: np.ndarray, noise: ImageNoise
     ) -> tuple[np.ndarray, np.ndarray]:
         """Uncertainty of the membership of every cell: slope (m,) with respect to its value, and independent part (m,).
 
-        Whole cells are inside or outside a contact. A cell whose smoothed value exceeds the threshold by `above` on
+        Whole cells are inside or outside a contact. A cell whose smoothed value exceeds the threshold by `excess` on
         average, with standard deviation σ, is inside with probability p = Φ(z), z = above / σ. On average, its
-        membership changes with its value at the rate φ(z) / σ; the rest has the standard deviation √(p (1 − p) −
-        φ(z)²), independently for each cell.
+        membership changes with its value at the rate φ(z) / σ; the remaining part has the standard deviation
+        √(p (1 − p) − φ(z)²), independently for each cell.
         """
-        number = np.bincount(cell, minlength=self.num_cells)
-        mean = np.bincount(cell, above, minlength=self.num_cells) / np.maximum(number, 1)
+        num_pixels = np.bincount(cell_indices, minlength=self.num_cells)
+        mean_excess = np.bincount(cell_indices, excess, minlength=self.num_cells) / np.maximum(num_pixels, 1)
         deviation = np.maximum(noise.smoothed(self.smoothing), np.finfo(float).tiny)
-        off = mean / deviation
-        chance, density = ndtr(off), np.exp(-(off**2) / 2) / np.sqrt(2 * np.pi)
-        return density / deviation, np.sqrt(np.maximum(chance * (1 - chance) - density**2, 0.0))
+        normalised_excess = mean_excess / deviation
+        probability, density = ndtr(normalised_excess), np.exp(-(normalised_excess**2) / 2) / np.sqrt(2 * np.pi)
+        return density / deviation, np.sqrt(np.maximum(probability * (1 - probability) - density**2, 0.0))
 
 
 def _import_opencv() -> Any:

@@ -52,25 +52,25 @@ class _TrackedTouch(Module):
     """State of a touch that is being tracked.
 
     **Fields**: `number`: position in order of onset; `time`: time of the last frame, seconds; `place`: position at that
-    time, metres; `velocity`: m/s; `seen`: times and contacts so far; `hidden`: whether another touch's contact may hide
-    it now.
+    time, metres; `velocity`: m/s; `observations`: times and contacts so far; `is_hidden`: whether the contact of
+    another touch may hide it now.
     """
 
     number: int
     time: float
-    place: Float[np.ndarray, "2"]
+    position: Float[np.ndarray, "2"]
     velocity: Float[np.ndarray, "2"]
-    seen: tuple[tuple[float, Contact], ...]
-    hidden: bool = False
+    observations: tuple[tuple[float, Contact], ...]
+    is_hidden: bool = False
 
-    def at(self, time: float) -> np.ndarray:
-        """Predicted position at a time, metres."""
-        return self.place + (time - self.time) * self.velocity
+    def predicted_position(self, time: float) -> np.ndarray:
+        """Predicted position at a `time` in seconds, metres."""
+        return self.position + (time - self.time) * self.velocity
 
     def path(self) -> TouchPath:
         """Return the path so far."""
-        times, contacts = zip(*self.seen, strict=True)
-        columns = ([getattr(one, name) for one in contacts] for name in ("centroid", "peak", "area"))
+        times, contacts = zip(*self.observations, strict=True)
+        columns = ([getattr(contact, name) for contact in contacts] for name in ("centroid", "peak", "area"))
         return TouchPath(self.number, np.array(times), *map(np.array, columns))
 
 
@@ -129,35 +129,56 @@ class ContactTracker(Module):
         check_kind("contacts", contacts, (list, tuple, np.ndarray), "a list of them, those of one frame")
         for number, contact in enumerate(contacts):
             check_kind(f"contacts[{number}]", contact, Contact, "a Contact, as of find_contacts")
-        passed = time - self.time
+        interval = time - self.time
         # The interval between frames is added, up to the gap, so that a single missing frame of a slow stream is
         # bridged too.
-        spare = min(passed, self.gap)
-        waited = [time - one.seen[-1][0] > self.gap * (_HIDDEN_GAPS if one.hidden else 1) + spare for one in self.open]
-        late = [one for one, over in zip(self.open, waited, strict=True) if over]
-        going = [one for one, over in zip(self.open, waited, strict=True) if not over]
-        expected = np.array([one.at(time) for one in going]).reshape(-1, 1, 2)
-        places = np.array([one.centroid for one in contacts]).reshape(1, -1, 2)
-        distance = np.linalg.norm(expected - places, axis=-1)
-        most = self.reach + self.fastest * passed if going else 0.0
+        tolerance = min(interval, self.gap)
+        has_ended = [
+            time - touch.observations[-1][0] > self.gap * (_HIDDEN_GAPS if touch.is_hidden else 1) + tolerance
+            for touch in self.open
+        ]
+        ended_touches = [touch for touch, ended in zip(self.open, has_ended, strict=True) if ended]
+        current_touches = [touch for touch, ended in zip(self.open, has_ended, strict=True) if not ended]
+        predicted_positions = np.array([touch.predicted_position(time) for touch in current_touches])
+        contact_positions = np.array([contact.centroid for contact in contacts])
+        distances = np.linalg.norm(predicted_positions.reshape(-1, 1, 2) - contact_positions.reshape(1, -1, 2), axis=-1)
+        max_distance = self.reach + self.fastest * interval if current_touches else 0.0
         # Pairs beyond the maximum distance all cost the same, so that no pair within it is given up for them.
-        rows, columns = linear_sum_assignment(np.where(distance <= most, distance, 1e3 * most))
-        pairs = {int(row): int(one) for row, one in zip(rows, columns, strict=True) if distance[row, one] <= most}
-        wide = self.reach + np.sqrt(np.array([one.area for one in contacts]) / np.pi)
-        lost = [row for row in range(len(going)) if row not in pairs]
-        hidden = {row for row in lost for one in pairs.values() if distance[row, one] <= wide[one]}
-        followed = [
-            _update_touch(one, time, contacts[pairs[row]])
-            if row in pairs
-            else _TrackedTouch(one.number, time, one.at(time), one.velocity, one.seen, row in hidden)
-            for row, one in enumerate(going)
+        rows, columns = linear_sum_assignment(np.where(distances <= max_distance, distances, 1e3 * max_distance))
+        # Index of the contact that is assigned to each touch, by the index of the touch.
+        assigned_contacts = {
+            int(row): int(column)
+            for row, column in zip(rows, columns, strict=True)
+            if distances[row, column] <= max_distance
+        }
+        hiding_distances = self.reach + np.sqrt(np.array([contact.area for contact in contacts]) / np.pi)
+        unassigned_touches = [row for row in range(len(current_touches)) if row not in assigned_contacts]
+        hidden_touches = {
+            row
+            for row in unassigned_touches
+            for column in assigned_contacts.values()
+            if distances[row, column] <= hiding_distances[column]
+        }
+        updated_touches = [
+            _update_touch(touch, time, contacts[assigned_contacts[row]])
+            if row in assigned_contacts
+            else _TrackedTouch(
+                touch.number,
+                time,
+                touch.predicted_position(time),
+                touch.velocity,
+                touch.observations,
+                row in hidden_touches,
+            )
+            for row, touch in enumerate(current_touches)
         ]
-        new = [contacts[one] for one in range(len(contacts)) if one not in pairs.values()]
-        first = [
-            _TrackedTouch(self.number + k, time, one.centroid, np.zeros(2), ((time, one),)) for k, one in enumerate(new)
+        new_contacts = [contacts[column] for column in range(len(contacts)) if column not in assigned_contacts.values()]
+        new_touches = [
+            _TrackedTouch(self.number + index, time, contact.centroid, np.zeros(2), ((time, contact),))
+            for index, contact in enumerate(new_contacts)
         ]
-        closed = self.closed + self._finished_paths(late)
-        values = (time, (*followed, *first), closed, self.number + len(new))
+        closed = self.closed + self._finished_paths(ended_touches)
+        values = (time, (*updated_touches, *new_touches), closed, self.number + len(new_contacts))
         return ContactTracker(self.gap, self.reach, self.fastest, self.least, *values)
 
     @property
@@ -165,8 +186,8 @@ class ContactTracker(Module):
         """All touches so far, including the current ones, in order of onset."""
         return sorted(self.closed + self._finished_paths(self.open), key=lambda path: path.number)
 
-    def _finished_paths(self, tracked: Iterable[_TrackedTouch]) -> tuple[TouchPath, ...]:
-        return tuple(one.path() for one in tracked if len(one.seen) >= self.least)
+    def _finished_paths(self, touches: Iterable[_TrackedTouch]) -> tuple[TouchPath, ...]:
+        return tuple(touch.path() for touch in touches if len(touch.observations) >= self.least)
 
 
 def track_contacts(
@@ -189,22 +210,24 @@ def track_contacts(
     print([path.position for path in paths])
     ```
     """
-    wanted = "a list with those of every frame, each a list"
-    check_kind("contacts", contacts, (list, tuple, np.ndarray), wanted)
-    for number, found in enumerate(contacts):
-        check_kind(f"contacts[{number}]", found, (list, tuple, np.ndarray), "a list of contacts, those of one frame")
+    requirement = "a list with those of every frame, each a list"
+    check_kind("contacts", contacts, (list, tuple, np.ndarray), requirement)
+    for index, frame_contacts in enumerate(contacts):
+        check_kind(
+            f"contacts[{index}]", frame_contacts, (list, tuple, np.ndarray), "a list of contacts, those of one frame"
+        )
     times = real_array("times", times, "seconds (F,), one for each frame")
     if times.shape != (len(contacts),):
         raise ValueError(f"times: give one for each of the {len(contacts)} frames; they have shape {times.shape}.")
     tracker = ContactTracker() if tracker is None else tracker
     check_kind("tracker", tracker, ContactTracker, "a ContactTracker(), to begin with")
-    for time, found in zip(times, contacts, strict=True):
-        tracker = tracker.follow(float(time), found)
+    for time, frame_contacts in zip(times, contacts, strict=True):
+        tracker = tracker.follow(float(time), frame_contacts)
     return tracker.touches
 
 
 def _update_touch(touch: _TrackedTouch, time: float, contact: Contact) -> _TrackedTouch:
     """Return the state of a touch after a frame in which it is seen as this contact."""
-    off = (contact.centroid - touch.at(time)) / (time - touch.time)
-    velocity = touch.velocity + _VELOCITY_GAIN * off
-    return _TrackedTouch(touch.number, time, contact.centroid, velocity, (*touch.seen, (time, contact)))
+    velocity_error = (contact.centroid - touch.predicted_position(time)) / (time - touch.time)
+    velocity = touch.velocity + _VELOCITY_GAIN * velocity_error
+    return _TrackedTouch(touch.number, time, contact.centroid, velocity, (*touch.observations, (time, contact)))

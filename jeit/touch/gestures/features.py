@@ -24,19 +24,19 @@ FEATURES = {
 """Names of the seven features of a touch, and their units; "image" stands for the unit of the images."""
 
 # Number of instants, evenly spaced from onset to end of a touch, at which the maximum change P is sampled.
-_INSTANTS = 16
-_FURTHER = (
+_NUM_INSTANTS = 16
+_FURTHER_FEATURES = (
     "area", "area spread", "path length", "farthest", "speed", "fastest", "straightness", "peaks", "rise", "decay",
     "roughness", "pauses", "centre of gravity", "breadth",
 )  # fmt: skip
-COURSE_FEATURES = (*FEATURES, *_FURTHER, *(f"course {one + 1}" for one in range(_INSTANTS)))
+COURSE_FEATURES = (*FEATURES, *_FURTHER_FEATURES, *(f"course {instant + 1}" for instant in range(_NUM_INSTANTS)))
 """Names of the features of `course_features`: the seven, further ones of the time course, and samples of P."""
 
-SEQUENCE_PLACES = 32
+NUM_SEQUENCE_INSTANTS = 32
 SEQUENCE_VALUES = ("change", "share", "mean", "area", "half", "speed", "distance", "along")
-"""Quantities that `sequence_features` samples at each of `SEQUENCE_PLACES` instants of a touch, from onset to end."""
+"""Quantities that `sequence_features` samples at `NUM_SEQUENCE_INSTANTS` instants of a touch, from onset to end."""
 SEQUENCE_FEATURES = (
-    *COURSE_FEATURES, *(f"{name} {one + 1}" for one in range(SEQUENCE_PLACES) for name in SEQUENCE_VALUES)
+    *COURSE_FEATURES, *(f"{name} {instant + 1}" for instant in range(NUM_SEQUENCE_INSTANTS) for name in SEQUENCE_VALUES)
 )  # fmt: skip
 """Names of the features of `sequence_features`."""
 
@@ -80,7 +80,7 @@ def touch_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Touc
     ```
     """
     courses = _time_courses(touches)
-    values = np.array([_seven_features(one) for one in courses]).reshape(len(courses), len(FEATURES))
+    values = np.array([_seven_features(course) for course in courses]).reshape(len(courses), len(FEATURES))
     return TouchFeatures(values, tuple(FEATURES), tuple(FEATURES.values()))
 
 
@@ -95,10 +95,12 @@ def course_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Tou
     `touches` is not a list of touches.
     """
     courses = _time_courses(touches)
-    seven = touch_features(touches)
-    values = np.array([_further_features(one) for one in courses]).reshape(len(courses), len(_FURTHER) + _INSTANTS)
-    units = ("m²", "1", "m", "m", "m/s", "m/s", "1", "1", "s", "s", "1", "1", "1", "1", *["1"] * _INSTANTS)
-    return TouchFeatures(np.hstack([seven.values, values]), COURSE_FEATURES, (*seven.units, *units))
+    seven_features = touch_features(touches)
+    values = np.array([_further_features(course) for course in courses]).reshape(
+        len(courses), len(_FURTHER_FEATURES) + _NUM_INSTANTS
+    )
+    units = ("m²", "1", "m", "m", "m/s", "m/s", "1", "1", "s", "s", "1", "1", "1", "1", *["1"] * _NUM_INSTANTS)
+    return TouchFeatures(np.hstack([seven_features.values, values]), COURSE_FEATURES, (*seven_features.units, *units))
 
 
 def sequence_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
@@ -110,29 +112,30 @@ def sequence_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> T
     positive. Raises `ValueError` if `touches` is not a list of touches.
     """
     courses = _time_courses(touches)
-    whole = course_features(touches)
-    wide = SEQUENCE_PLACES * len(SEQUENCE_VALUES)
-    values = np.array([_sampled_course(one).ravel() for one in courses]).reshape(len(courses), wide)
-    units = ("image", "1", "image", "m²", "1", "m/s", "m", "m") * SEQUENCE_PLACES
-    return TouchFeatures(np.hstack([whole.values, values]), SEQUENCE_FEATURES, (*whole.units, *units))
+    course_values = course_features(touches)
+    num_columns = NUM_SEQUENCE_INSTANTS * len(SEQUENCE_VALUES)
+    values = np.array([_sample_course(course).ravel() for course in courses]).reshape(len(courses), num_columns)
+    units = ("image", "1", "image", "m²", "1", "m/s", "m", "m") * NUM_SEQUENCE_INSTANTS
+    return TouchFeatures(np.hstack([course_values.values, values]), SEQUENCE_FEATURES, (*course_values.units, *units))
 
 
 def _time_courses(touches) -> list[ChangeCourse]:
     check_kind("touches", touches, (list, tuple), "a list of touches, such as of find_touches")
-    for number, one in enumerate(touches):
-        check_kind(f"touches[{number}]", one, StreamTouch, "a StreamTouch, such as of find_touches")
-    return [one.course for one in touches]
+    for touch_index, touch in enumerate(touches):
+        check_kind(f"touches[{touch_index}]", touch, StreamTouch, "a StreamTouch, such as of find_touches")
+    return [touch.course for touch in touches]
 
 
 def _seven_features(course: ChangeCourse) -> list[float]:
-    at = int(course.peak.argmax())
-    passed = np.diff(course.seconds)
-    rate = np.mean(np.abs(np.diff(course.peak)) / passed) if passed.size else 0.0
+    """Compute the features of one touch, in the order of `FEATURES`."""
+    peak_frame = int(course.peak.argmax())
+    intervals = np.diff(course.seconds)
+    rate = np.mean(np.abs(np.diff(course.peak)) / intervals) if intervals.size else 0.0
     return [
-        course.peak[at],
+        course.peak[peak_frame],
         course.least.min(),
-        course.half_share[at],
-        course.mean[at],
+        course.half_share[peak_frame],
+        course.mean[peak_frame],
         course.seconds[-1] - course.seconds[0],
         float(rate),
         float(np.linalg.norm(course.centroid[-1] - course.centroid[0])),
@@ -140,54 +143,68 @@ def _seven_features(course: ChangeCourse) -> list[float]:
 
 
 def _further_features(course: ChangeCourse) -> list[float]:
-    there = np.isfinite(course.centroid[:, 0])  # a frame below the level has no centroid
-    place, seconds = course.centroid[there], course.seconds[there]
-    steps = np.linalg.norm(np.diff(place, axis=0), axis=1)
-    length, moved = float(steps.sum()), float(np.linalg.norm(place[-1] - place[0]))
+    """Compute the features of one touch that `COURSE_FEATURES` adds to the seven, in its order."""
+    has_centroid = np.isfinite(course.centroid[:, 0])  # a frame below the level has no centroid
+    centroids, seconds = course.centroid[has_centroid], course.seconds[has_centroid]
+    steps = np.linalg.norm(np.diff(centroids, axis=0), axis=1)
+    path_length, displacement = float(steps.sum()), float(np.linalg.norm(centroids[-1] - centroids[0]))
     duration = max(course.seconds[-1] - course.seconds[0], 1e-9)
     speeds = steps / np.diff(seconds) if steps.size else np.zeros(1)
-    share = course.peak / course.peak.max()
-    at = int(share.argmax())
-    when = (course.seconds - course.seconds[0]) / duration
-    weight = share / share.sum()
-    middle = float(weight @ when)
-    rises = np.diff(share)
-    turns = np.flatnonzero((rises[:-1] > 0) & (rises[1:] <= 0)) + 1
+    relative_peaks = course.peak / course.peak.max()
+    peak_frame = int(relative_peaks.argmax())
+    relative_times = (course.seconds - course.seconds[0]) / duration
+    weights = relative_peaks / relative_peaks.sum()
+    mean_time = float(weights @ relative_times)
+    differences = np.diff(relative_peaks)
+    peak_frames = np.flatnonzero((differences[:-1] > 0) & (differences[1:] <= 0)) + 1
     return [
-        float(course.area[there].mean()),
-        float(course.area[there].std() / course.area[there].mean()),
-        length,
-        float(np.linalg.norm(place - place[0], axis=1).max()),
-        length / duration,
+        float(course.area[has_centroid].mean()),
+        float(course.area[has_centroid].std() / course.area[has_centroid].mean()),
+        path_length,
+        float(np.linalg.norm(centroids - centroids[0], axis=1).max()),
+        path_length / duration,
         float(np.quantile(speeds, 0.9)),
-        moved / max(length, 1e-9),
-        float(max(np.count_nonzero(share[turns] > 0.5), 1)),
-        float(course.seconds[at] - course.seconds[0]),
-        float(course.seconds[-1] - course.seconds[at]),
-        float(np.abs(rises).sum()),
-        float(np.mean(share < 0.5)),
-        middle,
-        float(np.sqrt(weight @ (when - middle) ** 2)),
-        *np.interp(np.linspace(0, 1, _INSTANTS), when, share),
+        displacement / max(path_length, 1e-9),
+        float(max(np.count_nonzero(relative_peaks[peak_frames] > 0.5), 1)),
+        float(course.seconds[peak_frame] - course.seconds[0]),
+        float(course.seconds[-1] - course.seconds[peak_frame]),
+        float(np.abs(differences).sum()),
+        float(np.mean(relative_peaks < 0.5)),
+        mean_time,
+        float(np.sqrt(weights @ (relative_times - mean_time) ** 2)),
+        *np.interp(np.linspace(0, 1, _NUM_INSTANTS), relative_times, relative_peaks),
     ]
 
 
-def _sampled_course(course: ChangeCourse) -> Float[np.ndarray, "T c"]:
-    """Sample the quantities `SEQUENCE_VALUES` at `SEQUENCE_PLACES` instants of a touch."""
+def _sample_course(course: ChangeCourse) -> Float[np.ndarray, "T c"]:
+    """Sample the quantities `SEQUENCE_VALUES` at `NUM_SEQUENCE_INSTANTS` instants of a touch."""
     seconds = course.seconds
-    when = np.linspace(seconds[0], seconds[-1], SEQUENCE_PLACES)
-    there = np.isfinite(course.centroid[:, 0])  # a frame below the level has no centroid
-    place = np.stack([np.interp(when, seconds[there], one[there]) for one in course.centroid.T], axis=1)
-    steps = np.linalg.norm(np.diff(place, axis=0, prepend=place[:1]), axis=1)
-    speed = steps / max((seconds[-1] - seconds[0]) / (SEQUENCE_PLACES - 1), 1e-9)
-    middle = place - place.mean(axis=0)
-    along = middle @ np.linalg.svd(middle, full_matrices=False)[2][0]
-    along = along - along[0]
-    forwards = along[np.abs(along).argmax()]
-    change, mean, area, half = (
-        np.interp(when, seconds, one) for one in (course.peak, course.mean, course.area, course.half_share)
+    instants = np.linspace(seconds[0], seconds[-1], NUM_SEQUENCE_INSTANTS)
+    has_centroid = np.isfinite(course.centroid[:, 0])  # a frame below the level has no centroid
+    centroids = np.stack(
+        [np.interp(instants, seconds[has_centroid], coordinate[has_centroid]) for coordinate in course.centroid.T],
+        axis=1,
     )
-    distance = np.linalg.norm(place - place[0], axis=1)
+    steps = np.linalg.norm(np.diff(centroids, axis=0, prepend=centroids[:1]), axis=1)
+    speed = steps / max((seconds[-1] - seconds[0]) / (NUM_SEQUENCE_INSTANTS - 1), 1e-9)
+    centred_path = centroids - centroids.mean(axis=0)
+    positions_along = centred_path @ np.linalg.svd(centred_path, full_matrices=False)[2][0]
+    positions_along = positions_along - positions_along[0]
+    largest_displacement = positions_along[np.abs(positions_along).argmax()]
+    change, mean, area, half = (
+        np.interp(instants, seconds, values) for values in (course.peak, course.mean, course.area, course.half_share)
+    )
+    distance = np.linalg.norm(centroids - centroids[0], axis=1)
     return np.stack(
-        [change, change / course.peak.max(), mean, area, half, speed, distance, np.sign(forwards) * along], axis=1
+        [
+            change,
+            change / course.peak.max(),
+            mean,
+            area,
+            half,
+            speed,
+            distance,
+            np.sign(largest_displacement) * positions_along,
+        ],
+        axis=1,
     )

@@ -22,7 +22,7 @@ from jeit.touch.learnt.methods import CLASSIFIERS, log_odds
 from jeit.touch.learnt.temporal_network import TemporalNetwork
 
 
-def logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest:
+def fit_logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest:
     """Fit a `LogitBoostClassifier()`, as Silvera Tawil et al. (2011) do, and convert it to a forest, which is
     faster."""
     from jeit.touch.gestures.logit_boost import LogitBoostClassifier
@@ -30,15 +30,15 @@ def logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest
     return Forest.from_stumps(LogitBoostClassifier().fit(features, label))
 
 
-def temporal_network(features: Float[np.ndarray, "n k"], label: np.ndarray) -> TemporalNetwork:
+def fit_temporal_network(features: Float[np.ndarray, "n k"], label: np.ndarray) -> TemporalNetwork:
     """Fit a small neural network to features computed by `sequence_features`."""
     return TemporalNetwork.fit(features, label, whole=len(COURSE_FEATURES), values=len(SEQUENCE_VALUES))
 
 
 GESTURE_CLASSIFIERS: dict[str, Callable[..., Any]] = {
-    "logit-boost": logit_boost,
+    "logit-boost": fit_logit_boost,
     **CLASSIFIERS,
-    "temporal-network": temporal_network,
+    "temporal-network": fit_temporal_network,
 }
 """Functions that fit classifiers, by name: LogitBoost, the nine of learnt skins, and a network for the time course."""
 
@@ -94,14 +94,14 @@ def held_out_odds(
     odds = np.full((len(true_classes), true_classes.max() + 1), -1e3)
 
     def predict(fold: int) -> None:
-        out = folds == fold
-        if len(np.unique(true_classes[~out])) < 2:
+        is_held_out = folds == fold
+        if len(np.unique(true_classes[~is_held_out])) < 2:
             raise ValueError(
                 "labels: without the touches of one fold, or person, only one gesture remains; give touches of more."
             )
-        scale = Scale.from_features(features[~out])
-        model = GESTURE_CLASSIFIERS[method](scale(features[~out]), true_classes[~out])
-        odds[np.ix_(out, model.classes_)] = log_odds(model, scale(features[out]))
+        scale = Scale.from_features(features[~is_held_out])
+        model = GESTURE_CLASSIFIERS[method](scale(features[~is_held_out]), true_classes[~is_held_out])
+        odds[np.ix_(is_held_out, model.classes_)] = log_odds(model, scale(features[is_held_out]))
 
     apply_over_folds(predict, int(folds.max()) + 1)
     return odds
@@ -113,16 +113,16 @@ def random_folds(true_classes: np.ndarray, num_folds: int, seed: int = 0) -> Int
     Returns the number of the fold of each touch (n,). With fewer touches than `num_folds`, there are fewer folds.
     """
     rng = np.random.default_rng(seed)
-    fold, first = np.empty(len(true_classes), int), 0
-    for one in np.unique(true_classes):
-        own = rng.permutation(np.flatnonzero(true_classes == one))
-        fold[own] = (first + np.arange(len(own))) % num_folds
-        first += len(own)
-    return np.unique(fold, return_inverse=True)[1]
+    folds, num_assigned = np.empty(len(true_classes), int), 0
+    for class_index in np.unique(true_classes):
+        class_rows = rng.permutation(np.flatnonzero(true_classes == class_index))
+        folds[class_rows] = (num_assigned + np.arange(len(class_rows))) % num_folds
+        num_assigned += len(class_rows)
+    return np.unique(folds, return_inverse=True)[1]
 
 
 def person_folds(people: np.ndarray, max_folds: int | None = None) -> Int[np.ndarray, " n"]:
     """Assign touches to folds (n,): one fold for each person, or at most `max_folds` folds with equally many people
     each."""
-    number = np.unique(people, return_inverse=True)[1].ravel()
-    return number if max_folds is None else number % max_folds
+    person_indices = np.unique(people, return_inverse=True)[1].ravel()
+    return person_indices if max_folds is None else person_indices % max_folds

@@ -17,7 +17,7 @@ from jeit.touch.gestures.gesture_model import METHODS, Reading, check_labels
 from jeit.touch.gestures.touch_images import TouchImages
 
 # Maximum number of recordings used to determine the sign of touches.
-_RECORDINGS_FOR_SIGN = 60
+_MAX_RECORDINGS_FOR_SIGN = 60
 
 
 @dataclass(frozen=True)
@@ -67,34 +67,38 @@ def learn_gestures(
     ```
     """
     check_kind("recordings", recordings, GestureSet, "a GestureSet, as of GestureSet.read(path)")
-    report = progress or (lambda said: None)
+    report = progress or (lambda message: None)
     check_name("method", method, METHODS)
     check_labels(recordings.gesture)
     images = TouchImages.prepare(description, recordings.reference[None], progress=report)
-    still = images.changes(recordings.untouched)
-    level, sign = _touch_level_and_sign(images, still, recordings)
+    untouched_changes = images.changes(recordings.untouched)
+    level, sign = _touch_level_and_sign(images, untouched_changes, recordings)
     touches: list[StreamTouch] = []
-    kept, without_touch = [], []
-    for number, (seconds, changes) in enumerate(_times_and_changes(images, recordings, range(len(recordings)))):
-        if number % 50 == 0:
-            report(f"images: recording {number} of {len(recordings)}")
-        found = find_touches(level, seconds, sign * changes) if len(seconds) else []
-        if found:
-            touches.append(max(found, key=lambda one: one.offset - one.onset))
-            kept.append(number)
+    with_touch, without_touch = [], []
+    for recording_index, (seconds, changes) in enumerate(
+        _times_and_changes(images, recordings, range(len(recordings)))
+    ):
+        if recording_index % 50 == 0:
+            report(f"images: recording {recording_index} of {len(recordings)}")
+        recording_touches = find_touches(level, seconds, sign * changes) if len(seconds) else []
+        if recording_touches:
+            touches.append(max(recording_touches, key=lambda touch: touch.offset - touch.onset))
+            with_touch.append(recording_index)
         else:
-            without_touch.append(number)
-    if len(without_touch) > len(kept):
+            without_touch.append(recording_index)
+    if len(without_touch) > len(with_touch):
         raise ValueError(
             f"recordings: {len(without_touch)} of {len(recordings)} have no touch that exceeds the untouched skin's "
             "noise and drift; touch more firmly, or record the untouched skin just before."
         )
-    rate = 1 / float(np.median([np.median(np.diff(one.course.seconds)) for one in touches if len(one.course) > 1]))
+    rate = 1 / float(
+        np.median([np.median(np.diff(touch.course.seconds)) for touch in touches if len(touch.course) > 1])
+    )
     protocol = images.calibration.model.protocol
     model = GestureModel.fit(
         touches,
-        recordings.gesture[kept],
-        people=recordings.person[kept],
+        recordings.gesture[with_touch],
+        people=recordings.person[with_touch],
         method=method,
         form=form,
         reading=Reading(level.level, images.background, sign, rate, images.num_channels, protocol.name),
@@ -107,23 +111,25 @@ def learn_gestures(
 def _touch_level_and_sign(images: TouchImages, untouched: np.ndarray, recordings: GestureSet) -> tuple[TouchLevel, int]:
     """Determine the sign of touches, and their level: with this sign, touches exceed their level by the larger
     factor."""
-    some = np.unique(np.linspace(0, len(recordings) - 1, min(_RECORDINGS_FOR_SIGN, len(recordings))).astype(int))
-    changes = [one for _, one in _times_and_changes(images, recordings, some.tolist())]
-    found = []
+    indices = np.unique(np.linspace(0, len(recordings) - 1, min(_MAX_RECORDINGS_FOR_SIGN, len(recordings))).astype(int))
+    changes_of_recordings = [changes for _, changes in _times_and_changes(images, recordings, indices.tolist())]
+    candidates = []
     for sign in (1, -1):
         level = TouchLevel.of_untouched(images.mesh, sign * untouched)
-        exceeds = [np.nanmax(sign * one) / level.level for one in changes if np.isfinite(one).any()]
-        found.append((float(np.median(exceeds)) if exceeds else 0.0, level, sign))
-    return max(found, key=lambda one: one[0])[1:]
+        ratios = [
+            np.nanmax(sign * changes) / level.level for changes in changes_of_recordings if np.isfinite(changes).any()
+        ]
+        candidates.append((float(np.median(ratios)) if ratios else 0.0, level, sign))
+    return max(candidates, key=lambda candidate: candidate[0])[1:]
 
 
 def _times_and_changes(
     images: TouchImages, recordings: GestureSet, indices: Sequence[int]
 ) -> Iterator[tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T m"]]]:
     """Yield the times and the images of change of the recordings `indices`, all imaged as one stream."""
-    frames = (frame for one in indices for frame in recordings.recording(one)[1])
-    found = images.stream(frames)
-    for one in indices:
-        seconds, _ = recordings.recording(one)
-        own = [change for _, change in islice(found, len(seconds))]
-        yield seconds, np.array(own).reshape(len(seconds), images.mesh.num_cells)
+    frames = (frame for index in indices for frame in recordings.recording(index)[1])
+    stream = images.stream(frames)
+    for index in indices:
+        seconds, _ = recordings.recording(index)
+        changes = [change for _, change in islice(stream, len(seconds))]
+        yield seconds, np.array(changes).reshape(len(seconds), images.mesh.num_cells)

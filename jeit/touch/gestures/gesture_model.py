@@ -30,7 +30,7 @@ from jeit.touch.learnt.file import read_plain, write_plain
 from jeit.touch.learnt.methods import fit_sharpness, log_odds, probabilities
 
 # Minimum factor between the conductivities of two skins that are considered different, or given in different units.
-_OTHER_SKIN = 5.0
+_MIN_CONDUCTIVITY_RATIO = 5.0
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Reading:
                 "them on this skin."
             )
         ratio = background / self.background
-        if not 1 / _OTHER_SKIN < ratio < _OTHER_SKIN:
+        if not 1 / _MIN_CONDUCTIVITY_RATIO < ratio < _MIN_CONDUCTIVITY_RATIO:
             raise ValueError(
                 f"the untouched skin has {ratio:.3g} times the conductivity of that which gestures were learnt on: is "
                 "it the same, and are voltages in the unit and at the current that its description says?"
@@ -90,12 +90,12 @@ class Reading:
 METHODS = ("auto", *GESTURE_CLASSIFIERS)
 # Maximum number of folds when the method is chosen by cross-validation; fraction of held-out touches that are accepted
 # as similar to the training set.
-_FOLDS, _LIKE = 10, 0.99
+_MAX_FOLDS, _SIMILARITY_QUANTILE = 10, 0.99
 # Number of touches whose distances from the training set are computed at once.
-_AT_ONCE = 1000
+_CHUNK_SIZE = 1000
 GESTURE_FILE = "gestures.skops"
 """Name of the model's file in the output folder of `jeit touch gestures`."""
-_KIND, _VERSION = "a jeit gesture model", 3
+_FILE_KIND, _FILE_VERSION = "a jeit gesture model", 3
 
 
 @dataclass(frozen=True)
@@ -178,45 +178,49 @@ class GestureModel:
         need_extra("learn", "learning gestures")
         check_name("method", method, METHODS)
         check_name("form", form, ("auto", *FEATURE_FORMS))
-        named, people_of = _check_labels_and_people(touches, labels, people)
-        names, right = np.unique(named, return_inverse=True)
-        remarks = list(notes)
-        if people_of is not None and len(np.unique(people_of)) > 1:
-            folds = person_folds(people_of, _FOLDS)
+        label_array, people_array = _check_labels_and_people(touches, labels, people)
+        names, class_indices = np.unique(label_array, return_inverse=True)
+        model_notes = list(notes)
+        if people_array is not None and len(np.unique(people_array)) > 1:
+            folds = person_folds(people_array, _MAX_FOLDS)
         else:
-            folds = random_folds(right, _FOLDS)
-            remarks.append("one person, or nobody, is named: chosen on touches held out at random, not on people.")
-        found = []
-        for shape in FEATURE_FORMS:
-            values = FEATURE_FORMS[shape](touches).values
+            folds = random_folds(class_indices, _MAX_FOLDS)
+            model_notes.append("one person, or nobody, is named: chosen on touches held out at random, not on people.")
+        results = []
+        for feature_form in FEATURE_FORMS:
+            values = FEATURE_FORMS[feature_form](touches).values
             for name in GESTURE_CLASSIFIERS:
-                if method not in ("auto", name) or form not in ("auto", shape) or shape not in feature_forms(name):
+                if (
+                    method not in ("auto", name)
+                    or form not in ("auto", feature_form)
+                    or feature_form not in feature_forms(name)
+                ):
                     continue
                 if progress is not None:
-                    progress(f"{name} on {shape}")
-                odds = held_out_odds(name, values, right, folds)
-                found.append((float(np.mean(odds.argmax(axis=1) != right)), name, shape, odds))
-        if not found:
-            raise ValueError(f"form: '{method}' takes {' or '.join(feature_forms(method))}; '{form}' was asked for.")
-        found.sort(key=lambda one: one[0])
-        _, chosen, shape, odds = found[0]
-        values, courses = FEATURE_FORMS[shape](touches).values, course_features(touches).values
-        tried = [(f"{name} on {shape}", error) for error, name, shape, _ in found]
+                    progress(f"{name} on {feature_form}")
+                odds = held_out_odds(name, values, class_indices, folds)
+                results.append((float(np.mean(odds.argmax(axis=1) != class_indices)), name, feature_form, odds))
+        if not results:
+            raise ValueError(f"form: '{method}' takes {' or '.join(feature_forms(method))}; '{form}' was requested.")
+        results.sort(key=lambda result: result[0])
+        _, chosen_method, feature_form, odds = results[0]
+        values, courses = FEATURE_FORMS[feature_form](touches).values, course_features(touches).values
+        tried = [(f"{name} on {feature_form}", error) for error, name, feature_form, _ in results]
         scale, known_scale = Scale.from_features(values), Scale.from_features(courses)
         known = known_scale(courses)
         return cls(
-            names=tuple(str(one) for one in names),
-            method=chosen,
-            form=shape,
+            names=tuple(str(name) for name in names),
+            method=chosen_method,
+            form=feature_form,
             scale=scale,
-            model=GESTURE_CLASSIFIERS[chosen](scale(values), right),
-            sharpness=fit_sharpness(odds, right),
+            model=GESTURE_CLASSIFIERS[chosen_method](scale(values), class_indices),
+            sharpness=fit_sharpness(odds, class_indices),
             known=known,
             known_scale=known_scale,
             farthest=_held_out_distance(known, folds),
             reading=reading,
-            standing=Standing(tried[0][0], tried, names[odds.argmax(axis=1)], named),
-            notes=tuple(remarks),
+            standing=Standing(tried[0][0], tried, names[odds.argmax(axis=1)], label_array),
+            notes=tuple(model_notes),
         )
 
     def predict(self, touches: list[StreamTouch]) -> Gestures:
@@ -227,24 +231,28 @@ class GestureModel:
         """
         values = FEATURE_FORMS[self.form](touches).values
         if not len(values):
-            nothing = np.empty(0)
+            empty_array = np.empty(0)
             return Gestures(
-                nothing.astype(str), nothing, np.empty((0, len(self.names))), self.names, nothing.astype(bool)
+                empty_array.astype(str),
+                empty_array,
+                np.empty((0, len(self.names))),
+                self.names,
+                empty_array.astype(bool),
             )
         odds = np.full((len(values), len(self.names)), -1e3)
         odds[:, self.model.classes_] = log_odds(self.model, self.scale(values))
         shares = probabilities(odds, self.sharpness)
-        distance = _nearest_distance(self.known, self.known_scale(course_features(touches).values))
-        said = np.array(self.names)[shares.argmax(axis=1)]
-        return Gestures(said, shares.max(axis=1), shares, self.names, distance > self.farthest)
+        distances = _nearest_distance(self.known, self.known_scale(course_features(touches).values))
+        gestures = np.array(self.names)[shares.argmax(axis=1)]
+        return Gestures(gestures, shares.max(axis=1), shares, self.names, distances > self.farthest)
 
     def write(self, path: str | Path) -> None:
         """Write the model, without its `standing`, to one file. Raises `ValueError` if `path` is a folder."""
-        own = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "standing"}
+        field_values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "standing"}
         for name in ("scale", "known_scale"):
-            own[name] = {one.name: getattr(own[name], one.name) for one in fields(Scale)}
-        own["reading"] = None if self.reading is None else vars(self.reading)
-        write_plain(path, _KIND, _VERSION, own, GESTURE_FILE)
+            field_values[name] = {field.name: getattr(field_values[name], field.name) for field in fields(Scale)}
+        field_values["reading"] = None if self.reading is None else vars(self.reading)
+        write_plain(path, _FILE_KIND, _FILE_VERSION, field_values, GESTURE_FILE)
 
     @classmethod
     def read(cls, path: str | Path) -> "GestureModel":
@@ -257,25 +265,30 @@ class GestureModel:
         if not path.is_file():
             raise FileNotFoundError(f"'{path}': there is no such file; `jeit touch gestures` makes one.")
 
-        def make(own: dict[str, Any]) -> "GestureModel":
-            parts: dict[str, Any] = {name: Scale(**own[name]) for name in ("scale", "known_scale")}
-            parts["reading"] = None if own["reading"] is None else Reading(**own["reading"])
-            whole: Any = own | parts | {"names": tuple(own["names"]), "notes": tuple(own["notes"])}
-            return cls(**whole)
+        def make(field_values: dict[str, Any]) -> "GestureModel":
+            parts: dict[str, Any] = {name: Scale(**field_values[name]) for name in ("scale", "known_scale")}
+            parts["reading"] = None if field_values["reading"] is None else Reading(**field_values["reading"])
+            all_values: Any = (
+                field_values | parts | {"names": tuple(field_values["names"]), "notes": tuple(field_values["notes"])}
+            )
+            return cls(**all_values)
 
-        return read_plain(path, _KIND, _VERSION, "gesture model", make)
+        return read_plain(path, _FILE_KIND, _FILE_VERSION, "gesture model", make)
 
 
 def _check_labels_and_people(touches, labels, people) -> tuple[np.ndarray, np.ndarray | None]:
+    """Convert the labels and people of touches to arrays (n,). Raises `ValueError` if they do not match the touches."""
     check_kind("touches", touches, (list, tuple), "a list of touches, such as of find_touches")
-    named = np.asarray(labels)
-    if named.shape != (len(touches),) or named.dtype.kind not in "UT":
-        raise ValueError(f"labels must be the names of {len(touches)} gestures; they are {named.dtype} {named.shape}.")
-    given = None if people is None else np.asarray(people)
-    if given is not None and given.shape != named.shape:
-        raise ValueError(f"people must be {len(touches)}, one for each touch; they have shape {given.shape}.")
-    check_labels(named)
-    return named.astype(str), given
+    label_array = np.asarray(labels)
+    if label_array.shape != (len(touches),) or label_array.dtype.kind not in "UT":
+        raise ValueError(
+            f"labels must be the names of {len(touches)} gestures; they are {label_array.dtype} {label_array.shape}."
+        )
+    people_array = None if people is None else np.asarray(people)
+    if people_array is not None and people_array.shape != label_array.shape:
+        raise ValueError(f"people must be {len(touches)}, one for each touch; they have shape {people_array.shape}.")
+    check_labels(label_array)
+    return label_array.astype(str), people_array
 
 
 def check_labels(labels: np.ndarray) -> None:
@@ -284,7 +297,7 @@ def check_labels(labels: np.ndarray) -> None:
     Raises `ValueError` if a name is empty, if there are fewer than two gestures, or if a gesture occurs only once.
     """
     names, count = np.unique(labels, return_counts=True)
-    if any(not str(one).strip() for one in names):
+    if any(not str(name).strip() for name in names):
         raise ValueError("labels: some are empty; give every touch the name of a gesture.")
     if len(names) < 2:
         raise ValueError("labels: give touches of two gestures, or more.")
@@ -293,16 +306,16 @@ def check_labels(labels: np.ndarray) -> None:
 
 
 def _nearest_distance(training_features: np.ndarray, features: np.ndarray) -> Float[np.ndarray, " n"]:
-    """Distance (n,) of each row of `features` (n, k) from the nearest row of the `training_features` features (N,
-    k)."""
+    """Compute the distance (n,) of each row of `features` (n, k) from the nearest row of `training_features` (N, k)."""
     from scipy.spatial.distance import cdist
 
-    return apply_in_parts(lambda some: cdist(some, training_features).min(axis=1), features, _AT_ONCE)
+    return apply_in_parts(lambda rows: cdist(rows, training_features).min(axis=1), features, _CHUNK_SIZE)
 
 
 def _held_out_distance(training_features: Float[np.ndarray, "N k"], folds: Int[np.ndarray, " N"]) -> float:
-    """99 % quantile of the distance of held-out touches from the nearest touch of the other folds."""
-    apart = [
-        _nearest_distance(training_features[folds != one], training_features[folds == one]) for one in np.unique(folds)
+    """Compute the 99 % quantile of the distance of held-out touches from the nearest touch of the other folds."""
+    distances = [
+        _nearest_distance(training_features[folds != fold_index], training_features[folds == fold_index])
+        for fold_index in np.unique(folds)
     ]
-    return float(np.quantile(np.concatenate(apart), _LIKE))
+    return float(np.quantile(np.concatenate(distances), _SIMILARITY_QUANTILE))

@@ -17,7 +17,7 @@ from jeit.arguments import describe
 
 # Maximum magnitude of responses (Friedman et al. 2000, section 4.2; the value of WEKA); minimum weight; maximum number
 # of times that a step is halved.
-_MOST_RESPONSE, _LEAST_WEIGHT, _MOST_HALVINGS = 3.0, 1e-12, 30
+_MAX_RESPONSE, _MIN_WEIGHT, _MAX_HALVINGS = 3.0, 1e-12, 30
 
 
 class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
@@ -71,24 +71,26 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
         # scikit-learn's trees split samples in single precision.
         X, y = validate_data(self, X, y, dtype=np.float32)
         check_classification_targets(y)
-        self.classes_, number = np.unique(y, return_inverse=True)
+        self.classes_, class_indices = np.unique(y, return_inverse=True)
         if len(self.classes_) < 2:
             raise ValueError(f"y has one class only, {describe(self.classes_[0])}; give samples of two or more.")
-        right = np.eye(len(self.classes_))[number]
-        score = np.zeros(right.shape)
-        stumps, steps, likelihood = [], [], [_log_likelihood(score, number)]
+        class_indicators = np.eye(len(self.classes_))[class_indices]
+        score = np.zeros(class_indicators.shape)
+        stumps, steps, likelihoods = [], [], [_log_likelihood(score, class_indices)]
         for _ in range(self.n_estimators):
-            stump = _fit_stumps(X, right, _softmax(score))
-            gained = _stump_values(X, *stump)
-            step, found = _largest_step(score, gained, number, float(self.learning_rate), likelihood[-1])
-            score = score + step * gained
+            stump = _fit_stumps(X, class_indicators, _softmax(score))
+            increments = _stump_values(X, *stump)
+            step, new_likelihood = _largest_step(
+                score, increments, class_indices, float(self.learning_rate), likelihoods[-1]
+            )
+            score = score + step * increments
             stumps.append(stump)
             steps.append(step)
-            likelihood.append(found)
+            likelihoods.append(new_likelihood)
         feature, threshold, below, above = map(np.array, zip(*stumps, strict=True))
         self.feature_, self.threshold_, self.step_ = feature.astype(int), threshold, np.array(steps)
-        self.below_, self.above_ = (self.step_[:, None] * one for one in (below, above))
-        self.log_likelihood_ = np.array(likelihood)
+        self.below_, self.above_ = (self.step_[:, None] * values for values in (below, above))
+        self.log_likelihood_ = np.array(likelihoods)
         return self
 
     def _staged_scores(self, X: Any) -> Iterator[Float[np.ndarray, "n J"]]:
@@ -117,20 +119,20 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
             yield self.classes_[score.argmax(axis=1)]
 
     def decision_function(self, X: Any) -> np.ndarray:
-        """Scores F (n, J), whose softmax gives the probabilities, for features (n, k); for two classes, log-odds F_1 −
-        F_0 (n,)."""
-        *_, last = self.staged_decision_function(X)
-        return last
+        """Return the scores F (n, J), whose softmax gives the probabilities, for features (n, k); for two classes,
+        log-odds F_1 − F_0 (n,)."""
+        *_, last_scores = self.staged_decision_function(X)
+        return last_scores
 
     def predict_proba(self, X: Any) -> Float[np.ndarray, "n J"]:
-        """Probabilities (n, J) of the classes, in the order of `classes_`."""
-        *_, last = self.staged_predict_proba(X)
-        return last
+        """Predict the probabilities (n, J) of the classes, in the order of `classes_`."""
+        *_, last_probabilities = self.staged_predict_proba(X)
+        return last_probabilities
 
     def predict(self, X: Any) -> np.ndarray:
-        """Most probable class (n,) for features (n, k)."""
-        *_, last = self.staged_predict(X)
-        return last
+        """Predict the most probable class (n,) for features (n, k)."""
+        *_, last_classes = self.staged_predict(X)
+        return last_classes
 
 
 def _fit_stumps(X: np.ndarray, class_indicators: np.ndarray, probability: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -138,50 +140,64 @@ def _fit_stumps(X: np.ndarray, class_indicators: np.ndarray, probability: np.nda
 
     A stump that finds no split is constant, with an infinite threshold.
     """
-    off = class_indicators - probability
+    residual = class_indicators - probability
     variance = probability * (1 - probability)
-    response = np.clip(off / np.maximum(variance, _LEAST_WEIGHT), -_MOST_RESPONSE, _MOST_RESPONSE)
-    weight = np.maximum(np.where(response == 0, 0.0, off / np.where(response == 0, 1.0, response)), _LEAST_WEIGHT)
-    response = off / weight  # smaller where the weight was raised, to keep the gradient
-    number = class_indicators.shape[1]
-    found = []
-    for one in range(number):
-        tree = DecisionTreeRegressor(max_depth=1, random_state=0).fit(X, response[:, one], weight[:, one]).tree_
-        parted = tree.node_count > 1
-        below, above = (float(tree.value[node, 0, 0]) for node in ((1, 2) if parted else (0, 0)))
-        place = (int(tree.feature[0]), float(tree.threshold[0])) if parted else (0, np.inf)
-        found.append((*place, (number - 1) / number * below, (number - 1) / number * above))
-    feature, threshold, below, above = (np.array(one) for one in zip(*found, strict=True))
-    return feature, threshold, below, above
+    response = np.clip(residual / np.maximum(variance, _MIN_WEIGHT), -_MAX_RESPONSE, _MAX_RESPONSE)
+    weight = np.maximum(np.where(response == 0, 0.0, residual / np.where(response == 0, 1.0, response)), _MIN_WEIGHT)
+    response = residual / weight  # smaller where the weight was raised, so that the gradient is unchanged
+    num_classes = class_indicators.shape[1]
+    stumps = []
+    for class_index in range(num_classes):
+        tree = (
+            DecisionTreeRegressor(max_depth=1, random_state=0)
+            .fit(X, response[:, class_index], weight[:, class_index])
+            .tree_
+        )
+        has_split = tree.node_count > 1
+        value_below, value_above = (float(tree.value[node, 0, 0]) for node in ((1, 2) if has_split else (0, 0)))
+        feature_and_threshold = (int(tree.feature[0]), float(tree.threshold[0])) if has_split else (0, np.inf)
+        stumps.append(
+            (
+                *feature_and_threshold,
+                (num_classes - 1) / num_classes * value_below,
+                (num_classes - 1) / num_classes * value_above,
+            )
+        )
+    feature, threshold, value_below, value_above = (np.array(column) for column in zip(*stumps, strict=True))
+    return feature, threshold, value_below, value_above
 
 
 def _stump_values(X: np.ndarray, feature, threshold, below, above) -> Float[np.ndarray, "n J"]:
-    """Values (n, J) that the stumps of a round add to F."""
-    said = np.where(X[:, feature] <= threshold, below, above)
-    return said - said.mean(axis=1, keepdims=True)
+    """Return the values (n, J) that the stumps of a round add to F."""
+    values = np.where(X[:, feature] <= threshold, below, above)
+    return values - values.mean(axis=1, keepdims=True)
 
 
-def _largest_step(score, increments, class_indices, step: float, least_likelihood: float) -> tuple[float, float]:
-    """Find the largest step of `step`, `step` / 2, `step` / 4 … that keeps the log-likelihood at `least_likelihood` or
+def _largest_step(score, increments, class_indices, step: float, min_likelihood: float) -> tuple[float, float]:
+    """Find the largest step of `step`, `step` / 2, `step` / 4 … that keeps the log-likelihood at `min_likelihood` or
     above.
 
     Returns the step, and the log-likelihood of the classes `class_indices` (n,) after it. The step is 0 if the
     remaining gain is below rounding errors.
     """
-    for _ in range(_MOST_HALVINGS):
-        found = _log_likelihood(score + step * increments, class_indices)
-        if found >= least_likelihood:
-            return step, found
+    for _ in range(_MAX_HALVINGS):
+        likelihood = _log_likelihood(score + step * increments, class_indices)
+        if likelihood >= min_likelihood:
+            return step, likelihood
         step /= 2
-    return 0.0, least_likelihood
+    return 0.0, min_likelihood
 
 
 def _log_likelihood(score: np.ndarray, class_indices: np.ndarray) -> float:
-    """Mean natural log-likelihood of the classes `class_indices` (n,) for the scores (n, J)."""
-    shifted = score - score.max(axis=1, keepdims=True)
-    return float(np.mean(shifted[np.arange(len(class_indices)), class_indices] - np.log(np.exp(shifted).sum(axis=1))))
+    """Compute the mean natural log-likelihood of the classes `class_indices` (n,) for the scores (n, J)."""
+    shifted_scores = score - score.max(axis=1, keepdims=True)
+    return float(
+        np.mean(
+            shifted_scores[np.arange(len(class_indices)), class_indices] - np.log(np.exp(shifted_scores).sum(axis=1))
+        )
+    )
 
 
 def _softmax(score: np.ndarray) -> Float[np.ndarray, "n J"]:
-    powers = np.exp(score - score.max(axis=1, keepdims=True))
-    return powers / powers.sum(axis=1, keepdims=True)
+    exponentials = np.exp(score - score.max(axis=1, keepdims=True))
+    return exponentials / exponentials.sum(axis=1, keepdims=True)

@@ -17,9 +17,9 @@ from jeit.mesh import Mesh, centroids, check_flat, measures
 from jeit_solvers.module import Module
 
 # Minimum number of untouched frames for estimating the standard deviation of their peaks.
-_LEAST_FRAMES = 10
+_MIN_UNTOUCHED_FRAMES = 10
 # Number of standard deviations by which the level of a touch exceeds the mean peak of untouched frames.
-_ABOVE = 5.0
+_LEVEL_DEVIATIONS = 5.0
 
 
 class ChangeCourse(Module):
@@ -45,17 +45,17 @@ class ChangeCourse(Module):
 
     def select(self, frames: slice | np.ndarray) -> "ChangeCourse":
         """Return the time course of some of the frames."""
-        return ChangeCourse(*(getattr(self, name)[frames] for name in _COLUMNS))
+        return ChangeCourse(*(getattr(self, name)[frames] for name in _FIELD_NAMES))
 
     @classmethod
     def joined(cls, courses: "list[ChangeCourse]") -> "ChangeCourse":
         """Concatenate time courses; an empty list gives a time course without frames."""
-        shapes = {name: np.empty((0, 2) if name == "centroid" else 0) for name in _COLUMNS}
-        parts = {name: [shapes[name], *(getattr(one, name) for one in courses)] for name in _COLUMNS}
-        return cls(*(np.concatenate(parts[name]) for name in _COLUMNS))
+        empty_arrays = {name: np.empty((0, 2) if name == "centroid" else 0) for name in _FIELD_NAMES}
+        arrays = {name: [empty_arrays[name], *(getattr(course, name) for course in courses)] for name in _FIELD_NAMES}
+        return cls(*(np.concatenate(arrays[name]) for name in _FIELD_NAMES))
 
 
-_COLUMNS = ("seconds", "peak", "least", "half_share", "mean", "area", "centroid")
+_FIELD_NAMES = ("seconds", "peak", "least", "half_share", "mean", "area", "centroid")
 
 
 class TouchLevel(Module):
@@ -106,13 +106,13 @@ class TouchLevel(Module):
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
         images = check_images(images, mesh.num_cells)
         peaks = images[np.isfinite(images).all(axis=1)].max(axis=1, initial=-np.inf)
-        if len(peaks) < _LEAST_FRAMES:
+        if len(peaks) < _MIN_UNTOUCHED_FRAMES:
             raise ValueError(
-                f"images: give {_LEAST_FRAMES} frames of an untouched skin, or more; {len(peaks)} have none."
+                f"images: give {_MIN_UNTOUCHED_FRAMES} frames of an untouched skin, or more; {len(peaks)} have none."
             )
         if np.ptp(peaks) == 0:
             raise ValueError("images are all the same and show no noise. Give what was read, not copies of a frame.")
-        return cls(mesh, float(peaks.mean() + _ABOVE * peaks.std(ddof=1)))
+        return cls(mesh, float(peaks.mean() + _LEVEL_DEVIATIONS * peaks.std(ddof=1)))
 
     def course(self, seconds: Float[np.ndarray, " F"], images: Float[np.ndarray, "F m"]) -> ChangeCourse:
         """Compute the time course of images (F, m) at times `seconds` (F,).
@@ -124,18 +124,18 @@ class TouchLevel(Module):
         if not np.isfinite(images).all():
             raise ValueError("images have NaN or infinite values; leave out those frames, as `find_touches` does.")
         peak = images.max(axis=1, initial=-np.inf)
-        above = images > self.level
-        number = np.maximum(above.sum(axis=1), 1)
-        weight = self.areas * np.where(above, images - self.level, 0.0)
-        total = weight.sum(axis=1, keepdims=True)
-        centroid = weight @ self.centres / np.where(total > 0, total, np.nan)
+        is_above_level = images > self.level
+        num_above = np.maximum(is_above_level.sum(axis=1), 1)
+        weights = self.areas * np.where(is_above_level, images - self.level, 0.0)
+        total_weight = weights.sum(axis=1, keepdims=True)
+        centroid = weights @ self.centres / np.where(total_weight > 0, total_weight, np.nan)
         return ChangeCourse(
             seconds=seconds,
             peak=peak,
             least=images.min(axis=1, initial=np.inf),
             half_share=np.mean(images >= peak[:, None] / 2, axis=1),
-            mean=np.where(above, images, 0.0).sum(axis=1) / number,
-            area=above @ self.areas,
+            mean=np.where(is_above_level, images, 0.0).sum(axis=1) / num_above,
+            area=is_above_level @ self.areas,
             centroid=centroid,
         )
 
@@ -165,7 +165,7 @@ def check_seconds(seconds: Float[np.ndarray, " F"], num_frames: int) -> Float[np
 
 # Minimum untouched time between two touches, seconds; minimum number of frames of a touch; tolerance for rounding of
 # times, seconds.
-_GAP, _LEAST, _ROUNDING = 0.1, 2, 1e-9
+_MIN_GAP, _MIN_TOUCH_FRAMES, _TIME_TOLERANCE = 0.1, 2, 1e-9
 
 
 class StreamTouch(Module):
@@ -232,8 +232,8 @@ class TouchStream(Module):
     """
 
     level: TouchLevel
-    gap: float = _GAP
-    least: int = _LEAST
+    gap: float = _MIN_GAP
+    least: int = _MIN_TOUCH_FRAMES
     second: float = -np.inf
     open: tuple[ChangeCourse, ...] = ()
     held: int = 0
@@ -256,17 +256,17 @@ class TouchStream(Module):
         if second == self.second or not np.isfinite(frame).all():
             return replace(self, lost=(self.lost[0], self.lost[1] + 1)) if self.open else self
         course = self.level.course(np.array([float(second)]), frame)
-        after, unseen = self, second - self.second >= self.gap - _ROUNDING
-        if self.open and second - self.open[self.held - 1].seconds[0] >= self.gap - _ROUNDING:
-            after = replace(self, ended=(*self.ended, *self._current_touch()), open=(), held=0, lost=(0, 0))
-        above = bool(course.peak[0] > self.level.level)
-        if above and not after.open:
-            after = replace(after, begun_before=bool(unseen))
-        if above or after.open:
-            after = replace(after, open=(*after.open, course))
-        if above:
-            after = replace(after, held=len(after.open), lost=(sum(after.lost), 0))
-        return replace(after, second=float(second))
+        new_state, is_after_gap = self, second - self.second >= self.gap - _TIME_TOLERANCE
+        if self.open and second - self.open[self.held - 1].seconds[0] >= self.gap - _TIME_TOLERANCE:
+            new_state = replace(self, ended=(*self.ended, *self._current_touch()), open=(), held=0, lost=(0, 0))
+        is_above_level = bool(course.peak[0] > self.level.level)
+        if is_above_level and not new_state.open:
+            new_state = replace(new_state, begun_before=bool(is_after_gap))
+        if is_above_level or new_state.open:
+            new_state = replace(new_state, open=(*new_state.open, course))
+        if is_above_level:
+            new_state = replace(new_state, held=len(new_state.open), lost=(sum(new_state.lost), 0))
+        return replace(new_state, second=float(second))
 
     @property
     def touches(self) -> list[StreamTouch]:
@@ -287,8 +287,8 @@ def find_touches(
     seconds: Float[np.ndarray, " F"],
     images: Float[np.ndarray, "F m"],
     *,
-    gap: float = _GAP,
-    least: int = _LEAST,
+    gap: float = _MIN_GAP,
+    least: int = _MIN_TOUCH_FRAMES,
 ) -> list[StreamTouch]:
     """Find the touches in a series of images, as a `TouchStream` does frame by frame.
 
@@ -313,27 +313,31 @@ def find_touches(
     _check_settings(level, gap, least)
     images = check_images(images, len(level.areas))
     seconds = check_seconds(seconds, len(images))
-    finite = np.flatnonzero(np.isfinite(images).all(axis=1))
-    used = finite[np.diff(seconds[finite], prepend=-np.inf) > 0]
-    passed = np.diff(seconds[used])
-    if passed.size and np.median(passed) >= gap - _ROUNDING:
+    finite_frames = np.flatnonzero(np.isfinite(images).all(axis=1))
+    used_frames = finite_frames[np.diff(seconds[finite_frames], prepend=-np.inf) > 0]
+    intervals = np.diff(seconds[used_frames])
+    if intervals.size and np.median(intervals) >= gap - _TIME_TOLERANCE:
         raise ValueError(
-            f"gap is {gap:g} s, and frames are {np.median(passed):.3g} s apart: no touch lasts for two of them. Give a "
-            "greater gap."
+            f"gap is {gap:g} s, and frames are {np.median(intervals):.3g} s apart: no touch lasts for two of them. "
+            "Give a greater gap."
         )
-    course = level.course(seconds[used], images[used])
-    unseen = np.concatenate([[True], passed >= gap - _ROUNDING, [True]])
-    above = np.flatnonzero(course.peak > level.level)
-    parts = np.split(above, 1 + np.flatnonzero(np.diff(course.seconds[above]) >= gap - _ROUNDING))
-    found = []
-    for part in parts:
-        if not part.size or part[-1] - part[0] + 1 < least:
+    course = level.course(seconds[used_frames], images[used_frames])
+    is_after_gap = np.concatenate([[True], intervals >= gap - _TIME_TOLERANCE, [True]])
+    frames_above_level = np.flatnonzero(course.peak > level.level)
+    frame_groups = np.split(
+        frames_above_level, 1 + np.flatnonzero(np.diff(course.seconds[frames_above_level]) >= gap - _TIME_TOLERANCE)
+    )
+    touches = []
+    for frames in frame_groups:
+        if not frames.size or frames[-1] - frames[0] + 1 < least:
             continue
-        first, last = part[0], part[-1]
-        lost = int(used[last] - used[first] - (last - first))
-        own = course.select(slice(first, last + 1))
-        found.append(StreamTouch(own, lost, bool(unseen[first]), bool(unseen[last + 1])))
-    return found
+        first_frame, last_frame = frames[0], frames[-1]
+        num_lost = int(used_frames[last_frame] - used_frames[first_frame] - (last_frame - first_frame))
+        touch_course = course.select(slice(first_frame, last_frame + 1))
+        touches.append(
+            StreamTouch(touch_course, num_lost, bool(is_after_gap[first_frame]), bool(is_after_gap[last_frame + 1]))
+        )
+    return touches
 
 
 def _check_settings(level, gap, least) -> None:

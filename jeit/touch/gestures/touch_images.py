@@ -23,7 +23,7 @@ from jeit.inverse.streaming.stream import FrameImage
 from jeit.mesh import Mesh
 
 # Minimum number of frames of an untouched skin.
-_FEWEST = 3
+_MIN_UNTOUCHED_FRAMES = 3
 
 TOUCH_IMAGES = StreamSettings(solver=OneStep(), prior="noser")
 """Default settings for imaging touches."""
@@ -90,14 +90,17 @@ class TouchImages:
 
         Yields the status of each frame, and its change of conductivity (m,), S, which is NaN if the frame was refused.
         """
-        refused = np.full(self.mesh.num_cells, np.nan)
-        for one in stream(self.imager, frames):
-            yield one, refused if one.conductivity is None else one.conductivity - self.background
+        refused_change = np.full(self.mesh.num_cells, np.nan)
+        for frame_image in stream(self.imager, frames):
+            yield (
+                frame_image,
+                refused_change if frame_image.conductivity is None else frame_image.conductivity - self.background,
+            )
 
     def changes(self, frames: Float[np.ndarray, "F M"]) -> Float[np.ndarray, "F m"]:
         """Compute changes of conductivity (F, m), S, from frames (F, M), volts; NaN for frames that are refused."""
-        found = [change for _, change in self.stream(frames)]
-        return np.array(found).reshape(len(found), self.mesh.num_cells)
+        changes = [change for _, change in self.stream(frames)]
+        return np.array(changes).reshape(len(changes), self.mesh.num_cells)
 
 
 def untouched_frames(
@@ -123,13 +126,14 @@ def untouched_frames(
     """
     if recording.reference is not None:
         return recording.reference
-    first = recording.frames[seconds < seconds[0] + span]
-    read = first[np.isfinite(first).any(axis=1)]
-    if len(read) < _FEWEST:
-        step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
-        hint = f" Frames are {step:.3g} s apart: are these milliseconds?" if step > span else ""
+    first_frames = recording.frames[seconds < seconds[0] + span]
+    frames_with_readings = first_frames[np.isfinite(first_frames).any(axis=1)]
+    if len(frames_with_readings) < _MIN_UNTOUCHED_FRAMES:
+        interval = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+        hint = f" Frames are {interval:.3g} s apart: are these milliseconds?" if interval > span else ""
         raise ValueError(
-            f"untouched: the first {span:g} s of '{recording.name}' have {counted(len(read), 'frame')} with a reading; "
-            f"{_FEWEST} are needed of the untouched skin. Give a longer time, or a reference.{hint}"
+            f"untouched: the first {span:g} s of '{recording.name}' have "
+            f"{counted(len(frames_with_readings), 'frame')} with a reading; {_MIN_UNTOUCHED_FRAMES} are needed of the "
+            f"untouched skin. Give a longer time, or a reference.{hint}"
         )
-    return read
+    return frames_with_readings

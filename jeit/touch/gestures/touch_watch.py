@@ -22,12 +22,12 @@ from jeit.touch.gestures.touch_images import TouchImages
 
 # Minimum untouched time between two touches: seconds, and number of frames, of which the longer applies; untouched time
 # after which the reference follows the skin, seconds; time constant with which it follows, seconds.
-_GAP, _FRAMES_APART, _SETTLED, _FOLLOWED = 0.1, 2.5, 0.5, 2.0
+_MIN_GAP, _MIN_GAP_FRAMES, _SETTLING_TIME, _DRIFT_TIME_CONSTANT = 0.1, 2.5, 0.5, 2.0
 # Maximum fraction of the initial untouched frames that may exceed the learnt level.
-_MOST_ABOVE = 0.1
+_MAX_FRACTION_ABOVE_LEVEL = 0.1
 # Signs that the skin was touched when its reference was recorded: minimum ratio to the level of the largest change, if
 # it is opposite to a touch; minimum time, seconds, for which it lasts.
-_OPPOSITE, _LIFTED = 3.0, 0.5
+_MIN_OPPOSITE_RATIO, _MIN_OPPOSITE_TIME = 3.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class TouchWatch:
     images: TouchImages
     level: TouchLevel
     model: GestureModel
-    gap: float = _GAP
+    gap: float = _MIN_GAP
     patience: float = 30.0
     notes: tuple[str, ...] = ()
 
@@ -140,18 +140,18 @@ class TouchWatch:
         level = TouchLevel(images.mesh, model.reading.level)
         peaks = np.nanmax(model.reading.sign * images.changes(untouched), axis=1)
         peaks = peaks[np.isfinite(peaks)]
-        if len(peaks) and np.mean(peaks > level.level) > _MOST_ABOVE:
-            own = TouchLevel.of_untouched(images.mesh, model.reading.sign * images.changes(untouched))
+        if len(peaks) and np.mean(peaks > level.level) > _MAX_FRACTION_ABOVE_LEVEL:
+            raised_level = TouchLevel.of_untouched(images.mesh, model.reading.sign * images.changes(untouched))
             notes.append(
                 f"the untouched skin's images reach {peaks.max() / level.level:.2g} times the level that a touch "
                 "exceeded when gestures were learnt: a higher one is used, and weak touches are missed. Was the "
                 "skin touched meanwhile?"
             )
-            level = own
-        learnt = model.reading.rate
-        if not 0.5 < rate / learnt < 2:
-            notes.append(f"gestures were learnt at {learnt:.3g} frames/s, and frames come at {rate:.3g}.")
-        return cls(images, level, model, max(_GAP, _FRAMES_APART / rate), patience, tuple(notes))
+            level = raised_level
+        training_rate = model.reading.rate
+        if not 0.5 < rate / training_rate < 2:
+            notes.append(f"gestures were learnt at {training_rate:.3g} frames/s, and frames come at {rate:.3g}.")
+        return cls(images, level, model, max(_MIN_GAP, _MIN_GAP_FRAMES / rate), patience, tuple(notes))
 
     def follow(self, frames: Iterable[tuple[float, Any]]) -> Iterator[WatchedFrame]:
         """Process frames as they come: pairs of a time in seconds and voltages (M,).
@@ -171,106 +171,111 @@ class _Session:
         self.watch = watch
         self.sign = 1 if watch.model.reading is None else watch.model.reading.sign
         self.touches = TouchStream(watch.level, gap=watch.gap)
-        self.rest = np.asarray(watch.images.imager.expected, float)
-        self.drift = np.zeros_like(self.rest)
+        self.reference = np.asarray(watch.images.imager.expected, float)
+        self.drift = np.zeros_like(self.reference)
         # The last frame with the drift subtracted, None if it is invalid; then the clock time at which it came, its
         # time in the stream, and the time of the last result.
         self.frame: np.ndarray | None = None
-        self.came, self.second, self.last_seen = 0.0, -np.inf, -np.inf
-        self.last_touched, self.number = -np.inf, 0
-        self.named: NamedTouch | None = None
-        self.opposite_since: float | None = None
+        self.arrival_time, self.frame_time, self.last_result_time = 0.0, -np.inf, -np.inf
+        self.last_touch_time, self.num_ended_touches = -np.inf, 0
+        self.last_named_touch: NamedTouch | None = None
+        self.opposite_start: float | None = None
 
     def follow(self, frames: Iterable) -> Iterator[WatchedFrame]:
         """See `TouchWatch.follow`."""
         for image, change in self.watch.images.stream(self._frames_without_drift(frames)):
             yield self._frame_result(image, self.sign * change)
         if self.touches.touches:
-            self.came = time.perf_counter()
-            ended = tuple(self._ended_touch(one) for one in self.touches.touches)
-            yield WatchedFrame(self.second, None, np.nan, False, None, ended, time.perf_counter() - self.came)
+            self.arrival_time = time.perf_counter()
+            ended = tuple(self._ended_touch(touch) for touch in self.touches.touches)
+            yield WatchedFrame(
+                self.frame_time, None, np.nan, False, None, ended, time.perf_counter() - self.arrival_time
+            )
 
     def _frames_without_drift(self, frames: Iterable) -> Iterator:
         """Yield frames with the drift of the untouched skin subtracted."""
         for second, frame in frames:
-            self.came = time.perf_counter()
-            if not (is_number(second) and second >= self.second):
-                raise ValueError(f"seconds must not fall: after {self.second:g} s a frame has {describe(second)}.")
-            self.second = float(second)
+            self.arrival_time = time.perf_counter()
+            if not (is_number(second) and second >= self.frame_time):
+                raise ValueError(f"seconds must not fall: after {self.frame_time:g} s a frame has {describe(second)}.")
+            self.frame_time = float(second)
             try:
                 values = np.asarray(frame)
             except ValueError:  # a ragged array, which the stream refuses
                 values = np.empty(0)
-            plain = values.shape == self.rest.shape and values.dtype.kind in "iuf"
-            self.frame = values - self.drift if plain else None
+            is_valid = values.shape == self.reference.shape and values.dtype.kind in "iuf"
+            self.frame = values - self.drift if is_valid else None
             yield frame if self.frame is None else self.frame
 
     def _frame_result(self, image: FrameImage, change: np.ndarray) -> WatchedFrame:
         """Return the result for a frame with change of conductivity `change` (m,), which is positive where the skin is
         touched."""
-        second = self.second
+        second = self.frame_time
         self.touches = self.touches.follow(second, change)
-        ended = tuple(self._ended_touch(one) for one in self.touches.ended)
+        ended = tuple(self._ended_touch(touch) for touch in self.touches.ended)
         self.touches = replace(self.touches, ended=())
-        going, named = bool(self.touches.open), None
-        touched = going and self.touches.held == len(self.touches.open)
-        if touched:
-            self.last_touched, self.named = second, None  # the named touch continues
-        elif self.named is None and self.touches.touches:
-            (over,) = self.touches.touches
-            named = self.named = self._classify(over)
+        is_ongoing, newly_named = bool(self.touches.open), None
+        is_touched = is_ongoing and self.touches.held == len(self.touches.open)
+        if is_touched:
+            self.last_touch_time, self.last_named_touch = second, None  # the named touch continues
+        elif self.last_named_touch is None and self.touches.touches:
+            (ended_stream_touch,) = self.touches.touches
+            newly_named = self.last_named_touch = self._classify(ended_stream_touch)
         note = ""
         if self._is_lifted(image, change):
             note = f"at {second:.2f} s the skin is more at rest than when its rest was read: was it touched? Read anew."
             ended = (*ended, *self._reset_reference(image))
-        elif going and second - self.touches.open[0].seconds[0] >= self.watch.patience:
-            ended = (*ended, *(replace(one, held=True) for one in self._reset_reference(image)))
-        elif second - self.last_touched >= _SETTLED and np.isfinite(self.last_seen):
-            self._follow_drift(image, 1 - np.exp(-(second - self.last_seen) / _FOLLOWED))
-        self.last_seen = second
+        elif is_ongoing and second - self.touches.open[0].seconds[0] >= self.watch.patience:
+            ended = (*ended, *(replace(touch, held=True) for touch in self._reset_reference(image)))
+        elif second - self.last_touch_time >= _SETTLING_TIME and np.isfinite(self.last_result_time):
+            self._follow_drift(image, 1 - np.exp(-(second - self.last_result_time) / _DRIFT_TIME_CONSTANT))
+        self.last_result_time = second
         peak = float(change.max())
-        return WatchedFrame(second, image, peak, touched, named, ended, time.perf_counter() - self.came, note)
+        return WatchedFrame(
+            second, image, peak, is_touched, newly_named, ended, time.perf_counter() - self.arrival_time, note
+        )
 
     def _is_lifted(self, image: FrameImage, change: np.ndarray) -> bool:
         """Whether a touch that was present when the reference was recorded has been lifted for good."""
-        if not image.imaged or -change.min() <= max(change.max(), _OPPOSITE * self.watch.level.level):
-            self.opposite_since = None
-        elif self.opposite_since is None:
-            self.opposite_since = self.second
-        return self.opposite_since is not None and self.second - self.opposite_since >= _LIFTED
+        if not image.imaged or -change.min() <= max(change.max(), _MIN_OPPOSITE_RATIO * self.watch.level.level):
+            self.opposite_start = None
+        elif self.opposite_start is None:
+            self.opposite_start = self.frame_time
+        return self.opposite_start is not None and self.frame_time - self.opposite_start >= _MIN_OPPOSITE_TIME
 
     def _reset_reference(self, image: FrameImage) -> tuple[NamedTouch, ...]:
         """Make the last frame the reference of the untouched skin; returns the touch that this ends, if any."""
-        ended = tuple(self._ended_touch(one) for one in self.touches.touches)
+        ended = tuple(self._ended_touch(touch) for touch in self.touches.touches)
         self.touches = replace(self.touches, open=(), held=0, lost=(0, 0))
-        self.opposite_since = None
+        self.opposite_start = None
         self._follow_drift(image, 1.0)
         return ended
 
     def _follow_drift(self, image: FrameImage, share: float) -> None:
         """Add a fraction `share` of the last frame's deviation from the reference to the drift."""
         if self.frame is not None and image.imaged:
-            there = image.usable & np.isfinite(self.frame)
-            self.drift = self.drift + np.where(there, share * (self.frame - self.rest), 0.0)
+            is_usable = image.usable & np.isfinite(self.frame)
+            self.drift = self.drift + np.where(is_usable, share * (self.frame - self.reference), 0.0)
 
     def _classify(self, touch: StreamTouch) -> NamedTouch:
-        said = self.watch.model.predict([touch])
+        """Predict the gesture of a touch, with the time since its last frame arrived."""
+        gestures = self.watch.model.predict([touch])
         return NamedTouch(
-            number=self.number + 1,
+            number=self.num_ended_touches + 1,
             touch=touch,
-            gesture=str(said.gesture[0]),
-            probability=float(said.probability[0]),
-            probabilities=said.probabilities[0],
-            unlike=bool(said.unlike[0]),
-            named=self.second,
-            latency=time.perf_counter() - self.came,
+            gesture=str(gestures.gesture[0]),
+            probability=float(gestures.probability[0]),
+            probabilities=gestures.probabilities[0],
+            unlike=bool(gestures.unlike[0]),
+            named=self.frame_time,
+            latency=time.perf_counter() - self.arrival_time,
         )
 
     def _ended_touch(self, touch: StreamTouch) -> NamedTouch:
         """Return an ended touch with the prediction made when it was over, or with a new one if there is none for all
         of it."""
-        named, self.named = self.named, None
-        if named is None or len(named.touch.course) != len(touch.course):
-            named = self._classify(touch)
-        self.number += 1
-        return replace(named, touch=touch)
+        named_touch, self.last_named_touch = self.last_named_touch, None
+        if named_touch is None or len(named_touch.touch.course) != len(touch.course):
+            named_touch = self._classify(touch)
+        self.num_ended_touches += 1
+        return replace(named_touch, touch=touch)

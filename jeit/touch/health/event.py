@@ -95,21 +95,21 @@ class HealthEvent(Module):
     @property
     def open(self) -> bool:
         """Whether the event still applies: it is neither denied nor mended, and is not a repair."""
-        gone = self.status in (EventStatus.DENIED, EventStatus.MENDED)
-        return not gone and self.kind != EventKind.REPAIRED
+        is_closed = self.status in (EventStatus.DENIED, EventStatus.MENDED)
+        return not is_closed and self.kind != EventKind.REPAIRED
 
 
 # Minimum fraction of a step that occurs between the quarters of a window directly before and after it; for a constant
 # slope, the fraction is a quarter.
-_SHARP = 0.55
+_MIN_SHARPNESS = 0.55
 # Fraction of a step that the medians of all thirds of the frames after it must exceed; fraction that no third of the
 # frames before it may exceed.
-_STAYED, _NOT_YET = 0.5, 0.5
+_MIN_FRACTION_AFTER, _MAX_FRACTION_BEFORE = 0.5, 0.5
 # Fraction of the step below which a frame counts as before the step; maximum fraction of frames on the wrong side of
 # the step, because of touches of the opposite sign.
-_BACK, _SOME = 0.3, 0.1
+_BEFORE_LEVEL, _MAX_OUTLIER_FRACTION = 0.3, 0.1
 # Exponent of the power mean over channels, large enough to detect a change of a single channel among many.
-_POWER = 4
+_POWER_MEAN_EXPONENT = 4
 
 
 @dataclass(frozen=True)
@@ -135,18 +135,18 @@ def channel_medians(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]
     """Median of every channel over its readings; NaN for channels without readings."""
     if not np.isnan(frames).any():
         return np.median(frames, axis=0)
-    some = ~np.isnan(frames).all(axis=0)
-    found = np.full(frames.shape[1], np.nan)
-    found[some] = np.nanmedian(frames[:, some], axis=0)
-    return found
+    has_readings = ~np.isnan(frames).all(axis=0)
+    medians = np.full(frames.shape[1], np.nan)
+    medians[has_readings] = np.nanmedian(frames[:, has_readings], axis=0)
+    return medians
 
 
-def change_size(scaled: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "..."]:
+def change_size(scaled_changes: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "..."]:
     """Size of changes (..., M) divided by their healthy scale: a power mean over the channels that have readings."""
-    powers = np.minimum(np.abs(scaled), 1e9) ** _POWER
-    there = np.isfinite(powers)
-    mean = np.sum(np.where(there, powers, 0.0), axis=-1) / np.maximum(there.sum(axis=-1), 1)
-    return mean ** (1 / _POWER)
+    powers = np.minimum(np.abs(scaled_changes), 1e9) ** _POWER_MEAN_EXPONENT
+    has_reading = np.isfinite(powers)
+    mean_powers = np.sum(np.where(has_reading, powers, 0.0), axis=-1) / np.maximum(has_reading.sum(axis=-1), 1)
+    return mean_powers ** (1 / _POWER_MEAN_EXPONENT)
 
 
 def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M"], limit: float) -> Step | None:
@@ -160,22 +160,29 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
     if size <= limit:
         return None
     direction = np.nan_to_num(change / scale**2)
-    half = len(frames) // 2
-    before = np.where(np.isfinite(change), channel_medians(frames[:half]), 0.0)
-    readings = np.where(np.isfinite(frames), frames, before)
+    half_length = len(frames) // 2
+    initial_medians = np.where(np.isfinite(change), channel_medians(frames[:half_length]), 0.0)
+    readings = np.where(np.isfinite(frames), frames, initial_medians)
     # Component of the frames along the step: 0 before the step, 1 after it.
-    along = (readings - before) @ direction / max(np.nan_to_num(change) @ direction, 1e-300)
-    first = _best_split_index(np.clip(along, -1.0, 2.0), half)
-    quarter = max(2, half // 4)
-    if first < half // 2 or first + quarter > len(along):
+    projections = (readings - initial_medians) @ direction / max(np.nan_to_num(change) @ direction, 1e-300)
+    first_frame = _best_split_index(np.clip(projections, -1.0, 2.0), half_length)
+    quarter_length = max(2, half_length // 4)
+    if first_frame < half_length // 2 or first_frame + quarter_length > len(projections):
         return None
-    sharp = np.median(along[first : first + quarter]) - np.median(along[max(0, first - quarter) : first])
-    thirds = [np.median(part) for part in np.array_split(along[first:], 3)]
-    earlier = [np.median(part) for part in np.array_split(along[:first], 3)]
-    if sharp < _SHARP or min(thirds) < _STAYED or max(earlier) > _NOT_YET or not is_distinct(along, first):
+    sharpness = np.median(projections[first_frame : first_frame + quarter_length]) - np.median(
+        projections[max(0, first_frame - quarter_length) : first_frame]
+    )
+    medians_after = [np.median(third) for third in np.array_split(projections[first_frame:], 3)]
+    medians_before = [np.median(third) for third in np.array_split(projections[:first_frame], 3)]
+    if (
+        sharpness < _MIN_SHARPNESS
+        or min(medians_after) < _MIN_FRACTION_AFTER
+        or max(medians_before) > _MAX_FRACTION_BEFORE
+        or not is_distinct(projections, first_frame)
+    ):
         return None
-    # The step may not be where the windows meet.
-    return Step(channel_medians(frames[first:]) - channel_medians(frames[:first]), size, first)
+    # The step may be at another frame than the boundary between the windows.
+    return Step(channel_medians(frames[first_frame:]) - channel_medians(frames[:first_frame]), size, first_frame)
 
 
 def is_distinct(projections: Float[np.ndarray, " n"], first: int) -> bool:
@@ -184,16 +191,18 @@ def is_distinct(projections: Float[np.ndarray, " n"], first: int) -> bool:
     Between two touches, in contrast, frames return to 0.
     """
     noise = 1.4826 * np.median(np.abs(np.diff(projections))) / np.sqrt(2)
-    most = max(_SOME, 1.5 * float(ndtr((_BACK - 1) / max(noise, 1e-12))))
-    early = np.mean(projections[:first] > 1 - _BACK) if first else 0.0
-    return bool(np.mean(projections[first:] < _BACK) <= most and early <= most)
+    max_fraction = max(_MAX_OUTLIER_FRACTION, 1.5 * float(ndtr((_BEFORE_LEVEL - 1) / max(noise, 1e-12))))
+    early_fraction = np.mean(projections[:first] > 1 - _BEFORE_LEVEL) if first else 0.0
+    return bool(np.mean(projections[first:] < _BEFORE_LEVEL) <= max_fraction and early_fraction <= max_fraction)
 
 
 def _best_split_index(projections: np.ndarray, half: int) -> int:
     """Find the index at which splitting the frames into two constant parts fits best."""
-    number = len(projections)
-    total, sums = projections.sum(), np.cumsum(projections)[:-1]
-    count = np.arange(1, number)
-    between = sums**2 / count + (total - sums) ** 2 / (number - count)
-    allowed = slice(max(3, half // 2) - 1, number - 3)
-    return int(np.argmax(between[allowed])) + int(allowed.start) + 1
+    num_frames = len(projections)
+    total_sum, cumulative_sums = projections.sum(), np.cumsum(projections)[:-1]
+    num_before = np.arange(1, num_frames)
+    between_sum_of_squares = cumulative_sums**2 / num_before + (total_sum - cumulative_sums) ** 2 / (
+        num_frames - num_before
+    )
+    allowed_indices = slice(max(3, half // 2) - 1, num_frames - 3)
+    return int(np.argmax(between_sum_of_squares[allowed_indices])) + int(allowed_indices.start) + 1

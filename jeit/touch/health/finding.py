@@ -15,14 +15,14 @@ from jeit.touch.health.imaged_skin import ImagedSkin
 # Failing electrodes: maximum fraction of a change's energy that they may leave unexplained; minimum fraction of an
 # electrode's channels that have changed; minimum change of such a channel, divided by its reading; maximum fraction of
 # electrodes that may fail at once.
-_LEFT, _OWN, _RELATIVE, _AT_ONCE = 0.1, 0.75, 0.12, 0.25
+_MAX_UNEXPLAINED, _MIN_CHANGED_FRACTION, _MIN_RELATIVE_CHANGE, _MAX_FAULTY_FRACTION = 0.1, 0.75, 0.12, 0.25
 # Maximum ratio of a reading to its reference for a torn wire; minimum ratio of the noise to its healthy value for a
 # loose contact.
-_NOTHING, _WANDERS = 0.2, 5.0
+_TORN_RATIO, _LOOSE_NOISE_RATIO = 0.2, 5.0
 # Ratio of the standard deviation of a normal variable to the median magnitude of the difference of two.
-_DEVIATION = 1.0484
+_DEVIATION_PER_MEDIAN_DIFFERENCE = 1.0484
 # Maximum of a change divided by the reading; larger ones are clipped.
-_MOST = 10.0
+_MAX_RELATIVE_CHANGE = 10.0
 
 
 def faulty_electrodes(
@@ -33,21 +33,34 @@ def faulty_electrodes(
     Returns the numbers of these electrodes, or an empty list if the skin must have changed too. `uses_electrode` (L,
     M): whether each channel uses each electrode.
     """
-    size = np.sqrt(np.mean(reference[np.isfinite(reference)] ** 2))
-    relative = np.abs(np.nan_to_num(change)) / np.maximum(np.abs(reference), 0.1 * size)
-    relative = np.minimum(relative, _MOST)
+    rms_reading = np.sqrt(np.mean(reference[np.isfinite(reference)] ** 2))
+    relative_changes = np.abs(np.nan_to_num(change)) / np.maximum(np.abs(reference), 0.1 * rms_reading)
+    relative_changes = np.minimum(relative_changes, _MAX_RELATIVE_CHANGE)
     # The change of a channel with a weak reading is compared with the mean reading, not with its own.
-    energy = np.minimum(np.abs(np.nan_to_num(change)) / size, relative) ** 2
-    total, left, found = energy.sum(), np.ones(len(energy), bool), []
-    while total > 0 and energy[left].sum() > _LEFT * total and len(found) < max(1, _AT_ONCE * len(uses_electrode)):
-        own = np.array([energy[left & one].sum() / max(1, (left & one).sum()) ** 0.5 for one in uses_electrode])
-        best = int(own.argmax())
-        mine = uses_electrode[best] & left
-        if not mine.any() or np.mean(relative[mine] > _RELATIVE) < _OWN:
+    energies = np.minimum(np.abs(np.nan_to_num(change)) / rms_reading, relative_changes) ** 2
+    total_energy, is_unexplained, electrodes = energies.sum(), np.ones(len(energies), bool), []
+    while (
+        total_energy > 0
+        and energies[is_unexplained].sum() > _MAX_UNEXPLAINED * total_energy
+        and len(electrodes) < max(1, _MAX_FAULTY_FRACTION * len(uses_electrode))
+    ):
+        scores = np.array(
+            [
+                energies[is_unexplained & electrode_channels].sum()
+                / max(1, (is_unexplained & electrode_channels).sum()) ** 0.5
+                for electrode_channels in uses_electrode
+            ]
+        )
+        best_electrode = int(scores.argmax())
+        unexplained_channels = uses_electrode[best_electrode] & is_unexplained
+        if (
+            not unexplained_channels.any()
+            or np.mean(relative_changes[unexplained_channels] > _MIN_RELATIVE_CHANGE) < _MIN_CHANGED_FRACTION
+        ):
             return []
-        found.append(best)
-        left &= ~uses_electrode[best]
-    return found if total > 0 and energy[left].sum() <= _LEFT * total else []
+        electrodes.append(best_electrode)
+        is_unexplained &= ~uses_electrode[best_electrode]
+    return electrodes if total_energy > 0 and energies[is_unexplained].sum() <= _MAX_UNEXPLAINED * total_energy else []
 
 
 def kind_of_fault(
@@ -57,24 +70,26 @@ def kind_of_fault(
     electrode_channels: Bool[np.ndarray, " M"],
 ) -> EventKind:
     """Classify the fault of an electrode with channels `electrode_channels` (M,) from its latest `frames` (n, M)."""
-    now = frames[:, electrode_channels]
-    middle = np.nanmedian(now, axis=0)
-    size = np.sqrt(np.mean(reference[electrode_channels] ** 2))
-    constant = (
-        len(middle) > 1
-        and np.ptp(middle) <= 0.02 * np.abs(middle).max()
-        and np.ptp(reference[electrode_channels]) > 0.1 * size
+    electrode_frames = frames[:, electrode_channels]
+    medians = np.nanmedian(electrode_frames, axis=0)
+    rms_reading = np.sqrt(np.mean(reference[electrode_channels] ** 2))
+    is_constant = (
+        len(medians) > 1
+        and np.ptp(medians) <= 0.02 * np.abs(medians).max()
+        and np.ptp(reference[electrode_channels]) > 0.1 * rms_reading
     )
-    if constant or np.median(np.abs(middle)) < _NOTHING * np.median(np.abs(reference[electrode_channels])):
+    if is_constant or np.median(np.abs(medians)) < _TORN_RATIO * np.median(np.abs(reference[electrode_channels])):
         return EventKind.TORN
     # Touches hardly affect differences from frame to frame.
-    steps = np.diff(now, axis=0)
-    some = np.isfinite(steps).any(axis=0)
-    wander = np.zeros(len(middle))
-    if some.any():
-        wander[some] = _DEVIATION * np.nanmedian(np.abs(steps[:, some]), axis=0)
-    wander /= np.minimum(noise[electrode_channels], size)
-    if np.median(wander) > _WANDERS and np.median(np.abs(middle)) < _MOST * np.median(
+    differences = np.diff(electrode_frames, axis=0)
+    has_steps = np.isfinite(differences).any(axis=0)
+    noise_ratios = np.zeros(len(medians))
+    if has_steps.any():
+        noise_ratios[has_steps] = _DEVIATION_PER_MEDIAN_DIFFERENCE * np.nanmedian(
+            np.abs(differences[:, has_steps]), axis=0
+        )
+    noise_ratios /= np.minimum(noise[electrode_channels], rms_reading)
+    if np.median(noise_ratios) > _LOOSE_NOISE_RATIO and np.median(np.abs(medians)) < _MAX_RELATIVE_CHANGE * np.median(
         np.abs(reference[electrode_channels])
     ):
         return EventKind.LOOSE
@@ -83,7 +98,7 @@ def kind_of_fault(
 
 # Maximum fraction of the energy of a change in an electrode's channels that a cut beside the electrode leaves
 # unexplained; for a failing contact, the fraction is larger.
-_CUT_BESIDE = 0.1
+_MAX_CUT_MISFIT = 0.1
 
 
 @dataclass(frozen=True)
@@ -105,17 +120,17 @@ class LastingChange:
 class Finding:
     """Classification of a lasting change.
 
-    **Fields**: `kind`: kind of event; `reason`: explanation; `sure`: False if a press may cause the same change;
-    `electrode`: number of the failing electrode, or None; `loss`: fitted cut, or None; `own` (M,): channels that are
-    affected, None for all.
+    **Fields**: `kind`: kind of event; `reason`: explanation; `is_certain`: False if a press may cause the same change;
+    `electrode`: number of the failing electrode, or None; `loss`: fitted cut, or None; `channels` (M,): channels that
+    are affected, None for all.
     """
 
     kind: EventKind
     reason: str
-    sure: bool
+    is_certain: bool
     electrode: int | None = None
     loss: FittedLoss | None = None
-    own: Bool[np.ndarray, " M"] | None = None
+    channels: Bool[np.ndarray, " M"] | None = None
 
 
 def classify_change(
@@ -127,33 +142,36 @@ def classify_change(
     skin: ImagedSkin | None,
 ) -> list[Finding]:
     """Classify a `change` (M,) from the `reference` (M,), with the `frames` (n, M) after it."""
-    used = healthy.used & np.isfinite(change)
+    usable = healthy.used & np.isfinite(change)
     electrodes = [] if touching is None else faulty_electrodes(change, reference, touching & healthy.used)
     faults = []
-    for one in electrodes:
-        own = touching[one] & healthy.used  # pyright: ignore[reportOptionalSubscript]
-        kind = kind_of_fault(frames, reference, healthy.noise, own)
-        reason = f"Nearly all of the change is in the {int(own.sum())} channels of electrode {one + 1}."
-        faults.append(Finding(kind, reason, True, electrode=one, own=own))
+    for electrode in electrodes:
+        electrode_channels = touching[electrode] & healthy.used  # pyright: ignore[reportOptionalSubscript]
+        kind = kind_of_fault(frames, reference, healthy.noise, electrode_channels)
+        fault_reason = (
+            f"Nearly all of the change is in the {int(electrode_channels.sum())} channels of electrode {electrode + 1}."
+        )
+        faults.append(Finding(kind, fault_reason, True, electrode=electrode, channels=electrode_channels))
     # A cut right beside an electrode also changes almost only that electrode's channels. But it does not fluctuate, and
     # does not increase the current at the electrode.
-    if faults and (skin is None or any(one.kind != EventKind.DEAD for one in faults)):
+    if faults and (skin is None or any(fault.kind != EventKind.DEAD for fault in faults)):
         return faults
-    loss = None if skin is None else skin.fit_cut(change, used, healthy.scale)
-    if faults and (loss is None or loss.misfit > _CUT_BESIDE):
+    loss = None if skin is None else skin.fit_cut(change, usable, healthy.scale)
+    if faults and (loss is None or loss.misfit > _MAX_CUT_MISFIT):
         return faults
-    outside = healthy.fraction_outside(change)
-    unlike = outside > healthy.unlike
-    said = (
-        f"{100 * outside:.0f} % of it is in no direction of touches; of those, {100 * healthy.unlike:.0f} % at most."
-        if unlike
+    fraction_outside = healthy.fraction_outside(change)
+    is_unlike_touches = fraction_outside > healthy.max_fraction_outside
+    reason_text = (
+        f"{100 * fraction_outside:.0f} % of it is in no direction of touches; of those, "
+        f"{100 * healthy.max_fraction_outside:.0f} % at most."
+        if is_unlike_touches
         else "A press that is held looks the same: wait, or check the skin."
     )
     if loss is not None:
-        across = "through the whole skin" if loss.through else "perhaps through a part of its depth"
-        said = f"Conductivity is lost along a line, {across}. {said}"
-        return [Finding(EventKind.CUT, said, unlike or _loss_is_opposite_to_touch(skin), loss=loss)]
-    return [Finding(EventKind.CHANGED, said, unlike)]
+        depth_text = "through the whole skin" if loss.through else "perhaps through a part of its depth"
+        reason_text = f"Conductivity is lost along a line, {depth_text}. {reason_text}"
+        return [Finding(EventKind.CUT, reason_text, is_unlike_touches or _loss_is_opposite_to_touch(skin), loss=loss)]
+    return [Finding(EventKind.CHANGED, reason_text, is_unlike_touches)]
 
 
 def _loss_is_opposite_to_touch(skin: ImagedSkin | None) -> bool:

@@ -15,7 +15,7 @@ from jeit.touch.health import SkinHealth
 
 # Minimum fraction of a frame's channels that have a reading; number of healthy frames below which drift is poorly
 # known; ratio between the readings of two recordings that suggests different units.
-_READ, _FEW, _ANOTHER = 0.5, 250, 20.0
+_MIN_READ_FRACTION, _MIN_NUM_FRAMES, _MAX_UNIT_RATIO = 0.5, 250, 20.0
 
 
 def learn_health(
@@ -51,17 +51,17 @@ def learn_health(
     check_kind("healthy", healthy, FrameRecording, "a FrameRecording, as of read_frame_recording(path)")
     frames, seconds = healthy.frames, seconds_of(healthy, rate)
     if seconds is not None:
-        later = np.diff(seconds, prepend=-np.inf) > 0  # duplicate frames are left out
-        frames, seconds = frames[later], seconds[later]
-    given = {"patience": patience, "sign": sign}
+        is_later = np.diff(seconds, prepend=-np.inf) > 0  # duplicate frames are left out
+        frames, seconds = frames[is_later], seconds[is_later]
+    options = {"patience": patience, "sign": sign}
     if description is None:
-        return SkinHealth.fit(frames, seconds, **given)
+        return SkinHealth.fit(frames, seconds, **options)
     if description.domain is None or description.electrodes is None:
-        return SkinHealth.fit(frames, seconds, protocol=description.protocol(healthy.name), **given)
-    rest = np.nanmedian(frames, axis=0, keepdims=True) if healthy.reference is None else healthy.reference
-    images = TouchImages.prepare(description, rest, progress=progress)
+        return SkinHealth.fit(frames, seconds, protocol=description.protocol(healthy.name), **options)
+    rest_frames = np.nanmedian(frames, axis=0, keepdims=True) if healthy.reference is None else healthy.reference
+    images = TouchImages.prepare(description, rest_frames, progress=progress)
     background = np.full(images.mesh.num_cells, images.background)
-    return SkinHealth.fit(frames, seconds, model=images.calibration.model, conductivity=background, **given)
+    return SkinHealth.fit(frames, seconds, model=images.calibration.model, conductivity=background, **options)
 
 
 def seconds_of(recording: FrameRecording, rate: float | None) -> Float[np.ndarray, " F"] | None:
@@ -89,33 +89,39 @@ def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndar
     print(doubts_of(health, healthy_recording, damaged))
     ```
     """
-    known = health.healthy
-    there = np.isfinite(frames)
-    if not (there[:, known.used].mean(axis=1) >= _READ).any():
+    healthy_state = health.healthy
+    has_reading = np.isfinite(frames)
+    if not (has_reading[:, healthy_state.used].mean(axis=1) >= _MIN_READ_FRACTION).any():
         raise ValueError("frames: none of them has a reading in half of the healthy recording's channels.")
     doubts = []
-    window = known.window * known.stride
-    if len(frames) < 2 * window:
+    window_length = healthy_state.window * healthy_state.stride
+    if len(frames) < 2 * window_length:
         doubts.append(
-            f"{len(frames)} frames are fewer than two windows of {window}: a change that lasts cannot be distinguished "
-            "from a touch in them."
+            f"{len(frames)} frames are fewer than two windows of {window_length}: a change that lasts cannot be "
+            "distinguished from a touch in them."
         )
-    if known.brief or len(healthy.frames) < _FEW:
+    if healthy_state.is_brief or len(healthy.frames) < _MIN_NUM_FRAMES:
         doubts.append(
             f"the healthy recording has {len(healthy.frames)} frames, few beside the length of touches, or at all: "
             "findings may be false, and damage may be missed. Give forty of the longest touches, and a minute; or a "
             f"shorter patience than {health.patience:.3g}, if no touch lasts that long."
         )
-    silent = np.flatnonzero(known.used & ~there.any(axis=0))
-    if silent.size:
-        doubts.append(f"without any reading: channels {', '.join(map(str, silent[:12]))}, counted from 0.")
-    first = np.where(there.any(axis=0), np.take_along_axis(frames, there.argmax(axis=0)[None], axis=0)[0], np.nan)
-    constant = np.flatnonzero(known.used & there.any(axis=0) & (~there | (frames == first)).all(axis=0))
-    if constant.size and len(frames) > 2:
-        doubts.append(f"constant throughout: channels {', '.join(map(str, constant[:12]))}, counted from 0.")
-    off = np.nanmedian(np.where(there, frames, np.nan)[:, known.used & there.any(axis=0)], axis=0)
-    own = known.reference[known.used & there.any(axis=0)]
-    ratio = float(np.median(np.abs(off)) / max(np.median(np.abs(own)), 1e-300))
-    if not 1 / _ANOTHER < ratio < _ANOTHER:
+    silent_channels = np.flatnonzero(healthy_state.used & ~has_reading.any(axis=0))
+    if silent_channels.size:
+        doubts.append(f"without any reading: channels {', '.join(map(str, silent_channels[:12]))}, counted from 0.")
+    first_readings = np.where(
+        has_reading.any(axis=0), np.take_along_axis(frames, has_reading.argmax(axis=0)[None], axis=0)[0], np.nan
+    )
+    constant_channels = np.flatnonzero(
+        healthy_state.used & has_reading.any(axis=0) & (~has_reading | (frames == first_readings)).all(axis=0)
+    )
+    if constant_channels.size and len(frames) > 2:
+        doubts.append(f"constant throughout: channels {', '.join(map(str, constant_channels[:12]))}, counted from 0.")
+    medians = np.nanmedian(
+        np.where(has_reading, frames, np.nan)[:, healthy_state.used & has_reading.any(axis=0)], axis=0
+    )
+    healthy_medians = healthy_state.reference[healthy_state.used & has_reading.any(axis=0)]
+    ratio = float(np.median(np.abs(medians)) / max(np.median(np.abs(healthy_medians)), 1e-300))
+    if not 1 / _MAX_UNIT_RATIO < ratio < _MAX_UNIT_RATIO:
         doubts.append(f"frames are {ratio:.3g} times the healthy ones: are both in the same unit?")
     return doubts

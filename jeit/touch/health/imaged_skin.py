@@ -17,15 +17,15 @@ from jeit.touch.health.cut_path import FittedLoss, LossFit
 from jeit_solvers.engines import as_array
 
 # Maximum factor between the gain of a channel and that of all channels; if it is larger, the latter is used.
-_AGREES = 3.0
+_MAX_GAIN_FACTOR = 3.0
 # Maximum factor between readings and the model that model errors explain; a larger one is due to units or polarity.
-_OFF = 10.0
+_MAX_MODEL_FACTOR = 10.0
 # Fraction of an image's peak above which cells count for the starting point of the fit, their centroid.
-_ABOVE = 0.5
+_PEAK_FRACTION = 0.5
 # Thresholds for accepting a line as a cut: maximum misfit, and maximum ratio of its misfit to that of a spot.
-_EXPLAINS, _BETTER = 0.4, 0.6
+_MAX_MISFIT, _MAX_MISFIT_RATIO = 0.4, 0.6
 # Minimum distance of a second starting point from the first, divided by the skin's side.
-_APART = 0.05
+_MIN_START_DISTANCE = 0.05
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,16 @@ class ImagedSkin:
         predicted = np.asarray(model.voltages(values))
         used = np.isfinite(noise)
         ratio = reference[used] @ predicted[used] / (predicted[used] @ predicted[used])
-        if not 1 / _OFF < ratio < _OFF:
+        if not 1 / _MAX_MODEL_FACTOR < ratio < _MAX_MODEL_FACTOR:
             raise ValueError(
                 f"healthy: it is {ratio:.2g} times what the model predicts; are both in SI units, and the signs right?"
             )
-        each = reference / np.where(predicted == 0, np.inf, predicted)
-        gain = np.where(used & (each > ratio / _AGREES) & (each < ratio * _AGREES), each, ratio)
+        channel_ratios = reference / np.where(predicted == 0, np.inf, predicted)
+        gain = np.where(
+            used & (channel_ratios > ratio / _MAX_GAIN_FACTOR) & (channel_ratios < ratio * _MAX_GAIN_FACTOR),
+            channel_ratios,
+            ratio,
+        )
         return cls(model, values, values, gain, noise, int(sign))
 
     def linear_reconstruction(self, usable: Bool[np.ndarray, " M"]) -> LinearReconstruction:
@@ -85,15 +89,15 @@ class ImagedSkin:
 
         Channels without a reading are NaN; a frame without any reading gives NaN.
         """
-        there = np.isfinite(changes) & usable
-        volts = np.where(there, changes / self.gain, 0.0)
-        found = np.full((len(changes), self.model.mesh.num_cells), np.nan)
-        patterns, kind = np.unique(there, axis=0, return_inverse=True)
-        for number, pattern in enumerate(patterns):
+        has_reading = np.isfinite(changes) & usable
+        volts = np.where(has_reading, changes / self.gain, 0.0)
+        images = np.full((len(changes), self.model.mesh.num_cells), np.nan)
+        patterns, pattern_indices = np.unique(has_reading, axis=0, return_inverse=True)
+        for pattern_index, pattern in enumerate(patterns):
             if pattern.any():
-                rows = kind.ravel() == number
-                found[rows] = np.asarray(self.linear_reconstruction(pattern).image(as_array(volts[rows])))
-        return found
+                is_pattern = pattern_indices.ravel() == pattern_index
+                images[is_pattern] = np.asarray(self.linear_reconstruction(pattern).image(as_array(volts[is_pattern])))
+        return images
 
     def fit_cut(
         self, change: Float[np.ndarray, " M"], usable: Bool[np.ndarray, " M"], noise: Float[np.ndarray, " M"]
@@ -102,26 +106,26 @@ class ImagedSkin:
 
         `usable` (M,): channels to use; `noise` (M,): noise of the change, volts.
         """
-        there = usable & np.isfinite(change)
-        volts = np.where(there, change / self.gain, 0.0)
-        image = np.asarray(self.linear_reconstruction(there).image(as_array(volts)))
-        lost = np.maximum(-image, 0.0)
-        if not lost.max() > 0:
+        is_used = usable & np.isfinite(change)
+        volts = np.where(is_used, change / self.gain, 0.0)
+        image = np.asarray(self.linear_reconstruction(is_used).image(as_array(volts)))
+        losses = np.maximum(-image, 0.0)
+        if not losses.max() > 0:
             return None
         centres = np.asarray(centroids(self.model.mesh))[:, :2]
-        weight = np.asarray(measures(self.model.mesh)) * np.where(lost > _ABOVE * lost.max(), lost, 0.0)
-        start = weight @ centres / weight.sum()
-        channels = np.flatnonzero(there)
-        own = noise[channels] / np.abs(self.gain[channels])
-        fit = LossFit(self.model, self.conductivity, volts[channels], channels, own, start)
-        spot = fit.fit_spot(start)
+        weights = np.asarray(measures(self.model.mesh)) * np.where(losses > _PEAK_FRACTION * losses.max(), losses, 0.0)
+        start = weights @ centres / weights.sum()
+        channels = np.flatnonzero(is_used)
+        channel_noise = noise[channels] / np.abs(self.gain[channels])
+        loss_fit = LossFit(self.model, self.conductivity, volts[channels], channels, channel_noise, start)
+        spot_fit = loss_fit.fit_spot(start)
         starts = [start]
-        if np.linalg.norm(spot.path[0] - start) > _APART * fit.side:
-            starts.append(spot.path[0])
-        line = fit.fit_line(starts)
-        if line.misfit > _EXPLAINS or line.misfit > _BETTER * spot.misfit:
+        if np.linalg.norm(spot_fit.path[0] - start) > _MIN_START_DISTANCE * loss_fit.skin_size:
+            starts.append(spot_fit.path[0])
+        line_fit = loss_fit.fit_line(starts)
+        if line_fit.misfit > _MAX_MISFIT or line_fit.misfit > _MAX_MISFIT_RATIO * spot_fit.misfit:
             return None
-        return line
+        return line_fit
 
     def with_cut(self, loss: FittedLoss) -> "ImagedSkin":
         """Return the skin with a cut added."""

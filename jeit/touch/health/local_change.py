@@ -30,7 +30,7 @@ from jeit.mesh.checks import size_checked
 from jeit_solvers.engines import on_host
 
 # Maximum number of times that a cell is halved.
-_ROUNDS = 12
+_MAX_ROUNDS = 12
 # Electrodes that remain valid if the mesh of the skin gets more nodes.
 _MESH_INDEPENDENT = (BoundaryElectrodes, SheetDiscs, PointElectrodes, NodeElectrodes)
 
@@ -47,8 +47,8 @@ def finer_model(
     mesh = model.mesh
     check_flat(mesh, "cuts")
     if mesh.dimension == 2 and isinstance(model.electrodes, _MESH_INDEPENDENT):
-        finer, parent = finer_mesh(mesh, centre, radius, 0.5 * edge**2)
-        return ForwardModel(finer, model.electrodes, model.protocol), parent, edge
+        refined_mesh, parent = finer_mesh(mesh, centre, radius, 0.5 * edge**2)
+        return ForwardModel(refined_mesh, model.electrodes, model.protocol), parent, edge
     extent = np.ptp(np.asarray(mesh.points), axis=0)
     if mesh.dimension == 2:
         edge = float(np.sqrt(2 * np.mean(np.asarray(measures(mesh)))))
@@ -65,61 +65,66 @@ def finer_mesh(mesh: Mesh, centre: np.ndarray, radius: float, area: float) -> tu
     """
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     parent = np.arange(len(cells))
-    for _ in range(_ROUNDS):
-        made = Mesh.create(points, cells)
-        near = np.linalg.norm(np.asarray(centroids(made)) - centre, axis=1) < radius
-        large = near & (np.asarray(measures(made)) > area)
-        if not large.any():
+    for _ in range(_MAX_ROUNDS):
+        refined_mesh = Mesh.create(points, cells)
+        is_near = np.linalg.norm(np.asarray(centroids(refined_mesh)) - centre, axis=1) < radius
+        is_large = is_near & (np.asarray(measures(refined_mesh)) > area)
+        if not is_large.any():
             break
-        points, cells, parent = _halve(points, cells, parent, large)
+        points, cells, parent = _halve(points, cells, parent, is_large)
     return Mesh.create(points, cells), parent
 
 
-def _halve(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, large: Bool[np.ndarray, " m"]):
-    """Halve the `large` cells, and others as needed to avoid hanging nodes; returns points, cells and parents."""
-    pairs = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
-    edges, number = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
-    number = number.reshape(-1, 3)
+def _halve(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, is_large: Bool[np.ndarray, " m"]):
+    """Halve the cells that `is_large` (m,) marks, and others as needed to avoid hanging nodes. Returns points, cells
+    and parents."""
+    node_pairs = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
+    edges, edge_numbers = np.unique(node_pairs.reshape(-1, 2), axis=0, return_inverse=True)
+    edge_numbers = edge_numbers.reshape(-1, 3)
     lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     # If two edges of a cell are equally long, both neighbours must choose the same one.
     lengths = lengths * (1 + 1e-9 * np.arange(len(lengths)) / len(lengths))
-    longest = number[np.arange(len(cells)), lengths[number].argmax(axis=1)]
-    split = np.zeros(len(edges), bool)
-    split[longest[large]] = True
+    longest_edges = edge_numbers[np.arange(len(cells)), lengths[edge_numbers].argmax(axis=1)]
+    is_split = np.zeros(len(edges), bool)
+    is_split[longest_edges[is_large]] = True
     while True:
-        hanging = split[number].any(axis=1) & ~split[longest]
-        if not hanging.any():
+        is_hanging = is_split[edge_numbers].any(axis=1) & ~is_split[longest_edges]
+        if not is_hanging.any():
             break
-        split[longest[hanging]] = True
-    middle = np.full(len(edges), -1)
-    middle[split] = len(points) + np.arange(split.sum())
-    points = np.concatenate([points, points[edges[split]].mean(axis=1)])
+        is_split[longest_edges[is_hanging]] = True
+    midpoint_nodes = np.full(len(edges), -1)
+    midpoint_nodes[is_split] = len(points) + np.arange(is_split.sum())
+    points = np.concatenate([points, points[edges[is_split]].mean(axis=1)])
     # Turn each cell so that its longest edge comes first, then halve it.
-    place = lengths[number].argmax(axis=1)
+    longest_positions = lengths[edge_numbers].argmax(axis=1)
     rows = np.arange(len(cells))[:, None]
-    turned, own = cells[rows, (place[:, None] + np.arange(3)) % 3], number[rows, (place[:, None] + np.arange(3)) % 3]
-    kept = ~split[longest]
-    a, b, c = turned[~kept].T
-    new, whose = middle[own[~kept]], parent[~kept]
-    made, of = [turned[kept]], [parent[kept]]
-    for corner, other, across in ((b, c, new[:, 1]), (c, a, new[:, 2])):
-        # A half is the triangle (corner, other, middle of the longest edge); its edge from corner to other may be
-        # halved too.
-        halved = across >= 0
-        top = new[:, 0]
-        made += [
-            np.column_stack([corner, other, top])[~halved],
-            np.column_stack([corner, across, top])[halved],
-            np.column_stack([across, other, top])[halved],
+    rotated_cells, rotated_edges = (
+        cells[rows, (longest_positions[:, None] + np.arange(3)) % 3],
+        edge_numbers[rows, (longest_positions[:, None] + np.arange(3)) % 3],
+    )
+    is_unchanged = ~is_split[longest_edges]
+    first_node, second_node, third_node = rotated_cells[~is_unchanged].T
+    new_nodes, parents_of_halved = midpoint_nodes[rotated_edges[~is_unchanged]], parent[~is_unchanged]
+    new_cells, new_parents = [rotated_cells[is_unchanged]], [parent[is_unchanged]]
+    halves = ((second_node, third_node, new_nodes[:, 1]), (third_node, first_node, new_nodes[:, 2]))
+    for corner, opposite, edge_midpoint in halves:
+        # A half is the triangle (corner, opposite, midpoint of the longest edge); its edge from corner to opposite may
+        # be halved too.
+        is_halved = edge_midpoint >= 0
+        longest_midpoint = new_nodes[:, 0]
+        new_cells += [
+            np.column_stack([corner, opposite, longest_midpoint])[~is_halved],
+            np.column_stack([corner, edge_midpoint, longest_midpoint])[is_halved],
+            np.column_stack([edge_midpoint, opposite, longest_midpoint])[is_halved],
         ]
-        of += [whose[~halved], whose[halved], whose[halved]]
-    return points, np.concatenate(made), np.concatenate(of)
+        new_parents += [parents_of_halved[~is_halved], parents_of_halved[is_halved], parents_of_halved[is_halved]]
+    return points, np.concatenate(new_cells), np.concatenate(new_parents)
 
 
 # Maximum number of nodes of a region.
-_MOST_NODES = 2500
+_MAX_NUM_NODES = 2500
 # Factor by which the radius of a region with too many nodes is reduced.
-_SHRINKAGE = 0.85
+_SHRINKAGE_FACTOR = 0.85
 
 
 class LocalChange:
@@ -134,20 +139,20 @@ class LocalChange:
     ):
         self.model = model
         mesh = model.mesh
-        away = np.linalg.norm(np.asarray(centroids(mesh))[:, :2] - centre, axis=1)
+        distances = np.linalg.norm(np.asarray(centroids(mesh))[:, :2] - centre, axis=1)
         corners = np.asarray(mesh.cells)
-        while len(nodes := np.unique(corners[away < radius])) > _MOST_NODES:
-            radius *= _SHRINKAGE
+        while len(nodes := np.unique(corners[distances < radius])) > _MAX_NUM_NODES:
+            radius *= _SHRINKAGE_FACTOR
         self.radius = radius
-        self.cells: Int[np.ndarray, " c"] = np.flatnonzero(away < radius)
-        place = np.full(mesh.num_points, -1)
-        place[nodes] = np.arange(len(nodes))
-        self.corners = place[corners[self.cells]]
+        self.cells: Int[np.ndarray, " c"] = np.flatnonzero(distances < radius)
+        region_numbers = np.full(mesh.num_points, -1)
+        region_numbers[nodes] = np.arange(len(nodes))
+        self.corners = region_numbers[corners[self.cells]]
         self.gradients = np.asarray(gradients(mesh))[self.cells]  # (c, k, d)
         self.measures = np.asarray(measures(mesh))[self.cells]
         self.centres = np.asarray(centroids(mesh))[self.cells][:, :2]
         solved: SolvedSystem = on_host(evaluate(model, solved_system_of, conductivity))
-        self.at_rest, self.resistance = solved.product, solved.resistance
+        self.rest_product, self.resistance = solved.product, solved.resistance
         self.solution = np.asarray(solved.solution)[nodes]
         matrix = solved.operator.pattern.to_scipy(solved.operator.values).tocsr()
         self.inverse = _inverse_between(matrix, nodes)
@@ -163,37 +168,49 @@ class LocalChange:
         directions `directions`."""
         cells, product, solution = self._solve_change(change)
         fields: Any = unit_fields(solution, product, self.resistance)[0]  # pyright: ignore[reportArgumentType]
-        table = np.zeros((self.solution.shape[0], fields.shape[1]))
+        node_fields = np.zeros((self.solution.shape[0], fields.shape[1]))
         nodes = np.unique(self.corners[cells])
-        table[nodes] = fields
-        slope = np.einsum("ckd,ckl->dcl", self.gradients[cells], table[self.corners[cells]], optimize=True)
-        found = []
-        for way in directions:
-            part = way[cells] * self.measures[cells].reshape((-1,) + (1,) * (way.ndim - 1))
-            turned = np.einsum("cab,bcl->acl", part, slope) if part.ndim == 3 else part[:, None] * slope
-            energy = np.tensordot(slope, turned, axes=([0, 1], [0, 1]))
-            found.append(-np.asarray(centred(energy)))  # pyright: ignore[reportArgumentType]
-        return self._impedance(product), found
+        node_fields[nodes] = fields
+        field_gradients = np.einsum(
+            "ckd,ckl->dcl", self.gradients[cells], node_fields[self.corners[cells]], optimize=True
+        )
+        impedance_derivatives = []
+        for direction in directions:
+            conductance_changes = direction[cells] * self.measures[cells].reshape((-1,) + (1,) * (direction.ndim - 1))
+            current_changes = (
+                np.einsum("cab,bcl->acl", conductance_changes, field_gradients)
+                if conductance_changes.ndim == 3
+                else conductance_changes[:, None] * field_gradients
+            )
+            energies = np.tensordot(field_gradients, current_changes, axes=([0, 1], [0, 1]))
+            impedance_derivatives.append(-np.asarray(centred(energies)))  # pyright: ignore[reportArgumentType]
+        return self._impedance(product), impedance_derivatives
 
     def _solve_change(self, change: np.ndarray):
         """Solve for a change; returns the changed cells, Bᵀ(A + D)⁻¹B, and (A + D)⁻¹B at the nodes of these cells, in
         order."""
-        size = np.abs(change).reshape(len(change), -1).max(axis=1)
-        cells = np.flatnonzero(size > 0)
+        magnitudes = np.abs(change).reshape(len(change), -1).max(axis=1)
+        cells = np.flatnonzero(magnitudes > 0)
         if not len(cells):
-            return cells, np.asarray(self.at_rest), np.zeros((0, len(self.at_rest)))
+            return cells, np.asarray(self.rest_product), np.zeros((0, len(self.rest_product)))
         nodes, corners = np.unique(self.corners[cells], return_inverse=True)
         corners = corners.reshape(len(cells), -1)
-        slope = self.gradients[cells]
-        part = change[cells] * self.measures[cells].reshape((-1,) + (1,) * (change.ndim - 1))
-        turned = np.einsum("cka,cab->ckb", slope, part) if part.ndim == 3 else slope * part[:, None, None]
-        each = turned @ np.swapaxes(slope, 1, 2)
+        cell_gradients = self.gradients[cells]
+        conductance_changes = change[cells] * self.measures[cells].reshape((-1,) + (1,) * (change.ndim - 1))
+        weighted_gradients = (
+            np.einsum("cka,cab->ckb", cell_gradients, conductance_changes)
+            if conductance_changes.ndim == 3
+            else cell_gradients * conductance_changes[:, None, None]
+        )
+        cell_stiffness = weighted_gradients @ np.swapaxes(cell_gradients, 1, 2)
         stiffness = np.zeros((len(nodes), len(nodes)))
-        np.add.at(stiffness, (corners[:, :, None], corners[:, None, :]), each)
-        before = self.solution[nodes]
-        now = np.linalg.solve(np.eye(len(nodes)) + self.inverse[np.ix_(nodes, nodes)] @ stiffness, before)
-        product = self.at_rest - before.T @ (stiffness @ now)
-        return cells, product, now
+        np.add.at(stiffness, (corners[:, :, None], corners[:, None, :]), cell_stiffness)
+        initial_solution = self.solution[nodes]
+        changed_solution = np.linalg.solve(
+            np.eye(len(nodes)) + self.inverse[np.ix_(nodes, nodes)] @ stiffness, initial_solution
+        )
+        product = self.rest_product - initial_solution.T @ (stiffness @ changed_solution)
+        return cells, product, changed_solution
 
     def _impedance(self, product: Any) -> Float[np.ndarray, "L L"]:
         return np.asarray(electrode_impedance(product, self.resistance).transfer)
@@ -202,11 +219,11 @@ class LocalChange:
 def _inverse_between(matrix, nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t t"]:
     """Inverse of a sparse symmetric matrix between some nodes: inverse of the Schur complement without the others."""
     others = np.setdiff1d(np.arange(matrix.shape[0]), nodes)
-    left = matrix[nodes][:, nodes].toarray()
+    schur_complement = matrix[nodes][:, nodes].toarray()
     if len(others):
-        across = matrix[others][:, nodes]
-        edge = np.flatnonzero(np.diff(across.tocsc().indptr))
-        across = across[:, edge].toarray()
+        coupling = matrix[others][:, nodes]
+        coupled_nodes = np.flatnonzero(np.diff(coupling.tocsc().indptr))
+        coupling = coupling[:, coupled_nodes].toarray()
         factor = scipy.sparse.linalg.splu(matrix[others][:, others].tocsc(), permc_spec="MMD_AT_PLUS_A")
-        left[np.ix_(edge, edge)] -= across.T @ factor.solve(across)
-    return scipy.linalg.inv(0.5 * (left + left.T))
+        schur_complement[np.ix_(coupled_nodes, coupled_nodes)] -= coupling.T @ factor.solve(coupling)
+    return scipy.linalg.inv(0.5 * (schur_complement + schur_complement.T))

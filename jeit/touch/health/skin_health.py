@@ -31,23 +31,23 @@ from jeit.touch.health.imaged_skin import ImagedSkin
 # Time that no touch is held for: seconds; number of windows if frames have no times.
 PATIENCE, _PATIENCE_WINDOWS = 30.0, 3
 # Ratio of the patience to the length of a window.
-_WINDOW = 3.0
+_PATIENCE_PER_WINDOW = 3.0
 # Weight of the latest window when the reference is updated, every quarter of a window.
-_FOLLOWS = 0.1
+_REFERENCE_WEIGHT = 0.1
 # Fraction of a change that must have disappeared for it to count as gone; minimum fraction of channels with a reading,
 # otherwise a frame is refused.
-_GONE, _REFUSED = 0.6, 0.5
+_MIN_DISAPPEARED_FRACTION, _MIN_READ_FRACTION = 0.6, 0.5
 # Multiple of the span of healthy changes beyond which a channel does not measure the skin; maximum fraction of channels
 # that may be beyond it at once.
-_SPANS, _FEW = 3.0, 0.34
+_SPAN_FACTOR, _MAX_OUTLIER_FRACTION = 3.0, 0.34
 
 # Appended to the reason of an event that the first window shows.
-_SINCE = (
+_FIRST_WINDOW_NOTE = (
     "The change is present from the first frame on: gains or contacts that changed since the healthy "
     "recording have the same effect."
 )
 
-_OF_CHANNELS = (EventKind.NOISY, EventKind.STUCK)
+_CHANNEL_KINDS = (EventKind.NOISY, EventKind.STUCK)
 
 
 class WatchStatus(StrEnum):
@@ -142,16 +142,20 @@ class SkinHealth:
             period = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
         if patience is not None and not (is_number(patience) and patience > 0):
             raise ValueError(f"patience must be positive, in seconds; it is {describe(patience)}.")
-        wanted = PATIENCE if times is not None and patience is None else patience
-        learnt = HealthyState.learn(frames, period, None if wanted is None else float(wanted) / _WINDOW)
-        window = learnt.window * learnt.stride * learnt.period
-        wanted = max(_PATIENCE_WINDOWS * window if wanted is None else float(wanted), 2 * window)
+        wanted_patience = PATIENCE if times is not None and patience is None else patience
+        state = HealthyState.learn(
+            frames, period, None if wanted_patience is None else float(wanted_patience) / _PATIENCE_PER_WINDOW
+        )
+        duration = state.window * state.stride * state.period
+        wanted_patience = max(
+            _PATIENCE_WINDOWS * duration if wanted_patience is None else float(wanted_patience), 2 * duration
+        )
         skin = None
         if model is not None:
             check_model(model)
             if conductivity is None:
                 raise ValueError("conductivity: give that of the model's healthy skin, S/m (2-D: S).")
-            skin = ImagedSkin.create(model, conductivity, learnt.reference, learnt.noise, sign)
+            skin = ImagedSkin.create(model, conductivity, state.reference, state.noise, sign)
             protocol = model.protocol
         touching = None
         if protocol is not None:
@@ -161,8 +165,8 @@ class SkinHealth:
                     f"healthy has {frames.shape[1]} channels, and the protocol {protocol.num_measurements}; give both "
                     "of one skin."
                 )
-            touching = np.array([protocol.channels_touching(one) for one in range(protocol.num_electrodes)])
-        return cls(learnt, learnt.reference, learnt.used, wanted, skin, touching)
+            touching = np.array([protocol.channels_touching(electrode) for electrode in range(protocol.num_electrodes)])
+        return cls(state, state.reference, state.used, wanted_patience, skin, touching)
 
     def follow(self, time: float, frame: ArrayLike) -> "SkinHealth":
         """Return the state after a frame (M,) at `time`, seconds. NaN marks a channel without a reading.
@@ -177,15 +181,15 @@ class SkinHealth:
             raise ValueError(
                 f"frame has shape {values.shape}; this skin has {self.reference.size} channels, as its healthy frames."
             )
-        there = np.isfinite(values) & self.healthy.used
+        has_reading = np.isfinite(values) & self.healthy.used
         if not time > self.time:
             reason = f"Its time is not later than that of the frame before, {self.time:g}."
-        elif there.sum() < _REFUSED * self.healthy.used.sum():
-            reason = f"Only {int(there.sum())} of {int(self.healthy.used.sum())} channels have a reading."
+        elif has_reading.sum() < _MIN_READ_FRACTION * self.healthy.used.sum():
+            reason = f"Only {int(has_reading.sum())} of {int(self.healthy.used.sum())} channels have a reading."
         else:
-            return self._process(float(time), values, there)
-        none = np.zeros_like(there)
-        return replace(self, frames=self.frames + 1, status=WatchStatus.REFUSED, reason=reason, usable=none)
+            return self._process(float(time), values, has_reading)
+        no_channels = np.zeros_like(has_reading)
+        return replace(self, frames=self.frames + 1, status=WatchStatus.REFUSED, reason=reason, usable=no_channels)
 
     def confirm(self, event: HealthEvent) -> "SkinHealth":
         """Return the state after the user has confirmed an event, which may be the one in `held`.
@@ -205,9 +209,9 @@ class SkinHealth:
         """
         if self._pending is not None and self.held is not None and event.number == self.held.number:
             return replace(self, _pending=None)
-        denied = self._with_status(event, EventStatus.DENIED)
-        back = np.where(np.isfinite(event.change), self.reference - event.change, self.reference)
-        return replace(denied, reference=back, trusted=denied._trusted_channels(), skin=denied._current_skin())
+        state = self._with_status(event, EventStatus.DENIED)
+        reference = np.where(np.isfinite(event.change), self.reference - event.change, self.reference)
+        return replace(state, reference=reference, trusted=state._trusted_channels(), skin=state._current_skin())
 
     def repaired(self, frames: ArrayLike) -> "SkinHealth":
         """Return the state after the user has repaired the skin; all open events become mended.
@@ -217,15 +221,17 @@ class SkinHealth:
         since, such as gains, is then no event. Raises `ValueError` for frames with another number of channels, or
         without a reading in half of them.
         """
-        read = _check_frames("frames", np.atleast_2d(real_array("frames", frames, "(n, M) volts")))
-        if read.shape[1] != self.reference.size:
-            raise ValueError(f"frames have {read.shape[1]} channels, and this skin {self.reference.size}.")
-        fresh = channel_medians(np.where(np.isfinite(read), read, np.nan))
-        there = np.isfinite(fresh) & self.healthy.used
-        if there.sum() < _REFUSED * self.healthy.used.sum():
+        checked_frames = _check_frames("frames", np.atleast_2d(real_array("frames", frames, "(n, M) volts")))
+        if checked_frames.shape[1] != self.reference.size:
+            raise ValueError(f"frames have {checked_frames.shape[1]} channels, and this skin {self.reference.size}.")
+        new_reference = channel_medians(np.where(np.isfinite(checked_frames), checked_frames, np.nan))
+        has_reading = np.isfinite(new_reference) & self.healthy.used
+        if has_reading.sum() < _MIN_READ_FRACTION * self.healthy.used.sum():
             raise ValueError("frames: fewer than half of the channels have a reading; that is no reference.")
-        mended = tuple(_with_new_status(one, EventStatus.MENDED) if one.open else one for one in self.events)
-        change = np.where(there, fresh - self.reference, 0.0)
+        mended_events = tuple(
+            _with_new_status(event, EventStatus.MENDED) if event.open else event for event in self.events
+        )
+        change = np.where(has_reading, new_reference - self.reference, 0.0)
         strength = float(change_size(change / self.healthy.scale)) / self.healthy.limit
         event = HealthEvent(
             number=len(self.events),
@@ -241,9 +247,9 @@ class SkinHealth:
         )
         return replace(
             self,
-            events=(*mended, event),
-            reference=np.where(there, fresh, self.reference),
-            trusted=there,
+            events=(*mended_events, event),
+            reference=np.where(has_reading, new_reference, self.reference),
+            trusted=has_reading,
             skin=None if self.skin is None else self.skin.without_cuts(),
             _window=(),
             _part=(),
@@ -259,10 +265,10 @@ class SkinHealth:
         """
         if self.skin is None:
             raise ValueError("images need a forward model: give model and conductivity to SkinHealth.fit.")
-        read = _check_frames("frames", frames)
-        if read.shape[1] != self.reference.size:
-            raise ValueError(f"frames have {read.shape[1]} channels, and this skin {self.reference.size}.")
-        return self.skin.images(read - self.reference, self.trusted)
+        checked_frames = _check_frames("frames", frames)
+        if checked_frames.shape[1] != self.reference.size:
+            raise ValueError(f"frames have {checked_frames.shape[1]} channels, and this skin {self.reference.size}.")
+        return self.skin.images(checked_frames - self.reference, self.trusted)
 
     @property
     def held(self) -> HealthEvent | None:
@@ -275,188 +281,216 @@ class SkinHealth:
     @property
     def open_events(self) -> list[HealthEvent]:
         """The events that still apply."""
-        return [one for one in self.events if one.open]
+        return [event for event in self.events if event.open]
 
     def _process(self, time: float, values: np.ndarray, has_reading: np.ndarray) -> "SkinHealth":
         healthy = self.healthy
-        low, high = healthy.span + self.reference
-        far = _SPANS * (high - low) + healthy.limit * np.where(healthy.used, healthy.noise, 0.0)
-        strange = has_reading & ((values < low - far) | (values > high + far))
-        # If many channels are beyond their span, the skin has changed; the channels are not faulty.
-        strange &= strange.sum() <= _FEW * healthy.used.sum()
-        usable = has_reading & self.trusted & ~strange
-        lost = int((healthy.used & ~usable).sum())
-        status, reason = WatchStatus.WATCHED, ""
-        if lost:
-            status, reason = WatchStatus.PARTIAL, f"{lost} of {int(healthy.used.sum())} channels are not to be trusted."
-        part = (*self._part, np.where(has_reading, values, np.nan))
-        after = replace(
-            self, time=time, frames=self.frames + 1, status=status, reason=reason, usable=usable, _part=part
+        lower_limits, upper_limits = healthy.span + self.reference
+        margins = _SPAN_FACTOR * (upper_limits - lower_limits) + healthy.limit * np.where(
+            healthy.used, healthy.noise, 0.0
         )
-        if len(part) < healthy.stride:
-            return after
-        (step,) = average_frames(np.array(part), healthy.stride)
-        first = self.frames + 1 - healthy.stride
-        window = (*self._window, (time, first, step))[-2 * healthy.window :]
-        after = replace(after, _part=(), _window=window, _steps=self._steps + 1)
-        return after._compare_windows() if after._steps % max(1, healthy.window // 4) == 0 else after
+        is_outlier = has_reading & ((values < lower_limits - margins) | (values > upper_limits + margins))
+        # If many channels are beyond their span, the skin has changed; the channels are not faulty.
+        is_outlier &= is_outlier.sum() <= _MAX_OUTLIER_FRACTION * healthy.used.sum()
+        usable = has_reading & self.trusted & ~is_outlier
+        num_lost = int((healthy.used & ~usable).sum())
+        status, reason = WatchStatus.WATCHED, ""
+        if num_lost:
+            status, reason = (
+                WatchStatus.PARTIAL,
+                f"{num_lost} of {int(healthy.used.sum())} channels are not to be trusted.",
+            )
+        stride_frames = (*self._part, np.where(has_reading, values, np.nan))
+        next_state = replace(
+            self, time=time, frames=self.frames + 1, status=status, reason=reason, usable=usable, _part=stride_frames
+        )
+        if len(stride_frames) < healthy.stride:
+            return next_state
+        (step,) = average_frames(np.array(stride_frames), healthy.stride)
+        first_frame = self.frames + 1 - healthy.stride
+        window = (*self._window, (time, first_frame, step))[-2 * healthy.window :]
+        next_state = replace(next_state, _part=(), _window=window, _steps=self._steps + 1)
+        return next_state._compare_windows() if next_state._steps % max(1, healthy.window // 4) == 0 else next_state
 
     def _compare_windows(self) -> "SkinHealth":
         """Return the state after comparing the two windows."""
-        healthy, number = self.healthy, len(self._window)
-        if number < healthy.window:
+        healthy, num_steps = self.healthy, len(self._window)
+        if num_steps < healthy.window:
             return self
-        frames = np.array([one for _, _, one in self._window])
-        latest = channel_medians(frames[-healthy.window :])
+        frames = np.array([step_frame for _, _, step_frame in self._window])
+        medians = channel_medians(frames[-healthy.window :])
         if not self._settled:
-            return self._process_first_window(latest)
-        after = self._update_pending(latest)
-        if number == 2 * healthy.window:
+            return self._process_first_window(medians)
+        next_state = self._update_pending(medians)
+        if num_steps == 2 * healthy.window:
             # Changes in channels that are not trusted belong to known events.
-            step = lasting_step(frames, np.where(after.trusted, healthy.scale, np.inf), healthy.limit)
+            step = lasting_step(frames, np.where(next_state.trusted, healthy.scale, np.inf), healthy.limit)
             if step is not None:
-                return after._process_step(step, frames)
-            after = after._check_channels(frames)
-        off = np.where(self.trusted & np.isfinite(latest), latest - self.reference, 0.0)
-        if after._pending is None and change_size(off / healthy.scale) < healthy.limit:
-            followed = self.reference + _FOLLOWS * (latest - self.reference)
-            after = replace(after, reference=np.where(np.isfinite(latest), followed, self.reference))
-        return after
+                return next_state._process_step(step, frames)
+            next_state = next_state._check_channels(frames)
+        deviations = np.where(self.trusted & np.isfinite(medians), medians - self.reference, 0.0)
+        if next_state._pending is None and change_size(deviations / healthy.scale) < healthy.limit:
+            updated_reference = self.reference + _REFERENCE_WEIGHT * (medians - self.reference)
+            next_state = replace(
+                next_state, reference=np.where(np.isfinite(medians), updated_reference, self.reference)
+            )
+        return next_state
 
-    def _process_first_window(self, latest: np.ndarray) -> "SkinHealth":
+    def _process_first_window(self, medians: np.ndarray) -> "SkinHealth":
         """Return the state after the first window, which is compared with the healthy frames."""
         healthy = self.healthy
-        change = np.where(np.isfinite(latest), latest - healthy.reference, 0.0)
+        change = np.where(np.isfinite(medians), medians - healthy.reference, 0.0)
         # A uniform drift of conductivity, which scales all channels alike, is removed if it is small.
-        whole = np.where(healthy.used, healthy.reference / healthy.level, 0.0)
-        scaled = np.where(healthy.used, change / healthy.level, 0.0)
-        if whole @ whole > 0 and abs(scaled @ whole) < 0.1 * (whole @ whole):
-            scaled = scaled - whole * (scaled @ whole) / (whole @ whole)
-        size = float(change_size(scaled))
-        first = np.array([one for _, _, one in self._window]) - healthy.reference
-        along = np.nan_to_num(first / healthy.level**2) @ change / max((change / healthy.level**2) @ change, 1e-300)
-        begun = replace(self, _settled=True, reference=np.where(np.isfinite(latest), latest, self.reference))
-        if size <= healthy.level_limit or not is_distinct(along, 0):
-            return begun
+        uniform_change = np.where(healthy.used, healthy.reference / healthy.level_scale, 0.0)
+        scaled_change = np.where(healthy.used, change / healthy.level_scale, 0.0)
+        if uniform_change @ uniform_change > 0 and abs(scaled_change @ uniform_change) < 0.1 * (
+            uniform_change @ uniform_change
+        ):
+            scaled_change = scaled_change - uniform_change * (scaled_change @ uniform_change) / (
+                uniform_change @ uniform_change
+            )
+        size = float(change_size(scaled_change))
+        first_deviations = np.array([step_frame for _, _, step_frame in self._window]) - healthy.reference
+        direction = change / healthy.level_scale**2
+        projections = (
+            np.nan_to_num(first_deviations / healthy.level_scale**2) @ change / max(direction @ change, 1e-300)
+        )
+        state = replace(self, _settled=True, reference=np.where(np.isfinite(medians), medians, self.reference))
+        if size <= healthy.level_limit or not is_distinct(projections, 0):
+            return state
         time, frame, _ = self._window[0]
         change = LastingChange(change, size / healthy.level_limit * healthy.limit, time, frame, self.time)
-        frames = np.array([one for _, _, one in self._window])
-        found = classify_change(change.vector, frames, healthy.reference, healthy, self.touching, self.skin)
-        found = [one if one.own is not None else replace(one, reason=f"{one.reason} {_SINCE}") for one in found]
-        return replace(begun, reference=healthy.reference)._add_events(change, found, EventStatus.LASTING)
+        frames = np.array([step_frame for _, _, step_frame in self._window])
+        findings = classify_change(change.vector, frames, healthy.reference, healthy, self.touching, self.skin)
+        findings = [
+            finding
+            if finding.channels is not None
+            else replace(finding, reason=f"{finding.reason} {_FIRST_WINDOW_NOTE}")
+            for finding in findings
+        ]
+        return replace(state, reference=healthy.reference)._add_events(change, findings, EventStatus.LASTING)
 
-    def _update_pending(self, latest: np.ndarray) -> "SkinHealth":
+    def _update_pending(self, medians: np.ndarray) -> "SkinHealth":
         """Return the state after checking whether the pending change has disappeared or has lasted."""
         pending = self._pending
         if pending is None:
             return self
         change, scale = np.nan_to_num(pending.change.vector), np.where(self.trusted, self.healthy.scale, np.inf)
-        left = np.where(np.isfinite(latest), latest - self.reference, 0.0)
-        share = (left / scale**2) @ change / max((change / scale**2) @ change, 1e-300)
-        if share < 1 - _GONE:
+        remainder = np.where(np.isfinite(medians), medians - self.reference, 0.0)
+        remaining_fraction = (remainder / scale**2) @ change / max((change / scale**2) @ change, 1e-300)
+        if remaining_fraction < 1 - _MIN_DISAPPEARED_FRACTION:
             return replace(self, _pending=None)
         if self.time - pending.change.time < self.patience:
             return self
-        lasted = replace(pending.change, vector=np.where(self.trusted, left, 0.0), noticed=self.time)
+        lasting_change = replace(pending.change, vector=np.where(self.trusted, remainder, 0.0), noticed=self.time)
         reason = f"{pending.finding.reason} It has lasted for {self.time - pending.change.time:.3g} s or frames."
         return replace(self, _pending=None)._add_events(
-            lasted, [replace(pending.finding, reason=reason)], EventStatus.LASTING
+            lasting_change, [replace(pending.finding, reason=reason)], EventStatus.LASTING
         )
 
     def _process_step(self, step: Step, frames: np.ndarray) -> "SkinHealth":
         """Return the state after a lasting step."""
         time, frame, _ = self._window[step.first]
         change = LastingChange(step.change, step.size, time, frame, self.time)
-        fresh = replace(self, _window=self._window[step.first :])
-        off = np.where(np.isfinite(step.change), channel_medians(frames[step.first :]) - self.reference, 0.0)
+        next_state = replace(self, _window=self._window[step.first :])
+        deviations = np.where(np.isfinite(step.change), channel_medians(frames[step.first :]) - self.reference, 0.0)
         scale = np.where(self.trusted, self.healthy.scale, np.inf)
-        if change_size(off / scale) <= self.healthy.limit:  # the skin is as it was before a touch
-            return fresh
-        undone = fresh._reverse_change(change)
-        if undone is not None:
-            return undone
-        after = frames[step.first :]
-        found = classify_change(step.change, after, self.reference, self.healthy, self.touching, self.skin)
-        if found[0].electrode is not None or (found[0].sure and change.size > self.healthy.sudden):
-            return fresh._add_events(change, found, EventStatus.LASTING)
+        if change_size(deviations / scale) <= self.healthy.limit:  # the skin is as it was before a touch
+            return next_state
+        reversed_state = next_state._reverse_change(change)
+        if reversed_state is not None:
+            return reversed_state
+        frames_after = frames[step.first :]
+        findings = classify_change(step.change, frames_after, self.reference, self.healthy, self.touching, self.skin)
+        if findings[0].electrode is not None or (findings[0].is_certain and change.size > self.healthy.sudden_limit):
+            return next_state._add_events(change, findings, EventStatus.LASTING)
         if self._pending is not None:  # only one change is pending at a time: the first
-            return fresh
-        return replace(fresh, _pending=_PendingChange(change, found[0]))
+            return next_state
+        return replace(next_state, _pending=_PendingChange(change, findings[0]))
 
     def _check_channels(self, frames: np.ndarray) -> "SkinHealth":
         """Return the state after checking for single channels that are noisy or stuck."""
-        after, steadiness, asked = self, self.healthy.steadiness, self.trusted.copy()
-        for one in self.events:
-            if one.kind in _OF_CHANNELS and one.status == EventStatus.DENIED:
-                asked &= ~one.channels
-        for kind, which in (
-            (EventKind.NOISY, steadiness.noisy_channels(frames, asked)),
-            (EventKind.STUCK, steadiness.stuck_channels(frames, asked)),
+        next_state, steadiness, checked_channels = self, self.healthy.steadiness, self.trusted.copy()
+        for event in self.events:
+            if event.kind in _CHANNEL_KINDS and event.status == EventStatus.DENIED:
+                checked_channels &= ~event.channels
+        for kind, is_faulty in (
+            (EventKind.NOISY, steadiness.noisy_channels(frames, checked_channels)),
+            (EventKind.STUCK, steadiness.stuck_channels(frames, checked_channels)),
         ):
-            for channel in np.flatnonzero(which):
-                own = np.arange(self.reference.size) == channel
+            for channel in np.flatnonzero(is_faulty):
+                is_channel = np.arange(self.reference.size) == channel
                 time, frame, _ = self._window[0]
-                change = LastingChange(np.zeros(own.size), self.healthy.limit, time, frame, self.time)
-                said = "is several times as noisy as it was, or jumps" if kind == EventKind.NOISY else "does not move"
-                finding = Finding(kind, f"Channel {channel} {said}.", True, own=own)
-                event = after._create_event(change, finding, EventStatus.LASTING, len(after.events))
-                event = eqx.tree_at(lambda one: one.channels, event, own)
-                after = replace(after, events=(*after.events, event))
-        return after if after is self else replace(after, trusted=after._trusted_channels())
+                change = LastingChange(np.zeros(is_channel.size), self.healthy.limit, time, frame, self.time)
+                fault = "is several times as noisy as it was, or jumps" if kind == EventKind.NOISY else "does not move"
+                finding = Finding(kind, f"Channel {channel} {fault}.", True, channels=is_channel)
+                event = next_state._create_event(change, finding, EventStatus.LASTING, len(next_state.events))
+                event = eqx.tree_at(lambda event: event.channels, event, is_channel)
+                next_state = replace(next_state, events=(*next_state.events, event))
+        return next_state if next_state is self else replace(next_state, trusted=next_state._trusted_channels())
 
     def _reverse_change(self, change: LastingChange) -> "SkinHealth | None":
         """Return the state after a step that reverses an earlier change; None if it reverses none."""
-        for one in self.open_events:
-            there = np.isfinite(one.change) & np.isfinite(change.vector) & self.trusted
-            before = (one.change[there] / self.healthy.scale[there]).clip(-1e9, 1e9)
-            now = (change.vector[there] / self.healthy.scale[there]).clip(-1e9, 1e9)
-            share = -(now @ before) / max(before @ before, 1e-300)
-            if share > _GONE and np.linalg.norm(now + before) < 0.6 * np.linalg.norm(before):
+        for earlier_event in self.open_events:
+            is_used = np.isfinite(earlier_event.change) & np.isfinite(change.vector) & self.trusted
+            earlier_change = (earlier_event.change[is_used] / self.healthy.scale[is_used]).clip(-1e9, 1e9)
+            new_change = (change.vector[is_used] / self.healthy.scale[is_used]).clip(-1e9, 1e9)
+            fraction = -(new_change @ earlier_change) / max(earlier_change @ earlier_change, 1e-300)
+            if fraction > _MIN_DISAPPEARED_FRACTION and np.linalg.norm(
+                new_change + earlier_change
+            ) < 0.6 * np.linalg.norm(earlier_change):
                 events = tuple(
-                    _with_new_status(other, EventStatus.MENDED) if other.number == one.number else other
-                    for other in self.events
+                    _with_new_status(event, EventStatus.MENDED) if event.number == earlier_event.number else event
+                    for event in self.events
                 )
-                reason = f"Event {one.number} is gone: it was mended, or a press that has been lifted."
+                reason = f"Event {earlier_event.number} is gone: it was mended, or a press that has been lifted."
                 finding = Finding(EventKind.REPAIRED, reason, True)
-                event = self._create_event(change, finding, EventStatus.LASTING, len(events))
-                after = replace(self, events=(*events, event))
-                fresh = np.where(np.isfinite(change.vector), self.reference + change.vector, self.reference)
-                return replace(after, reference=fresh, trusted=after._trusted_channels(), skin=after._current_skin())
+                repair_event = self._create_event(change, finding, EventStatus.LASTING, len(events))
+                state = replace(self, events=(*events, repair_event))
+                reference = np.where(np.isfinite(change.vector), self.reference + change.vector, self.reference)
+                return replace(
+                    state, reference=reference, trusted=state._trusted_channels(), skin=state._current_skin()
+                )
         return None
 
-    def _add_events(self, change: LastingChange, found: list[Finding], status: EventStatus) -> "SkinHealth":
+    def _add_events(self, change: LastingChange, findings: list[Finding], status: EventStatus) -> "SkinHealth":
         """Return the state with events added; from now on, the reference contains their change."""
         events = [
-            self._create_event(change, one, status, len(self.events) + number) for number, one in enumerate(found)
+            self._create_event(change, finding, status, len(self.events) + index)
+            for index, finding in enumerate(findings)
         ]
         # If electrodes fail, the reference changes only in their channels: the skin may be touched at the time.
-        own = np.logical_or.reduce([np.ones_like(self.trusted) if one.own is None else one.own for one in found])
-        fresh = np.where(own & np.isfinite(change.vector), self.reference + change.vector, self.reference)
+        is_affected = np.logical_or.reduce(
+            [np.ones_like(self.trusted) if finding.channels is None else finding.channels for finding in findings]
+        )
+        new_reference = np.where(
+            is_affected & np.isfinite(change.vector), self.reference + change.vector, self.reference
+        )
         skin = self.skin
-        for one in found:
-            if one.loss is not None and skin is not None:
-                skin = skin.with_cut(one.loss)
-        after = replace(self, events=(*self.events, *events), reference=fresh, skin=skin)
-        return replace(after, trusted=after._trusted_channels())
+        for finding in findings:
+            if finding.loss is not None and skin is not None:
+                skin = skin.with_cut(finding.loss)
+        next_state = replace(self, events=(*self.events, *events), reference=new_reference, skin=skin)
+        return replace(next_state, trusted=next_state._trusted_channels())
 
-    def _create_event(self, change: LastingChange, found: Finding, status: EventStatus, number: int) -> HealthEvent:
-        own = np.ones(self.reference.size, bool) if found.own is None else found.own
-        large = np.abs(np.nan_to_num(change.vector)) > self.healthy.limit * self.healthy.scale
+    def _create_event(self, change: LastingChange, finding: Finding, status: EventStatus, number: int) -> HealthEvent:
+        is_affected = np.ones(self.reference.size, bool) if finding.channels is None else finding.channels
+        is_large = np.abs(np.nan_to_num(change.vector)) > self.healthy.limit * self.healthy.scale
         return HealthEvent(
             number=number,
-            kind=found.kind,
+            kind=finding.kind,
             status=status,
             time=change.time,
             noticed=change.noticed,
             frame=change.frame,
-            channels=large & own,
-            change=np.where(own, change.vector, 0.0),
+            channels=is_large & is_affected,
+            change=np.where(is_affected, change.vector, 0.0),
             strength=change.size / self.healthy.limit,
-            electrode=found.electrode,
-            path=None if found.loss is None else found.loss.path,
-            deviation=0.0 if found.loss is None else found.loss.deviation,
-            through=None if found.loss is None else found.loss.through,
-            reason=found.reason,
+            electrode=finding.electrode,
+            path=None if finding.loss is None else finding.loss.path,
+            deviation=0.0 if finding.loss is None else finding.loss.deviation,
+            through=None if finding.loss is None else finding.loss.through,
+            reason=finding.reason,
         )
 
     def _with_status(self, event: HealthEvent, status: EventStatus) -> "SkinHealth":
@@ -464,22 +498,25 @@ class SkinHealth:
         check_kind("event", event, HealthEvent, "one of health.events, or health.held")
         if not event.number < len(self.events):
             raise ValueError(f"event {event.number} does not belong to this skin, which has {len(self.events)} events.")
-        events = [_with_new_status(one, status) if one.number == event.number else one for one in self.events]
+        events = [
+            _with_new_status(known_event, status) if known_event.number == event.number else known_event
+            for known_event in self.events
+        ]
         return replace(self, events=tuple(events))
 
     def _current_skin(self) -> ImagedSkin | None:
         """Return the model, without cuts if no open event is a cut."""
-        cut = any(one.path is not None for one in self.open_events)
-        return self.skin if self.skin is None or cut else self.skin.without_cuts()
+        has_cut = any(event.path is not None for event in self.open_events)
+        return self.skin if self.skin is None or has_cut else self.skin.without_cuts()
 
     def _trusted_channels(self) -> Bool[np.ndarray, " M"]:
         """Whether each channel (M,) is trusted: it has readings, and no open event excludes it or its electrodes."""
         trusted = self.healthy.used.copy()
-        for one in self.open_events:
-            if one.electrode is not None and self.touching is not None:
-                trusted &= ~self.touching[one.electrode]
-            if one.kind in _OF_CHANNELS:
-                trusted &= ~one.channels
+        for event in self.open_events:
+            if event.electrode is not None and self.touching is not None:
+                trusted &= ~self.touching[event.electrode]
+            if event.kind in _CHANNEL_KINDS:
+                trusted &= ~event.channels
         return trusted
 
 
@@ -502,21 +539,21 @@ def watch(health: SkinHealth, frames: ArrayLike, times: ArrayLike | None = None)
     ```
     """
     check_kind("health", health, SkinHealth, "a SkinHealth, as of SkinHealth.fit(healthy)")
-    read = real_array("frames", frames, "(F, M) volts")
-    if read.ndim != 2:
-        raise ValueError(f"frames must be (F, M) volts; they have shape {read.shape}.")
+    checked_frames = real_array("frames", frames, "(F, M) volts")
+    if checked_frames.ndim != 2:
+        raise ValueError(f"frames must be (F, M) volts; they have shape {checked_frames.shape}.")
     if times is None:
-        first = health.time + 1 if np.isfinite(health.time) else 0.0
-        seconds = first + np.arange(len(read))
+        first_time = health.time + 1 if np.isfinite(health.time) else 0.0
+        seconds = first_time + np.arange(len(checked_frames))
     else:
-        seconds = _check_times(times, len(read))
-    for time, frame in zip(seconds, read, strict=True):
+        seconds = _check_times(times, len(checked_frames))
+    for time, frame in zip(seconds, checked_frames, strict=True):
         health = health.follow(float(time), frame)
     return health
 
 
 def _with_new_status(event: HealthEvent, status: EventStatus) -> HealthEvent:
-    return eqx.tree_at(lambda one: one.status, event, status)
+    return eqx.tree_at(lambda event_to_change: event_to_change.status, event, status)
 
 
 def _check_frames(name: str, values) -> Float[np.ndarray, "F M"]:

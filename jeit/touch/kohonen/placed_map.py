@@ -27,11 +27,11 @@ _NUM_NEAREST, _REGULARISATION = 9, 0.05
 _NUM_ON_GRID, _REGULARISATION_ON_GRID = 25, 0.005
 # Weight of the mean place of a neuron's presses in the fit of its place, relative to that of one press.
 _MEAN_WEIGHT = 0.3
-_FEWEST = 10
-# What a file has of a `PlacedMap` beside its map.
-_OF_PLACES = "places", "widening", "missed", "fitted"
+_MIN_PRESSES = 10
+# Fields of a `PlacedMap` that a file contains, besides its map.
+_PLACE_FIELDS = "places", "widening", "missed", "fitted"
 # Number of frames that are located at once.
-_AT_ONCE = 512
+_CHUNK_SIZE = 512
 
 
 @dataclass(frozen=True)
@@ -79,45 +79,59 @@ class PlacedMap:
                 f"positions must be finite metres ({len(frames)}, d), a row for each frame; they have shape "
                 f"{positions.shape}."
             )
-        if len(frames) < _FEWEST or (positions == positions[0]).all():
-            raise ValueError(f"positions: give those of {_FEWEST} presses or more, at different places.")
+        if len(frames) < _MIN_PRESSES or (positions == positions[0]).all():
+            raise ValueError(f"positions: give those of {_MIN_PRESSES} presses or more, at different places.")
         winners = learnt.nearest(frames, 1)[0][:, 0]
-        odd = np.arange(len(frames)) % 2 == 1
-        ways = []
-        for fit in (False, True):
-            off = spread = missed = 0.0
-            for out in (odd, ~odd):
-                part = cls._from_presses(learnt, frames[~out], positions[~out], winners[~out], fit)
-                placed = part._estimate_places(frames[out])
-                off += float(np.sum((placed.places - positions[out]) ** 2))
-                spread += float(np.sum(placed.spread**2))
-                missed += float(np.sum(placed.left**2))
-            ways.append((off, fit, float(np.sqrt(off / max(spread, 1e-300))), float(np.sqrt(missed / frames.size))))
-        _, fit, widening, _ = min(ways)
-        whole = cls._from_presses(learnt, frames, positions, winners, fit)
-        return replace(whole, widening=widening, missed=ways[0][3])
+        is_odd = np.arange(len(frames)) % 2 == 1
+        candidates = []
+        for is_fitted in (False, True):
+            squared_error = squared_spread = squared_residual = 0.0
+            for is_held_out in (is_odd, ~is_odd):
+                training_map = cls._from_presses(
+                    learnt, frames[~is_held_out], positions[~is_held_out], winners[~is_held_out], is_fitted
+                )
+                estimate = training_map._estimate_places(frames[is_held_out])
+                squared_error += float(np.sum((estimate.places - positions[is_held_out]) ** 2))
+                squared_spread += float(np.sum(estimate.spread**2))
+                squared_residual += float(np.sum(estimate.residuals**2))
+            candidates.append(
+                (
+                    squared_error,
+                    is_fitted,
+                    float(np.sqrt(squared_error / max(squared_spread, 1e-300))),
+                    float(np.sqrt(squared_residual / frames.size)),
+                )
+            )
+        _, is_fitted, widening, _ = min(candidates)
+        fitted_map = cls._from_presses(learnt, frames, positions, winners, is_fitted)
+        return replace(fitted_map, widening=widening, missed=candidates[0][3])
 
     @classmethod
-    def _from_presses(cls, learnt, frames, positions, winners, fit: bool) -> "PlacedMap":
+    def _from_presses(cls, learnt, frames, positions, winners, is_fitted: bool) -> "PlacedMap":
         """Create a map with places from presses and their winners (N,).
 
         Its standard deviations are not yet calibrated.
         """
-        number = learnt.shape[0] * learnt.shape[1]
-        count = np.bincount(winners, minlength=number)[:, None]
-        sums = np.stack([np.bincount(winners, one, minlength=number) for one in positions.T], axis=1)
-        means = np.where(count > 0, sums / np.maximum(count, 1), np.nan).reshape(*learnt.shape, -1)
-        placed = cls(learnt, means, 1.0, 0.0, means if fit else None)
-        if not fit:
-            return placed
-        near, shares, _ = placed._locating_neurons(frames)
-        row = np.repeat(np.arange(len(frames)), near.shape[1])
-        combined = csr_array((shares.ravel(), (row, near.ravel())), shape=(len(frames), np.count_nonzero(count)))
-        off = positions - combined @ means[placed.placed]
-        moved = [lsqr(combined, one, damp=np.sqrt(_MEAN_WEIGHT), atol=1e-9, btol=1e-9)[0] for one in off.T]
+        num_neurons = learnt.shape[0] * learnt.shape[1]
+        win_counts = np.bincount(winners, minlength=num_neurons)[:, None]
+        sums = np.stack([np.bincount(winners, column, minlength=num_neurons) for column in positions.T], axis=1)
+        means = np.where(win_counts > 0, sums / np.maximum(win_counts, 1), np.nan).reshape(*learnt.shape, -1)
+        placed_map = cls(learnt, means, 1.0, 0.0, means if is_fitted else None)
+        if not is_fitted:
+            return placed_map
+        neurons, shares, _ = placed_map._locating_neurons(frames)
+        rows = np.repeat(np.arange(len(frames)), neurons.shape[1])
+        combination_matrix = csr_array(
+            (shares.ravel(), (rows, neurons.ravel())), shape=(len(frames), np.count_nonzero(win_counts))
+        )
+        place_errors = positions - combination_matrix @ means[placed_map.placed]
+        place_corrections = [
+            lsqr(combination_matrix, column, damp=np.sqrt(_MEAN_WEIGHT), atol=1e-9, btol=1e-9)[0]
+            for column in place_errors.T
+        ]
         fitted = means.copy()
-        fitted[placed.placed] += np.stack(moved, axis=1)
-        return replace(placed, fitted=fitted)
+        fitted[placed_map.placed] += np.stack(place_corrections, axis=1)
+        return replace(placed_map, fitted=fitted)
 
     @property
     def placed(self) -> Bool[np.ndarray, "R C"]:
@@ -138,14 +152,14 @@ class PlacedMap:
         return placed.places, self.widening * placed.spread
 
     def _estimate_places(self, frames: Float[np.ndarray, "n M"]) -> "_Estimate":
-        near, shares, left = self._locating_neurons(frames)
-        there = self._placed_neurons.places[near]
-        own = there.mean(axis=1) if self.fitted is None else there[:, 0]
-        offset = np.einsum("nq,nqd->nd", shares, there) - own
-        most = np.linalg.norm(there - own[:, None], axis=2).max(axis=1)
-        length = np.linalg.norm(offset, axis=1)
-        said = own + offset * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
-        return _Estimate(said, np.sqrt(np.mean((there - said[:, None]) ** 2, axis=1)), left)
+        neurons, shares, residuals = self._locating_neurons(frames)
+        neuron_places = self._placed_neurons.places[neurons]
+        initial_places = neuron_places.mean(axis=1) if self.fitted is None else neuron_places[:, 0]
+        offset = np.einsum("nq,nqd->nd", shares, neuron_places) - initial_places
+        max_lengths = np.linalg.norm(neuron_places - initial_places[:, None], axis=2).max(axis=1)
+        lengths = np.linalg.norm(offset, axis=1)
+        places = initial_places + offset * np.minimum(1.0, max_lengths / np.maximum(lengths, 1e-300))[:, None]
+        return _Estimate(places, np.sqrt(np.mean((neuron_places - places[:, None]) ** 2, axis=1)), residuals)
 
     def _locating_neurons(self, frames: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the neurons that locate frames.
@@ -153,16 +167,24 @@ class PlacedMap:
         Returns their indices (n, q) among the neurons with places, their shares (n, q), and the residuals of the frames
         (n, M).
         """
-        known = self._placed_neurons
+        placed_neurons = self._placed_neurons
         if self.fitted is None:
-            near, held = known.neurons.nearest(frames, min(_NUM_NEAREST, len(known.places)))[0], _REGULARISATION
+            neurons, regularisation = (
+                placed_neurons.neurons.nearest(frames, min(_NUM_NEAREST, len(placed_neurons.places)))[0],
+                _REGULARISATION,
+            )
         else:
-            near, held = known.around[known.neurons.winners(frames)[:, 1]], _REGULARISATION_ON_GRID
-        shares, left = np.empty(near.shape), np.empty(frames.shape)
-        for first in range(0, len(frames), _AT_ONCE):
-            some = slice(first, first + _AT_ONCE)
-            shares[some], left[some] = _combination_shares(known.neurons.weights[0][near[some]], frames[some], held)
-        return near, shares, left
+            neurons, regularisation = (
+                placed_neurons.grid_neighbours[placed_neurons.neurons.winners(frames)[:, 1]],
+                _REGULARISATION_ON_GRID,
+            )
+        shares, residuals = np.empty(neurons.shape), np.empty(frames.shape)
+        for start in range(0, len(frames), _CHUNK_SIZE):
+            rows = slice(start, start + _CHUNK_SIZE)
+            shares[rows], residuals[rows] = _fit_combination_shares(
+                placed_neurons.neurons.weights[0][neurons[rows]], frames[rows], regularisation
+            )
+        return neurons, shares, residuals
 
     def predict(self, features: ArrayLike) -> Float[np.ndarray, "n d"]:
         """Predict only the places (n, d) of `locate`, in the interface of scikit-learn's estimators."""
@@ -173,53 +195,55 @@ class PlacedMap:
         neurons = SelfOrganisingMap(self.learnt.weights[self.placed][None], self.learnt.scale)
         places, grid = (self.places if self.fitted is None else self.fitted)[self.placed], np.argwhere(self.placed)
         # Sorted by the larger of the distances in rows and columns: the first is the neuron itself.
-        around = KDTree(grid).query(grid, min(_NUM_ON_GRID, len(grid)), p=np.inf)[1].reshape(len(grid), -1)
-        return _PlacedNeurons(neurons, places, around)
+        grid_neighbours = KDTree(grid).query(grid, min(_NUM_ON_GRID, len(grid)), p=np.inf)[1].reshape(len(grid), -1)
+        return _PlacedNeurons(neurons, places, grid_neighbours)
 
 
 class _PlacedNeurons(NamedTuple):
     """The neurons that have a place, as a map of one row.
 
-    `places` (k, d): the places that estimates use; `around` (k, q): indices of the neurons around each on the grid.
+    `places` (k, d): the places that estimates use; `grid_neighbours` (k, q): indices of the neurons around each on the
+    grid.
     """
 
     neurons: SelfOrganisingMap
     places: Float[np.ndarray, "k d"]
-    around: Int[np.ndarray, "k q"]
+    grid_neighbours: Int[np.ndarray, "k q"]
 
 
 class _Estimate(NamedTuple):
     """Estimated places (n, d), metres.
 
-    `spread` (n, d): standard deviations of the neurons' places around them; `left` (n, M): residuals of the frames.
+    `spread` (n, d): standard deviations of the neurons' places around them; `residuals` (n, M): residuals of the
+    frames.
     """
 
     places: Float[np.ndarray, "n d"]
     spread: Float[np.ndarray, "n d"]
-    left: Float[np.ndarray, "n M"]
+    residuals: Float[np.ndarray, "n M"]
 
 
-def _combination_shares(
+def _fit_combination_shares(
     neuron_frames: Float[np.ndarray, "n q M"], frames: Float[np.ndarray, "n M"], regularisation: float
 ):
     """Compute shares (n, q) of sum 1 whose combinations of the neurons' frames are nearest to the given frames.
 
     Also returns the residuals (n, M).
     """
-    count = neuron_frames.shape[1]
-    middle = neuron_frames.mean(axis=1, keepdims=True)
-    apart = neuron_frames - middle
-    gram = apart @ np.swapaxes(apart, 1, 2)
+    num_neurons = neuron_frames.shape[1]
+    mean_frames = neuron_frames.mean(axis=1, keepdims=True)
+    deviations = neuron_frames - mean_frames
+    gram = deviations @ np.swapaxes(deviations, 1, 2)
     diagonal = np.einsum("nqq->nq", gram)  # a view of `gram`
     diagonal += regularisation * diagonal.mean(axis=1, keepdims=True) + 1e-300
-    change = frames - middle[:, 0]
-    found = np.linalg.solve(gram, apart @ change[..., None])
-    left = change - (np.swapaxes(found, 1, 2) @ apart)[:, 0]
-    return found[..., 0] + (1 - found.sum(axis=1)) / count, left
+    change = frames - mean_frames[:, 0]
+    shares = np.linalg.solve(gram, deviations @ change[..., None])
+    residuals = change - (np.swapaxes(shares, 1, 2) @ deviations)[:, 0]
+    return shares[..., 0] + (1 - shares.sum(axis=1)) / num_neurons, residuals
 
 
 # Number of iterations; minimum distance of neighbours' frames, relative to the median, for the strength of a spring.
-_STEPS, _LEAST = 60, 1e-2
+_NUM_ITERATIONS, _MIN_RELATIVE_DISTANCE = 60, 1e-2
 
 
 def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2"]:
@@ -235,26 +259,26 @@ def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2
     check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")
     check_key(key)
     rows, columns = learnt.shape
-    first, second = neighbours(learnt.shape)
-    flat = learnt.weights.reshape(rows * columns, -1)
-    distance = np.linalg.norm(flat[first] - flat[second], axis=1)
-    usual = float(np.median(distance)) or 1.0
-    strength = usual / np.maximum(distance, _LEAST * usual)
+    first_ends, second_ends = neighbours(learnt.shape)
+    weight_rows = learnt.weights.reshape(rows * columns, -1)
+    distances = np.linalg.norm(weight_rows[first_ends] - weight_rows[second_ends], axis=1)
+    median_distance = float(np.median(distances)) or 1.0
+    strengths = median_distance / np.maximum(distances, _MIN_RELATIVE_DISTANCE * median_distance)
     graph = networkx.Graph()
     graph.add_nodes_from(range(rows * columns))
-    graph.add_weighted_edges_from(zip(first.tolist(), second.tolist(), strength.tolist(), strict=True))
+    graph.add_weighted_edges_from(zip(first_ends.tolist(), second_ends.tolist(), strengths.tolist(), strict=True))
     grid = np.stack(np.unravel_index(np.arange(rows * columns), learnt.shape), axis=1) / max(rows, columns)
     grid = grid + 1e-3 * np.asarray(jax.random.normal(key, grid.shape))
-    start = dict(enumerate(grid))
-    drawn = networkx.spring_layout(graph, pos=start, iterations=_STEPS, method="force", seed=0)
-    return np.array([drawn[one] for one in range(rows * columns)]).reshape(rows, columns, 2)
+    initial_places = dict(enumerate(grid))
+    final_places = networkx.spring_layout(graph, pos=initial_places, iterations=_NUM_ITERATIONS, method="force", seed=0)
+    return np.array([final_places[neuron] for neuron in range(rows * columns)]).reshape(rows, columns, 2)
 
 
 def neighbours(shape: tuple[int, int]) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " e"]]:
     """Return the indices of the neurons at both ends of every edge of a grid of this shape, counted row by row."""
-    number = np.arange(shape[0] * shape[1]).reshape(shape)
-    first = np.concatenate([number[:-1].ravel(), number[:, :-1].ravel()])
-    return first, np.concatenate([number[1:].ravel(), number[:, 1:].ravel()])
+    indices = np.arange(shape[0] * shape[1]).reshape(shape)
+    first_ends = np.concatenate([indices[:-1].ravel(), indices[:, :-1].ravel()])
+    return first_ends, np.concatenate([indices[1:].ravel(), indices[:, 1:].ravel()])
 
 
 def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
@@ -277,12 +301,12 @@ def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
     check_kind("learnt", learnt, (SelfOrganisingMap, PlacedMap), "a map, as of SelfOrganisingMap.fit, or a PlacedMap")
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / 'map.npz'}.")
-    placed = isinstance(learnt, PlacedMap)
-    plain = learnt.learnt if placed else learnt
-    more = {name: getattr(learnt, name) for name in _OF_PLACES} if placed else {}
-    more = {name: value for name, value in more.items() if value is not None}
+    has_places = isinstance(learnt, PlacedMap)
+    plain_map = learnt.learnt if has_places else learnt
+    place_arrays = {name: getattr(learnt, name) for name in _PLACE_FIELDS} if has_places else {}
+    place_arrays = {name: value for name, value in place_arrays.items() if value is not None}
     with written_whole(path) as file:
-        np.savez_compressed(file, weights=plain.weights, scale=plain.scale, **more)
+        np.savez_compressed(file, weights=plain_map.weights, scale=plain_map.scale, **place_arrays)
 
 
 def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:
@@ -306,13 +330,13 @@ def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:
     if not Path(path).is_file():
         raise FileNotFoundError(f"'{path}': there is no such file.")
     try:
-        arrays = npz_arrays(Path(path), "weights", "scale", *_OF_PLACES)
+        arrays = npz_arrays(Path(path), "weights", "scale", *_PLACE_FIELDS)
         need(arrays, "weights", "scale")
         learnt = SelfOrganisingMap(arrays["weights"], _read_scalar("scale", arrays))
         if "places" not in arrays:
             return learnt
-        numbers = _read_scalar("widening", arrays), _read_scalar("missed", arrays)
-        return PlacedMap(learnt, arrays["places"], *numbers, arrays.get("fitted"))
+        errors = _read_scalar("widening", arrays), _read_scalar("missed", arrays)
+        return PlacedMap(learnt, arrays["places"], *errors, arrays.get("fitted"))
     except ValueError as error:
         raise ValueError(f"'{path}' is no map: {error}") from None
 

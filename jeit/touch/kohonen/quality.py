@@ -15,7 +15,7 @@ from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap, checked_fr
 from jeit.touch.kohonen.training import MapSchedule
 
 # Maximum number of frames of which all pairs are compared; number of neighbours of each frame.
-_COMPARED, _NEIGHBOURS = 2000, 12
+_MAX_COMPARED_FRAMES, _NUM_NEIGHBOURS = 2000, 12
 
 
 @dataclass(frozen=True)
@@ -56,15 +56,15 @@ def map_quality(learnt: SelfOrganisingMap, frames: ArrayLike) -> MapQuality:
 
     check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")
     frames = learnt.checked(frames)
-    if len(frames) <= 2 * _NEIGHBOURS:
-        raise ValueError(f"frames: {len(frames)} are too few to compare; give {2 * _NEIGHBOURS + 1} or more.")
-    near, distance = learnt.nearest(frames, 2)
-    row, column = np.unravel_index(near, learnt.shape)
-    apart = np.maximum(np.abs(row[:, 0] - row[:, 1]), np.abs(column[:, 0] - column[:, 1]))
-    some = np.unique(np.linspace(0, len(frames) - 1, _COMPARED).astype(int))
-    grid = np.stack([row[some, 0], column[some, 0]], axis=1).astype(float)
-    trusted = trustworthiness(frames[some], grid, n_neighbors=_NEIGHBOURS)
-    return MapQuality(float(distance[:, 0].mean()), float(np.mean(apart > 1)), float(trusted))
+    if len(frames) <= 2 * _NUM_NEIGHBOURS:
+        raise ValueError(f"frames: {len(frames)} are too few to compare; give {2 * _NUM_NEIGHBOURS + 1} or more.")
+    nearest_neurons, distances = learnt.nearest(frames, 2)
+    row, column = np.unravel_index(nearest_neurons, learnt.shape)
+    grid_distances = np.maximum(np.abs(row[:, 0] - row[:, 1]), np.abs(column[:, 0] - column[:, 1]))
+    compared_frames = np.unique(np.linspace(0, len(frames) - 1, _MAX_COMPARED_FRAMES).astype(int))
+    grid_positions = np.stack([row[compared_frames, 0], column[compared_frames, 0]], axis=1).astype(float)
+    trust_score = trustworthiness(frames[compared_frames], grid_positions, n_neighbors=_NUM_NEIGHBOURS)
+    return MapQuality(float(distances[:, 0].mean()), float(np.mean(grid_distances > 1)), float(trust_score))
 
 
 def learning_curves(
@@ -95,5 +95,5 @@ def time_constant(curve: ArrayLike) -> float:
     values = real_array("curve", curve, "the means (T,) of a map's weights")
     if values.ndim != 1 or len(values) < 10 or not np.isfinite(values).all():
         raise ValueError(f"curve must be finite, (T,), of ten steps or more; it has shape {values.shape}.")
-    end = values[-len(values) // 10 :].mean()
-    return float(1 + np.argmax(values / end >= 1 - np.exp(-1)))
+    final_value = values[-len(values) // 10 :].mean()
+    return float(1 + np.argmax(values / final_value >= 1 - np.exp(-1)))

@@ -16,13 +16,13 @@ from jeit.arguments import check_key, check_kind, counted, describe, is_number, 
 from jeit.touch.kohonen.training import MapSchedule, train
 
 # Minimum number of frames: fewer define no order.
-_FEWEST = 3
+_MIN_FRAMES = 3
 # Standard deviation of the initial weights, relative to the frames' root mean square.
 _INITIAL_DEVIATION = 1e-3
 # Radius, in grid steps, at which only the winner moves: for its neighbours, exp(−1/2ρ²) underflows.
 _WINNER_ONLY_RADIUS = 0.01
 # Number of frames whose distances to all neurons are computed at once.
-_AT_ONCE = 1024
+_CHUNK_SIZE = 1024
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,13 @@ class SelfOrganisingMap:
 
         Returns their indices (n, count), counted row by row of the grid, and their distances (n, count).
         """
-        squared = self._squared_distances(frames)
-        some = np.argpartition(squared, count - 1, axis=1)[:, :count]
-        near = np.take_along_axis(squared, some, axis=1)
-        order = np.argsort(near, axis=1)
-        return np.take_along_axis(some, order, axis=1), np.sqrt(np.take_along_axis(near, order, axis=1))
+        squared_distances = self._squared_distances(frames)
+        candidates = np.argpartition(squared_distances, count - 1, axis=1)[:, :count]
+        candidate_distances = np.take_along_axis(squared_distances, candidates, axis=1)
+        order = np.argsort(candidate_distances, axis=1)
+        return np.take_along_axis(candidates, order, axis=1), np.sqrt(
+            np.take_along_axis(candidate_distances, order, axis=1)
+        )
 
     def checked(self, frames: ArrayLike) -> Float[np.ndarray, "n M"]:
         """Convert frames to an array (n, M). Raises `ValueError` for other shapes, and NaN."""
@@ -119,22 +121,22 @@ class SelfOrganisingMap:
     def _squared_distances(self, frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n k"]:
         """Compute squared distances (n, k) as |w − m|² − 2 (w − m)·(x − m) + |x − m|², with m the mean of the
         weights."""
-        middle, weights, squares = self._centred_weights
-        found = np.empty((len(frames), len(weights)))
-        for first in range(0, len(frames), _AT_ONCE):
-            own = frames[first : first + _AT_ONCE] - middle
-            part = found[first : first + _AT_ONCE]
-            np.matmul(own, weights.T, out=part)
-            part *= -2
-            part += squares
-            part += np.sum(own**2, axis=1)[:, None]
-        return np.maximum(found, 0.0, out=found)
+        mean_weights, weights, squares = self._centred_weights
+        distances = np.empty((len(frames), len(weights)))
+        for start in range(0, len(frames), _CHUNK_SIZE):
+            centred_frames = frames[start : start + _CHUNK_SIZE] - mean_weights
+            chunk = distances[start : start + _CHUNK_SIZE]
+            np.matmul(centred_frames, weights.T, out=chunk)
+            chunk *= -2
+            chunk += squares
+            chunk += np.sum(centred_frames**2, axis=1)[:, None]
+        return np.maximum(distances, 0.0, out=distances)
 
     @cached_property
     def _centred_weights(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        flat = self.weights.reshape(-1, self.weights.shape[2])
-        middle = flat.mean(axis=0)
-        return middle, flat - middle, np.sum((flat - middle) ** 2, axis=1)
+        weight_rows = self.weights.reshape(-1, self.weights.shape[2])
+        mean_weights = weight_rows.mean(axis=0)
+        return mean_weights, weight_rows - mean_weights, np.sum((weight_rows - mean_weights) ** 2, axis=1)
 
 
 def fit_maps(
@@ -151,8 +153,8 @@ def fit_maps(
     what is raised, are as in `SelfOrganisingMap.fit`.
     """
     frames = checked_frames(frames)
-    learnt, _ = learn_weights(frames, keys, shape, schedules)
-    return [_with_scale(one, frames, scale) for one in learnt]
+    weights, _ = learn_weights(frames, keys, shape, schedules)
+    return [_create_map(map_weights, frames, scale) for map_weights in weights]
 
 
 def learn_weights(
@@ -165,24 +167,24 @@ def learn_weights(
 
     Raises `ValueError` as `fit_maps` does.
     """
-    if len(frames) < _FEWEST or (frames == frames[0]).all():
+    if len(frames) < _MIN_FRAMES or (frames == frames[0]).all():
         raise ValueError(f"frames: {counted(len(frames), 'frame')}, all the same or too few to learn a map from.")
     check_kind("keys", keys, (list, tuple), "a list of them, such as [jax.random.key(0)]")
     for key in keys:
         check_key(key)
-    for one in schedules:
-        check_kind("schedule", one, MapSchedule, "a MapSchedule, such as MapSchedule()")
-    if not keys or len({one.steps for one in schedules}) != 1:
+    for schedule in schedules:
+        check_kind("schedule", schedule, MapSchedule, "a MapSchedule, such as MapSchedule()")
+    if not keys or len({schedule.steps for schedule in schedules}) != 1:
         raise ValueError("keys and schedules: give one at least of each, and schedules that show as many frames.")
     shape = _check_shape(shape)
     pairs = [(key, schedule) for key in keys for schedule in schedules]
-    starts = np.stack([_initial_weights(frames, key, shape) for key, _ in pairs])
-    orders = np.stack([_shuffled_order(key, len(frames), schedule.steps) for key, schedule in pairs])
+    initial_weights = np.stack([_draw_initial_weights(frames, key, shape) for key, _ in pairs])
+    orders = np.stack([_draw_order(key, len(frames), schedule.steps) for key, schedule in pairs])
     rates = np.stack([schedule.rates() for _, schedule in pairs])
-    longest = max(schedule.ordering for schedule in schedules)
-    radii = np.stack([_extend_radii(schedule.radii(shape), longest) for _, schedule in pairs])
-    many = jax.vmap(train, in_axes=(0, None, 0, 0, 0)) if len(pairs) > 1 else _train_single_map
-    weights, curves = many(jnp.asarray(starts), jnp.asarray(frames), orders, rates, radii)
+    max_ordering = max(schedule.ordering for schedule in schedules)
+    radii = np.stack([_extend_radii(schedule.radii(shape), max_ordering) for _, schedule in pairs])
+    train_maps = jax.vmap(train, in_axes=(0, None, 0, 0, 0)) if len(pairs) > 1 else _train_single_map
+    weights, curves = train_maps(jnp.asarray(initial_weights), jnp.asarray(frames), orders, rates, radii)
     return np.asarray(weights), np.asarray(curves)
 
 
@@ -206,46 +208,46 @@ def checked_frames(values, num_channels: int | None = None) -> Float[np.ndarray,
     return frames
 
 
-def _extend_radii(radii: Float[np.ndarray, " O"], longest: int) -> Float[np.ndarray, " L"]:
+def _extend_radii(radii: Float[np.ndarray, " O"], max_ordering: int) -> Float[np.ndarray, " L"]:
     """Extend radii to the length of the longest ordering phase of several schedules.
 
     The added radii, which belong to the tuning phase, are almost 0.
     """
-    return np.concatenate([radii, np.full(longest - len(radii), _WINNER_ONLY_RADIUS)])
+    return np.concatenate([radii, np.full(max_ordering - len(radii), _WINNER_ONLY_RADIUS)])
 
 
-def _train_single_map(starts, frames, orders, rates, radii):
-    return tuple(one[None] for one in train(starts[0], frames, orders[0], rates[0], radii[0]))
+def _train_single_map(initial_weights, frames, orders, rates, radii):
+    return tuple(array[None] for array in train(initial_weights[0], frames, orders[0], rates[0], radii[0]))
 
 
-def _with_scale(weights: np.ndarray, frames: np.ndarray, scale: float | None) -> SelfOrganisingMap:
+def _create_map(weights: np.ndarray, frames: np.ndarray, scale: float | None) -> SelfOrganisingMap:
     """Create a map; without a `scale`, it is the median distance of the frames from their winners."""
-    learnt = SelfOrganisingMap(weights, 1.0 if scale is None else scale)
+    fitted_map = SelfOrganisingMap(weights, 1.0 if scale is None else scale)
     if scale is not None:
-        return learnt
-    usual = float(np.median(np.sqrt(learnt._squared_distances(frames).min(axis=1))))
-    return SelfOrganisingMap(weights, usual or float(np.std(frames)))
+        return fitted_map
+    median_distance = float(np.median(np.sqrt(fitted_map._squared_distances(frames).min(axis=1))))
+    return SelfOrganisingMap(weights, median_distance or float(np.std(frames)))
 
 
-def _initial_weights(frames: np.ndarray, key: Array, shape: tuple[int, int]) -> Float[np.ndarray, "R C M"]:
+def _draw_initial_weights(frames: np.ndarray, key: Array, shape: tuple[int, int]) -> Float[np.ndarray, "R C M"]:
     """Draw the initial weights, which are small and random."""
-    size = _INITIAL_DEVIATION * float(np.sqrt(np.mean(frames**2)))
-    return size * np.asarray(jax.random.normal(key, (*shape, frames.shape[1])))
+    deviation = _INITIAL_DEVIATION * float(np.sqrt(np.mean(frames**2)))
+    return deviation * np.asarray(jax.random.normal(key, (*shape, frames.shape[1])))
 
 
-def _shuffled_order(key: Array, num_frames: int, num_steps: int) -> Int[np.ndarray, " T"]:
+def _draw_order(key: Array, num_frames: int, num_steps: int) -> Int[np.ndarray, " T"]:
     """Draw the order of `num_frames` frames for `num_steps` steps: a new permutation each time that all have been
     shown."""
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    rounds = [random.permutation(num_frames) for _ in range(-(-num_steps // num_frames))]
-    return np.concatenate(rounds)[:num_steps]
+    permutations = [random.permutation(num_frames) for _ in range(-(-num_steps // num_frames))]
+    return np.concatenate(permutations)[:num_steps]
 
 
 def _check_shape(shape) -> tuple[int, int]:
-    wanted = "two whole numbers, rows and columns, such as (32, 32)"
-    check_kind("shape", shape, (tuple, list), wanted)
-    if len(shape) != 2 or not all(is_number(one) and int(one) == one and one >= 1 for one in shape):
-        raise ValueError(f"shape must be {wanted}; it is {shape!r}.")
+    requirement = "two whole numbers, rows and columns, such as (32, 32)"
+    check_kind("shape", shape, (tuple, list), requirement)
+    if len(shape) != 2 or not all(is_number(count) and int(count) == count and count >= 1 for count in shape):
+        raise ValueError(f"shape must be {requirement}; it is {shape!r}.")
     rows, columns = int(shape[0]), int(shape[1])
     if rows * columns < 2:
         raise ValueError("shape: a map needs two neurons or more.")

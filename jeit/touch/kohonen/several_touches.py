@@ -13,10 +13,10 @@ from jeit.touch.kohonen.placed_map import PlacedMap
 
 # Minimum strength of a touch, relative to the strongest; minimum distance between touches, relative to the extent of
 # the map's places.
-_LEAST, _APART = 0.08, 0.1
+_MIN_STRENGTH, _RELATIVE_SEPARATION = 0.08, 0.1
 # Minimum decrease of the residual sum of squares for each further touch, in residual variances; maximum number of
 # touches.
-_EVIDENCE, _MOST = 25.0, 6
+_MIN_RESIDUAL_DECREASE, _MAX_TOUCHES = 25.0, 6
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ def neuron_shares(placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> 
     touches have one sign, so few of the non-negative shares are needed (Lawson and Hanson 1974). Raises `ValueError` if
     `placed` is no map with places, and for more than one frame, another number of channels, and NaN.
     """
-    sum_of = _TouchSum.from_frame(placed, frame, reference)
+    touch_sum = _TouchSum.from_frame(placed, frame, reference)
     shares = np.zeros(placed.learnt.shape)
-    shares[placed.placed] = sum_of.fit_shares(np.ones(len(sum_of.places), bool))[0]
+    shares[placed.placed] = touch_sum.fit_shares(np.ones(len(touch_sum.places), bool))[0]
     return shares
 
 
@@ -51,7 +51,7 @@ def touches_reported(
     frame: ArrayLike,
     reference: ArrayLike,
     *,
-    least: float = _LEAST,
+    least: float = _MIN_STRENGTH,
     apart: float | None = None,
 ) -> list[MapTouch]:
     """Detect the touches in a frame by a self-organising map: at most six, the strongest first.
@@ -80,21 +80,23 @@ def touches_reported(
         raise ValueError(f"least must be a share, from 0 to below 1; it is {describe(least)}.")
     if apart is not None and not (is_number(apart) and apart > 0):
         raise ValueError(f"apart must be positive, in metres; it is {describe(apart)}.")
-    sum_of = _TouchSum.from_frame(placed, frame, reference)
+    touch_sum = _TouchSum.from_frame(placed, frame, reference)
     if apart is None:
-        apart = _APART * float(np.ptp(sum_of.places, axis=0).max())
-    shares, left = sum_of.fit_shares(np.ones(len(sum_of.places), bool))
-    own = np.count_nonzero(shares)
-    if not own:
+        apart = _RELATIVE_SEPARATION * float(np.ptp(touch_sum.places, axis=0).max())
+    shares, residual = touch_sum.fit_shares(np.ones(len(touch_sum.places), bool))
+    num_neurons = np.count_nonzero(shares)
+    if not num_neurons:
         return []
-    variance = max(left / max(len(sum_of.change) - own, 1), sum_of.variance)
-    chosen = _select_groups(sum_of, sum_of.group_neurons(shares, apart), variance)
-    if not chosen:
+    variance = max(residual / max(len(touch_sum.change) - num_neurons, 1), touch_sum.variance)
+    selected_groups = _select_groups(touch_sum, touch_sum.group_neurons(shares, apart), variance)
+    if not selected_groups:
         return []
-    shares, _ = sum_of.fit_shares(np.any(chosen, axis=0))
-    touches = [_touch_of_group(sum_of.places[group], shares[group]) for group in chosen if shares[group].any()]
-    touches.sort(key=lambda one: -one.strength)
-    return [one for one in touches if one.strength >= least * max(1.0, touches[0].strength)]
+    shares, _ = touch_sum.fit_shares(np.any(selected_groups, axis=0))
+    touches = [
+        _create_touch(touch_sum.places[group], shares[group]) for group in selected_groups if shares[group].any()
+    ]
+    touches.sort(key=lambda touch: -touch.strength)
+    return [touch for touch in touches if touch.strength >= least * max(1.0, touches[0].strength)]
 
 
 @dataclass(frozen=True)
@@ -113,19 +115,23 @@ class _TouchSum:
     @classmethod
     def from_frame(cls, placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> "_TouchSum":
         check_kind("placed", placed, PlacedMap, "a map with places, as of PlacedMap.learn")
-        read, rest = (_check_frame(placed, name, given) for name, given in (("frame", frame), ("reference", reference)))
-        changes = placed.learnt.weights[placed.placed] - rest
+        frame_values, reference_values = (
+            _check_frame(placed, name, array) for name, array in (("frame", frame), ("reference", reference))
+        )
+        changes = placed.learnt.weights[placed.placed] - reference_values
         size = float(np.sqrt(np.mean(changes**2))) or 1.0
-        own = placed.places[placed.placed]
-        return cls((read - rest) / size, changes / size, own, (placed.missed / size) ** 2)
+        placed_positions = placed.places[placed.placed]
+        return cls(
+            (frame_values - reference_values) / size, changes / size, placed_positions, (placed.missed / size) ** 2
+        )
 
     def fit_shares(self, neurons: Bool[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], float]:
         """Fit the shares (k,) of the neurons `neurons`; also returns the residual sum of squares."""
         from scipy.optimize import nnls
 
-        found = np.zeros(len(neurons))
-        found[neurons], distance = nnls(self.changes[neurons].T, self.change)
-        return found, float(distance) ** 2
+        shares = np.zeros(len(neurons))
+        shares[neurons], residual_norm = nnls(self.changes[neurons].T, self.change)
+        return shares, float(residual_norm) ** 2
 
     def group_neurons(self, shares: Float[np.ndarray, " k"], apart: float) -> list[Bool[np.ndarray, " k"]]:
         """Group the neurons with shares into clusters of nearby places.
@@ -134,37 +140,38 @@ class _TouchSum:
         """
         from scipy.cluster.hierarchy import fcluster, linkage
 
-        own = np.flatnonzero(shares)
-        cluster = np.ones(1, int)
-        if len(own) > 1:
-            cluster = fcluster(linkage(self.places[own], "single"), apart, "distance")
-        members = [own[cluster == one] for one in np.unique(cluster)]
-        members.sort(key=lambda some: -np.linalg.norm(shares[some] @ self.changes[some]))
+        neurons_with_share = np.flatnonzero(shares)
+        cluster_numbers = np.ones(1, int)
+        if len(neurons_with_share) > 1:
+            cluster_numbers = fcluster(linkage(self.places[neurons_with_share], "single"), apart, "distance")
+        clusters = [neurons_with_share[cluster_numbers == number] for number in np.unique(cluster_numbers)]
+        clusters.sort(key=lambda cluster: -np.linalg.norm(shares[cluster] @ self.changes[cluster]))
         return [
-            np.linalg.norm(self.places[:, None] - self.places[some], axis=-1).min(axis=1) < apart / 2
-            for some in members[:_MOST]
+            np.linalg.norm(self.places[:, None] - self.places[cluster], axis=-1).min(axis=1) < apart / 2
+            for cluster in clusters[:_MAX_TOUCHES]
         ]
 
 
 def _select_groups(model: _TouchSum, groups: list[np.ndarray], variance: float) -> list[Bool[np.ndarray, " k"]]:
     """Select the groups of neurons that are needed to explain the frame, the most informative first."""
-    chosen: list[np.ndarray] = []
-    left = float(model.change @ model.change)
-    rest = list(groups)
-    while rest:
-        after = [model.fit_shares(np.any([*chosen, one], axis=0))[1] for one in rest]
-        best = int(np.argmin(after))
-        if left - after[best] < _EVIDENCE * variance:
+    selected_groups: list[np.ndarray] = []
+    residual = float(model.change @ model.change)
+    remaining_groups = list(groups)
+    while remaining_groups:
+        new_residuals = [model.fit_shares(np.any([*selected_groups, group], axis=0))[1] for group in remaining_groups]
+        best_index = int(np.argmin(new_residuals))
+        if residual - new_residuals[best_index] < _MIN_RESIDUAL_DECREASE * variance:
             break
-        chosen.append(rest.pop(best))
-        left = after[best]
-    return chosen
+        selected_groups.append(remaining_groups.pop(best_index))
+        residual = new_residuals[best_index]
+    return selected_groups
 
 
-def _touch_of_group(places: Float[np.ndarray, "k d"], shares: Float[np.ndarray, " k"]) -> MapTouch:
-    middle = shares @ places / shares.sum()
-    spread = np.sqrt(shares @ np.sum((places - middle) ** 2, axis=1) / shares.sum())
-    return MapTouch(middle, float(spread), float(shares.sum()))
+def _create_touch(places: Float[np.ndarray, "k d"], shares: Float[np.ndarray, " k"]) -> MapTouch:
+    """Create the touch of a group of neurons from their places and shares."""
+    centroid = shares @ places / shares.sum()
+    spread = np.sqrt(shares @ np.sum((places - centroid) ** 2, axis=1) / shares.sum())
+    return MapTouch(centroid, float(spread), float(shares.sum()))
 
 
 def _check_frame(placed: PlacedMap, name: str, value) -> Float[np.ndarray, " M"]:

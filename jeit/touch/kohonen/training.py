@@ -94,108 +94,118 @@ def train(
     `rates` (T,): rate ε for each. The first O frames shown are the ordering phase, with `radii` (O,) in grid steps; the
     others are the tuning phase. The function may be mapped by `jax.vmap` over weights, orders, rates and radii.
     """
-    shape, middle, ordering = weights.shape[:2], frames.mean(axis=0), len(radii)
+    shape, mean_frame, num_ordering = weights.shape[:2], frames.mean(axis=0), len(radii)
 
-    def train_phase(phase, flat, at_once, order, rates, *radii):
-        more = -len(order) % at_once
+    def train_phase(phase, weight_rows, block_size, order, rates, *radii):
+        num_padding = -len(order) % block_size
         # Frames are added to fill the last part; at a rate of 0, they change nothing.
-        order_rates = [jnp.pad(one, (0, more)) for one in (order, rates)]
-        filled = *order_rates, *(jnp.pad(one, (0, more), "edge") for one in radii)
+        order_rates = [jnp.pad(values, (0, num_padding)) for values in (order, rates)]
+        blocks = *order_rates, *(jnp.pad(values, (0, num_padding), "edge") for values in radii)
 
-        def train_block(flat, now):
-            some, *how = now
-            return phase(shape, flat, frames[some] - middle, *how)
+        def train_block(weight_rows, block):
+            frame_indices, *parameters = block
+            return phase(shape, weight_rows, frames[frame_indices] - mean_frame, *parameters)
 
-        flat, curve = jax.lax.scan(train_block, flat, tuple(one.reshape(-1, at_once) for one in filled))
-        return flat, curve.reshape(-1)[: len(order)]
+        weight_rows, curve = jax.lax.scan(
+            train_block, weight_rows, tuple(values.reshape(-1, block_size) for values in blocks)
+        )
+        return weight_rows, curve.reshape(-1)[: len(order)]
 
-    flat, curves = (weights - middle).reshape(-1, weights.shape[2]), []
-    if ordering:
-        flat, curve = train_phase(_ordering_phase, flat, _ORDERING_FRAMES, order[:ordering], rates[:ordering], radii)
+    weight_rows, curves = (weights - mean_frame).reshape(-1, weights.shape[2]), []
+    if num_ordering:
+        weight_rows, curve = train_phase(
+            _ordering_phase, weight_rows, _ORDERING_FRAMES, order[:num_ordering], rates[:num_ordering], radii
+        )
         curves.append(curve)
-    if len(order) > ordering:
-        flat, curve = train_phase(_tuning_phase, flat, _TUNING_FRAMES, order[ordering:], rates[ordering:])
+    if len(order) > num_ordering:
+        weight_rows, curve = train_phase(
+            _tuning_phase, weight_rows, _TUNING_FRAMES, order[num_ordering:], rates[num_ordering:]
+        )
         curves.append(curve)
-    return flat.reshape(weights.shape) + middle, jnp.concatenate(curves) + middle.mean()
+    return weight_rows.reshape(weights.shape) + mean_frame, jnp.concatenate(curves) + mean_frame.mean()
 
 
-def _ordering_phase(shape, flat, shown, rates, radii):
+def _ordering_phase(shape, weights, frames, rates, radii):
     """Show frames (n, M) to a map of this shape in the ordering phase, in which all neurons move.
 
     Returns the weights (k, M) after these frames, and their mean after each frame (n,).
     """
     row, column = jnp.arange(shape[0])[:, None], jnp.arange(shape[1])
 
-    def show_frame(state, now):
-        distances, level = state
-        one, rate, radius, to_others, mean = now
-        own = distances[one]
-        best_row, best_column = _winner(own, shape)
+    def show_frame(state, step):
+        distances, weight_means = state
+        index, rate, radius, to_other_frames, frame_mean = step
+        own_distances = distances[index]
+        best_row, best_column = _find_winner(own_distances, shape)
         share = rate * jnp.exp(-((row - best_row) ** 2 + (column - best_column) ** 2) / (2 * radius**2)).reshape(-1)
-        distances = (1 - share) * distances + share * (to_others[:, None] - (1 - share) * own)
-        level = level + share * (mean - level)
-        return (distances, level), (share, level.mean())
+        distances = (1 - share) * distances + share * (to_other_frames[:, None] - (1 - share) * own_distances)
+        weight_means = weight_means + share * (frame_mean - weight_means)
+        return (distances, weight_means), (share, weight_means.mean())
 
-    start, apart = (_squared_distances(shown, flat), flat.mean(axis=1)), _squared_distances(shown, shown)
-    each = jnp.arange(len(shown)), rates, radii, apart, shown.mean(axis=1)
-    _, (shares, curve) = jax.lax.scan(show_frame, start, each)
-    return _move_weights(flat, shares, shown), curve
+    initial_state, frame_distances = (
+        (_squared_distances(frames, weights), weights.mean(axis=1)),
+        _squared_distances(frames, frames),
+    )
+    steps = jnp.arange(len(frames)), rates, radii, frame_distances, frames.mean(axis=1)
+    _, (shares, curve) = jax.lax.scan(show_frame, initial_state, steps)
+    return _move_weights(weights, shares, frames), curve
 
 
-def _tuning_phase(shape, flat, shown, rates):
+def _tuning_phase(shape, weights, frames, rates):
     """Show frames in the tuning phase, in which only the winner moves.
 
     Returns the weights (k, M) after these frames, and their mean after each frame (n,)."""
 
-    def show_frame(state, now):
-        distances, level, (winner, moved) = state
-        one, rate, to_others, mean = now
-        # Write the distances of the previous frame's winner before any are read, which avoids a copy of all distances.
-        distances = distances.at[:, winner].set(moved, mode=_IN_BOUNDS)
-        row, column = _winner(distances[one], shape)
+    def show_frame(state, step):
+        distances, weight_means, (winner, winner_distances) = state
+        index, rate, to_other_frames, frame_mean = step
+        # The distances of the previous frame's winner are written before any are read, which avoids a copy of the
+        # array.
+        distances = distances.at[:, winner].set(winner_distances, mode=_IN_BOUNDS)
+        row, column = _find_winner(distances[index], shape)
         winner = row * shape[1] + column
-        moved = distances.at[:, winner].get(mode=_IN_BOUNDS)
-        moved = (1 - rate) * moved + rate * (to_others - (1 - rate) * moved[one])
-        level = level.at[winner].add(rate * (mean - level[winner]), mode=_IN_BOUNDS)
-        return (distances, level, (winner, moved)), (winner, level.mean())
+        old_distances = distances.at[:, winner].get(mode=_IN_BOUNDS)
+        winner_distances = (1 - rate) * old_distances + rate * (to_other_frames - (1 - rate) * old_distances[index])
+        weight_means = weight_means.at[winner].add(rate * (frame_mean - weight_means[winner]), mode=_IN_BOUNDS)
+        return (distances, weight_means, (winner, winner_distances)), (winner, weight_means.mean())
 
-    distances, apart = _squared_distances(shown, flat), _squared_distances(shown, shown)
-    start = distances, flat.mean(axis=1), (jnp.zeros((), int), distances[:, 0])
-    each = jnp.arange(len(shown)), rates, apart, shown.mean(axis=1)
-    _, (winners, curve) = jax.lax.scan(show_frame, start, each)
+    distances, frame_distances = _squared_distances(frames, weights), _squared_distances(frames, frames)
+    initial_state = distances, weights.mean(axis=1), (jnp.zeros((), int), distances[:, 0])
+    steps = jnp.arange(len(frames)), rates, frame_distances, frames.mean(axis=1)
+    _, (winners, curve) = jax.lax.scan(show_frame, initial_state, steps)
     shares = jnp.where(winners[:, None] == winners, rates[:, None], 0.0)
-    return flat.at[winners].set(_move_weights(flat[winners], shares, shown)), curve
+    return weights.at[winners].set(_move_weights(weights[winners], shares, frames)), curve
 
 
-def _squared_distances(shown, flat):
+def _squared_distances(frames, weights):
     """Compute squared distances (n, k) of frames (n, M) from weights (k, M)."""
-    return jnp.sum(shown**2, axis=1)[:, None] + jnp.sum(flat**2, axis=1) - 2 * shown @ flat.T
+    return jnp.sum(frames**2, axis=1)[:, None] + jnp.sum(weights**2, axis=1) - 2 * frames @ weights.T
 
 
-def _winner(distances, shape):
+def _find_winner(distances, shape):
     """Find the row and the column of the neuron with the smallest of the distances (k,).
 
     The minimum of each column is found first, since this is done for many columns at once.
     """
-    grid = distances.reshape(shape)
-    column = jnp.argmin(grid.min(axis=0))
-    return jnp.argmin(grid[:, column]), column
+    distance_grid = distances.reshape(shape)
+    column = jnp.argmin(distance_grid.min(axis=0))
+    return jnp.argmin(distance_grid[:, column]), column
 
 
-def _move_weights(weights, shares, shown):
+def _move_weights(weights, shares, frames):
     """Move weights (k, M) towards frames (n, M), one after another, by `shares` (n, k) of the remaining way."""
 
-    def remaining_share(after, share):
-        return after * (1 - share), after * share
+    def remaining_and_added(remaining, share):
+        return remaining * (1 - share), remaining * share
 
     # From the last frame to the first: later frames reduce the contribution of a frame by their own shares.
-    kept, moved = jax.lax.scan(remaining_share, jnp.ones(len(weights)), shares, reverse=True)
-    return kept[:, None] * weights + moved.T @ shown
+    weight_shares, frame_shares = jax.lax.scan(remaining_and_added, jnp.ones(len(weights)), shares, reverse=True)
+    return weight_shares[:, None] * weights + frame_shares.T @ frames
 
 
 def _check_decreasing(name: str, value, maximum: float, requirement: str) -> None:
-    span = real_array(name, value, f"the first and the last: {requirement}")
-    if span.shape != (2,) or not 0 < span[1] <= span[0] <= maximum or not np.isfinite(span).all():
+    limits = real_array(name, value, f"the first and the last: {requirement}")
+    if limits.shape != (2,) or not 0 < limits[1] <= limits[0] <= maximum or not np.isfinite(limits).all():
         raise ValueError(
             f"{name} must be the first and the last, positive and not rising: {requirement}; it is {value!r}."
         )

@@ -18,9 +18,9 @@ from jeit.touch.learnt.presses import Presses
 
 NUM_FOLDS = 5
 # Maximum distance of held-out presses from the nearest other press, relative to the same distance for random folds.
-_FARTHER = 2.0
+_MAX_DISTANCE_RATIO = 2.0
 # Places count as repeated if the number of different places, divided by the number of presses, is lower than this.
-_REPEATED = 0.7
+_MAX_UNIQUE_SHARE = 0.7
 
 
 def time_folds(
@@ -41,43 +41,43 @@ def time_folds(
     places (d > 1) are repeated, so do presses at the same place: otherwise the training set would contain copies of
     held-out presses.
     """
-    count = len(frames)
-    order = np.arange(count) if time is None else np.argsort(time, kind="stable")
-    rank = np.empty(count, int)
-    rank[order] = np.arange(count)
+    num_presses = len(frames)
+    order = np.arange(num_presses) if time is None else np.argsort(time, kind="stable")
+    rank = np.empty(num_presses, int)
+    rank[order] = np.arange(num_presses)
     notes = []
-    unit = np.arange(count)
+    unit = np.arange(num_presses)
     groups = unit if group is None else np.unique(group, return_inverse=True)[1]
-    grouped = group is not None and groups.max() > 0
-    if grouped:
+    is_grouped = group is not None and groups.max() > 0
+    if is_grouped:
         unit = groups
         num_folds = min(num_folds, int(unit.max()) + 1)
     elif group is not None:
         notes.append("all presses are of one group: folds are intervals of time.")
-    same = np.unique(np.nan_to_num(frames), axis=0, return_inverse=True)[1].ravel()
-    copies = count - same.max() - 1
-    if copies:
-        notes.append(f"{copies} frames are copies of others: kept in one fold with them.")
-        unit = _connected_sets(unit, same)
-    repeated = False
-    if positions is not None and positions.shape[1] > 1 and not grouped:
-        places = np.unique(positions, axis=0, return_inverse=True)[1].ravel()
-        repeated = num_folds <= places.max() + 1 < _REPEATED * count
-        if repeated:
-            notes.append(f"{places.max() + 1} places were repeated: held out with all of their presses.")
-            unit = _connected_sets(unit, places)
+    frame_indices = np.unique(np.nan_to_num(frames), axis=0, return_inverse=True)[1].ravel()
+    num_copies = num_presses - frame_indices.max() - 1
+    if num_copies:
+        notes.append(f"{num_copies} frames are copies of others: kept in one fold with them.")
+        unit = _connected_sets(unit, frame_indices)
+    has_repeated_places = False
+    if positions is not None and positions.shape[1] > 1 and not is_grouped:
+        place_indices = np.unique(positions, axis=0, return_inverse=True)[1].ravel()
+        has_repeated_places = num_folds <= place_indices.max() + 1 < _MAX_UNIQUE_SHARE * num_presses
+        if has_repeated_places:
+            notes.append(f"{place_indices.max() + 1} places were repeated: held out with all of their presses.")
+            unit = _connected_sets(unit, place_indices)
     num_intervals = num_folds
     fold = _assign_to_folds(unit, rank, num_folds, num_intervals)
-    while not grouped and num_intervals < count / 4 and not _training_sets_cover(fold, positions, kinds):
+    while not is_grouped and num_intervals < num_presses / 4 and not _training_sets_cover(fold, positions, kinds):
         num_intervals *= 2
         fold = _assign_to_folds(unit, rank, num_folds, num_intervals)
-    if kinds is not None and kinds.ndim == 1 and not grouped and not _training_sets_cover(fold, None, kinds):
+    if kinds is not None and kinds.ndim == 1 and not is_grouped and not _training_sets_cover(fold, None, kinds):
         fold = _assign_by_class(rank, kinds, num_folds)
-    if num_intervals > num_folds and not repeated:
-        what = "labels or keys were given" if positions is None else "places were pressed"
+    if num_intervals > num_folds and not has_repeated_places:
+        description = "labels or keys were given" if positions is None else "places were pressed"
         notes.append(
-            f"{what} one after the other: held out in {num_intervals} short intervals of time; drift between presses "
-            "may improve these results."
+            f"{description} one after the other: held out in {num_intervals} short intervals of time; drift between "
+            "presses may improve these results."
         )
     return fold, tuple(notes)
 
@@ -85,19 +85,21 @@ def time_folds(
 def _assign_to_folds(unit: np.ndarray, rank: np.ndarray, num_folds: int, num_intervals: int) -> Int[np.ndarray, " N"]:
     """Assign units of presses to folds: their order is cut into intervals, which are assigned to the folds in turn."""
     sizes = np.bincount(unit)
-    by_time = np.argsort(np.bincount(unit, rank) / sizes, kind="stable")
-    middles = np.cumsum(sizes[by_time]) - sizes[by_time] / 2
-    fold = np.empty(len(sizes), int)
-    fold[by_time] = np.minimum((middles * num_intervals / len(unit)).astype(int), num_intervals - 1) % num_folds
-    return np.unique(fold, return_inverse=True)[1][unit]
+    unit_order = np.argsort(np.bincount(unit, rank) / sizes, kind="stable")
+    middle_ranks = np.cumsum(sizes[unit_order]) - sizes[unit_order] / 2
+    fold_of_unit = np.empty(len(sizes), int)
+    fold_of_unit[unit_order] = (
+        np.minimum((middle_ranks * num_intervals / len(unit)).astype(int), num_intervals - 1) % num_folds
+    )
+    return np.unique(fold_of_unit, return_inverse=True)[1][unit]
 
 
 def _assign_by_class(rank: np.ndarray, kinds: np.ndarray, num_folds: int) -> Int[np.ndarray, " N"]:
     """Assign the presses of each class to the folds in turn, for data in which some classes are rare."""
     fold = np.empty(len(kinds), int)
     for kind in np.unique(kinds):
-        own = np.flatnonzero(kinds == kind)
-        fold[own[np.argsort(rank[own])]] = np.arange(len(own)) % num_folds
+        class_rows = np.flatnonzero(kinds == kind)
+        fold[class_rows[np.argsort(rank[class_rows])]] = np.arange(len(class_rows)) % num_folds
     return fold
 
 
@@ -106,18 +108,19 @@ def _training_sets_cover(fold: np.ndarray, positions: np.ndarray | None, kinds: 
     if kinds is not None and kinds.ndim == 2:
         return all(_training_sets_cover(fold, None, column) for column in kinds.T)
     if kinds is not None:
-        return all(set(kinds[fold == one]) <= set(kinds[fold != one]) for one in np.unique(fold))
+        return all(set(kinds[fold == fold_index]) <= set(kinds[fold != fold_index]) for fold_index in np.unique(fold))
     if positions is None:
         return True
-    dealt = np.random.default_rng(0).permutation(fold)
-    return _largest_distance(positions, fold) <= _FARTHER * _largest_distance(positions, dealt)
+    random_folds = np.random.default_rng(0).permutation(fold)
+    return _largest_distance(positions, fold) <= _MAX_DISTANCE_RATIO * _largest_distance(positions, random_folds)
 
 
 def _largest_distance(positions: np.ndarray, fold: np.ndarray) -> float:
-    """Mean distance of held-out presses from the nearest other press, in the fold in which it is largest."""
+    """Compute the mean distance of held-out presses from the nearest other press, in the fold where it is largest."""
     unit = positions.std(axis=0).max() or 1.0
     return max(
-        KDTree(positions[fold != one]).query(positions[fold == one])[0].mean() + 1e-3 * unit for one in np.unique(fold)
+        KDTree(positions[fold != fold_index]).query(positions[fold == fold_index])[0].mean() + 1e-3 * unit
+        for fold_index in np.unique(fold)
     )
 
 
@@ -176,26 +179,26 @@ def learn_quantities(
     Returns the models, their accuracies, and notes.
     """
     notes, standing = [], {}
-    found: dict[str, Any] = dict.fromkeys(("place", "force", "label", "keys"))
-    every = np.arange(len(changes))
+    models: dict[str, Any] = dict.fromkeys(("place", "force", "label", "keys"))
+    all_rows = np.arange(len(changes))
     if presses.positions is not None:
         rows, folds, remarks = places_and_folds(presses)
         notes += remarks
         places = presses.positions[rows]
-        found["place"], standing["place"] = _learn_targets(
+        models["place"], standing["place"] = _learn_targets(
             changes, reference, places, rows, folds, method, imaged, progress
         )
     if presses.force is not None:
-        known = presses.positions is not None and np.isfinite(presses.positions).all()
-        alike = presses.positions if known else presses.force[:, None]
-        folds, _ = time_folds(presses.frames, *_groups_and_times(presses, every), positions=alike)
+        has_all_places = presses.positions is not None and np.isfinite(presses.positions).all()
+        grouping_values = presses.positions if has_all_places else presses.force[:, None]
+        folds, _ = time_folds(presses.frames, *_groups_and_times(presses, all_rows), positions=grouping_values)
         force = presses.force[:, None]
-        found["force"], standing["force"] = _learn_targets(
-            changes, reference, force, every, folds, method, imaged, progress
+        models["force"], standing["force"] = _learn_targets(
+            changes, reference, force, all_rows, folds, method, imaged, progress
         )
     if presses.label is not None:
-        folds, remarks = time_folds(presses.frames, *_groups_and_times(presses, every), kinds=presses.label)
-        learnt, tried = learn_labels(
+        folds, remarks = time_folds(presses.frames, *_groups_and_times(presses, all_rows), kinds=presses.label)
+        learnt, results = learn_labels(
             changes,
             reference,
             presses.label,
@@ -205,23 +208,23 @@ def learn_quantities(
             progress=progress,
         )
         notes += [*remarks, *learnt.notes]
-        found["label"] = learnt
-        methods = [(f"{one.method} on {one.form}", one.error) for one in tried]
-        standing["label"] = Standing(methods[0][0], methods, learnt.classes[tried[0].held_out], presses.label)
+        models["label"] = learnt
+        methods = [(f"{result.method} on {result.form}", result.error) for result in results]
+        standing["label"] = Standing(methods[0][0], methods, learnt.classes[results[0].held_out], presses.label)
     if presses.touched is not None:
-        folds, remarks = time_folds(presses.frames, *_groups_and_times(presses, every), kinds=presses.touched)
+        folds, remarks = time_folds(presses.frames, *_groups_and_times(presses, all_rows), kinds=presses.touched)
         notes += remarks
         if presses.touched.sum(axis=1).max() < 2:
-            notes.append("no two keys were pressed together: what is said of keys pressed together is a guess.")
-        found["keys"], tried = learn_keys(changes, reference, presses.touched, folds, progress=progress)
-        pairs = zip(tried.methods, tried.errors.tolist(), strict=True)
+            notes.append("no two keys were pressed together: predictions of keys pressed together are unreliable.")
+        models["keys"], results = learn_keys(changes, reference, presses.touched, folds, progress=progress)
+        pairs = zip(results.methods, results.errors.tolist(), strict=True)
         methods = [(f"key {key}: {name}", error) for key, (name, error) in enumerate(pairs)]
-        standing["keys"] = Standing("for each key its own", methods, tried.held_out, presses.touched)
-    return found, standing, notes
+        standing["keys"] = Standing("for each key its own", methods, results.held_out, presses.touched)
+    return models, standing, notes
 
 
 def places_and_folds(presses: Presses) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Rows of presses that have a place, their cross-validation folds, and notes."""
+    """Return the rows of the presses that have a place, their cross-validation folds, and notes."""
     positions = np.asarray(presses.positions)
     rows = np.flatnonzero(~np.isnan(positions).any(axis=1))
     folds, remarks = time_folds(presses.frames[rows], *_groups_and_times(presses, rows), positions=positions[rows])
@@ -232,11 +235,18 @@ def _learn_targets(
     changes, reference, targets, rows, folds, method, imaged, progress
 ) -> tuple[LearntNumbers, Standing]:
     """Learn targets (n, d) from the changes of the given rows; returns the model and its accuracy."""
-    own, asked = None if reference is None else reference[rows], _method_or_auto(method, number_methods)
-    learnt, tried = learn_numbers(changes[rows], own, targets, folds, method=asked, imaged=imaged, progress=progress)
-    methods = [(one.name, one.error) for one in tried]
-    said = tried[0].held_out
-    return learnt, Standing(methods[0][0], methods, said, targets, learnt.spread.held_out(said, changes[rows]))
+    selected_reference, number_method = (
+        None if reference is None else reference[rows],
+        _method_or_auto(method, number_methods),
+    )
+    learnt, results = learn_numbers(
+        changes[rows], selected_reference, targets, folds, method=number_method, imaged=imaged, progress=progress
+    )
+    methods = [(result.name, result.error) for result in results]
+    predictions = results[0].held_out
+    return learnt, Standing(
+        methods[0][0], methods, predictions, targets, learnt.spread.held_out(predictions, changes[rows])
+    )
 
 
 def _method_or_auto(method: str, methods) -> str:

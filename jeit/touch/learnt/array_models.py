@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from jeit.touch.learnt.extras import apply_in_parts
 
 # Number of frames evaluated at once, so that the data stay in the processor's cache.
-_AT_ONCE = 128
+_CHUNK_SIZE = 128
 
 
 @dataclass(frozen=True)
@@ -45,23 +45,23 @@ class Forest:
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """Compute the sum (n, d) of the trees' values."""
-        trees, size, targets = self.value.shape
-        first_node = size * np.arange(trees)
+        num_trees, num_nodes, num_targets = self.value.shape
+        first_node = num_nodes * np.arange(num_trees)
         # Nodes are numbered through all trees, and arrays are flat: `take` is faster than indexing two axes.
         feature, threshold = self.feature.ravel(), self.threshold.ravel()
-        below, above = ((one + first_node[:, None]).ravel() for one in (self.left, self.right))
-        value = self.value.reshape(-1, targets)
+        left_children, right_children = ((child + first_node[:, None]).ravel() for child in (self.left, self.right))
+        value = self.value.reshape(-1, num_targets)
 
         def evaluate(rows: np.ndarray) -> np.ndarray:
-            row = (rows.shape[1] * np.arange(len(rows)))[:, None]
-            flat = np.ascontiguousarray(rows).ravel()
-            node = np.broadcast_to(first_node, (len(rows), trees))
+            row_starts = (rows.shape[1] * np.arange(len(rows)))[:, None]
+            flat_features = np.ascontiguousarray(rows).ravel()
+            node = np.broadcast_to(first_node, (len(rows), num_trees))
             for _ in range(self.depth):
-                further = flat.take(row + feature.take(node)) > threshold.take(node)
-                node = np.where(further, above.take(node), below.take(node))
+                exceeds_threshold = flat_features.take(row_starts + feature.take(node)) > threshold.take(node)
+                node = np.where(exceeds_threshold, right_children.take(node), left_children.take(node))
             return value.take(node, axis=0).sum(axis=1)
 
-        return apply_in_parts(evaluate, features, _AT_ONCE) + self.start
+        return apply_in_parts(evaluate, features, _CHUNK_SIZE) + self.start
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """Compute the score of each class (n, d), for classifiers: the sum of the trees' values."""
@@ -72,8 +72,8 @@ class Forest:
         """Convert scikit-learn's histogram gradient boosting regressors, one for each of d targets."""
         trees = []
         for target, model in enumerate(models):
-            for (one,) in model._predictors:
-                nodes = one.nodes
+            for (regressor_tree,) in model._predictors:
+                nodes = regressor_tree.nodes
                 value = np.zeros((len(nodes), len(models)))
                 value[:, target] = nodes["value"]
                 leaf = nodes["is_leaf"].astype(bool)
@@ -87,16 +87,16 @@ class Forest:
 
         With two classes, the second has half of the model's log-odds, and the first the same with opposite sign.
         """
-        trees, number = [], len(model.classes_)
-        for one in model._predictors:
-            for target, tree in enumerate(one):
+        trees, num_classes = [], len(model.classes_)
+        for round_trees in model._predictors:
+            for target, tree in enumerate(round_trees):
                 nodes = tree.nodes
-                own = np.array([-0.5, 0.5]) if number == 2 else np.eye(number)[target]
+                class_weights = np.array([-0.5, 0.5]) if num_classes == 2 else np.eye(num_classes)[target]
                 leaf = nodes["is_leaf"].astype(bool)
-                value = np.outer(nodes["value"], own)
+                value = np.outer(nodes["value"], class_weights)
                 trees.append((nodes["feature_idx"], nodes["num_threshold"], nodes["left"], nodes["right"], leaf, value))
         start = np.ravel(model._baseline_prediction).astype(float)
-        start = np.array([-0.5, 0.5]) * start[0] if number == 2 else start
+        start = np.array([-0.5, 0.5]) * start[0] if num_classes == 2 else start
         return cls._pack_trees(trees, start, model.classes_)
 
     @classmethod
@@ -104,10 +104,10 @@ class Forest:
         """Convert scikit-learn's regression trees to a forest that predicts their mean."""
         trees = []
         for model in models:
-            one = model.tree_
-            leaf = one.children_left < 0
-            value = one.value[:, :, 0] / len(models)
-            trees.append((one.feature, one.threshold, one.children_left, one.children_right, leaf, value))
+            tree = model.tree_
+            leaf = tree.children_left < 0
+            value = tree.value[:, :, 0] / len(models)
+            trees.append((tree.feature, tree.threshold, tree.children_left, tree.children_right, leaf, value))
         targets = trees[0][-1].shape[1]
         return cls._pack_trees(trees, np.zeros(targets), np.arange(targets))
 
@@ -121,51 +121,67 @@ class Forest:
         """
         trees = []
         for model, weight in zip(models, weights, strict=True):
-            one = model.tree_
-            share = one.value[:, 0] / one.value[:, 0].sum(axis=1, keepdims=True)
+            tree = model.tree_
+            class_shares = tree.value[:, 0] / tree.value[:, 0].sum(axis=1, keepdims=True)
             if votes:
-                share = np.eye(share.shape[1])[share.argmax(axis=1)]
-            value = np.zeros((len(share), len(classes)))
-            value[:, model.classes_.astype(int)] = weight * share
-            leaf = one.children_left < 0
-            trees.append((one.feature, one.threshold, one.children_left, one.children_right, leaf, value))
+                class_shares = np.eye(class_shares.shape[1])[class_shares.argmax(axis=1)]
+            value = np.zeros((len(class_shares), len(classes)))
+            value[:, model.classes_.astype(int)] = weight * class_shares
+            leaf = tree.children_left < 0
+            trees.append((tree.feature, tree.threshold, tree.children_left, tree.children_right, leaf, value))
         return cls._pack_trees(trees, np.zeros(len(classes)), classes)
 
     @classmethod
     def from_stumps(cls, model: Any) -> "Forest":
         """Convert a `LogitBoostClassifier`: each stump becomes a tree that contributes to the scores of all classes."""
-        rounds, number = model.feature_.shape
+        num_rounds, num_classes = model.feature_.shape
         trees = []
-        for one, kind in np.ndindex(rounds, number):
-            own = np.eye(number)[kind] - 1 / number
-            said = np.outer([0.0, model.below_[one, kind], model.above_[one, kind]], own)
-            asked, at = np.array([model.feature_[one, kind], 0, 0]), np.array([model.threshold_[one, kind], 0.0, 0.0])
-            trees.append((asked, at, np.array([1, 1, 2]), np.array([2, 1, 2]), np.array([False, True, True]), said))
-        return cls._pack_trees(trees, np.zeros(number), model.classes_)
+        for round_index, class_index in np.ndindex(num_rounds, num_classes):
+            class_weights = np.eye(num_classes)[class_index] - 1 / num_classes
+            leaf_values = np.outer(
+                [0.0, model.below_[round_index, class_index], model.above_[round_index, class_index]], class_weights
+            )
+            tested_features, thresholds = (
+                np.array([model.feature_[round_index, class_index], 0, 0]),
+                np.array([model.threshold_[round_index, class_index], 0.0, 0.0]),
+            )
+            trees.append(
+                (
+                    tested_features,
+                    thresholds,
+                    np.array([1, 1, 2]),
+                    np.array([2, 1, 2]),
+                    np.array([False, True, True]),
+                    leaf_values,
+                )
+            )
+        return cls._pack_trees(trees, np.zeros(num_classes), model.classes_)
 
     @classmethod
     def _pack_trees(cls, trees: list[tuple], start: np.ndarray, classes: np.ndarray) -> "Forest":
-        most, depth = max(len(tree[0]) for tree in trees), 1
-        feature, left, right = (np.zeros((len(trees), most), np.int32) for _ in range(3))
-        threshold = np.zeros((len(trees), most))
-        value = np.zeros((len(trees), most, len(start)))
-        for number, (asked, at, below, above, leaf, said) in enumerate(trees):
-            size, itself = len(asked), np.arange(len(asked))
-            feature[number, :size] = np.where(leaf, 0, asked)
-            threshold[number, :size] = np.where(leaf, 0.0, at)
-            left[number, :size] = np.where(leaf, itself, below)
-            right[number, :size] = np.where(leaf, itself, above)
-            value[number, :size] = said
-            level = np.zeros(size, int)
-            for node in itself[~leaf]:  # parents come before their children
-                level[[left[number, node], right[number, node]]] = level[node] + 1
+        """Create a forest from trees, each a tuple of arrays: tested features, thresholds, left and right children,
+        whether a node is a leaf, and the values of the nodes."""
+        max_nodes, depth = max(len(tree[0]) for tree in trees), 1
+        feature, left, right = (np.zeros((len(trees), max_nodes), np.int32) for _ in range(3))
+        threshold = np.zeros((len(trees), max_nodes))
+        value = np.zeros((len(trees), max_nodes, len(start)))
+        for tree_index, (tested_features, thresholds, left_children, right_children, leaf, values) in enumerate(trees):
+            num_nodes, node_indices = len(tested_features), np.arange(len(tested_features))
+            feature[tree_index, :num_nodes] = np.where(leaf, 0, tested_features)
+            threshold[tree_index, :num_nodes] = np.where(leaf, 0.0, thresholds)
+            left[tree_index, :num_nodes] = np.where(leaf, node_indices, left_children)
+            right[tree_index, :num_nodes] = np.where(leaf, node_indices, right_children)
+            value[tree_index, :num_nodes] = values
+            level = np.zeros(num_nodes, int)
+            for node in node_indices[~leaf]:  # parents come before their children
+                level[[left[tree_index, node], right[tree_index, node]]] = level[node] + 1
             depth = max(depth, int(level.max()))
         return cls(feature, threshold, left, right, value, depth, start, classes)
 
 
 # Number of frames whose distances from all presses are computed at once.
-_FRAMES = 128
-_COUNTS = (3, 5, 8, 12)
+_NEIGHBOUR_CHUNK_SIZE = 128
+_CANDIDATE_COUNTS = (3, 5, 8, 12)
 
 
 @dataclass(frozen=True)
@@ -184,14 +200,14 @@ class NearestNeighbours:
     @classmethod
     def fit_regressor(cls, features, targets) -> "NearestNeighbours":
         """Create a regressor of targets (N, d), with the `count` that has the lowest leave-one-out error."""
-        count = min(max(_COUNTS), len(features) - 1)
-        every = cls(features, targets, count + 1, np.arange(targets.shape[1]))
-        distance, number = (one[:, 1:] for one in every._nearest_presses(features))
-        weight = 1 / np.maximum(distance, 1e-12)[..., None]
-        means = np.cumsum(weight * targets[number], axis=1) / np.cumsum(weight, axis=1)
-        off = np.linalg.norm(means - targets[:, None], axis=-1).mean(axis=0)
-        best = min([one for one in _COUNTS if one <= count] or [count], key=lambda one: off[one - 1])
-        return cls(features, targets, best, every.classes_)
+        count = min(max(_CANDIDATE_COUNTS), len(features) - 1)
+        all_neighbours = cls(features, targets, count + 1, np.arange(targets.shape[1]))
+        distances, indices = (array[:, 1:] for array in all_neighbours._nearest_presses(features))
+        weights = 1 / np.maximum(distances, 1e-12)[..., None]
+        means = np.cumsum(weights * targets[indices], axis=1) / np.cumsum(weights, axis=1)
+        errors = np.linalg.norm(means - targets[:, None], axis=-1).mean(axis=0)
+        best_count = min([k for k in _CANDIDATE_COUNTS if k <= count] or [count], key=lambda k: errors[k - 1])
+        return cls(features, targets, best_count, all_neighbours.classes_)
 
     @classmethod
     def fit_classifier(cls, features, label) -> "NearestNeighbours":
@@ -201,9 +217,9 @@ class NearestNeighbours:
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """Predict targets (n, d)."""
-        distance, number = self._nearest_presses(features)
-        weight = 1 / np.maximum(distance, 1e-12)
-        return np.einsum("nc,ncd->nd", weight / weight.sum(axis=1, keepdims=True), self.known[number])
+        distances, indices = self._nearest_presses(features)
+        weights = 1 / np.maximum(distances, 1e-12)
+        return np.einsum("nc,ncd->nd", weights / weights.sum(axis=1, keepdims=True), self.known[indices])
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Predict the share of each class (n, C) among the nearest presses."""
@@ -213,15 +229,17 @@ class NearestNeighbours:
         """Find the nearest presses: their distances (n, c), the nearest first, and their indices (n, c)."""
 
         def find_nearest(rows: np.ndarray) -> np.ndarray:
-            squared = (-2 * rows) @ self.features.T
-            squared += self._squared_norms  # the frame's squared norm is left out: it is the same for all presses
-            number = np.argpartition(squared, self.count - 1, axis=1)[:, : self.count]
-            apart = np.linalg.norm(self.features[number] - rows[:, None], axis=2)
-            order = np.argsort(apart, axis=1, kind="stable")
-            return np.stack([np.take_along_axis(one, order, axis=1) for one in (apart, number)], axis=-1)
+            shifted_squares = (-2 * rows) @ self.features.T
+            shifted_squares += (
+                self._squared_norms
+            )  # without the frame's squared norm, which is the same for all presses
+            indices = np.argpartition(shifted_squares, self.count - 1, axis=1)[:, : self.count]
+            distances = np.linalg.norm(self.features[indices] - rows[:, None], axis=2)
+            order = np.argsort(distances, axis=1, kind="stable")
+            return np.stack([np.take_along_axis(array, order, axis=1) for array in (distances, indices)], axis=-1)
 
-        found = apply_in_parts(find_nearest, features, _FRAMES)
-        return found[..., 0], found[..., 1].astype(int)
+        neighbours = apply_in_parts(find_nearest, features, _NEIGHBOUR_CHUNK_SIZE)
+        return neighbours[..., 0], neighbours[..., 1].astype(int)
 
     @cached_property
     def _squared_norms(self) -> Float[np.ndarray, " N"]:
@@ -252,7 +270,7 @@ class SupportVectorMachine:
     @classmethod
     def from_scikit_learn(cls, machine) -> "SupportVectorMachine":
         """Convert scikit-learn's support vector classifier with a linear or a polynomial kernel."""
-        linear = machine.kernel == "linear"
+        is_linear = machine.kernel == "linear"
         start = np.concatenate([[0], np.cumsum(machine.n_support_)])
         # In scikit-learn, a positive value means the second of two classes, but the first class of a pair if there are
         # more.
@@ -262,10 +280,10 @@ class SupportVectorMachine:
             sign * machine.dual_coef_,
             start,
             sign * machine.intercept_,
-            1.0 if linear else float(machine._gamma),
-            0.0 if linear else float(machine.coef0),
-            1 if linear else int(machine.degree),
-            sign * machine.coef_ if linear else None,
+            1.0 if is_linear else float(machine._gamma),
+            0.0 if is_linear else float(machine.coef0),
+            1 if is_linear else int(machine.degree),
+            sign * machine.coef_ if is_linear else None,
             machine.classes_,
         )
 
@@ -274,10 +292,10 @@ class SupportVectorMachine:
 
         A term below 1/2 from the distances to the boundaries is added, which orders classes with equal counts.
         """
-        pairs, side = self._boundary_distances(features)
-        votes = (pairs > 0) @ (side > 0).astype(float) + (pairs <= 0) @ (side < 0).astype(float)
-        sure = pairs @ side
-        return votes + sure / (3 * (np.abs(sure) + 1))
+        distances, side_signs = self._boundary_distances(features)
+        votes = (distances > 0) @ (side_signs > 0).astype(float) + (distances <= 0) @ (side_signs < 0).astype(float)
+        confidences = distances @ side_signs
+        return votes + confidences / (3 * (np.abs(confidences) + 1))
 
     def pair_odds(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Compute, for each class, the sum of its log-probabilities relative to every other class (n, C).
@@ -285,26 +303,31 @@ class SupportVectorMachine:
         Relative to one other class, the probability is 1 / (1 + exp(-2 d)) at a distance d from the boundary between
         the two, in units of its margin. Unlike numbers of won decisions, the sums measure confidence.
         """
-        pairs, side = self._boundary_distances(features)
-        won, lost = -np.logaddexp(0.0, -2 * pairs), -np.logaddexp(0.0, 2 * pairs)
-        return won @ (side > 0).astype(float) + lost @ (side < 0).astype(float)
+        distances, side_signs = self._boundary_distances(features)
+        log_probabilities_won, log_probabilities_lost = (
+            -np.logaddexp(0.0, -2 * distances),
+            -np.logaddexp(0.0, 2 * distances),
+        )
+        return log_probabilities_won @ (side_signs > 0).astype(float) + log_probabilities_lost @ (
+            side_signs < 0
+        ).astype(float)
 
     def _boundary_distances(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n P"], Float[np.ndarray, "P C"]]:
         """Compute signed distances (n, P) from the boundaries of all pairs of classes.
 
         Also returns the sign of the distance on the side of each class (P, C), 0 for classes that are not of the pair.
         """
-        count = len(self.classes_)
-        first, second = np.triu_indices(count, 1)
+        num_classes = len(self.classes_)
+        first, second = np.triu_indices(num_classes, 1)
         if self.slopes is not None:
-            pairs = features @ self.slopes.T + self.intercepts
+            distances = features @ self.slopes.T + self.intercepts
         else:
             kernel = (self.gain * features @ self.support.T + self.offset) ** self.degree
-            sums = np.empty((len(features), count - 1, count))
-            for one in range(count):
-                own = slice(self.start[one], self.start[one + 1])
-                sums[:, :, one] = kernel[:, own] @ self.weights[:, own].T
-            pairs = sums[:, second - 1, first] + sums[:, first, second] + self.intercepts
-        side = np.zeros((len(first), count))
-        side[np.arange(len(first)), first], side[np.arange(len(first)), second] = 1.0, -1.0
-        return pairs, side
+            sums = np.empty((len(features), num_classes - 1, num_classes))
+            for class_index in range(num_classes):
+                class_vectors = slice(self.start[class_index], self.start[class_index + 1])
+                sums[:, :, class_index] = kernel[:, class_vectors] @ self.weights[:, class_vectors].T
+            distances = sums[:, second - 1, first] + sums[:, first, second] + self.intercepts
+        side_signs = np.zeros((len(first), num_classes))
+        side_signs[np.arange(len(first)), first], side_signs[np.arange(len(first)), second] = 1.0, -1.0
+        return distances, side_signs

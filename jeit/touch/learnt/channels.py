@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 
 # Number of scores used; maximum number of presses stored; fraction of the usual norm of scores that is added to a
 # frame's norm, by which distances are divided.
-_SCORES, _MOST_KEPT, _SMALL = 8, 4000, 0.5
+_NUM_SCORES, _MAX_STORED_PRESSES, _NORM_OFFSET_FRACTION = 8, 4000, 0.5
 _USUAL_QUANTILE = 0.99
 
 
@@ -41,19 +41,19 @@ class Neighbourhood:
     @classmethod
     def learn(cls, scores: Float[np.ndarray, "N K"]) -> "Neighbourhood":
         """Fit to the scores of presses (N, K)."""
-        kept = scores[:: -(-len(scores) // _MOST_KEPT), :_SCORES]
-        size = float(np.median(np.linalg.norm(kept, axis=1))) or 1.0
-        found = cls(kept, size, 1.0)
-        apart = found._relative_distances(kept, second=True)
-        return cls(kept, size, max(float(np.quantile(apart, _USUAL_QUANTILE)), 1e-6))
+        stored_scores = scores[:: -(-len(scores) // _MAX_STORED_PRESSES), :_NUM_SCORES]
+        size = float(np.median(np.linalg.norm(stored_scores, axis=1))) or 1.0
+        unscaled_neighbourhood = cls(stored_scores, size, 1.0)
+        distances = unscaled_neighbourhood._relative_distances(stored_scores, skip_first=True)
+        return cls(stored_scores, size, max(float(np.quantile(distances, _USUAL_QUANTILE)), 1e-6))
 
     def __call__(self, scores: Float[np.ndarray, "n K"]) -> Float[np.ndarray, " n"]:
         """Compute the distances (n,) of frames with these scores from the nearest press, divided by `usual`."""
-        return self._relative_distances(scores[:, :_SCORES]) / self.usual
+        return self._relative_distances(scores[:, :_NUM_SCORES]) / self.usual
 
-    def _relative_distances(self, scores: np.ndarray, *, second: bool = False) -> np.ndarray:
-        distance = np.asarray(self._search_tree.query(scores, 2)[0])[:, int(second)]
-        return distance / (np.linalg.norm(scores, axis=1) + _SMALL * self.size)
+    def _relative_distances(self, scores: np.ndarray, *, skip_first: bool = False) -> np.ndarray:
+        distance = np.asarray(self._search_tree.query(scores, 2)[0])[:, int(skip_first)]
+        return distance / (np.linalg.norm(scores, axis=1) + _NORM_OFFSET_FRACTION * self.size)
 
     @cached_property
     def _search_tree(self) -> KDTree:
@@ -62,24 +62,24 @@ class Neighbourhood:
 
 # Fraction of the variance that is left to noise; maximum number of patterns; number of presses required for each
 # pattern.
-_LEFT, _MOST, _PRESSES_EACH = 1e-3, 60, 4
+_NOISE_VARIANCE_FRACTION, _MAX_PATTERNS, _PRESSES_PER_PATTERN = 1e-3, 60, 4
 # A channel is dead if its residual exceeds this multiple of this quantile of the residuals of training presses.
-_BEYOND, _QUANTILE = 2.0, 0.999
+_RESIDUAL_FACTOR, _RESIDUAL_QUANTILE = 2.0, 0.999
 # Maximum distance of a working channel's reading from its training range, relative to the width of that range; maximum
 # fraction of channels that may exceed it, above which the frame counts as unusual and the channels as alive.
-_SPANS, _FEW = 2.0, 0.1
+_MAX_RANGE_EXCESS, _MAX_EXCEEDING_FRACTION = 2.0, 0.1
 # Variation below this fraction of the largest change is rounding error.
-_ROUNDING = 1e-13
+_ROUNDING_ERROR = 1e-13
 # Candidate values added to the diagonal of the covariance of channels, which are scaled to variance 1.
 _DIAGONALS = np.logspace(-6, 0, 13)
 # Maximum fraction of dead channels, at which the search for dead channels stops.
-_MOST_DEAD = 0.34
+_MAX_DEAD_FRACTION = 0.34
 # Number of consecutive frames with a unique set of missing channels after which frames are processed one by one.
-_ALONE = 8
+_MAX_UNIQUE_FRAMES = 8
 # Number of standard deviations, those of the mean square of normal residuals, by which a frame's must exceed 1.
-_SIGNIFICANT = 2.0
+_EXCESS_STANDARD_DEVIATIONS = 2.0
 # Novelty of a frame whose distance from the nearest press is the usual distance between presses.
-_NEAR = 2 / 1.75
+_NOVELTY_AT_USUAL_DISTANCE = 2 / 1.75
 
 
 @dataclass(frozen=True)
@@ -118,36 +118,57 @@ class Channels:
         used = missing.mean(axis=0) < 0.5
         deviation = np.zeros(changes.shape[1])
         deviation[used] = np.nanstd(changes[:, used], axis=0)
-        size = np.nanmax(np.abs(changes[:, used]), initial=0.0)
-        used &= deviation > max(1e-9 * deviation.max(initial=0.0), _ROUNDING * size)
+        max_change = np.nanmax(np.abs(changes[:, used]), initial=0.0)
+        used &= deviation > max(1e-9 * deviation.max(initial=0.0), _ROUNDING_ERROR * max_change)
         if not used.any():
             raise ValueError("frames: no channel changes; are these frames, and the skin connected?")
         scale = deviation[used]
         scaled = np.where(missing[:, used], 0.0, changes[:, used]) / scale
-        there, half = ~missing[:, used], len(scaled) // 2
+        has_reading, half = ~missing[:, used], len(scaled) // 2
         # Residuals are larger for frames outside the training set than in it, so each half of the frames is evaluated
         # with the patterns of the other half.
-        left, apart, misses = [], [], np.zeros((2, len(_DIAGONALS), int(used.sum())))
-        for learnt, other in ((slice(None, half), slice(half, None)), (slice(half, None), slice(None, half))):
-            variance, directions = _variances(scaled[learnt])
-            misses += _leave_one_out_errors(scaled[other], variance, directions)
-            model = _fit_patterns(scaled[learnt], variance, directions)
-            scores, residual = _most_likely_scores(scaled[other], there[other], *model)
-            left.append(np.where(there[other], np.abs(residual), np.nan))
-            apart.append(_novelty(scores, residual, there[other], model[1]))
-        left, apart = np.concatenate(left), np.concatenate(apart)
-        farthest = _BEYOND * np.nanquantile(left, _QUANTILE, axis=0)
-        farthest = np.maximum(farthest, max(6.0, float(np.nanquantile(left, 0.99))))
+        residuals, novelties, leave_one_out_errors = [], [], np.zeros((2, len(_DIAGONALS), int(used.sum())))
+        for training_rows, test_rows in (
+            (slice(None, half), slice(half, None)),
+            (slice(half, None), slice(None, half)),
+        ):
+            variance, directions = _variances(scaled[training_rows])
+            leave_one_out_errors += _leave_one_out_errors(scaled[test_rows], variance, directions)
+            model = _fit_patterns(scaled[training_rows], variance, directions)
+            scores, residual = _most_likely_scores(scaled[test_rows], has_reading[test_rows], *model)
+            residuals.append(np.where(has_reading[test_rows], np.abs(residual), np.nan))
+            novelties.append(_novelty(scores, residual, has_reading[test_rows], model[1]))
+        residuals, novelties = np.concatenate(residuals), np.concatenate(novelties)
+        farthest = _RESIDUAL_FACTOR * np.nanquantile(residuals, _RESIDUAL_QUANTILE, axis=0)
+        farthest = np.maximum(farthest, max(6.0, float(np.nanquantile(residuals, 0.99))))
         variance, directions = _variances(scaled)
-        best = int(misses[0].sum(axis=1).argmin())
-        weight, unpredicted = variance / (variance + _DIAGONALS[best]), misses[1, best] / 2
+        best_diagonal = int(leave_one_out_errors[0].sum(axis=1).argmin())
+        weight, unpredicted = (
+            variance / (variance + _DIAGONALS[best_diagonal]),
+            leave_one_out_errors[1, best_diagonal] / 2,
+        )
         patterns, spread, noise = _fit_patterns(scaled, variance, directions)
-        every, _ = _most_likely_scores(scaled, there, patterns, spread, noise)
-        usual = float(np.quantile(apart, 0.99))
-        least, most = np.nanmin(changes[:, used], axis=0) / scale, np.nanmax(changes[:, used], axis=0) / scale
-        far = np.stack([least - _SPANS * (most - least), most + _SPANS * (most - least)])
-        near = Neighbourhood.learn(every)
-        return cls(used, scale, far, patterns, spread, noise, farthest, directions, weight, unpredicted, usual, near)
+        scores, _ = _most_likely_scores(scaled, has_reading, patterns, spread, noise)
+        usual = float(np.quantile(novelties, 0.99))
+        minima, maxima = np.nanmin(changes[:, used], axis=0) / scale, np.nanmax(changes[:, used], axis=0) / scale
+        limits = np.stack(
+            [minima - _MAX_RANGE_EXCESS * (maxima - minima), maxima + _MAX_RANGE_EXCESS * (maxima - minima)]
+        )
+        neighbourhood = Neighbourhood.learn(scores)
+        return cls(
+            used,
+            scale,
+            limits,
+            patterns,
+            spread,
+            noise,
+            farthest,
+            directions,
+            weight,
+            unpredicted,
+            usual,
+            neighbourhood,
+        )
 
     def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Replace changes of dead or missing channels by their prediction from the other channels.
@@ -156,30 +177,44 @@ class Channels:
         for a frame that is as far from the training set as the farthest frame in it; and the standard deviation (n, m)
         of errors of the readings that residuals show beyond those of the training set, in the unit of changes.
         """
-        whole = changes[:, self.used] / self.scale
-        given, far = ~np.isnan(whole), (whole < self.range[0]) | (whole > self.range[1])
+        completed_changes = changes[:, self.used] / self.scale
+        has_reading, out_of_range = (
+            ~np.isnan(completed_changes),
+            (completed_changes < self.range[0]) | (completed_changes > self.range[1]),
+        )
         # If many channels are out of range, the frame is unusual, and the channels are not dead.
-        given &= ~far | (far.sum(axis=1, keepdims=True) > max(1, _FEW * whole.shape[1]))
-        whole, alive = np.where(given, whole, 0.0), given.copy()
-        scores, residual = self._scores_and_residuals(whole)
-        left, alone = np.flatnonzero((np.abs(residual) > self.farthest).any(axis=1) | ~given.all(axis=1)), 0
-        while left.size:
+        has_reading &= ~out_of_range | (
+            out_of_range.sum(axis=1, keepdims=True) > max(1, _MAX_EXCEEDING_FRACTION * completed_changes.shape[1])
+        )
+        completed_changes, alive = np.where(has_reading, completed_changes, 0.0), has_reading.copy()
+        scores, residual = self._scores_and_residuals(completed_changes)
+        remaining_frames, num_unique_frames = (
+            np.flatnonzero((np.abs(residual) > self.farthest).any(axis=1) | ~has_reading.all(axis=1)),
+            0,
+        )
+        while remaining_frames.size:
             # Most frames have the same dead channels, so the set found for one frame is tried on all remaining frames.
-            pattern = self._working_channels(whole[left[0]], given[left[0]])
-            some = left if alone < _ALONE else left[:1]
-            beyond, some_scores, some_residual = self._deviations(whole[some], given[some], pattern)
-            same = (beyond <= 1) == pattern
-            borne = same.all(axis=1)
-            borne[0] = True
-            alone = alone + 1 if borne.sum() == 1 else 0
-            rows = some[borne]
-            alive[rows], scores[rows] = pattern, some_scores[borne]
-            residual[rows] = np.where(pattern, some_residual[borne], 0.0)
-            whole[np.ix_(rows, ~pattern)] = self._predict_others(whole[np.ix_(rows, pattern)], pattern)
-            left = np.setdiff1d(left, rows, assume_unique=True)
+            is_working = self._working_channels(
+                completed_changes[remaining_frames[0]], has_reading[remaining_frames[0]]
+            )
+            tried_frames = remaining_frames if num_unique_frames < _MAX_UNIQUE_FRAMES else remaining_frames[:1]
+            relative_deviations, tried_scores, tried_residual = self._deviations(
+                completed_changes[tried_frames], has_reading[tried_frames], is_working
+            )
+            agrees_with_pattern = (relative_deviations <= 1) == is_working
+            is_completed = agrees_with_pattern.all(axis=1)
+            is_completed[0] = True
+            num_unique_frames = num_unique_frames + 1 if is_completed.sum() == 1 else 0
+            rows = tried_frames[is_completed]
+            alive[rows], scores[rows] = is_working, tried_scores[is_completed]
+            residual[rows] = np.where(is_working, tried_residual[is_completed], 0.0)
+            completed_changes[np.ix_(rows, ~is_working)] = self._predict_others(
+                completed_changes[np.ix_(rows, is_working)], is_working
+            )
+            remaining_frames = np.setdiff1d(remaining_frames, rows, assume_unique=True)
         novelty = _novelty(scores, residual, alive, self.spread) / self.usual
-        novelty = np.maximum(novelty, _NEAR * self.neighbourhood(scores))
-        return whole * self.scale, alive, novelty, self._excess(residual, alive)
+        novelty = np.maximum(novelty, _NOVELTY_AT_USUAL_DISTANCE * self.neighbourhood(scores))
+        return completed_changes * self.scale, alive, novelty, self._excess(residual, alive)
 
     def _working_channels(self, frame: np.ndarray, has_reading: np.ndarray) -> np.ndarray:
         """Determine which channels of a frame agree with the prediction from the others.
@@ -187,16 +222,16 @@ class Channels:
         The channels with the largest deviations are removed repeatedly; then channels that agree with the remaining
         ones are restored.
         """
-        alive, fewest, back = has_reading.copy(), (1 - _MOST_DEAD) * len(frame), False
-        while alive.sum() > fewest:
-            (beyond,) = self._deviations(frame[None], has_reading[None], alive)[0]
-            worst = np.max(beyond, where=alive, initial=0.0)
-            if worst <= 1 and back:
+        alive, min_alive, is_restored = has_reading.copy(), (1 - _MAX_DEAD_FRACTION) * len(frame), False
+        while alive.sum() > min_alive:
+            (relative_deviations,) = self._deviations(frame[None], has_reading[None], alive)[0]
+            max_deviation = np.max(relative_deviations, where=alive, initial=0.0)
+            if max_deviation <= 1 and is_restored:
                 break
-            if worst <= 1:
-                alive, back = beyond <= 1, True
+            if max_deviation <= 1:
+                alive, is_restored = relative_deviations <= 1, True
             else:
-                alive &= beyond < (worst if back else max(1.0, worst / 2))
+                alive &= relative_deviations < (max_deviation if is_restored else max(1.0, max_deviation / 2))
         return alive
 
     def _deviations(self, changes, has_reading, alive) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -205,40 +240,46 @@ class Channels:
         They are divided by the maximum deviation of a working channel, and infinite for readings that are not
         `has_reading` (n, m). Also returns the frames' scores (n, k) and residuals (n, m).
         """
-        weighted = self.patterns * (alive / self.noise**2)[:, None]
-        gain = weighted @ np.linalg.inv(weighted.T @ self.patterns + np.diag(1 / self.spread**2))
+        weighted_patterns = self.patterns * (alive / self.noise**2)[:, None]
+        gain = weighted_patterns @ np.linalg.inv(weighted_patterns.T @ self.patterns + np.diag(1 / self.spread**2))
         scores = changes @ gain
         residual = (changes - scores @ self.patterns.T) / self.noise
-        free = 1 - np.einsum(
+        variance_factor = 1 - np.einsum(
             "ij,ij->i", self.patterns, gain
-        )  # variance of a residual, which the channel's weight in its own prediction reduces
-        beyond = np.where(has_reading, np.abs(residual) / np.sqrt(np.maximum(free, 1e-6)) / self.farthest, np.inf)
-        return beyond, scores, residual
+        )  # variance of a residual, relative to the noise; the channel's weight in its own prediction reduces it
+        relative_deviations = np.where(
+            has_reading, np.abs(residual) / np.sqrt(np.maximum(variance_factor, 1e-6)) / self.farthest, np.inf
+        )
+        return relative_deviations, scores, residual
 
     def _predict_others(
         self, alive_readings: Float[np.ndarray, "n a"], alive: np.ndarray
     ) -> Float[np.ndarray, "n m-a"]:
         """Predict the most likely readings of the channels that are not `alive` (m,) from those that are."""
-        dead = self.directions[~alive] * self.weight
-        predicted = dead @ (alive_readings @ self.directions[alive]).T
-        return np.linalg.solve(np.eye(len(dead)) - dead @ self.directions[~alive].T, predicted).T
+        dead_directions = self.directions[~alive] * self.weight
+        right_sides = dead_directions @ (alive_readings @ self.directions[alive]).T
+        return np.linalg.solve(
+            np.eye(len(dead_directions)) - dead_directions @ self.directions[~alive].T, right_sides
+        ).T
 
     def prediction_errors(self, alive: Bool[np.ndarray, "n m"], max_errors: int) -> Float[np.ndarray, "q n m"]:
         """Compute the errors of readings that are predicted for frames with some channels `alive`.
 
         Returns the q ≤ `max_errors` largest independent errors, each of one standard deviation, in the unit of changes.
         """
-        found = np.zeros((min(max_errors, int((~alive).sum(axis=1).max(initial=0))), *alive.shape))
-        patterns, kind = np.unique(alive, axis=0, return_inverse=True)
-        for one, pattern in enumerate(patterns):
-            dead, doubt = self.directions[~pattern], np.sqrt(self.unpredicted[~pattern])
-            inverse = np.linalg.inv(np.eye(len(dead)) - (dead * self.weight) @ dead.T)
-            variance, vectors = np.linalg.eigh(doubt[:, None] * inverse * doubt)
+        errors = np.zeros((min(max_errors, int((~alive).sum(axis=1).max(initial=0))), *alive.shape))
+        patterns, pattern_indices = np.unique(alive, axis=0, return_inverse=True)
+        for pattern_index, pattern in enumerate(patterns):
+            dead_directions, deviations = self.directions[~pattern], np.sqrt(self.unpredicted[~pattern])
+            inverse = np.linalg.inv(np.eye(len(dead_directions)) - (dead_directions * self.weight) @ dead_directions.T)
+            variance, vectors = np.linalg.eigh(deviations[:, None] * inverse * deviations)
             columns = vectors[:, ::-1] * np.sqrt(np.maximum(variance[::-1], 0.0))
-            frames, channels = np.flatnonzero(kind.ravel() == one), np.flatnonzero(~pattern)
-            for way in range(min(len(found), len(channels))):
-                found[np.ix_(np.array([way]), frames, channels)] = columns[:, way] * self.scale[channels]
-        return found
+            frames, channels = np.flatnonzero(pattern_indices.ravel() == pattern_index), np.flatnonzero(~pattern)
+            for error_index in range(min(len(errors), len(channels))):
+                errors[np.ix_(np.array([error_index]), frames, channels)] = (
+                    columns[:, error_index] * self.scale[channels]
+                )
+        return errors
 
     def _excess(self, residual: np.ndarray, alive: np.ndarray) -> Float[np.ndarray, "n m"]:
         """Estimate the standard deviation (n, m) of errors of readings that frames show beyond those of the presses.
@@ -247,11 +288,15 @@ class Channels:
         significantly, as after a drift, is attributed to independent errors of all channels `alive`. The k patterns
         explain a fraction k/m of such errors.
         """
-        number = np.maximum(alive.sum(axis=1), 1)
-        free = np.maximum(number - self.patterns.shape[1], 1)
-        usual = 1 + _SIGNIFICANT * np.sqrt(2 / free)
-        beyond = np.maximum(np.sum(np.where(alive, residual, 0.0) ** 2, axis=1) / number - usual, 0.0)
-        return np.sqrt(beyond * number / free)[:, None] * np.where(alive, self.noise * self.scale, 0.0)
+        num_alive = np.maximum(alive.sum(axis=1), 1)
+        degrees_of_freedom = np.maximum(num_alive - self.patterns.shape[1], 1)
+        max_mean_square = 1 + _EXCESS_STANDARD_DEVIATIONS * np.sqrt(2 / degrees_of_freedom)
+        excess_mean_square = np.maximum(
+            np.sum(np.where(alive, residual, 0.0) ** 2, axis=1) / num_alive - max_mean_square, 0.0
+        )
+        return np.sqrt(excess_mean_square * num_alive / degrees_of_freedom)[:, None] * np.where(
+            alive, self.noise * self.scale, 0.0
+        )
 
     def _scores_and_residuals(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute scores and residuals of frames (n, m) whose channels are all alive."""
@@ -261,20 +306,20 @@ class Channels:
     @cached_property
     def _score_matrix(self) -> Float[np.ndarray, "m k"]:
         """Matrix that maps the readings of all channels to scores, if all channels are alive."""
-        weighted = self.patterns / self.noise[:, None] ** 2
-        return np.linalg.solve(weighted.T @ self.patterns + np.diag(1 / self.spread**2), weighted.T).T
+        weighted_patterns = self.patterns / self.noise[:, None] ** 2
+        return np.linalg.solve(weighted_patterns.T @ self.patterns + np.diag(1 / self.spread**2), weighted_patterns.T).T
 
 
 def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "m r"]]:
     """Compute the variance along each principal direction of the frames, in decreasing order, and the directions."""
-    number, channels = scaled.shape
-    if channels <= number:
+    num_frames, num_channels = scaled.shape
+    if num_channels <= num_frames:
         squares, directions = np.linalg.eigh(scaled.T @ scaled)
     else:  # the smaller of the two matrices
-        squares, combined = np.linalg.eigh(scaled @ scaled.T)
-        directions = scaled.T @ combined / np.sqrt(np.maximum(squares, 1e-300))
-    kept = np.flatnonzero(squares > _ROUNDING * squares[-1])[::-1]
-    return squares[kept] / number, directions[:, kept]
+        squares, combinations = np.linalg.eigh(scaled @ scaled.T)
+        directions = scaled.T @ combinations / np.sqrt(np.maximum(squares, 1e-300))
+    significant_indices = np.flatnonzero(squares > _ROUNDING_ERROR * squares[-1])[::-1]
+    return squares[significant_indices] / num_frames, directions[:, significant_indices]
 
 
 def _fit_patterns(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -282,28 +327,32 @@ def _fit_patterns(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray,
 
     The noise is the part of each channel that the patterns do not explain.
     """
-    explained = np.cumsum(variance) / np.sum(variance)
-    number = min(int(np.searchsorted(explained, 1 - _LEFT)) + 1, _MOST, max(1, len(scaled) // _PRESSES_EACH))
-    number = min(number, max(1, scaled.shape[1] // 2))
-    patterns = directions[:, :number]
-    left = scaled - scaled @ patterns @ patterns.T
-    noise = np.sqrt(np.mean(left**2, axis=0) * len(scaled) / max(1, len(scaled) - number))
-    return patterns, np.sqrt(variance[:number]), np.maximum(noise, 1e-6)
+    explained_fractions = np.cumsum(variance) / np.sum(variance)
+    num_patterns = min(
+        int(np.searchsorted(explained_fractions, 1 - _NOISE_VARIANCE_FRACTION)) + 1,
+        _MAX_PATTERNS,
+        max(1, len(scaled) // _PRESSES_PER_PATTERN),
+    )
+    num_patterns = min(num_patterns, max(1, scaled.shape[1] // 2))
+    patterns = directions[:, :num_patterns]
+    residuals = scaled - scaled @ patterns @ patterns.T
+    noise = np.sqrt(np.mean(residuals**2, axis=0) * len(scaled) / max(1, len(scaled) - num_patterns))
+    return patterns, np.sqrt(variance[:num_patterns]), np.maximum(noise, 1e-6)
 
 
 def _leave_one_out_errors(scaled, variance, directions) -> Float[np.ndarray, "2 D m"]:
     """Compute mean squared prediction errors of channels, for covariances with each of the diagonals.
 
-    Returns two arrays (D, m): the error of each channel as predicted by the others, and this error times `free`, one
-    minus the weight of the channel in its own prediction; `prediction_errors` uses the second.
+    Returns two arrays (D, m): the error of each channel as predicted by the others, and this error times
+    `residual_factor`, one minus the weight of the channel in its own prediction; `prediction_errors` uses the second.
     """
-    scores, found = scaled @ directions, []
+    scores, errors = scaled @ directions, []
     for diagonal in _DIAGONALS:
         weight = variance / (variance + diagonal)
-        free = 1 - np.sum(directions**2 * weight, axis=1)
-        square = np.mean((scaled - (scores * weight) @ directions.T) ** 2, axis=0)
-        found.append((square / free**2, square / free))
-    return np.swapaxes(np.array(found), 0, 1)
+        residual_factor = 1 - np.sum(directions**2 * weight, axis=1)
+        mean_square = np.mean((scaled - (scores * weight) @ directions.T) ** 2, axis=0)
+        errors.append((mean_square / residual_factor**2, mean_square / residual_factor))
+    return np.swapaxes(np.array(errors), 0, 1)
 
 
 def _most_likely_scores(changes, alive, patterns, spread, noise) -> tuple[np.ndarray, np.ndarray]:
@@ -311,12 +360,12 @@ def _most_likely_scores(changes, alive, patterns, spread, noise) -> tuple[np.nda
 
     Residuals are 0 for channels that are not `alive` (n, m).
     """
-    weighted = patterns / noise[:, None] ** 2
+    weighted_patterns = patterns / noise[:, None] ** 2
     prior = np.diag(1 / spread**2)
-    scores = np.linalg.solve(weighted.T @ patterns + prior, weighted.T @ changes.T).T
+    scores = np.linalg.solve(weighted_patterns.T @ patterns + prior, weighted_patterns.T @ changes.T).T
     for frame in np.flatnonzero(~alive.all(axis=1)):
-        own = weighted * alive[frame, :, None]
-        scores[frame] = np.linalg.solve(own.T @ patterns + prior, own.T @ changes[frame])
+        alive_patterns = weighted_patterns * alive[frame, :, None]
+        scores[frame] = np.linalg.solve(alive_patterns.T @ patterns + prior, alive_patterns.T @ changes[frame])
     return scores, np.where(alive, (changes - scores @ patterns.T) / noise, 0.0)
 
 
@@ -325,8 +374,8 @@ def _novelty(scores, residual, alive, spread) -> np.ndarray:
 
     Residuals are relative to the noise, and scores relative to their spread.
     """
-    left = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(alive.sum(axis=1), 1))
-    return np.maximum(left, np.sqrt(np.mean((scores / spread) ** 2, axis=1)))
+    residual_size = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(alive.sum(axis=1), 1))
+    return np.maximum(residual_size, np.sqrt(np.mean((scores / spread) ** 2, axis=1)))
 
 
 def choose_channels(
@@ -334,23 +383,25 @@ def choose_channels(
 ) -> Int[np.ndarray, " n"]:
     """Select channels by simultaneous orthogonal matching pursuit (Tropp et al. 2006), the most informative first.
 
-    Each channel explains most of what the previous ones leave unexplained of the `targets`, by least squares. Products
-    of the answers are explained too, since places are not linear in voltages.
+    Each channel explains, by least squares, most of the part of the `targets` that the previous channels leave
+    unexplained. Products of the targets are explained too, since places are not linear in voltages.
     """
     products = [targets[:, i] * targets[:, j] for i in range(targets.shape[1]) for j in range(i + 1)]
-    left = np.column_stack([targets, *(one - one.mean() for one in products[:20])])
-    left = left - left.mean(axis=0)
+    unexplained_targets = np.column_stack([targets, *(product - product.mean() for product in products[:20])])
+    unexplained_targets = unexplained_targets - unexplained_targets.mean(axis=0)
     candidates = scaled - scaled.mean(axis=0)
-    first = np.sum(candidates**2, axis=0)
-    chosen: list[int] = []
+    initial_norms = np.sum(candidates**2, axis=0)
+    selected_channels: list[int] = []
     for _ in range(min(num_channels, scaled.shape[1])):
-        size = np.sum(candidates**2, axis=0)
-        gain = np.sum((candidates.T @ left) ** 2, axis=1) / np.where(size > 1e-8 * first, size, np.inf)
-        gain[chosen] = -1
-        best = int(gain.argmax())
-        chosen.append(best)
-        if size[best] > 1e-8 * first[best]:
-            direction = candidates[:, best] / np.sqrt(size[best])
-            left = left - np.outer(direction, direction @ left)
+        norms = np.sum(candidates**2, axis=0)
+        gain = np.sum((candidates.T @ unexplained_targets) ** 2, axis=1) / np.where(
+            norms > 1e-8 * initial_norms, norms, np.inf
+        )
+        gain[selected_channels] = -1
+        best_channel = int(gain.argmax())
+        selected_channels.append(best_channel)
+        if norms[best_channel] > 1e-8 * initial_norms[best_channel]:
+            direction = candidates[:, best_channel] / np.sqrt(norms[best_channel])
+            unexplained_targets = unexplained_targets - np.outer(direction, direction @ unexplained_targets)
             candidates = candidates - np.outer(direction, direction @ candidates)
-    return np.array(chosen)
+    return np.array(selected_channels)

@@ -27,7 +27,7 @@ def one_thread() -> AbstractContextManager:
 
 def apply_in_parts(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, at_once: int) -> np.ndarray:
     """Apply `function` to `at_once` rows at a time, which limits memory, and concatenate the results."""
-    return np.concatenate([function(rows[some]) for some in _slices(len(rows), at_once)])
+    return np.concatenate([function(rows[chunk]) for chunk in _slices(len(rows), at_once)])
 
 
 def apply_over_threads(
@@ -37,13 +37,13 @@ def apply_over_threads(
 
     Many parts are computed in parallel.
     """
-    parts = _slices(len(arrays[0]), at_once)
-    if len(parts) < 4:
-        found = [function(*(one[some] for one in arrays)) for some in parts]
+    chunks = _slices(len(arrays[0]), at_once)
+    if len(chunks) < 4:
+        results = [function(*(array[chunk] for array in arrays)) for chunk in chunks]
     else:
         with one_thread(), ThreadPoolExecutor(number_of_cores()) as pool:
-            found = list(pool.map(lambda some: function(*(one[some] for one in arrays)), parts))
-    return {key: np.concatenate([one[key] for one in found]) for key in found[0]}
+            results = list(pool.map(lambda chunk: function(*(array[chunk] for array in arrays)), chunks))
+    return {key: np.concatenate([result[key] for result in results]) for key in results[0]}
 
 
 def apply_over_folds(function: Callable[[int], Any], num_folds: int) -> list[Any]:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jeit.touch.learnt.imaged import ContactFeatures, ImageFeatures, ImageReconstruction
 
 # Minimum number of frames with the same targets as another frame, from which the noise of frames is estimated.
-_FEWEST = 20
+_MIN_REPEATED_FRAMES = 20
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,13 @@ class WhitenedChanges:
         group, count = _group_equal_rows(answers)
         means = np.zeros((len(count), changes.shape[1]))
         np.add.at(means, group, changes / count[group, None])
-        left = ((changes - means[group]) / scale)[count[group] > 1]
-        if not left.any():
+        residuals = ((changes - means[group]) / scale)[count[group] > 1]
+        if not residuals.any():
             return cls(np.diag(1 / scale))
-        freedom = len(left) - np.sum(count > 1)
-        values, vectors = np.linalg.eigh(len(left) / freedom * ledoit_wolf(left, assume_centered=True)[0])
+        degrees_of_freedom = len(residuals) - np.sum(count > 1)
+        values, vectors = np.linalg.eigh(
+            len(residuals) / degrees_of_freedom * ledoit_wolf(residuals, assume_centered=True)[0]
+        )
         values = np.maximum(values, 1e-12 * values.max())
         return cls((vectors / np.sqrt(values)) @ vectors.T / scale[:, None])
 
@@ -45,13 +47,13 @@ class WhitenedChanges:
         return changes @ self.root
 
     def deviation(self, values: Float[np.ndarray, "N m"]) -> Float[np.ndarray, " m"]:
-        """Unit of each feature, the same for all: the root mean square of their standard deviations."""
+        """Return the unit of the features, the same for all: the root mean square of their standard deviations."""
         return np.full(values.shape[1], np.sqrt(np.mean(values.var(axis=0))))
 
 
 def are_repeated(answers: Float[np.ndarray, "N d"]) -> bool:
     """Whether enough frames have the same answers as another frame to estimate their noise."""
-    return int(np.sum(_group_equal_rows(answers)[1] - 1)) >= _FEWEST
+    return int(np.sum(_group_equal_rows(answers)[1] - 1)) >= _MIN_REPEATED_FRAMES
 
 
 def _group_equal_rows(targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,34 +64,35 @@ def _group_equal_rows(targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 # Maximum number of principal components; number of presses required for each.
-_MOST, _PRESSES_EACH = 60, 3
+_MAX_COMPONENTS, _PRESSES_PER_COMPONENT = 60, 3
 
 
-def _differences(changes, reference, unit):
-    """Features (n, m): changes divided by the `unit` of each channel."""
+def _divide_by_unit(changes, reference, unit):
+    """Compute features (n, m): changes divided by the `unit` of each channel."""
     return changes / unit
 
 
-def _ratios(changes, reference, unit):
-    """Features (n, m): changes relative to the reference."""
+def _divide_by_reference(changes, reference, unit):
+    """Compute features (n, m): changes relative to the reference."""
     size = np.maximum(np.abs(reference), 1e-3 * np.sqrt(np.mean(reference**2, axis=1, keepdims=True)))
     return changes / np.where(size > 0, size, 1.0)
 
 
-def _compressed(changes, reference, unit):
-    """Features (n, m): changes, divided by `unit`, on a scale that compresses large ones."""
+def _compress_changes(changes, reference, unit):
+    """Compute features (n, m): changes, divided by `unit`, on a scale that compresses large ones."""
     return np.sign(changes) * np.log1p(np.abs(changes) / unit)
 
 
-def _normalised(changes, reference, unit):
-    """Features (n, m + 1): changes divided by `unit` and by the frame's root mean square, and its logarithm."""
+def _normalise_scaled_changes(changes, reference, unit):
+    """Compute features (n, m + 1): changes divided by `unit` and by the frame's root mean square, and its logarithm."""
     size = np.sqrt(np.mean((changes / unit) ** 2, axis=1, keepdims=True))
     size = np.where(size > 0, size, 1.0)
     return np.hstack([changes / unit / size, np.log(size)])
 
 
-def _shapes(changes, reference, unit):
-    """Features (n, m + 1): changes divided by the frame's root mean square, and its logarithm; no `unit` is used."""
+def _normalise_changes(changes, reference, unit):
+    """Compute features (n, m + 1): changes divided by the frame's root mean square, and its logarithm, without
+    `unit`."""
     size = np.sqrt(np.mean(changes**2, axis=1, keepdims=True))
     size = np.where(size > 0, size, 1.0)
     return np.hstack([changes / size, np.log(size)])
@@ -97,11 +100,11 @@ def _shapes(changes, reference, unit):
 
 # Forms of features: functions of changes (n, m), the reference (n, m), and a unit (m,) for each channel.
 FORMS = {
-    "differences": _differences,
-    "ratios": _ratios,
-    "compressed": _compressed,
-    "normalised": _normalised,
-    "shapes": _shapes,
+    "differences": _divide_by_unit,
+    "ratios": _divide_by_reference,
+    "compressed": _compress_changes,
+    "normalised": _normalise_scaled_changes,
+    "shapes": _normalise_changes,
 }
 # Functions that fit a learnt form of features to changes (N, m) and targets (N, d).
 Maker = Callable[[np.ndarray, np.ndarray], WhitenedChanges | ContactFeatures | ImageFeatures]
@@ -141,18 +144,18 @@ class Features:
             unit, values, mean, deviation = standardisation(form, changes, reference)
         else:
             unit, values = np.ones(changes.shape[1]), made(changes)
-            mean, deviation = values.mean(axis=0), _infinite_where_zero(made.deviation(values))
+            mean, deviation = values.mean(axis=0), _replace_zeros_by_infinity(made.deviation(values))
         if not rotated or isinstance(made, ContactFeatures):
             return cls(form, unit, mean, deviation, None, made)
         rows = np.linalg.svd((values - mean) / deviation, full_matrices=False)[2]
-        components = rows[: max(2, min(_MOST, len(values) // _PRESSES_EACH))].T
+        components = rows[: max(2, min(_MAX_COMPONENTS, len(values) // _PRESSES_PER_COMPONENT))].T
         return cls(form, unit, mean, deviation, components, made)
 
     def __call__(self, changes: np.ndarray, reference: np.ndarray) -> Float[np.ndarray, "n k"]:
         """Compute the features (n, k) of changes (n, m)."""
         values = FORMS[self.form](changes, reference, self.unit) if self.made is None else self.made(changes)
-        standard = (values - self.mean) / self.deviation
-        return standard if self.components is None else standard @ self.components
+        standardised_values = (values - self.mean) / self.deviation
+        return standardised_values if self.components is None else standardised_values @ self.components
 
 
 def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -165,12 +168,13 @@ def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tu
     unit = np.median(size, axis=0)
     unit = np.where(unit > 0, unit, np.mean(size, axis=0))
     values = FORMS[form](changes, reference, np.where(unit > 0, unit, 1.0))
-    return np.where(unit > 0, unit, 1.0), values, values.mean(axis=0), _infinite_where_zero(values.std(axis=0))
+    return np.where(unit > 0, unit, 1.0), values, values.mean(axis=0), _replace_zeros_by_infinity(values.std(axis=0))
 
 
-def _infinite_where_zero(deviation: np.ndarray) -> np.ndarray:
-    known = deviation > 1e-9 * max(deviation.max(), 1e-300)
-    return np.where(known, deviation, np.inf)
+def _replace_zeros_by_infinity(deviation: np.ndarray) -> np.ndarray:
+    """Replace standard deviations that are negligible compared with the largest one by infinity."""
+    is_nonzero = deviation > 1e-9 * max(deviation.max(), 1e-300)
+    return np.where(is_nonzero, deviation, np.inf)
 
 
 @dataclass(frozen=True)
@@ -187,13 +191,13 @@ class Forms:
     def available(
         cls, answers: Float[np.ndarray, "N d"], imaged: ImageReconstruction | None, *, has_reference: bool
     ) -> "Forms":
-        """Select the forms that can be computed from the data."""
+        """Return the forms that can be computed from the data."""
         makers: dict[str, Maker] = {"whitened": WhitenedChanges.learn} if are_repeated(answers) else {}
         if imaged is not None:
             makers |= {"contacts": lambda changes, answers: ContactFeatures(imaged)}
             makers |= {"images": lambda changes, answers: ImageFeatures(imaged)}
-        plain = [form for form in FORMS if has_reference or form != "ratios"]
-        return cls((*plain, *makers), makers)
+        unlearnt_forms = [form for form in FORMS if has_reference or form != "ratios"]
+        return cls((*unlearnt_forms, *makers), makers)
 
     def learn(self, form: str, changes, reference, answers, *, rotated: bool = True) -> Features:
         """Fit features of one form, as `Features.learn` does."""

@@ -32,9 +32,9 @@ from jeit.touch.learnt.network import Network
 from jeit.touch.learnt.numbers import DeviationModel, LearntNumbers
 from jeit.touch.learnt.temporal_network import TemporalNetwork
 
-_SCHEMA = "schema.json"
-# Matches the number of an object in the schema, and where it is part of the name of a file.
-_NUMBER = re.compile(r'("__id__": |"file": ")(\d+)')
+_SCHEMA_FILE = "schema.json"
+# Matches the number of an object in the schema, also where the number is part of a file name.
+_OBJECT_NUMBER = re.compile(r'("__id__": |"file": ")(\d+)')
 
 
 def write_sealed(content: Any, file: BinaryIO) -> None:
@@ -43,18 +43,18 @@ def write_sealed(content: Any, file: BinaryIO) -> None:
 
     with zipfile.ZipFile(io.BytesIO(dumps(content))) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
-    numbers: dict[str, str] = {}
+    new_numbers: dict[str, str] = {}
 
-    def renumber(found: re.Match[str]) -> str:
-        return found[1] + numbers.setdefault(found[2], str(len(numbers)))
+    def renumber(match: re.Match[str]) -> str:
+        return match[1] + new_numbers.setdefault(match[2], str(len(new_numbers)))
 
-    schema = _NUMBER.sub(renumber, members.pop(_SCHEMA).decode())
-    named = {f"{numbers[Path(name).stem]}.npy": values for name, values in members.items()}
-    named = {_SCHEMA: schema.encode(), **dict(sorted(named.items()))}
+    schema = _OBJECT_NUMBER.sub(renumber, members.pop(_SCHEMA_FILE).decode())
+    renamed_members = {f"{new_numbers[Path(name).stem]}.npy": values for name, values in members.items()}
+    renamed_members = {_SCHEMA_FILE: schema.encode(), **dict(sorted(renamed_members.items()))}
     with zipfile.ZipFile(file, "w") as archive:
-        for name, values in named.items():
+        for name, values in renamed_members.items():
             archive.writestr(zipfile.ZipInfo(name), values)
-        archive.comment = _seal(named)
+        archive.comment = _seal(renamed_members)
 
 
 def check_seal(path: Path) -> None:
@@ -66,14 +66,14 @@ def check_seal(path: Path) -> None:
 
 
 def _seal(members: dict[str, bytes]) -> bytes:
-    """Checksum of the names and contents of an archive's members."""
+    """Compute a checksum of the names and contents of an archive's members."""
     digest = hashlib.sha256()
     for name in sorted(members):
         digest.update(f"{name} {len(members[name])}\n".encode() + members[name])
     return b"jeit " + digest.hexdigest().encode()
 
 
-_KIND, _VERSION = "a jeit learnt skin", 2
+_FILE_KIND, _FILE_VERSION = "a jeit learnt skin", 2
 # Names of fields in files of version 0.2, and their present names.
 _OLD_FIELDS = {"unforetold": "unpredicted"}
 # Classes of stored objects, by the names that files have for them.
@@ -121,8 +121,8 @@ def write_skin(skin: LearntSkin, path: str | Path) -> None:
     learnt = read_skin("skin.skops")
     ```
     """
-    fields_by_name = {one.name: getattr(skin, one.name) for one in fields(skin) if one.name != "standing"}
-    write_plain(path, _KIND, _VERSION, fields_by_name, "skin.skops")
+    fields_by_name = {item.name: getattr(skin, item.name) for item in fields(skin) if item.name != "standing"}
+    write_plain(path, _FILE_KIND, _FILE_VERSION, fields_by_name, "skin.skops")
 
 
 def read_skin(path: str | Path) -> LearntSkin:
@@ -148,7 +148,7 @@ def read_skin(path: str | Path) -> LearntSkin:
         path = path / "skin.skops"
     if not path.is_file():
         raise FileNotFoundError(f"'{path}': there is no such file; `jeit touch fit` makes one.")
-    return read_plain(path, _KIND, _VERSION, "learnt skin", lambda own: LearntSkin(**own))
+    return read_plain(path, _FILE_KIND, _FILE_VERSION, "learnt skin", lambda skin_fields: LearntSkin(**skin_fields))
 
 
 def write_plain(path: str | Path, kind: str, version: int, fields_by_name: dict[str, Any], example: str) -> None:
@@ -177,9 +177,9 @@ def read_plain(path: Path, kind: str, version: int, description: str, make: Call
 
     try:
         check_archive(path)
-        strange = sorted(get_untrusted_types(file=path))
-        if strange:
-            raise ValueError(f"it holds {listed(strange, max_names=3)}, which no {description} does")
+        untrusted_types = sorted(get_untrusted_types(file=path))
+        if untrusted_types:
+            raise ValueError(f"it holds {listed(untrusted_types, max_names=3)}, which no {description} does")
         content = load(path, trusted=[])
         if not isinstance(content, dict) or content.get("kind") != kind:
             raise ValueError("it is of another kind")
@@ -197,18 +197,18 @@ def _to_plain(value):
     if type(value) in _STORED_NAMES:
         return {
             "jeit": _STORED_NAMES[type(value)],
-            **{one.name: _to_plain(getattr(value, one.name)) for one in fields(value)},
+            **{item.name: _to_plain(getattr(value, item.name)) for item in fields(value)},
         }
     if isinstance(value, dict):
-        return {key: _to_plain(one) for key, one in value.items()}
+        return {key: _to_plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_to_plain(one) for one in value]
+        return [_to_plain(item) for item in value]
     return value
 
 
 def _from_plain(value):
     """Convert the dictionaries that `_to_plain` made back to objects of jeit's classes."""
     if isinstance(value, dict):
-        held = {_OLD_FIELDS.get(key, key): _from_plain(one) for key, one in value.items() if key != "jeit"}
-        return _STORED_CLASSES[value["jeit"]](**held) if "jeit" in value else held
-    return [_from_plain(one) for one in value] if isinstance(value, list) else value
+        restored_values = {_OLD_FIELDS.get(key, key): _from_plain(item) for key, item in value.items() if key != "jeit"}
+        return _STORED_CLASSES[value["jeit"]](**restored_values) if "jeit" in value else restored_values
+    return [_from_plain(item) for item in value] if isinstance(value, list) else value

@@ -17,10 +17,10 @@ from jeit_solvers.engines import as_array
 
 # A contact is the region above this fraction of its peak, among the cells nearest to the peak; the number of these
 # cells, as a fraction of all.
-_LEVEL, _ROUND = 0.7, 0.2
+_CONTACT_LEVEL, _NEIGHBOUR_FRACTION = 0.7, 0.2
 # Weight of each feature of the contact, where each cell of the image has weight 1.
-_WEIGHT = 3.0
-_AT_ONCE = 128
+_CONTACT_WEIGHT = 3.0
+_CHUNK_SIZE = 128
 
 
 @dataclass(frozen=True)
@@ -47,14 +47,16 @@ class ImageReconstruction:
         """
         notes, conductivity, mask = [], 1.0, as_array(used)
         if reference is not None and np.abs(reference[used]).max() > 0:
-            turned = np.sign(np.where(used, model.voltages(1.0), 0.0) @ reference)  # -1 where the polarity is reversed
-            found = calibrate(model, as_array(turned * reference), mask=mask, contact="fixed")
-            if np.isfinite(found.misfit):
-                model, conductivity = found.model, found.conductivity
-                notes += [found.note] if found.note else []
+            polarity = np.sign(
+                np.where(used, model.voltages(1.0), 0.0) @ reference
+            )  # -1 where the polarity is reversed
+            calibration = calibrate(model, as_array(polarity * reference), mask=mask, contact="fixed")
+            if np.isfinite(calibration.misfit):
+                model, conductivity = calibration.model, calibration.conductivity
+                notes += [calibration.note] if calibration.note else []
         matrix = np.asarray(one_step(model, conductivity, mask=mask).matrix).T[used]
         centres, sizes = np.asarray(centroids(model.mesh)), np.asarray(measures(model.mesh))
-        around = KDTree(centres).query(centres, max(1, int(_ROUND * len(centres))))[1]
+        around = KDTree(centres).query(centres, max(1, int(_NEIGHBOUR_FRACTION * len(centres))))[1]
         image = changes @ matrix
         sign = np.sign(np.median(image.max(axis=1) + image.min(axis=1))) or 1.0
         return cls(sign * matrix, centres, sizes, np.reshape(around, (len(centres), -1))), notes
@@ -62,15 +64,18 @@ class ImageReconstruction:
     def contacts(self, images: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n d+3"]:
         """Describe the strongest contact of each image: its centroid (d,), and the logarithms of its peak, integral and
         size."""
-        row = np.arange(len(images))[:, None]
+        row_indices = np.arange(len(images))[:, None]
         cells = self.around[images.argmax(axis=1)]
-        near, sizes = images[row, cells], self.sizes[cells]
+        neighbour_values, sizes = images[row_indices, cells], self.sizes[cells]
         peak = np.maximum(images.max(axis=1), 1e-300)[:, None]
-        above = sizes * np.maximum(near - _LEVEL * peak, 0.0)
-        weight = np.maximum(above.sum(axis=1, keepdims=True), 1e-300)
-        place = np.einsum("nk,nkd->nd", above / weight, self.centres[cells])
-        integral, area = (sizes * np.maximum(near, 0.0)).sum(axis=1), (sizes * (above > 0)).sum(axis=1)
-        return np.column_stack([place, np.log(np.maximum(np.column_stack([peak, integral, area]), 1e-300))])
+        weights_above_level = sizes * np.maximum(neighbour_values - _CONTACT_LEVEL * peak, 0.0)
+        total_weight = np.maximum(weights_above_level.sum(axis=1, keepdims=True), 1e-300)
+        centroid = np.einsum("nk,nkd->nd", weights_above_level / total_weight, self.centres[cells])
+        integral, area = (
+            (sizes * np.maximum(neighbour_values, 0.0)).sum(axis=1),
+            (sizes * (weights_above_level > 0)).sum(axis=1),
+        )
+        return np.column_stack([centroid, np.log(np.maximum(np.column_stack([peak, integral, area]), 1e-300))])
 
 
 @dataclass(frozen=True)
@@ -81,10 +86,10 @@ class ContactFeatures:
 
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n p"]:
         """Compute the features (n, p) of changes (n, m)."""
-        return apply_in_parts(lambda some: self.imaged.contacts(some @ self.imaged.matrix), changes, _AT_ONCE)
+        return apply_in_parts(lambda rows: self.imaged.contacts(rows @ self.imaged.matrix), changes, _CHUNK_SIZE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
-        """Unit of each feature: its standard deviation."""
+        """Return the unit of each feature, its standard deviation."""
         return values.std(axis=0)
 
 
@@ -105,22 +110,29 @@ class ImageFeatures:
             size = np.maximum(np.sqrt(np.mean(image**2, axis=1, keepdims=True)), 1e-300)
             return np.hstack([self.imaged.contacts(image), np.log(size), image / size])
 
-        return apply_in_parts(features, changes, _AT_ONCE)
+        return apply_in_parts(features, changes, _CHUNK_SIZE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
-        """Unit of each feature.
+        """Return the unit of each feature.
 
         For the contact and the logarithm, it is a fraction of the feature's standard deviation; for all cells of the
         image, it is the root mean square of their standard deviations.
         """
-        number = values.shape[1] - len(self.imaged.sizes)
-        own = values.std(axis=0)
-        return np.concatenate([own[:number] / _WEIGHT, np.full(len(own) - number, np.sqrt(np.mean(own[number:] ** 2)))])
+        num_other_features = values.shape[1] - len(self.imaged.sizes)
+        deviations = values.std(axis=0)
+        return np.concatenate(
+            [
+                deviations[:num_other_features] / _CONTACT_WEIGHT,
+                np.full(len(deviations) - num_other_features, np.sqrt(np.mean(deviations[num_other_features:] ** 2))),
+            ]
+        )
 
 
 def check_imaged(model: ForwardModel, num_channels: int) -> None:
     """Check the model of a skin. Raises `ValueError` if it is no model, or has another number of channels."""
     check_kind("model", model, ForwardModel, "a ForwardModel(mesh, electrodes, protocol)")
-    number = model.protocol.num_measurements
-    if number != num_channels:
-        raise ValueError(f"model: its protocol has {number} channels, and frames have {num_channels}; give the skin's.")
+    num_model_channels = model.protocol.num_measurements
+    if num_model_channels != num_channels:
+        raise ValueError(
+            f"model: its protocol has {num_model_channels} channels, and frames have {num_channels}; give the skin's."
+        )

@@ -16,7 +16,7 @@ from jeit.touch.learnt.imaged import ImageReconstruction
 from jeit.touch.learnt.methods import CLASSIFIERS, covariance_shrinkage, fit_sharpness, log_odds, probabilities
 
 METHODS = ("auto", *CLASSIFIERS)
-_QUICK = "linear-discriminant"
+_QUICK_METHOD = "linear-discriminant"
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def learn_labels(
     *,
     method: str = "auto",
     imaged: ImageReconstruction | None = None,
-    progress: Callable[[str], None] = lambda said: None,
+    progress: Callable[[str], None] = lambda message: None,
 ) -> tuple[LearntLabels, list[LabelMethodResult]]:
     """Learn labels (N,) from changes (N, m), their reference, and images of the changes if `imaged` is given.
 
@@ -71,30 +71,30 @@ def learn_labels(
     """
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference
-    classes, right = np.unique(label, return_inverse=True)
-    forms = Forms.available(right[:, None], imaged, has_reference=has_reference)
-    tried = []
+    classes, true_classes = np.unique(label, return_inverse=True)
+    forms = Forms.available(true_classes[:, None], imaged, has_reference=has_reference)
+    results = []
     for form in forms.names:
-        progress(f"{_QUICK} on {form}")
-        tried.append(_hold_out(_QUICK, form, forms, changes, reference, right, folds))
-    form = min(tried, key=_error_rate).form
-    for name in [one for one in CLASSIFIERS if one != _QUICK and method in ("auto", one)]:
+        progress(f"{_QUICK_METHOD} on {form}")
+        results.append(_hold_out(_QUICK_METHOD, form, forms, changes, reference, true_classes, folds))
+    form = min(results, key=_error_rate).form
+    for name in [name for name in CLASSIFIERS if name != _QUICK_METHOD and method in ("auto", name)]:
         progress(f"{name} on {form}")
-        tried.append(_hold_out(name, form, forms, changes, reference, right, folds))
-    tried.sort(key=_error_rate)
-    tried = [one for one in tried if method in ("auto", one.method)]
-    best = tried[0]
-    features = forms.learn(best.form, changes, reference, right[:, None])
-    scores = features(changes, reference)
+        results.append(_hold_out(name, form, forms, changes, reference, true_classes, folds))
+    results.sort(key=_error_rate)
+    results = [result for result in results if method in ("auto", result.method)]
+    best_result = results[0]
+    features = forms.learn(best_result.form, changes, reference, true_classes[:, None])
+    feature_values = features(changes, reference)
     notes = []
-    if best.method == "quadratic-discriminant" and covariance_shrinkage(scores, right):
-        fewest = np.bincount(right).min()
+    if best_result.method == "quadratic-discriminant" and covariance_shrinkage(feature_values, true_classes):
+        min_presses = np.bincount(true_classes).min()
         notes.append(
-            f"quadratic discriminant: a class has only {fewest} presses for {scores.shape[1]} features; covariances "
-            f"are shrunk by {covariance_shrinkage(scores, right):g}."
+            f"quadratic discriminant: a class has only {min_presses} presses for {feature_values.shape[1]} features; "
+            f"covariances are shrunk by {covariance_shrinkage(feature_values, true_classes):g}."
         )
-    model = CLASSIFIERS[best.method](scores, right)
-    return LearntLabels(features, model, classes, fit_sharpness(best.odds, right), notes), tried
+    model = CLASSIFIERS[best_result.method](feature_values, true_classes)
+    return LearntLabels(features, model, classes, fit_sharpness(best_result.odds, true_classes), notes), results
 
 
 def _error_rate(result: LabelMethodResult) -> float:
@@ -102,26 +102,31 @@ def _error_rate(result: LabelMethodResult) -> float:
 
 
 def _hold_out(method, form, forms: Forms, changes, reference, true_classes, folds) -> LabelMethodResult:
-    number = true_classes.max() + 1
-    odds = np.full((len(true_classes), number), -1e3)
+    """Predict the classes of all presses by cross-validation of a method on one form of the features."""
+    num_classes = true_classes.max() + 1
+    odds = np.full((len(true_classes), num_classes), -1e3)
 
     def predict(fold: int) -> None:
-        out = folds == fold
-        features = forms.learn(form, changes[~out], reference[~out], true_classes[~out, None])
-        model = CLASSIFIERS[method](features(changes[~out], reference[~out]), true_classes[~out])
-        odds[np.ix_(out, model.classes_)] = log_odds(model, features(changes[out], reference[out]))
+        is_held_out = folds == fold
+        features = forms.learn(form, changes[~is_held_out], reference[~is_held_out], true_classes[~is_held_out, None])
+        model = CLASSIFIERS[method](
+            features(changes[~is_held_out], reference[~is_held_out]), true_classes[~is_held_out]
+        )
+        odds[np.ix_(is_held_out, model.classes_)] = log_odds(
+            model, features(changes[is_held_out], reference[is_held_out])
+        )
 
     apply_over_folds(predict, folds.max() + 1)
     held_out = odds.argmax(axis=1)
     return LabelMethodResult(method, form, held_out, odds, float(np.mean(held_out != true_classes)))
 
 
-_STRENGTHS = (1e-3, 1e-2, 1e-1, 1.0)
-_FORMS = ("differences", "compressed")
-# Number of channels that the discriminant and the trees use, those that best separate a key from the others; number of
+_INVERSE_PENALTIES = (1e-3, 1e-2, 1e-1, 1.0)
+_KEY_FORMS = ("differences", "compressed")
+# Number of channels that the discriminant and the trees use, which are those that best separate a key; number of
 # trees.
-_FEW, _TREES = 200, 150
-_TREE: dict[str, Any] = {"max_features": 0.3, "min_samples_leaf": 2, "random_state": 0}
+_NUM_SELECTED_CHANNELS, _NUM_TREES = 200, 150
+_TREE_OPTIONS: dict[str, Any] = {"max_features": 0.3, "min_samples_leaf": 2, "random_state": 0}
 
 
 @dataclass(frozen=True)
@@ -158,8 +163,11 @@ class LearntKeys:
     def predict(self, changes, reference) -> tuple[Bool[np.ndarray, "n K"], Float[np.ndarray, "n K"]]:
         """Predict which keys are pressed, and the probability of each."""
         odds = [log_odds(model, features(changes, reference)) for features, model, _ in self.members]
-        said = [probabilities(one, sharp)[:, 1] for one, (_, _, sharp) in zip(odds, self.members, strict=True)]
-        probability = np.column_stack(said)
+        key_probabilities = [
+            probabilities(key_odds, sharpness)[:, 1]
+            for key_odds, (_, _, sharpness) in zip(odds, self.members, strict=True)
+        ]
+        probability = np.column_stack(key_probabilities)
         return probability > 0.5, probability
 
 
@@ -181,7 +189,7 @@ def learn_keys(
     touched: Bool[np.ndarray, "N K"],
     folds: np.ndarray,
     *,
-    progress: Callable[[str], None] = lambda said: None,
+    progress: Callable[[str], None] = lambda message: None,
 ) -> tuple[LearntKeys, KeyMethodResults]:
     """Learn to predict which of K keys are pressed from changes (N, m).
 
@@ -189,68 +197,81 @@ def learn_keys(
     of these methods.
     """
     reference = np.zeros_like(changes) if reference is None else reference
-    number, keys = touched.shape
-    odds = {name: np.empty((number, keys)) for name in _candidates()}
+    num_presses, num_keys = touched.shape
+    odds = {name: np.empty((num_presses, num_keys)) for name in _key_methods()}
 
     def predict(fold: int) -> None:
-        out = folds == fold
-        for form in _FORMS:
-            features = StandardisedFeatures.learn(form, changes[~out], reference[~out])
-            learnt, asked = features(changes[~out], reference[~out]), features(changes[out], reference[out])
-            rotation = np.linalg.svd(learnt, full_matrices=False)[2].T  # faster, and equivalent for linear methods
-            linear = learnt @ rotation, asked @ rotation
-            for key in range(keys):
-                answers = touched[~out, key].astype(int)
-                if answers.min() == answers.max():  # all presses of the key, or all without it, are held out
+        is_held_out = folds == fold
+        for form in _KEY_FORMS:
+            features = StandardisedFeatures.learn(form, changes[~is_held_out], reference[~is_held_out])
+            training_features, held_out_features = (
+                features(changes[~is_held_out], reference[~is_held_out]),
+                features(changes[is_held_out], reference[is_held_out]),
+            )
+            rotation = np.linalg.svd(training_features, full_matrices=False)[
+                2
+            ].T  # faster, and equivalent for linear methods
+            rotated_features = training_features @ rotation, held_out_features @ rotation
+            for key in range(num_keys):
+                training_answers = touched[~is_held_out, key].astype(int)
+                if (
+                    training_answers.min() == training_answers.max()
+                ):  # all presses of the key, or all without it, are held out
                     for name in odds:
-                        odds[name][out, key] = 2.0 * answers[0] - 1
+                        odds[name][is_held_out, key] = 2.0 * training_answers[0] - 1
                     continue
-                for name, (needs, strength) in _candidates().items():
+                for name, (kind, strength) in _key_methods().items():
                     if name.partition(" on ")[2] != form:
                         continue
-                    if needs == "linear":
-                        model = _fit_logistic(linear[0], answers, strength)
-                        odds[name][out, key] = model.decision_function(linear[1])
+                    if kind == "linear":
+                        model = _fit_logistic(rotated_features[0], training_answers, strength)
+                        odds[name][is_held_out, key] = model.decision_function(rotated_features[1])
                     else:
-                        few = _select_features(learnt, answers)
-                        model = _METHODS[needs](learnt[:, few], answers)
-                        said = log_odds(model, asked[:, few])
-                        odds[name][out, key] = said[:, 1] - said[:, 0]
+                        selected_features = _select_features(training_features, training_answers)
+                        model = _CHANNEL_METHODS[kind](training_features[:, selected_features], training_answers)
+                        class_odds = log_odds(model, held_out_features[:, selected_features])
+                        odds[name][is_held_out, key] = class_odds[:, 1] - class_odds[:, 0]
         progress(f"keys, fold {fold + 1} of {folds.max() + 1}")
 
     apply_over_folds(predict, folds.max() + 1)
-    members, methods, held_out = [], [], np.empty((number, keys), bool)
-    for key in range(keys):
-        right = touched[:, key]
+    members, methods, held_out = [], [], np.empty((num_presses, num_keys), bool)
+    for key in range(num_keys):
+        is_pressed = touched[:, key]
         # Choose by the error rate and the likelihood, since many methods have the same number of errors.
-        name = min(odds, key=lambda name: _loss(odds[name][:, key], right))
+        name = min(odds, key=lambda name: _loss(odds[name][:, key], is_pressed))
         methods.append(name)
         held_out[:, key] = odds[name][:, key] > 0
-        members.append(_fit_key(name, changes, reference, right.astype(int), odds[name][:, key]))
-        progress(f"key {key + 1} of {keys}")
+        members.append(_fit_key(name, changes, reference, is_pressed.astype(int), odds[name][:, key]))
+        progress(f"key {key + 1} of {num_keys}")
     return LearntKeys(members), KeyMethodResults(methods, held_out, np.mean(held_out != touched, axis=0))
 
 
-def _candidates() -> dict[str, tuple[str, float]]:
-    """Candidate methods by name: the kind of classifier, and the constant C of logistic regression."""
-    found = {}
-    for form in _FORMS:
-        found |= {f"logistic, C = {strength:g} on {form}": ("linear", strength) for strength in _STRENGTHS}
-        found |= {f"discriminant of {_FEW} channels on {form}": ("discriminant", 0.0)}
-        found |= {f"trees of {_FEW} channels on {form}": ("trees", 0.0)}
-    return found
+def _key_methods() -> dict[str, tuple[str, float]]:
+    """Return the candidate methods by name: the kind of classifier, and the constant C of logistic regression."""
+    candidates = {}
+    for form in _KEY_FORMS:
+        candidates |= {f"logistic, C = {strength:g} on {form}": ("linear", strength) for strength in _INVERSE_PENALTIES}
+        candidates |= {f"discriminant of {_NUM_SELECTED_CHANNELS} channels on {form}": ("discriminant", 0.0)}
+        candidates |= {f"trees of {_NUM_SELECTED_CHANNELS} channels on {form}": ("trees", 0.0)}
+    return candidates
 
 
 def _fit_key(name: str, changes, reference, answers, odds) -> tuple[StandardisedFeatures, Any, float]:
-    needs, strength = _candidates()[name]
+    """Fit the method `name` to one key; returns its features, its classifier, and the sharpness of probabilities.
+
+    `answers` (N,): 1 where the key is pressed; `odds` (N,): log-odds of held-out presses, for the sharpness.
+    """
+    kind, strength = _key_methods()[name]
     features = StandardisedFeatures.learn(name.partition(" on ")[2], changes, reference)
     values = features(changes, reference)
-    sharp = fit_sharpness(np.column_stack([np.zeros(len(odds)), odds]), answers)
-    if needs == "linear":
-        return features, _fit_rotated(values, answers, strength), sharp
-    few = _select_features(values, answers)
-    chosen = StandardisedFeatures(features.form, features.unit, features.mean, features.deviation, few)
-    return chosen, _METHODS[needs](values[:, few], answers), sharp
+    sharpness = fit_sharpness(np.column_stack([np.zeros(len(odds)), odds]), answers)
+    if kind == "linear":
+        return features, _fit_rotated(values, answers, strength), sharpness
+    feature_indices = _select_features(values, answers)
+    key_features = StandardisedFeatures(
+        features.form, features.unit, features.mean, features.deviation, feature_indices
+    )
+    return key_features, _CHANNEL_METHODS[kind](values[:, feature_indices], answers), sharpness
 
 
 def _fit_rotated(values, answers, strength):
@@ -278,24 +299,33 @@ def _fit_discriminant(values, answers):
 def _fit_trees(values, answers):
     from sklearn.ensemble import ExtraTreesClassifier
 
-    found = ExtraTreesClassifier(_TREES, **_TREE).fit(values, answers)
-    return Forest.from_classification_trees(found.estimators_, np.full(_TREES, 1 / _TREES), found.classes_, votes=False)
+    ensemble = ExtraTreesClassifier(_NUM_TREES, **_TREE_OPTIONS).fit(values, answers)
+    return Forest.from_classification_trees(
+        ensemble.estimators_, np.full(_NUM_TREES, 1 / _NUM_TREES), ensemble.classes_, votes=False
+    )
 
 
-_METHODS = {"discriminant": _fit_discriminant, "trees": _fit_trees}
+_CHANNEL_METHODS = {"discriminant": _fit_discriminant, "trees": _fit_trees}
 
 
-def _select_features(values: np.ndarray, answers: np.ndarray) -> np.ndarray:
+def _select_features(values: np.ndarray, is_pressed: np.ndarray) -> np.ndarray:
     """Select the features whose means differ most between the two classes, relative to the spread within them."""
-    one, other = values[answers == 1], values[answers == 0]
-    within = np.sqrt((one.var(axis=0) * len(one) + other.var(axis=0) * len(other)) / len(values))
-    return np.sort(np.argsort(-np.abs(one.mean(axis=0) - other.mean(axis=0)) / np.maximum(within, 1e-12))[:_FEW])
+    pressed_values, released_values = values[is_pressed == 1], values[is_pressed == 0]
+    deviation = np.sqrt(
+        (pressed_values.var(axis=0) * len(pressed_values) + released_values.var(axis=0) * len(released_values))
+        / len(values)
+    )
+    return np.sort(
+        np.argsort(-np.abs(pressed_values.mean(axis=0) - released_values.mean(axis=0)) / np.maximum(deviation, 1e-12))[
+            :_NUM_SELECTED_CHANNELS
+        ]
+    )
 
 
 def _loss(odds: np.ndarray, true_classes: np.ndarray) -> float:
     """Compute the error rate plus 0.1 times the mean negative log-likelihood of the true answers, at the best
     sharpness."""
     columns = np.column_stack([np.zeros(len(odds)), odds])
-    sharp = fit_sharpness(columns, true_classes.astype(int))
-    likely = probabilities(columns, sharp)[np.arange(len(true_classes)), true_classes.astype(int)]
-    return float(np.mean((odds > 0) != true_classes) - 0.1 * np.mean(np.log(np.maximum(likely, 1e-9))))
+    sharpness = fit_sharpness(columns, true_classes.astype(int))
+    likelihoods = probabilities(columns, sharpness)[np.arange(len(true_classes)), true_classes.astype(int)]
+    return float(np.mean((odds > 0) != true_classes) - 0.1 * np.mean(np.log(np.maximum(likelihoods, 1e-9))))

@@ -37,16 +37,16 @@ from jeit.touch.learnt.presses import (
 
 # A frame is unlike the training set above this novelty, which is 1 for the farthest frame in it, or below this fraction
 # of channels that are alive.
-_UNLIKE, _FEWEST = 2.0, 0.66
-_AT_ONCE = 256
+_MAX_NOVELTY, _MIN_ALIVE = 2.0, 0.66
+_CHUNK_SIZE = 256
 # Number of principal directions of the error of predicted readings that are propagated to predictions; number of random
 # errors of all readings that are.
-_UNSURE, _DRAWS = 4, 4
+_MAX_ERROR_DIRECTIONS, _NUM_DRAWS = 4, 4
 # Minimum number of touched frames for the detection of stuck channels.
-_MANY = 20
+_MIN_TOUCHED_FRAMES = 20
 # Minimum cosine similarity of a reference to that of the training set; maximum ratio of their norms. Beyond these
 # limits, it is taken for the reference of another skin.
-_ALIKE, _SIZES = 0.8, 5.0
+_MIN_COSINE_SIMILARITY, _MAX_NORM_RATIO = 0.8, 5.0
 
 
 @dataclass(frozen=True)
@@ -109,49 +109,49 @@ class LearntSkin:
         """
         _check_fit(presses, method, model, num_channels, per_session)
         with one_thread():
-            report = progress or (lambda said: None)
+            report = progress or (lambda message: None)
             return cls._fit(presses, method, model, num_channels, per_session, report)
 
     @classmethod
     def _fit(cls, presses: Presses, method, model, num_channels, per_session, progress) -> "LearntSkin":
         notes = list(presses.notes)
-        presses, dropped = _usable_presses(presses)
-        notes += dropped
+        presses, usability_notes = _usable_presses(presses)
+        notes += usability_notes
         changes = changes_from_reference(presses.frames, presses.reference)
         if per_session:
             changes = standardise_sessions(changes, presses.group)
         progress("channels")
         channels = Channels.learn(changes)
         if num_channels is not None:
-            channels, said = _reduce_channels(channels, changes, presses, num_channels)
-            notes.append(said)
+            channels, note = _reduce_channels(channels, changes, presses, num_channels)
+            notes.append(note)
         elif not channels.used.all():
-            silent = np.flatnonzero(~channels.used)
+            silent_channels = np.flatnonzero(~channels.used)
             notes.append(
-                f"{counted(len(silent), 'channel')} of {len(channels.used)} without changes, not used: "
-                f"{_list_briefly(silent)}."
+                f"{counted(len(silent_channels), 'channel')} of {len(channels.used)} without changes, not used: "
+                f"{_list_briefly(silent_channels)}."
             )
-        whole, alive, *_ = channels.complete(changes)
+        changes, alive, *_ = channels.complete(changes)
         if not alive.all():
             notes.append(
                 f"{100 * (1 - alive.mean()):.2g} % of the readings disagree with the prediction from the other "
                 f"channels and were replaced by it."
             )
-        whole, presses, lag, said = _align_frames(whole, presses)
-        quiet = _quiet_threshold(whole / channels.scale, presses)
+        changes, presses, lag, model_notes = _align_frames(changes, presses)
+        quiet = _quiet_threshold(changes / channels.scale, presses)
         mean = None if presses.reference is None else mean_reference(presses.reference)
         imaged = None
         if model is not None:
             progress("images")
-            imaged, remarks = ImageReconstruction.create(model, whole, channels.used, mean)
-            said += remarks
-        ours = None if mean is None else reference_used(presses.reference, mean, channels.used, len(whole))
-        found, standing, remarks = learn_quantities(whole, ours, presses, method, imaged, progress)
-        notes = list(dict.fromkeys([*notes, *said, *remarks]))
+            imaged, image_notes = ImageReconstruction.create(model, changes, channels.used, mean)
+            model_notes += image_notes
+        references = None if mean is None else reference_used(presses.reference, mean, channels.used, len(changes))
+        models, standing, fit_notes = learn_quantities(changes, references, presses, method, imaged, progress)
+        notes = list(dict.fromkeys([*notes, *model_notes, *fit_notes]))
         return cls(
             channels,
             mean,
-            **found,
+            **models,
             quiet=quiet,
             lag=lag,
             per_session=per_session,
@@ -174,14 +174,15 @@ class LearntSkin:
         if self.per_session:
             changes = standardise_sessions(changes, group)
         changes = np.where(self._stuck_channels(frames, changes), np.nan, changes)
-        found = apply_over_threads(
+        predictions = apply_over_threads(
             self._predict,
             changes,
             reference_used(reference, self.mean_reference, self.channels.used, len(changes)),
-            at_once=_AT_ONCE,
+            at_once=_CHUNK_SIZE,
         )
-        said: dict[str, Any] = {one.name: found.get(one.name) for one in fields(Touches) if one.name != "notes"}
-        return Touches(**said, notes=self._prediction_notes(found["alive"], found["unlike"]))
+        names = [field.name for field in fields(Touches) if field.name != "notes"]
+        touch_fields: dict[str, Any] = {name: predictions.get(name) for name in names}
+        return Touches(**touch_fields, notes=self._prediction_notes(predictions["alive"], predictions["unlike"]))
 
     def _stuck_channels(self, frames: np.ndarray, changes: np.ndarray) -> np.ndarray:
         """Detect stuck channels (M,), whose readings are the same in all frames although many frames are touched.
@@ -189,123 +190,136 @@ class LearntSkin:
         Only touched frames count, since a coarse converter may give the same readings of an untouched skin for a long
         time.
         """
-        same = (frames == frames[0]).all(axis=0)
-        if same.all() or not same.any() or len(frames) < _MANY:
-            return np.zeros_like(same)
-        scaled = np.where(same, 0.0, np.nan_to_num(changes))[:, self.channels.used] / self.channels.scale
-        return same & (np.count_nonzero(np.sqrt(np.mean(scaled**2, axis=1)) > self.quiet) >= _MANY)
+        is_constant = (frames == frames[0]).all(axis=0)
+        if is_constant.all() or not is_constant.any() or len(frames) < _MIN_TOUCHED_FRAMES:
+            return np.zeros_like(is_constant)
+        scaled = np.where(is_constant, 0.0, np.nan_to_num(changes))[:, self.channels.used] / self.channels.scale
+        return is_constant & (np.count_nonzero(np.sqrt(np.mean(scaled**2, axis=1)) > self.quiet) >= _MIN_TOUCHED_FRAMES)
 
     def _predict(self, changes: Float[np.ndarray, "n M"], reference: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
         """Predict the fields of `Touches` that were learnt, for frames with these changes."""
-        whole, alive, novelty, excess = self.channels.complete(changes)
-        touching = np.sqrt(np.mean((whole / self.channels.scale) ** 2, axis=1)) > self.quiet
+        completed_changes, alive, novelty, excess = self.channels.complete(changes)
+        is_touched = np.sqrt(np.mean((completed_changes / self.channels.scale) ** 2, axis=1)) > self.quiet
         # Small changes mean that the skin is untouched, but frames with too many missing channels always count as
         # unlike.
-        unlike = (novelty > _UNLIKE) & touching | (alive.mean(axis=1) < _FEWEST)
-        found = {"novelty": novelty, "unlike": unlike, "alive": np.zeros(changes.shape, bool)}
-        found["alive"][:, self.channels.used] = alive
+        is_unlike = (novelty > _MAX_NOVELTY) & is_touched | (alive.mean(axis=1) < _MIN_ALIVE)
+        predictions = {"novelty": novelty, "unlike": is_unlike, "alive": np.zeros(changes.shape, bool)}
+        predictions["alive"][:, self.channels.used] = alive
         if self.label is not None:
-            label, probability = self.label.predict(whole, reference)
-            found["label"] = np.where(unlike, "", np.where(touching, label, NO_TOUCH))
-            found["probability"] = np.where(unlike | (~touching & (label != NO_TOUCH)), np.nan, probability)
-            touching &= label != NO_TOUCH
-        shown = (touching & ~unlike)[:, None]
+            label, probability = self.label.predict(completed_changes, reference)
+            predictions["label"] = np.where(is_unlike, "", np.where(is_touched, label, NO_TOUCH))
+            predictions["probability"] = np.where(is_unlike | (~is_touched & (label != NO_TOUCH)), np.nan, probability)
+            is_touched &= label != NO_TOUCH
+        has_prediction = (is_touched & ~is_unlike)[:, None]
         if self.place is not None:
-            said, std = self._predict_targets(self.place, whole, reference, alive, excess)
-            found |= {"position": np.where(shown, said, np.nan), "position_std": np.where(shown, std, np.nan)}
+            values, std = self._predict_targets(self.place, completed_changes, reference, alive, excess)
+            predictions |= {
+                "position": np.where(has_prediction, values, np.nan),
+                "position_std": np.where(has_prediction, std, np.nan),
+            }
         if self.force is not None:
-            said, std = self._predict_targets(self.force, whole, reference, alive, excess)
-            still = ~touching & ~unlike
-            pressed = np.where(shown, np.maximum(said, 0.0), np.nan)[:, 0]
-            found |= {"force": np.where(still, 0.0, pressed), "force_std": np.where(shown, std, np.nan)[:, 0]}
+            values, std = self._predict_targets(self.force, completed_changes, reference, alive, excess)
+            is_untouched = ~is_touched & ~is_unlike
+            forces = np.where(has_prediction, np.maximum(values, 0.0), np.nan)[:, 0]
+            predictions |= {
+                "force": np.where(is_untouched, 0.0, forces),
+                "force_std": np.where(has_prediction, std, np.nan)[:, 0],
+            }
         if self.keys is not None:
-            touched, probability = self.keys.predict(whole, reference)
-            found["touched"] = touched & shown
-            found["key_probability"] = np.where(unlike[:, None], np.nan, np.where(touching[:, None], probability, 0.0))
-        return found
+            pressed_keys, probability = self.keys.predict(completed_changes, reference)
+            predictions["touched"] = pressed_keys & has_prediction
+            probability = np.where(is_touched[:, None], probability, 0.0)
+            predictions["key_probability"] = np.where(is_unlike[:, None], np.nan, probability)
+        return predictions
 
     def _predict_targets(
-        self, learnt: LearntNumbers, changes, reference, alive, excess
+        self, model: LearntNumbers, changes, reference, alive, excess
     ) -> tuple[np.ndarray, np.ndarray]:
         """Predict targets (n, d) and their standard deviations.
 
         The standard deviations include the uncertainty of the readings predicted for dead channels, and errors of all
         readings, where these deviate more from the patterns of the training set than its presses do.
         """
-        noisy = np.flatnonzero(excess.any(axis=1))
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], (_DRAWS, 1, changes.shape[1]))
-        moved = (changes[noisy] + signs * excess[noisy]).reshape(-1, changes.shape[1])
-        # One call for all: with few frames, calls take longer than predictions.
-        every = np.concatenate([changes, moved]), np.concatenate([reference, np.tile(reference[noisy], (_DRAWS, 1))])
-        said, off = np.split(learnt.predict(*every), [len(changes)])
-        std = learnt.spread(said, changes)
-        off = off.reshape(_DRAWS, len(noisy), said.shape[1]) - said[noisy]
-        std[noisy] = np.hypot(std[noisy], np.sqrt(np.mean(off**2, axis=0)))
-        lacking = np.flatnonzero(~alive.all(axis=1))
-        if not lacking.size:
-            return said, std
-        for moved in self.channels.prediction_errors(alive[lacking], _UNSURE):
-            off = learnt.predict(changes[lacking] + moved, reference[lacking]) - said[lacking]
-            std[lacking] = np.hypot(std[lacking], off)
-        return said, std
+        noisy_rows = np.flatnonzero(excess.any(axis=1))
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (_NUM_DRAWS, 1, changes.shape[1]))
+        perturbed_changes = (changes[noisy_rows] + signs * excess[noisy_rows]).reshape(-1, changes.shape[1])
+        # All inputs are predicted in one call, since for few frames the overhead of a call exceeds its computation.
+        repeated_references = np.tile(reference[noisy_rows], (_NUM_DRAWS, 1))
+        inputs = np.concatenate([changes, perturbed_changes]), np.concatenate([reference, repeated_references])
+        predictions, errors = np.split(model.predict(*inputs), [len(changes)])
+        std = model.spread(predictions, changes)
+        errors = errors.reshape(_NUM_DRAWS, len(noisy_rows), predictions.shape[1]) - predictions[noisy_rows]
+        std[noisy_rows] = np.hypot(std[noisy_rows], np.sqrt(np.mean(errors**2, axis=0)))
+        partial_rows = np.flatnonzero(~alive.all(axis=1))
+        if not partial_rows.size:
+            return predictions, std
+        for reading_errors in self.channels.prediction_errors(alive[partial_rows], _MAX_ERROR_DIRECTIONS):
+            errors = (
+                model.predict(changes[partial_rows] + reading_errors, reference[partial_rows])
+                - predictions[partial_rows]
+            )
+            std[partial_rows] = np.hypot(std[partial_rows], errors)
+        return predictions, std
 
     def _check_frames(self, frames) -> np.ndarray:
         frames = np.asarray(frames)
         frames = check_frames("frames", frames[None] if frames.ndim == 1 else frames)
-        number = len(self.channels.used)
+        num_channels = len(self.channels.used)
         if not len(frames):
             raise ValueError("frames: the array is empty; give at least one frame.")
-        if frames.shape[1] != number:
-            raise ValueError(f"frames have {frames.shape[1]} channels, and the skin that was learnt has {number}.")
+        if frames.shape[1] != num_channels:
+            raise ValueError(
+                f"frames have {frames.shape[1]} channels, and the skin that was learnt has {num_channels}."
+            )
         return frames
 
-    def _check_reference(self, frames, given) -> np.ndarray | None:
+    def _check_reference(self, frames, values) -> np.ndarray | None:
         if self.mean_reference is None:
-            if given is not None:
+            if values is not None:
                 raise ValueError("reference: the skin was learnt from changes, without a reference; leave it out.")
             return None
-        if given is None:
+        if values is None:
             raise ValueError(
                 "reference is missing: the training presses had one; give a frame (channels,), or one for each frame."
             )
-        reference = check_reference(given, frames)
-        there = np.isfinite(reference).any(axis=0) & self.channels.used
-        own, learnt = mean_reference(reference)[there], self.mean_reference[there]
-        if not there.any():
+        reference = check_reference(values, frames)
+        is_read = np.isfinite(reference).any(axis=0) & self.channels.used
+        a, b = mean_reference(reference)[is_read], self.mean_reference[is_read]  # of frames, of the training set
+        if not is_read.any():
             raise ValueError(
                 "reference has no finite reading in any channel that is used; give a frame of the untouched skin."
             )
-        if not learnt.any():  # the frames of the training set were changes already
+        if not b.any():  # the frames of the training set were changes already
             return reference
-        alike = float(own @ learnt / np.sqrt((own @ own) * (learnt @ learnt))) if own.any() else 0.0
-        size = np.sqrt((own @ own) / (learnt @ learnt))
-        if alike < _ALIKE or not 1 / _SIZES < size < _SIZES:
+        cosine = float(a @ b / np.sqrt((a @ a) * (b @ b))) if a.any() else 0.0
+        norm_ratio = np.sqrt((a @ a) / (b @ b))
+        if cosine < _MIN_COSINE_SIMILARITY or not 1 / _MAX_NORM_RATIO < norm_ratio < _MAX_NORM_RATIO:
             raise ValueError(
-                f"reference is unlike that of the training set (cosine {alike:.2f}, {size:.3g} times as large): "
-                f"is it of "
-                "this skin, with its channels in the same order and units?"
+                f"reference is unlike that of the training set (cosine {cosine:.2f}, {norm_ratio:.3g} "
+                "times as large): is it of this skin, with its channels in the same order and units?"
             )
         return reference
 
-    def _prediction_notes(self, alive: np.ndarray, unlike: np.ndarray) -> tuple[str, ...]:
+    def _prediction_notes(self, alive: np.ndarray, is_unlike: np.ndarray) -> tuple[str, ...]:
         notes = []
-        numbers = np.flatnonzero(self.channels.used)
-        alive = alive[:, numbers]
-        lost = np.mean(~alive, axis=0)
-        dead = numbers[lost > 0.5]
-        if dead.size:
+        used_channels = np.flatnonzero(self.channels.used)
+        alive = alive[:, used_channels]
+        dead_fractions = np.mean(~alive, axis=0)
+        dead_channels = used_channels[dead_fractions > 0.5]
+        if dead_channels.size:
             notes.append(
-                f"channels that disagree with the prediction from the others and are not used: {_list_briefly(dead)}."
+                "channels that disagree with the prediction from the others and are not used: "
+                f"{_list_briefly(dead_channels)}."
             )
-        elif lost.any():
+        elif dead_fractions.any():
             notes.append(
                 f"{100 * np.mean(~alive):.2g} % of the readings disagree with the prediction from the other "
                 f"channels and were replaced by it."
             )
-        if unlike.any():
+        if is_unlike.any():
             notes.append(
-                f"{int(unlike.sum())} of {len(unlike)} frames are unlike all frames of the training set: they have no "
-                "prediction."
+                f"{int(is_unlike.sum())} of {len(is_unlike)} frames are unlike all frames of the training set: they "
+                "have no prediction."
             )
         return tuple(notes)
 
@@ -314,19 +328,19 @@ def _check_fit(presses: Presses, method: str, model, num_channels: int | None, p
     need_extra("learn", "learning a skin")
     check_kind("presses", presses, Presses, "Presses, as of read_presses(path)")
     check_name("method", method, METHODS)
-    numbers = presses.positions is not None or presses.force is not None
+    has_targets = presses.positions is not None or presses.force is not None
     if method != "auto" and not (
-        (numbers and method in number_methods.METHODS)
+        (has_targets and method in number_methods.METHODS)
         or (presses.label is not None and method in label_methods.METHODS)
     ):
-        learnt = "labels" if method in label_methods.METHODS else "places and forces"
-        raise ValueError(f"method: {method!r} learns {learnt}, and the presses have none; leave method to 'auto'.")
-    whole = isinstance(num_channels, int | np.integer) and not isinstance(num_channels, bool)
-    most = presses.frames.shape[1]
-    if num_channels is not None and not (whole and 2 <= num_channels <= most):
-        raise ValueError(f"num_channels must be from 2 to {most}, those there are; it is {num_channels}.")
+        quantities = "labels" if method in label_methods.METHODS else "places and forces"
+        raise ValueError(f"method: {method!r} learns {quantities}, and the presses have none; leave method to 'auto'.")
+    is_whole_number = isinstance(num_channels, int | np.integer) and not isinstance(num_channels, bool)
+    max_channels = presses.frames.shape[1]
+    if num_channels is not None and not (is_whole_number and 2 <= num_channels <= max_channels):
+        raise ValueError(f"num_channels must be from 2 to {max_channels}, those there are; it is {num_channels}.")
     if model is not None:
-        check_imaged(model, most)
+        check_imaged(model, max_channels)
     if model is not None and per_session:
         raise ValueError("model: images are of changes in volts, and per_session takes their unit away; leave one out.")
     if per_session and presses.group is None:
@@ -339,30 +353,35 @@ def _usable_presses(presses: Presses) -> tuple[Presses, list[str]]:
     Channels without a reading in any press do not count.
     """
     changes = changes_from_reference(presses.frames, presses.reference)
-    there = np.isfinite(changes)
-    ever = there.any(axis=0)
+    is_read = np.isfinite(changes)
+    has_data = is_read.any(axis=0)
     notes = []
-    if not ever.all():
-        silent = np.flatnonzero(~ever)
-        notes.append(f"{counted(len(silent), 'channel')} without any reading: {_list_briefly(silent)}.")
-    fair = there[:, ever].mean(axis=1) >= _FEWEST if ever.any() else np.zeros(len(there), bool)
-    if fair.sum() < 10:
-        raise ValueError(f"frames: only {int(fair.sum())} have readings of two thirds of the channels; 10 are needed.")
-    if not fair.all():
-        notes.append(f"{int((~fair).sum())} presses lack more than a third of their readings, and are not used.")
-    return presses.rows(fair), notes
+    if not has_data.all():
+        channels = np.flatnonzero(~has_data)
+        notes.append(f"{counted(len(channels), 'channel')} without any reading: {_list_briefly(channels)}.")
+    is_usable = is_read[:, has_data].mean(axis=1) >= _MIN_ALIVE if has_data.any() else np.zeros(len(is_read), bool)
+    if is_usable.sum() < 10:
+        raise ValueError(
+            f"frames: only {int(is_usable.sum())} have readings of two thirds of the channels; 10 are needed."
+        )
+    if not is_usable.all():
+        notes.append(f"{int((~is_usable).sum())} presses lack more than a third of their readings, and are not used.")
+    return presses.rows(is_usable), notes
 
 
 def _reduce_channels(
     channels: Channels, changes: np.ndarray, presses: Presses, num_channels: int
 ) -> tuple[Channels, str]:
     scaled = np.where(np.isnan(changes), 0.0, changes)[:, channels.used] / channels.scale
-    chosen = np.flatnonzero(channels.used)[choose_channels(scaled, _standardised_targets(presses), num_channels)]
-    kept = np.full(changes.shape, np.nan)
-    kept[:, chosen] = changes[:, chosen]
+    selected_channels = np.flatnonzero(channels.used)[
+        choose_channels(scaled, _standardised_targets(presses), num_channels)
+    ]
+    selected_changes = np.full(changes.shape, np.nan)
+    selected_changes[:, selected_channels] = changes[:, selected_channels]
+    channel_list = _list_briefly(np.sort(selected_channels), 200)
     return Channels.learn(
-        kept
-    ), f"{len(chosen)} of {changes.shape[1]} channels are used: {_list_briefly(np.sort(chosen), 200)}."
+        selected_changes
+    ), f"{len(selected_channels)} of {changes.shape[1]} channels are used: {channel_list}."
 
 
 def _standardised_targets(presses: Presses) -> np.ndarray:
@@ -386,20 +405,22 @@ def _quiet_threshold(scaled: np.ndarray, presses: Presses) -> float:
 
     With fewer than five untouched frames, it is half of the 1 % quantile of the touched frames.
     """
-    still = np.zeros(len(scaled), bool)
+    is_untouched = np.zeros(len(scaled), bool)
     if presses.positions is not None:
-        still |= np.isnan(presses.positions).any(axis=1)
+        is_untouched |= np.isnan(presses.positions).any(axis=1)
     if presses.label is not None:
-        still |= presses.label == NO_TOUCH
+        is_untouched |= presses.label == NO_TOUCH
     if presses.touched is not None:
-        still |= ~presses.touched.any(axis=1)
+        is_untouched |= ~presses.touched.any(axis=1)
     size = np.sqrt(np.mean(scaled**2, axis=1))
-    if still.sum() < 5:
-        return 0.5 * float(np.quantile(size[~still], 0.01))
+    if is_untouched.sum() < 5:
+        return 0.5 * float(np.quantile(size[~is_untouched], 0.01))
     sizes = np.sort(size)
     # Choose the threshold with the lowest sum of the error rates of untouched and of touched frames.
-    wrong = [np.mean(size[still] > at) + np.mean(size[~still] <= at) for at in sizes]
-    return float(sizes[int(np.argmin(wrong))])
+    error_sums = [
+        np.mean(size[is_untouched] > threshold) + np.mean(size[~is_untouched] <= threshold) for threshold in sizes
+    ]
+    return float(sizes[int(np.argmin(error_sums))])
 
 
 def _align_frames(changes: np.ndarray, presses: Presses) -> tuple[np.ndarray, Presses, int, list[str]]:
@@ -410,19 +431,20 @@ def _align_frames(changes: np.ndarray, presses: Presses) -> tuple[np.ndarray, Pr
     if presses.positions is None:
         return changes, presses, 0, []
     rows, folds, _ = places_and_folds(presses)
-    lag, straight, late = estimate_lag(changes[rows], presses.positions[rows], folds)
+    lag, error_without_lag, error_with_lag = estimate_lag(changes[rows], presses.positions[rows], folds)
     if not lag:
         return changes, presses, 0, []
-    frames, answers = aligned_slices(len(changes), lag)
-    reference = None if presses.reference is None else presses.reference[frames]
-    moved = replace(presses.rows(answers), frames=presses.frames[frames], reference=reference)
-    said = (
+    frame_rows, press_rows = aligned_slices(len(changes), lag)
+    reference = None if presses.reference is None else presses.reference[frame_rows]
+    aligned_presses = replace(presses.rows(press_rows), frames=presses.frames[frame_rows], reference=reference)
+    note = (
         f"frames seem to be of the press {counted(abs(lag), 'row')} {'before' if lag > 0 else 'after'} (places "
-        f"estimated {1e3 * late:.3g} mm off, as recorded {1e3 * straight:.3g} mm): learnt so; check the recording."
+        f"estimated {1e3 * error_with_lag:.3g} mm off, as recorded {1e3 * error_without_lag:.3g} mm): learnt so; "
+        "check the recording."
     )
-    return changes[frames], moved, lag, [said]
+    return changes[frame_rows], aligned_presses, lag, [note]
 
 
 def _list_briefly(numbers: np.ndarray, max_listed: int = 12) -> str:
-    said = ", ".join(str(one) for one in numbers[:max_listed])
-    return said if len(numbers) <= max_listed else f"{said}, … ({len(numbers)} in all)"
+    text = ", ".join(str(number) for number in numbers[:max_listed])
+    return text if len(numbers) <= max_listed else f"{text}, … ({len(numbers)} in all)"

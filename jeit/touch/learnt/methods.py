@@ -26,8 +26,8 @@ from jeit_solvers import number_of_cores
 
 # Number of presses from which length and noise are estimated; maximum number of centres. If there are no more presses
 # than this, all are centres.
-_TUNED_ON, _CENTRES = 400, 640
-_AT_ONCE = 512
+_NUM_TUNING_PRESSES, _MAX_CENTRES = 400, 640
+_CHUNK_SIZE = 512
 
 
 @dataclass(frozen=True)
@@ -47,35 +47,36 @@ class GaussianProcess:
     def fit(cls, features, targets) -> "GaussianProcess":
         """Fit standardised `targets` (N, d) to `features` (N, k)."""
         order = np.random.default_rng(0).permutation(len(features))
-        some = order[:_TUNED_ON]
-        length, noise = _estimate_length_and_noise(features[some], targets[some])
-        chosen = np.sort(order[:_CENTRES])
-        centres = features[chosen]
-        among = _matern_kernel(cdist(centres, centres) / length)
+        tuning_presses = order[:_NUM_TUNING_PRESSES]
+        length, noise = _estimate_length_and_noise(features[tuning_presses], targets[tuning_presses])
+        centre_indices = np.sort(order[:_MAX_CENTRES])
+        centres = features[centre_indices]
+        centre_kernel = _matern_kernel(cdist(centres, centres) / length)
         if len(centres) == len(features):
-            matrix, load = among + noise * np.eye(len(among)), targets[chosen]
+            matrix, right_side = centre_kernel + noise * np.eye(len(centre_kernel)), targets[centre_indices]
         else:
-            across = _matern_kernel(cdist(features, centres) / length)
-            matrix, load = across.T @ across + noise * among, across.T @ targets
+            press_kernel = _matern_kernel(cdist(features, centres) / length)
+            matrix, right_side = press_kernel.T @ press_kernel + noise * centre_kernel, press_kernel.T @ targets
             matrix += 1e-8 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
-        return cls(centres, cho_solve(cho_factor(matrix), load), length)
+        return cls(centres, cho_solve(cho_factor(matrix), right_side), length)
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """Predict targets (n, d)."""
-        scaled = self.centres / self.length
-        squares = np.sum(scaled**2, axis=1)
+        scaled_centres = self.centres / self.length
+        squared_norms = np.sum(scaled_centres**2, axis=1)
 
         def predict_rows(rows: np.ndarray) -> np.ndarray:
             rows = rows / self.length
-            squared = np.sum(rows**2, axis=1)[:, None] + squares - 2 * rows @ scaled.T
-            return _matern_kernel(np.sqrt(np.maximum(squared, 0.0))) @ self.weights
+            squared_distances = np.sum(rows**2, axis=1)[:, None] + squared_norms - 2 * rows @ scaled_centres.T
+            return _matern_kernel(np.sqrt(np.maximum(squared_distances, 0.0))) @ self.weights
 
-        return apply_in_parts(predict_rows, features, _AT_ONCE)
+        return apply_in_parts(predict_rows, features, _CHUNK_SIZE)
 
 
 def _matern_kernel(distance: np.ndarray) -> np.ndarray:
-    scaled = np.sqrt(3.0) * distance
-    return (1 + scaled) * np.exp(-scaled)
+    """Evaluate the Matérn kernel of order 3/2 at distances divided by the length."""
+    scaled_distance = np.sqrt(3.0) * distance
+    return (1 + scaled_distance) * np.exp(-scaled_distance)
 
 
 def _estimate_length_and_noise(features: np.ndarray, targets: np.ndarray) -> tuple[float, float]:
@@ -83,101 +84,105 @@ def _estimate_length_and_noise(features: np.ndarray, targets: np.ndarray) -> tup
 
     The variance of the function follows from these two in closed form.
     """
-    apart = cdist(features, features)
-    usual = float(np.sqrt(np.mean(apart**2))) or 1.0
+    distances = cdist(features, features)
+    mean_distance = float(np.sqrt(np.mean(distances**2))) or 1.0
 
-    def negative_log_likelihood(logs: np.ndarray) -> float:
-        matrix = _matern_kernel(apart / (usual * np.exp(logs[0]))) + np.exp(logs[1]) * np.eye(len(apart))
+    def negative_log_likelihood(log_parameters: np.ndarray) -> float:
+        matrix = _matern_kernel(distances / (mean_distance * np.exp(log_parameters[0]))) + np.exp(
+            log_parameters[1]
+        ) * np.eye(len(distances))
         try:
             factor = cho_factor(matrix, lower=True)
         except np.linalg.LinAlgError:
             return 1e12
-        size = np.mean(np.sum(targets * cho_solve(factor, targets), axis=0) / len(targets))
-        return float(2 * np.sum(np.log(np.diag(factor[0]))) + len(targets) * np.log(max(size, 1e-300)))
+        variance = np.mean(np.sum(targets * cho_solve(factor, targets), axis=0) / len(targets))
+        return float(2 * np.sum(np.log(np.diag(factor[0]))) + len(targets) * np.log(max(variance, 1e-300)))
 
     bounds = [(np.log(0.05), np.log(50.0)), (np.log(1e-6), np.log(1e3))]
     starts = [(0.5, np.log(0.05)), (2.0, np.log(0.3))]
-    tuned = min(
+    optimum = min(
         (
             minimize(negative_log_likelihood, start, method="Nelder-Mead", bounds=bounds, options={"maxfev": 60})
             for start in starts
         ),
-        key=lambda found: found.fun,
+        key=lambda result: result.fun,
     )
-    return usual * float(np.exp(tuned.x[0])), float(np.exp(tuned.x[1]))
+    return mean_distance * float(np.exp(optimum.x[0])), float(np.exp(optimum.x[1]))
 
 
 _ALPHAS = np.logspace(-2, 5, 15)
-_TREES = 100
+_NUM_TREES = 100
 # Maximum number of times that each press is presented to a map, in each phase.
-_SHOWN = 50
+_MAX_PRESENTATIONS = 50
 
 
-def ridge(features, targets) -> Any:
+def fit_ridge(features, targets) -> Any:
     """Fit ridge regression, with the penalty that generalised cross-validation chooses."""
     from sklearn.linear_model import RidgeCV
 
     return RidgeCV(_ALPHAS).fit(features, targets)
 
 
-def trees(features, targets) -> Any:
+def fit_gradient_boosting(features, targets) -> Any:
     """Fit gradient-boosted regression trees, one model for each target."""
     from sklearn.ensemble import HistGradientBoostingRegressor
 
     options = {"max_iter": 100, "max_leaf_nodes": 15, "min_samples_leaf": 8, "l2_regularization": 1.0}
-    models = [HistGradientBoostingRegressor(random_state=0, **options).fit(features, one) for one in targets.T]
+    models = [HistGradientBoostingRegressor(random_state=0, **options).fit(features, target) for target in targets.T]
     return Forest.from_boosted_regressors(models)
 
 
-def forest(features, targets) -> Any:
+def fit_extra_trees(features, targets) -> Any:
     """Fit trees with random splits, whose predictions are averaged (Geurts et al. 2006)."""
     from sklearn.ensemble import ExtraTreesRegressor
 
     targets = targets[:, 0] if targets.shape[1] == 1 else targets
-    found = ExtraTreesRegressor(_TREES, max_features=0.3, min_samples_leaf=2, random_state=0).fit(features, targets)
-    return Forest.from_averaged_trees(found.estimators_)
+    ensemble = ExtraTreesRegressor(_NUM_TREES, max_features=0.3, min_samples_leaf=2, random_state=0).fit(
+        features, targets
+    )
+    return Forest.from_averaged_trees(ensemble.estimators_)
 
 
-def som(features, targets) -> Any:
+def fit_self_organising_map(features, targets) -> Any:
     """Fit a self-organising map, which interpolates between the mean targets of the presses that each neuron won."""
     import jax
 
-    shown = min(MapSchedule().ordering, _SHOWN * len(features))
-    learnt = SelfOrganisingMap.fit(features, jax.random.key(0), schedule=MapSchedule(shown, shown))
-    return PlacedMap.learn(learnt, features, targets)
+    num_steps = min(MapSchedule().ordering, _MAX_PRESENTATIONS * len(features))
+    fitted_map = SelfOrganisingMap.fit(features, jax.random.key(0), schedule=MapSchedule(num_steps, num_steps))
+    return PlacedMap.learn(fitted_map, features, targets)
 
 
 REGRESSORS: dict[str, Callable[..., Any]] = {
-    "ridge": ridge,
+    "ridge": fit_ridge,
     "neighbours": NearestNeighbours.fit_regressor,
     "gaussian-process": GaussianProcess.fit,
-    "trees": trees,
-    "forest": forest,
+    "trees": fit_gradient_boosting,
+    "forest": fit_extra_trees,
     "network": Network.train,
-    "som": som,
+    "som": fit_self_organising_map,
 }
 # Methods that are quick enough to be tried on every form of the features.
-QUICK = ("ridge", "neighbours")
+QUICK_METHODS = ("ridge", "neighbours")
 # Methods that select few informative channels: they use the channels instead of principal components.
-OF_CHANNELS = ("forest",)
+CHANNEL_METHODS = ("forest",)
 
 
 # For the ensembles of Russo et al. (2017): number of members; number of leaves of a boosted tree.
-_MEMBERS, _LEAVES = 30, 21
+_NUM_MEMBERS, _MAX_LEAVES = 30, 21
 # Shrinkage of covariances if a class has fewer presses than twice the number of features; minimum variance of a class
 # along any axis, relative to the maximum.
-_SHRUNK, _LEAST = 0.1, 1e-4
+_SHRINKAGE, _MIN_VARIANCE_RATIO = 0.1, 1e-4
 
 
-def tree(features, label) -> Any:
+def fit_decision_tree(features, label) -> Any:
     """Fit a decision tree."""
     from sklearn.tree import DecisionTreeClassifier
 
-    found = DecisionTreeClassifier(min_samples_leaf=2, random_state=0).fit(features, label)
-    return Forest.from_classification_trees([_with_numbered_classes(found)], np.ones(1), np.unique(label), votes=False)
+    fitted_tree = DecisionTreeClassifier(min_samples_leaf=2, random_state=0).fit(features, label)
+    return Forest.from_classification_trees([_number_classes(fitted_tree)], np.ones(1), np.unique(label), votes=False)
 
 
-def linear_discriminant(features, label) -> Any:
+def fit_linear_discriminant(features, label) -> Any:
     """Fit a linear discriminant: normal classes with a common covariance, with Ledoit-Wolf shrinkage."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
@@ -207,81 +212,85 @@ class QuadraticDiscriminant:
 
         If a class has too few presses for a covariance, all covariances are shrunk towards multiples of the identity.
         """
-        classes, number = np.unique(label, return_inverse=True)
-        shrunk, size = covariance_shrinkage(features, label), features.shape[1]
-        everywhere = np.mean(np.var(features, axis=0))
+        classes, class_indices = np.unique(label, return_inverse=True)
+        shrinkage, num_features = covariance_shrinkage(features, label), features.shape[1]
+        mean_variance = np.mean(np.var(features, axis=0))
         means, whiten, offset = [], [], []
-        for one in range(len(classes)):
-            own = features[number == one]
-            covariance = np.cov(own.T, bias=len(own) < 2).reshape(size, size)
-            covariance = (1 - shrunk) * covariance + shrunk * np.trace(covariance) / size * np.eye(size)
+        for class_index in range(len(classes)):
+            class_features = features[class_indices == class_index]
+            covariance = np.cov(class_features.T, bias=len(class_features) < 2).reshape(num_features, num_features)
+            covariance = (1 - shrinkage) * covariance + shrinkage * np.trace(covariance) / num_features * np.eye(
+                num_features
+            )
             values, axes = np.linalg.eigh(covariance)
-            values = np.maximum(values, _LEAST * max(values.max(), _LEAST * everywhere))
-            means.append(own.mean(axis=0))
+            values = np.maximum(values, _MIN_VARIANCE_RATIO * max(values.max(), _MIN_VARIANCE_RATIO * mean_variance))
+            means.append(class_features.mean(axis=0))
             whiten.append(axes / np.sqrt(values))
-            offset.append(np.log(len(own) / len(features)) - 0.5 * np.sum(np.log(values)))
+            offset.append(np.log(len(class_features) / len(features)) - 0.5 * np.sum(np.log(values)))
         return cls(np.array(means), np.array(whiten), np.array(offset), classes)
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Compute the logarithms (n, C) of each class's density times its share of the presses, up to a constant."""
-        found = np.empty((len(features), len(self.offset)))
-        for one, (mean, whiten, offset) in enumerate(zip(self.mean, self.whiten, self.offset, strict=True)):
-            found[:, one] = offset - 0.5 * np.sum(((features - mean) @ whiten) ** 2, axis=1)
-        return found
+        scores = np.empty((len(features), len(self.offset)))
+        for class_index, (mean, whiten, offset) in enumerate(zip(self.mean, self.whiten, self.offset, strict=True)):
+            scores[:, class_index] = offset - 0.5 * np.sum(((features - mean) @ whiten) ** 2, axis=1)
+        return scores
 
 
-def linear_svm(features, label) -> Any:
+def fit_linear_svm(features, label) -> Any:
     """Fit a support vector machine with a linear kernel."""
     from sklearn.svm import SVC
 
     return SupportVectorMachine.from_scikit_learn(SVC(kernel="linear").fit(features, label))
 
 
-def quadratic_svm(features, label) -> Any:
+def fit_quadratic_svm(features, label) -> Any:
     """Fit a support vector machine with a quadratic kernel."""
     from sklearn.svm import SVC
 
     return SupportVectorMachine.from_scikit_learn(SVC(kernel="poly", degree=2, coef0=1.0).fit(features, label))
 
 
-def boosted_trees(features, label) -> Any:
+def fit_boosted_trees(features, label) -> Any:
     """Fit decision trees by AdaBoost, in which each tree has one weighted vote."""
     from sklearn.ensemble import AdaBoostClassifier
     from sklearn.tree import DecisionTreeClassifier
 
-    one = DecisionTreeClassifier(max_leaf_nodes=_LEAVES, random_state=0)
-    found = AdaBoostClassifier(one, n_estimators=_MEMBERS, random_state=0).fit(features, label)
-    members, weights = found.estimators_, found.estimator_weights_[: len(found.estimators_)]
+    base_tree = DecisionTreeClassifier(max_leaf_nodes=_MAX_LEAVES, random_state=0)
+    ensemble = AdaBoostClassifier(base_tree, n_estimators=_NUM_MEMBERS, random_state=0).fit(features, label)
+    members, weights = ensemble.estimators_, ensemble.estimator_weights_[: len(ensemble.estimators_)]
     return Forest.from_classification_trees(
-        [_with_numbered_classes(one, found) for one in members], weights, np.unique(label), votes=True
+        [_number_classes(member, ensemble) for member in members], weights, np.unique(label), votes=True
     )
 
 
-def bagged_trees(features, label) -> Any:
+def fit_bagged_trees(features, label) -> Any:
     """Fit decision trees, each independently to a bootstrap sample of the presses."""
     from joblib import parallel_config
     from sklearn.ensemble import BaggingClassifier
     from sklearn.tree import DecisionTreeClassifier
 
-    bagged = BaggingClassifier(
-        DecisionTreeClassifier(random_state=0), _MEMBERS, n_jobs=number_of_cores(), random_state=0
+    classifier = BaggingClassifier(
+        DecisionTreeClassifier(random_state=0), _NUM_MEMBERS, n_jobs=number_of_cores(), random_state=0
     )
     with parallel_config("threading"):
-        found = bagged.fit(features, label)
-    weights = np.full(_MEMBERS, 1 / _MEMBERS)
+        ensemble = classifier.fit(features, label)
+    weights = np.full(_NUM_MEMBERS, 1 / _NUM_MEMBERS)
     return Forest.from_classification_trees(
-        [_with_numbered_classes(one) for one in found.estimators_], weights, np.unique(label), votes=False
+        [_number_classes(member) for member in ensemble.estimators_], weights, np.unique(label), votes=False
     )
 
 
-def subspace_discriminant(features, label) -> Any:
+def fit_subspace_discriminant(features, label) -> Any:
     """Fit an ensemble of linear discriminants, each to a random half of the features."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
     from sklearn.ensemble import BaggingClassifier
 
-    one = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
-    found = BaggingClassifier(one, _MEMBERS, bootstrap=False, max_features=0.5, random_state=0).fit(features, label)
-    return LinearEnsemble.from_bagged(found, features.shape[1])
+    discriminant = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
+    ensemble = BaggingClassifier(discriminant, _NUM_MEMBERS, bootstrap=False, max_features=0.5, random_state=0).fit(
+        features, label
+    )
+    return LinearEnsemble.from_bagged(ensemble, features.shape[1])
 
 
 @dataclass(frozen=True)
@@ -301,43 +310,48 @@ class LinearEnsemble:
         members = bagged.estimators_
         weights = np.zeros((len(members), len(bagged.classes_), num_features))
         intercepts = np.zeros(weights.shape[:2])
-        for one, some, weight, intercept in zip(members, bagged.estimators_features_, weights, intercepts, strict=True):
-            binary = len(one.coef_) == 1  # two classes: only the log-odds of the second are given
-            weight[-1 if binary else slice(None), some] = one.coef_[0] if binary else one.coef_
-            intercept[-1 if binary else slice(None)] = one.intercept_[0] if binary else one.intercept_
+        for member, feature_indices, weight, intercept in zip(
+            members, bagged.estimators_features_, weights, intercepts, strict=True
+        ):
+            is_binary = len(member.coef_) == 1  # two classes: only the log-odds of the second are given
+            weight[-1 if is_binary else slice(None), feature_indices] = member.coef_[0] if is_binary else member.coef_
+            intercept[-1 if is_binary else slice(None)] = member.intercept_[0] if is_binary else member.intercept_
         return cls(weights, intercepts, bagged.classes_)
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Compute the probabilities (n, C) of the classes, averaged over the ensemble."""
-        found = np.zeros((len(features), len(self.classes_)))
+        summed_probabilities = np.zeros((len(features), len(self.classes_)))
         for weight, intercept in zip(self.weights, self.intercepts, strict=True):
-            found += probabilities(features @ weight.T + intercept, 1.0)
-        return found / len(self.weights)
+            summed_probabilities += probabilities(features @ weight.T + intercept, 1.0)
+        return summed_probabilities / len(self.weights)
 
 
-def _with_numbered_classes(tree, among=None):
-    """Replace the classes of a tree by their indices, among the classes of the ensemble `among` if it is given."""
-    tree.classes_ = np.arange(len(tree.classes_)) if among is None else np.searchsorted(among.classes_, tree.classes_)
+def _number_classes(tree, ensemble=None):
+    """Replace the classes of a tree by their indices, among the classes of the `ensemble` if it is given."""
+    tree.classes_ = (
+        np.arange(len(tree.classes_)) if ensemble is None else np.searchsorted(ensemble.classes_, tree.classes_)
+    )
     return tree
 
 
 CLASSIFIERS: dict[str, Callable[..., Any]] = {
-    "tree": tree,
-    "linear-discriminant": linear_discriminant,
+    "tree": fit_decision_tree,
+    "linear-discriminant": fit_linear_discriminant,
     "quadratic-discriminant": QuadraticDiscriminant.fit,
-    "linear-svm": linear_svm,
-    "quadratic-svm": quadratic_svm,
+    "linear-svm": fit_linear_svm,
+    "quadratic-svm": fit_quadratic_svm,
     "nearest": NearestNeighbours.fit_classifier,
-    "boosted-trees": boosted_trees,
-    "bagged-trees": bagged_trees,
-    "subspace-discriminant": subspace_discriminant,
+    "boosted-trees": fit_boosted_trees,
+    "bagged-trees": fit_bagged_trees,
+    "subspace-discriminant": fit_subspace_discriminant,
 }
 
 
 def covariance_shrinkage(features, label) -> float:
-    """Shrinkage of the covariances of classes; 0 if every class has at least twice as many presses as features."""
-    fewest = np.unique(label, return_counts=True)[1].min()
-    return _SHRUNK if fewest < 2 * features.shape[1] else 0.0
+    """Return the shrinkage of the covariances of classes; 0 if every class has at least twice as many presses as
+    features."""
+    min_presses = np.unique(label, return_counts=True)[1].min()
+    return _SHRINKAGE if min_presses < 2 * features.shape[1] else 0.0
 
 
 def log_odds(model, features) -> Float[np.ndarray, "n C"]:
@@ -350,21 +364,23 @@ def log_odds(model, features) -> Float[np.ndarray, "n C"]:
         return np.log(np.maximum(model.predict_proba(features), 1e-6))
     if hasattr(model, "pair_odds"):
         return model.pair_odds(features)
-    said = model.decision_function(features)
-    return np.column_stack([-said, said]) if said.ndim == 1 else said
+    scores = model.decision_function(features)
+    return np.column_stack([-scores, scores]) if scores.ndim == 1 else scores
 
 
 def probabilities(odds: np.ndarray, sharpness: float) -> Float[np.ndarray, "n C"]:
     """Compute the probability of each class (n, C) from its log-odds times the `sharpness`."""
-    scaled = sharpness * odds
-    powers = np.exp(scaled - scaled.max(axis=1, keepdims=True))
-    return powers / powers.sum(axis=1, keepdims=True)
+    scaled_odds = sharpness * odds
+    exponentials = np.exp(scaled_odds - scaled_odds.max(axis=1, keepdims=True))
+    return exponentials / exponentials.sum(axis=1, keepdims=True)
 
 
 def fit_sharpness(odds: np.ndarray, true_classes: np.ndarray) -> float:
-    """Choose the sharpness that maximises the likelihood of the true classes `true_classes` (N,) of held-out
-    presses."""
+    """Choose the sharpness that maximises the likelihood of the `true_classes` (N,) of held-out presses."""
     candidates = np.geomspace(0.02, 50, 60)
     rows = np.arange(len(true_classes))
-    likely = [np.mean(np.log(np.maximum(probabilities(odds, one)[rows, true_classes], 1e-9))) for one in candidates]
-    return float(candidates[int(np.argmax(likely))])
+    log_likelihoods = [
+        np.mean(np.log(np.maximum(probabilities(odds, candidate)[rows, true_classes], 1e-9)))
+        for candidate in candidates
+    ]
+    return float(candidates[int(np.argmax(log_likelihoods))])

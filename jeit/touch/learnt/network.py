@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-_WIDTH, _BATCH, _EPOCHS, _RATE, _DECAY = 64, 64, 150, 3e-3, 1e-2
+_HIDDEN_SIZE, _BATCH_SIZE, _NUM_EPOCHS, _LEARNING_RATE, _WEIGHT_DECAY = 64, 64, 150, 3e-3, 1e-2
 # Standard deviation of the noise added to features in each batch, relative to their scale.
-_NOISE = 0.1
+_FEATURE_NOISE = 0.1
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Network:
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """Predict targets (n, d)."""
         values = features / self.scale
-        for number, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+        for layer_index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             values = values @ weight.T + bias
-            values = np.tanh(values) if number + 1 < len(self.weights) else values
+            values = np.tanh(values) if layer_index + 1 < len(self.weights) else values
         return values
 
     @classmethod
@@ -42,19 +42,19 @@ class Network:
 
         size = float(np.sqrt(np.mean(features**2))) or 1.0
         scale = np.full(features.shape[1], size)
-        steps = _EPOCHS * max(1, -(-len(features) // _BATCH))
+        num_steps = _NUM_EPOCHS * max(1, -(-len(features) // _BATCH_SIZE))
         rng = np.random.default_rng(0)
-        order = np.concatenate([rng.permutation(len(features)) for _ in range(_EPOCHS)])
+        order = np.concatenate([rng.permutation(len(features)) for _ in range(_NUM_EPOCHS)])
         # The number of rows is padded to a multiple of the batch size, so that folds of about the same size share the
         # compiled function; no batch uses the added rows.
-        more = ((0, -len(features) % _BATCH), (0, 0))
-        layers = _compiled_training(steps)(
-            jnp.asarray(np.pad(features / scale, more), jnp.float32),
-            jnp.asarray(np.pad(targets, more), jnp.float32),
-            jnp.asarray(np.resize(order, (steps, _BATCH))),
+        row_padding = ((0, -len(features) % _BATCH_SIZE), (0, 0))
+        layers = _compiled_training(num_steps)(
+            jnp.asarray(np.pad(features / scale, row_padding), jnp.float32),
+            jnp.asarray(np.pad(targets, row_padding), jnp.float32),
+            jnp.asarray(np.resize(order, (num_steps, _BATCH_SIZE))),
             jax.random.split(jax.random.key(0)),
         )
-        layers = [(np.asarray(one.weight, float), np.asarray(one.bias, float)) for one in layers]
+        layers = [(np.asarray(layer.weight, float), np.asarray(layer.bias, float)) for layer in layers]
         return cls([weight for weight, _ in layers], [bias for _, bias in layers], scale)
 
 
@@ -69,25 +69,27 @@ def _compiled_training(num_steps: int) -> Callable[..., Any]:
     import jax.numpy as jnp
     import optax
 
-    optimiser = optax.adamw(optax.cosine_decay_schedule(_RATE, num_steps), weight_decay=_DECAY)
+    optimiser = optax.adamw(optax.cosine_decay_schedule(_LEARNING_RATE, num_steps), weight_decay=_WEIGHT_DECAY)
 
     @jax.jit
     def train(features, targets, batches, keys):
-        sizes = features.shape[1], targets.shape[1], _WIDTH, 2
+        sizes = features.shape[1], targets.shape[1], _HIDDEN_SIZE, 2
         network = eqx.nn.MLP(*sizes, activation=jnp.tanh, dtype=jnp.float32, key=keys[0])
-        moving, still = eqx.partition(network, eqx.is_inexact_array)
+        parameters, static_part = eqx.partition(network, eqx.is_inexact_array)
 
-        def loss(moving, index, key):
-            given = features[index] + _NOISE * jax.random.normal(key, (_BATCH, features.shape[1]), features.dtype)
-            return jnp.mean((jax.vmap(eqx.combine(moving, still))(given) - targets[index]) ** 2)
+        def loss(parameters, index, key):
+            noisy_features = features[index] + _FEATURE_NOISE * jax.random.normal(
+                key, (_BATCH_SIZE, features.shape[1]), features.dtype
+            )
+            return jnp.mean((jax.vmap(eqx.combine(parameters, static_part))(noisy_features) - targets[index]) ** 2)
 
         def update(carry, index):
-            moving, state, key = carry
-            key, own = jax.random.split(key)
-            updates, state = optimiser.update(jax.grad(loss)(moving, index, own), state, moving)
-            return (eqx.apply_updates(moving, updates), state, key), None
+            parameters, state, key = carry
+            key, step_key = jax.random.split(key)
+            updates, state = optimiser.update(jax.grad(loss)(parameters, index, step_key), state, parameters)
+            return (eqx.apply_updates(parameters, updates), state, key), None
 
-        moving = jax.lax.scan(update, (moving, optimiser.init(moving), keys[1]), batches)[0][0]
-        return moving.layers
+        parameters = jax.lax.scan(update, (parameters, optimiser.init(parameters), keys[1]), batches)[0][0]
+        return parameters.layers
 
     return train

@@ -14,16 +14,18 @@ from scipy.spatial import KDTree
 from jeit.touch.learnt.extras import apply_over_folds
 from jeit.touch.learnt.features import Features, Forms
 from jeit.touch.learnt.imaged import ImageReconstruction
-from jeit.touch.learnt.methods import OF_CHANNELS, QUICK, REGRESSORS
+from jeit.touch.learnt.methods import CHANNEL_METHODS, QUICK_METHODS, REGRESSORS
 
-_LIKE, _SHARES = 40, ((1.0, 0.6827), (1.96, 0.95))
+_NUM_SIMILAR, _TARGET_COVERAGES = 40, ((1.0, 0.6827), (1.96, 0.95))
+# Number of similar presses from which a variance is estimated; pairs of a multiple of the standard deviation and the
+# share of normally distributed errors within it.
 # Weight of the size of the changes relative to the predicted values, in the distance between presses; fraction of a
 # variance that is the mean squared error of all presses, where the rest is that of similar presses.
-_SIZE, _ALL = 0.3, 0.15
+_SIZE_WEIGHT, _GLOBAL_FRACTION = 0.3, 0.15
 # Minimum number of presses from which the coverage of standard deviations is estimated.
-_ENOUGH = 30
+_MIN_CALIBRATION_PRESSES = 30
 # Minimum standard deviation, relative to the spread of the predictions for the training set.
-_LEAST = 1e-4
+_MIN_RELATIVE_DEVIATION = 1e-4
 
 
 @dataclass(frozen=True)
@@ -43,31 +45,35 @@ class DeviationModel:
 
     @classmethod
     def learn(
-        cls, predictions: np.ndarray, changes: np.ndarray, errors: np.ndarray, last: np.ndarray
+        cls, predictions: np.ndarray, changes: np.ndarray, errors: np.ndarray, last_presses: np.ndarray
     ) -> "DeviationModel":
-        """Fit to predictions `predictions` (N, d) for held-out presses, their changes (N, m), and their errors (N, d).
+        """Fit to `predictions` (N, d) for held-out presses, their changes (N, m), and their errors (N, d).
 
-        `last` (N,): presses recorded before or after all presses that their predictions were learnt from. If there are
-        enough of them, the standard deviations are calibrated on these alone, since future presses are predicted
-        likewise.
+        `last_presses` (N,): presses recorded before or after all presses that their predictions were learnt from. If
+        there are enough of them, the standard deviations are calibrated on these alone, since future presses are
+        predicted likewise.
         """
         where = np.column_stack([predictions, _log_size(changes)])
         low, unit = where.mean(axis=0), where.std(axis=0)
         unit = np.where(unit > 0, unit, 1.0)
-        unit[-1] /= _SIZE
-        most = np.quantile(np.abs(errors), 0.99, axis=0)  # one large error is not representative of its neighbours
-        squares = np.minimum(np.abs(errors), most) ** 2
-        found = cls((where - low) / unit, squares, low, unit, np.ones(errors.shape[1]))
-        local = found._local_deviations(found.where, leave_one_out=True)
-        last = last if last.sum() >= _ENOUGH else np.ones_like(last)
-        factor = [
-            _calibration_factor(np.abs(error) / one) for error, one in zip(errors[last].T, local[last].T, strict=True)
+        unit[-1] /= _SIZE_WEIGHT
+        max_errors = np.quantile(
+            np.abs(errors), 0.99, axis=0
+        )  # one large error is not representative of its neighbours
+        squares = np.minimum(np.abs(errors), max_errors) ** 2
+        uncalibrated_model = cls((where - low) / unit, squares, low, unit, np.ones(errors.shape[1]))
+        local_deviations = uncalibrated_model._local_deviations(uncalibrated_model.where, leave_one_out=True)
+        last_presses = last_presses if last_presses.sum() >= _MIN_CALIBRATION_PRESSES else np.ones_like(last_presses)
+        factors = [
+            _calibration_factor(np.abs(errors_of_target) / deviations)
+            for errors_of_target, deviations in zip(
+                errors[last_presses].T, local_deviations[last_presses].T, strict=True
+            )
         ]
-        return cls(found.where, squares, low, unit, np.array(factor))
+        return cls(uncalibrated_model.where, squares, low, unit, np.array(factors))
 
     def __call__(self, predictions: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "n d"]:
-        """Compute the standard deviations (n, d) of predictions `predictions` (n, d) for frames with these changes (n,
-        m)."""
+        """Compute the standard deviations (n, d) of `predictions` (n, d) for frames with these changes (n, m)."""
         where = (np.column_stack([predictions, _log_size(changes)]) - self.low) / self.unit
         return self.factor * self._local_deviations(where)
 
@@ -77,11 +83,17 @@ class DeviationModel:
         return self.factor * self._local_deviations(where, leave_one_out=True)
 
     def _local_deviations(self, where: np.ndarray, *, leave_one_out: bool = False) -> np.ndarray:
-        number = min(_LIKE, len(self.where) - 1)
-        near = np.asarray(self._search_tree.query(where, number + leave_one_out)[1])[:, int(leave_one_out) :]
-        like = self.squares[near].mean(axis=1)
-        everywhere = self.squares.mean(axis=0)
-        return np.maximum(np.sqrt((1 - _ALL) * like + _ALL * everywhere), _LEAST * self.unit[: like.shape[1]])
+        """Estimate standard deviations (n, d) from the errors of the held-out presses that are nearest to `where`."""
+        num_neighbours = min(_NUM_SIMILAR, len(self.where) - 1)
+        neighbours = np.asarray(self._search_tree.query(where, num_neighbours + leave_one_out)[1])[
+            :, int(leave_one_out) :
+        ]
+        similar_variance = self.squares[neighbours].mean(axis=1)
+        mean_variance = self.squares.mean(axis=0)
+        return np.maximum(
+            np.sqrt((1 - _GLOBAL_FRACTION) * similar_variance + _GLOBAL_FRACTION * mean_variance),
+            _MIN_RELATIVE_DEVIATION * self.unit[: similar_variance.shape[1]],
+        )
 
     @cached_property
     def _search_tree(self) -> KDTree:
@@ -99,16 +111,17 @@ def _calibration_factor(ratios: np.ndarray) -> float:
     distribution.
     """
     candidates = np.geomspace(0.2, 5, 200)
-    missed = [
-        max(abs(np.mean(ratios <= times * candidate) - share) for times, share in _SHARES) for candidate in candidates
+    coverage_errors = [
+        max(abs(np.mean(ratios <= multiple * candidate) - share) for multiple, share in _TARGET_COVERAGES)
+        for candidate in candidates
     ]
-    return float(candidates[int(np.argmin(missed))])
+    return float(candidates[int(np.argmin(coverage_errors))])
 
 
 BLEND = "blend"
 METHODS = ("auto", *REGRESSORS, BLEND)
 # Maximum number of methods in a blend; maximum error of a blend, relative to that of the best single method.
-_BLENDED, _BETTER = 3, 0.98
+_MAX_BLENDED_METHODS, _MAX_BLEND_ERROR_RATIO = 3, 0.98
 
 
 @dataclass(frozen=True)
@@ -146,10 +159,12 @@ class LearntNumbers:
         self, changes: Float[np.ndarray, "n m"], reference: Float[np.ndarray, "n m"]
     ) -> Float[np.ndarray, "n d"]:
         """Predict targets (n, d) from changes (n, m) and their reference."""
-        said = 0.0
+        summed_predictions = 0.0
         for features, model in self.members:
-            said = said + np.asarray(model.predict(features(changes, reference))).reshape(len(changes), -1)
-        return self.mean + self.scale * said / len(self.members)
+            summed_predictions = summed_predictions + np.asarray(model.predict(features(changes, reference))).reshape(
+                len(changes), -1
+            )
+        return self.mean + self.scale * summed_predictions / len(self.members)
 
 
 def learn_numbers(
@@ -160,7 +175,7 @@ def learn_numbers(
     *,
     method: str = "auto",
     imaged: ImageReconstruction | None = None,
-    progress: Callable[[str], None] = lambda said: None,
+    progress: Callable[[str], None] = lambda message: None,
 ) -> tuple[LearntNumbers, list[MethodResult]]:
     """Learn `targets` (N, d) from changes (N, m), their reference, and images of the changes if `imaged` is given.
 
@@ -171,46 +186,65 @@ def learn_numbers(
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference
     forms = Forms.available(targets, imaged, has_reference=has_reference)
-    cut = _CrossValidation(changes, reference, targets, folds, forms)
-    tried = []
+    cross_validation = _CrossValidation(changes, reference, targets, folds, forms)
+    results = []
     for form in forms.names:
-        for quick in QUICK:
-            progress(f"{quick} on {form}")
-            tried.append(cut.hold_out(quick, form))
-    best = list(dict.fromkeys(one.form for one in sorted(tried, key=_mean_error)))[:2]
-    wanted = [one for one in REGRESSORS if one not in QUICK and method in ("auto", BLEND, one)]
-    for name in wanted:
-        for form in best if name in ("gaussian-process", "forest") else best[:1]:
-            progress(f"{name} on {form}")
-            tried.append(cut.hold_out(name, form))
-    tried.sort(key=_mean_error)
+        for quick_method in QUICK_METHODS:
+            progress(f"{quick_method} on {form}")
+            results.append(cross_validation.hold_out(quick_method, form))
+    best_forms = list(dict.fromkeys(result.form for result in sorted(results, key=_mean_error)))[:2]
+    slower_methods = [name for name in REGRESSORS if name not in QUICK_METHODS and method in ("auto", BLEND, name)]
+    for slower_method in slower_methods:
+        for form in best_forms if slower_method in ("gaussian-process", "forest") else best_forms[:1]:
+            progress(f"{slower_method} on {form}")
+            results.append(cross_validation.hold_out(slower_method, form))
+    results.sort(key=_mean_error)
     if method not in ("auto", BLEND):
-        tried = [one for one in tried if one.method == method]
-    chosen = _choose_methods(tried, targets, blend=method == BLEND) if method in ("auto", BLEND) else tried[:1]
-    said = np.mean([one.held_out for one in chosen], axis=0)
-    if len(chosen) > 1:
-        tried.insert(
-            0, MethodResult(BLEND, " + ".join(one.name for one in chosen), said, _mean_distance(said, targets))
+        results = [result for result in results if result.method == method]
+    chosen_results = (
+        _choose_methods(results, targets, blend=method == BLEND) if method in ("auto", BLEND) else results[:1]
+    )
+    predictions = np.mean([result.held_out for result in chosen_results], axis=0)
+    if len(chosen_results) > 1:
+        results.insert(
+            0,
+            MethodResult(
+                BLEND,
+                " + ".join(result.name for result in chosen_results),
+                predictions,
+                _mean_distance(predictions, targets),
+            ),
         )
     members = []
-    for one in chosen:
-        progress(f"{one.method}, all presses")
-        features = forms.learn(one.form, changes, reference, targets, rotated=one.method not in OF_CHANNELS)
-        model = REGRESSORS[one.method](features(changes, reference), (targets - cut.mean) / cut.scale)
+    for result in chosen_results:
+        progress(f"{result.method}, all presses")
+        features = forms.learn(result.form, changes, reference, targets, rotated=result.method not in CHANNEL_METHODS)
+        model = REGRESSORS[result.method](
+            features(changes, reference), (targets - cross_validation.mean) / cross_validation.scale
+        )
         members.append((features, model))
-    ends = (folds == 0) | (folds == folds.max())
-    spread = DeviationModel.learn(said, changes, said - targets, ends)
-    return LearntNumbers(members, cut.mean, cut.scale, spread), tried
+    is_in_end_fold = (folds == 0) | (folds == folds.max())
+    spread = DeviationModel.learn(predictions, changes, predictions - targets, is_in_end_fold)
+    return LearntNumbers(members, cross_validation.mean, cross_validation.scale, spread), results
 
 
-def _choose_methods(tried: list[MethodResult], targets: np.ndarray, *, blend: bool) -> list[MethodResult]:
+def _choose_methods(results: list[MethodResult], targets: np.ndarray, *, blend: bool) -> list[MethodResult]:
     """Choose the best method alone, or a blend of several methods if it is better or `blend` requires it."""
-    own = list({one.method: one for one in reversed(tried)}.values())
-    own = sorted(own, key=_mean_error)[:_BLENDED]
-    together = [own[:number] for number in range(2, len(own) + 1)]
-    best = min(together, key=lambda some: _mean_distance(np.mean([one.held_out for one in some], axis=0), targets))
-    error = _mean_distance(np.mean([one.held_out for one in best], axis=0), targets)
-    return best if blend or error < _BETTER * own[0].error else own[:1]
+    best_of_each_method = list({result.method: result for result in reversed(results)}.values())
+    best_of_each_method = sorted(best_of_each_method, key=_mean_error)[:_MAX_BLENDED_METHODS]
+    blends = [best_of_each_method[:num_members] for num_members in range(2, len(best_of_each_method) + 1)]
+    best_blend = min(
+        blends,
+        key=lambda blend_results: _mean_distance(
+            np.mean([result.held_out for result in blend_results], axis=0), targets
+        ),
+    )
+    error = _mean_distance(np.mean([result.held_out for result in best_blend], axis=0), targets)
+    return (
+        best_blend
+        if blend or error < _MAX_BLEND_ERROR_RATIO * best_of_each_method[0].error
+        else best_of_each_method[:1]
+    )
 
 
 def _mean_error(result: MethodResult) -> float:
@@ -233,22 +267,28 @@ class _CrossValidation:
         self.features = {}
 
     def hold_out(self, method: str, form: str) -> MethodResult:
-        said = np.empty_like(self.targets)
+        predictions = np.empty_like(self.targets)
 
         def predict(fold: int) -> None:
-            out = self.folds == fold
-            learnt, asked = self._fold_features(form, fold, out, rotated=method not in OF_CHANNELS)
-            model = REGRESSORS[method](learnt, (self.targets[~out] - self.mean) / self.scale)
-            said[out] = self.mean + self.scale * np.asarray(model.predict(asked)).reshape(int(out.sum()), -1)
+            is_held_out = self.folds == fold
+            training_features, held_out_features = self._fold_features(
+                form, fold, is_held_out, rotated=method not in CHANNEL_METHODS
+            )
+            model = REGRESSORS[method](training_features, (self.targets[~is_held_out] - self.mean) / self.scale)
+            predictions[is_held_out] = self.mean + self.scale * np.asarray(model.predict(held_out_features)).reshape(
+                int(is_held_out.sum()), -1
+            )
 
         apply_over_folds(predict, self.folds.max() + 1)
-        return MethodResult(method, form, said, _mean_distance(said, self.targets))
+        return MethodResult(method, form, predictions, _mean_distance(predictions, self.targets))
 
-    def _fold_features(self, form: str, fold: int, out: np.ndarray, *, rotated: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _fold_features(
+        self, form: str, fold: int, is_held_out: np.ndarray, *, rotated: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
         if (form, fold, rotated) not in self.features:
-            learnt = self.changes[~out], self.reference[~out], self.targets[~out]
-            features = self.forms.learn(form, *learnt, rotated=rotated)
+            training_data = self.changes[~is_held_out], self.reference[~is_held_out], self.targets[~is_held_out]
+            features = self.forms.learn(form, *training_data, rotated=rotated)
             self.features[form, fold, rotated] = tuple(
-                features(self.changes[some], self.reference[some]) for some in (~out, out)
+                features(self.changes[rows], self.reference[rows]) for rows in (~is_held_out, is_held_out)
             )
         return self.features[form, fold, rotated]

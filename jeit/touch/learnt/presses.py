@@ -17,7 +17,7 @@ from jeit.files import need, npz_arrays
 from jeit.touch.learnt.features import Features
 
 # Minimum number of frames of a session, if sessions are standardised separately.
-_SESSION = 20
+_MIN_SESSION_FRAMES = 20
 
 
 def changes_from_reference(frames: Float[np.ndarray, "n M"], reference: np.ndarray | None) -> Float[np.ndarray, "n M"]:
@@ -36,20 +36,23 @@ def standardise_sessions(changes: np.ndarray, group) -> np.ndarray:
         raise ValueError(f"group has shape {group.shape}; give ({len(changes)},), the session of each frame.")
     result = np.empty_like(changes)
     for session in np.unique(group):
-        own = changes[group == session]
-        if len(own) < _SESSION:
+        session_changes = changes[group == session]
+        if len(session_changes) < _MIN_SESSION_FRAMES:
             raise ValueError(
-                f"group: session {session} has {len(own)} frames; {_SESSION} are needed to standardise one."
+                f"group: session {session} has {len(session_changes)} frames; {_MIN_SESSION_FRAMES} are needed to "
+                "standardise one."
             )
-        deviation = np.nanstd(own, axis=0)
-        result[group == session] = (own - np.nanmedian(own, axis=0)) / np.where(deviation > 0, deviation, np.inf)
+        deviation = np.nanstd(session_changes, axis=0)
+        result[group == session] = (session_changes - np.nanmedian(session_changes, axis=0)) / np.where(
+            deviation > 0, deviation, np.inf
+        )
     return result
 
 
 def mean_reference(reference: np.ndarray) -> np.ndarray:
     """Compute the mean reference of each channel; 0 for channels without any reading."""
-    there = np.isfinite(reference)
-    return np.where(there, reference, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+    is_finite = np.isfinite(reference)
+    return np.where(is_finite, reference, 0.0).sum(axis=0) / np.maximum(is_finite.sum(axis=0), 1)
 
 
 def reference_used(
@@ -65,14 +68,14 @@ def reference_used(
 
 
 # Maximum extent of the positions: larger ones must be in millimetres.
-_LONGEST = 5.0  # m
+_MAX_EXTENT = 5.0  # m
 # Maximum force of a press: larger ones must be in grams or millinewtons.
-_HARDEST = 2000.0  # N
-_FEWEST, _FEWEST_OF_A_KIND = 10, 4
+_MAX_FORCE = 2000.0  # N
+_MIN_PRESSES, _MIN_PRESSES_PER_CLASS = 10, 4
 # Label of a frame of the untouched skin.
 NO_TOUCH = "none"
-_NO_TOUCH = ("none", "no touch", "no-touch", "no_touch", "notouch")
-_ROWS = ("positions", "force", "label", "touched", "group", "time")
+_NO_TOUCH_SYNONYMS = ("none", "no touch", "no-touch", "no_touch", "notouch")
+_OPTIONAL_FIELDS = ("positions", "force", "label", "touched", "group", "time")
 
 
 @dataclass(frozen=True)
@@ -129,11 +132,12 @@ class Presses:
         presses without any quantity to learn, and invalid values.
         """
         frames = check_frames("frames", frames)
-        if len(frames) < _FEWEST:
+        if len(frames) < _MIN_PRESSES:
             raise ValueError(
-                f"frames: {len(frames)} presses are too few to learn from and to validate on; give {_FEWEST} or more."
+                f"frames: {len(frames)} presses are too few to learn from and to validate on; give {_MIN_PRESSES} or "
+                "more."
             )
-        given = {
+        optional_arrays = {
             "positions": None if positions is None else _check_positions(positions),
             "force": None if force is None else _check_force(force),
             "label": None if label is None else _check_label(label),
@@ -141,18 +145,18 @@ class Presses:
             "group": None if group is None else _one_dimensional("group", group),
             "time": None if time is None else _check_time(time),
         }
-        for key, values in given.items():
+        for key, values in optional_arrays.items():
             if values is not None and len(values) != len(frames):
                 raise ValueError(f"{key} has {len(values)} rows and frames {len(frames)}; give one for each press.")
-        if all(given[key] is None for key in ("positions", "force", "label", "touched")):
+        if all(optional_arrays[key] is None for key in ("positions", "force", "label", "touched")):
             raise ValueError("frames: there is nothing to learn from them; give positions, force, label or touched.")
         reference = None if reference is None else check_reference(reference, frames)
-        return replace(cls(frames, reference, name=name), **given)
+        return replace(cls(frames, reference, name=name), **optional_arrays)
 
     def rows(self, index: ArrayLike | slice) -> "Presses":
         """Select presses by their indices, or by a slice."""
-        kept = {key: getattr(self, key) for key in ("frames", "reference", *_ROWS)}
-        return replace(self, **{key: None if values is None else values[index] for key, values in kept.items()})
+        arrays = {key: getattr(self, key) for key in ("frames", "reference", *_OPTIONAL_FIELDS)}
+        return replace(self, **{key: None if values is None else values[index] for key, values in arrays.items()})
 
 
 def read_presses(path: str | Path) -> Presses:
@@ -172,7 +176,7 @@ def read_presses(path: str | Path) -> Presses:
     ```
     """
     with _with_file_name(path):
-        return Presses.create(**_read_arrays(path, "frames", "reference", *_ROWS), name=Path(path).name)
+        return Presses.create(**_read_arrays(path, "frames", "reference", *_OPTIONAL_FIELDS), name=Path(path).name)
 
 
 def read_frames(path: str | Path) -> dict[str, np.ndarray]:
@@ -248,111 +252,116 @@ def check_reference(values, frames) -> Float[np.ndarray, "N M"]:
     return np.where(np.isfinite(reference), reference, np.nan)
 
 
-def _check_positions(given) -> np.ndarray:
-    positions = np.asarray(given)
+def _check_positions(values) -> np.ndarray:
+    positions = np.asarray(values)
     if positions.dtype.kind not in "fiu" or positions.ndim != 2 or positions.shape[1] not in (2, 3):
         raise ValueError(
             f"positions is {positions.dtype} of shape {positions.shape}; give numbers, (presses, 2) or (presses, 3), "
             "in metres."
         )
     positions = positions.astype(float)
-    bad = np.isinf(positions).any(axis=1) | (np.isnan(positions).any(axis=1) & ~np.isnan(positions).all(axis=1))
-    if bad.any():
-        row = int(np.flatnonzero(bad)[0])
+    is_invalid = np.isinf(positions).any(axis=1) | (np.isnan(positions).any(axis=1) & ~np.isnan(positions).all(axis=1))
+    if is_invalid.any():
+        row = int(np.flatnonzero(is_invalid)[0])
         raise ValueError(
             f"positions: row {row} is {positions[row].tolist()}; give numbers, or NaN throughout where nothing touched."
         )
-    there = positions[~np.isnan(positions).any(axis=1)]
-    if len(there) < _FEWEST:
-        raise ValueError(f"positions: {len(there)} presses have one; give {_FEWEST} or more, or leave positions out.")
-    extent = np.ptp(there, axis=0).max()
-    if extent > _LONGEST:
+    known_positions = positions[~np.isnan(positions).any(axis=1)]
+    if len(known_positions) < _MIN_PRESSES:
+        raise ValueError(
+            f"positions: {len(known_positions)} presses have one; give {_MIN_PRESSES} or more, or leave positions out."
+        )
+    extent = np.ptp(known_positions, axis=0).max()
+    if extent > _MAX_EXTENT:
         raise ValueError(
             f"positions spread over {extent:.4g}: are these metres? Divide millimetres by 1000; no side may be longer "
-            f"than {_LONGEST:g} m."
+            f"than {_MAX_EXTENT:g} m."
         )
     if extent == 0:
         raise ValueError("positions are all the same: there is nothing to learn.")
     return positions
 
 
-def _check_force(given) -> np.ndarray:
-    force = _one_dimensional("force", given)
+def _check_force(values) -> np.ndarray:
+    force = _one_dimensional("force", values)
     if force.dtype.kind not in "fiu" or not np.isfinite(force).all():
         raise ValueError("force must be finite numbers, in newtons; 0 where nothing touched.")
-    if np.abs(force).max() > _HARDEST:
+    if np.abs(force).max() > _MAX_FORCE:
         raise ValueError(f"force is up to {np.abs(force).max():.4g}: are these newtons? 100 g weigh 0.981 N.")
     if np.ptp(force) == 0:
         raise ValueError("force is the same in all presses: there is nothing to learn.")
     return force.astype(float)
 
 
-def _check_label(given) -> np.ndarray:
-    label = np.asarray(given)
+def _check_label(values) -> np.ndarray:
+    label = np.asarray(values)
     if label.dtype.kind == "O":
-        kinds = sorted({type(one).__name__ for one in label.ravel()})
-        if kinds != ["str"]:
-            raise ValueError(f"label mixes {' and '.join(kinds)}; give text throughout.")
+        type_names = sorted({type(element).__name__ for element in label.ravel()})
+        if type_names != ["str"]:
+            raise ValueError(f"label mixes {' and '.join(type_names)}; give text throughout.")
         label = label.astype(str)
     label = _one_dimensional("label", label)
     if label.dtype.kind not in "Uiub":
         raise ValueError(f"label is {label.dtype}; give text, or whole numbers.")
     label = label.astype(str)
-    if any(not one.strip() for one in label):
+    if any(not text.strip() for text in label):
         raise ValueError("label: some are empty; give every press one, and 'none' where nothing touched.")
-    label = np.array([NO_TOUCH if one.strip().lower() in _NO_TOUCH else one.strip() for one in label])
-    kinds, counts = np.unique(label, return_counts=True)
-    if len(kinds) < 2:
-        raise ValueError(f"label: all presses are '{kinds[0]}'; give two kinds or more, or leave label out.")
-    if counts.min() < _FEWEST_OF_A_KIND:
-        rare = kinds[counts.argmin()]
+    label = np.array([NO_TOUCH if text.strip().lower() in _NO_TOUCH_SYNONYMS else text.strip() for text in label])
+    classes, counts = np.unique(label, return_counts=True)
+    if len(classes) < 2:
+        raise ValueError(f"label: all presses are '{classes[0]}'; give two kinds or more, or leave label out.")
+    if counts.min() < _MIN_PRESSES_PER_CLASS:
+        rarest_class = classes[counts.argmin()]
         raise ValueError(
-            f"label: '{rare}' has {counts.min()} of the presses; give {_FEWEST_OF_A_KIND} or more of each kind, better "
-            "twenty."
+            f"label: '{rarest_class}' has {counts.min()} of the presses; give {_MIN_PRESSES_PER_CLASS} or more of "
+            "each kind, better twenty."
         )
     return label
 
 
-def _check_touched(given) -> np.ndarray:
-    touched = np.asarray(given)
+def _check_touched(values) -> np.ndarray:
+    touched = np.asarray(values)
     if touched.ndim != 2 or touched.dtype.kind not in "biuf" or not np.isin(touched, (0, 1)).all():
         raise ValueError(
             f"touched is {touched.dtype} of shape {touched.shape}; give (presses, keys), true where a key was pressed."
         )
     touched = touched.astype(bool)
-    fixed = np.flatnonzero(touched.all(axis=0) | ~touched.any(axis=0))
-    if fixed.size:
-        raise ValueError(f"touched: key {fixed[0]} is the same in all presses; leave its column out.")
-    count = np.minimum(touched.sum(axis=0), (~touched).sum(axis=0))
-    if count.min() < _FEWEST_OF_A_KIND:
+    constant_keys = np.flatnonzero(touched.all(axis=0) | ~touched.any(axis=0))
+    if constant_keys.size:
+        raise ValueError(f"touched: key {constant_keys[0]} is the same in all presses; leave its column out.")
+    num_rarer_presses = np.minimum(touched.sum(axis=0), (~touched).sum(axis=0))
+    if num_rarer_presses.min() < _MIN_PRESSES_PER_CLASS:
         raise ValueError(
-            f"touched: key {count.argmin()} differs in {count.min()} of the presses only; give {_FEWEST_OF_A_KIND} or "
-            "more with it and without, better twenty."
+            f"touched: key {num_rarer_presses.argmin()} differs in {num_rarer_presses.min()} of the presses only; "
+            f"give {_MIN_PRESSES_PER_CLASS} or more with it and without, better twenty."
         )
     return touched
 
 
-def _check_time(given) -> np.ndarray:
-    time = _one_dimensional("time", given)
+def _check_time(values) -> np.ndarray:
+    time = _one_dimensional("time", values)
     if time.dtype.kind not in "fiu" or not np.isfinite(time).all():
         raise ValueError("time must be finite numbers, in seconds.")
     return time.astype(float)
 
 
-def _one_dimensional(name: str, given: ArrayLike) -> np.ndarray:
-    values = np.asarray(given)
-    if values.ndim == 2 and 1 in values.shape:
-        values = values.ravel()
-    if values.ndim != 1 or values.dtype.kind == "O":
-        raise ValueError(f"{name} is {values.dtype} of shape {values.shape}; give one plain value for each press.")
-    return values
+def _one_dimensional(name: str, values: ArrayLike) -> np.ndarray:
+    flat_values = np.asarray(values)
+    if flat_values.ndim == 2 and 1 in flat_values.shape:
+        flat_values = flat_values.ravel()
+    if flat_values.ndim != 1 or flat_values.dtype.kind == "O":
+        raise ValueError(
+            f"{name} is {flat_values.dtype} of shape {flat_values.shape}; give one plain value for each press."
+        )
+    return flat_values
 
 
-_MOST, _NEIGHBOURS, _COMPONENTS = 2, 8, 12
+# Maximum lag in rows; number of similar frames whose places are averaged; number of principal components compared.
+_MAX_LAG, _NUM_NEIGHBOURS, _NUM_COMPONENTS = 2, 8, 12
 # Conditions for a lag, by the mean errors of estimated places. Without a lag, the error is more than this fraction of
 # the error of guessing the mean place, and with the lag it is less. With any other lag, the error is larger by more
 # than this number of standard errors.
-_GUESS, _STANDARD_ERRORS = 0.95, 4.0
+_MAX_GUESS_ERROR_RATIO, _MIN_STANDARD_ERRORS = 0.95, 4.0
 
 
 def estimate_lag(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) -> tuple[int, float, float]:
@@ -362,15 +371,18 @@ def estimate_lag(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) 
     it.
     """
     features = Features.learn("normalised", changes, np.zeros_like(changes))
-    scores = features(changes, np.zeros_like(changes))[:, :_COMPONENTS]
-    errors = {lag: _place_errors(scores, positions, folds, lag) for lag in range(-_MOST, _MOST + 1)}
-    guess = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
-    means = {lag: float(off.mean()) for lag, off in errors.items()}
-    best, second = sorted(means, key=lambda lag: means[lag])[:2]
-    enough = _STANDARD_ERRORS * float(errors[best].std()) / np.sqrt(len(positions))
-    plain = means[0] > _GUESS * guess > means[best] and means[second] - means[best] > enough
-    best = best if plain else 0
-    return best, means[0], means[best]
+    scores = features(changes, np.zeros_like(changes))[:, :_NUM_COMPONENTS]
+    errors = {lag: _place_errors(scores, positions, folds, lag) for lag in range(-_MAX_LAG, _MAX_LAG + 1)}
+    guess_error = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
+    mean_errors = {lag: float(place_errors.mean()) for lag, place_errors in errors.items()}
+    best_lag, second_best_lag = sorted(mean_errors, key=lambda lag: mean_errors[lag])[:2]
+    min_difference = _MIN_STANDARD_ERRORS * float(errors[best_lag].std()) / np.sqrt(len(positions))
+    is_clear = (
+        mean_errors[0] > _MAX_GUESS_ERROR_RATIO * guess_error > mean_errors[best_lag]
+        and mean_errors[second_best_lag] - mean_errors[best_lag] > min_difference
+    )
+    best_lag = best_lag if is_clear else 0
+    return best_lag, mean_errors[0], mean_errors[best_lag]
 
 
 def aligned_slices(num_rows: int, lag: int) -> tuple[slice, slice]:
@@ -379,15 +391,22 @@ def aligned_slices(num_rows: int, lag: int) -> tuple[slice, slice]:
 
 
 def _place_errors(scores: np.ndarray, positions: np.ndarray, folds: np.ndarray, lag: int) -> np.ndarray:
+    """Compute the errors of places that are estimated from the frames with the most similar scores in other folds."""
     frames, presses = aligned_slices(len(scores), lag)
     scores, positions, folds = scores[frames], positions[presses], folds[presses]
-    off = np.empty(len(scores))
+    errors = np.empty(len(scores))
     for fold in np.unique(folds):
-        out = folds == fold
-        learnt = positions[~out]
-        near = KDTree(scores[~out]).query(scores[out], min(_NEIGHBOURS, len(learnt)))[1].reshape(out.sum(), -1)
-        off[out] = np.linalg.norm(learnt[near].mean(axis=1) - positions[out], axis=1)
-    return off
+        is_held_out = folds == fold
+        training_positions = positions[~is_held_out]
+        neighbours = (
+            KDTree(scores[~is_held_out])
+            .query(scores[is_held_out], min(_NUM_NEIGHBOURS, len(training_positions)))[1]
+            .reshape(is_held_out.sum(), -1)
+        )
+        errors[is_held_out] = np.linalg.norm(
+            training_positions[neighbours].mean(axis=1) - positions[is_held_out], axis=1
+        )
+    return errors
 
 
 @dataclass(frozen=True)

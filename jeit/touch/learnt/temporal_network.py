@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-_HIDDEN, _DENSE, _WIDE = 24, 32, 5
-_MEMBERS, _BATCH, _EPOCHS, _RATE, _DECAY = 2, 64, 45, 3e-3, 2e-2
+_HIDDEN_SIZE, _DENSE_SIZE, _KERNEL_SIZE = 24, 32, 5
+_NUM_NETWORKS, _BATCH_SIZE, _NUM_EPOCHS, _LEARNING_RATE, _WEIGHT_DECAY = 2, 64, 45, 3e-3, 2e-2
 # Standard deviation of the noise added to features in each batch, relative to their scale; amount of label smoothing;
 # dropout rate of the values that enter the dense layer.
-_NOISE, _SMOOTHED, _DROPPED = 0.15, 0.05, 0.2
+_FEATURE_NOISE, _LABEL_SMOOTHING, _DROPOUT_RATE = 0.15, 0.05, 0.2
 
 
 @dataclass(frozen=True)
@@ -46,17 +46,23 @@ class TemporalNetwork:
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Compute the probabilities (n, C) of the classes, averaged over the networks."""
-        course = features[:, self.whole :].reshape(len(features), -1, self.first.shape[2] // _WIDE)
-        said = np.zeros((len(features), len(self.classes_)))
-        for one in range(len(self.first)):
-            hidden = _relu(_neighbouring_steps(course, np) @ self.first[one].T + self.first_bias[one])
-            hidden = _relu(_neighbouring_steps(hidden, np) @ self.second[one].T + self.second_bias[one])
-            pooled = np.concatenate([features[:, : self.whole], hidden.mean(axis=1), hidden.max(axis=1)], axis=1)
-            dense = _relu(pooled @ self.dense[one].T + self.dense_bias[one])
-            odds = dense @ self.last[one].T + self.last_bias[one]
-            powers = np.exp(odds - odds.max(axis=1, keepdims=True))
-            said += powers / powers.sum(axis=1, keepdims=True)
-        return said / len(self.first)
+        course = features[:, self.whole :].reshape(len(features), -1, self.first.shape[2] // _KERNEL_SIZE)
+        summed_probabilities = np.zeros((len(features), len(self.classes_)))
+        for network_index in range(len(self.first)):
+            hidden = _relu(
+                _neighbouring_steps(course, np) @ self.first[network_index].T + self.first_bias[network_index]
+            )
+            hidden = _relu(
+                _neighbouring_steps(hidden, np) @ self.second[network_index].T + self.second_bias[network_index]
+            )
+            pooled_features = np.concatenate(
+                [features[:, : self.whole], hidden.mean(axis=1), hidden.max(axis=1)], axis=1
+            )
+            dense = _relu(pooled_features @ self.dense[network_index].T + self.dense_bias[network_index])
+            odds = dense @ self.last[network_index].T + self.last_bias[network_index]
+            exponentials = np.exp(odds - odds.max(axis=1, keepdims=True))
+            summed_probabilities += exponentials / exponentials.sum(axis=1, keepdims=True)
+        return summed_probabilities / len(self.first)
 
     @classmethod
     def fit(
@@ -69,20 +75,20 @@ class TemporalNetwork:
         import jax
         import jax.numpy as jnp
 
-        classes, number = np.unique(label, return_inverse=True)
-        steps = _EPOCHS * max(1, -(-len(features) // _BATCH))
+        classes, class_indices = np.unique(label, return_inverse=True)
+        num_steps = _NUM_EPOCHS * max(1, -(-len(features) // _BATCH_SIZE))
         rng = np.random.default_rng(0)
-        order = np.concatenate([rng.permutation(len(features)) for _ in range(_EPOCHS)])
+        order = np.concatenate([rng.permutation(len(features)) for _ in range(_NUM_EPOCHS)])
         # The number of rows is padded to a multiple of the batch size, so that folds of about the same size share the
         # compiled function; no batch uses the added rows.
-        more = -len(features) % _BATCH
-        trained = _compiled_training(steps, whole, values, len(classes))(
-            jnp.asarray(np.pad(features, ((0, more), (0, 0))), jnp.float32),
-            jnp.asarray(np.pad(number, (0, more))),
-            jnp.asarray(np.resize(order, (steps, _BATCH))),
-            jax.random.split(jax.random.key(0), _MEMBERS),
+        num_padding_rows = -len(features) % _BATCH_SIZE
+        parameters = _compiled_training(num_steps, whole, values, len(classes))(
+            jnp.asarray(np.pad(features, ((0, num_padding_rows), (0, 0))), jnp.float32),
+            jnp.asarray(np.pad(class_indices, (0, num_padding_rows))),
+            jnp.asarray(np.resize(order, (num_steps, _BATCH_SIZE))),
+            jax.random.split(jax.random.key(0), _NUM_NETWORKS),
         )
-        return cls(*(np.asarray(one, float) for one in trained), whole=whole, classes_=classes)
+        return cls(*(np.asarray(parameter, float) for parameter in parameters), whole=whole, classes_=classes)
 
 
 def _relu(values):
@@ -91,13 +97,15 @@ def _relu(values):
 
 def _neighbouring_steps(course, engine):
     """Concatenate each time step with the two before and the two after it (n, T, 5 c); zeros beyond the ends."""
-    half, length = _WIDE // 2, course.shape[-2]
-    padded = engine.pad(course, ((0, 0), (half, half), (0, 0)))
-    return engine.concatenate([padded[:, one : one + length] for one in range(_WIDE)], axis=-1)
+    half_width, num_steps = _KERNEL_SIZE // 2, course.shape[-2]
+    padded_course = engine.pad(course, ((0, 0), (half_width, half_width), (0, 0)))
+    return engine.concatenate(
+        [padded_course[:, first_step : first_step + num_steps] for first_step in range(_KERNEL_SIZE)], axis=-1
+    )
 
 
 @functools.cache
-def _compiled_training(num_steps: int, whole: int, values: int, classes: int) -> Callable[..., Any]:
+def _compiled_training(num_steps: int, whole: int, values: int, num_classes: int) -> Callable[..., Any]:
     """Return a function that trains networks in `num_steps` steps, compiled once for each shape.
 
     The function returns weights and biases, layer by layer, from features, indices of the classes, the rows of each
@@ -107,45 +115,56 @@ def _compiled_training(num_steps: int, whole: int, values: int, classes: int) ->
     import jax.numpy as jnp
     import optax
 
-    optimiser = optax.adamw(optax.cosine_decay_schedule(_RATE, num_steps), weight_decay=_DECAY)
-    sizes = [(_HIDDEN, _WIDE * values), (_HIDDEN, _WIDE * _HIDDEN), (_DENSE, whole + 2 * _HIDDEN), (classes, _DENSE)]
+    optimiser = optax.adamw(optax.cosine_decay_schedule(_LEARNING_RATE, num_steps), weight_decay=_WEIGHT_DECAY)
+    sizes = [
+        (_HIDDEN_SIZE, _KERNEL_SIZE * values),
+        (_HIDDEN_SIZE, _KERNEL_SIZE * _HIDDEN_SIZE),
+        (_DENSE_SIZE, whole + 2 * _HIDDEN_SIZE),
+        (num_classes, _DENSE_SIZE),
+    ]
 
     def log_odds(weights, features, key):
         first, first_bias, second, second_bias, dense, dense_bias, last, last_bias = weights
         course = features[:, whole:].reshape(len(features), -1, values)
         hidden = jax.nn.relu(_neighbouring_steps(course, jnp) @ first.T + first_bias)
         hidden = jax.nn.relu(_neighbouring_steps(hidden, jnp) @ second.T + second_bias)
-        pooled = jnp.concatenate([features[:, :whole], hidden.mean(axis=1), hidden.max(axis=1)], axis=1)
-        pooled = pooled * jax.random.bernoulli(key, 1 - _DROPPED, pooled.shape) / (1 - _DROPPED)
-        return jax.nn.relu(pooled @ dense.T + dense_bias) @ last.T + last_bias
+        pooled_features = jnp.concatenate([features[:, :whole], hidden.mean(axis=1), hidden.max(axis=1)], axis=1)
+        pooled_features = (
+            pooled_features * jax.random.bernoulli(key, 1 - _DROPOUT_RATE, pooled_features.shape) / (1 - _DROPOUT_RATE)
+        )
+        return jax.nn.relu(pooled_features @ dense.T + dense_bias) @ last.T + last_bias
 
-    def loss(weights, features, number, key):
-        for_noise, for_dropping = jax.random.split(key)
-        noisy = features + _NOISE * jax.random.normal(for_noise, features.shape, features.dtype)
-        wanted = (1 - _SMOOTHED) * jax.nn.one_hot(number, classes) + _SMOOTHED / classes
-        return -jnp.mean(jnp.sum(wanted * jax.nn.log_softmax(log_odds(weights, noisy, for_dropping)), axis=1))
+    def loss(weights, features, class_indices, key):
+        noise_key, dropout_key = jax.random.split(key)
+        noisy_features = features + _FEATURE_NOISE * jax.random.normal(noise_key, features.shape, features.dtype)
+        target_probabilities = (1 - _LABEL_SMOOTHING) * jax.nn.one_hot(
+            class_indices, num_classes
+        ) + _LABEL_SMOOTHING / num_classes
+        return -jnp.mean(
+            jnp.sum(target_probabilities * jax.nn.log_softmax(log_odds(weights, noisy_features, dropout_key)), axis=1)
+        )
 
     def draw_weights(key):
         weights = []
-        for own, size in zip(jax.random.split(key, len(sizes)), sizes, strict=True):
-            weights += [jnp.sqrt(2 / size[1]) * jax.random.normal(own, size, jnp.float32)]
+        for layer_key, size in zip(jax.random.split(key, len(sizes)), sizes, strict=True):
+            weights += [jnp.sqrt(2 / size[1]) * jax.random.normal(layer_key, size, jnp.float32)]
             weights += [jnp.zeros(size[0], jnp.float32)]
         return tuple(weights)
 
     @jax.jit
-    def train(features, number, batches, keys):
+    def train(features, class_indices, batches, keys):
         def update(carry, index):
             weights, state, key = carry
-            key, own = jax.random.split(key)
-            slope = jax.grad(loss)(weights, features[index], number[index], own)
-            updates, state = optimiser.update(slope, state, weights)
+            key, step_key = jax.random.split(key)
+            gradients = jax.grad(loss)(weights, features[index], class_indices[index], step_key)
+            updates, state = optimiser.update(gradients, state, weights)
             return (optax.apply_updates(weights, updates), state, key), None
 
-        def train_one(key):
-            for_start, for_steps = jax.random.split(key)
-            weights = draw_weights(for_start)
-            return jax.lax.scan(update, (weights, optimiser.init(weights), for_steps), batches)[0][0]
+        def train_network(key):
+            init_key, training_key = jax.random.split(key)
+            weights = draw_weights(init_key)
+            return jax.lax.scan(update, (weights, optimiser.init(weights), training_key), batches)[0][0]
 
-        return jax.vmap(train_one)(keys)
+        return jax.vmap(train_network)(keys)
 
     return train

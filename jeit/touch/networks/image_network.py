@@ -30,22 +30,22 @@ from jeit.touch.simulate.contact.indents import relative_to
 from jeit.touch.training import check_same, read_model, write_model
 
 DESIGNS = ("unrolled", "three-stages")
-_KIND, _VERSION = "a jeit image network", 1
+_FILE_KIND, _FILE_VERSION = "a jeit image network", 1
 # Maximum number of steps of an unrolled network.
-_MOST_STEPS = 100
-FILE = "network.jeit"
-# Maximum number of frames that are imaged at once: more would exceed the cache. JAX compiles a program for each power
-# of two up to this number.
-_AT_ONCE = 64
+_MAX_STEPS = 100
+NETWORK_FILE = "network.jeit"
+# Maximum number of frames that are imaged at once; larger batches would exceed the processor's cache. JAX compiles a
+# program for each power of two up to this number.
+_MAX_BATCH_SIZE = 64
 # Thresholds for unreliable maps: fraction of the squared change that the map does not explain; size of the change that
 # is tested, as a multiple of the noise; depth, divided by the skin's thickness; outward bulge, as a multiple of the
 # noise floor. An unexplained fraction alone is no evidence, since a network that has learnt little misses many touches:
 # the map must bulge more than it is indented as well.
-_UNEXPLAINED, _LOUD, _TOO_DEEP, _BULGE = 0.6, 3.0, 1.2, 3.0
+_MAX_UNEXPLAINED_FRACTION, _MIN_CHANGE_TO_NOISE, _MAX_RELATIVE_DEPTH, _MIN_BULGE_TO_FLOOR = 0.6, 3.0, 1.2, 3.0
 # Maximum fraction of missing channels with which a frame is still used.
-MOST_MISSING = 0.5
+MAX_MISSING_FRACTION = 0.5
 # Maximum relative change; larger ones are not caused by touch.
-_GREATEST = 100.0
+_MAX_RELATIVE_CHANGE = 100.0
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ class ImageNetwork:
         return cls(network, design, float(skin.thickness), shape, extent, float(noise), made_for)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Fields without the compiled programs, which are not pickled but compiled again."""
-        return {one.name: getattr(self, one.name) for one in fields(self)}
+        """Return the fields without the compiled programs, which are not pickled but compiled again."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def depth(self, voltages: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "*n rows columns"]:
         """Estimate the indentation depth, metres, from frames (M,) or (n, M), volts.
@@ -104,29 +104,33 @@ class ImageNetwork:
         Raises `ValueError` if voltages are infinite or change by more than 100 times the reference, and if too many
         channels are missing: more than half of them, or any for the design "three-stages".
         """
-        channels = self.made_for["channels"]
-        frames = real_array("voltages", voltages, f"frames ({channels},) or (n, {channels}), volts")
-        rest = real_array("reference", reference, f"a frame ({channels},), volts")
-        for name, given in (("voltages", frames), ("reference", rest)):
-            if given.shape[-1:] != (channels,) or given.ndim > (2 if name == "voltages" else 1):
-                raise ValueError(f"{name} has shape {given.shape}; this network takes {channels} channels.")
-            if np.isinf(given).any():
-                raise ValueError(f"{name} is infinite in channel {np.flatnonzero(np.isinf(given))[0] % channels}.")
+        num_channels = self.made_for["channels"]
+        frames = real_array("voltages", voltages, f"frames ({num_channels},) or (n, {num_channels}), volts")
+        reference_frame = real_array("reference", reference, f"a frame ({num_channels},), volts")
+        for name, array in (("voltages", frames), ("reference", reference_frame)):
+            if array.shape[-1:] != (num_channels,) or array.ndim > (2 if name == "voltages" else 1):
+                raise ValueError(f"{name} has shape {array.shape}; this network takes {num_channels} channels.")
+            if np.isinf(array).any():
+                raise ValueError(f"{name} is infinite in channel {np.flatnonzero(np.isinf(array))[0] % num_channels}.")
         frames = np.atleast_2d(frames)
-        lost = np.isnan(frames) | np.isnan(rest)
-        most = MOST_MISSING * channels if isinstance(self.network, Unrolled) else 0
-        worst = int(lost.sum(axis=1).argmax()) if len(lost) else 0
-        if lost.any() and lost[worst].sum() > most:
-            which = np.flatnonzero(lost[worst])
-            named = ", ".join(map(str, which[:6])) + (", …" if len(which) > 6 else "")
+        is_missing = np.isnan(frames) | np.isnan(reference_frame)
+        max_missing = MAX_MISSING_FRACTION * num_channels if isinstance(self.network, Unrolled) else 0
+        worst_frame = int(is_missing.sum(axis=1).argmax()) if len(is_missing) else 0
+        if is_missing.any() and is_missing[worst_frame].sum() > max_missing:
+            missing_channels = np.flatnonzero(is_missing[worst_frame])
+            listed_channels = ", ".join(map(str, missing_channels[:6])) + (", …" if len(missing_channels) > 6 else "")
             raise ValueError(
-                f"voltages: no reading of {len(which)} of {channels} channels ({named}); "
-                + ("half of them are needed." if most else "a network of three stages needs all, another does not.")
+                f"voltages: no reading of {len(missing_channels)} of {num_channels} channels ({listed_channels}); "
+                + (
+                    "half of them are needed."
+                    if max_missing
+                    else "a network of three stages needs all, another does not."
+                )
             )
-        change = np.where(lost, np.nan, relative_to(np.nan_to_num(rest), np.nan_to_num(frames)))
-        if (most_changed := np.nanmax(np.abs(change), initial=0)) > _GREATEST:
-            raise ValueError(f"voltages are {most_changed:.3g} times those of the reference; are units the same?")
-        return fill_missing(change, self._covariance, self.noise) if lost.any() else change
+        change = np.where(is_missing, np.nan, relative_to(np.nan_to_num(reference_frame), np.nan_to_num(frames)))
+        if (max_change := np.nanmax(np.abs(change), initial=0)) > _MAX_RELATIVE_CHANGE:
+            raise ValueError(f"voltages are {max_change:.3g} times those of the reference; are units the same?")
+        return fill_missing(change, self._covariance, self.noise) if is_missing.any() else change
 
     def doubts(self, change: Float[np.ndarray, "n M"], share: Float[np.ndarray, "n rows columns"]) -> list[str]:
         """State why each map of `share(change)` is unreliable; an empty string if there is no evidence against the map.
@@ -135,26 +139,30 @@ class ImageNetwork:
         more than it is indented, and its indentation does not explain the change by the forward model, which only the
         design "unrolled" has.
         """
-        found = ["" for _ in share]
-        size = np.linalg.norm(change, axis=1)
-        loud = size > _LOUD * self.noise * np.sqrt(change.shape[1])
-        missed, bulge = np.zeros(len(share)), _BULGE * self.floor / self.thickness
-        if isinstance(self.network, Unrolled) and loud.any():
-            response = np.asarray(self._predict_changes(np.maximum(share, 0)))
-            missed[loud] = (np.linalg.norm(change - response, axis=1)[loud] / size[loud]) ** 2
-        for number, one in enumerate(share):
-            if missed[number] > _UNEXPLAINED and -one.min() > max(one.max(), bulge):
-                found[number] = (
+        reasons = ["" for _ in share]
+        change_norms = np.linalg.norm(change, axis=1)
+        is_testable = change_norms > _MIN_CHANGE_TO_NOISE * self.noise * np.sqrt(change.shape[1])
+        unexplained_fractions, min_bulge = np.zeros(len(share)), _MIN_BULGE_TO_FLOOR * self.floor / self.thickness
+        if isinstance(self.network, Unrolled) and is_testable.any():
+            predicted_changes = np.asarray(self._predict_changes(np.maximum(share, 0)))
+            unexplained_fractions[is_testable] = (
+                np.linalg.norm(change - predicted_changes, axis=1)[is_testable] / change_norms[is_testable]
+            ) ** 2
+        for map_index, depth_map in enumerate(share):
+            if unexplained_fractions[map_index] > _MAX_UNEXPLAINED_FRACTION and -depth_map.min() > max(
+                depth_map.max(), min_bulge
+            ):
+                reasons[map_index] = (
                     "the change is not that of a touch, but of a skin pushed outwards; do frame and reference "
                     "have the same "
                     "signs, and was the skin untouched in the reference?"
                 )
-            elif one.max() > _TOO_DEEP:
-                found[number] = (
-                    f"{1e3 * self.thickness * float(one.max()):.3g} mm deep, and the skin is "
+            elif depth_map.max() > _MAX_RELATIVE_DEPTH:
+                reasons[map_index] = (
+                    f"{1e3 * self.thickness * float(depth_map.max()):.3g} mm deep, and the skin is "
                     f"{1e3 * self.thickness:.3g} mm thick; are the units those of the reference?"
                 )
-        return found
+        return reasons
 
     @functools.cached_property
     def floor(self) -> float:
@@ -183,31 +191,33 @@ class ImageNetwork:
 
         `change` is relative to a reference, as computed by `jeit.touch.simulate.relative_changes`.
         """
-        number = len(change)
-        if not number:
+        num_frames = len(change)
+        if not num_frames:
             return np.zeros((0, *self.shape), np.float32)
-        size = min(_AT_ONCE, 2 ** (number - 1).bit_length())
-        given = np.zeros((-(-number // size) * size, change.shape[1]), np.float32)
-        given[:number] = change
-        if len(given) == size:
-            return np.asarray(self._compiled(given))[:number]
-        starts, compiled = range(0, len(given), size), self._compiled
+        batch_size = min(_MAX_BATCH_SIZE, 2 ** (num_frames - 1).bit_length())
+        padded_changes = np.zeros((-(-num_frames // batch_size) * batch_size, change.shape[1]), np.float32)
+        padded_changes[:num_frames] = change
+        if len(padded_changes) == batch_size:
+            return np.asarray(self._compiled(padded_changes))[:num_frames]
+        starts, compiled = range(0, len(padded_changes), batch_size), self._compiled
         # A program leaves cores idle between its convolutions: running two at once takes three quarters of the time.
         with ThreadPoolExecutor(min(len(starts), os.cpu_count() or 1)) as pool:
-            parts = list(pool.map(lambda one: np.asarray(compiled(given[one : one + size])), starts))
-        return np.concatenate(parts)[:number]
+            parts = list(
+                pool.map(lambda start: np.asarray(compiled(padded_changes[start : start + batch_size])), starts)
+            )
+        return np.concatenate(parts)[:num_frames]
 
     @functools.cached_property
     def _compiled(self) -> Callable[..., Any]:
         """Compiled function from relative changes to relative depth maps."""
-        arrays, still = eqx.partition(self.network, eqx.is_array)
-        called = jax.jit(lambda arrays, change: eqx.combine(arrays, still)(change))
-        return lambda change: called(arrays, jnp.asarray(change))
+        arrays, static_part = eqx.partition(self.network, eqx.is_array)
+        run_network = jax.jit(lambda arrays, change: eqx.combine(arrays, static_part)(change))
+        return lambda change: run_network(arrays, jnp.asarray(change))
 
     def check_protocol(self, protocol: Protocol, name: str = "the data") -> None:
         """Raise `ValueError`, with the difference, if the network was trained for another protocol; currents may
         differ."""
-        check_same(name, self.made_for, _channels_of(protocol))
+        check_same(name, self.made_for, _describe_protocol(protocol))
 
 
 def describe_skin(protocol: Protocol, centres: ArrayLike, extent: tuple[float, ...]) -> dict[str, Any]:
@@ -216,9 +226,9 @@ def describe_skin(protocol: Protocol, centres: ArrayLike, extent: tuple[float, .
     `protocol`: its protocol; `centres` (L, 2): centres of its electrodes, metres; `extent`: (x_min, x_max, y_min,
     y_max) of its bounding box, metres.
     """
-    places = np.round(1e3 * np.asarray(centres), 3).tolist()
-    skin = np.round(1e3 * np.asarray(extent), 3).tolist()
-    return {**_channels_of(protocol), "skin_mm": skin, "electrodes_mm": places}
+    centres_mm = np.round(1e3 * np.asarray(centres), 3).tolist()
+    extent_mm = np.round(1e3 * np.asarray(extent), 3).tolist()
+    return {**_describe_protocol(protocol), "skin_mm": extent_mm, "electrodes_mm": centres_mm}
 
 
 def write_network(network: ImageNetwork, path: str | Path) -> None:
@@ -250,7 +260,7 @@ def write_network(network: ImageNetwork, path: str | Path) -> None:
         "made_for": network.made_for,
         "versions": {name: version(name) for name in ("jeit", "jax", "equinox")},
     }
-    write_model(path, _KIND, _VERSION, head, network.network)
+    write_model(path, _FILE_KIND, _FILE_VERSION, head, network.network)
 
 
 def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
@@ -274,10 +284,10 @@ def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
     ```
     """
     path = Path(path)
-    path = path / FILE if path.is_dir() else path
-    head, network = read_model(path, _KIND, _VERSION, _untrained_network)
+    path = path / NETWORK_FILE if path.is_dir() else path
+    head, network = read_model(path, _FILE_KIND, _FILE_VERSION, _untrained_network)
     low_x, high_x, low_y, high_y = map(float, head["extent_m"])
-    found = ImageNetwork(
+    image_network = ImageNetwork(
         network,
         head["design"],
         float(head["thickness_m"]),
@@ -287,9 +297,11 @@ def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
         head["made_for"],
     )
     if skin is not None:
-        here = describe_skin(skin.model.protocol, skin.layout.centres, (*map(float, skin.flat_outline.extent),))
-        check_same(path, found.made_for, here)
-    return found
+        skin_description = describe_skin(
+            skin.model.protocol, skin.layout.centres, (*map(float, skin.flat_outline.extent),)
+        )
+        check_same(path, image_network.made_for, skin_description)
+    return image_network
 
 
 def _untrained_network(head: dict[str, Any]) -> ThreeStages | Unrolled:
@@ -297,24 +309,35 @@ def _untrained_network(head: dict[str, Any]) -> ThreeStages | Unrolled:
     check_name("design", head["design"], DESIGNS)
     rows, columns = head["shape"]
     channels, key = head["made_for"]["channels"], jax.random.key(0)
-    for number in (rows, columns, channels):
-        if not (isinstance(number, int) and 1 <= number <= 10_000):
-            raise ValueError(f"its header gives {describe(number)} rows, columns or channels")
-    numbers = [head["thickness_m"], head["noise"], *head["extent_m"]]
-    if len(numbers) != 6 or not all(is_number(one) for one in numbers):
+    for count in (rows, columns, channels):
+        if not (isinstance(count, int) and 1 <= count <= 10_000):
+            raise ValueError(f"its header gives {describe(count)} rows, columns or channels")
+    lengths_and_noise = [head["thickness_m"], head["noise"], *head["extent_m"]]
+    if len(lengths_and_noise) != 6 or not all(is_number(number) for number in lengths_and_noise):
         raise ValueError("its header gives no thickness, noise and extent")
-    if not (isinstance(head["steps"], int) and 0 <= head["steps"] <= _MOST_STEPS):
+    if not (isinstance(head["steps"], int) and 0 <= head["steps"] <= _MAX_STEPS):
         raise ValueError(f"its header gives {describe(head['steps'])} steps")
     if head["design"] == "three-stages":
         return ThreeStages(channels, (rows, columns), key=key)
     return Unrolled(channels, (rows, columns), head["steps"], key=key)
 
 
-def _channels_of(protocol: Protocol) -> dict[str, Any]:
-    """Numbers of channels and electrodes of a protocol, and a hash of its drive and measurement patterns, for any
-    current."""
-    drive, measured = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
-    patterns = np.round(np.concatenate([drive / np.abs(drive).max(), measured / np.abs(measured).max()]), 6) + 0.0
+def _describe_protocol(protocol: Protocol) -> dict[str, Any]:
+    """Return the numbers of channels and electrodes of a protocol, and a hash of its drive and measurement patterns,
+    for any current."""
+    drive_patterns, measurement_patterns = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
+    patterns = (
+        np.round(
+            np.concatenate(
+                [
+                    drive_patterns / np.abs(drive_patterns).max(),
+                    measurement_patterns / np.abs(measurement_patterns).max(),
+                ]
+            ),
+            6,
+        )
+        + 0.0
+    )
     return {
         "channels": protocol.num_measurements,
         "electrodes": protocol.num_electrodes,
@@ -330,11 +353,11 @@ def fill_missing(
     C is the `covariance` of the changes that touches cause; index 1 stands for known channels, 2 for missing ones; y₁
     are the known changes. `noise`: standard deviation of the Gaussian noise of each channel.
     """
-    found = np.array(changes, float)
-    known = np.isfinite(found)
-    for mask in np.unique(known[~known.all(axis=1)], axis=0):
-        rows = (known == mask).all(axis=1)
-        own = covariance[np.ix_(mask, mask)] + noise**2 * np.eye(int(mask.sum()))
-        expected = np.linalg.solve(own, covariance[np.ix_(mask, ~mask)])
-        found[np.ix_(rows, ~mask)] = found[np.ix_(rows, mask)] @ expected
-    return found
+    completed_changes = np.array(changes, float)
+    is_known = np.isfinite(completed_changes)
+    for mask in np.unique(is_known[~is_known.all(axis=1)], axis=0):
+        rows = (is_known == mask).all(axis=1)
+        known_covariance = covariance[np.ix_(mask, mask)] + noise**2 * np.eye(int(mask.sum()))
+        expected = np.linalg.solve(known_covariance, covariance[np.ix_(mask, ~mask)])
+        completed_changes[np.ix_(rows, ~mask)] = completed_changes[np.ix_(rows, mask)] @ expected
+    return completed_changes

@@ -21,7 +21,7 @@ from jeit.arguments.extras import need_extra
 from jeit.design import Skin, touches_away_from_the_edge
 from jeit.design.study.store import OtherContents, Store
 from jeit.layout import Layout
-from jeit.touch.networks.image_network import DESIGNS, FILE, ImageNetwork, write_network
+from jeit.touch.networks.image_network import DESIGNS, NETWORK_FILE, ImageNetwork, write_network
 from jeit.touch.networks.linear_channels import (
     LinearChannels,
     depth_centroids,
@@ -44,7 +44,7 @@ from jeit.touch.training import (
 )
 
 # Maximum number of touches that are in memory, and shuffled, at once: 120 MB for 94 channels and 48 × 48 maps.
-_AT_ONCE = 12_000
+_MAX_TOUCHES_IN_MEMORY = 12_000
 
 
 class SimulatedTouches(Protocol):
@@ -77,10 +77,10 @@ class TouchExamples(NamedTuple):
 class StoredTouches:
     """Touches of a finished set of `simulate_presses`, read from its store on access.
 
-    Chunks of the store are read together in larger chunks of about `at_once` touches, or fewer.
+    Chunks of the store are read together in larger chunks of about `max_chunk_size` touches, or fewer.
     """
 
-    def __init__(self, indents: IndentSet, path: str | Path, at_once: int = _AT_ONCE):
+    def __init__(self, indents: IndentSet, path: str | Path, max_chunk_size: int = _MAX_TOUCHES_IN_MEMORY):
         """Open the store. Raises `ValueError` if it is not finished, and as `Store` does."""
         store, chunks = Store(indents.contents(), path, create=False), indents.chunks
         checksums = store.finished()
@@ -91,9 +91,9 @@ class StoredTouches:
         self.fingerprint = hashlib.sha256(repr(sorted(checksums.items())).encode()).hexdigest()
         self._arrays = store.open_dataset()
         # The chunks are of similar size, so that none is smaller than a batch.
-        number = min(-(-indents.number // at_once), len(chunks))
-        parts = np.array_split(np.arange(len(chunks)), number)
-        self.spans = [range(chunks[part[0]].start, chunks[part[-1]].stop) for part in parts]
+        num_chunks = min(-(-indents.number // max_chunk_size), len(chunks))
+        chunk_groups = np.array_split(np.arange(len(chunks)), num_chunks)
+        self.spans = [range(chunks[chunk_group[0]].start, chunks[chunk_group[-1]].stop) for chunk_group in chunk_groups]
 
     def rows(self, *names: str) -> "StoredRows":
         """Return the arrays of these names, which are read chunk by chunk; see `SimulatedTouches`."""
@@ -134,9 +134,9 @@ class StoredRows:
 # Training of the unrolled network: weight of the maps of all steps but the last; weight of the voltage misfit; both are
 # relative to the weight of the last map. Model error, relative to the changes; maximum standard deviation of the drift
 # of log contact impedances; maximum noise, as a multiple of the given noise.
-_EARLY, _MISFIT, _MODEL_ERROR, _DRIFT, _LOUDER = 0.3, 0.05, 0.1, 0.1, 6.0
+_EARLY_MAP_WEIGHT, _MISFIT_WEIGHT, _MODEL_ERROR, _MAX_CONTACT_DRIFT, _MAX_NOISE_FACTOR = 0.3, 0.05, 0.1, 0.1, 6.0
 # Scale of squared depths, chosen so that losses are about one before training.
-_SCALE = 0.002
+_LOSS_SCALE = 0.002
 
 
 class TrainedNetwork(NamedTuple):
@@ -164,10 +164,12 @@ class TrainingRuns(NamedTuple):
     def run(self, name: str, network, objective: TrainingObjective, training, validation) -> TrainingResult:
         """Run one training, with a random key that depends on its name."""
         key = jax.random.fold_in(self.key, int.from_bytes(name.encode()[:4], "little"))
-        kept = None if self.folder is None else self.folder / f"{name}.training"
+        checkpoint = None if self.folder is None else self.folder / f"{name}.training"
         report = self.progress
-        said = None if report is None else (lambda text: report(f"{name}, {text}"))
-        return fit_network(network, objective, training, validation, self.plan, key=key, checkpoint=kept, progress=said)
+        report_step = None if report is None else (lambda message: report(f"{name}, {message}"))
+        return fit_network(
+            network, objective, training, validation, self.plan, key=key, checkpoint=checkpoint, progress=report_step
+        )
 
 
 def train_three_stages(
@@ -178,60 +180,60 @@ def train_three_stages(
     Both autoencoders are fixed while the projection is trained. `noise`: standard deviation of relative changes.
     """
     shape = validation.depth.shape[1:]
-    network_start = ThreeStages(validation.change.shape[1], shape, key=runs.key)
+    initial_network = ThreeStages(validation.change.shape[1], shape, key=runs.key)
     mean, deviation = mean_and_deviation(training.rows("change"))
-    noisy = np.hypot(deviation, noise)
-    network_start = eqx.tree_at(
-        lambda one: (one.mean, one.deviation),
-        network_start,
-        (jnp.asarray(mean, jnp.float32), jnp.asarray(noisy, jnp.float32)),
+    noisy_deviation = np.hypot(deviation, noise)
+    initial_network = eqx.tree_at(
+        lambda network: (network.mean, network.deviation),
+        initial_network,
+        (jnp.asarray(mean, jnp.float32), jnp.asarray(noisy_deviation, jnp.float32)),
     )
-    noise_scale = jnp.asarray(noise / noisy, jnp.float32)
-    changes = MappedRows(training.rows("change"), network_start.standardise, f"standardised under noise of {noise}")
-    voltages, depth = (jax.random.fold_in(runs.key, one) for one in (1, 2))
+    noise_scale = jnp.asarray(noise / noisy_deviation, jnp.float32)
+    changes = MappedRows(training.rows("change"), initial_network.standardise, f"standardised under noise of {noise}")
+    voltage_key, depth_key = (jax.random.fold_in(runs.key, number) for number in (1, 2))
 
     def denoising_loss(network, batch, key):
-        first, second = jax.random.split(key)
-        noisy = batch + noise_scale * jax.random.normal(first, batch.shape, batch.dtype)
-        return jnp.mean((network(noisy, second) - batch) ** 2), network
+        noise_key, dropout_key = jax.random.split(key)
+        noisy_batch = batch + noise_scale * jax.random.normal(noise_key, batch.shape, batch.dtype)
+        return jnp.mean((network(noisy_batch, dropout_key) - batch) ** 2), network
 
     def map_loss(network, batch, key):
-        return jnp.mean((network(batch, key) - batch) ** 2) / _SCALE, network
+        return jnp.mean((network(batch, key) - batch) ** 2) / _LOSS_SCALE, network
 
     trainings = {
         "voltages": runs.run(
             "voltages",
-            VoltageAutoencoder(validation.change.shape[1], key=voltages),
+            VoltageAutoencoder(validation.change.shape[1], key=voltage_key),
             TrainingObjective(denoising_loss, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=1)),
             changes,
-            network_start.standardise(jnp.asarray(validation.change, jnp.float32)),
+            initial_network.standardise(jnp.asarray(validation.change, jnp.float32)),
         ),
         "maps": runs.run(
             "maps",
-            DepthAutoencoder(shape, key=depth),
+            DepthAutoencoder(shape, key=depth_key),
             TrainingObjective(
-                map_loss, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=(1, 2)) / _SCALE
+                map_loss, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=(1, 2)) / _LOSS_SCALE
             ),
             training.rows("depth"),
             validation.depth,
         ),
     }
-    ends = (trainings["voltages"].network.encoder, trainings["maps"].network.decoder)
-    network_start = eqx.tree_at(lambda one: (one.encoder, one.decoder), network_start, ends)
-    trained = eqx.tree_at(
-        lambda one: one.projection,
-        jax.tree.map(lambda _: False, network_start),
-        jax.tree.map(eqx.is_inexact_array, network_start.projection),
+    trained_parts = (trainings["voltages"].network.encoder, trainings["maps"].network.decoder)
+    initial_network = eqx.tree_at(lambda network: (network.encoder, network.decoder), initial_network, trained_parts)
+    is_trained = eqx.tree_at(
+        lambda network: network.projection,
+        jax.tree.map(lambda _: False, initial_network),
+        jax.tree.map(eqx.is_inexact_array, initial_network.projection),
     )
 
     def projection_loss(network, batch, key):
-        change, wanted = batch
-        noisy = change + noise * jax.random.normal(key, change.shape, change.dtype)
-        return jnp.mean((network(noisy) - wanted) ** 2) / _SCALE, network
+        change, true_maps = batch
+        noisy_change = change + noise * jax.random.normal(key, change.shape, change.dtype)
+        return jnp.mean((network(noisy_change) - true_maps) ** 2) / _LOSS_SCALE, network
 
     rows = training.rows("change", "depth"), _add_noise(validation, noise)
     trainings["projection"] = runs.run(
-        "projection", network_start, TrainingObjective(projection_loss, _map_errors, trained), *rows
+        "projection", initial_network, TrainingObjective(projection_loss, _map_errors, is_trained), *rows
     )
     return TrainedNetwork(trainings["projection"].network, trainings)
 
@@ -255,24 +257,26 @@ def train_unrolled(
     def loss(network, batch, key):
         change, depth = batch
         keys = jax.random.split(key, 4)
-        # Squares of uniform random numbers: most amounts of drift and noise are near the usual ones.
-        drift_size, noise_size = (jax.random.uniform(one, (len(change), 1), change.dtype) ** 2 for one in keys[2:])
-        drift = _DRIFT * drift_size * jax.random.normal(keys[1], (len(change), len(contacts)), change.dtype)
-        own = noise * _LOUDER**noise_size
-        noisy = change + own * jax.random.normal(keys[0], change.shape, change.dtype) + drift @ contacts
-        *early, last = network.maps_after_steps(noisy)
-        value = jnp.mean((last - depth) ** 2)
-        for one in early:
-            value = value + _EARLY * jnp.mean((one - depth) ** 2)
-        expected_misfit = own[:, 0] ** 2 + _MODEL_ERROR**2 * jnp.mean(change**2, axis=1)
-        relative_misfit = jnp.mean((network.predicted_changes(last) - change) ** 2, axis=1) / expected_misfit
+        # The amounts of drift and noise are squares of uniform random numbers, so that most are near the usual amounts.
+        drift_size, noise_size = (
+            jax.random.uniform(size_key, (len(change), 1), change.dtype) ** 2 for size_key in keys[2:]
+        )
+        drift = _MAX_CONTACT_DRIFT * drift_size * jax.random.normal(keys[1], (len(change), len(contacts)), change.dtype)
+        noise_levels = noise * _MAX_NOISE_FACTOR**noise_size
+        noisy_change = change + noise_levels * jax.random.normal(keys[0], change.shape, change.dtype) + drift @ contacts
+        *early_maps, last_map = network.maps_after_steps(noisy_change)
+        loss_value = jnp.mean((last_map - depth) ** 2)
+        for early_map in early_maps:
+            loss_value = loss_value + _EARLY_MAP_WEIGHT * jnp.mean((early_map - depth) ** 2)
+        expected_misfit = noise_levels[:, 0] ** 2 + _MODEL_ERROR**2 * jnp.mean(change**2, axis=1)
+        relative_misfit = jnp.mean((network.predicted_changes(last_map) - change) ** 2, axis=1) / expected_misfit
         # The logarithm of the misfit is used, since touches on electrodes, which the model explains least, would
         # otherwise dominate.
-        return value / _SCALE + _MISFIT * jnp.mean(jnp.log1p(relative_misfit)), network
+        return loss_value / _LOSS_SCALE + _MISFIT_WEIGHT * jnp.mean(jnp.log1p(relative_misfit)), network
 
     rows = training.rows("change", "depth"), _add_noise(validation, noise)
-    found = runs.run("unrolled", untrained, TrainingObjective(loss, _map_errors, untrained.trained), *rows)
-    return TrainedNetwork(found.network, {"unrolled": found})
+    result = runs.run("unrolled", untrained, TrainingObjective(loss, _map_errors, untrained.trained), *rows)
+    return TrainedNetwork(result.network, {"unrolled": result})
 
 
 def shuffle_pairs(examples: TouchExamples, seed: int = 0) -> TouchExamples:
@@ -283,20 +287,22 @@ def shuffle_pairs(examples: TouchExamples, seed: int = 0) -> TouchExamples:
 
 def _map_errors(network, batch):
     change, depth = batch
-    return jnp.mean((network(change) - depth) ** 2, axis=(1, 2)) / _SCALE
+    return jnp.mean((network(change) - depth) ** 2, axis=(1, 2)) / _LOSS_SCALE
 
 
 def mean_and_deviation(rows: Rows) -> tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]]:
-    """Mean and standard deviation of each column of rows that are arrays (n, M), over all their chunks."""
-    number, mean, squares = 0, np.zeros(()), np.zeros(())
-    for chunk, size in enumerate(rows.sizes):
-        own = np.asarray(rows.chunk(chunk), float)
-        middle = own.mean(axis=0)
+    """Compute the mean and standard deviation of each column of rows that are arrays (n, M), over all their chunks."""
+    num_rows, mean, squares = 0, np.zeros(()), np.zeros(())
+    for chunk_index, size in enumerate(rows.sizes):
+        values = np.asarray(rows.chunk(chunk_index), float)
+        chunk_mean = values.mean(axis=0)
         # Sum of squares about the mean of both parts together (Chan, Golub and LeVeque 1983).
-        off, number = middle - mean, number + size
-        squares = squares + ((own - middle) ** 2).sum(axis=0) + off**2 * (number - size) * size / number
-        mean = mean + off * size / number
-    return mean, np.sqrt(squares / number)
+        difference, num_rows = chunk_mean - mean, num_rows + size
+        squares = (
+            squares + ((values - chunk_mean) ** 2).sum(axis=0) + difference**2 * (num_rows - size) * size / num_rows
+        )
+        mean = mean + difference * size / num_rows
+    return mean, np.sqrt(squares / num_rows)
 
 
 def _add_noise(examples: TouchExamples, noise: float) -> tuple[Float[np.ndarray, "n M"], Float[np.ndarray, "n r c"]]:
@@ -309,9 +315,9 @@ def _add_noise(examples: TouchExamples, noise: float) -> tuple[Float[np.ndarray,
 SHAPE = (48, 48)
 # Number of touches of a chunk; seeds of the training set, the held-out set, and the test set, on which no choice
 # depends.
-_CHUNK, _SEEDS = 250, (0, 1, 2)
+_CHUNK_SIZE, _SEED_OFFSETS = 250, (0, 1, 2)
 # Evaluation: diameter of a ball, metres; its depth, divided by the skin's thickness; number of places along a side.
-_BALL, _DEPTH, _PLACES = 0.015, 0.75, 15
+_BALL_DIAMETER, _BALL_DEPTH, _PLACES_PER_SIDE = 0.015, 0.75, 15
 
 
 @dataclass(frozen=True)
@@ -441,43 +447,48 @@ def learn_images(
     report("noise")
     noise = detection_noise(skin)
     sets = {}
-    for name, number, own in zip(
-        ("learnt", "held-out", "standing"), (preset.number, preset.held_out, preset.held_out), _SEEDS, strict=True
+    for name, num_touches, seed_offset in zip(
+        ("learnt", "held-out", "standing"),
+        (preset.number, preset.held_out, preset.held_out),
+        _SEED_OFFSETS,
+        strict=True,
     ):
-        indents = IndentSet(skin, touch_draws(skin), number, seed=3 * seed + own, shape=SHAPE, chunk=_CHUNK)
-        where = work / f"{name}.zarr"
+        indents = IndentSet(
+            skin, touch_draws(skin), num_touches, seed=3 * seed + seed_offset, shape=SHAPE, chunk=_CHUNK_SIZE
+        )
+        path = work / f"{name}.zarr"
         try:
             simulate_presses(
                 indents,
-                where,
+                path,
                 client=client,
-                progress=lambda now, name=name: report(f"touches {name}: {now.points} of {now.all_points}"),
+                progress=lambda state, name=name: report(f"touches {name}: {state.points} of {state.all_points}"),
             )
         except OtherContents:
             raise ValueError(
                 f"folder '{folder}' was begun for another skin, seed or number of touches; give another folder, or "
                 f"delete '{work}' to learn anew."
             ) from None
-        sets[name] = StoredTouches(indents, where)
-    held, judged = (sets[name].in_memory() for name in ("held-out", "standing"))
+        sets[name] = StoredTouches(indents, path)
+    held_out_examples, test_examples = (sets[name].in_memory() for name in ("held-out", "standing"))
     seconds["touches"] = time.monotonic() - start
     key = jax.random.key(seed)
     runs = TrainingRuns(preset.plan_of(design), key, work, progress)
     if design == "unrolled":
         channels = LinearChannels.from_skin(skin, SHAPE)
-        start_network = Unrolled(held.change.shape[1], SHAPE, key=jax.random.fold_in(key, 3))
-        places = image_places(skin, SHAPE[1], SHAPE[0])
-        start_network = start_network.adapted_to_skin(channels, places, skin.layout.centres, noise)
-        learnt = train_unrolled(start_network, channels, sets["learnt"], held, noise, runs)
+        initial_network = Unrolled(held_out_examples.change.shape[1], SHAPE, key=jax.random.fold_in(key, 3))
+        pixel_positions = image_places(skin, SHAPE[1], SHAPE[0])
+        initial_network = initial_network.adapted_to_skin(channels, pixel_positions, skin.layout.centres, noise)
+        trained_network = train_unrolled(initial_network, channels, sets["learnt"], held_out_examples, noise, runs)
     else:
-        learnt = train_three_stages(sets["learnt"], held, noise, runs)
+        trained_network = train_three_stages(sets["learnt"], held_out_examples, noise, runs)
     seconds["training"] = time.monotonic() - start - seconds["touches"]
-    network = ImageNetwork.from_skin(learnt.network, skin, noise, SHAPE)
+    network = ImageNetwork.from_skin(trained_network.network, skin, noise, SHAPE)
     report("standing")
-    standing = evaluate_network(network, skin, judged)
+    standing = evaluate_network(network, skin, test_examples)
     seconds["all"] = time.monotonic() - start
-    write_network(network, Path(folder) / FILE)
-    return LearntImages(network, learnt.courses, standing, seconds)
+    write_network(network, Path(folder) / NETWORK_FILE)
+    return LearntImages(network, trained_network.courses, standing, seconds)
 
 
 def evaluate_network(network: ImageNetwork, skin: Skin, examples: TouchExamples, seed: int = 0) -> ImageStanding:
@@ -489,10 +500,10 @@ def evaluate_network(network: ImageNetwork, skin: Skin, examples: TouchExamples,
 
     maps = estimate_maps(examples.change)
     explained = 1 - float(np.mean((maps - examples.depth) ** 2) / np.mean(examples.depth**2))
-    grid = touches_away_from_the_edge(skin.outline, _BALL / 2, _PLACES, _PLACES)
-    tip, depth = ball_indenter(_BALL), min(_DEPTH * float(skin.thickness), _BALL / 2)
+    grid = touches_away_from_the_edge(skin.outline, _BALL_DIAMETER / 2, _PLACES_PER_SIDE, _PLACES_PER_SIDE)
+    tip, depth = ball_indenter(_BALL_DIAMETER), min(_BALL_DEPTH * float(skin.thickness), _BALL_DIAMETER / 2)
     ball_maps = estimate_maps(relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places]))
     rows, columns = network.shape
-    place = error_statistics(depth_centroids(ball_maps, image_places(skin, columns, rows)), grid.places)
+    place_errors = error_statistics(depth_centroids(ball_maps, image_places(skin, columns, rows)), grid.places)
     deepest = float(np.median(ball_maps.max(axis=(1, 2)))) * float(skin.thickness) / depth
-    return ImageStanding(explained, place, deepest, examples.depth[:6], maps[:6])
+    return ImageStanding(explained, place_errors, deepest, examples.depth[:6], maps[:6])

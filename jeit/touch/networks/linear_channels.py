@@ -34,49 +34,51 @@ _TOUCH_FRACTION = 0.5
 
 
 def deepest_positions(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
-    """Positions (n, 2) of the deepest pixels of maps, metres; `places` (r, c, 2): positions of the pixels,
+    """Return the positions (n, 2) of the deepest pixels of maps, metres; `places` (r, c, 2): positions of the pixels,
     metres."""
     deepest = maps.reshape(len(maps), -1).argmax(axis=1)
     return places.reshape(-1, 2)[deepest]
 
 
 def depth_centroids(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
-    """Centroid (n, 2) of the indentation in each of n maps, metres: the mean position of the pixels deeper than half of
-    the map's maximum depth, weighted by depth. `places` (r, c, 2): positions of the pixels, metres."""
-    flat = maps.reshape(len(maps), -1)
-    most = flat.max(axis=1, keepdims=True)
-    weight = np.where(flat > _TOUCH_FRACTION * most, np.maximum(flat, 0), 0)
+    """Compute the centroid (n, 2) of the indentation in each of n maps, metres: the mean position of the pixels deeper
+    than half of the map's maximum depth, weighted by depth. `places` (r, c, 2): positions of the pixels, metres."""
+    flat_maps = maps.reshape(len(maps), -1)
+    max_depths = flat_maps.max(axis=1, keepdims=True)
+    weights = np.where(flat_maps > _TOUCH_FRACTION * max_depths, np.maximum(flat_maps, 0), 0)
     # A map without any depth gives the middle of the skin.
-    weight = np.where(most > 0, weight, 1.0)
-    return weight @ places.reshape(-1, 2) / weight.sum(axis=1, keepdims=True)
+    weights = np.where(max_depths > 0, weights, 1.0)
+    return weights @ places.reshape(-1, 2) / weights.sum(axis=1, keepdims=True)
 
 
-def error_statistics(estimated: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "n 2"]) -> dict[str, float]:
-    """Mean, standard deviation (sd) and root mean square (rms) of the distance between estimated and true positions,
-    metres."""
-    off = np.linalg.norm(estimated - true, axis=1)
-    return {"mean": float(off.mean()), "sd": float(off.std()), "rms": float(np.sqrt(np.mean(off**2)))}
+def error_statistics(
+    estimated_positions: Float[np.ndarray, "n 2"], true_positions: Float[np.ndarray, "n 2"]
+) -> dict[str, float]:
+    """Compute the mean, standard deviation (sd) and root mean square (rms) of the distance between estimated and true
+    positions, metres."""
+    distances = np.linalg.norm(estimated_positions - true_positions, axis=1)
+    return {"mean": float(distances.mean()), "sd": float(distances.std()), "rms": float(np.sqrt(np.mean(distances**2)))}
 
 
 # Minimum and maximum depth of a touch, divided by the skin's thickness; in Park et al., 1 and 8 mm of 10 mm.
 DEPTHS = (0.1, 0.8)
 # Maximum number of bodies that touch at once.
-_AT_ONCE = 3
+_MAX_BODIES = 3
 # Limit of detection of Park et al., newtons, for a ball of 15 mm diameter; the change at this limit, in standard
 # deviations of the noise; number of places along a side at which the change is computed.
-_DETECTED_FORCE, _DEVIATIONS, _PLACES = 0.7, 3.0, 15
+_DETECTION_LIMIT, _DETECTION_DEVIATIONS, _PLACES_PER_SIDE = 0.7, 3.0, 15
 # Minimum distance of a touch's centre from the skin's edge, divided by the skin's shorter side.
-_MARGIN = 0.04
+_EDGE_MARGIN = 0.04
 
 
 def wrench() -> JoinedIndenters:
-    """An open-ended wrench laid flat, 100 mm long."""
+    """Create an open-ended wrench laid flat, 100 mm long."""
     jaw = PlacedIndenter(RingIndenter(0.030, 0.014), (0.040, 0.0))
     return JoinedIndenters(PlacedIndenter(BarIndenter(0.070, 0.010), (-0.010, 0.0)), jaw)
 
 
 def touching_bodies() -> list[AbstractIndenter]:
-    """Bodies that touch the skin: bells, balls, discs, bars, and a wrench."""
+    """Create the bodies that touch the skin: bells, balls, discs, bars, and a wrench."""
     return [
         *(RevolvedIndenter(Bell(0.02, deviation)) for deviation in (5e-3, 7.5e-3, 10e-3)),
         *(ball_indenter(diameter) for diameter in (0.015, 0.020, 0.030)),
@@ -87,16 +89,17 @@ def touching_bodies() -> list[AbstractIndenter]:
 
 
 def touch_draws(skin: Skin) -> IndentDraws:
-    """Random touches by one to three of the `touching_bodies`, anywhere on a skin and turned by any angle."""
+    """Create random touches by one to three of the `touching_bodies`, anywhere on a skin and turned by any angle."""
     thickness = float(skin.thickness)
     low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
     depth = (DEPTHS[0] * thickness, DEPTHS[1] * thickness)
-    margin = _MARGIN * min(high_x - low_x, high_y - low_y)
-    return IndentDraws(touching_bodies(), skin.flat_outline, depth, margin=margin, at_once=_AT_ONCE)
+    margin = _EDGE_MARGIN * min(high_x - low_x, high_y - low_y)
+    return IndentDraws(touching_bodies(), skin.flat_outline, depth, margin=margin, at_once=_MAX_BODIES)
 
 
-def detection_noise(skin: Skin, limit: float = _DETECTED_FORCE) -> float:
-    """Relative noise of a channel at which a ball of 15 mm diameter, pressed with `limit` newtons, is just detected.
+def detection_noise(skin: Skin, limit: float = _DETECTION_LIMIT) -> float:
+    """Compute the relative noise of a channel at which a ball of 15 mm diameter, pressed with `limit` newtons, is just
+    detected.
 
     The ball is pressed at places all over the skin. At each, the maximum relative change over all channels is computed;
     the noise is a third of the median of these maxima. Park et al. 2022 detect 0.7 N; this load indents a hydrogel of
@@ -104,16 +107,16 @@ def detection_noise(skin: Skin, limit: float = _DETECTED_FORCE) -> float:
     """
     tip = ball_indenter(0.015)
     depth = material("hydrogel").support.pressure(tip, limit).approach
-    grid = touches_away_from_the_edge(skin.flat_outline, 0.0075, _PLACES, _PLACES)
+    grid = touches_away_from_the_edge(skin.flat_outline, 0.0075, _PLACES_PER_SIDE, _PLACES_PER_SIDE)
     change = relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places])
     # Rounded to four digits, which do not depend on the order of summation.
-    return float(f"{np.median(np.abs(change).max(axis=1)) / _DEVIATIONS:.4g}")
+    return float(f"{np.median(np.abs(change).max(axis=1)) / _DETECTION_DEVIATIONS:.4g}")
 
 
 # Number of points along a side of each cell; there are several, since pixels are smaller than cells.
 _POINTS_PER_SIDE = 6
 # Maximum depth for the nonlinear formula; larger depths continue it linearly.
-_MOST_DEPTH = 0.9
+_MAX_DEPTH = 0.9
 
 
 class LinearChannels(NamedTuple):
@@ -133,30 +136,36 @@ class LinearChannels(NamedTuple):
         """Compute the model of a skin, with its pixels on a grid of this shape over its bounding box."""
         rows, columns = shape
         model, conductivity = skin.model, np.asarray(skin.model_conductivity)
-        rest, jacobian = (np.asarray(one) for one in model.voltages_and_jacobian(conductivity))
+        rest_voltages, jacobian = (np.asarray(array) for array in model.voltages_and_jacobian(conductivity))
         points = lattice(np.asarray(model.mesh.points)[np.asarray(model.mesh.cells)], _POINTS_PER_SIDE)
-        cell_changes = relative_to(rest, rest - jacobian.T * np.broadcast_to(conductivity, jacobian.shape[1])[:, None])
+        cell_changes = relative_to(
+            rest_voltages, rest_voltages - jacobian.T * np.broadcast_to(conductivity, jacobian.shape[1])[:, None]
+        )
         tree = KDTree(image_places(skin, columns, rows).reshape(-1, 2))
-        pixel = np.asarray(tree.query(points[..., :2].reshape(-1, 2))[1])
+        pixel_indices = np.asarray(tree.query(points[..., :2].reshape(-1, 2))[1])
         # A point at depth b, divided by the skin's thickness, loses all conductivity under indentations δ > b. The line
         # through 0 that fits this best, for depths drawn uniformly in log δ, is δ ∫ [δ' > b] dδ' / ∫ δ' dδ'. In a
         # sheet, which has no depth b, every point loses δ.
-        share = np.ones(points.shape[:2])
+        point_shares = np.ones(points.shape[:2])
         if skin.num_layers:
-            below = (points[..., 2].max() - points[..., 2]) / float(skin.thickness)
-            least, most = DEPTHS
-            share = np.maximum(most - np.maximum(below, least), 0) / ((most**2 - least**2) / 2)
-        operator = np.zeros((rows * columns, len(rest)))
-        for place, number in enumerate(pixel.reshape(points.shape[:2]).T):
-            np.add.at(operator, number, cell_changes * share[:, place, None] / points.shape[1])
-        return cls(round_relative(operator.T), round_relative(_contact_changes(skin, rest, conductivity)), shape)
+            depths = (points[..., 2].max() - points[..., 2]) / float(skin.thickness)
+            min_depth, max_depth = DEPTHS
+            point_shares = np.maximum(max_depth - np.maximum(depths, min_depth), 0) / (
+                (max_depth**2 - min_depth**2) / 2
+            )
+        operator = np.zeros((rows * columns, len(rest_voltages)))
+        for point_index, cell_pixels in enumerate(pixel_indices.reshape(points.shape[:2]).T):
+            np.add.at(operator, cell_pixels, cell_changes * point_shares[:, point_index, None] / points.shape[1])
+        return cls(
+            round_relative(operator.T), round_relative(_contact_changes(skin, rest_voltages, conductivity)), shape
+        )
 
     def coarser_operator(self) -> Float[np.ndarray, "M p"]:
-        """Operator (M, P / 4) for pixels twice as wide and high: the sum over the four pixels that each of them
-        covers."""
+        """Compute the operator (M, P / 4) for pixels twice as wide and high: the sum over the four pixels that each of
+        them covers."""
         rows, columns = self.shape
-        parts = self.operator.reshape(len(self.operator), rows // 2, 2, columns // 2, 2)
-        return parts.sum(axis=(2, 4)).reshape(len(parts), -1)
+        pixel_blocks = self.operator.reshape(len(self.operator), rows // 2, 2, columns // 2, 2)
+        return pixel_blocks.sum(axis=(2, 4)).reshape(len(pixel_blocks), -1)
 
 
 def round_relative(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -169,7 +178,8 @@ def round_relative(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]
 
 
 def strength(depth):
-    """Strength δ / √(1 − δ), to which changes of voltages are proportional, of an indentation of relative depth δ.
+    """Compute the strength δ / √(1 − δ), to which changes of voltages are proportional, of an indentation of relative
+    depth δ.
 
     δ is the depth divided by the skin's thickness.
 
@@ -177,22 +187,24 @@ def strength(depth):
     In two dimensions, patches with e^s and e^−s times the conductivity change voltages oppositely, to first order in
     their size (Keller's duality). The strength 2 sinh(s / 2), with log(1 − δ) = −s, has this property.
     """
-    clipped = jnp.clip(depth, 0.0, _MOST_DEPTH)
-    return clipped / jnp.sqrt(1 - clipped) + (depth - clipped)
+    clipped_depth = jnp.clip(depth, 0.0, _MAX_DEPTH)
+    return clipped_depth / jnp.sqrt(1 - clipped_depth) + (depth - clipped_depth)
 
 
 def depth_from_strength(strength):
-    """Relative depths δ with the given strengths: the inverse of `strength`. Negative strengths give negative
-    depths."""
-    above = jnp.maximum(strength, 0.0)
-    return (jnp.sqrt(above**2 + 4) - above) * above / 2 + jnp.minimum(strength, 0.0)
+    """Compute the relative depths δ with the given strengths: the inverse of `strength`. Negative strengths give
+    negative depths."""
+    positive_strength = jnp.maximum(strength, 0.0)
+    return (jnp.sqrt(positive_strength**2 + 4) - positive_strength) * positive_strength / 2 + jnp.minimum(strength, 0.0)
 
 
-def _contact_changes(skin: Skin, rest, conductivity) -> Float[np.ndarray, "L M"]:
-    """Relative changes of the M channels per unit of the logarithm of each of the L contact impedances; `rest` (M,):
-    voltages of the untouched skin."""
+def _contact_changes(skin: Skin, rest_voltages, conductivity) -> Float[np.ndarray, "L M"]:
+    """Compute the relative changes of the M channels per unit of the logarithm of each of the L contact impedances;
+    `rest_voltages` (M,): voltages of the untouched skin."""
     model = skin.model
-    fields, impedance = (np.asarray(one) for one in model.fields(conductivity))
-    slope = ContactSensitivity(model.mesh, model.electrodes)(fields, impedance, model.electrodes.contact_impedance)
-    changes = np.stack([select_channels(model.protocol, one) for one in slope])
-    return relative_to(np.asarray(rest), np.asarray(rest) + changes)
+    fields, impedance = (np.asarray(array) for array in model.fields(conductivity))
+    derivatives = ContactSensitivity(model.mesh, model.electrodes)(
+        fields, impedance, model.electrodes.contact_impedance
+    )
+    changes = np.stack([select_channels(model.protocol, derivative) for derivative in derivatives])
+    return relative_to(np.asarray(rest_voltages), np.asarray(rest_voltages) + changes)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jeit.arguments import check_kind
 from jeit.data import Measurement
-from jeit.touch.networks.image_network import MOST_MISSING, ImageNetwork
+from jeit.touch.networks.image_network import MAX_MISSING_FRACTION, ImageNetwork
 
 # Maximum difference, metres, of electrode positions and of the skin's size from those that a network was trained for.
 _POSITION_TOLERANCE = 1e-3
@@ -32,12 +32,12 @@ class FrameDepth(NamedTuple):
 
 
 def resting_frame(frames: Float[np.ndarray, "r M"], name: str = "reference") -> Float[np.ndarray, " M"]:
-    """Mean (M,) of frames of the untouched skin, volts; NaN for channels without a reading.
+    """Compute the mean (M,) of frames of the untouched skin, volts; NaN for channels without a reading.
 
     **Arguments:**
 
     - `frames`: the frames (r, M), volts.
-    - `name`: what they are called in the error.
+    - `name`: name of the frames in error messages.
 
     Raises `ValueError` if more than half of the channels have no reading.
 
@@ -48,11 +48,13 @@ def resting_frame(frames: Float[np.ndarray, "r M"], name: str = "reference") -> 
     image = linear.image(frame - reference)
     ```
     """
-    known = np.isfinite(frames)
-    number = known.sum(axis=0)
-    if np.mean(number == 0) > MOST_MISSING:
-        raise ValueError(f"'{name}' has no voltage of {int(np.sum(number == 0))} of {len(number)} channels.")
-    return np.where(number, np.where(known, frames, 0).sum(axis=0) / np.maximum(number, 1), np.nan)
+    is_known = np.isfinite(frames)
+    num_readings = is_known.sum(axis=0)
+    if np.mean(num_readings == 0) > MAX_MISSING_FRACTION:
+        raise ValueError(
+            f"'{name}' has no voltage of {int(np.sum(num_readings == 0))} of {len(num_readings)} channels."
+        )
+    return np.where(num_readings, np.where(is_known, frames, 0).sum(axis=0) / np.maximum(num_readings, 1), np.nan)
 
 
 def check_measured(network: ImageNetwork, measurement: Measurement) -> None:
@@ -66,15 +68,15 @@ def check_measured(network: ImageNetwork, measurement: Measurement) -> None:
     if np.iscomplexobj(measurement.voltages):
         raise ValueError(f"'{measurement.name}' is complex, and the network was trained on real voltages.")
     _check_extent(network, measurement)
-    places = getattr(measurement.electrodes, "position", None)
-    if places is None or np.ndim(places) != 2:
+    positions = getattr(measurement.electrodes, "position", None)
+    if positions is None or np.ndim(positions) != 2:
         return
-    own = 1e-3 * np.asarray(network.made_for["electrodes_mm"])
-    off = np.linalg.norm(np.asarray(places)[:, :2] - own, axis=1)
-    if off.max() > _POSITION_TOLERANCE:
+    trained_positions = 1e-3 * np.asarray(network.made_for["electrodes_mm"])
+    distances = np.linalg.norm(np.asarray(positions)[:, :2] - trained_positions, axis=1)
+    if distances.max() > _POSITION_TOLERANCE:
         raise ValueError(
-            f"'{measurement.name}': electrode {off.argmax() + 1} is {1e3 * off.max():.3g} mm from where the network's "
-            "is; train one for this skin."
+            f"'{measurement.name}': electrode {distances.argmax() + 1} is {1e3 * distances.max():.3g} mm from where "
+            "the network's is; train one for this skin."
         )
 
 
@@ -82,14 +84,16 @@ def _check_extent(network: ImageNetwork, measurement: Measurement) -> None:
     """Raise `ValueError` if the skin of a measurement differs in size from that of the network by more than a
     millimetre."""
     domain = measurement.domain
-    here = getattr(domain, "extent", None)
-    if here is None or np.shape(here) != (4,):
+    measured_extent = getattr(domain, "extent", None)
+    if measured_extent is None or np.shape(measured_extent) != (4,):
         return
-    own, given = (np.subtract(one[1::2], one[::2]) for one in (network.extent, np.asarray(here, float)))
-    if np.abs(own - given).max() > _POSITION_TOLERANCE:
+    trained_size, measured_size = (
+        np.subtract(extent[1::2], extent[::2]) for extent in (network.extent, np.asarray(measured_extent, float))
+    )
+    if np.abs(trained_size - measured_size).max() > _POSITION_TOLERANCE:
         raise ValueError(
-            f"'{measurement.name}': its skin is {1e3 * given[0]:.4g} × {1e3 * given[1]:.4g} mm, and the network's "
-            f"{1e3 * own[0]:.4g} × {1e3 * own[1]:.4g} mm; train one for this skin."
+            f"'{measurement.name}': its skin is {1e3 * measured_size[0]:.4g} × {1e3 * measured_size[1]:.4g} mm, and "
+            f"the network's {1e3 * trained_size[0]:.4g} × {1e3 * trained_size[1]:.4g} mm; train one for this skin."
         )
 
 
@@ -117,8 +121,8 @@ def stream_depths(network: ImageNetwork, frames: Iterable, rest: Float[np.ndarra
     """
     check_kind("frames", frames, Iterable, "frames one after another, each (M,) volts")
     network.doubts(np.ones((1, len(rest))), network.share(np.zeros((1, len(rest)))))
-    for number, frame in enumerate(frames):
-        begin = time.perf_counter()
+    for frame_index, frame in enumerate(frames):
+        start_time = time.perf_counter()
         try:
             change = network.changes(np.asarray(frame, float), rest)
             share = network.share(change)
@@ -126,4 +130,4 @@ def stream_depths(network: ImageNetwork, frames: Iterable, rest: Float[np.ndarra
             depth = None if reason else network.thickness * share[0]
         except (ValueError, TypeError) as error:
             depth, reason = None, " ".join(str(error).split())
-        yield FrameDepth(number, depth, reason, time.perf_counter() - begin)
+        yield FrameDepth(frame_index, depth, reason, time.perf_counter() - start_time)

@@ -19,7 +19,7 @@ from jeit_solvers.module import Module
 
 
 class Dense(Module):
-    """Dense layer x W + b for a batch x (b, i)."""
+    """Dense layer x W + b for a batch x (b, i), with the `weight` W and the `bias` b."""
 
     weight: Float[Array, "i o"]
     bias: Float[Array, " o"]
@@ -50,8 +50,8 @@ class Convolution(Module):
     def __call__(self, image: Float[Array, "b r c i"]) -> Float[Array, "b p q o"]:
         """Apply the layer to a batch."""
         layout = ("NHWC", "HWIO", "NHWC")
-        steps = (self.stride, self.stride)
-        return jax.lax.conv_general_dilated(image, self.weight, steps, "SAME", dimension_numbers=layout) + self.bias
+        strides = (self.stride, self.stride)
+        return jax.lax.conv_general_dilated(image, self.weight, strides, "SAME", dimension_numbers=layout) + self.bias
 
     def apply_to_repeated(self, image: Float[Array, "b r c i"]) -> Float[Array, "b s d o"]:
         """Return the layer's output for `repeat_pixels(image)`, with four ninths of the multiplications.
@@ -59,19 +59,24 @@ class Convolution(Module):
         Of the three rows of the enlarged image that contribute to a pixel, two are equal, so the weights of both are
         added before the multiplication; likewise for columns.
         """
-        number, rows, columns, _ = image.shape
-        tall = jnp.stack([self.weight.at[1].add(self.weight[2])[:2], self.weight.at[1].add(self.weight[0])[1:]])
-        wide = [tall.at[:, :, 1].add(tall[:, :, 2])[:, :, :2], tall.at[:, :, 1].add(tall[:, :, 0])[:, :, 1:]]
-        both = jnp.moveaxis(jnp.stack(wide, axis=1), (0, 1), (3, 4)).reshape(2, 2, image.shape[-1], -1)
+        num_images, rows, columns, _ = image.shape
+        row_weights = jnp.stack([self.weight.at[1].add(self.weight[2])[:2], self.weight.at[1].add(self.weight[0])[1:]])
+        column_weights = [
+            row_weights.at[:, :, 1].add(row_weights[:, :, 2])[:, :, :2],
+            row_weights.at[:, :, 1].add(row_weights[:, :, 0])[:, :, 1:],
+        ]
+        pixel_weights = jnp.moveaxis(jnp.stack(column_weights, axis=1), (0, 1), (3, 4)).reshape(
+            2, 2, image.shape[-1], -1
+        )
         # The image is padded in advance: for a padded convolution of even size, XLA takes twenty times as long to
         # compute derivatives.
-        framed = jnp.pad(image, ((0, 0), (1, 1), (1, 1), (0, 0)))
+        padded_image = jnp.pad(image, ((0, 0), (1, 1), (1, 1), (0, 0)))
         layout = ("NHWC", "HWIO", "NHWC")
-        parts = jax.lax.conv_general_dilated(framed, both, (1, 1), "VALID", dimension_numbers=layout)
-        parts = parts.reshape(number, rows + 1, columns + 1, 2, 2, -1)
-        lines = [[parts[:, a : a + rows, b : b + columns, a, b] for b in (0, 1)] for a in (0, 1)]
-        whole = jnp.stack([jnp.stack(line, axis=3) for line in lines], axis=2)
-        return whole.reshape(number, 2 * rows, 2 * columns, -1) + self.bias
+        outputs = jax.lax.conv_general_dilated(padded_image, pixel_weights, (1, 1), "VALID", dimension_numbers=layout)
+        outputs = outputs.reshape(num_images, rows + 1, columns + 1, 2, 2, -1)
+        output_rows = [[outputs[:, a : a + rows, b : b + columns, a, b] for b in (0, 1)] for a in (0, 1)]
+        output_image = jnp.stack([jnp.stack(output_row, axis=3) for output_row in output_rows], axis=2)
+        return output_image.reshape(num_images, 2 * rows, 2 * columns, -1) + self.bias
 
 
 class Chain(Module):
@@ -87,32 +92,34 @@ class Chain(Module):
     def dense(cls, widths: Sequence[int], *, key: Array, dropout: float = 0.0) -> "Chain":
         """Create dense layers in sequence, from each of the `widths` to the next."""
         keys = jax.random.split(key, len(widths) - 1)
-        return cls(tuple(Dense(i, o, key=one) for (i, o), one in zip(pairwise(widths), keys, strict=True)), dropout)
+        return cls(
+            tuple(Dense(i, o, key=layer_key) for (i, o), layer_key in zip(pairwise(widths), keys, strict=True)), dropout
+        )
 
     def __call__(self, values: Array, key: Array | None = None) -> Array:
         """Apply the layers to a batch; the output of the last layer has no activation function."""
-        for number, layer in enumerate(self.layers):
-            if number:
+        for layer_index, layer in enumerate(self.layers):
+            if layer_index:
                 values = jax.nn.elu(values)
                 if key is not None and self.dropout:
-                    kept = jax.random.bernoulli(jax.random.fold_in(key, number), 1 - self.dropout, values.shape)
-                    values = jnp.where(kept, values / (1 - self.dropout), 0.0)
+                    is_kept = jax.random.bernoulli(jax.random.fold_in(key, layer_index), 1 - self.dropout, values.shape)
+                    values = jnp.where(is_kept, values / (1 - self.dropout), 0.0)
             values = layer(values)  # pyright: ignore[reportCallIssue]
         return values
 
 
 def repeat_pixels(image: Float[Array, "b r c i"]) -> Float[Array, "b s d i"]:
     """Enlarge images to twice the rows and columns: each pixel becomes 2 × 2 equal pixels."""
-    number, rows, columns, channels = image.shape
-    wide = jnp.broadcast_to(image[:, :, None, :, None], (number, rows, 2, columns, 2, channels))
-    return wide.reshape(number, 2 * rows, 2 * columns, channels)
+    num_images, rows, columns, num_channels = image.shape
+    repeated_image = jnp.broadcast_to(image[:, :, None, :, None], (num_images, rows, 2, columns, 2, num_channels))
+    return repeated_image.reshape(num_images, 2 * rows, 2 * columns, num_channels)
 
 
 def channels_to_pixels(image: Float[Array, "b r c 4"]) -> Float[Array, "b s d"]:
     """Arrange the four channels of each pixel as 2 × 2 pixels of one channel."""
-    number, rows, columns, _ = image.shape
-    parts = image.reshape(number, rows, columns, 2, 2)
-    return jnp.moveaxis(parts, 3, 2).reshape(number, 2 * rows, 2 * columns)
+    num_images, rows, columns, _ = image.shape
+    pixel_blocks = image.reshape(num_images, rows, columns, 2, 2)
+    return jnp.moveaxis(pixel_blocks, 3, 2).reshape(num_images, 2 * rows, 2 * columns)
 
 
 def _draw_weights(key: Array, shape: tuple[int, ...], inputs: int) -> Array:
@@ -120,10 +127,12 @@ def _draw_weights(key: Array, shape: tuple[int, ...], inputs: int) -> Array:
     return jax.random.normal(key, shape, jnp.float32) * np.float32(np.sqrt(2 / inputs))
 
 
-_HIDDEN, _LATENT, _DROPOUT = 256, 84, 0.03
-_CHANNELS, _CODE = (16, 32, 64), 128
+# Numbers of values of the hidden layers and of the latent vector, and dropout rate, of the autoencoder of voltages;
+# numbers of channels of the convolutions and of values of the code of depth maps.
+_HIDDEN_SIZE, _LATENT_SIZE, _DROPOUT_RATE = 256, 84, 0.03
+_NUM_FILTERS, _CODE_SIZE = (16, 32, 64), 128
 # Standard deviation of the noise added to the input of the autoencoder of depth maps, divided by the thickness.
-_NOISE = 0.02
+_DEPTH_NOISE = 0.02
 
 
 class VoltageAutoencoder(Module):
@@ -132,16 +141,16 @@ class VoltageAutoencoder(Module):
     encoder: Chain
     decoder: Chain
 
-    def __init__(self, channels: int, *, key: Array):
-        """Create an untrained autoencoder for `channels` channels."""
-        inwards, outwards = jax.random.split(key)
-        self.encoder = Chain.dense((channels, _HIDDEN, _LATENT), key=inwards, dropout=_DROPOUT)
-        self.decoder = Chain.dense((_LATENT, _HIDDEN, channels), key=outwards, dropout=_DROPOUT)
+    def __init__(self, num_channels: int, *, key: Array):
+        """Create an untrained autoencoder for `num_channels` channels."""
+        encoder_key, decoder_key = jax.random.split(key)
+        self.encoder = Chain.dense((num_channels, _HIDDEN_SIZE, _LATENT_SIZE), key=encoder_key, dropout=_DROPOUT_RATE)
+        self.decoder = Chain.dense((_LATENT_SIZE, _HIDDEN_SIZE, num_channels), key=decoder_key, dropout=_DROPOUT_RATE)
 
     def __call__(self, changes: Float[Array, "b M"], key: Array | None = None) -> Float[Array, "b M"]:
         """Reconstruct changes without noise; dropout is applied if a key is given."""
-        first, second = (None, None) if key is None else jax.random.split(key)
-        return self.decoder(jax.nn.elu(self.encoder(changes, first)), second)
+        encoder_key, decoder_key = (None, None) if key is None else jax.random.split(key)
+        return self.decoder(jax.nn.elu(self.encoder(changes, encoder_key)), decoder_key)
 
 
 class DepthEncoder(Module):
@@ -152,10 +161,12 @@ class DepthEncoder(Module):
 
     def __init__(self, shape: tuple[int, int], *, key: Array):
         """Create an untrained network for maps of this shape; rows and columns are multiples of 8."""
-        *keys, last = jax.random.split(key, len(_CHANNELS) + 1)
-        widths = (1, *_CHANNELS)
-        self.layers = tuple(Convolution(i, o, 2, key=one) for (i, o), one in zip(pairwise(widths), keys, strict=True))
-        self.last = Dense(shape[0] * shape[1] // 64 * _CHANNELS[-1], _CODE, key=last)
+        *layer_keys, last_key = jax.random.split(key, len(_NUM_FILTERS) + 1)
+        widths = (1, *_NUM_FILTERS)
+        self.layers = tuple(
+            Convolution(i, o, 2, key=layer_key) for (i, o), layer_key in zip(pairwise(widths), layer_keys, strict=True)
+        )
+        self.last = Dense(shape[0] * shape[1] // 64 * _NUM_FILTERS[-1], _CODE_SIZE, key=last_key)
 
     def __call__(self, maps: Float[Array, "b r c"]) -> Float[Array, "b 128"]:
         """Encode a batch."""
@@ -174,11 +185,13 @@ class DepthDecoder(Module):
 
     def __init__(self, shape: tuple[int, int], *, key: Array):
         """Create an untrained network for maps of this shape; rows and columns are multiples of 8."""
-        first, *keys = jax.random.split(key, len(_CHANNELS) + 1)
-        widths = (*_CHANNELS[::-1], 1)
+        first_key, *layer_keys = jax.random.split(key, len(_NUM_FILTERS) + 1)
+        widths = (*_NUM_FILTERS[::-1], 1)
         self.shape = (shape[0] // 8, shape[1] // 8)
-        self.first = Dense(_CODE, self.shape[0] * self.shape[1] * widths[0], key=first)
-        self.layers = tuple(Convolution(i, o, key=one) for (i, o), one in zip(pairwise(widths), keys, strict=True))
+        self.first = Dense(_CODE_SIZE, self.shape[0] * self.shape[1] * widths[0], key=first_key)
+        self.layers = tuple(
+            Convolution(i, o, key=layer_key) for (i, o), layer_key in zip(pairwise(widths), layer_keys, strict=True)
+        )
 
     def __call__(self, code: Float[Array, "b 128"]) -> Float[Array, "b r c"]:
         """Decode a batch."""
@@ -196,13 +209,13 @@ class DepthAutoencoder(Module):
 
     def __init__(self, shape: tuple[int, int], *, key: Array):
         """Create an untrained network for maps of this shape; rows and columns are multiples of 8."""
-        inwards, outwards = jax.random.split(key)
-        self.encoder, self.decoder = DepthEncoder(shape, key=inwards), DepthDecoder(shape, key=outwards)
+        encoder_key, decoder_key = jax.random.split(key)
+        self.encoder, self.decoder = DepthEncoder(shape, key=encoder_key), DepthDecoder(shape, key=decoder_key)
 
     def __call__(self, maps: Float[Array, "b r c"], key: Array | None = None) -> Float[Array, "b r c"]:
         """Reconstruct maps; noise is added to the input if a key is given."""
         if key is not None:
-            maps = maps + _NOISE * jax.random.normal(key, maps.shape, maps.dtype)
+            maps = maps + _DEPTH_NOISE * jax.random.normal(key, maps.shape, maps.dtype)
         return self.decoder(jax.nn.elu(self.encoder(maps)))
 
 
@@ -219,13 +232,13 @@ class ThreeStages(Module):
     projection: Chain
     decoder: DepthDecoder
 
-    def __init__(self, channels: int, shape: tuple[int, int], *, key: Array):
-        """Create an untrained network for `channels` channels and maps of this shape."""
-        voltages, depth, between = jax.random.split(key, 3)
-        self.mean, self.deviation = jnp.zeros(channels, jnp.float32), jnp.ones(channels, jnp.float32)
-        self.encoder = VoltageAutoencoder(channels, key=voltages).encoder
-        self.projection = Chain.dense((_LATENT, _HIDDEN, _HIDDEN, _CODE), key=between)
-        self.decoder = DepthAutoencoder(shape, key=depth).decoder
+    def __init__(self, num_channels: int, shape: tuple[int, int], *, key: Array):
+        """Create an untrained network for `num_channels` channels and maps of this shape."""
+        encoder_key, decoder_key, projection_key = jax.random.split(key, 3)
+        self.mean, self.deviation = jnp.zeros(num_channels, jnp.float32), jnp.ones(num_channels, jnp.float32)
+        self.encoder = VoltageAutoencoder(num_channels, key=encoder_key).encoder
+        self.projection = Chain.dense((_LATENT_SIZE, _HIDDEN_SIZE, _HIDDEN_SIZE, _CODE_SIZE), key=projection_key)
+        self.decoder = DepthAutoencoder(shape, key=decoder_key).decoder
 
     def standardise(self, changes: Float[Array, "b M"]) -> Float[Array, "b M"]:
         """Standardise changes by the `mean` and `deviation` of the training set."""

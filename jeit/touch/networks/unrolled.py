@@ -18,11 +18,12 @@ from jeit.touch.networks.linear_channels import LinearChannels, depth_from_stren
 from jeit.touch.networks.three_stages import Convolution, channels_to_pixels, repeat_pixels
 from jeit_solvers.module import Module
 
-_WIDE, _NARROW = 24, 16
+# Numbers of channels of the network's inner layers and of its outer ones.
+_INNER_CHANNELS, _OUTER_CHANNELS = 24, 16
 # Prior: standard deviation of a pixel's strength; its correlation length, divided by the skin's longer side. Linear
 # images: multiples of the noise for the images without drift, of which the first is the initial map; standard deviation
 # of the drift of log contact impedances, for one more image.
-_DEVIATION, _LENGTH, _TIMES, _DRIFT = 0.15, 0.04, (8.0, 1.5), 0.05
+_STRENGTH_DEVIATION, _CORRELATION_LENGTH, _NOISE_MULTIPLES, _CONTACT_DRIFT = 0.15, 0.04, (8.0, 1.5), 0.05
 
 
 class Refinement(Module):
@@ -33,60 +34,63 @@ class Refinement(Module):
     outwards: tuple[Convolution, ...]
     last: Convolution
 
-    def __init__(self, channels: int, *, key: Array):
-        """Create an untrained network for images with `channels` channels."""
+    def __init__(self, num_channels: int, *, key: Array):
+        """Create an untrained network for images with `num_channels` channels."""
         keys = jax.random.split(key, 9)
         self.inwards = (
-            Convolution(channels, _NARROW, key=keys[0]),
-            Convolution(_NARROW, _WIDE, 2, key=keys[1]),
-            Convolution(_WIDE, _WIDE, key=keys[2]),
-            Convolution(_WIDE, _WIDE, 2, key=keys[3]),
-            Convolution(_WIDE, _WIDE, key=keys[4]),
+            Convolution(num_channels, _OUTER_CHANNELS, key=keys[0]),
+            Convolution(_OUTER_CHANNELS, _INNER_CHANNELS, 2, key=keys[1]),
+            Convolution(_INNER_CHANNELS, _INNER_CHANNELS, key=keys[2]),
+            Convolution(_INNER_CHANNELS, _INNER_CHANNELS, 2, key=keys[3]),
+            Convolution(_INNER_CHANNELS, _INNER_CHANNELS, key=keys[4]),
         )
         self.outwards = (
-            Convolution(_WIDE, _WIDE, key=keys[5]),
-            Convolution(_WIDE, _NARROW, key=keys[6]),
-            Convolution(_NARROW, _NARROW, key=keys[7]),
+            Convolution(_INNER_CHANNELS, _INNER_CHANNELS, key=keys[5]),
+            Convolution(_INNER_CHANNELS, _OUTER_CHANNELS, key=keys[6]),
+            Convolution(_OUTER_CHANNELS, _OUTER_CHANNELS, key=keys[7]),
         )
-        last = Convolution(_NARROW, 4, key=keys[8])
+        last_layer = Convolution(_OUTER_CHANNELS, 4, key=keys[8])
         # The initial weights are small, so that an untrained network hardly changes the linear images.
-        self.last = eqx.tree_at(lambda one: one.weight, last, 0.01 * last.weight)
+        self.last = eqx.tree_at(lambda layer: layer.weight, last_layer, 0.01 * last_layer.weight)
 
     def __call__(self, images: Float[Array, "b r c i"]) -> Float[Array, "b s d"]:
         """Apply the network to a batch."""
         elu = jax.nn.elu
-        first = elu(self.inwards[0](images))
-        second = elu(self.inwards[2](elu(self.inwards[1](first))))
-        third = elu(self.inwards[4](elu(self.inwards[3](second))))
-        wide = elu(self.outwards[0](second + repeat_pixels(third)))
-        fine = elu(self.outwards[2](first + repeat_pixels(elu(self.outwards[1](wide)))))
-        return channels_to_pixels(self.last(fine))
+        full_features = elu(self.inwards[0](images))
+        half_features = elu(self.inwards[2](elu(self.inwards[1](full_features))))
+        quarter_features = elu(self.inwards[4](elu(self.inwards[3](half_features))))
+        half_decoded = elu(self.outwards[0](half_features + repeat_pixels(quarter_features)))
+        full_decoded = elu(self.outwards[2](full_features + repeat_pixels(elu(self.outwards[1](half_decoded)))))
+        return channels_to_pixels(self.last(full_decoded))
 
 
 class Unrolled(Module):
     """Network from relative changes (b, M) to depth maps (b, rows, columns), divided by the skin's thickness.
 
     **Fields**: `operator` (M, P): response of the channels to the pixels; `imagers` (M, p, k): transposed matrices of
-    the linear images, on pixels twice as wide; `still` (rows / 2, columns / 2, s): constant images that describe the
-    skin; `steps`: networks that correct the map; `shape`: (rows, columns) of the maps. Only `steps` are trained; the
-    others depend on the skin.
+    the linear images, on pixels twice as wide; `constant_images` (rows / 2, columns / 2, s): constant images that
+    describe the skin; `steps`: networks that correct the map; `shape`: (rows, columns) of the maps. Only `steps` are
+    trained; the others depend on the skin.
     """
 
     operator: Float[Array, "M P"]
     imagers: Float[Array, "M p k"]
-    still: Float[Array, "r c s"]
+    constant_images: Float[Array, "r c s"]
     steps: tuple[Refinement, ...]
     shape: tuple[int, int] = eqx.field(static=True)
 
-    def __init__(self, channels: int, shape: tuple[int, int], num_steps: int = 1, *, key: Array):
-        """Create an untrained network for `channels` channels and maps of this shape, not yet adapted to a skin."""
+    def __init__(self, num_channels: int, shape: tuple[int, int], num_steps: int = 1, *, key: Array):
+        """Create an untrained network for `num_channels` channels and maps of this shape, not yet adapted to a skin."""
         rows, columns = shape[0] // 2, shape[1] // 2
-        images = len(_TIMES) + 1
-        self.operator = jnp.zeros((channels, shape[0] * shape[1]), jnp.float32)
-        self.imagers = jnp.zeros((channels, rows * columns, images), jnp.float32)
-        self.still = jnp.zeros((rows, columns, 2), jnp.float32)
+        num_images = len(_NOISE_MULTIPLES) + 1
+        self.operator = jnp.zeros((num_channels, shape[0] * shape[1]), jnp.float32)
+        self.imagers = jnp.zeros((num_channels, rows * columns, num_images), jnp.float32)
+        self.constant_images = jnp.zeros((rows, columns, 2), jnp.float32)
         keys = jax.random.split(key, num_steps)
-        self.steps = tuple(Refinement(images + 2 + (4 if number else 0), key=one) for number, one in enumerate(keys))
+        self.steps = tuple(
+            Refinement(num_images + 2 + (4 if step_index else 0), key=step_key)
+            for step_index, step_key in enumerate(keys)
+        )
         self.shape = shape
 
     def adapted_to_skin(
@@ -99,54 +103,67 @@ class Unrolled(Module):
         """
         operator = channels.coarser_operator()
         covariance = _covariance(pixel_positions[::2, ::2].reshape(-1, 2))
-        across = operator @ covariance
-        own = across @ operator.T
-        drift = _DRIFT**2 * channels.contacts.T @ channels.contacts
-        white = noise**2 * np.eye(len(own))
-        rests = [*(times**2 * white for times in _TIMES), white + drift]
-        imagers = np.stack([np.linalg.solve(own + rest, across) for rest in rests], axis=-1)
-        middles = pixel_positions.reshape(self.shape[0] // 2, 2, self.shape[1] // 2, 2, 2).mean(axis=(1, 3))
-        distance = np.linalg.norm(middles[..., None, :] - np.asarray(electrode_positions), axis=-1).min(axis=-1)
-        response = np.log(np.linalg.norm(operator, axis=0).reshape(distance.shape) + 1e-9)
-        still = np.stack([distance / distance.max(), (response - response.mean()) / response.std()], axis=-1)
-        arrays = [jnp.asarray(round_relative(one), jnp.float32) for one in (channels.operator, imagers, still)]
-        return eqx.tree_at(lambda one: (one.operator, one.imagers, one.still), self, arrays)
+        cross_covariance = operator @ covariance
+        change_covariance = cross_covariance @ operator.T
+        drift = _CONTACT_DRIFT**2 * channels.contacts.T @ channels.contacts
+        noise_covariance = noise**2 * np.eye(len(change_covariance))
+        error_covariances = [
+            *(multiple**2 * noise_covariance for multiple in _NOISE_MULTIPLES),
+            noise_covariance + drift,
+        ]
+        imagers = np.stack(
+            [
+                np.linalg.solve(change_covariance + error_covariance, cross_covariance)
+                for error_covariance in error_covariances
+            ],
+            axis=-1,
+        )
+        block_centres = pixel_positions.reshape(self.shape[0] // 2, 2, self.shape[1] // 2, 2, 2).mean(axis=(1, 3))
+        distances = np.linalg.norm(block_centres[..., None, :] - np.asarray(electrode_positions), axis=-1).min(axis=-1)
+        response = np.log(np.linalg.norm(operator, axis=0).reshape(distances.shape) + 1e-9)
+        constant_images = np.stack(
+            [distances / distances.max(), (response - response.mean()) / response.std()], axis=-1
+        )
+        arrays = [
+            jnp.asarray(round_relative(array), jnp.float32) for array in (channels.operator, imagers, constant_images)
+        ]
+        return eqx.tree_at(lambda network: (network.operator, network.imagers, network.constant_images), self, arrays)
 
     @property
     def trained(self) -> "Unrolled":
         """Tree of booleans like the network: true for the arrays that are trained."""
-        nothing = jax.tree.map(lambda _: False, self)
-        return eqx.tree_at(lambda one: one.steps, nothing, jax.tree.map(eqx.is_inexact_array, self.steps))
+        all_false = jax.tree.map(lambda _: False, self)
+        return eqx.tree_at(lambda network: network.steps, all_false, jax.tree.map(eqx.is_inexact_array, self.steps))
 
     def covariance(self, pixel_positions: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "M M"]:
-        """Covariance (M, M) of the changes of channels for strengths of the prior, with pixels at `pixel_positions` (r,
-        c, 2), metres."""
+        """Compute the covariance (M, M) of the changes of channels for strengths of the prior, with pixels at
+        `pixel_positions` (r, c, 2), metres."""
         rows, columns = self.shape[0] // 2, self.shape[1] // 2
         operator = np.asarray(self.operator, float).reshape(-1, rows, 2, columns, 2).sum(axis=(2, 4))
         operator = operator.reshape(len(operator), -1)
         return operator @ _covariance(pixel_positions[::2, ::2].reshape(-1, 2)) @ operator.T
 
     def predicted_changes(self, maps: Float[Array, "b r c"]) -> Float[Array, "b M"]:
-        """Relative changes (b, M) that the forward model predicts for maps."""
+        """Compute the relative changes (b, M) that the forward model predicts for maps."""
         return strength(maps).reshape(len(maps), -1) @ self.operator.T
 
     def maps_after_steps(self, changes: Float[Array, "b M"]) -> list[Float[Array, "b r c"]]:
         """Compute the depth maps (b, rows, columns) after each step of the network."""
-        number, (rows, columns) = len(changes), (self.shape[0] // 2, self.shape[1] // 2)
-        still = jnp.broadcast_to(self.still, (number, *self.still.shape))
-        found = []
+        num_frames, (rows, columns) = len(changes), (self.shape[0] // 2, self.shape[1] // 2)
+        constant_images = jnp.broadcast_to(self.constant_images, (num_frames, *self.constant_images.shape))
+        maps_of_steps = []
         for step in self.steps:
-            rest = changes - self.predicted_changes(found[-1]) if found else changes
-            images = (rest @ self.imagers.reshape(len(self.imagers), -1)).reshape(number, rows, columns, -1)
-            parts = [images / _DEVIATION, still]
-            if found:
-                maps = found[-1]
-                folded = maps.reshape(number, rows, 2, columns, 2)
-                parts.append(jnp.moveaxis(folded, 2, 3).reshape(number, rows, columns, 4))
+            residual = changes - self.predicted_changes(maps_of_steps[-1]) if maps_of_steps else changes
+            images = (residual @ self.imagers.reshape(len(self.imagers), -1)).reshape(num_frames, rows, columns, -1)
+            inputs = [images / _STRENGTH_DEVIATION, constant_images]
+            if maps_of_steps:
+                maps = maps_of_steps[-1]
+                pixel_blocks = maps.reshape(num_frames, rows, 2, columns, 2)
+                inputs.append(jnp.moveaxis(pixel_blocks, 2, 3).reshape(num_frames, rows, columns, 4))
             else:
                 maps = repeat_pixels(depth_from_strength(images[..., :1]))[..., 0]
-            found.append(maps + step(jnp.concatenate(parts, axis=-1)))
-        return found
+            maps_of_steps.append(maps + step(jnp.concatenate(inputs, axis=-1)))
+        return maps_of_steps
 
     def __call__(self, changes: Float[Array, "b M"]) -> Float[Array, "b r c"]:
         """Compute the depth maps (b, rows, columns) after the last step."""
@@ -154,7 +171,8 @@ class Unrolled(Module):
 
 
 def _covariance(pixel_positions: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p p"]:
-    """Gaussian covariance of the strengths of pixels at `pixel_positions`, as a function of their distance."""
-    length = _LENGTH * np.ptp(pixel_positions, axis=0).max()
-    squared = ((pixel_positions[:, None] - pixel_positions) ** 2).sum(axis=-1)
-    return _DEVIATION**2 * np.exp(-squared / (2 * length**2))
+    """Compute the Gaussian covariance of the strengths of pixels at `pixel_positions`, as a function of their
+    distance."""
+    length = _CORRELATION_LENGTH * np.ptp(pixel_positions, axis=0).max()
+    squared_distances = ((pixel_positions[:, None] - pixel_positions) ** 2).sum(axis=-1)
+    return _STRENGTH_DEVIATION**2 * np.exp(-squared_distances / (2 * length**2))

@@ -75,10 +75,10 @@ def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axe
         ax.add_patch(Polygon(contact.contour, fill=False, edgecolor=INK, linewidth=1.2, zorder=3))
         ax.plot(x, y, marker="+", color=INK, markersize=9, markeredgewidth=1.4, zorder=4, path_effects=_HALO)
         text = f"({1e3 * x:+.1f}, {1e3 * y:+.1f}) mm".replace("-", "−")
-        top = contact.contour[:, 1].max()
+        contour_top = contact.contour[:, 1].max()
         ax.annotate(
             text,
-            (x, top),
+            (x, contour_top),
             (0, 4),
             textcoords="offset points",
             ha="center",
@@ -93,12 +93,12 @@ def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axe
 def check_contacts(contacts) -> None:
     """Check that `contacts` is a list of contacts. Raises `ValueError` otherwise."""
     check_kind("contacts", contacts, (list, tuple), "a list of contacts, as of find_contacts(finder, image)")
-    for number, contact in enumerate(contacts):
-        check_kind(f"contacts[{number}]", contact, Contact, "a Contact")
+    for index, contact in enumerate(contacts):
+        check_kind(f"contacts[{index}]", contact, Contact, "a Contact")
 
 
 def largest_magnitude(values: np.ndarray) -> float:
-    """Maximum magnitude of the finite values; 0 if there are none."""
+    """Return the maximum magnitude of the finite values; 0 if there are none."""
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
@@ -128,22 +128,22 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     axes = _new_axes() if axes is None else np.asarray(axes, object).ravel()
     if axes.size != len(_TITLES):
         raise ValueError(f"axes: give six, one for each stage; there are {axes.size}.")
-    inside = np.isfinite(stages.region)
+    is_inside = np.isfinite(stages.region)
     factor, with_prefix = with_si_prefix(largest_magnitude(stages.region), unit)
-    strongest = factor * largest_magnitude(stages.region) or 1.0
-    keywords = {"cmap": "RdBu_r", "vmin": -strongest, "vmax": strongest}
-    region = _draw_pixels(axes[0], factor * stages.region, stages, keywords)
+    colour_limit = factor * largest_magnitude(stages.region) or 1.0
+    colour_options = {"cmap": "RdBu_r", "vmin": -colour_limit, "vmax": colour_limit}
+    region_image = _draw_pixels(axes[0], factor * stages.region, stages, colour_options)
     # The colour bar is as tall as its image, whatever the height of the axes.
-    bar = axes[0].inset_axes((1.02, 0.1, 0.035, 0.8))
-    draw_colour_bar(axes[0], region, f"Change ({with_prefix})", show_sign=True, position=bar)
-    black = {"cmap": "gray", "vmin": 0, "vmax": 255}
-    greys = (stages.grey, 255.0 * stages.threshold, 255.0 * stages.opened, stages.grey)
-    for ax, pixels in zip(axes[1:5], greys, strict=True):
-        _draw_pixels(ax, np.where(inside, pixels, np.nan), stages, black)
+    colour_bar_axes = axes[0].inset_axes((1.02, 0.1, 0.035, 0.8))
+    draw_colour_bar(axes[0], region_image, f"Change ({with_prefix})", show_sign=True, position=colour_bar_axes)
+    grey_options = {"cmap": "gray", "vmin": 0, "vmax": 255}
+    grey_images = (stages.grey, 255.0 * stages.threshold, 255.0 * stages.opened, stages.grey)
+    for ax, pixels in zip(axes[1:5], grey_images, strict=True):
+        _draw_pixels(ax, np.where(is_inside, pixels, np.nan), stages, grey_options)
     for contact in stages.contacts:
-        closed = np.vstack([contact.contour, contact.contour[:1]])
-        axes[4].plot(*closed.T, color="#d1495b", linewidth=1.4)
-    _draw_pixels(axes[5], factor * stages.region, stages, keywords)
+        closed_contour = np.vstack([contact.contour, contact.contour[:1]])
+        axes[4].plot(*closed_contour.T, color="#d1495b", linewidth=1.4)
+    _draw_pixels(axes[5], factor * stages.region, stages, colour_options)
     draw_contacts(stages.contacts, ax=axes[5])
     for ax, title in zip(axes, _TITLES, strict=True):
         hide_axes(ax, stages.extent, numbered=False)

@@ -26,7 +26,7 @@ from jeit.touch.health import EventKind, EventStatus, HealthEvent, SkinHealth
 from jeit.touch.health.event import change_size
 
 _HALO = [withStroke(linewidth=4, foreground="white")]
-_CUT, _MENDED = SERIES_COLOURS[1], SERIES_COLOURS[2]
+_CUT_COLOUR, _MENDED_COLOUR = SERIES_COLOURS[1], SERIES_COLOURS[2]
 
 
 def plot_health(
@@ -79,32 +79,33 @@ def plot_health(
     for event in health.events:
         if event.path is not None and event.status != EventStatus.DENIED:
             _draw_cut(ax, event)
-    failed = [one.electrode for one in health.open_events if one.electrode is not None]
-    if failed:
-        places = np.asarray(electrodes.position)[failed, :2]  # pyright: ignore[reportAttributeAccessIssue]
-        ax.plot(*places.T, "x", color=_CUT, markersize=11, markeredgewidth=2.4, zorder=6, path_effects=_HALO)
+    failed_electrodes = [event.electrode for event in health.open_events if event.electrode is not None]
+    if failed_electrodes:
+        places = np.asarray(electrodes.position)[failed_electrodes, :2]  # pyright: ignore[reportAttributeAccessIssue]
+        ax.plot(*places.T, "x", color=_CUT_COLOUR, markersize=11, markeredgewidth=2.4, zorder=6, path_effects=_HALO)
     return ax
 
 
 def _draw_cut(ax: Axes, event: HealthEvent) -> None:
-    mended, path = event.status == EventStatus.MENDED, np.asarray(event.path)
-    colour = _MENDED if mended else _CUT
-    style = (0, (2.5, 1.5)) if mended else "-"
+    """Draw the path of a cut, labelled with its length and time; a mended cut is dashed."""
+    is_mended, path = event.status == EventStatus.MENDED, np.asarray(event.path)
+    colour = _MENDED_COLOUR if is_mended else _CUT_COLOUR
+    style = (0, (2.5, 1.5)) if is_mended else "-"
     ax.plot(*path.T, color=colour, linestyle=style, linewidth=2.4, zorder=5, path_effects=_HALO)
     # The deviation is omitted where it rounds to 0 mm.
-    known = f" ± {1e3 * event.deviation:.0f}" if 1e3 * event.deviation >= 0.5 else ""
-    said = f"{'mended' if mended else 'cut'}, {1e3 * event.length:.0f}{known} mm, at {event.time:.4g} s"
-    low, high = ax.get_xlim()
-    top = path[path[:, 1].argmax()]
+    deviation_text = f" ± {1e3 * event.deviation:.0f}" if 1e3 * event.deviation >= 0.5 else ""
+    label = f"{'mended' if is_mended else 'cut'}, {1e3 * event.length:.0f}{deviation_text} mm, at {event.time:.4g} s"
+    left_limit, right_limit = ax.get_xlim()
+    highest_point = path[path[:, 1].argmax()]
     # A label near the edge of the skin extends away from the edge.
-    share = (top[0] - low) / (high - low)
-    aligned = "left" if share < 0.25 else "right" if share > 0.75 else "center"
+    relative_x = (highest_point[0] - left_limit) / (right_limit - left_limit)
+    alignment = "left" if relative_x < 0.25 else "right" if relative_x > 0.75 else "center"
     ax.annotate(
-        said,
-        top,
+        label,
+        highest_point,
         (0, 7),
         textcoords="offset points",
-        ha=aligned,
+        ha=alignment,
         color=colour,
         fontsize=9,
         zorder=7,
@@ -113,7 +114,7 @@ def _draw_cut(ax: Axes, event: HealthEvent) -> None:
 
 
 # Maximum number of events with labels; minimum upper end of the y axis, as a multiple of the limit.
-_MOST_LABELS, _LEAST = 12, 1.5
+_MAX_LABELS, _MIN_AXIS_LIMIT = 12, 1.5
 
 
 def plot_health_course(
@@ -142,24 +143,26 @@ def plot_health_course(
     ```
     """
     check_kind("health", health, SkinHealth, "a SkinHealth, as of watch(health, frames)")
-    when, read = np.asarray(times, float), np.asarray(frames, float)
-    if read.shape != (len(when), health.reference.size):
-        raise ValueError(f"frames have shape {read.shape}; give ({len(when)}, {health.reference.size}).")
+    time_values, frame_values = np.asarray(times, float), np.asarray(frames, float)
+    if frame_values.shape != (len(time_values), health.reference.size):
+        raise ValueError(f"frames have shape {frame_values.shape}; give ({len(time_values)}, {health.reference.size}).")
     healthy = health.healthy
-    there = healthy.used & np.isfinite(read)
-    off = np.where(there, (read - healthy.reference) / np.where(healthy.used, healthy.scale, np.inf), np.nan)
-    size = np.where(there.any(axis=1), change_size(off) / healthy.limit, np.nan)
+    has_reading = healthy.used & np.isfinite(frame_values)
+    scaled_changes = np.where(
+        has_reading, (frame_values - healthy.reference) / np.where(healthy.used, healthy.scale, np.inf), np.nan
+    )
+    relative_sizes = np.where(has_reading.any(axis=1), change_size(scaled_changes) / healthy.limit, np.nan)
     ax = axes_or_new(ax, (9.0, 3.2))
-    ax.plot(when, size, color=INK, linewidth=0.8)
+    ax.plot(time_values, relative_sizes, color=INK, linewidth=0.8)
     ax.axhline(1.0, color=SOFT, linewidth=1, linestyle=(0, (4, 3)))
     ax.text(1, 1.0, " limit", color=SOFT, fontsize=8, va="center", transform=ax.get_yaxis_transform())
     for event in health.events:
         colour = SERIES_COLOURS[2] if event.kind == EventKind.REPAIRED else SERIES_COLOURS[1]
         ax.axvline(event.time, color=colour, linewidth=1.4)
-        if len(health.events) <= _MOST_LABELS:
-            own = "" if event.electrode is None else f" {event.electrode + 1}"
+        if len(health.events) <= _MAX_LABELS:
+            electrode_text = "" if event.electrode is None else f" {event.electrode + 1}"
             ax.annotate(
-                f"{event.kind}{own}",
+                f"{event.kind}{electrode_text}",
                 (event.time, 1),
                 (3, -3 - 11 * (event.number % 3)),
                 xycoords=("data", "axes fraction"),
@@ -170,7 +173,7 @@ def plot_health_course(
             )
     ax.set_yscale("symlog", linthresh=1.0)
     ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    ax.set_ylim(0, max(_LEAST, 1.6 * float(np.nanmax(size, initial=1.0))))
+    ax.set_ylim(0, max(_MIN_AXIS_LIMIT, 1.6 * float(np.nanmax(relative_sizes, initial=1.0))))
     ax.set_ylabel("Change, times the limit", color=INK)
     soften_axes(ax)
     if title is not None:

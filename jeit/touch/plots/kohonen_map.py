@@ -13,8 +13,8 @@ from jeit.arguments import check_kind, real_array
 from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, draw_colour_bar, draw_scale_bar, extent_of, hide_axes
 from jeit.touch.kohonen import MapTouch
 
-# Area of the mark of a neuron in points², in a map with 1024 neurons.
-_MARK, _NEURONS = 26.0, 1024
+# Area of a neuron's marker, points², in a map with the second number of neurons.
+_MARKER_AREA, _REFERENCE_NEURONS = 26.0, 1024
 
 
 def plot_map(
@@ -52,28 +52,33 @@ def plot_map(
     places = real_array("places", places, "places (R, C, 2) of neurons")
     if places.ndim != 3 or places.shape[2] != 2:
         raise ValueError(f"places must be (R, C, 2); they have shape {places.shape}.")
-    there = np.isfinite(places).all(axis=2)
-    if not there.any():
+    has_place = np.isfinite(places).all(axis=2)
+    if not has_place.any():
         raise ValueError("places: no neuron has one.")
     if values is not None and np.shape(values) != places.shape[:2]:
         raise ValueError(f"values must be one for each neuron, {places.shape[:2]}; they have shape {np.shape(values)}.")
     check_kind("touches", touches, (list, tuple), "a list of touches, as of touches_reported")
     ax = axes_or_new(ax)
-    extent = extent_of(places[there])
+    extent = extent_of(places[has_place])
     hide_axes(ax, extent, numbered=False)
-    lines = [
-        ends
-        for first, second in ((places[:-1], places[1:]), (places[:, :-1], places[:, 1:]))
-        for ends in np.stack([first, second], axis=-2).reshape(-1, 2, 2)
-        if np.isfinite(ends).all()
+    edges = [
+        edge
+        for first_ends, second_ends in ((places[:-1], places[1:]), (places[:, :-1], places[:, 1:]))
+        for edge in np.stack([first_ends, second_ends], axis=-2).reshape(-1, 2, 2)
+        if np.isfinite(edge).all()
     ]
-    ax.add_collection(LineCollection(lines, colors=INK if values is None else SOFT, linewidths=0.5, zorder=1))
+    ax.add_collection(LineCollection(edges, colors=INK if values is None else SOFT, linewidths=0.5, zorder=1))
     if values is not None:
-        size = _MARK * min(4.0, _NEURONS / there.size)
-        drawn = ax.scatter(
-            *places[there].T, c=np.asarray(values)[there], s=size, cmap=SEQUENTIAL, linewidths=0, zorder=2
+        marker_area = _MARKER_AREA * min(4.0, _REFERENCE_NEURONS / has_place.size)
+        points = ax.scatter(
+            *places[has_place].T,
+            c=np.asarray(values)[has_place],
+            s=marker_area,
+            cmap=SEQUENTIAL,
+            linewidths=0,
+            zorder=2,
         )
-        draw_colour_bar(ax, drawn, label)
+        draw_colour_bar(ax, points, label)
     for touch in touches:
         ax.plot(*touch.place, marker="+", color="#d1495b", markersize=13, markeredgewidth=2.2, zorder=4)
     if on_skin:

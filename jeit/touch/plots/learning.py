@@ -20,7 +20,7 @@ from jeit.plot.axes import (
 from jeit.touch import Standing
 
 # Maximum number of labels for which a confusion matrix has tick labels.
-_MOST_TICK_LABELS = 24
+_MAX_TICK_LABELS = 24
 
 
 def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
@@ -29,30 +29,45 @@ def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | N
     `place`: the standing `place` of a `LearntSkin`.
     """
     ax = axes_or_new(ax)
-    off = 1e3 * np.linalg.norm(place.held_out - place.right, axis=1)
+    errors_mm = 1e3 * np.linalg.norm(place.held_out - place.right, axis=1)
     extent = extent_of(place.right)
     hide_axes(ax, extent, numbered=False)
-    most = float(np.quantile(off, 0.98)) or 1.0
-    order = np.argsort(off)
-    drawn = ax.scatter(*place.right[order, :2].T, c=off[order], s=22, cmap=SEQUENTIAL, vmin=0, vmax=most, linewidths=0)
+    colour_limit = float(np.quantile(errors_mm, 0.98)) or 1.0
+    order = np.argsort(errors_mm)
+    points = ax.scatter(
+        *place.right[order, :2].T, c=errors_mm[order], s=22, cmap=SEQUENTIAL, vmin=0, vmax=colour_limit, linewidths=0
+    )
     draw_scale_bar(ax, extent)
-    draw_colour_bar(ax, drawn, "Error of presses held out (mm)")
-    ax.set_title(f"Places: {off.mean():.3g} mm on average, median {np.median(off):.3g} mm" if title is None else title)
+    draw_colour_bar(ax, points, "Error of presses held out (mm)")
+    ax.set_title(
+        f"Places: {errors_mm.mean():.3g} mm on average, median {np.median(errors_mm):.3g} mm"
+        if title is None
+        else title
+    )
     return ax
 
 
 def plot_force_errors(force: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the forces estimated for held-out presses against the true forces, in newtons."""
     ax = axes_or_new(ax)
-    right, said = force.right[:, 0], force.held_out[:, 0]
-    ends = [min(right.min(), said.min()), max(right.max(), said.max())]
-    ax.plot(ends, ends, color=SOFT, linewidth=1, zorder=1)
+    true_forces, estimated_forces = force.right[:, 0], force.held_out[:, 0]
+    limits = [min(true_forces.min(), estimated_forces.min()), max(true_forces.max(), estimated_forces.max())]
+    ax.plot(limits, limits, color=SOFT, linewidth=1, zorder=1)
     ax.plot(
-        right, said, linestyle="none", marker="o", markersize=3.5, alpha=0.6, color=SERIES_COLOURS[0], markeredgewidth=0
+        true_forces,
+        estimated_forces,
+        linestyle="none",
+        marker="o",
+        markersize=3.5,
+        alpha=0.6,
+        color=SERIES_COLOURS[0],
+        markeredgewidth=0,
     )
     ax.set_xlabel("Force (N)", color=INK)
     ax.set_ylabel("Estimated force of presses held out (N)", color=INK)
-    ax.set_title(f"Forces: {np.abs(said - right).mean():.3g} N off on average" if title is None else title)
+    ax.set_title(
+        f"Forces: {np.abs(estimated_forces - true_forces).mean():.3g} N off on average" if title is None else title
+    )
     soften_axes(ax)
     return ax
 
@@ -74,38 +89,43 @@ def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None
     ```
     """
     ax = axes_or_new(ax)
-    kinds = np.unique(label.right)
-    counts = np.array([[np.sum((label.right == one) & (label.held_out == other)) for other in kinds] for one in kinds])
+    labels = np.unique(label.right)
+    counts = np.array(
+        [
+            [np.sum((label.right == true_label) & (label.held_out == predicted_label)) for predicted_label in labels]
+            for true_label in labels
+        ]
+    )
     shares = 100 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    drawn = ax.imshow(shares, cmap="Blues", vmin=0, vmax=100)
-    draw_colour_bar(ax, drawn, "Share of the kind (%)")
-    if len(kinds) <= _MOST_TICK_LABELS:
-        turned = 90 if max(len(one) for one in kinds) > 3 else 0
-        ax.set_xticks(range(len(kinds)), kinds, rotation=turned)
-        ax.set_yticks(range(len(kinds)), kinds)
-    if len(kinds) <= 10:
+    matrix_image = ax.imshow(shares, cmap="Blues", vmin=0, vmax=100)
+    draw_colour_bar(ax, matrix_image, "Share of the kind (%)")
+    if len(labels) <= _MAX_TICK_LABELS:
+        rotation = 90 if max(len(text) for text in labels) > 3 else 0
+        ax.set_xticks(range(len(labels)), labels, rotation=rotation)
+        ax.set_yticks(range(len(labels)), labels)
+    if len(labels) <= 10:
         for row, column in np.argwhere(shares >= 0.5):
             colour = "white" if shares[row, column] > 50 else INK
             ax.text(column, row, f"{shares[row, column]:.0f}", ha="center", va="center", color=colour, fontsize=8)
     ax.set_xlabel("Predicted label", color=INK)
     ax.set_ylabel("True label", color=INK)
-    right = 100 * np.mean(label.right == label.held_out)
-    ax.set_title(f"Labels: {right:.1f} % right of presses held out" if title is None else title)
+    percentage = 100 * np.mean(label.right == label.held_out)
+    ax.set_title(f"Labels: {percentage:.1f} % right of presses held out" if title is None else title)
     return ax
 
 
 def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the share of held-out presses in which each key was classified wrongly, in per cent."""
     ax = axes_or_new(ax)
-    wrong = 100 * np.mean(keys.held_out != keys.right, axis=0)
-    ax.bar(range(len(wrong)), wrong, color=SERIES_COLOURS[0], width=0.7)
-    ax.set_xticks(range(len(wrong)))
+    error_rates = 100 * np.mean(keys.held_out != keys.right, axis=0)
+    ax.bar(range(len(error_rates)), error_rates, color=SERIES_COLOURS[0], width=0.7)
+    ax.set_xticks(range(len(error_rates)))
     ax.set_xlabel("Key", color=INK)
     ax.set_ylabel("Classified wrongly (%)", color=INK)
-    ax.set_ylim(0, max(1.0, 1.1 * wrong.max()))
-    whole = 100 * np.mean((keys.held_out == keys.right).all(axis=1))
-    said = f"Keys: {100 - wrong.mean():.1f} % right, whole patterns {whole:.1f} %"
-    ax.set_title(said if title is None else title)
+    ax.set_ylim(0, max(1.0, 1.1 * error_rates.max()))
+    pattern_share = 100 * np.mean((keys.held_out == keys.right).all(axis=1))
+    default_title = f"Keys: {100 - error_rates.mean():.1f} % right, whole patterns {pattern_share:.1f} %"
+    ax.set_title(default_title if title is None else title)
     soften_axes(ax)
     return ax
 
@@ -113,10 +133,10 @@ def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None
 def plot_tried(label: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the accuracy of each method that was tried, on held-out presses, in per cent; the best is at the top."""
     ax = axes_or_new(ax)
-    names, right = [one for one, _ in label.tried], [100 * (1 - error) for _, error in label.tried]
-    colours = [SERIES_COLOURS[0] if one == label.method else "#c9d3de" for one in names]
-    ax.barh(range(len(names)), right, color=colours, height=0.7)
-    for row, value in enumerate(right):
+    names, percentages = [name for name, _ in label.tried], [100 * (1 - error) for _, error in label.tried]
+    colours = [SERIES_COLOURS[0] if name == label.method else "#c9d3de" for name in names]
+    ax.barh(range(len(names)), percentages, color=colours, height=0.7)
+    for row, value in enumerate(percentages):
         ax.text(value, row, f" {value:.0f}", va="center", color=INK, fontsize=8)
     ax.set_yticks(range(len(names)), names, fontsize=8)
     ax.invert_yaxis()

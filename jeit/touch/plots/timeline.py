@@ -32,8 +32,8 @@ from jeit.touch.listening.feature_images import EVERY
 
 # Gap between frames, as a multiple of the median interval, at which a curve is interrupted; maximum number of points of
 # a curve; minimum length of a bar, as a share of the whole time; maximum number of touches with numbers.
-_LONG_GAP, _POINTS, _SHORTEST, _NUMBERED = 10.0, 3000, 0.003, 60
-_UNLIKE = "#b9bdc4"
+_MIN_GAP_RATIO, _MAX_POINTS, _MIN_BAR_SHARE, _MAX_NUMBERED = 10.0, 3000, 0.003, 60
+_UNLIKE_COLOUR = "#b9bdc4"
 
 
 def plot_changes(
@@ -50,15 +50,17 @@ def plot_changes(
 
     Refused frames, which are NaN, leave gaps. Raises `ValueError` for shapes that do not match.
     """
-    when, values = np.asarray(seconds, float), np.asarray(peaks, float)
-    if when.shape != values.shape or when.ndim != 1:
-        raise ValueError(f"peaks have shape {values.shape} and seconds {when.shape}; give one of each for every frame.")
+    times, values = np.asarray(seconds, float), np.asarray(peaks, float)
+    if times.shape != values.shape or times.ndim != 1:
+        raise ValueError(
+            f"peaks have shape {values.shape} and seconds {times.shape}; give one of each for every frame."
+        )
     ax = axes_or_new(ax, (9.0, 2.6))
-    factor, name = with_si_prefix(float(np.nanmax(values, initial=level)), unit)
-    ax.plot(*_reduce_points(*_interrupt_at_gaps(when, factor * values)), color=INK, linewidth=0.8)
+    factor, prefixed_unit = with_si_prefix(float(np.nanmax(values, initial=level)), unit)
+    ax.plot(*_reduce_points(*_interrupt_at_gaps(times, factor * values)), color=INK, linewidth=0.8)
     ax.axhline(factor * level, color=SOFT, linewidth=1, linestyle=(0, (4, 3)))
     ax.text(1, factor * level, " level", color=SOFT, fontsize=8, va="center", transform=ax.get_yaxis_transform())
-    ax.set_ylabel(f"Greatest change ({name})", color=INK)
+    ax.set_ylabel(f"Greatest change ({prefixed_unit})", color=INK)
     ax.set_ylim(bottom=min(0.0, factor * float(np.nanmin(values, initial=0.0))))
     soften_axes(ax)
     if title is not None:
@@ -91,28 +93,40 @@ def plot_timeline(
     """
     check_named_touches(touches)
     ax = axes_or_new(ax, (9.0, 2.6))
-    lanes = [*names, *(["unlike any"] if any(one.unlike for one in touches) else [])]
-    ends = [one.touch.offset for one in touches]
-    span = max(ends, default=1.0) - min((one.touch.onset for one in touches), default=0.0)
-    for one in touches:
-        lane = len(names) if one.unlike else lanes.index(one.gesture)
-        length = max(one.touch.offset - one.touch.onset, _SHORTEST * span)
+    lanes = [*names, *(["unlike any"] if any(touch.unlike for touch in touches) else [])]
+    offsets = [touch.touch.offset for touch in touches]
+    duration = max(offsets, default=1.0) - min((touch.touch.onset for touch in touches), default=0.0)
+    for touch in touches:
+        lane = len(names) if touch.unlike else lanes.index(touch.gesture)
+        length = max(touch.touch.offset - touch.touch.onset, _MIN_BAR_SHARE * duration)
         bar = Rectangle(
-            (one.touch.onset, lane - 0.36),
+            (touch.touch.onset, lane - 0.36),
             length,
             0.72,
-            color=gesture_colour(one, names),
-            alpha=_opacity(one),
+            color=gesture_colour(touch, names),
+            alpha=_opacity(touch),
             linewidth=0,
         )
         ax.add_patch(bar)
-        if not one.touch.whole:
+        if not touch.touch.whole:
             ax.plot(
-                one.touch.offset if one.touch.cut_off else one.touch.onset, lane, marker="|", color=INK, markersize=14
+                touch.touch.offset if touch.touch.cut_off else touch.touch.onset,
+                lane,
+                marker="|",
+                color=INK,
+                markersize=14,
             )
-        if len(touches) <= _NUMBERED:
-            where = (one.touch.onset + length / 2, lane - 0.42)
-            ax.annotate(f"{one.number}", where, (0, 1), textcoords="offset points", ha="center", color=INK, fontsize=7)
+        if len(touches) <= _MAX_NUMBERED:
+            label_position = (touch.touch.onset + length / 2, lane - 0.42)
+            ax.annotate(
+                f"{touch.number}",
+                label_position,
+                (0, 1),
+                textcoords="offset points",
+                ha="center",
+                color=INK,
+                fontsize=7,
+            )
     ax.set_yticks(range(len(lanes)), lanes)
     ax.set_ylim(len(lanes) - 0.4, -0.75)
     ax.autoscale_view(scaley=False)
@@ -159,18 +173,24 @@ def plot_touch_paths(
     draw_outline(mesh, ax)
     if electrodes is not None:
         draw_electrodes(mesh, electrodes, numbers=False, ax=ax)
-    for one in touches:
-        place = one.touch.course.centroid
-        place = place[np.isfinite(place).all(axis=1)]
-        if len(place):
-            colour = gesture_colour(one, names)
-            ax.plot(*place.T, color=colour, linewidth=1.4, alpha=_opacity(one), zorder=3)
+    for touch in touches:
+        centroids = touch.touch.course.centroid
+        centroids = centroids[np.isfinite(centroids).all(axis=1)]
+        if len(centroids):
+            colour = gesture_colour(touch, names)
+            ax.plot(*centroids.T, color=colour, linewidth=1.4, alpha=_opacity(touch), zorder=3)
             ax.plot(
-                *place[0], marker="o", markersize=4.5, color=colour, alpha=_opacity(one), markeredgewidth=0, zorder=4
+                *centroids[0],
+                marker="o",
+                markersize=4.5,
+                color=colour,
+                alpha=_opacity(touch),
+                markeredgewidth=0,
+                zorder=4,
             )
-            if len(touches) <= _NUMBERED:
+            if len(touches) <= _MAX_NUMBERED:
                 ax.annotate(
-                    f"{one.number}", place[0], (4, 2), textcoords="offset points", color=INK, fontsize=7, zorder=5
+                    f"{touch.number}", centroids[0], (4, 2), textcoords="offset points", color=INK, fontsize=7, zorder=5
                 )
     hide_axes(ax, extent)
     draw_scale_bar(ax, extent)
@@ -180,15 +200,15 @@ def plot_touch_paths(
 
 
 def gesture_colour(touch: NamedTouch, names: Sequence[str]) -> str:
-    """Colour of a touch's gesture; grey for touches unlike any in the training set."""
-    return _UNLIKE if touch.unlike else SERIES_COLOURS[list(names).index(touch.gesture) % len(SERIES_COLOURS)]
+    """Return the colour of a touch's gesture; grey for touches unlike any in the training set."""
+    return _UNLIKE_COLOUR if touch.unlike else SERIES_COLOURS[list(names).index(touch.gesture) % len(SERIES_COLOURS)]
 
 
 def check_named_touches(touches) -> None:
     """Check that `touches` is a list of named touches. Raises `ValueError` otherwise."""
     check_kind("touches", touches, (list, tuple), "a list of named touches, as TouchWatch.follow gives them")
-    for number, one in enumerate(touches):
-        check_kind(f"touches[{number}]", one, NamedTouch, "a NamedTouch")
+    for index, touch in enumerate(touches):
+        check_kind(f"touches[{index}]", touch, NamedTouch, "a NamedTouch")
 
 
 def _opacity(touch: NamedTouch) -> float:
@@ -197,18 +217,24 @@ def _opacity(touch: NamedTouch) -> float:
 
 def _interrupt_at_gaps(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Insert NaN into a curve at long gaps between frames, so that it is interrupted."""
-    passed = np.diff(times)
-    gaps = 1 + np.flatnonzero(passed > _LONG_GAP * np.median(passed)) if passed.size else np.zeros(0, int)
+    intervals = np.diff(times)
+    gaps = 1 + np.flatnonzero(intervals > _MIN_GAP_RATIO * np.median(intervals)) if intervals.size else np.zeros(0, int)
     return np.insert(times, gaps, times[gaps]), np.insert(values, gaps, np.nan)
 
 
 def _reduce_points(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Reduce a curve to about `_POINTS` points, keeping its extremes."""
-    if len(times) <= _POINTS:
+    """Reduce a curve to about `_MAX_POINTS` points, keeping its extremes."""
+    if len(times) <= _MAX_POINTS:
         return times, values
-    parts = np.array_split(np.arange(len(times)), _POINTS // 2)
-    filled = np.where(np.isfinite(values), values, 0.0)
-    rows = np.unique([part[at] for part in parts for at in (filled[part].argmin(), filled[part].argmax())])
+    segments = np.array_split(np.arange(len(times)), _MAX_POINTS // 2)
+    filled_values = np.where(np.isfinite(values), values, 0.0)
+    rows = np.unique(
+        [
+            segment[extreme_index]
+            for segment in segments
+            for extreme_index in (filled_values[segment].argmin(), filled_values[segment].argmax())
+        ]
+    )
     return times[rows], values[rows]
 
 
@@ -231,10 +257,10 @@ def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes
     """
     ax = axes_or_new(ax, (8.0, 3.2))
     names, times = labels.names, labels.times
-    shown = np.where((labels.named != "")[:, None], labels.probabilities, np.nan).T
+    shown_probabilities = np.where((labels.named != "")[:, None], labels.probabilities, np.nan).T
     extent = (float(times[0]) - EVERY / 2, float(times[-1]) + EVERY / 2, -0.5, len(names) - 0.5)
-    drawn = ax.imshow(
-        100 * shown,
+    probability_image = ax.imshow(
+        100 * shown_probabilities,
         aspect="auto",
         origin="lower",
         extent=extent,
@@ -243,16 +269,18 @@ def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes
         vmax=100,
         interpolation="nearest",
     )
-    draw_colour_bar(ax, drawn, "Probability (%)")
+    draw_colour_bar(ax, probability_image, "Probability (%)")
     for event in labels.events:
         if event.name:
-            row, span = names.index(event.name) - 0.42, [event.start, event.end]
-            ax.plot(span, [row, row], color=SERIES_COLOURS[1], linewidth=2.5, solid_capstyle="butt")
+            bar_height, bar_limits = names.index(event.name) - 0.42, [event.start, event.end]
+            ax.plot(bar_limits, [bar_height, bar_height], color=SERIES_COLOURS[1], linewidth=2.5, solid_capstyle="butt")
     ax.set_yticks(range(len(names)), names)
     ax.set_xlim(0, extent[1])
     ax.set_xlabel("Time (s)", color=INK)
-    quiet = int((labels.named == "").sum())
-    said = f"{labels.name}: sounds in red" + (f"; blank, {quiet} of {len(labels)} windows quiet" if quiet else "")
-    ax.set_title(said if title is None else title)
+    num_quiet = int((labels.named == "").sum())
+    default_title = f"{labels.name}: sounds in red" + (
+        f"; blank, {num_quiet} of {len(labels)} windows quiet" if num_quiet else ""
+    )
+    ax.set_title(default_title if title is None else title)
     soften_axes(ax)
     return ax

@@ -26,7 +26,7 @@ from jeit.touch import Touches
 from jeit.touch.training import TrainingResult
 
 # Maximum number of ellipses, so that they do not hide each other.
-_MOST_ELLIPSES = 400
+_MAX_ELLIPSES = 400
 
 
 def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None = None) -> Axes:
@@ -37,24 +37,25 @@ def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None =
     if touches.position is None:
         raise ValueError("touches have no places: the skin did not learn any.")
     ax = axes_or_new(ax)
-    there = np.flatnonzero(np.isfinite(touches.position).all(axis=1))
-    if not there.size:
+    touched_frames = np.flatnonzero(np.isfinite(touches.position).all(axis=1))
+    if not touched_frames.size:
         ax.set_axis_off()
-        said = "All frames unlike any learnt from" if touches.unlike.all() else "No touch"
-        ax.set_title(said if title is None else title)
+        default_title = "All frames unlike any learnt from" if touches.unlike.all() else "No touch"
+        ax.set_title(default_title if title is None else title)
         return ax
-    place, std = touches.position[there, :2], touches.position_std[there, :2]  # pyright: ignore[reportOptionalSubscript]
-    extent = extent_of(np.vstack([place - std, place + std]))
+    places = touches.position[touched_frames, :2]
+    std = touches.position_std[touched_frames, :2]  # pyright: ignore[reportOptionalSubscript]
+    extent = extent_of(np.vstack([places - std, places + std]))
     hide_axes(ax, extent, numbered=False)
-    some = np.linspace(0, len(there) - 1, min(len(there), _MOST_ELLIPSES)).astype(int)
-    size = 2 * std[some]
+    drawn_indices = np.linspace(0, len(touched_frames) - 1, min(len(touched_frames), _MAX_ELLIPSES)).astype(int)
+    diameters = 2 * std[drawn_indices]
     ax.add_collection(
         EllipseCollection(
-            size[:, 0],
-            size[:, 1],
-            np.zeros(len(some)),
+            diameters[:, 0],
+            diameters[:, 1],
+            np.zeros(len(drawn_indices)),
             units="xy",
-            offsets=place[some],
+            offsets=places[drawn_indices],
             transOffset=ax.transData,
             facecolors="none",
             edgecolors=SERIES_COLOURS[0],
@@ -62,10 +63,10 @@ def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None =
             alpha=0.35,
         )
     )
-    drawn = ax.scatter(*place.T, c=there, s=12, cmap=SEQUENTIAL, linewidths=0, zorder=3)
+    points = ax.scatter(*places.T, c=touched_frames, s=12, cmap=SEQUENTIAL, linewidths=0, zorder=3)
     draw_scale_bar(ax, extent)
-    draw_colour_bar(ax, drawn, "Frame")
-    ax.set_title(f"{len(there)} touches, ellipses of one standard deviation" if title is None else title)
+    draw_colour_bar(ax, points, "Frame")
+    ax.set_title(f"{len(touched_frames)} touches, ellipses of one standard deviation" if title is None else title)
     return ax
 
 
@@ -80,23 +81,29 @@ def plot_answers(touches: Touches, *, title: str | None = None, ax: Axes | None 
         ax.set_yticks(range(touches.touched.shape[1]))
         ax.set_ylabel("Key", color=INK)
     elif touches.label is not None:
-        kinds = [str(one) for one in np.unique(touches.label) if one]
-        said = touches.label != ""
-        level = np.searchsorted(kinds, touches.label[said])
+        labels = [str(text) for text in np.unique(touches.label) if text]
+        has_label = touches.label != ""
+        label_indices = np.searchsorted(labels, touches.label[has_label])
         ax.plot(
-            frame[said], level, linestyle="none", marker="o", markersize=3.5, color=SERIES_COLOURS[0], markeredgewidth=0
+            frame[has_label],
+            label_indices,
+            linestyle="none",
+            marker="o",
+            markersize=3.5,
+            color=SERIES_COLOURS[0],
+            markeredgewidth=0,
         )
-        ax.set_yticks(range(len(kinds)), kinds)
+        ax.set_yticks(range(len(labels)), labels)
     elif touches.force is not None and touches.force_std is not None:
-        low, high = touches.force - touches.force_std, touches.force + touches.force_std
-        ax.fill_between(frame, low, high, color=SERIES_COLOURS[0], alpha=0.2, linewidth=0)
+        lower_limits, upper_limits = touches.force - touches.force_std, touches.force + touches.force_std
+        ax.fill_between(frame, lower_limits, upper_limits, color=SERIES_COLOURS[0], alpha=0.2, linewidth=0)
         ax.plot(frame, touches.force, color=SERIES_COLOURS[0], linewidth=1.2)
         ax.set_ylabel("Force (N)", color=INK)
-    for one in frame[touches.unlike]:
-        ax.axvline(one, color=SERIES_COLOURS[1], linewidth=0.6, alpha=0.5, zorder=0)
+    for unlike_frame in frame[touches.unlike]:
+        ax.axvline(unlike_frame, color=SERIES_COLOURS[1], linewidth=0.6, alpha=0.5, zorder=0)
     ax.set_xlabel("Frame", color=INK)
-    unlike = int(touches.unlike.sum())
-    ax.set_title((f"red: {unlike} frames unlike any learnt from" if unlike else "") if title is None else title)
+    num_unlike = int(touches.unlike.sum())
+    ax.set_title((f"red: {num_unlike} frames unlike any learnt from" if num_unlike else "") if title is None else title)
     soften_axes(ax)
     return ax
 
@@ -135,13 +142,19 @@ def plot_depth_map(
         raise ValueError(f"depth must be a map (rows, columns); it has shape {depth.shape}.")
     ax = axes_or_new(ax)
     hide_axes(ax, extent, numbered=False)
-    top = 1e3 * (float(depth.max()) if most is None else most) or 1.0
-    drawn = ax.imshow(
-        1e3 * depth, origin="lower", extent=extent, cmap=SEQUENTIAL, vmin=0.0, vmax=top, interpolation="nearest"
+    colour_limit = 1e3 * (float(depth.max()) if most is None else most) or 1.0
+    mesh_image = ax.imshow(
+        1e3 * depth,
+        origin="lower",
+        extent=extent,
+        cmap=SEQUENTIAL,
+        vmin=0.0,
+        vmax=colour_limit,
+        interpolation="nearest",
     )
     draw_scale_bar(ax, extent)
     if colour_bar:
-        draw_colour_bar(ax, drawn, "Depth (mm)")
+        draw_colour_bar(ax, mesh_image, "Depth (mm)")
     if title is not None:
         ax.set_title(title)
     return ax
@@ -154,12 +167,12 @@ def plot_losses(courses: Mapping[str, TrainingResult], *, title: str | None = No
     """
     check_kind("courses", courses, Mapping, "trainings by name, such as learnt.courses")
     ax = axes_or_new(ax)
-    for (name, trained), colour in zip(courses.items(), SERIES_COLOURS * len(courses), strict=False):
-        check_kind(f"courses[{name!r}]", trained, TrainingResult, "a TrainingResult, as of fit")
-        own = trained.course
-        shares = np.array(own.validation) / own.validation[0]
-        ax.plot(own.steps, shares, color=colour, linewidth=1.6, label=name)
-        ax.plot(own.steps[own.best], shares[own.best], marker="o", color=colour, markersize=5)
+    for (name, result), colour in zip(courses.items(), SERIES_COLOURS * len(courses), strict=False):
+        check_kind(f"courses[{name!r}]", result, TrainingResult, "a TrainingResult, as of fit")
+        course = result.course
+        relative_losses = np.array(course.validation) / course.validation[0]
+        ax.plot(course.steps, relative_losses, color=colour, linewidth=1.6, label=name)
+        ax.plot(course.steps[course.best], relative_losses[course.best], marker="o", color=colour, markersize=5)
     ax.set_xlabel("Batches", color=INK)
     ax.set_ylabel("Loss of touches held out, of that at first", color=INK)
     soften_axes(ax)

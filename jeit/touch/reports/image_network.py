@@ -24,9 +24,9 @@ LEARNT_FILES = ("network.jeit", "report.json", "learning.png")
 DEPTH_FILES = ("frames.csv", "depth.npz", "depth.png", "report.json")
 _PACKAGES = ("jeit", "jax", "equinox", "optax", "numpy")
 # Maximum number of maps drawn.
-_DRAWN = 6
+_MAX_DRAWN_MAPS = 6
 # Maximum number of refused frames that a report lists.
-_LISTED = 1000
+_MAX_LISTED_FRAMES = 1000
 
 
 def write_learnt_images(learnt: LearntImages, folder: str | Path) -> None:
@@ -34,9 +34,9 @@ def write_learnt_images(learnt: LearntImages, folder: str | Path) -> None:
 
     Raises `ValueError` if `folder` cannot be a folder.
     """
-    with results(folder, LEARNT_FILES) as made:
-        write_json(report_learnt_images(learnt), made / "report.json")
-        draw_learnt_images(learnt).savefig(made / "learning.png", dpi=130)
+    with results(folder, LEARNT_FILES) as result_folder:
+        write_json(report_learnt_images(learnt), result_folder / "report.json")
+        draw_learnt_images(learnt).savefig(result_folder / "learning.png", dpi=130)
 
 
 def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
@@ -44,14 +44,14 @@ def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
     network = learnt.network
     trainings = {
         name: {
-            "ended": one.reason,
-            "batches": one.course.steps[-1],
-            "best_batches": one.course.steps[one.course.best],
-            "best_loss_held_out": one.course.validation[one.course.best],
-            "loss_held_out": one.course.validation,
-            "loss": one.course.training,
+            "ended": training.reason,
+            "batches": training.course.steps[-1],
+            "best_batches": training.course.steps[training.course.best],
+            "best_loss_held_out": training.course.validation[training.course.best],
+            "loss_held_out": training.course.validation,
+            "loss": training.course.training,
         }
-        for name, one in learnt.courses.items()
+        for name, training in learnt.courses.items()
     }
     return as_plain_values(
         {
@@ -78,18 +78,20 @@ def draw_learnt_images(learnt: LearntImages):
 
     from jeit.touch.plots import plot_depth_map, plot_losses
 
-    right, estimated = learnt.standing.right, learnt.standing.estimated
-    figure = Figure(figsize=(3 + 2.6 * (len(right) + 1), 5.4), layout="constrained")
-    parts = figure.subfigures(1, 2, width_ratios=(4.4, 2.6 * max(len(right), 1)), squeeze=False)
-    losses, maps = parts[0]
-    plot_losses(learnt.courses, ax=losses.subplots())
-    panels = maps.subplots(2, len(right), squeeze=False)
+    true_maps, estimated_maps = learnt.standing.right, learnt.standing.estimated
+    figure = Figure(figsize=(3 + 2.6 * (len(true_maps) + 1), 5.4), layout="constrained")
+    subfigures = figure.subfigures(1, 2, width_ratios=(4.4, 2.6 * max(len(true_maps), 1)), squeeze=False)
+    loss_figure, map_figure = subfigures[0]
+    plot_losses(learnt.courses, ax=loss_figure.subplots())
+    axes = map_figure.subplots(2, len(true_maps), squeeze=False)
     thickness = learnt.network.thickness
-    most = thickness * float(right.max())
-    for row, (name, some) in zip(panels, (("right", right), ("estimated", estimated)), strict=True):
-        for ax, one in zip(row, some, strict=True):
-            plot_depth_map(thickness * one, learnt.network.extent, most=most, colour_bar=ax is row[-1], ax=ax)
-        row[0].set_title(name)
+    max_depth = thickness * float(true_maps.max())
+    for row_axes, (name, maps_of_kind) in zip(axes, (("right", true_maps), ("estimated", estimated_maps)), strict=True):
+        for ax, depth_map in zip(row_axes, maps_of_kind, strict=True):
+            plot_depth_map(
+                thickness * depth_map, learnt.network.extent, most=max_depth, colour_bar=ax is row_axes[-1], ax=ax
+            )
+        row_axes[0].set_title(name)
     return figure
 
 
@@ -120,7 +122,7 @@ class WrittenDepths:
 
 
 def write_depths(
-    found: Iterable[FrameDepth],
+    frame_depths: Iterable[FrameDepth],
     network: ImageNetwork,
     folder: str | Path,
     *,
@@ -134,44 +136,51 @@ def write_depths(
     its maximum depth. At the end, `depth.npz` with all maps, `depth.png` and `report.json` are written. The number of
     frames is not limited: their maps are kept on disk, not in memory.
 
-    `found`: the frames that `stream_depths` yields. Maps of refused frames are NaN; if no depth exceeds the noise
-    floor, the centroid is left empty. `progress` is called with every frame, and `drawing` as by `write_stream`. Each
-    file is written completely or not at all. Raises `ValueError` if `folder` cannot be a folder, and if no frame was
-    imaged, in which case no file remains; `OSError` on a full disk.
+    `frame_depths`: the frames that `stream_depths` yields. Maps of refused frames are NaN; if no depth exceeds the
+    noise floor, the centroid is left empty. `progress` is called with every frame, and `drawing` as by `write_stream`.
+    Each file is written completely or not at all. Raises `ValueError` if `folder` cannot be a folder, and if no frame
+    was imaged, in which case no file remains; `OSError` on a full disk.
     """
-    where = results_folder(folder, DEPTH_FILES)
-    for earlier in DEPTH_FILES[1:]:
-        (where / earlier).unlink(missing_ok=True)  # files of earlier frames
-    clear_unfinished(where)
-    report = drawing or (lambda said: None)
-    with GrowingRows(where, network.shape) as rows:
-        imaged = _FrameStatistics(network)
-        with GrowingTable(where / "frames.csv", ("frame", "x_m", "y_m", "depth_m")) as table:
-            for one in found:
-                line, depth = imaged.add_frame(one)
+    result_folder = results_folder(folder, DEPTH_FILES)
+    for file_name in DEPTH_FILES[1:]:
+        (result_folder / file_name).unlink(missing_ok=True)  # files of earlier frames
+    clear_unfinished(result_folder)
+    report = drawing or (lambda message: None)
+    with GrowingRows(result_folder, network.shape) as rows:
+        statistics = _FrameStatistics(network)
+        with GrowingTable(result_folder / "frames.csv", ("frame", "x_m", "y_m", "depth_m")) as table:
+            for frame in frame_depths:
+                table_row, depth = statistics.add_frame(frame)
                 with reporting_partial_results(rows):
-                    table.write(line)
+                    table.write(table_row)
                     rows.append(depth)
                 if progress is not None:
-                    progress(one)
-        if not imaged.imaged:
-            (where / "frames.csv").unlink()
-            reason = imaged.first_reason or "there is none"
+                    progress(frame)
+        if not statistics.imaged:
+            (result_folder / "frames.csv").unlink()
+            reason = statistics.first_reason or "there is none"
             raise ValueError(
                 f"'{name}': {counted(rows.number, 'frame')}, and none could be imaged; the first: {reason}"
             )
         report("images")
         with reporting_partial_results(rows):
             extent = np.array(network.extent)
-            rows.write_npz(where / "depth.npz", "depth", {"extent": extent}, lambda far: report(f"images: {far}"))
-        with results(where, ("report.json",)) as made:
-            write_json(imaged.report(name, rows.number), made / "report.json")
+            rows.write_npz(
+                result_folder / "depth.npz",
+                "depth",
+                {"extent": extent},
+                lambda progress_text: report(f"images: {progress_text}"),
+            )
+        with results(result_folder, ("report.json",)) as report_folder:
+            write_json(statistics.report(name, rows.number), report_folder / "report.json")
         report(PICTURES[0])
-        row, number = imaged.row.values().astype(int), imaged.number.values().astype(int)
-        chosen = np.unique(np.linspace(0, len(row) - 1, _DRAWN).round().astype(int))
-        with written_whole(where / "depth.png") as file:
-            _draw_depths(rows.read(row[chosen]), number[chosen], imaged.deepest.depth, network).savefig(file, dpi=130)
-        return WrittenDepths(rows.number, imaged.imaged, imaged.deepest, imaged.latency.values())
+        row_indices, frame_numbers = statistics.row.values().astype(int), statistics.number.values().astype(int)
+        drawn_indices = np.unique(np.linspace(0, len(row_indices) - 1, _MAX_DRAWN_MAPS).round().astype(int))
+        with written_whole(result_folder / "depth.png") as file:
+            _draw_depths(
+                rows.read(row_indices[drawn_indices]), frame_numbers[drawn_indices], statistics.deepest.depth, network
+            ).savefig(file, dpi=130)
+        return WrittenDepths(rows.number, statistics.imaged, statistics.deepest, statistics.latency.values())
 
 
 class _FrameStatistics:
@@ -179,7 +188,7 @@ class _FrameStatistics:
 
     def __init__(self, network: ImageNetwork):
         self.network, self._places = network, pixel_places(network.extent, network.shape)
-        self._nothing = np.full(network.shape, np.nan)
+        self._empty_map = np.full(network.shape, np.nan)
         self.imaged, self.number_refused, self.first_reason = 0, 0, ""
         self.refused: list[int] = []
         self.row, self.number, self.latency = Sample(), Sample(), Sample()
@@ -190,20 +199,20 @@ class _FrameStatistics:
         if frame.depth is None:
             self.number_refused += 1
             self.first_reason = self.first_reason or frame.reason
-            self.refused += [frame.number] if len(self.refused) < _LISTED else []
-            return [frame.number, "", "", ""], self._nothing
+            self.refused += [frame.number] if len(self.refused) < _MAX_LISTED_FRAMES else []
+            return [frame.number, "", "", ""], self._empty_map
         for sample, value in ((self.row, self.imaged + self.number_refused), (self.number, frame.number)):
             sample.append(value)
         self.latency.append(frame.latency)
         self.imaged += 1
         depth = float(frame.depth.max())
-        middle = depth_centroids(frame.depth[None], self._places)[0]
+        centroid = depth_centroids(frame.depth[None], self._places)[0]
         if not depth > self.network.floor:
-            middle = np.full(2, np.nan)
+            centroid = np.full(2, np.nan)
         if depth > self.deepest.depth:
-            self.deepest = DeepestFrame(frame.number, depth, middle)
-        said = [f"{value:.6g}" if np.isfinite(value) else "" for value in (*middle, depth)]
-        return [frame.number, *said], frame.depth
+            self.deepest = DeepestFrame(frame.number, depth, centroid)
+        texts = [f"{value:.6g}" if np.isfinite(value) else "" for value in (*centroid, depth)]
+        return [frame.number, *texts], frame.depth
 
     def report(self, name: str, num_frames: int) -> dict[str, Any]:
         """Report the statistics as plain numbers, strings, lists and dictionaries."""
@@ -227,14 +236,15 @@ class _FrameStatistics:
 def _draw_depths(
     maps: Float[np.ndarray, "k rows columns"], numbers: Int[np.ndarray, " k"], deepest: float, network: ImageNetwork
 ):
+    """Draw depth maps of the frames `numbers`; `deepest`: maximum depth of all frames, metres."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_depth_map
 
     figure = Figure(figsize=(4.2 * len(maps), 4.2), layout="constrained")
     # The colour scale reaches at least 4 times the noise floor, so that noise on an untouched skin does not fill it.
-    most = max(deepest, 4 * network.floor)
-    for ax, one, number in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, numbers, strict=True):
-        last = number == numbers[-1]
-        plot_depth_map(one, network.extent, most=most, colour_bar=last, title=f"frame {number}", ax=ax)
+    max_depth = max(deepest, 4 * network.floor)
+    for ax, depth_map, number in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, numbers, strict=True):
+        is_last = number == numbers[-1]
+        plot_depth_map(depth_map, network.extent, most=max_depth, colour_bar=is_last, title=f"frame {number}", ax=ax)
     return figure

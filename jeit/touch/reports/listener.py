@@ -33,10 +33,10 @@ def write_listener(listener: Listener, folder: str | Path) -> None:
     listener = Listener.read("listener")
     ```
     """
-    with results(folder, LISTENER_FILES) as made:
-        listener.write(made / "listener.jeit")
-        write_json(report_listener(listener), made / "report.json")
-        draw_listener(listener).savefig(made / "learning.png", dpi=150)
+    with results(folder, LISTENER_FILES) as result_folder:
+        listener.write(result_folder / "listener.jeit")
+        write_json(report_listener(listener), result_folder / "report.json")
+        draw_listener(listener).savefig(result_folder / "learning.png", dpi=150)
 
 
 def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -> None:
@@ -63,22 +63,22 @@ def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -
     ```
     """
     columns = _table_columns(labels)
-    with results(folder, SOUND_LABEL_FILES) as made:
-        write_rows(made / "events.csv", list(columns), zip(*columns.values(), strict=True))
-        write_json(report_sound_labels(labels, model=model), made / "report.json")
-        draw_sound_labels(labels).savefig(made / "timeline.png", dpi=150)
+    with results(folder, SOUND_LABEL_FILES) as result_folder:
+        write_rows(result_folder / "events.csv", list(columns), zip(*columns.values(), strict=True))
+        write_json(report_sound_labels(labels, model=model), result_folder / "report.json")
+        draw_sound_labels(labels).savefig(result_folder / "timeline.png", dpi=150)
 
 
 def report_listener(listener: Listener) -> dict[str, Any]:
     """Report how well a listener has learnt, as plain numbers, strings, lists and dictionaries."""
     standing, held_out = listener.standing, None
     if standing is not None:
-        right = standing.held_out == standing.right
+        is_right = standing.held_out == standing.right
         held_out = {
-            "clips": len(right),
-            "right": right.mean(),
+            "clips": len(is_right),
+            "right": is_right.mean(),
             "right_by_chance": 1 / len(listener.names),
-            "right_of_each": {name: right[standing.right == name].mean() for name in np.unique(standing.right)},
+            "right_of_each": {name: is_right[standing.right == name].mean() for name in np.unique(standing.right)},
             "tried": [{"method": name, "right": 1 - error} for name, error in standing.tried],
         }
     return as_plain_values(
@@ -98,17 +98,17 @@ def report_listener(listener: Listener) -> dict[str, Any]:
 
 def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
     """Report the classified sounds as plain numbers, strings, lists and dictionaries; unknown values are None."""
-    whole, probability = labels.whole
+    recording_class, probability = labels.whole
     names, counts = np.unique(labels.named, return_counts=True)
     events = [
         {
-            "sound": one.name or None,
-            "from_s": one.start,
-            "to_s": one.end,
-            "probability": one.probability if one.name else None,
-            "mean_position_m": one.place,
+            "sound": event.name or None,
+            "from_s": event.start,
+            "to_s": event.end,
+            "probability": event.probability if event.name else None,
+            "mean_position_m": event.place,
         }
-        for one in labels.events
+        for event in labels.events
     ]
     return as_plain_values(
         {
@@ -117,7 +117,7 @@ def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
             "windows": len(labels),
             "window_s": LENGTH,
             "every_s": EVERY,
-            "whole": {"sound": whole or None, "probability": probability if whole else None},
+            "whole": {"sound": recording_class or None, "probability": probability if recording_class else None},
             "windows_of_each": {name or "quiet": count for name, count in zip(names, counts, strict=True)},
             "events": events,
             "notes": list(labels.notes),
@@ -132,9 +132,9 @@ def summary(listener: Listener) -> str:
     standing = listener.standing
     if standing is None:
         return "not known: nothing could be held out"
-    right = 100 * np.mean(standing.held_out == standing.right)
-    tried = ", ".join(f"{name} {100 * (1 - error):.1f} %" for name, error in standing.tried)
-    return f"{right:.1f} % of {len(standing.right)} clips right; tried: {tried}"
+    percentage = 100 * np.mean(standing.held_out == standing.right)
+    method_texts = ", ".join(f"{name} {100 * (1 - error):.1f} %" for name, error in standing.tried)
+    return f"{percentage:.1f} % of {len(standing.right)} clips right; tried: {method_texts}"
 
 
 def draw_listener(listener: Listener):
@@ -149,11 +149,11 @@ def draw_listener(listener: Listener):
         ax.set_axis_off()
         ax.set_title("No clips could be held out")
         return figure
-    right = 100 * np.mean(listener.standing.held_out == listener.standing.right)
-    number = len(listener.standing.right)
+    percentage = 100 * np.mean(listener.standing.held_out == listener.standing.right)
+    num_clips = len(listener.standing.right)
     plot_confusion(
         listener.standing,
-        title=f"{listener.method}: {right:.1f} % of {number} clips held out classified correctly",
+        title=f"{listener.method}: {percentage:.1f} % of {num_clips} clips held out classified correctly",
         ax=ax,
     )
     return figure
@@ -171,19 +171,22 @@ def draw_sound_labels(labels: SoundLabels):
 
 
 def _table_columns(labels: SoundLabels) -> dict[str, list]:
-    """Columns of `events.csv`, by name."""
+    """Return the columns of `events.csv`, by name."""
     columns: dict[str, list] = {
         "time_s": [f"{time:.4f}" for time in labels.times],
         "sound": labels.named.tolist(),
         "probability": _format_numbers(labels.probability),
-        **{f"p_{name}": _format_numbers(own) for name, own in zip(labels.names, labels.probabilities.T, strict=True)},
+        **{
+            f"p_{name}": _format_numbers(values)
+            for name, values in zip(labels.names, labels.probabilities.T, strict=True)
+        },
         "microphone": labels.strongest.tolist(),
     }
     if labels.position is not None and labels.position_std is not None:
         axes = "xyz"[: labels.position.shape[1]]
-        columns |= {f"{axis}_m": _format_numbers(own) for axis, own in zip(axes, labels.position.T, strict=True)}
+        columns |= {f"{axis}_m": _format_numbers(values) for axis, values in zip(axes, labels.position.T, strict=True)}
         columns |= {
-            f"std_{axis}_m": _format_numbers(own) for axis, own in zip(axes, labels.position_std.T, strict=True)
+            f"std_{axis}_m": _format_numbers(values) for axis, values in zip(axes, labels.position_std.T, strict=True)
         }
     return columns
 

@@ -14,7 +14,7 @@ from jeit.touch.health import HealthEvent, SkinHealth
 
 HEALTH_FILES = ("events.csv", "report.json", "health.png")
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
-_EVENTS = (
+_EVENT_COLUMNS = (
     "event", "kind", "status", "time", "noticed", "frame", "electrode", "channels", "strength", "length_m",
     "length_deviation_m", "path_m", "reason",
 )  # fmt: skip
@@ -36,39 +36,41 @@ def write_health(
     frames; `notes`: reasons to doubt the result. In the table, a path is a list of points x y in metres, separated by
     semicolons; electrodes are numbered from 1. Raises `ValueError` if `folder` cannot be a folder.
     """
-    with results(folder, HEALTH_FILES) as made:
-        write_rows(made / "events.csv", _EVENTS, (_event_row(one) for one in health.events))
-        write_json(report_health(health, name, timed) | {"notes": list(notes)}, made / "report.json")
-        draw_health(health, times, frames, timed).savefig(made / "health.png", dpi=130)
+    with results(folder, HEALTH_FILES) as result_folder:
+        write_rows(result_folder / "events.csv", _EVENT_COLUMNS, (_event_row(event) for event in health.events))
+        write_json(report_health(health, name, timed) | {"notes": list(notes)}, result_folder / "report.json")
+        draw_health(health, times, frames, timed).savefig(result_folder / "health.png", dpi=130)
 
 
 def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:
     """Report the detected events as plain numbers, strings, lists and dictionaries; unknown values are None."""
-    held = health.held
+    held_event = health.held
     return as_plain_values(
         {
             "recording": name,
             "frames": health.frames,
             "events": [
                 {
-                    "event": one.number,
-                    "kind": one.kind,
-                    "status": one.status,
-                    "time": one.time,
-                    "noticed": one.noticed,
-                    "frame": one.frame,
-                    "electrode": None if one.electrode is None else one.electrode + 1,
-                    "channels": np.flatnonzero(one.channels),
-                    "strength": one.strength,
-                    "length_m": None if one.path is None else one.length,
-                    "length_deviation_m": None if one.path is None else one.deviation,
-                    "through": one.through,
-                    "path_m": one.path,
-                    "reason": one.reason,
+                    "event": event.number,
+                    "kind": event.kind,
+                    "status": event.status,
+                    "time": event.time,
+                    "noticed": event.noticed,
+                    "frame": event.frame,
+                    "electrode": None if event.electrode is None else event.electrode + 1,
+                    "channels": np.flatnonzero(event.channels),
+                    "strength": event.strength,
+                    "length_m": None if event.path is None else event.length,
+                    "length_deviation_m": None if event.path is None else event.deviation,
+                    "through": event.through,
+                    "path_m": event.path,
+                    "reason": event.reason,
                 }
-                for one in health.events
+                for event in health.events
             ],
-            "held": None if held is None else {"time": held.time, "kind": held.kind, "reason": held.reason},
+            "held": None
+            if held_event is None
+            else {"time": held_event.time, "kind": held_event.kind, "reason": held_event.reason},
             "trusted_channels": np.flatnonzero(health.trusted),
             "channels_without_a_reading": np.flatnonzero(~health.healthy.used),
             "patience": health.patience,
@@ -87,19 +89,19 @@ def draw_health(health: SkinHealth, times: Float[np.ndarray, " F"], frames: Floa
 
     figure = Figure(figsize=(13.0, 4.6) if health.skin is not None else (9.5, 3.6), layout="constrained")
     if health.skin is not None:
-        ax, beside = figure.subplots(1, 2, width_ratios=(1.7, 1))
-        plot_health(health, title="The skin now", ax=beside)
+        ax, skin_axes = figure.subplots(1, 2, width_ratios=(1.7, 1))
+        plot_health(health, title="The skin now", ax=skin_axes)
     else:
         ax = figure.subplots()
-    number = len(health.events)
-    said = f"{number} event{'' if number == 1 else 's'} in {len(frames):,} frames"
-    plot_health_course(health, times, frames, title=said, ax=ax)
+    num_events = len(health.events)
+    course_title = f"{num_events} event{'' if num_events == 1 else 's'} in {len(frames):,} frames"
+    plot_health_course(health, times, frames, title=course_title, ax=ax)
     ax.set_xlabel("Time (s)" if timed else "Frame")
     return figure
 
 
 def _event_row(event: HealthEvent) -> list[object]:
-    """Row of `events.csv` for an event."""
+    """Create the row of `events.csv` for an event."""
     path = "" if event.path is None else "; ".join(f"{x:.5f} {y:.5f}" for x, y in event.path)
     return [
         event.number,

@@ -39,10 +39,10 @@ def write_gestures(learnt: LearntGestures, folder: str | Path, *, name: str = "r
 
     `name`: name of the recordings. Raises `ValueError` if `folder` cannot be a folder.
     """
-    with results(folder, GESTURE_FILES) as made:
-        learnt.model.write(made / GESTURE_FILE)
-        write_json(report_gestures(learnt, name), made / "report.json")
-        draw_gestures(learnt).savefig(made / "gestures.png", dpi=150)
+    with results(folder, GESTURE_FILES) as result_folder:
+        learnt.model.write(result_folder / GESTURE_FILE)
+        write_json(report_gestures(learnt, name), result_folder / "report.json")
+        draw_gestures(learnt).savefig(result_folder / "gestures.png", dpi=150)
 
 
 def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:
@@ -59,12 +59,12 @@ def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:
         "versions": {package: version_of(package) for package in _LEARNING_PACKAGES},
     }
     if standing is not None:
-        right = standing.held_out == standing.right
+        is_right = standing.held_out == standing.right
         report["held_out"] = {
             "touches": len(standing.right),
-            "right": right.mean(),
-            "right_by_gesture": {one: right[standing.right == one].mean() for one in model.names},
-            "tried": [{"classifier": one, "right": 1 - error} for one, error in standing.tried],
+            "right": is_right.mean(),
+            "right_by_gesture": {name: is_right[standing.right == name].mean() for name in model.names},
+            "tried": [{"classifier": name, "right": 1 - error} for name, error in standing.tried],
         }
     return as_plain_values(report)
 
@@ -78,21 +78,21 @@ def draw_gestures(learnt: LearntGestures):
     standing = learnt.model.standing
     figure = Figure(figsize=(12.0, 5.4), layout="constrained")
     if standing is not None:
-        left, right = figure.subplots(1, 2)
-        share = 100 * np.mean(standing.held_out == standing.right)
-        plot_confusion(standing, title=f"Gestures: {share:.1f} % right of touches held out", ax=left)
-        plot_tried(standing, ax=right)
+        left_axes, right_axes = figure.subplots(1, 2)
+        percentage = 100 * np.mean(standing.held_out == standing.right)
+        plot_confusion(standing, title=f"Gestures: {percentage:.1f} % right of touches held out", ax=left_axes)
+        plot_tried(standing, ax=right_axes)
     return figure
 
 
 WATCH_FILES = ("events.csv", "paths.csv", "report.json", "timeline.png")
-_PACKAGES = ("jeit", "jax", "numpy", "scikit-learn")
-_EVENTS = (
+_WATCH_PACKAGES = ("jeit", "jax", "numpy", "scikit-learn")
+_EVENT_COLUMNS = (
     "touch", "onset_s", "offset_s", "gesture", "probability", "unlike", "x_m", "y_m", "path_length_m",
     "displacement_m", "peak_S", "area_m2", "begun_before", "cut_off", "held", "lost_frames", "longest_gap_s", "named_s",
     "latency_ms",
 )  # fmt: skip
-_PATHS = ("touch", "time_s", "x_m", "y_m", "peak_S")
+_PATH_COLUMNS = ("touch", "time_s", "x_m", "y_m", "peak_S")
 
 
 @dataclass(frozen=True)
@@ -132,26 +132,29 @@ def write_watch(
     be a folder.
     """
     folder = results_folder(folder, WATCH_FILES)
-    for earlier in WATCH_FILES[2:]:
-        (folder / earlier).unlink(missing_ok=True)  # files of earlier touches
+    for file_name in WATCH_FILES[2:]:
+        (folder / file_name).unlink(missing_ok=True)  # files of earlier touches
     touches: list[NamedTouch] = []
     seconds, peaks, latency, counts, reason, notes = [], [], [], {}, "", []
-    with GrowingTable(folder / "events.csv", _EVENTS) as events, GrowingTable(folder / "paths.csv", _PATHS) as paths:
-        for one in watched:
-            for touch in one.ended:
+    with (
+        GrowingTable(folder / "events.csv", _EVENT_COLUMNS) as events,
+        GrowingTable(folder / "paths.csv", _PATH_COLUMNS) as paths,
+    ):
+        for frame in watched:
+            for touch in frame.ended:
                 touches.append(touch)
                 events.write(_event_row(touch))
                 for row in _path_rows(touch):
                     paths.write(row)
-            if one.image is not None:
-                seconds.append(one.second)
-                peaks.append(one.peak)
-                counts[str(one.image.status)] = counts.get(str(one.image.status), 0) + 1
-                reason = reason or ("" if one.image.imaged else one.image.reason)
-            latency += [one.latency] if one.named is not None else []
-            notes += [one.note] if one.note else []
+            if frame.image is not None:
+                seconds.append(frame.second)
+                peaks.append(frame.peak)
+                counts[str(frame.image.status)] = counts.get(str(frame.image.status), 0) + 1
+                reason = reason or ("" if frame.image.imaged else frame.image.reason)
+            latency += [frame.latency] if frame.named is not None else []
+            notes += [frame.note] if frame.note else []
             if progress is not None:
-                progress(one)
+                progress(frame)
     if not seconds:
         raise ValueError(f"'{name}': there was no frame in it.")
     written = WrittenWatch(
@@ -163,16 +166,16 @@ def write_watch(
         first_reason=reason,
         notes=tuple(notes),
     )
-    with results(folder, WATCH_FILES[2:]) as made:
-        write_json(report_watch(written, watch, name), made / "report.json")
-        draw_watch(written, watch).savefig(made / "timeline.png", dpi=130)
+    with results(folder, WATCH_FILES[2:]) as result_folder:
+        write_json(report_watch(written, watch, name), result_folder / "report.json")
+        draw_watch(written, watch).savefig(result_folder / "timeline.png", dpi=130)
     return written
 
 
 def report_watch(written: WrittenWatch, watch: TouchWatch, name: str) -> dict[str, Any]:
     """Report the detected touches as plain numbers, strings, lists and dictionaries; unknown values are None."""
-    names, number = np.unique([one.gesture for one in written.touches if not one.unlike], return_counts=True)
-    quick = written.latency
+    names, counts = np.unique([touch.gesture for touch in written.touches if not touch.unlike], return_counts=True)
+    latencies = written.latency
     return as_plain_values(
         {
             "stream": name,
@@ -181,22 +184,22 @@ def report_watch(written: WrittenWatch, watch: TouchWatch, name: str) -> dict[st
             "status": written.counts,
             "first_refusal": written.first_reason or None,
             "touches": len(written.touches),
-            "gestures": dict(zip(names.tolist(), number.tolist(), strict=True)),
-            "unlike_any_learnt": sum(one.unlike for one in written.touches),
-            "cut_off": sum(not one.touch.whole for one in written.touches),
-            "held": sum(one.held for one in written.touches),
+            "gestures": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+            "unlike_any_learnt": sum(touch.unlike for touch in written.touches),
+            "cut_off": sum(not touch.touch.whole for touch in written.touches),
+            "held": sum(touch.held for touch in written.touches),
             "gestures_known": list(watch.model.names),
             "classifier": f"{watch.model.method} on {watch.model.form}",
             "level_S": watch.level.level,
             "gap_s": watch.gap,
             "patience_s": watch.patience,
-            "named_within_s": {"median": np.median(quick), "99_percent": np.quantile(quick, 0.99)}
-            if quick.size
+            "named_within_s": {"median": np.median(latencies), "99_percent": np.quantile(latencies, 0.99)}
+            if latencies.size
             else None,
             "background_S": watch.images.background,
             "notes": [*watch.notes, *written.notes, *watch.model.notes, *watch.images.reference.notes],
             "units": {"length": "m", "time": "s", "change": "S"},
-            "versions": {package: version_of(package) for package in _PACKAGES},
+            "versions": {package: version_of(package) for package in _WATCH_PACKAGES},
         }
     )
 
@@ -210,15 +213,15 @@ def draw_watch(written: WrittenWatch, watch: TouchWatch):
     names = watch.model.names
     figure = Figure(figsize=(13.0, 2.6 + 0.42 * max(len(names), 5)), layout="constrained")
     grid = figure.add_gridspec(2, 2, width_ratios=(1.9, 1), height_ratios=(1, 1.25))
-    above = figure.add_subplot(grid[0, 0])
-    lanes = figure.add_subplot(grid[1, 0], sharex=above)
-    refused = int(np.isnan(written.peaks).sum())
-    said = f"{counted(len(written.touches), 'touch')} in {written.seconds[-1] - written.seconds[0]:.4g} s"
-    said += f"; {counted(refused, 'frame')} refused" if refused else ""
-    plot_changes(written.seconds, written.peaks, watch.level.level, title=said, ax=above)
-    plot_timeline(list(written.touches), names, ax=lanes)
-    above.set_xlim(*_first_and_last(written.seconds))
-    above.tick_params(labelbottom=False)
+    upper_axes = figure.add_subplot(grid[0, 0])
+    lower_axes = figure.add_subplot(grid[1, 0], sharex=upper_axes)
+    num_refused = int(np.isnan(written.peaks).sum())
+    title = f"{counted(len(written.touches), 'touch')} in {written.seconds[-1] - written.seconds[0]:.4g} s"
+    title += f"; {counted(num_refused, 'frame')} refused" if num_refused else ""
+    plot_changes(written.seconds, written.peaks, watch.level.level, title=title, ax=upper_axes)
+    plot_timeline(list(written.touches), names, ax=lower_axes)
+    upper_axes.set_xlim(*_first_and_last(written.seconds))
+    upper_axes.tick_params(labelbottom=False)
     model = watch.images.calibration.model
     plot_touch_paths(
         model.mesh,
@@ -232,16 +235,16 @@ def draw_watch(written: WrittenWatch, watch: TouchWatch):
 
 
 def _first_and_last(seconds: np.ndarray) -> tuple[float, float]:
-    """Times of the first and the last frame, seconds."""
+    """Return the times of the first and the last frame, seconds."""
     return float(seconds[0]), max(float(seconds[-1]), float(seconds[0]) + 1e-3)
 
 
 def _event_row(touch: NamedTouch) -> list[object]:
-    """Row of `events.csv` for a touch."""
+    """Create the row of `events.csv` for a touch."""
     course = touch.touch.course
-    at = int(course.peak.argmax())
-    place = course.centroid[np.isfinite(course.centroid).all(axis=1)]
-    length = float(np.linalg.norm(np.diff(place, axis=0), axis=1).sum())
+    peak_frame = int(course.peak.argmax())
+    centroids = course.centroid[np.isfinite(course.centroid).all(axis=1)]
+    path_length = float(np.linalg.norm(np.diff(centroids, axis=0), axis=1).sum())
     return [
         touch.number,
         f"{touch.touch.onset:.4f}",
@@ -249,11 +252,11 @@ def _event_row(touch: NamedTouch) -> list[object]:
         "" if touch.unlike else touch.gesture,
         f"{touch.probability:.4f}",
         int(touch.unlike),
-        *(f"{value:.5f}" for value in course.centroid[at]),
-        f"{length:.5f}",
-        f"{np.linalg.norm(place[-1] - place[0]):.5f}",
-        f"{course.peak[at]:.6g}",
-        f"{course.area[at]:.6g}",
+        *(f"{value:.5f}" for value in course.centroid[peak_frame]),
+        f"{path_length:.5f}",
+        f"{np.linalg.norm(centroids[-1] - centroids[0]):.5f}",
+        f"{course.peak[peak_frame]:.6g}",
+        f"{course.area[peak_frame]:.6g}",
         int(touch.touch.begun_before),
         int(touch.touch.cut_off),
         int(touch.held),
@@ -265,16 +268,16 @@ def _event_row(touch: NamedTouch) -> list[object]:
 
 
 def _path_rows(touch: NamedTouch) -> list[list[object]]:
-    """Rows of `paths.csv` for a touch, one for each of its frames."""
+    """Create the rows of `paths.csv` for a touch, one for each of its frames."""
     course = touch.touch.course
     return [
         [
             touch.number,
             f"{second:.4f}",
-            *(f"{value:.5f}" if np.isfinite(value) else "" for value in place),
+            *(f"{value:.5f}" if np.isfinite(value) else "" for value in centroid),
             f"{peak:.6g}",
         ]
-        for second, place, peak in zip(course.seconds, course.centroid, course.peak, strict=True)
+        for second, centroid, peak in zip(course.seconds, course.centroid, course.peak, strict=True)
     ]
 
 
@@ -411,7 +414,7 @@ def _report_contacts(found: RecordedContacts, images: TouchImages, name: str) ->
             ],
             "notes": list(found.notes),
             "units": {"onset": "s", "position": "m", "path_length": "m", "peak": "S", "background": "S"},
-            "versions": {package: version_of(package) for package in _PACKAGES[:3]},
+            "versions": {package: version_of(package) for package in _WATCH_PACKAGES[:3]},
         }
     )
 

@@ -109,20 +109,20 @@ class ChunkBatches(NamedTuple):
 class BatchOrder:
     """The order of rows in batches.
 
-    In every epoch, the chunks, and the rows within each chunk, are shuffled anew. The remaining rows that do not fill a
-    batch are left out; they are others in each epoch. `sizes`: number of rows of each chunk; `batch`: number of rows in
-    a batch. The order depends only on `seed`, so that the index of a batch determines its rows.
+    In every epoch, the chunks, and the rows within each chunk, are shuffled anew. Rows that remain when no full batch
+    can be formed are left out; they differ between epochs. `sizes`: number of rows of each chunk; `batch`: number of
+    rows in a batch. The order depends only on `seed`, so that the index of a batch determines its rows.
     """
 
     def __init__(self, sizes: tuple[int, ...], batch: int, seed: list[int]):
         self.batch, self.seed = min(batch, *sizes), seed
-        self.batches = [size // self.batch for size in sizes]
+        self.num_batches = [size // self.batch for size in sizes]
         self.sizes = sizes
 
     @property
     def batches_per_epoch(self) -> int:
         """Number of batches in an epoch."""
-        return sum(self.batches)
+        return sum(self.num_batches)
 
     def chunk_batches(self, first: int, last: int, max_batches: int) -> Iterator[ChunkBatches]:
         """Yield the batches from `first` to `last`, exclusive, grouped by chunk.
@@ -130,18 +130,20 @@ class BatchOrder:
         `max_batches`: maximum number of batches in a group.
         """
         while first < last:
-            epoch, place = divmod(first, self.batches_per_epoch)
+            epoch, batch_in_epoch = divmod(first, self.batches_per_epoch)
             chunks = self._permutation(len(self.sizes), epoch)
-            ends = np.cumsum([self.batches[one] for one in chunks])
-            which = int(np.searchsorted(ends, place, side="right"))
-            chunk = int(chunks[which])
-            within = place - (int(ends[which]) - self.batches[chunk])
-            number = min(max_batches, last - first, int(ends[which]) - place)
-            rows = self._permutation(self.sizes[chunk], epoch, 1 + chunk)[within * self.batch :][: number * self.batch]
-            yield ChunkBatches(chunk, rows.reshape(number, self.batch), first)
-            first += number
+            last_batches = np.cumsum([self.num_batches[chunk_index] for chunk_index in chunks])
+            position = int(np.searchsorted(last_batches, batch_in_epoch, side="right"))
+            chunk = int(chunks[position])
+            batch_in_chunk = batch_in_epoch - (int(last_batches[position]) - self.num_batches[chunk])
+            group_size = min(max_batches, last - first, int(last_batches[position]) - batch_in_epoch)
+            rows = self._permutation(self.sizes[chunk], epoch, 1 + chunk)[batch_in_chunk * self.batch :][
+                : group_size * self.batch
+            ]
+            yield ChunkBatches(chunk, rows.reshape(group_size, self.batch), first)
+            first += group_size
 
-    def _permutation(self, count: int, *place: int) -> np.ndarray:
-        """Random permutation of 0 … `count` - 1, determined by the seed and by `place`: the epoch, or epoch and
-        chunk."""
-        return np.random.default_rng([*self.seed, *place]).permutation(count)
+    def _permutation(self, count: int, *location: int) -> np.ndarray:
+        """Draw a random permutation of 0 … `count` - 1, determined by the seed and by `location`: the epoch, or epoch
+        and chunk."""
+        return np.random.default_rng([*self.seed, *location]).permutation(count)

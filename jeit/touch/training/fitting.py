@@ -21,7 +21,7 @@ from jeit.touch.training.batches import ArrayRows, BatchOrder
 from jeit.touch.training.model_file import Checkpoint, Course, State
 
 # Number of batches after which a checkpoint may be written; maximum number of held-out rows evaluated at once.
-_CHECKPOINT_BATCHES, _AT_ONCE = 32, 256
+_CHECKPOINT_BATCHES, _MAX_BATCH_SIZE = 32, 256
 
 
 class TrainingObjective(NamedTuple):
@@ -80,13 +80,13 @@ class TrainingPlan:
     def __post_init__(self):
         """Raises `ValueError` for settings that are not valid numbers."""
         for name in ("rate", "decay"):
-            given = getattr(self, name)
-            if not (is_number(given) and given > 0):
-                raise ValueError(f"{name} must be positive; it is {describe(given)}.")
+            value = getattr(self, name)
+            if not (is_number(value) and value > 0):
+                raise ValueError(f"{name} must be positive; it is {describe(value)}.")
         for name in ("batch", "epochs", "patience", "decay_epochs", "look_every"):
-            given = getattr(self, name)
-            if not (isinstance(given, int) and given >= 1) and not (name == "look_every" and given is None):
-                raise ValueError(f"{name} must be a whole number, 1 or more; it is {describe(given)}.")
+            value = getattr(self, name)
+            if not (isinstance(value, int) and value >= 1) and not (name == "look_every" and value is None):
+                raise ValueError(f"{name} must be a whole number, 1 or more; it is {describe(value)}.")
         if not (is_number(self.seconds) and self.seconds >= 0):
             raise ValueError(f"seconds must be zero or more; it is {describe(self.seconds)}.")
 
@@ -146,8 +146,8 @@ def fit_network(
     check_kind("objective", objective, TrainingObjective, "a TrainingObjective(loss, held_out)")
     plan = TrainingPlan() if plan is None else plan
     rows = training if _are_rows(training) else ArrayRows(training)
-    held = ArrayRows(validation, "validation")
-    held_out_arrays = jax.tree.map(jnp.asarray, held.arrays)
+    validation_rows = ArrayRows(validation, "validation")
+    held_out_arrays = jax.tree.map(jnp.asarray, validation_rows.arrays)
     seed = [int(word) for word in np.asarray(jax.random.key_data(key) if _is_typed_key(key) else key).ravel()]
     order = BatchOrder(rows.sizes, plan.batch, seed)
     run = _CompiledTraining(network, objective, plan, order, jax.random.wrap_key_data(jnp.asarray(seed, jnp.uint32)))
@@ -155,31 +155,37 @@ def fit_network(
         "plan": {**dataclasses.asdict(plan), "seconds": 0},
         "key": seed,
         "network": [
-            str(one) for one in jax.tree.leaves(eqx.filter_eval_shape(lambda: network)) if hasattr(one, "shape")
+            str(leaf) for leaf in jax.tree.leaves(eqx.filter_eval_shape(lambda: network)) if hasattr(leaf, "shape")
         ],
         "training": rows.fingerprint,
-        "validation": held.fingerprint,
+        "validation": validation_rows.fingerprint,
     }
-    kept = None if checkpoint is None else Checkpoint(checkpoint, fingerprint)
-    state = run.initial_state() if kept is None else kept.read(run.initial_state())
+    checkpoint_file = None if checkpoint is None else Checkpoint(checkpoint, fingerprint)
+    state = run.initial_state() if checkpoint_file is None else checkpoint_file.read(run.initial_state())
     look_every = plan.look_every or order.batches_per_epoch
-    last, saved, loaded = plan.epochs * order.batches_per_epoch, time.monotonic(), (-1, None)
-    while (reason := _end_reason(state, plan, last)) is None:
-        upto = min(last, (state.step // look_every + 1) * look_every)
-        for batches in order.chunk_batches(state.step, upto, _CHECKPOINT_BATCHES):
-            if loaded[0] != batches.chunk:
-                loaded = -1, None  # so that two chunks are never in memory
-                loaded = batches.chunk, jax.tree.map(jnp.asarray, rows.chunk(batches.chunk))
-            state = run.train_batches(state, loaded[1], batches.rows)
-            if state.step < upto and kept is not None and time.monotonic() - saved >= plan.seconds:
-                kept.write(state)
-                saved = time.monotonic()
-        state = run.evaluate(state, held_out_arrays, upto - (upto - 1) // look_every * look_every)
+    last_batch, last_saved, loaded_chunk = plan.epochs * order.batches_per_epoch, time.monotonic(), (-1, None)
+    while (reason := _end_reason(state, plan, last_batch)) is None:
+        next_evaluation = min(last_batch, (state.step // look_every + 1) * look_every)
+        for batches in order.chunk_batches(state.step, next_evaluation, _CHECKPOINT_BATCHES):
+            if loaded_chunk[0] != batches.chunk:
+                loaded_chunk = -1, None  # so that two chunks are never in memory
+                loaded_chunk = batches.chunk, jax.tree.map(jnp.asarray, rows.chunk(batches.chunk))
+            state = run.train_batches(state, loaded_chunk[1], batches.rows)
+            if (
+                state.step < next_evaluation
+                and checkpoint_file is not None
+                and time.monotonic() - last_saved >= plan.seconds
+            ):
+                checkpoint_file.write(state)
+                last_saved = time.monotonic()
+        state = run.evaluate(state, held_out_arrays, next_evaluation - (next_evaluation - 1) // look_every * look_every)
         if progress is not None:
             progress(_describe_progress(state, plan, order.batches_per_epoch))
-        if kept is not None and (time.monotonic() - saved >= plan.seconds or _end_reason(state, plan, last)):
-            kept.write(state)
-            saved = time.monotonic()
+        if checkpoint_file is not None and (
+            time.monotonic() - last_saved >= plan.seconds or _end_reason(state, plan, last_batch)
+        ):
+            checkpoint_file.write(state)
+            last_saved = time.monotonic()
     return TrainingResult(run.combine(state.best), state.course, reason)
 
 
@@ -196,25 +202,25 @@ class _CompiledTraining:
         combine, trained = self.combine, objective.trained
 
         def update(arrays, state, batch, key):
-            moving, still = eqx.partition(combine(arrays), trained)
+            trained_part, fixed_part = eqx.partition(combine(arrays), trained)
 
-            def loss(moving):
-                value, after = objective.loss(eqx.combine(moving, still), batch, key)
-                return value, eqx.filter(eqx.partition(after, trained)[1], eqx.is_array)
+            def loss(trained_part):
+                loss_value, updated_network = objective.loss(eqx.combine(trained_part, fixed_part), batch, key)
+                return loss_value, eqx.filter(eqx.partition(updated_network, trained)[1], eqx.is_array)
 
-            (value, still_after), slope = eqx.filter_value_and_grad(loss, has_aux=True)(moving)
-            updates, state = adam.update(slope, state, eqx.filter(moving, eqx.is_inexact_array))
-            moving = eqx.apply_updates(moving, updates)
-            return eqx.combine(eqx.filter(moving, eqx.is_array), still_after), state, value
+            (loss_value, updated_fixed_part), gradients = eqx.filter_value_and_grad(loss, has_aux=True)(trained_part)
+            updates, state = adam.update(gradients, state, eqx.filter(trained_part, eqx.is_inexact_array))
+            trained_part = eqx.apply_updates(trained_part, updates)
+            return eqx.combine(eqx.filter(trained_part, eqx.is_array), updated_fixed_part), state, loss_value
 
         # Each step is one call: on CPUs, XLA's convolutions take a hundred times as long within compiled loops.
-        def train_batch(arrays, state, total, data, rows, number):
-            batch = jax.tree.map(lambda one: one[rows], data)
-            arrays, state, value = update(arrays, state, batch, jax.random.fold_in(key, number))
-            return arrays, state, total + value.astype(total.dtype)
+        def train_batch(arrays, state, total_loss, data, rows, batch_index):
+            batch = jax.tree.map(lambda array: array[rows], data)
+            arrays, state, loss_value = update(arrays, state, batch, jax.random.fold_in(key, batch_index))
+            return arrays, state, total_loss + loss_value.astype(total_loss.dtype)
 
         def held_out_loss(arrays, data, rows):
-            return objective.held_out(combine(arrays), jax.tree.map(lambda one: one[rows], data))
+            return objective.held_out(combine(arrays), jax.tree.map(lambda array: array[rows], data))
 
         self._train_batch, self._held_out_loss = jax.jit(train_batch), jax.jit(held_out_loss)
         self.optimiser = adam.init(eqx.filter(eqx.partition(network, trained)[0], eqx.is_inexact_array))
@@ -229,47 +235,55 @@ class _CompiledTraining:
 
     def train_batches(self, state: State, data, rows: Int[np.ndarray, "b batch"]) -> State:
         """Train on batches of these rows; returns the new state."""
-        arrays, optimiser, total = state.moving, state.optimiser, state.total
-        for place, batch in enumerate(rows):
-            arrays, optimiser, total = self._train_batch(arrays, optimiser, total, data, batch, state.step + place)
-        return State(state.step + len(rows), state.course, arrays, optimiser, state.best, total)
+        arrays, optimiser, total_loss = state.arrays, state.optimiser, state.total
+        for offset, batch in enumerate(rows):
+            arrays, optimiser, total_loss = self._train_batch(
+                arrays, optimiser, total_loss, data, batch, state.step + offset
+            )
+        return State(state.step + len(rows), state.course, arrays, optimiser, state.best, total_loss)
 
-    def evaluate(self, state: State, data, since: int) -> State:
-        """Evaluate the held-out rows, `since` batches after the last evaluation; returns the new state.
+    def evaluate(self, state: State, data, num_batches: int) -> State:
+        """Evaluate the held-out rows, `num_batches` batches after the last evaluation; returns the new state.
 
         Raises `ValueError` if neither this loss nor any before was finite.
         """
-        number = len(jax.tree.leaves(data)[0])
-        size = min(number, _AT_ONCE)
-        index = np.minimum(np.arange(-(-number // size) * size), number - 1).reshape(-1, size)
-        each = [np.asarray(self._held_out_loss(state.moving, data, rows)) for rows in index]
-        held = float(np.concatenate(each)[:number].mean())
-        own = state.course
-        course = Course([*own.steps, state.step], [*own.training, float(state.total) / since], [*own.validation, held])
-        if not np.isfinite(held) and not np.isfinite(own.validation).any():
+        num_rows = len(jax.tree.leaves(data)[0])
+        batch_size = min(num_rows, _MAX_BATCH_SIZE)
+        row_indices = np.minimum(np.arange(-(-num_rows // batch_size) * batch_size), num_rows - 1).reshape(
+            -1, batch_size
+        )
+        losses = [np.asarray(self._held_out_loss(state.arrays, data, rows)) for rows in row_indices]
+        held_out_loss = float(np.concatenate(losses)[:num_rows].mean())
+        previous_course = state.course
+        course = Course(
+            [*previous_course.steps, state.step],
+            [*previous_course.training, float(state.total) / num_batches],
+            [*previous_course.validation, held_out_loss],
+        )
+        if not np.isfinite(held_out_loss) and not np.isfinite(previous_course.validation).any():
             raise ValueError(
-                f"the loss of the rows held out is {held} after {state.step} batches; are all rows finite, and is the "
-                "plan's rate too large?"
+                f"the loss of the rows held out is {held_out_loss} after {state.step} batches; are all rows finite, "
+                "and is the plan's rate too large?"
             )
-        finite = [value if np.isfinite(value) else np.inf for value in course.validation]
-        course = course._replace(validation=finite)
-        best = state.moving if course.best == len(finite) - 1 else state.best
-        return State(state.step, course, state.moving, state.optimiser, best, jnp.zeros(()))
+        finite_losses = [value if np.isfinite(value) else np.inf for value in course.validation]
+        course = course._replace(validation=finite_losses)
+        best_arrays = state.arrays if course.best == len(finite_losses) - 1 else state.best
+        return State(state.step, course, state.arrays, state.optimiser, best_arrays, jnp.zeros(()))
 
 
 def _end_reason(state: State, plan: TrainingPlan, last_batch: int) -> str | None:
     """Return the reason why the training has ended, or None if it has not."""
-    looks = len(state.course.validation)
-    if looks and looks - 1 - state.course.best >= plan.patience:
+    num_evaluations = len(state.course.validation)
+    if num_evaluations and num_evaluations - 1 - state.course.best >= plan.patience:
         return f"no better at {plan.patience} looks in a row"
     return f"{plan.epochs} epochs done" if state.step >= last_batch else None
 
 
 def _describe_progress(state: State, plan: TrainingPlan, batches_per_epoch: int) -> str:
-    own = state.course
+    course = state.course
     return (
-        f"epoch {state.step / batches_per_epoch:.3g} of {plan.epochs}: {own.training[-1]:.4g}, held out "
-        f"{own.validation[-1]:.4g} (best {own.validation[own.best]:.4g})"
+        f"epoch {state.step / batches_per_epoch:.3g} of {plan.epochs}: {course.training[-1]:.4g}, held out "
+        f"{course.validation[-1]:.4g} (best {course.validation[course.best]:.4g})"
     )
 
 

@@ -18,7 +18,7 @@ from jeit.arguments import describe
 from jeit.files import reason, written_whole
 
 # First bytes of a file; maximum size of the header, and of all arrays together, bytes.
-_MAGIC, _LONGEST_HEAD, _LARGEST = b"jeit model\n", 2**20, 2**31
+_MAGIC, _MAX_HEADER_SIZE, _MAX_ARRAY_SIZE = b"jeit model\n", 2**20, 2**31
 
 
 def write_model(path: str | Path, kind: str, version: int, head: dict[str, Any], model: Any) -> None:
@@ -32,11 +32,13 @@ def write_model(path: str | Path, kind: str, version: int, head: dict[str, Any],
     if path.is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {path / 'network.jeit'}.")
     text = json.dumps({"kind": kind, "version": version, **head}, allow_nan=True).encode()
-    if len(text) > _LONGEST_HEAD:
-        raise ValueError(f"head has {len(text)} bytes as JSON, more than {_LONGEST_HEAD}; put arrays into the model.")
+    if len(text) > _MAX_HEADER_SIZE:
+        raise ValueError(
+            f"head has {len(text)} bytes as JSON, more than {_MAX_HEADER_SIZE}; put arrays into the model."
+        )
     arrays = [leaf for leaf in jax.tree.leaves(model) if eqx.is_array(leaf)]
-    if _num_bytes(arrays) > _LARGEST:
-        raise ValueError(f"model has {_num_bytes(arrays)} bytes of arrays, and a file {_LARGEST} at most.")
+    if _num_bytes(arrays) > _MAX_ARRAY_SIZE:
+        raise ValueError(f"model has {_num_bytes(arrays)} bytes of arrays, and a file {_MAX_ARRAY_SIZE} at most.")
     with written_whole(path) as file:
         file.write(_MAGIC + text + b"\n")
         for array in arrays:
@@ -66,34 +68,35 @@ def read_model(
     with _open_file(Path(path), kind) as file:
         head = _read_header(file, kind, version)
         try:
-            like = eqx.filter_eval_shape(make, head)
+            architecture = eqx.filter_eval_shape(make, head)
         except (KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
             raise ValueError(
                 f"its header does not describe such a model ({type(error).__name__}: {reason(error)})"
             ) from None
-        arrays = [leaf for leaf in jax.tree.leaves(like) if isinstance(leaf, jax.ShapeDtypeStruct)]
-        left = os.fstat(file.fileno()).st_size - file.tell()
-        if not _num_bytes(arrays) <= min(left, _LARGEST):
+        arrays = [leaf for leaf in jax.tree.leaves(architecture) if isinstance(leaf, jax.ShapeDtypeStruct)]
+        remaining_bytes = os.fstat(file.fileno()).st_size - file.tell()
+        if not _num_bytes(arrays) <= min(remaining_bytes, _MAX_ARRAY_SIZE):
             raise ValueError(
-                f"it has {left} bytes of arrays, fewer than the {_num_bytes(arrays)} that its header describes"
+                f"it has {remaining_bytes} bytes of arrays, fewer than the {_num_bytes(arrays)} that its header "
+                "describes"
             )
-        model = jax.tree.map(lambda leaf: _read_array(file, leaf), like)
+        model = jax.tree.map(lambda leaf: _read_array(file, leaf), architecture)
         if file.read(1):
             raise ValueError("it has more bytes after its last array")
     return head, model
 
 
-def check_same(path: str | Path, made_for: dict[str, Any], here: dict[str, Any]) -> None:
+def check_same(path: str | Path, made_for: dict[str, Any], expected: dict[str, Any]) -> None:
     """Check that a model is used for what it was trained for.
 
-    `made_for`, `here`: descriptions, such as of a skin and its protocol, as dictionaries of JSON values, in which
+    `made_for`, `expected`: descriptions, such as of a skin and its protocol, as dictionaries of JSON values, in which
     numbers may differ by a millionth. Raises `ValueError`, which states the first difference.
     """
-    for name in here:
-        if not _are_equal(made_for.get(name), here[name]):
+    for name in expected:
+        if not _are_equal(made_for.get(name), expected[name]):
             raise ValueError(
                 f"'{path}' was trained for another skin or protocol: its {name} is {_shorten(made_for.get(name))}, and "
-                f"here it is {_shorten(here[name])}; train one for this."
+                f"here it is {_shorten(expected[name])}; train one for this."
             )
 
 
@@ -112,9 +115,10 @@ def _open_file(path: Path, kind: str) -> Iterator[BinaryIO]:
 
 
 def _read_header(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:
+    """Read the header of a file. Raises `ValueError` if the file is of another kind or version."""
     if file.read(len(_MAGIC)) != _MAGIC:
         raise ValueError("it is a file of another kind")
-    line = file.readline(_LONGEST_HEAD + 1)
+    line = file.readline(_MAX_HEADER_SIZE + 1)
     if not line.endswith(b"\n"):
         raise ValueError("its header is truncated, or too long")
     try:
@@ -122,15 +126,15 @@ def _read_header(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:
     except (ValueError, RecursionError):
         raise ValueError("its header is not JSON") from None
     if not isinstance(head, dict) or head.get("kind") != kind:
-        other = head.get("kind") if isinstance(head, dict) else head
-        raise ValueError(f"it is {describe(other)}")
+        stored_kind = head.get("kind") if isinstance(head, dict) else head
+        raise ValueError(f"it is {describe(stored_kind)}")
     if head.get("version") != version:
         raise ValueError(f"it is of version {describe(head.get('version'))}, and this jeit reads {version}")
     return head
 
 
 def _num_bytes(arrays) -> int:
-    return sum(math.prod(one.shape) * np.dtype(one.dtype).itemsize for one in arrays)
+    return sum(math.prod(array.shape) * np.dtype(array.dtype).itemsize for array in arrays)
 
 
 def _read_array(file: BinaryIO, leaf: Any) -> Any:
@@ -167,7 +171,7 @@ def _shorten(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:59]}…"
 
 
-_KIND, _VERSION = "a jeit training under way", 1
+_CHECKPOINT_KIND, _CHECKPOINT_VERSION = "a jeit training under way", 1
 
 
 class Course(NamedTuple):
@@ -190,14 +194,14 @@ class Course(NamedTuple):
 class State(NamedTuple):
     """The whole state of a training.
 
-    `step`: number of batches processed; `course`: the training history; `moving`: current arrays of the network,
+    `step`: number of batches processed; `course`: the training history; `arrays`: current arrays of the network,
     trained or not; `optimiser`: state of the optimiser; `best`: arrays of the best network so far; `total`: sum of the
     losses since the last evaluation.
     """
 
     step: int
     course: Course
-    moving: Any
+    arrays: Any
     optimiser: Any
     best: Any
     total: Any
@@ -212,7 +216,7 @@ class Checkpoint:
     def write(self, state: State) -> None:
         """Write the state; the file is replaced only when all is written."""
         head = {"training": self.fingerprint, "step": state.step, "course": list(state.course)}
-        write_model(self.path, _KIND, _VERSION, head, state[2:])
+        write_model(self.path, _CHECKPOINT_KIND, _CHECKPOINT_VERSION, head, state[2:])
 
     def read(self, initial_state: State) -> State:
         """Read the state; if there is no file, return `initial_state`, the state before the first batch.
@@ -231,5 +235,5 @@ class Checkpoint:
                     )
             return jax.tree.map(lambda leaf: leaf, initial_state[2:])
 
-        head, arrays = read_model(self.path, _KIND, _VERSION, make)
+        head, arrays = read_model(self.path, _CHECKPOINT_KIND, _CHECKPOINT_VERSION, make)
         return State(head["step"], Course(*head["course"]), *arrays)

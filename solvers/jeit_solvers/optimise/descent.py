@@ -98,9 +98,9 @@ def ended_number(result: optx.RESULTS) -> Int[Array, ""]:
     Status.of_number(ended_number(optx.RESULTS.successful))
     ```
     """
-    limit = result == optx.RESULTS.nonlinear_max_steps_reached
-    other = jnp.where(limit, Status.STEP_LIMIT.number, Status.STALLED.number)
-    return jnp.where(result == optx.RESULTS.successful, Status.CONVERGED.number, other)
+    reached_limit = result == optx.RESULTS.nonlinear_max_steps_reached
+    other_number = jnp.where(reached_limit, Status.STEP_LIMIT.number, Status.STALLED.number)
+    return jnp.where(result == optx.RESULTS.successful, Status.CONVERGED.number, other_number)
 
 
 Objective = Callable[[Float[Array, " n"]], Float[Array, ""]]
@@ -220,27 +220,28 @@ def scipy_lbfgsb(
     ```
     """
     shape = np.shape(start)
-    ends = [np.broadcast_to(np.asarray(end, float), shape).ravel() for end in (lower, upper)]
+    bounds_per_entry = [np.broadcast_to(np.asarray(bound, float), shape).ravel() for bound in (lower, upper)]
 
-    def of_vector(vector):
+    def evaluate_vector(vector):
         value, gradient = value_and_gradient(jnp.asarray(vector).reshape(shape))
         return np.asarray(value, float), np.asarray(gradient, float).ravel()
 
-    found = scipy.optimize.minimize(
-        of_vector,
+    result = scipy.optimize.minimize(
+        evaluate_vector,
         np.asarray(start, float).ravel(),
         jac=True,
         tol=tolerance,
-        bounds=np.stack(ends, axis=1),
+        bounds=np.stack(bounds_per_entry, axis=1),
         method="L-BFGS-B",
         callback=None if callback is None else lambda vector: callback(jnp.asarray(vector).reshape(shape)),
         options={"maxiter": max_steps},
     )
-    status = Status.CONVERGED if found.success else Status.STEP_LIMIT if found.status == 1 else Status.STALLED
-    return found.x.reshape(shape), float(found.fun), status
+    status = Status.CONVERGED if result.success else Status.STEP_LIMIT if result.status == 1 else Status.STALLED
+    return result.x.reshape(shape), float(result.fun), status
 
 
-_LEAST_SCALE = 2.0**-20
+# Minimum scale of a shortened step, and fraction of the predicted decrease that an accepted step must achieve.
+_MIN_SCALE = 2.0**-20
 _SUFFICIENT_DECREASE = 1e-4
 # Rounding error of a cost, which is a sum of many squares, in units of its machine precision.
 _ROUNDING_FACTOR = 100.0
@@ -298,7 +299,7 @@ class Descent(optx.AbstractLeastSquaresSolver):
         if "expand" not in options:
             raise ValueError("Descent needs options={'expand': function}; see its documentation.")
         xp = namespace(y)
-        zero, number = xp.zeros((), y.dtype), xp.zeros((), int)
+        zero, zero_count = xp.zeros((), y.dtype), xp.zeros((), int)
         return DescentState(
             trial=y,
             direction=xp.zeros_like(y),
@@ -307,8 +308,8 @@ class Descent(optx.AbstractLeastSquaresSolver):
             curvature=zero,
             cost=zero + np.inf,
             damping=zero + self.damping,
-            num_steps=number,
-            num_accepted=number,
+            num_steps=zero_count,
+            num_accepted=zero_count,
             history=xp.full(self.history, np.nan, y.dtype),
             converged=xp.zeros((), bool),
             stuck=xp.zeros((), bool),
@@ -318,13 +319,15 @@ class Descent(optx.AbstractLeastSquaresSolver):
         """Evaluate the trial point. If its cost is low enough, continue from it; otherwise try a shorter step."""
         xp = namespace(y)
         cost, step = options["expand"](state.trial, args)
-        predicted = -(state.scale * state.slope + 0.5 * state.scale**2 * state.curvature)
+        predicted_decrease = -(state.scale * state.slope + 0.5 * state.scale**2 * state.curvature)
         # Close to the minimum steps change the cost by less than its rounding, and lead nearer all the same.
-        rounding = _ROUNDING_FACTOR * np.finfo(y.dtype).eps * state.cost
-        good = xp.isfinite(cost) & (cost <= state.cost + rounding - _SUFFICIENT_DECREASE * predicted)
+        rounding_error = _ROUNDING_FACTOR * np.finfo(y.dtype).eps * state.cost
+        is_accepted = xp.isfinite(cost) & (
+            cost <= state.cost + rounding_error - _SUFFICIENT_DECREASE * predicted_decrease
+        )
 
         def accepted():
-            gain = xp.where(xp.isfinite(state.cost), (state.cost - cost) / predicted, 0.5)
+            gain = xp.where(xp.isfinite(state.cost), (state.cost - cost) / predicted_decrease, 0.5)
             damping = state.damping * xp.select([gain > 0.75, gain < 0.25], [0.25, 4.0], 1.0)
             direction, slope, curvature = step(damping)
             return DescentState(
@@ -345,17 +348,25 @@ class Descent(optx.AbstractLeastSquaresSolver):
         def rejected():
             scale = state.scale / 2
             shorter = eqx.tree_at(
-                lambda s: (s.trial, s.scale, s.damping, s.num_steps, s.stuck),
+                lambda descent_state: (
+                    descent_state.trial,
+                    descent_state.scale,
+                    descent_state.damping,
+                    descent_state.num_steps,
+                    descent_state.stuck,
+                ),
                 state,
-                (y + scale * state.direction, scale, 4 * state.damping, state.num_steps + 1, scale < _LEAST_SCALE),
+                (y + scale * state.direction, scale, 4 * state.damping, state.num_steps + 1, scale < _MIN_SCALE),
             )
             # If the cost at the start is not finite, no shorter step is possible.
-            return eqx.tree_at(lambda s: s.stuck, shorter, shorter.stuck | ~xp.isfinite(state.cost))
+            return eqx.tree_at(
+                lambda descent_state: descent_state.stuck, shorter, shorter.stuck | ~xp.isfinite(state.cost)
+            )
 
         if xp is np:
-            return (state.trial, accepted(), None) if good else (y, rejected(), None)
-        new = jax.lax.cond(good, accepted, rejected)
-        return jnp.where(good, state.trial, y), new, None
+            return (state.trial, accepted(), None) if is_accepted else (y, rejected(), None)
+        next_state = jax.lax.cond(is_accepted, accepted, rejected)
+        return jnp.where(is_accepted, state.trial, y), next_state, None
 
     def at_once(
         self, expand: Callable[..., Any], start: Float[np.ndarray, " n"], arguments: Any, max_steps: int
@@ -363,11 +374,11 @@ class Descent(optx.AbstractLeastSquaresSolver):
         """Take in NumPy the same steps that `optimistix.least_squares` takes in a compiled program. Returns the final
         point and state."""
         options, point = {"expand": expand}, start
-        nothing: Any = None  # further arguments from optimistix, which are not used
-        state = self.init(nothing, point, arguments, options, nothing, nothing, nothing)
+        unused: Any = None  # further arguments from optimistix, which are not used
+        state = self.init(unused, point, arguments, options, unused, unused, unused)
         with np.errstate(all="ignore"):
             while state.num_steps < max_steps and not (state.converged or state.stuck):
-                point, state, _ = self.step(nothing, point, arguments, options, state, nothing)
+                point, state, _ = self.step(unused, point, arguments, options, state, unused)
         return point, state
 
     def terminate(self, fn, y, args, options, state, tags):

@@ -71,18 +71,20 @@ def _minimum(point, problem, gradient, precondition):
 
 @_minimum.def_jvp
 def _minimum_jvp(primals, tangents):
-    found, problem, gradient, precondition = primals
-    point = _minimum(found, problem, gradient, precondition)
-    along = tangents[1]
-    if not jax.tree.leaves(along):
+    solver_point, problem, gradient, precondition = primals
+    point = _minimum(solver_point, problem, gradient, precondition)
+    problem_tangent = tangents[1]
+    if not jax.tree.leaves(problem_tangent):
         return point, jnp.zeros_like(point)
     # Treated as constants: only the minimum is differentiated, not the steps that lead to it.
-    start, constant = undifferentiated((found, problem))
-    model = precondition(start, constant)
-    at = point + jax.lax.stop_gradient(_refine(start, constant, gradient, model) - start)
-    _, slope = eqx.filter_jvp(lambda problem: gradient(at, problem), (problem,), (along,))
-    _, hessian = jax.linearize(lambda x: gradient(x, problem), at)
-    return point, _solve(hessian, -slope, model)
+    start_point, constant_problem = undifferentiated((solver_point, problem))
+    model = precondition(start_point, constant_problem)
+    refined_point = point + jax.lax.stop_gradient(_refine(start_point, constant_problem, gradient, model) - start_point)
+    _, gradient_change = eqx.filter_jvp(
+        lambda problem: gradient(refined_point, problem), (problem,), (problem_tangent,)
+    )
+    _, hessian = jax.linearize(lambda x: gradient(x, problem), refined_point)
+    return point, _solve(hessian, -gradient_change, model)
 
 
 def _solve(hessian: LinearMap, right_hand_side: Float[Array, " n"], preconditioner: LinearMap) -> Float[Array, " n"]:
@@ -102,31 +104,31 @@ def _conjugate_gradients(
     Computations, 2013, 11.5). `hessian_product`: returns H v for a vector v; `preconditioner`: returns an approximation
     of H⁻¹ v."""
 
-    def go_on(state):
-        _, _, _, energy, number = state
-        return (energy > tolerance) & (number < _MAX_STEPS)
+    def is_unfinished(state):
+        _, _, _, energy, num_steps = state
+        return (energy > tolerance) & (num_steps < _MAX_STEPS)
 
     def step(state):
-        x, residual, direction, energy, number = state
+        x, residual, direction, energy, num_steps = state
         hessian_direction = hessian_product(direction)
-        length = energy / (direction @ hessian_direction)
-        residual = residual - length * hessian_direction
+        step_length = energy / (direction @ hessian_direction)
+        residual = residual - step_length * hessian_direction
         preconditioned = preconditioner(residual)
         new_energy = residual @ preconditioned
         return (
-            x + length * direction,
+            x + step_length * direction,
             residual,
             preconditioned + (new_energy / energy) * direction,
             new_energy,
-            number + 1,
+            num_steps + 1,
         )
 
     start = preconditioner(right_hand_side)
     start_energy = right_hand_side @ start
     tolerance = _TOLERANCE**2 * start_energy
-    return jax.lax.while_loop(go_on, step, (jnp.zeros_like(right_hand_side), right_hand_side, start, start_energy, 0))[
-        0
-    ]
+    return jax.lax.while_loop(
+        is_unfinished, step, (jnp.zeros_like(right_hand_side), right_hand_side, start, start_energy, 0)
+    )[0]
 
 
 def _refine(
@@ -136,16 +138,16 @@ def _refine(
     become shorter in the norm of the Hessian."""
 
     def step(state):
-        at, before, length, number, _ = state
-        slope, hessian = jax.linearize(lambda x: gradient(x, problem), at)
-        direction = _conjugate_gradients(hessian, -slope, preconditioner)
-        now = jnp.sqrt(jnp.abs(slope @ direction))
-        better = now < length
-        return jnp.where(better, at + direction, before), at, now, number + 1, better
+        trial, last_point, length, num_steps, _ = state
+        trial_gradient, hessian = jax.linearize(lambda x: gradient(x, problem), trial)
+        direction = _conjugate_gradients(hessian, -trial_gradient, preconditioner)
+        new_length = jnp.sqrt(jnp.abs(trial_gradient @ direction))
+        is_shorter = new_length < length
+        return jnp.where(is_shorter, trial + direction, last_point), trial, new_length, num_steps + 1, is_shorter
 
-    def go_on(state):
-        _, _, length, number, better = state
-        return better & (number < _MAX_NEWTON_STEPS) & (length > _LAST_STEP_LENGTH)
+    def is_unfinished(state):
+        _, _, length, num_steps, is_shorter = state
+        return is_shorter & (num_steps < _MAX_NEWTON_STEPS) & (length > _LAST_STEP_LENGTH)
 
     start = point, point, jnp.asarray(jnp.inf, point.dtype), 0, jnp.bool_(True)
-    return jax.lax.while_loop(go_on, step, start)[0]
+    return jax.lax.while_loop(is_unfinished, step, start)[0]

@@ -27,7 +27,7 @@ _MAX_DAMPING = 1e12
 # Minimum number of functions for which gathering is worthwhile.
 _MIN_GATHERED = 32
 # Number of steps that the whole batch takes before the unfinished functions are gathered.
-_STEPS_OF_WHOLE_BATCH = 8
+_WHOLE_BATCH_STEPS = 8
 # Distance between points for finite differences of slopes in a Hessian.
 _DIFFERENCE_STEP = 1e-6
 
@@ -67,16 +67,16 @@ def solve_small(matrix: Float[Array, "n n F"], right_hand_sides: Float[Array, "n
     solve_small(small, jnp.ones((3, 100)))
     ```
     """
-    number, lower = matrix.shape[0], _cholesky(matrix)
+    num_unknowns, lower = matrix.shape[0], _cholesky(matrix)
     forward: list[Array] = []
-    for i in range(number):
-        rest = right_hand_sides[i] - sum(lower[i, k] * forward[k] for k in range(i))
-        forward.append(rest / lower[i, i])
+    for i in range(num_unknowns):
+        remainder = right_hand_sides[i] - sum(lower[i, k] * forward[k] for k in range(i))
+        forward.append(remainder / lower[i, i])
     solution: dict[int, Array] = {}
-    for i in reversed(range(number)):
-        rest = forward[i] - sum(lower[k, i] * solution[k] for k in range(i + 1, number))
-        solution[i] = rest / lower[i, i]
-    return namespace(matrix, right_hand_sides).stack([solution[i] for i in range(number)])
+    for i in reversed(range(num_unknowns)):
+        remainder = forward[i] - sum(lower[k, i] * solution[k] for k in range(i + 1, num_unknowns))
+        solution[i] = remainder / lower[i, i]
+    return namespace(matrix, right_hand_sides).stack([solution[i] for i in range(num_unknowns)])
 
 
 def gradient_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Float[Array, "n F"]:
@@ -95,7 +95,7 @@ def gradient_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> F
     """
     if isinstance(x, np.ndarray):
         return host.stack(slopes(value, x)[1])
-    return jax.grad(lambda at: jnp.sum(value(at)))(x)
+    return jax.grad(lambda points: jnp.sum(value(points)))(x)
 
 
 def hessian_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Float[Array, "n n F"]:
@@ -113,13 +113,15 @@ def hessian_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Fl
     ```
     """
     if isinstance(x, np.ndarray):
-        apart = _DIFFERENCE_STEP * np.eye(len(x))[:, :, None]
+        differences = _DIFFERENCE_STEP * np.eye(len(x))[:, :, None]
 
-        def second(k: int, m: int) -> Any:
-            ahead, behind = (complex_slope(value, at, m) for at in (x + apart[k], x - apart[k]))
-            return (ahead - behind) / (2 * _DIFFERENCE_STEP)
+        def second_derivative(k: int, m: int) -> Any:
+            slope_ahead, slope_behind = (
+                complex_slope(value, points, m) for points in (x + differences[k], x - differences[k])
+            )
+            return (slope_ahead - slope_behind) / (2 * _DIFFERENCE_STEP)
 
-        return symmetric_small([[second(k, m) for m in range(k + 1)] for k in range(len(x))])
+        return symmetric_small([[second_derivative(k, m) for m in range(k + 1)] for k in range(len(x))])
     directions = jnp.eye(len(x))[:, :, None] * jnp.ones_like(x)
     return jnp.stack([jax.jvp(partial(gradient_small, value), (x,), (direction,))[1] for direction in directions])
 
@@ -146,8 +148,8 @@ def _cholesky(matrix: Float[Array, "n n F"]) -> dict[tuple[int, int], Array]:
     lower: dict[tuple[int, int], Array] = {}
     for j in range(matrix.shape[0]):
         for i in range(j, matrix.shape[0]):
-            rest = matrix[i, j] - sum(lower[i, k] * lower[j, k] for k in range(j))
-            lower[i, j] = namespace(matrix).sqrt(rest) if i == j else rest / lower[j, j]
+            remainder = matrix[i, j] - sum(lower[i, k] * lower[j, k] for k in range(j))
+            lower[i, j] = namespace(matrix).sqrt(remainder) if i == j else remainder / lower[j, j]
     return lower
 
 
@@ -165,8 +167,8 @@ def symmetric_small(rows: Sequence[Sequence[Array]]) -> Float[Array, "n n F"]:
     matrices = symmetric_small([[2 * one], [one, 2 * one]])
     ```
     """
-    number, xp = len(rows), namespace(rows)
-    return xp.stack([xp.stack([rows[max(i, j)][min(i, j)] for j in range(number)]) for i in range(number)])
+    num_rows, xp = len(rows), namespace(rows)
+    return xp.stack([xp.stack([rows[max(i, j)][min(i, j)] for j in range(num_rows)]) for i in range(num_rows)])
 
 
 def inverse_small(matrix: Float[Array, "n n F"]) -> Float[Array, "n n F"]:
@@ -195,8 +197,8 @@ class _State(Module):
     gradient: Array
     matrix: Array
     damping: Array
-    taken: Array
-    done: Array
+    num_taken: Array
+    is_done: Array
     converged: Array
 
 
@@ -257,35 +259,37 @@ def minimise_small(
     """
     limits = _Limits(lower, upper, largest_step, max_steps, tolerance)
     xp = namespace(start, data, lower, upper)
-    first = xp.clip(start, lower, upper)
-    number = first.shape[1]
-    nothing = xp.zeros(number, bool)
+    clipped_start = xp.clip(start, lower, upper)
+    num_functions = clipped_start.shape[1]
+    no_functions = xp.zeros(num_functions, bool)
     state = _State(
-        x=first,
-        value=xp.full(number, xp.inf),
-        gradient=xp.zeros_like(first),
-        matrix=xp.eye(len(first))[:, :, None] * xp.ones_like(first),
-        damping=xp.full(number, 1e-2),
-        taken=xp.zeros(number, int),
-        done=nothing if skip is None else skip,
-        converged=nothing,
+        x=clipped_start,
+        value=xp.full(num_functions, xp.inf),
+        gradient=xp.zeros_like(clipped_start),
+        matrix=xp.eye(len(clipped_start))[:, :, None] * xp.ones_like(clipped_start),
+        damping=xp.full(num_functions, 1e-2),
+        num_taken=xp.zeros(num_functions, int),
+        is_done=no_functions if skip is None else skip,
+        converged=no_functions,
     )
-    part = number if xp is np else number // 4
-    if part < _MIN_GATHERED:
+    num_gathered = num_functions if xp is np else num_functions // 4
+    if num_gathered < _MIN_GATHERED:
         state = _take_steps(state, data, max_steps + 1, finish or expand, limits)
     else:
         if skip is None:
-            state = _take_steps(state, data, _STEPS_OF_WHOLE_BATCH + 1, expand, limits)
+            state = _take_steps(state, data, _WHOLE_BATCH_STEPS + 1, expand, limits)
 
-        def go_on_with_some(state: _State) -> _State:
-            index = _first_true_indices(~state.done, part)
-            gathered, mine = jax.tree.map(lambda array: xp.take(array, index, axis=-1, mode="clip"), (state, data))
-            gathered = replace(gathered, done=gathered.done | (index == number))
-            ended = _take_steps(gathered, mine, max_steps + 1, finish or expand, limits)
-            return jax.tree.map(lambda all, some: set_at(all, (..., index), some), state, ended)
+        def continue_unfinished(state: _State) -> _State:
+            index = _first_true_indices(~state.is_done, num_gathered)
+            gathered, gathered_data = jax.tree.map(
+                lambda array: xp.take(array, index, axis=-1, mode="clip"), (state, data)
+            )
+            gathered = replace(gathered, is_done=gathered.is_done | (index == num_functions))
+            new_state = _take_steps(gathered, gathered_data, max_steps + 1, finish or expand, limits)
+            return jax.tree.map(lambda array, new_values: set_at(array, (..., index), new_values), state, new_state)
 
-        state = while_loop(lambda state: ~xp.all(state.done), go_on_with_some, state)
-    return Minimum(state.x, state.value, state.converged, xp.max(state.taken, initial=0))
+        state = while_loop(lambda state: ~xp.all(state.is_done), continue_unfinished, state)
+    return Minimum(state.x, state.value, state.converged, xp.max(state.num_taken, initial=0))
 
 
 def _first_true_indices(flags: Bool[Array, " F"], max_count: int) -> Int[Array, " i"]:
@@ -299,15 +303,15 @@ def _first_true_indices(flags: Bool[Array, " F"], max_count: int) -> Int[Array, 
 def _next_step(state: _State, limits: _Limits) -> tuple[Array, Array]:
     """End point of the next step, and the first-order prediction of the decrease of the value."""
     x, gradient, matrix, xp = state.x, state.gradient, state.matrix, namespace(state)
-    held = ((x <= limits.lower) & (gradient > 0)) | ((x >= limits.upper) & (gradient < 0))
+    is_fixed = ((x <= limits.lower) & (gradient > 0)) | ((x >= limits.upper) & (gradient < 0))
     diagonal = xp.eye(x.shape[0], dtype=bool)[:, :, None]
-    damped = matrix + diagonal * (state.damping * matrix + 1e-300)
-    damped = xp.where(held[:, None] | held[None], xp.where(diagonal, 1.0, 0.0), damped)
-    step = -solve_small(damped, xp.where(held, 0.0, gradient))
+    damped_matrix = matrix + diagonal * (state.damping * matrix + 1e-300)
+    damped_matrix = xp.where(is_fixed[:, None] | is_fixed[None], xp.where(diagonal, 1.0, 0.0), damped_matrix)
+    step = -solve_small(damped_matrix, xp.where(is_fixed, 0.0, gradient))
     step = xp.where(xp.isfinite(step), step, 0.0)
     step = step / xp.maximum(1.0, xp.max(xp.abs(step) / limits.largest_step, axis=0))
-    new = xp.clip(x + step, limits.lower, limits.upper)
-    return new, -xp.sum((new - x) * gradient, axis=0)
+    end_point = xp.clip(x + step, limits.lower, limits.upper)
+    return end_point, -xp.sum((end_point - x) * gradient, axis=0)
 
 
 def _take_steps(state: _State, data, steps: int, expand: Expansion, limits: _Limits) -> _State:
@@ -315,31 +319,33 @@ def _take_steps(state: _State, data, steps: int, expand: Expansion, limits: _Lim
     xp = namespace(state, data)
 
     def body(loop):
-        count, state = loop
+        num_iterations, state = loop
         # The first iteration only evaluates the start, from which no step has been computed yet.
-        fresh = xp.isinf(state.value)
-        trial, promised = _next_step(state, limits)
+        is_start = xp.isinf(state.value)
+        trial, predicted_decrease = _next_step(state, limits)
         value, gradient, matrix = expand(trial, data)
-        better = (value <= state.value) & ~state.done
+        is_lower = (value <= state.value) & ~state.is_done
         # A step that is cut off at a bound may lead uphill; then a more damped one, closer to the gradient, is tried.
-        settled = (promised >= 0) & (promised <= limits.tolerance * (1 + xp.abs(state.value))) & ~fresh
-        damping = xp.where(better, xp.maximum(state.damping / 10, 1e-12), 8 * xp.maximum(state.damping, 1e-4))
-        taken = state.taken + ~(state.done | fresh)
+        is_settled = (
+            (predicted_decrease >= 0) & (predicted_decrease <= limits.tolerance * (1 + xp.abs(state.value))) & ~is_start
+        )
+        damping = xp.where(is_lower, xp.maximum(state.damping / 10, 1e-12), 8 * xp.maximum(state.damping, 1e-4))
+        num_taken = state.num_taken + ~(state.is_done | is_start)
         # The search also ends when steps become too small to change the value.
-        converged = state.converged | (~state.done & (settled | (damping > _MAX_DAMPING)))
-        broken = fresh & ~xp.isfinite(value)
-        return count + 1, _State(
-            x=xp.where(better, trial, state.x),
-            value=xp.where(better, value, state.value),
-            gradient=xp.where(better, gradient, state.gradient),
-            matrix=xp.where(better, matrix, state.matrix),
+        converged = state.converged | (~state.is_done & (is_settled | (damping > _MAX_DAMPING)))
+        is_invalid = is_start & ~xp.isfinite(value)
+        return num_iterations + 1, _State(
+            x=xp.where(is_lower, trial, state.x),
+            value=xp.where(is_lower, value, state.value),
+            gradient=xp.where(is_lower, gradient, state.gradient),
+            matrix=xp.where(is_lower, matrix, state.matrix),
             damping=damping,
-            taken=taken,
-            done=state.done | converged | broken | (taken >= limits.max_steps),
+            num_taken=num_taken,
+            is_done=state.is_done | converged | is_invalid | (num_taken >= limits.max_steps),
             converged=converged,
         )
 
-    def go_on(loop):
-        return (loop[0] < steps) & ~xp.all(loop[1].done)
+    def is_unfinished(loop):
+        return (loop[0] < steps) & ~xp.all(loop[1].is_done)
 
-    return while_loop(go_on, body, (xp.zeros((), int), state))[1]
+    return while_loop(is_unfinished, body, (xp.zeros((), int), state))[1]

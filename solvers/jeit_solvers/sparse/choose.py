@@ -105,7 +105,7 @@ def conjugate_gradient(
     direction = inverse_diagonal * vector
     target = tolerance * jnp.linalg.norm(direction)
 
-    def keep_going(iterate: Iterate):
+    def is_unfinished(iterate: Iterate):
         return ~iterate.converged & ~iterate.broken_down & (iterate.step < max_steps)
 
     def one_step(iterate: Iterate) -> Iterate:
@@ -134,7 +134,7 @@ def conjugate_gradient(
         jnp.linalg.norm(vector) == 0,
         ~jnp.all(jnp.isfinite(vector)),
     )
-    return jax.lax.while_loop(keep_going, one_step, start)
+    return jax.lax.while_loop(is_unfinished, one_step, start)
 
 
 class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
@@ -275,21 +275,25 @@ def choose_solver(
     ```
     """
     fronts = find_fronts(pattern, coordinates)
-    limit = memory_of_machine() / 2 if memory_limit is None else memory_limit
-    memory = 8.0 * (fronts.num_factor_entries + fronts.num_waiting_entries)
-    seconds, iterative = fronts.num_operations / _OPERATIONS_PER_SECOND, pattern.num_entries * _MULTIGRID_SECONDS
+    allowed_memory = memory_of_machine() / 2 if memory_limit is None else memory_limit
+    factor_memory = 8.0 * (fronts.num_factor_entries + fronts.num_waiting_entries)
+    seconds, multigrid_seconds = (
+        fronts.num_operations / _OPERATIONS_PER_SECOND,
+        pattern.num_entries * _MULTIGRID_SECONDS,
+    )
     multigrid_memory = _format_bytes(pattern.num_entries * _MULTIGRID_BYTES)
     cost = (
         f"a factorisation takes {fronts.num_operations:.1e} operations, about {seconds:.1g} s, and "
-        f"{_format_bytes(memory)}; multigrid takes about {iterative:.1g} s and {multigrid_memory} for 32 solutions"
+        f"{_format_bytes(factor_memory)}; multigrid takes about {multigrid_seconds:.1g} s and {multigrid_memory} for "
+        "32 solutions"
     )
-    if memory > limit or seconds > _DIRECT_TIME_FACTOR * iterative:
-        why = f"{cost}; {_format_bytes(limit)} are allowed"
+    if factor_memory > allowed_memory or seconds > _DIRECT_TIME_FACTOR * multigrid_seconds:
+        comparison = f"{cost}; {_format_bytes(allowed_memory)} are allowed"
         if multigrid_is_installed():
-            return Multigrid(tolerance, reason=f"iterative: {why}")
-        if memory > limit:
-            slower = "; without pyamg (pip install 'jeit[large]') conjugate gradients take several times as long"
-            return ConjugateGradient(tolerance, reason=f"iterative: {why}{slower}")
+            return Multigrid(tolerance, reason=f"iterative: {comparison}")
+        if factor_memory > allowed_memory:
+            cg_note = "; without pyamg (pip install 'jeit[large]') conjugate gradients take several times as long"
+            return ConjugateGradient(tolerance, reason=f"iterative: {comparison}{cg_note}")
     on_cpu = jax.default_backend() == "cpu"
     if fronts.num_operations > (_MAX_COMPILED_OPERATIONS_CPU if on_cpu else _MAX_COMPILED_OPERATIONS):
         return FrontalCholesky(fronts, f"direct: {cost}")

@@ -48,8 +48,8 @@ def nested_dissection(graph: csr_array, depth: int, coordinates: np.ndarray | No
 
 def _edges_within_parts(part: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The edges that connect two nodes of the same part."""
-    same = (part[rows] == part[columns]) & (part[rows] >= 0)
-    return rows[same], columns[same]
+    is_inside = (part[rows] == part[columns]) & (part[rows] >= 0)
+    return rows[is_inside], columns[is_inside]
 
 
 def _halve_parts(
@@ -62,31 +62,31 @@ def _halve_parts(
     imbalance.
     """
     nodes = np.flatnonzero(part >= 0)
-    own = part[nodes]
-    counts = np.bincount(own, minlength=num_parts)
+    node_parts = part[nodes]
+    counts = np.bincount(node_parts, minlength=num_parts)
     # Fronts are padded to the largest one of their stage. The smaller the part, the more an even split is worth, and
     # the less an additional node in the separator costs.
-    small = counts < 400
-    price_of_imbalance = np.where(small, 0.5, 0.1)
-    best, best_cost = np.full(part.size, 2), np.full(num_parts, np.inf)
-    for key in _splitting_functions(graph, nodes, own, num_parts, coordinates):
-        order = np.lexsort((key, own))
+    is_small = counts < 400
+    price_of_imbalance = np.where(is_small, 0.5, 0.1)
+    best_side, best_cost = np.full(part.size, 2), np.full(num_parts, np.inf)
+    for key in _splitting_functions(graph, nodes, node_parts, num_parts, coordinates):
+        order = np.lexsort((key, node_parts))
         rank = np.empty(nodes.size, dtype=np.int64)
         rank[order] = np.arange(nodes.size) - np.repeat(np.cumsum(counts) - counts, counts)
         for off_middle in (-1, 0, 1):
-            share = 0.5 + off_middle * np.where(small, 0.04, 0.05)
+            share = 0.5 + off_middle * np.where(is_small, 0.04, 0.05)
             below = np.maximum(1, np.rint(share * counts)).astype(np.int64)
             side = np.zeros(part.size, dtype=np.int64)
-            side[nodes] = rank >= below[own]
+            side[nodes] = rank >= below[node_parts]
             crossing = side[columns] > side[rows]
             side[_minimum_vertex_cover(rows[crossing], columns[crossing])] = 2
-            halves = np.bincount(3 * own + side[nodes], minlength=3 * num_parts).reshape(-1, 3)
+            halves = np.bincount(3 * node_parts + side[nodes], minlength=3 * num_parts).reshape(-1, 3)
             cost = halves[:, 2] + price_of_imbalance * np.abs(halves[:, 0] - halves[:, 1])
-            better = cost < best_cost
-            best_cost[better] = cost[better]
-            chosen = nodes[better[own]]
-            best[chosen] = side[chosen]
-    return best
+            is_better = cost < best_cost
+            best_cost[is_better] = cost[is_better]
+            changed_nodes = nodes[is_better[node_parts]]
+            best_side[changed_nodes] = side[changed_nodes]
+    return best_side
 
 
 def _splitting_functions(
@@ -98,8 +98,8 @@ def _splitting_functions(
     order = np.argsort(part, kind="stable")
     key = np.empty(nodes.size)
     for members in np.split(order, np.cumsum(np.bincount(part, minlength=num_parts))[:-1]):
-        chosen = nodes[members]
-        key[members] = _distance_function(graph[chosen][:, chosen])
+        part_nodes = nodes[members]
+        key[members] = _distance_function(graph[part_nodes][:, part_nodes])
     return [key]
 
 
@@ -177,27 +177,29 @@ def _minimum_vertex_cover(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     nodes as a maximum matching has edges."""
     if lower.size == 0:
         return np.empty(0, dtype=np.int64)
-    left, left_local = np.unique(lower, return_inverse=True)
-    right, right_local = np.unique(upper, return_inverse=True)
-    edges = csr_array((np.ones(lower.size, dtype=np.int8), (left_local, right_local)), shape=(left.size, right.size))
+    left_nodes, left_local = np.unique(lower, return_inverse=True)
+    right_nodes, right_local = np.unique(upper, return_inverse=True)
+    edges = csr_array(
+        (np.ones(lower.size, dtype=np.int8), (left_local, right_local)), shape=(left_nodes.size, right_nodes.size)
+    )
     match_of_left = maximum_bipartite_matching(edges, perm_type="column")
-    match_of_right = np.full(right.size, -1)
-    matched = match_of_left >= 0
-    match_of_right[match_of_left[matched]] = np.flatnonzero(matched)
+    match_of_right = np.full(right_nodes.size, -1)
+    is_matched = match_of_left >= 0
+    match_of_right[match_of_left[is_matched]] = np.flatnonzero(is_matched)
     # Follow alternating paths from the unmatched left nodes; the cover consists of the left nodes not reached and the
     # right nodes reached.
-    reached_left = ~matched
-    reached_right = np.zeros(right.size, dtype=bool)
+    reached_left = ~is_matched
+    reached_right = np.zeros(right_nodes.size, dtype=bool)
     while True:
-        found = np.zeros(right.size, dtype=bool)
-        found[right_local[reached_left[left_local]]] = True
-        found &= ~reached_right
-        if not found.any():
+        newly_reached = np.zeros(right_nodes.size, dtype=bool)
+        newly_reached[right_local[reached_left[left_local]]] = True
+        newly_reached &= ~reached_right
+        if not newly_reached.any():
             break
-        reached_right |= found
-        back = match_of_right[found]
-        reached_left[back[back >= 0]] = True
-    return np.concatenate([left[~reached_left], right[reached_right]])
+        reached_right |= newly_reached
+        matched_left = match_of_right[newly_reached]
+        reached_left[matched_left[matched_left >= 0]] = True
+    return np.concatenate([left_nodes[~reached_left], right_nodes[reached_right]])
 
 
 def _num_nodes(graph: csr_array) -> int:

@@ -92,22 +92,22 @@ class Fronts:
     @property
     def num_operations(self) -> float:
         """Number of floating-point operations of a factorisation."""
-        return float(sum(_num_front_operations(one.pivots, one.border) for one in self.fronts))
+        return float(sum(_num_front_operations(front.pivots, front.border) for front in self.fronts))
 
     @property
     def num_factor_entries(self) -> int:
         """Number of entries of the factor as it is stored."""
-        return sum(one.pivots * (one.pivots + one.border) for one in self.fronts)
+        return sum(front.pivots * (front.pivots + front.border) for front in self.fronts)
 
     @property
     def num_waiting_entries(self) -> int:
         """Greatest number of entries of Schur complements that wait for their parents, if fronts are eliminated one
         after the other."""
-        waiting = most = 0
-        for one in self.fronts:
-            most = max(most, waiting + one.border**2)
-            waiting += one.border**2 - sum(self.fronts[child].border ** 2 for child in one.children)
-        return most
+        waiting = max_waiting = 0
+        for front in self.fronts:
+            max_waiting = max(max_waiting, waiting + front.border**2)
+            waiting += front.border**2 - sum(self.fronts[child].border ** 2 for child in front.children)
+        return max_waiting
 
 
 def _num_front_operations(pivots: Any, border: Any) -> Any:
@@ -130,14 +130,14 @@ def find_fronts(pattern: SparsityPattern, coordinates: Any = None) -> Fronts:
     ```
     """
     coordinates = checked_coordinates(pattern, coordinates)
-    rows, columns = (np.asarray(one, dtype=np.int64) for one in (pattern.rows, pattern.columns))
-    found = hashlib.blake2b(digest_size=16)
-    for one in (rows, columns, coordinates if coordinates is not None else np.zeros(0), np.array(_LEAF_SIZE)):
-        found.update(np.ascontiguousarray(one).tobytes())
-    key = found.digest()
-    if (known := _CACHED_FRONTS.get(key)) is None:
-        _CACHED_FRONTS[key] = known = _build_fronts(pattern.size, rows, columns, coordinates, key)
-    return known
+    rows, columns = (np.asarray(array, dtype=np.int64) for array in (pattern.rows, pattern.columns))
+    digest = hashlib.blake2b(digest_size=16)
+    for array in (rows, columns, coordinates if coordinates is not None else np.zeros(0), np.array(_LEAF_SIZE)):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    key = digest.digest()
+    if (fronts := _CACHED_FRONTS.get(key)) is None:
+        _CACHED_FRONTS[key] = fronts = _build_fronts(pattern.size, rows, columns, coordinates, key)
+    return fronts
 
 
 # Fronts in use, shared by models that are created again on the same mesh.
@@ -151,19 +151,19 @@ def _build_fronts(
     owner = nested_dissection(graph_of(rows, columns, size), depth, coordinates)
     nodes, owner = np.unique(owner, return_inverse=True)
     level = np.floor(np.log2(nodes + 1)).astype(int)
-    split = min(_LEVELS_ABOVE_SUBTREES, depth)
+    top_levels = min(_LEVELS_ABOVE_SUBTREES, depth)
     # Steps: the subtrees are number 0, the levels above them 1, 2, …
-    step = np.maximum(split - level, 0)
-    subtree = np.where(step, 0, (nodes + 1) >> np.maximum(level - split, 0))
-    by_number = np.lexsort((_post_order_positions(nodes, level, depth), subtree, step))
-    number = np.argsort(by_number)
-    tree = _EliminationTree(size, rows, columns, number[owner], level[by_number], coordinates)
-    part = np.where(step, nodes, subtree)[by_number]
-    starts = np.flatnonzero(np.diff(part, prepend=-1))
-    slices = [slice(*both) for both in itertools.pairwise([*starts.tolist(), len(nodes)])]
-    step_of = step[by_number][starts]
-    steps = tuple(tuple(itertools.compress(slices, step_of == one)) for one in range(split + 1))
-    top = int(tree.pivots[: np.count_nonzero(step == 0)].sum())
+    steps_of_nodes = np.maximum(top_levels - level, 0)
+    subtree = np.where(steps_of_nodes, 0, (nodes + 1) >> np.maximum(level - top_levels, 0))
+    old_numbers = np.lexsort((_post_order_positions(nodes, level, depth), subtree, steps_of_nodes))
+    new_numbers = np.argsort(old_numbers)
+    tree = _EliminationTree(size, rows, columns, new_numbers[owner], level[old_numbers], coordinates)
+    part_of_front = np.where(steps_of_nodes, nodes, subtree)[old_numbers]
+    starts = np.flatnonzero(np.diff(part_of_front, prepend=-1))
+    slices = [slice(start, stop) for start, stop in itertools.pairwise([*starts.tolist(), len(nodes)])]
+    step_of = steps_of_nodes[old_numbers][starts]
+    steps = tuple(tuple(itertools.compress(slices, step_of == step_number)) for step_number in range(top_levels + 1))
+    top = int(tree.pivots[: np.count_nonzero(steps_of_nodes == 0)].sum())
     return Fronts(size, len(rows), tree.order, tree.entry_order, tree.fronts(top), steps, top, key)
 
 
@@ -173,8 +173,8 @@ def _post_order_positions(nodes: np.ndarray, level: np.ndarray, depth: int) -> n
     for above in range(depth):
         # The ancestor of a node just below level `above`: a left one comes before its whole right sibling.
         height = level - above - 1
-        left = (height >= 0) & ((((nodes + 1) >> np.maximum(height, 0)) & 1) == 0)
-        position -= np.where(height >= 0, 1 + np.where(left, 2 ** (depth - above) - 1, 0), 0)
+        is_left = (height >= 0) & ((((nodes + 1) >> np.maximum(height, 0)) & 1) == 0)
+        position -= np.where(height >= 0, 1 + np.where(is_left, 2 ** (depth - above) - 1, 0), 0)
     return position
 
 
@@ -210,48 +210,48 @@ class _EliminationTree:
         pending = np.unique((first * size + self.late)[first != second])
         self.parent, borders = np.full(count, -1), [np.zeros(0, dtype=np.int64)]
         for level in range(int(self.level.max()), -1, -1):
-            mine = self.level[pending // size] == level
-            border, pending = pending[mine], pending[~mine]
+            is_in_level = self.level[pending // size] == level
+            border, pending = pending[is_in_level], pending[~is_in_level]
             child, row = np.divmod(border, size)
             borders.append(border)
             start = np.flatnonzero(np.diff(child, prepend=-1))
             self.parent[child[start]] = front[row[start]]
-            above = self.parent[child]
-            pending = np.unique(np.concatenate([pending, (above * size + row)[front[row] != above]]))
+            parent_front = self.parent[child]
+            pending = np.unique(np.concatenate([pending, (parent_front * size + row)[front[row] != parent_front]]))
         self.keys = np.sort(np.concatenate(borders))
         self.border_front, self.border_row = np.divmod(self.keys, size)
 
     def _local_indices(self, fronts: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Index of each matrix row within the given front, which lists its pivots first and then its border."""
         in_border = np.searchsorted(self.keys, fronts * self.size + rows) - self.border_first[fronts]
-        own = self.front[rows] == fronts
-        return np.where(own, rows - self.first[fronts], self.pivots[fronts] + in_border)
+        is_pivot = self.front[rows] == fronts
+        return np.where(is_pivot, rows - self.first[fronts], self.pivots[fronts] + in_border)
 
     def fronts(self, top: int) -> tuple[Front, ...]:
         """All fronts; `top`: number of the first row above the subtrees."""
         holder = self.front[self.early]
         height = self.pivots + self.border
-        place = (self.early - self.first[holder]) * height[holder] + self._local_indices(holder, self.late)
-        place = place[self.entry_order]
-        ends = np.searchsorted(holder[self.entry_order], np.arange(len(height) + 1)).tolist()
-        among = self.rows_in_parent < self.pivots[self.parent[self.border_front]]
-        among_pivots = np.bincount(self.border_front[among], minlength=len(height)).tolist()
-        below = np.bincount(self.border_front[self.border_row < top], minlength=len(height)).tolist()
+        panel_indices = (self.early - self.first[holder]) * height[holder] + self._local_indices(holder, self.late)
+        panel_indices = panel_indices[self.entry_order]
+        entry_ends = np.searchsorted(holder[self.entry_order], np.arange(len(height) + 1)).tolist()
+        is_parent_pivot = self.rows_in_parent < self.pivots[self.parent[self.border_front]]
+        num_parent_pivots = np.bincount(self.border_front[is_parent_pivot], minlength=len(height)).tolist()
+        num_subtree_rows = np.bincount(self.border_front[self.border_row < top], minlength=len(height)).tolist()
         children: list[list[int]] = [[] for _ in height]
         for child, parent in enumerate(self.parent.tolist()):
             if parent >= 0:
                 children[parent].append(child)
         starts, counts = self.border_first.tolist(), self.border.tolist()
-        made = []
+        fronts = []
         for number, (pivots, first) in enumerate(zip(self.pivots.tolist(), self.first.tolist(), strict=True)):
             rows = slice(starts[number], starts[number] + counts[number])
-            entries = slice(ends[number], ends[number + 1])
-            one = Front(
-                pivots, counts[number], first, self.border_row[rows], entries, place[entries],
-                tuple(children[number]), self.rows_in_parent[rows], among_pivots[number], below[number],
+            entries = slice(entry_ends[number], entry_ends[number + 1])
+            front = Front(
+                pivots, counts[number], first, self.border_row[rows], entries, panel_indices[entries],
+                tuple(children[number]), self.rows_in_parent[rows], num_parent_pivots[number], num_subtree_rows[number]
             )  # fmt: skip
-            made.append(one)
-        return tuple(made)
+            fronts.append(front)
+        return tuple(fronts)
 
 
 def _morton_positions(coordinates: np.ndarray) -> np.ndarray:

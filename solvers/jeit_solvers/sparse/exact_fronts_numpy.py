@@ -58,7 +58,9 @@ class FrontalFactor(NamedTuple):
         if self.panels is not None:
             for slices in reversed(self.fronts.steps):
                 _for_each_slice(
-                    lambda some: self._substitute_back(vectors, some), slices, self._num_operations(vectors)
+                    lambda front_slice: self._substitute_back(vectors, front_slice),
+                    slices,
+                    self._num_operations(vectors),
                 )
         solution = np.empty_like(vectors)
         solution[self.fronts.order] = vectors
@@ -85,14 +87,14 @@ class FrontalFactor(NamedTuple):
         # Subtrees run in parallel, so each collects its contributions to the rows above the subtrees in an array of its
         # own.
         subtree_updates = [np.zeros_like(later_rows) for _ in subtrees]
-        numbers = {front_slice.start: number for number, front_slice in enumerate(subtrees)}
+        subtree_numbers = {front_slice.start: number for number, front_slice in enumerate(subtrees)}
 
         def forward(front_slice: slice) -> None:
-            self._eliminate_forward(vectors, subtree_updates[numbers[front_slice.start]], front_slice)
+            self._eliminate_forward(vectors, subtree_updates[subtree_numbers[front_slice.start]], front_slice)
 
         _for_each_slice(forward, subtrees, self._num_operations(vectors))
-        for one in subtree_updates:
-            later_rows += one
+        for update in subtree_updates:
+            later_rows += update
         for level in levels:  # one after the other, for their borders overlap
             _for_each_slice(lambda front_slice: self._eliminate_forward(vectors, later_rows, front_slice), level, 0.0)
         return vectors
@@ -111,14 +113,14 @@ class FrontalFactor(NamedTuple):
         assert self.panels is not None
         top = self.fronts.top
         for front, panel in zip(self.fronts.fronts[front_slice], self.panels[front_slice], strict=True):
-            own = vectors[front.first : front.first + front.pivots]
-            if not own.any():  # as in a part of the body without electrodes
+            pivot_rows = vectors[front.first : front.first + front.pivots]
+            if not pivot_rows.any():  # as in a part of the body without electrodes
                 continue
-            solve_triangle(panel, own, transposed=False)
+            solve_triangle(panel, pivot_rows, transposed=False)
             if front.border:
-                passed_on, inside = panel[:, front.pivots :].T @ own, front.num_subtree_rows
-                vectors[front.rows[:inside]] -= passed_on[:inside]
-                later[front.rows[inside:] - top] -= passed_on[inside:]
+                contributions, num_inside = panel[:, front.pivots :].T @ pivot_rows, front.num_subtree_rows
+                vectors[front.rows[:num_inside]] -= contributions[:num_inside]
+                later[front.rows[num_inside:] - top] -= contributions[num_inside:]
 
     def _substitute_back(self, vectors: np.ndarray, front_slice: slice) -> None:
         """Back substitution for some fronts: replace the rows of their pivots by those of the solution. Later rows of
@@ -127,10 +129,10 @@ class FrontalFactor(NamedTuple):
         for front, panel in zip(
             reversed(self.fronts.fronts[front_slice]), reversed(self.panels[front_slice]), strict=True
         ):
-            own = vectors[front.first : front.first + front.pivots]
+            pivot_rows = vectors[front.first : front.first + front.pivots]
             if front.border:
-                own -= panel[:, front.pivots :] @ vectors[front.rows]
-            solve_triangle(panel, own, transposed=True)
+                pivot_rows -= panel[:, front.pivots :] @ vectors[front.rows]
+            solve_triangle(panel, pivot_rows, transposed=True)
 
 
 def factorise_fronts(fronts: Fronts, values: Inexact[np.ndarray, " nnz"]) -> FrontalFactor:
@@ -158,14 +160,16 @@ def factorise_fronts(fronts: Fronts, values: Inexact[np.ndarray, " nnz"]) -> Fro
     panels: list[Any] = [None] * len(fronts.fronts)
     schur_complements: list[Any] = [None] * len(fronts.fronts)
 
-    def eliminate_slice(some: slice) -> None:
-        for number in range(some.start, some.stop):
+    def eliminate_slice(front_slice: slice) -> None:
+        for number in range(front_slice.start, front_slice.stop):
             if not _eliminate_front(fronts, ordered_values, panels, schur_complements, number):
                 return
 
     for slices in fronts.steps:
         _for_each_slice(eliminate_slice, slices, fronts.num_operations)
-        if any(panels[number] is None for some in slices for number in range(some.start, some.stop)):
+        if any(
+            panels[number] is None for front_slice in slices for number in range(front_slice.start, front_slice.stop)
+        ):
             return FrontalFactor(fronts, None)
     return FrontalFactor(fronts, panels)
 
@@ -198,20 +202,20 @@ def _eliminate_front(
     """Assemble and eliminate one front, and store its panel and the Schur complement for its parent. Returns False if
     the front is not positive definite."""
     front = fronts.fronts[front_index]
-    pivots, border = front.pivots, front.border
-    panel = np.zeros((pivots, pivots + border), ordered_values.dtype)
+    num_pivots, num_border = front.pivots, front.border
+    panel = np.zeros((num_pivots, num_pivots + num_border), ordered_values.dtype)
     panel.reshape(-1)[front.panel_indices] = ordered_values[front.entries]
-    corner = np.zeros((border, border), ordered_values.dtype)
+    corner = np.zeros((num_border, num_border), ordered_values.dtype)
     for child in front.children:
         schur, schur_complements[child] = schur_complements[child], None
-        into, split = fronts.fronts[child].rows_in_parent, fronts.fronts[child].num_parent_pivots
-        if split:
-            _add_rows(panel, into[:split], into, schur[:split])
-        into = into[split:] - pivots
-        for first in range(0, len(into), _ADDED_ROWS):
-            last, start = min(first + _ADDED_ROWS, len(into)), into[first]
-            lower = schur[split + first : split + last, split + first :]
-            _add_rows(corner[:, start:], into[first:last], into[first:] - start, lower)
+        parent_rows, num_parent_pivots = fronts.fronts[child].rows_in_parent, fronts.fronts[child].num_parent_pivots
+        if num_parent_pivots:
+            _add_rows(panel, parent_rows[:num_parent_pivots], parent_rows, schur[:num_parent_pivots])
+        parent_rows = parent_rows[num_parent_pivots:] - num_pivots
+        for first in range(0, len(parent_rows), _ADDED_ROWS):
+            last, start = min(first + _ADDED_ROWS, len(parent_rows)), parent_rows[first]
+            lower_rows = schur[num_parent_pivots + first : num_parent_pivots + last, num_parent_pivots + first :]
+            _add_rows(corner[:, start:], parent_rows[first:last], parent_rows[first:] - start, lower_rows)
     if not eliminate(panel, corner):
         return False
     panels[front_index] = panel

@@ -83,12 +83,12 @@ class PaddedSum(NamedTuple):
         left_over = target.size - np.concatenate([[0], np.cumsum(np.bincount(rank, minlength=1))])
         width = int(np.argmin(np.arange(left_over.size) * num_sums + _SCATTER_COST * left_over))
         gather = np.full((width, num_sums), num_sources, dtype=np.int32)
-        inside = rank < width
-        gather[rank[inside], target[inside]] = source[inside]
+        is_gathered = rank < width
+        gather[rank[is_gathered], target[is_gathered]] = source[is_gathered]
         rounds = np.argsort(rank, kind="stable")
-        rounds = rounds[~inside[rounds]]
-        ends = np.cumsum(np.bincount(rank[rounds] - width))
-        return cls(store.add(gather), store.add(target[rounds]), store.add(source[rounds]), tuple(ends.tolist()))
+        rounds = rounds[~is_gathered[rounds]]
+        round_ends = np.cumsum(np.bincount(rank[rounds] - width))
+        return cls(store.add(gather), store.add(target[rounds]), store.add(source[rounds]), tuple(round_ends.tolist()))
 
     def apply(
         self, indices: Int[Array, " total"], contributions: Inexact[Array, "sources *k"]
@@ -112,19 +112,19 @@ class PaddedSum(NamedTuple):
     ) -> None:
         """In NumPy, add the sums with indices from `start` up to, but not including, `stop` to `total` (sums, k) in
         place. They are processed in chunks, so that temporary arrays stay in the cache."""
-        at_once = max(1, _NUMPY_CHUNK // math.prod(contributions.shape[1:]))
+        chunk_size = max(1, _NUMPY_CHUNK // math.prod(contributions.shape[1:]))
         gathered: Any = self.gather.read(indices)
-        for first in range(start, stop, at_once) if len(gathered) else ():
-            some = slice(first, min(first + at_once, stop))
+        for first in range(start, stop, chunk_size) if len(gathered) else ():
+            chunk = slice(first, min(first + chunk_size, stop))
             for layer in gathered:
-                total[some] += gather_or_zero(contributions, layer[some])
+                total[chunk] += gather_or_zero(contributions, layer[chunk])
         sums: Any = self.overflow_sum.read(indices)
         sources: Any = self.overflow_source.read(indices)
-        for begin, end in zip((0, *self.rounds), self.rounds, strict=False):
-            first, last = begin + np.searchsorted(sums[begin:end], (start, stop))
-            for one in range(first, last, at_once):
-                some = slice(one, min(one + at_once, last))
-                total[sums[some]] += gather(contributions, sources[some])
+        for round_start, round_end in zip((0, *self.rounds), self.rounds, strict=False):
+            first, last = round_start + np.searchsorted(sums[round_start:round_end], (start, stop))
+            for chunk_start in range(first, last, chunk_size):
+                chunk = slice(chunk_start, min(chunk_start + chunk_size, last))
+                total[sums[chunk]] += gather(contributions, sources[chunk])
 
     def read_back(
         self, indices: Int[Array, " total"], sums: Inexact[Array, " sums"], into: Inexact[Array, " sources"]

@@ -94,21 +94,21 @@ class Multigrid(NumpySolver):
     def solve_in_numpy(self, pattern: SparsityPattern, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Solutions (n, k) for columns (n, k); NaN where there is none."""
         key = pattern_key(pattern)
-        made = _LAST_HIERARCHY.get_or_compute(key, values, lambda: hierarchy(pattern.to_scipy(values)))
+        matrix_hierarchy = _LAST_HIERARCHY.get_or_compute(key, values, lambda: hierarchy(pattern.to_scipy(values)))
         dtype = np.result_type(values, columns, float)
-        load = np.ascontiguousarray(columns, dtype)
-        if made.levels is None:
-            return np.full(load.shape, np.nan, dtype)
-        if np.iscomplexobj(load) and not np.iscomplexobj(values):
-            load = load.view(float)  # real and imaginary parts are columns of their own
-        solution = np.empty_like(load)
+        right_hand_sides = np.ascontiguousarray(columns, dtype)
+        if matrix_hierarchy.levels is None:
+            return np.full(right_hand_sides.shape, np.nan, dtype)
+        if np.iscomplexobj(right_hand_sides) and not np.iscomplexobj(values):
+            right_hand_sides = right_hand_sides.view(float)  # real and imaginary parts are columns of their own
+        solution = np.empty_like(right_hand_sides)
 
         def solve(part: slice) -> None:
-            group = np.ascontiguousarray(load[:, part])
-            solution[:, part] = _conjugate_gradients(made, group, self.tolerance, self.max_steps)
+            group = np.ascontiguousarray(right_hand_sides[:, part])
+            solution[:, part] = _conjugate_gradients(matrix_hierarchy, group, self.tolerance, self.max_steps)
 
-        together = max(1, min(_MAX_COLUMNS, -(-load.shape[1] // number_of_cores())))
-        on_cores(solve, [slice(start, start + together) for start in range(0, load.shape[1], together)])
+        together = max(1, min(_MAX_COLUMNS, -(-right_hand_sides.shape[1] // number_of_cores())))
+        on_cores(solve, [slice(start, start + together) for start in range(0, right_hand_sides.shape[1], together)])
         return solution.view(dtype)
 
 
@@ -122,7 +122,7 @@ def hierarchy(matrix: csr_array) -> Hierarchy:
     diagonal = matrix.diagonal()
     if not (np.isfinite(matrix.data).all() and (diagonal.real > 0).all()):
         return Hierarchy(matrix, None)
-    found = importlib.import_module("pyamg").smoothed_aggregation_solver(
+    pyamg_solver = importlib.import_module("pyamg").smoothed_aggregation_solver(
         matrix.real.tocsr(),
         symmetry="symmetric",
         strength=("symmetric", {"theta": 0.0}),
@@ -131,13 +131,15 @@ def hierarchy(matrix: csr_array) -> Hierarchy:
         postsmoother=None,
         max_coarse=_MAX_COARSEST_SIZE,
     )
-    return Hierarchy(matrix, [_build_level(one) for one in found.levels])
+    return Hierarchy(matrix, [_build_level(level) for level in pyamg_solver.levels])
 
 
 def _build_level(pyamg_level: Any) -> Level:
     matrix = csr_array(pyamg_level.A)
-    sums = abs(matrix).sum(axis=1).reshape(-1, 1)
-    scale = (1 / np.where(sums > 0, sums, 1)).astype(np.float32)  # rows of zeros, as PyAMG makes of isolated nodes
+    row_sums = abs(matrix).sum(axis=1).reshape(-1, 1)
+    scale = (1 / np.where(row_sums > 0, row_sums, 1)).astype(
+        np.float32
+    )  # rows of zeros, as PyAMG makes of isolated nodes
     if not hasattr(pyamg_level, "P"):
         return Level(matrix, scale, inverse=np.linalg.pinv(matrix.toarray(), hermitian=True).astype(np.float32))
     prolongation = csr_array(pyamg_level.P).astype(np.float32)
@@ -149,13 +151,13 @@ def _v_cycle(levels: list[Level], right_hand_side: np.ndarray) -> np.ndarray:
     level, *coarser = levels
     if level.inverse is not None:
         return level.inverse @ right_hand_side
-    first, second = _WEIGHTS
-    solution = np.float32(first) * level.scale * right_hand_side
-    _relax(level, solution, right_hand_side, second)
+    first_weight, second_weight = _WEIGHTS
+    solution = np.float32(first_weight) * level.scale * right_hand_side
+    _relax(level, solution, right_hand_side, second_weight)
     residual = level.matrix @ solution
     np.subtract(right_hand_side, residual, out=residual)
     solution += level.prolongation @ _v_cycle(coarser, level.restriction @ residual)
-    for weight in (second, first):
+    for weight in (second_weight, first_weight):
         _relax(level, solution, right_hand_side, weight)
     return solution
 
@@ -185,7 +187,7 @@ def _conjugate_gradients(
     solution, residual, norm = np.zeros_like(right_hand_side), right_hand_side.copy(), _column_norms(right_hand_side)
     preconditioned = _precondition(hierarchy.levels, residual, norm)
     direction, weight = preconditioned.copy(), _column_products(residual, preconditioned)
-    target, target_error = tolerance * norm, tolerance * _column_norms(preconditioned)
+    max_norm, max_error = tolerance * norm, tolerance * _column_norms(preconditioned)
     is_converged = norm == 0
     for _ in range(max_steps):
         product = hierarchy.matrix @ direction
@@ -198,11 +200,11 @@ def _conjugate_gradients(
         solution += np.multiply(direction, length, out=product)
         norm = _column_norms(residual)
         preconditioned = _precondition(hierarchy.levels, residual, norm)
-        before, weight = weight, _column_products(residual, preconditioned)
-        is_converged |= (norm <= target) & (_column_norms(preconditioned) <= target_error)
+        last_weight, weight = weight, _column_products(residual, preconditioned)
+        is_converged |= (norm <= max_norm) & (_column_norms(preconditioned) <= max_error)
         if is_converged.all() or not np.isfinite(weight).all():
             break
-        direction *= np.divide(weight, before, out=np.zeros_like(weight), where=~is_converged)
+        direction *= np.divide(weight, last_weight, out=np.zeros_like(weight), where=~is_converged)
         direction += preconditioned
     solution[:, ~is_converged] = np.nan
     return solution

@@ -57,17 +57,19 @@ class Strips(Module):
     ) -> "Strips":
         """Partition the unknowns into strips perpendicular to the longest extent of their `coordinates` (n, d).
         `selected` (n,): the unknowns between which the inverse is needed."""
-        long, *others = coordinates.T[np.argsort(-np.ptp(coordinates, axis=0))]
-        strip = _breadth_first_levels(pattern, long)
+        longest, *other_axes = coordinates.T[np.argsort(-np.ptp(coordinates, axis=0))]
+        strip = _breadth_first_levels(pattern, longest)
         # Neighbours in a strip are neighbours in memory.
-        order = np.lexsort((*others[::-1], ~selected, strip))
+        order = np.lexsort((*other_axes[::-1], ~selected, strip))
         counts = np.bincount(strip)
-        within = np.empty(len(strip), int)
-        within[order] = np.arange(len(strip)) - np.repeat(np.cumsum(counts) - counts, counts)
-        size = int(counts.max())
-        most = int(np.bincount(strip[selected], minlength=1).max())
-        most = min(-(-max(most, 1) // 8) * 8, size)  # rounded to few sizes, because a program is compiled for each
-        return cls((strip * size + within).astype(np.int32), len(counts), size, most)
+        index_in_strip = np.empty(len(strip), int)
+        index_in_strip[order] = np.arange(len(strip)) - np.repeat(np.cumsum(counts) - counts, counts)
+        strip_size = int(counts.max())
+        num_selected = int(np.bincount(strip[selected], minlength=1).max())
+        num_selected = min(
+            -(-max(num_selected, 1) // 8) * 8, strip_size
+        )  # rounded to few sizes, because a program is compiled for each
+        return cls((strip * strip_size + index_in_strip).astype(np.int32), len(counts), strip_size, num_selected)
 
     @property
     def place(self) -> Int[np.ndarray, " n"]:
@@ -122,8 +124,8 @@ class NearInverse(Module):
 
     def add(self, left: Inexact[Array, "p r"], right: Inexact[Array, "p r"]) -> "NearInverse":
         """G + left rightᵀ, which must be symmetric; both factors have rows in the order of places."""
-        joined = (jnp.concatenate(pair, axis=1) for pair in ((self.left, left), (self.right, right)))
-        return NearInverse(self.band, *joined)
+        factors = (jnp.concatenate(factor_pair, axis=1) for factor_pair in ((self.left, left), (self.right, right)))
+        return NearInverse(self.band, *factors)
 
 
 @partial(jax.jit, static_argnums=2)
@@ -144,7 +146,7 @@ def near_inverse(strips: Strips, operator: SparseSymmetric, max_distance: int) -
     near = near_inverse(strips, operator, 2)
     ```
     """
-    size, selected = strips.strip_size, strips.selected_per_strip
+    strip_size, num_selected = strips.strip_size, strips.selected_per_strip
     blocks, couplings = _strip_blocks(strips, operator)
 
     def eliminate(schur_update, strip):
@@ -153,22 +155,26 @@ def near_inverse(strips: Strips, operator: SparseSymmetric, max_distance: int) -
         weights = pivot @ coupling
         return coupling.T @ weights, (pivot, weights)
 
-    def substitute(following, strip):
+    def substitute(following_blocks, strip):
         pivot, weights = strip
-        ahead = -weights @ following
-        own = pivot - ahead[:, :size] @ weights.T
-        own = (own + own.T) / 2
-        near = jnp.concatenate([own[:, :selected], ahead[:, :selected], ahead[:, size:]], axis=1)[:selected]
-        kept = size + (max_distance - 1) * selected
-        following = jnp.concatenate([own, ahead[:, :selected], ahead[:, size:]], axis=1)[:, :kept]
-        return following, near
+        later_blocks = -weights @ following_blocks
+        diagonal_block = pivot - later_blocks[:, :strip_size] @ weights.T
+        diagonal_block = (diagonal_block + diagonal_block.T) / 2
+        selected_blocks = jnp.concatenate(
+            [diagonal_block[:, :num_selected], later_blocks[:, :num_selected], later_blocks[:, strip_size:]], axis=1
+        )[:num_selected]
+        num_columns = strip_size + (max_distance - 1) * num_selected
+        following_blocks = jnp.concatenate(
+            [diagonal_block, later_blocks[:, :num_selected], later_blocks[:, strip_size:]], axis=1
+        )[:, :num_columns]
+        return following_blocks, selected_blocks
 
-    nothing = jnp.zeros((size, size), operator.values.dtype)
-    _, eliminated = jax.lax.scan(eliminate, nothing, (blocks, couplings))
-    nothing = jnp.zeros((size, size + (max_distance - 1) * selected), operator.values.dtype)
-    _, upper = jax.lax.scan(substitute, nothing, eliminated, reverse=True)
-    none = jnp.zeros((strips.num_strips * selected, 0), upper.dtype)
-    return NearInverse(upper, none, none)
+    zero_block = jnp.zeros((strip_size, strip_size), operator.values.dtype)
+    _, eliminated = jax.lax.scan(eliminate, zero_block, (blocks, couplings))
+    zero_block = jnp.zeros((strip_size, strip_size + (max_distance - 1) * num_selected), operator.values.dtype)
+    _, upper = jax.lax.scan(substitute, zero_block, eliminated, reverse=True)
+    no_factors = jnp.zeros((strips.num_strips * num_selected, 0), upper.dtype)
+    return NearInverse(upper, no_factors, no_factors)
 
 
 def _strip_blocks(strips: Strips, operator: SparseSymmetric):
@@ -179,13 +185,15 @@ def _strip_blocks(strips: Strips, operator: SparseSymmetric):
     rows, columns = position[operator.pattern.rows], position[operator.pattern.columns]
     first, last = jnp.minimum(rows, columns), jnp.maximum(rows, columns)
     strip, row, column = first // strips.strip_size, first % strips.strip_size, last % strips.strip_size
-    inside = jnp.where(last // strips.strip_size == strip, strip, strips.num_strips)
-    across = jnp.where(last // strips.strip_size == strip, strips.num_strips, strip)
-    filler = jnp.ones(strips.num_strips * strips.strip_size).at[position].set(0).reshape(shape[:2])
-    blocks = jnp.eye(strips.strip_size, dtype=operator.values.dtype) * filler[:, None]
-    blocks = blocks.at[inside, row, column].set(operator.values, mode="drop")
-    blocks = blocks.at[inside, column, row].set(operator.values, mode="drop")
-    couplings = jnp.zeros(shape, operator.values.dtype).at[across, row, column].set(operator.values, mode="drop")
+    own_strip = jnp.where(last // strips.strip_size == strip, strip, strips.num_strips)
+    coupling_strip = jnp.where(last // strips.strip_size == strip, strips.num_strips, strip)
+    is_filler = jnp.ones(strips.num_strips * strips.strip_size).at[position].set(0).reshape(shape[:2])
+    blocks = jnp.eye(strips.strip_size, dtype=operator.values.dtype) * is_filler[:, None]
+    blocks = blocks.at[own_strip, row, column].set(operator.values, mode="drop")
+    blocks = blocks.at[own_strip, column, row].set(operator.values, mode="drop")
+    couplings = (
+        jnp.zeros(shape, operator.values.dtype).at[coupling_strip, row, column].set(operator.values, mode="drop")
+    )
     return blocks, couplings
 
 
@@ -195,14 +203,14 @@ def _breadth_first_levels(pattern: SparsityPattern, coordinate: np.ndarray) -> I
     rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
     graph = csr_array((np.ones(len(rows), np.float32), (rows, columns)), shape=(pattern.size, pattern.size))
     graph = graph + graph.T
-    level, number = np.full(pattern.size, -1), 0
+    level, level_number = np.full(pattern.size, -1), 0
     frontier = np.zeros(pattern.size, bool)
-    while (unseen := level < 0).any():
+    while (is_unseen := level < 0).any():
         if not frontier.any():
-            end = np.flatnonzero(unseen)[coordinate[unseen].argmin()]
-            neighbours = graph.indices[graph.indptr[end] : graph.indptr[end + 1]]
-            frontier = unseen & (coordinate <= (coordinate[end] + coordinate[neighbours].max()) / 2)
-        level[frontier] = number
-        number += 1
+            first_node = np.flatnonzero(is_unseen)[coordinate[is_unseen].argmin()]
+            neighbours = graph.indices[graph.indptr[first_node] : graph.indptr[first_node + 1]]
+            frontier = is_unseen & (coordinate <= (coordinate[first_node] + coordinate[neighbours].max()) / 2)
+        level[frontier] = level_number
+        level_number += 1
         frontier = (graph @ frontier.astype(np.float32) > 0) & (level < 0)
     return level

@@ -171,18 +171,20 @@ class NumpySolver(MatrixSolver):
         shape = jax.ShapeDtypeStruct(columns.shape, dtype)
 
         def solve_with(pattern: SparsityPattern, values: Any, columns: Any) -> np.ndarray:
-            found = self.solve_in_numpy(pattern, np.asarray(values), np.asarray(columns))
-            return found.astype(dtype, copy=False)
+            solutions = self.solve_in_numpy(pattern, np.asarray(values), np.asarray(columns))
+            return solutions.astype(dtype, copy=False)
 
         if has_values(pattern):  # constants, kept out of the compiled program because they are large
-            known = on_host(pattern)
+            host_pattern = on_host(pattern)
             if has_values(state, columns):
-                return host.asarray(solve_with(known, state.values, columns))
-            return call_numpy(lambda values, columns: solve_with(known, values, columns), shape, state.values, columns)
+                return host.asarray(solve_with(host_pattern, state.values, columns))
+            return call_numpy(
+                lambda values, columns: solve_with(host_pattern, values, columns), shape, state.values, columns
+            )
 
         def solve_any(indices: np.ndarray, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
-            given = SparsityPattern(indices, pattern.layout, pattern.size)  # pyright: ignore[reportArgumentType]
-            return solve_with(given, values, columns)
+            traced_pattern = SparsityPattern(indices, pattern.layout, pattern.size)  # pyright: ignore[reportArgumentType]
+            return solve_with(traced_pattern, values, columns)
 
         return call_numpy(solve_any, shape, pattern.indices, state.values, columns)
 

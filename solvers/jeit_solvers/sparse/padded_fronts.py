@@ -66,22 +66,24 @@ class EliminationTree:
         below them."""
         nodes = np.arange(2 ** (depth + 1) - 1)
         level = np.floor(np.log2(nodes + 1)).astype(int)
-        largest = np.zeros(depth + 1, dtype=int)
-        np.maximum.at(largest, level, np.bincount(owner, minlength=nodes.size))
-        heights = _merged_levels(largest)
+        max_separators = np.zeros(depth + 1, dtype=int)
+        np.maximum.at(max_separators, level, np.bincount(owner, minlength=nodes.size))
+        heights = _merged_levels(max_separators)
         first_level = depth + 1 - np.cumsum(heights)
         stage_of_level = np.searchsorted(-first_level, -np.arange(depth + 1), side="left")
-        top = nodes.copy()
+        top_nodes = nodes.copy()
         for _ in range(max(heights)):
-            top = np.where(level[top] > first_level[stage_of_level[level[top]]], (top - 1) // 2, top)
-        kept, front_of_node = np.unique(top, return_inverse=True)
+            top_nodes = np.where(
+                level[top_nodes] > first_level[stage_of_level[level[top_nodes]]], (top_nodes - 1) // 2, top_nodes
+            )
+        front_nodes, front_of_node = np.unique(top_nodes, return_inverse=True)
         self.front = front_of_node[owner]
-        self.parent = np.where(kept > 0, front_of_node[(kept - 1) // 2], -1)
-        self.stage = stage_of_level[level[kept]]
+        self.parent = np.where(front_nodes > 0, front_of_node[(front_nodes - 1) // 2], -1)
+        self.stage = stage_of_level[level[front_nodes]]
         self.num_stages = len(heights)
-        by_stage = np.argsort(self.stage, kind="stable")
-        self.slot = np.empty(kept.size, dtype=np.int64)
-        self.slot[by_stage] = rank_within(self.stage[by_stage])
+        stage_order = np.argsort(self.stage, kind="stable")
+        self.slot = np.empty(front_nodes.size, dtype=np.int64)
+        self.slot[stage_order] = rank_within(self.stage[stage_order])
 
     def _find_borders(self) -> None:
         """Find the border of each front: the later rows of its entries, and the borders of its children without its own
@@ -90,13 +92,13 @@ class EliminationTree:
         pending = np.unique(first[first != second] * self.size + self.late[first != second])
         self.borders = []
         for stage in range(self.num_stages):
-            mine = self.stage[pending // self.size] == stage
-            border = pending[mine]
+            is_in_stage = self.stage[pending // self.size] == stage
+            border = pending[is_in_stage]
             self.borders.append(border)
             child, row = np.divmod(border, self.size)
-            above = self.parent[child]
-            inherited = (above * self.size + row)[self.front[row] != above]
-            pending = np.unique(np.concatenate([pending[~mine], inherited]))
+            parent_front = self.parent[child]
+            inherited = (parent_front * self.size + row)[self.front[row] != parent_front]
+            pending = np.unique(np.concatenate([pending[~is_in_stage], inherited]))
 
     def position(self, fronts: np.ndarray, rows: np.ndarray, stage: int) -> np.ndarray:
         """Local indices of matrix rows in fronts of one stage: pivots first, then the border."""
@@ -122,12 +124,12 @@ def _merged_levels(largest_separators: np.ndarray) -> list[int]:
         while level > 0:
             # About half of a front's surroundings are separators of the next levels above, so its border is a few times
             # as long as these.
-            batch, above = 2 ** (level - 1), int(largest_separators[level - 1])
-            border = 3 * above
-            apart = operations(2 * batch, pivots, border) + operations(batch, above, border)
-            if operations(batch, 2 * pivots + above, border) - apart > _OPERATIONS_WORTH_A_STAGE:
+            batch, next_separator = 2 ** (level - 1), int(largest_separators[level - 1])
+            border = 3 * next_separator
+            separate_operations = operations(2 * batch, pivots, border) + operations(batch, next_separator, border)
+            if operations(batch, 2 * pivots + next_separator, border) - separate_operations > _OPERATIONS_WORTH_A_STAGE:
                 break
-            height, pivots, level = height + 1, 2 * pivots + above, level - 1
+            height, pivots, level = height + 1, 2 * pivots + next_separator, level - 1
         heights.append(height)
         level -= 1
     return heights
@@ -142,8 +144,8 @@ def rank_within(groups: np.ndarray) -> np.ndarray:
 def graph_of(rows: np.ndarray, columns: np.ndarray, size: int) -> csr_array:
     """Graph of the pattern: its entries without the diagonal, in both triangles."""
     rows, columns = rows[size:], columns[size:]
-    ends = (np.concatenate([rows, columns]), np.concatenate([columns, rows]))
-    return csr_array((np.ones(2 * rows.size, dtype=np.int8), ends), shape=(size, size))
+    coordinates = (np.concatenate([rows, columns]), np.concatenate([columns, rows]))
+    return csr_array((np.ones(2 * rows.size, dtype=np.int8), coordinates), shape=(size, size))
 
 
 class Link(NamedTuple):
@@ -262,8 +264,8 @@ def checked_coordinates(pattern: SparsityPattern, coordinates: Any) -> np.ndarra
 def _plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> FactorisationPlan:
     """Make the plan with all index maps for an elimination tree. If a plan of the same tree is in use, for example in a
     forward model on the mesh of which a prior also needs matrices, its index maps are shared."""
-    known = _plan_key(pattern, tree)
-    indices, layout = _CACHED_INDICES.get(known), _CACHED_LAYOUTS.get(known)
+    key = _plan_key(pattern, tree)
+    indices, layout = _CACHED_INDICES.get(key), _CACHED_LAYOUTS.get(key)
     if indices is None or layout is None:
         store = IndexStore()
         stages = tuple(_build_stage(store, pattern, tree, stage) for stage in range(tree.num_stages))
@@ -272,16 +274,16 @@ def _plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> Factorisat
         solution = offsets[stage_of_row] + tree.slot[tree.front] * np.asarray(tree.pivots)[stage_of_row] + tree.place
         layout = IndexLayout(stages, store.add(solution))
         indices = store.pack()
-        _CACHED_INDICES[known], _CACHED_LAYOUTS[known] = indices, layout
+        _CACHED_INDICES[key], _CACHED_LAYOUTS[key] = indices, layout
     return FactorisationPlan(indices, layout, pattern.size, pattern.num_entries)
 
 
 def _plan_key(pattern: SparsityPattern, tree: EliminationTree) -> bytes:
     """Key of the plan of a tree in the cache of plans."""
-    found = hashlib.blake2b(digest_size=16)
-    for one in (pattern.rows, pattern.columns, tree.front, tree.place, tree.parent, tree.stage, tree.slot):
-        found.update(np.asarray(one).tobytes())
-    return found.digest()
+    digest = hashlib.blake2b(digest_size=16)
+    for array in (pattern.rows, pattern.columns, tree.front, tree.place, tree.parent, tree.stage, tree.slot):
+        digest.update(np.asarray(array).tobytes())
+    return digest.digest()
 
 
 # Index maps of plans in use, because making a plan of a solid takes seconds, and storing it hundreds of megabytes.
@@ -331,13 +333,13 @@ def _plan_matrix_entries(
     front = tree.front[early]
     column, row = tree.place[early], tree.position(front, late, stage)
     # Pivot blocks of the fronts are filled on both sides of the diagonal.
-    both = (row < pivots) & (row != column)
+    is_mirrored = (row < pivots) & (row != column)
     first = tree.slot[front] * height
     members = np.argsort(np.where(tree.stage == stage, tree.slot, tree.parent.size), kind="stable")[:batch]
-    padded, pad = np.nonzero(np.arange(pivots) >= tree.pivot_count[members][:, None])
-    target = [(first + row) * pivots + column, ((first + column) * pivots + row)[both]]
-    target.append((padded * height + pad) * pivots + pad)
-    source = [entries, entries[both], np.full(padded.size, pattern.num_entries)]
+    padded_fronts, padded_pivots = np.nonzero(np.arange(pivots) >= tree.pivot_count[members][:, None])
+    target = [(first + row) * pivots + column, ((first + column) * pivots + row)[is_mirrored]]
+    target.append((padded_fronts * height + padded_pivots) * pivots + padded_pivots)
+    source = [entries, entries[is_mirrored], np.full(padded_fronts.size, pattern.num_entries)]
     return PaddedSum.create(
         store, np.concatenate(target), np.concatenate(source), batch * height * pivots, pattern.num_entries + 1
     )
@@ -347,23 +349,25 @@ def _plan_link(store: IndexStore, tree: EliminationTree, source: int, stage: int
     batch, pivots, border = int(tree.batch[stage]), tree.pivots[stage], tree.border[stage]
     height, count, width = pivots + border, int(tree.batch[source]), tree.border[source]
     child, row = np.divmod(tree.borders[source], tree.size)
-    place, front = rank_within(child), tree.parent[child]
+    border_indices, front = rank_within(child), tree.parent[child]
     # Local row in the parent front of each border row of each child; -1 marks padding.
-    into = np.full((count, width), -1)
-    into[tree.slot[child], place] = tree.position(front, row, stage)
+    parent_rows = np.full((count, width), -1)
+    parent_rows[tree.slot[child], border_indices] = tree.position(front, row, stage)
     parent_slot = np.zeros(count, dtype=np.int64)
     parent_slot[tree.slot[child]] = tree.slot[front]
     flat = np.arange(count * width * width).reshape(count, width, width)
-    first, second, base = np.broadcast_arrays(into[:, :, None], into[:, None, :], parent_slot[:, None, None])
+    first, second, base = np.broadcast_arrays(
+        parent_rows[:, :, None], parent_rows[:, None, :], parent_slot[:, None, None]
+    )
     valid = (first >= 0) & (second >= 0)
     panel, corner = valid & (second < pivots), valid & (first >= pivots) & (second >= pivots)
-    in_panel = ((base * height + first) * pivots + second)[panel]
-    in_corner = ((base * border + first - pivots) * border + second - pivots)[corner]
-    in_rows = parent_slot[:, None] * height + into
-    used = into >= 0
+    panel_targets = ((base * height + first) * pivots + second)[panel]
+    corner_targets = ((base * border + first - pivots) * border + second - pivots)[corner]
+    row_targets = parent_slot[:, None] * height + parent_rows
+    is_used = parent_rows >= 0
     return Link(
         source,
-        PaddedSum.create(store, in_panel, flat[panel], batch * height * pivots, flat.size),
-        PaddedSum.create(store, in_corner, flat[corner], batch * border * border, flat.size),
-        PaddedSum.create(store, in_rows[used], np.flatnonzero(used), batch * height, count * width),
+        PaddedSum.create(store, panel_targets, flat[panel], batch * height * pivots, flat.size),
+        PaddedSum.create(store, corner_targets, flat[corner], batch * border * border, flat.size),
+        PaddedSum.create(store, row_targets[is_used], np.flatnonzero(is_used), batch * height, count * width),
     )

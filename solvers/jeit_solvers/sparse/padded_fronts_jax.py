@@ -99,13 +99,13 @@ def _factorise_stages(layout: IndexLayout, indices: Int[Array, " total"], values
     stages, _ = layout.content
     dtype = values.dtype
     extended = jnp.concatenate([values, jnp.ones(1, dtype)])
-    inverses, lowers, left = [], [], []
+    inverses, lowers, schur_complements = [], [], []
     for stage in stages:
         pivots, border = stage.pivots, stage.border
         panel = stage.entries.apply(indices, extended)
         corner = jnp.zeros(stage.batch * border * border, dtype)
         for link in stage.links:
-            schur = left[link.source].reshape(-1)
+            schur = schur_complements[link.source].reshape(-1)
             panel += link.panel.apply(indices, schur)
             corner += link.corner.apply(indices, schur)
         panel = panel.reshape(stage.batch, pivots + border, pivots)
@@ -115,7 +115,7 @@ def _factorise_stages(layout: IndexLayout, indices: Int[Array, " total"], values
         lowers.append(lower)
         corner = corner.reshape(stage.batch, border, border)
         corner -= lower @ _transposed(lower)
-        left.append(corner)
+        schur_complements.append(corner)
     return Factor(tuple(inverses), tuple(lowers))
 
 
@@ -129,18 +129,20 @@ def _factorise_in_numpy(
     """The same as `_factorise_stages`, in NumPy and in place, with the fronts of a stage distributed over the cores."""
     stages, _ = layout.content
     extended = np.concatenate([values, np.ones(1, values.dtype)])
-    inverses, lowers, left = [], [], []
+    inverses, lowers, schur_complements = [], [], []
     for stage in stages:
         batch, pivots, border = stage.batch, stage.pivots, stage.border
         panel = np.zeros((batch, pivots + border, pivots), values.dtype)
         corner = np.zeros((batch, border, border), values.dtype)
         inverse, lower = np.empty_like(panel, shape=(batch, pivots, pivots)), np.empty_like(panel[:, pivots:])
-        some = partial(_eliminate_fronts, stage, indices, extended, left, panel, corner, inverse, lower)
-        many = batch * (pivots + border) ** 2 > _MIN_PARALLEL_ENTRIES
-        on_cores(some, parts_for_cores(batch) if many else [slice(0, batch)])
+        eliminate_slice = partial(
+            _eliminate_fronts, stage, indices, extended, schur_complements, panel, corner, inverse, lower
+        )
+        is_large = batch * (pivots + border) ** 2 > _MIN_PARALLEL_ENTRIES
+        on_cores(eliminate_slice, parts_for_cores(batch) if is_large else [slice(0, batch)])
         inverses.append(inverse)
         lowers.append(lower)
-        left.append(corner)
+        schur_complements.append(corner)
     return Factor(tuple(inverses), tuple(lowers))
 
 
@@ -150,23 +152,23 @@ def _eliminate_fronts(
     """Assemble and eliminate the fronts `front_slice` of a stage, in place. `schur_complements`: those of all earlier
     stages."""
 
-    def add(padded_sum, contributions, target):
+    def add_contributions(padded_sum, contributions, target):
         size = target[0].size
         padded_sum.add_some(
             indices, contributions, target.reshape(-1), front_slice.start * size, front_slice.stop * size
         )
 
-    add(stage.entries, extended, panel)
+    add_contributions(stage.entries, extended, panel)
     for link in stage.links:
         schur = schur_complements[link.source].reshape(-1)
-        add(link.panel, schur, panel)
-        add(link.corner, schur, corner)
+        add_contributions(link.panel, schur, panel)
+        add_contributions(link.corner, schur, corner)
     inverse[front_slice] = inverse_cholesky(panel[front_slice, : stage.pivots])
     np.matmul(panel[front_slice, stage.pivots :], _transposed(inverse[front_slice]), out=lower[front_slice])
-    together = max(1, _UPDATED_ENTRIES // max(stage.border**2, 1))
-    for first in range(front_slice.start, front_slice.stop, together):
-        few = slice(first, min(first + together, front_slice.stop))
-        corner[few] -= lower[few] @ _transposed(lower[few])
+    num_together = max(1, _UPDATED_ENTRIES // max(stage.border**2, 1))
+    for first in range(front_slice.start, front_slice.stop, num_together):
+        update_slice = slice(first, min(first + num_together, front_slice.stop))
+        corner[update_slice] -= lower[update_slice] @ _transposed(lower[update_slice])
 
 
 def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
@@ -317,23 +319,25 @@ def _inverse_entries(
     stages, _ = layout.content
     xp, dtype = namespace(factor), factor.inverses[0].dtype
     entries = xp.zeros(num_entries + 2, dtype)  # one more for padded pivots, and one for positions outside the pattern
-    first_child = {one.parent: number for number, one in reversed(list(enumerate(stages))) if one.border}
+    first_child = {stage.parent: number for number, stage in reversed(list(enumerate(stages))) if stage.border}
     fronts: dict[int, Inexact[Array, "batch height height"]] = {}
     for number in reversed(range(len(stages))):
         stage, inverse = stages[number], factor.inverses[number]
-        mine = _transposed(inverse) @ inverse
-        whole = mine
+        pivot_block = _transposed(inverse) @ inverse
+        front_block = pivot_block
         if stage.border:
-            above = fronts[stage.parent]
-            corner = _border_block(above, stage.above.read(indices))
-            pulled = factor.lowers[number] @ inverse
-            side = corner @ pulled
-            mine = mine + _transposed(pulled) @ side
-            panel = xp.concatenate([mine, -side], axis=1)
-            whole = xp.concatenate([panel, xp.concatenate([-_transposed(side), corner], axis=1)], axis=2)
-        entries = stage.entries.read_back(indices, whole[:, :, : stage.pivots].reshape(-1), entries)
+            parent_blocks = fronts[stage.parent]
+            corner = _border_block(parent_blocks, stage.above.read(indices))
+            weights = factor.lowers[number] @ inverse
+            border_columns = corner @ weights
+            pivot_block = pivot_block + _transposed(weights) @ border_columns
+            panel = xp.concatenate([pivot_block, -border_columns], axis=1)
+            front_block = xp.concatenate(
+                [panel, xp.concatenate([-_transposed(border_columns), corner], axis=1)], axis=2
+            )
+        entries = stage.entries.read_back(indices, front_block[:, :, : stage.pivots].reshape(-1), entries)
         if number in first_child:
-            fronts[number] = whole
+            fronts[number] = front_block
         if stage.border and first_child[stage.parent] == number:
             del fronts[stage.parent]  # no front further down needs it
     return entries[:num_entries]
@@ -343,12 +347,12 @@ def _border_block(above: Inexact[Array, "parents height height"], rows: Int[Arra
     """Entries of the inverse between the rows of the children's borders, read from the parents' fronts; zero for
     padding."""
     height = above.shape[-1]
-    slot, place = rows // height, rows % height
+    slot, local_index = rows // height, rows % height
     # Padding gets the index after the last entry.
-    flat = (slot[:, :, None] * height + place[:, :, None]) * height + place[:, None, :]
-    there = rows < above.shape[0] * height
-    flat = namespace(above).where(there[:, :, None] & there[:, None, :], flat, above.size)
-    return gather_or_zero(above.reshape(-1), flat)
+    flat_indices = (slot[:, :, None] * height + local_index[:, :, None]) * height + local_index[:, None, :]
+    is_row = rows < above.shape[0] * height
+    flat_indices = namespace(above).where(is_row[:, :, None] & is_row[:, None, :], flat_indices, above.size)
+    return gather_or_zero(above.reshape(-1), flat_indices)
 
 
 _compiled_inverse_entries = jax.jit(_inverse_entries, static_argnums=(0, 1))
@@ -358,10 +362,13 @@ def _backward_solve(
     layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, rows: Inexact[Array, "rows k"]
 ) -> Inexact[Array, "n k"]:
     stages, solution = layout.content
-    ends = np.cumsum([stage.batch * stage.pivots for stage in stages])
-    parts = namespace(rows).split(rows, ends[:-1])
-    parts = [part.reshape(stage.batch, stage.pivots, -1) for part, stage in zip(parts, stages, strict=True)]
-    return _backward_stages(stages, indices, factor, parts)[solution.read(indices)]
+    stage_ends = np.cumsum([stage.batch * stage.pivots for stage in stages])
+    stage_rows = namespace(rows).split(rows, stage_ends[:-1])
+    stage_rows = [
+        rows_of_stage.reshape(stage.batch, stage.pivots, -1)
+        for rows_of_stage, stage in zip(stage_rows, stages, strict=True)
+    ]
+    return _backward_stages(stages, indices, factor, stage_rows)[solution.read(indices)]
 
 
 _compiled_backward_solve = jax.jit(_backward_solve, static_argnums=0)
@@ -391,13 +398,15 @@ def _forward_stages(
     reduced, updates = [], []
     for stage, inverse, lower in zip(stages, factor.inverses, factor.lowers, strict=True):
         rows = gather_or_zero(vectors, stage.right_hand_side.read(indices))
-        received = [link.rows.apply(indices, updates[link.source].reshape(-1, count)) for link in stage.links]
-        received = [one.reshape(stage.batch, -1, count) for one in received]
-        rows = sum((one[:, : stage.pivots] for one in received), rows)
-        nothing = namespace(vectors).zeros((), vectors.dtype)
-        passed_on = functools.reduce(operator.add, [one[:, stage.pivots :] for one in received] or [nothing])
+        child_updates = [link.rows.apply(indices, updates[link.source].reshape(-1, count)) for link in stage.links]
+        child_updates = [update.reshape(stage.batch, -1, count) for update in child_updates]
+        rows = sum((update[:, : stage.pivots] for update in child_updates), rows)
+        zero = namespace(vectors).zeros((), vectors.dtype)
+        border_update = functools.reduce(
+            operator.add, [update[:, stage.pivots :] for update in child_updates] or [zero]
+        )
         reduced.append(inverse @ rows)
-        updates.append(passed_on - lower @ reduced[-1])
+        updates.append(border_update - lower @ reduced[-1])
     return reduced
 
 
@@ -414,14 +423,14 @@ def _backward_stages(
     read from its parent."""
     count, xp = reduced[0].shape[-1], namespace(reduced)
     fronts: dict[int, Inexact[Array, "rows k"]] = {}
-    solved = []
+    pivot_values = []
     for number in reversed(range(len(stages))):
-        stage, local = stages[number], reduced[number]
-        above = xp.zeros((stage.batch, 0, count), local.dtype)
+        stage, pivot_residual = stages[number], reduced[number]
+        border_values = xp.zeros((stage.batch, 0, count), pivot_residual.dtype)
         if stage.border:
-            above = gather_or_zero(fronts[stage.parent], stage.above.read(indices))
-            local = local - _transposed(factor.lowers[number]) @ above
-        pivots = _transposed(factor.inverses[number]) @ local
-        solved.append(pivots.reshape(-1, count))
-        fronts[number] = xp.concatenate([pivots, above], axis=1).reshape(-1, count)
-    return xp.concatenate(solved[::-1])
+            border_values = gather_or_zero(fronts[stage.parent], stage.above.read(indices))
+            pivot_residual = pivot_residual - _transposed(factor.lowers[number]) @ border_values
+        pivots = _transposed(factor.inverses[number]) @ pivot_residual
+        pivot_values.append(pivots.reshape(-1, count))
+        fronts[number] = xp.concatenate([pivots, border_values], axis=1).reshape(-1, count)
+    return xp.concatenate(pivot_values[::-1])

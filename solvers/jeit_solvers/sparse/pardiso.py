@@ -1,6 +1,6 @@
 """PARDISO, the direct solver of Intel's oneMKL, for sparse symmetric systems on a CPU.
 
-A user names it where jeit's own factorisation takes too much memory or time (Schenk and Gärtner, Future Gener. Comput.
+Users select it where jeit's own factorisation takes too much memory or time (Schenk and Gärtner, Future Gener. Comput.
 Syst. 20, 2004). Complex symmetric systems are solved as real symmetric ones of twice the size, since pypardiso, the
 binding, passes real matrices only.
 """
@@ -81,17 +81,17 @@ class _Factor:
 
     def solve(self, columns: np.ndarray) -> np.ndarray:
         """Solutions (n, k); NaN if the matrix could not be factorised."""
-        complex_columns = np.iscomplexobj(columns)
+        is_complex_input = np.iscomplexobj(columns)
         if self.failed:
-            return np.full(columns.shape, np.nan, complex if self.is_complex or complex_columns else float)
+            return np.full(columns.shape, np.nan, complex if self.is_complex or is_complex_input else float)
         if not self.is_complex:
-            parts = [np.real(columns), np.imag(columns)] if complex_columns else [columns]
-            found = self._solve(np.hstack(parts))
-            number = columns.shape[1]
-            return found[:, :number] + 1j * found[:, number:] if complex_columns else found
-        found = self._solve(np.vstack([np.real(columns), -np.imag(columns)]))
-        half = len(found) // 2
-        return found[:half] + 1j * found[half:]
+            column_blocks = [np.real(columns), np.imag(columns)] if is_complex_input else [columns]
+            solution = self._solve(np.hstack(column_blocks))
+            num_columns = columns.shape[1]
+            return solution[:, :num_columns] + 1j * solution[:, num_columns:] if is_complex_input else solution
+        solution = self._solve(np.vstack([np.real(columns), -np.imag(columns)]))
+        num_rows = len(solution) // 2
+        return solution[:num_rows] + 1j * solution[num_rows:]
 
     def _solve(self, columns: np.ndarray) -> np.ndarray:
         with self.lock:

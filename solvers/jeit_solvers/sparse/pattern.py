@@ -160,24 +160,25 @@ class SparsityPattern(Module):
             above, below = np.maximum(rows, columns), np.minimum(rows, columns)
             # Entries on the diagonal get negative keys, so that they come first, in the order of rows.
             keys.append(np.where(above == below, above - size, above * size + below))
-        unique, entry = np.unique(np.concatenate(keys), return_inverse=True)
+        unique, entry_of_value = np.unique(np.concatenate(keys), return_inverse=True)
         on_diagonal = np.zeros(size, dtype=bool)
         on_diagonal[unique[unique < 0] + size] = True
         if not on_diagonal.all():
-            missing = np.flatnonzero(~on_diagonal)
+            missing_rows = np.flatnonzero(~on_diagonal)
             raise ValueError(
-                f"{caller}: {missing.size} of {size} rows {reason}, the first are {missing[:5].tolist()}. A matrix "
-                "with this pattern cannot be positive definite: leave these unknowns out, and number the rest 0..n-1."
+                f"{caller}: {missing_rows.size} of {size} rows {reason}, the first are {missing_rows[:5].tolist()}. "
+                "A matrix with this pattern cannot be positive definite: leave these unknowns out, and number the rest "
+                "0..n-1."
             )
         below = unique[size:]
         rows = np.concatenate([np.arange(size), below // size])
         columns = np.concatenate([np.arange(size), below % size])
-        ends = np.cumsum([key.size for key in keys])
+        group_ends = np.cumsum([key.size for key in keys])
         store = IndexStore()
         entries = store.add(np.stack([rows, columns]))
         maps = tuple(
-            AssemblyMap.create(store, part, size, unique.size, shape)
-            for part, shape in zip(np.split(entry, ends[:-1]), shapes, strict=True)
+            AssemblyMap.create(store, entries_of_group, size, unique.size, shape)
+            for entries_of_group, shape in zip(np.split(entry_of_value, group_ends[:-1]), shapes, strict=True)
         )
         return cls(store.pack(), IndexLayout(entries, maps), size)
 
@@ -194,14 +195,14 @@ class SparsityPattern(Module):
                 f"assemble: this pattern has {len(self._assembly)} groups of elements, "
                 f"and {len(element_matrices)} arrays were given; use None for a group that adds nothing."
             )
-        parts = [
+        contributions = [
             group.apply(self.indices, _as_numeric(matrices), f"assemble: argument {number}")
             for number, (group, matrices) in enumerate(zip(self._assembly, element_matrices, strict=True))
             if matrices is not None
         ]
-        if not parts:
+        if not contributions:
             raise ValueError("assemble: every group is None, so there is nothing to assemble.")
-        return sum(parts[1:], start=parts[0])
+        return sum(contributions[1:], start=contributions[0])
 
     def entries_between(self, values: Inexact[Array, " nnz"], group: int = 0) -> Inexact[Array, "pairs m"]:
         """Entries of the matrix between the nodes of each element of a group, packed as for `assemble`: (k (k + 1) / 2,

@@ -10,8 +10,8 @@ from jeit.touch.gestures import GestureModel, touch_features
 from jeit.touch.gestures.gesture_classifiers import (
     GESTURE_CLASSIFIERS,
     feature_forms,
+    fit_logit_boost,
     held_out_odds,
-    logit_boost,
     person_folds,
     random_folds,
 )
@@ -83,7 +83,7 @@ def test_a_class_that_one_person_never_made():
 def test_a_forest_of_stumps_is_logit_boost():
     made, labels, _ = touches()
     values = touch_features(made).values
-    forest, plain = logit_boost(values, labels), LogitBoostClassifier().fit(values, labels)
+    forest, plain = fit_logit_boost(values, labels), LogitBoostClassifier().fit(values, labels)
     np.testing.assert_allclose(forest.decision_function(values), plain.decision_function(values), atol=1e-9)
     assert forest.classes_.tolist() == plain.classes_.tolist()
 

@@ -101,7 +101,7 @@ def test_an_overlong_step_is_halved(monkeypatch):
     """Without clipped responses misclassified samples shift their leaf too far."""
     from jeit.touch.gestures import logit_boost
 
-    monkeypatch.setattr(logit_boost, "_MOST_RESPONSE", 1e9)
+    monkeypatch.setattr(logit_boost, "_MAX_RESPONSE", 1e9)
     rng = np.random.default_rng(1)
     x = rng.normal(size=(60, 2))
     label = x[:, 0] > 0

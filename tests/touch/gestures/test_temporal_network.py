@@ -9,8 +9,8 @@ from made_touches import KINDS, touch, touches
 from jeit.touch.gestures import GestureModel, touch_features
 from jeit.touch.gestures.features import (
     COURSE_FEATURES,
+    NUM_SEQUENCE_INSTANTS,
     SEQUENCE_FEATURES,
-    SEQUENCE_PLACES,
     SEQUENCE_VALUES,
     course_features,
     sequence_features,
@@ -27,7 +27,7 @@ def test_the_sequence_is_the_time_course():
     assert len(found.units) == found.values.shape[1] == len(found.names)
     whole = len(COURSE_FEATURES)
     np.testing.assert_array_equal(found.values[:, :whole], course_features(made).values)
-    places = found.values[:, whole:].reshape(len(made), SEQUENCE_PLACES, len(SEQUENCE_VALUES))
+    places = found.values[:, whole:].reshape(len(made), NUM_SEQUENCE_INSTANTS, len(SEQUENCE_VALUES))
     course = made[2].course  # a stroke, 0.1 m along
     own = dict(zip(SEQUENCE_VALUES, places[2].T, strict=True))
     assert own["change"][[0, -1]] == pytest.approx(course.peak[[0, -1]])
@@ -44,7 +44,7 @@ def test_the_sequence_is_the_time_course():
 def test_an_order_in_time_is_learnt(monkeypatch):
     """Classes with the same values in rising or falling order: no mean or maximum distinguishes them."""
     rng = np.random.default_rng(0)
-    monkeypatch.setattr(temporal_network, "_EPOCHS", 20)
+    monkeypatch.setattr(temporal_network, "_NUM_EPOCHS", 20)
     label = rng.integers(0, 2, 400)
     course = np.sort(rng.normal(size=(400, 8, 2)), axis=1)
     course[label == 1] = course[label == 1, ::-1]
@@ -116,7 +116,7 @@ def test_gestures_of_people_are_classified():
 def test_forms():
     made, labels, _ = touches(people=2)
     assert feature_forms("temporal-network") == ("sequence",)
-    with pytest.raises(ValueError, match="form: 'temporal-network' takes sequence; 'seven' was asked for"):
+    with pytest.raises(ValueError, match="form: 'temporal-network' takes sequence; 'seven' was requested"):
         GestureModel.fit(made, labels, method="temporal-network", form="seven")
     with pytest.raises(ValueError, match="takes seven or course; 'sequence'"):
         GestureModel.fit(made, labels, method="nearest", form="sequence")

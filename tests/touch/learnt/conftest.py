@@ -39,7 +39,7 @@ def few_seconds():
     with libraries_found_once(), pytest.MonkeyPatch.context() as patch:
         for slow in ("trees", "network", "som"):
             patch.setitem(methods.REGRESSORS, slow, Mean)
-        patch.setattr(methods, "_TREES", 10)
+        patch.setattr(methods, "_NUM_TREES", 10)
         yield
 
 

@@ -221,7 +221,7 @@ def test_labels_and_no_touch():
 @pytest.fixture
 def few_trees(monkeypatch):
     """Fifteen for each key, where a hundred and fifty take ten times as long."""
-    monkeypatch.setattr(labels, "_TREES", 15)
+    monkeypatch.setattr(labels, "_NUM_TREES", 15)
 
 
 @pytest.mark.slow

@@ -23,7 +23,9 @@ ASKED = RNG.normal(size=(50, 6)) * np.linspace(2, 0.5, 6)
 
 @pytest.mark.parametrize("name", sorted(REGRESSORS))
 def test_numbers_are_learnt(name, monkeypatch):
-    monkeypatch.setattr("jeit.touch.learnt.methods._SHOWN", 20)  # a map with few presses, each presented this often
+    monkeypatch.setattr(
+        "jeit.touch.learnt.methods._MAX_PRESENTATIONS", 20
+    )  # a map with few presses, each presented this often
     predicted = np.asarray(REGRESSORS[name](FEATURES, TARGETS).predict(ASKED))
     right = np.stack([np.tanh(ASKED[:, 0]), np.sin(ASKED[:, 1])], axis=1)
     guess = np.abs(right - right.mean(axis=0)).mean()
@@ -116,7 +118,7 @@ def test_the_gaussian_process_is_scikit_learns():
 
 def test_few_inducing_points_predict_nearly_the_same(monkeypatch):
     whole = GaussianProcess.fit(FEATURES, TARGETS).predict(ASKED)
-    monkeypatch.setattr("jeit.touch.learnt.methods._CENTRES", 150)
+    monkeypatch.setattr("jeit.touch.learnt.methods._MAX_CENTRES", 150)
     few = GaussianProcess.fit(FEATURES, TARGETS)
     assert len(few.centres) == 150
     assert np.abs(few.predict(ASKED) - whole).mean() < 0.05

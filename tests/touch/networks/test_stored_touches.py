@@ -44,8 +44,8 @@ def test_the_number_of_chunks_in_memory(stored):
     """Six chunks of the store, the last of them half full, distributed as evenly as possible."""
     indents, path, found = stored
     assert StoredTouches(indents, path).rows("change").sizes == (110,)
-    assert StoredTouches(indents, path, at_once=1).rows("change").sizes == (20, 20, 20, 20, 20, 10)
-    rows = StoredTouches(indents, path, at_once=50).rows("change", "depth")
+    assert StoredTouches(indents, path, max_chunk_size=1).rows("change").sizes == (20, 20, 20, 20, 20, 10)
+    rows = StoredTouches(indents, path, max_chunk_size=50).rows("change", "depth")
     assert rows.sizes == (40, 40, 30)
     chunks = [rows.chunk(number) for number in range(3)]
     for place, name in enumerate(("change", "depth")):
@@ -59,7 +59,7 @@ def test_fingerprints(stored, small_skin, tmp_path):
     store.
     """
     indents, path, _ = stored
-    own = StoredTouches(indents, path, at_once=50)
+    own = StoredTouches(indents, path, max_chunk_size=50)
     again = IndentSet(small_skin, touch_draws(small_skin), 110, shape=(16, 16), chunk=20)
     simulate_presses(again, tmp_path / "again.zarr")
     assert StoredTouches(again, tmp_path / "again.zarr", 50).rows("depth").fingerprint == own.rows("depth").fingerprint
@@ -90,7 +90,7 @@ def test_incomplete_touches(stored, small_skin, tmp_path):
 def test_mean_and_deviation(stored):
     indents, path, found = stored
     change = found["change"].to_numpy().astype(np.float32).astype(float)
-    mean, deviation = mean_and_deviation(StoredTouches(indents, path, at_once=50).rows("change"))
+    mean, deviation = mean_and_deviation(StoredTouches(indents, path, max_chunk_size=50).rows("change"))
     assert np.allclose(mean, change.mean(axis=0), rtol=1e-12, atol=1e-15)
     assert np.allclose(deviation, change.std(axis=0), rtol=1e-12)
 
@@ -150,7 +150,7 @@ def test_the_objectives_of_the_three_stages(stored, other, small_skin, monkeypat
     indents, path, _ = stored
     runs = Looked(PLAN, jax.random.key(0))
     runs.losses = {}
-    found = train_three_stages(StoredTouches(indents, path, at_once=50), other, 1e-3, runs)
+    found = train_three_stages(StoredTouches(indents, path, max_chunk_size=50), other, 1e-3, runs)
     assert list(runs.losses) == list(found.courses) == ["voltages", "maps", "projection"]
     assert all(loss.shape == () and held.shape == (40,) for loss, held, _ in runs.losses.values())
     # Standardised changes have a mean square of about one, and so has the error of an untrained network.
@@ -171,7 +171,7 @@ def three_stages(stored, other, tmp_path_factory):
     """
     indents, path, _ = stored
     folder, loaded = tmp_path_factory.mktemp("trained"), []
-    touches = StoredTouches(indents, path, at_once=50)
+    touches = StoredTouches(indents, path, max_chunk_size=50)
     read = touches.read
     touches.read = lambda name, number: loaded.append((name, number)) or read(name, number)
 
@@ -266,7 +266,7 @@ def test_training_interrupted_between_chunks_continues_to_the_same_bits(paper, s
             raise Stopped
 
     def train():
-        touches = StoredTouches(stored[0], stored[1], at_once=50)
+        touches = StoredTouches(stored[0], stored[1], max_chunk_size=50)
         return train_three_stages(touches, other, 1e-3, TrainingRuns(PLAN, jax.random.key(0), tmp_path, stop))
 
     with pytest.raises(Stopped):

@@ -18,13 +18,13 @@ from jeit.touch.simulate.contact.samples import Samples
 
 # Lattice for contacts on few samples; number of samples below which it is used; width that it resolves, as a share of
 # the radius of a cell.
-_FINE_LATTICE, _FEW, _RESOLVED_WIDTH = 11, 6, 1 / 6
+_FINE_LATTICE, _MIN_NUM_SAMPLES, _RESOLVED_FRACTION = 11, 6, 1 / 6
 # Number of presses computed at once, so that the arrays fit in the cache.
-_AT_ONCE = 16
+_PRESSES_AT_ONCE = 16
 # Factor of the reach of a contact with about half its area on the skin; 2^(1/4) for a ball on a Winkler foundation.
-_MARGIN = 1.25
-# Share of skin in the area within reach of a press, below which its pressure may extend farther.
-_ON_SKIN = 0.6
+_REACH_MARGIN = 1.25
+# Minimum fraction of skin in the area within reach of a press; below it, the pressure may extend farther.
+_MIN_SKIN_FRACTION = 0.6
 
 
 class PressedCells(NamedTuple):
@@ -51,104 +51,121 @@ def pressed_cells(
     presses = [press for touch in touches for press in touch]
     if not presses:
         return PressedCells(np.zeros((len(touches), 1), int), np.zeros((len(touches), 1, samples.points.shape[1])))
-    found = _pressed_cells(samples, support, presses, progress)
+    pressed = _pressed_cells(samples, support, presses, progress)
     if all(len(touch) == 1 for touch in touches):
-        return found
-    rows, pressures, first = [], [], 0
+        return pressed
+    rows_of_cells, pressures, first_press = [], [], 0
     for touch in touches:
-        own = slice(first, first + len(touch))
-        first += len(touch)
-        there = found.pressure[own].any(axis=-1)
-        cells, place = np.unique(found.cells[own][there], return_inverse=True)
-        total = np.zeros((len(cells), found.pressure.shape[-1]))
-        np.add.at(total, place, found.pressure[own][there])
-        rows.append(cells)
-        pressures.append(total)
-    return _pad_and_stack(rows, pressures)
+        touch_presses = slice(first_press, first_press + len(touch))
+        first_press += len(touch)
+        is_pressed = pressed.pressure[touch_presses].any(axis=-1)
+        cells, cell_indices = np.unique(pressed.cells[touch_presses][is_pressed], return_inverse=True)
+        total_pressures = np.zeros((len(cells), pressed.pressure.shape[-1]))
+        np.add.at(total_pressures, cell_indices, pressed.pressure[touch_presses][is_pressed])
+        rows_of_cells.append(cells)
+        pressures.append(total_pressures)
+    return _pad_and_stack(rows_of_cells, pressures)
 
 
 def _pressed_cells(
     samples: Samples, support: AbstractSupport, presses: Sequence[Press], progress: Callable[[str], None] | None
 ) -> PressedCells:
     samples.check(presses)
-    position = np.array([press.position for press in presses])
-    shapes = _indenter_numbers(presses)
-    farthest = samples.chord * np.array([press.indenter.reach for press in presses])
+    positions = np.array([press.position for press in presses])
+    indenter_numbers = _indenter_numbers(presses)
+    max_reaches = samples.chord * np.array([press.indenter.reach for press in presses])
     # The extent of the pressure on a flat skin is no upper bound for that on a concave skin.
-    reaches = farthest if samples.curved is not None else _reach_bounds(support, presses, shapes)
-    extent = np.minimum(reaches, farthest) + samples.radius
+    reach_bounds = max_reaches if samples.curved is not None else _reach_bounds(support, presses, indenter_numbers)
+    extents = np.minimum(reach_bounds, max_reaches) + samples.radius
     tree = KDTree(samples.points.mean(axis=1))
-    near = tree.query_ball_point(position, extent, return_sorted=True)
-    on_skin = samples.points.shape[1] * np.array([samples.area[cells].sum() for cells in near])
-    beyond = np.flatnonzero(on_skin < _ON_SKIN * np.pi * extent**2)
-    near[beyond] = tree.query_ball_point(position[beyond], farthest[beyond] + samples.radius, return_sorted=True)
-    near = samples.facing_cells(presses, near)
-    number = np.array([len(cells) for cells in near])
-    empty = np.flatnonzero(number == 0)
-    if empty.size:
+    candidate_cells = tree.query_ball_point(positions, extents, return_sorted=True)
+    skin_areas = samples.points.shape[1] * np.array([samples.area[cells].sum() for cells in candidate_cells])
+    wide_presses = np.flatnonzero(skin_areas < _MIN_SKIN_FRACTION * np.pi * extents**2)
+    candidate_cells[wide_presses] = tree.query_ball_point(
+        positions[wide_presses], max_reaches[wide_presses] + samples.radius, return_sorted=True
+    )
+    candidate_cells = samples.facing_cells(presses, candidate_cells)
+    num_cells = np.array([len(cells) for cells in candidate_cells])
+    empty_presses = np.flatnonzero(num_cells == 0)
+    if empty_presses.size:
         raise ValueError(
-            f"position: {empty.size} of {len(presses)} presses lie off the skin, the first at "
-            f"{millimetre_text(position[empty[0]])} mm; places are in metres."
+            f"position: {empty_presses.size} of {len(presses)} presses lie off the skin, the first at "
+            f"{millimetre_text(positions[empty_presses[0]])} mm; places are in metres."
         )
-    rows: list = [None] * len(presses)
+    rows_of_cells: list = [None] * len(presses)
     pressures: list = [None] * len(presses)
-    done = 0
-    for shape in np.unique(shapes):
-        same = np.flatnonzero(shapes == shape)
-        same = same[np.argsort(number[same], kind="stable")]
-        for some in np.split(same, range(_AT_ONCE, len(same), _AT_ONCE)):
-            cells, there = pad_rows([np.asarray(near[one], int) for one in some])
-            pressure = _pressures_of_equal_indenters(samples, support, [presses[one] for one in some], cells, there)
-            for one, own, pressed in zip(some, cells, pressure, strict=True):
-                kept = pressed.any(axis=-1)
-                rows[one], pressures[one] = own[kept], pressed[kept]
-            done += len(some)
+    num_done = 0
+    for indenter_number in np.unique(indenter_numbers):
+        press_indices = np.flatnonzero(indenter_numbers == indenter_number)
+        press_indices = press_indices[np.argsort(num_cells[press_indices], kind="stable")]
+        for chunk in np.split(press_indices, range(_PRESSES_AT_ONCE, len(press_indices), _PRESSES_AT_ONCE)):
+            cells, is_cell = pad_rows([np.asarray(candidate_cells[press_index], int) for press_index in chunk])
+            pressure = _pressures_of_equal_indenters(
+                samples, support, [presses[press_index] for press_index in chunk], cells, is_cell
+            )
+            for press_index, touch_cells, touch_pressure in zip(chunk, cells, pressure, strict=True):
+                is_pressed = touch_pressure.any(axis=-1)
+                rows_of_cells[press_index], pressures[press_index] = touch_cells[is_pressed], touch_pressure[is_pressed]
+            num_done += len(chunk)
             if progress is not None:
-                progress(f"pressure: {done} of {len(presses)}")
-    return _pad_and_stack(rows, pressures)
+                progress(f"pressure: {num_done} of {len(presses)}")
+    return _pad_and_stack(rows_of_cells, pressures)
 
 
 def _indenter_numbers(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
     """Numbers of the indenters of presses; equal indenters have the same number."""
     numbers: dict = {}
-    known: dict[int, int] = {}
+    numbers_by_id: dict[int, int] = {}
     for press in presses:
-        if id(press.indenter) not in known:
+        if id(press.indenter) not in numbers_by_id:
             leaves, structure = jax.tree.flatten(press.indenter)
             values = tuple((np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in leaves)
-            known[id(press.indenter)] = numbers.setdefault((structure, values), len(numbers))
-    return np.array([known[id(press.indenter)] for press in presses])
+            numbers_by_id[id(press.indenter)] = numbers.setdefault((structure, values), len(numbers))
+    return np.array([numbers_by_id[id(press.indenter)] for press in presses])
 
 
-def _reach_bounds(support: AbstractSupport, presses: Sequence[Press], shapes) -> Float[np.ndarray, " n"]:
+def _reach_bounds(support: AbstractSupport, presses: Sequence[Press], indenter_numbers) -> Float[np.ndarray, " n"]:
     """Upper bound of the distance from the origin at which each press exerts pressure, metres.
 
-    The bound is the reach for the load rounded up to a power of two, times `_MARGIN` for presses at the edge of the
-    skin.
+    The bound is the reach for the load rounded up to a power of two, times `_REACH_MARGIN` for presses at the edge of
+    the skin.
     """
-    known: dict[tuple[int, int], float] = {}
-    doublings = np.ceil(np.log2([press.load for press in presses]))
-    for press, *case in zip(presses, shapes, doublings, strict=True):
-        if tuple(case) not in known:
+    known_reaches: dict[tuple[int, int], float] = {}
+    log2_loads = np.ceil(np.log2([press.load for press in presses]))
+    for press, *indenter_and_doublings in zip(presses, indenter_numbers, log2_loads, strict=True):
+        if tuple(indenter_and_doublings) not in known_reaches:
             try:
-                extent = _MARGIN * support.pressure(press.indenter, 2.0 ** case[1]).reach
+                extent = _REACH_MARGIN * support.pressure(press.indenter, 2.0 ** indenter_and_doublings[1]).reach
             except ValueError:  # the rounded load exceeds the limit of the support; the load of the press may not
                 extent = press.indenter.reach
-            known[tuple(case)] = min(extent, press.indenter.reach)
-    return np.array([known[case] for case in zip(shapes, doublings, strict=True)])
+            known_reaches[tuple(indenter_and_doublings)] = min(extent, press.indenter.reach)
+    return np.array(
+        [
+            known_reaches[indenter_and_doublings]
+            for indenter_and_doublings in zip(indenter_numbers, log2_loads, strict=True)
+        ]
+    )
 
 
 def _pressures_of_equal_indenters(samples: Samples, support: AbstractSupport, presses: Sequence[Press], cells, is_cell):
     """Pressures (b, c, s) of presses with the same indenter at the samples of `cells` (b, c)."""
     points = samples.points[cells]
-    shape = points.shape[:-1]
-    local, fall, share = samples.to_indenter_frames(presses, cells, points.reshape(len(cells), -1, points.shape[-1]))
-    area = np.broadcast_to((share * samples.area[cells] * is_cell)[..., None], shape).reshape(len(cells), -1)
-    load = np.array([press.load for press in presses])
-    pressure = support.spread(presses[0].indenter, load, local, area, _height_below_plane(samples, fall)) * (area > 0)
-    pressure = pressure.reshape(shape)
-    for one in np.flatnonzero(np.count_nonzero(pressure, axis=(1, 2)) < _FEW).tolist():
-        pressure[one] = _pressures_on_finer_lattice(samples, support, presses[one], cells[one], is_cell[one])
+    sample_shape = points.shape[:-1]
+    local_points, fall, area_ratios = samples.to_indenter_frames(
+        presses, cells, points.reshape(len(cells), -1, points.shape[-1])
+    )
+    sample_areas = np.broadcast_to((area_ratios * samples.area[cells] * is_cell)[..., None], sample_shape).reshape(
+        len(cells), -1
+    )
+    loads = np.array([press.load for press in presses])
+    pressure = support.spread(
+        presses[0].indenter, loads, local_points, sample_areas, _height_below_plane(samples, fall)
+    ) * (sample_areas > 0)
+    pressure = pressure.reshape(sample_shape)
+    for press_index in np.flatnonzero(np.count_nonzero(pressure, axis=(1, 2)) < _MIN_NUM_SAMPLES).tolist():
+        pressure[press_index] = _pressures_on_finer_lattice(
+            samples, support, presses[press_index], cells[press_index], is_cell[press_index]
+        )
     return pressure
 
 
@@ -159,25 +176,38 @@ def _pressures_on_finer_lattice(samples: Samples, support: AbstractSupport, pres
     for a press that touches no skin.
     """
     points = samples.lattice_points(cells, _FINE_LATTICE)
-    fine, coarse = points.shape[1], samples.points.shape[1]
-    local, fall, share = samples.to_indenter_frames([press], cells[None], points.reshape(1, -1, points.shape[-1]))
-    area = np.repeat(share[0] * samples.area[cells] * is_cell * coarse / fine, fine)[None]
-    load = np.array([press.load])
-    pressure = support.spread(press.indenter, load, local, area, _height_below_plane(samples, fall)) * (area > 0)
+    num_fine_samples, num_samples = points.shape[1], samples.points.shape[1]
+    local_points, fall, area_ratios = samples.to_indenter_frames(
+        [press], cells[None], points.reshape(1, -1, points.shape[-1])
+    )
+    sample_areas = np.repeat(
+        area_ratios[0] * samples.area[cells] * is_cell * num_samples / num_fine_samples, num_fine_samples
+    )[None]
+    loads = np.array([press.load])
+    pressure = support.spread(press.indenter, loads, local_points, sample_areas, _height_below_plane(samples, fall)) * (
+        sample_areas > 0
+    )
     if pressure.any():
-        return np.repeat(pressure.reshape(-1, fine).mean(axis=1, keepdims=True), coarse, axis=1)
-    pressure = np.zeros((len(cells), coarse))
-    distance = np.linalg.norm(local.reshape(-1, fine, 2), axis=-1).min(axis=1)
-    cell = np.where(is_cell, distance, np.inf).argmin()
-    if not (distance[cell] < _RESOLVED_WIDTH * samples.radius and np.isfinite(press.indenter.gap(np.zeros(2)))):
+        return np.repeat(pressure.reshape(-1, num_fine_samples).mean(axis=1, keepdims=True), num_samples, axis=1)
+    pressure = np.zeros((len(cells), num_samples))
+    distances = np.linalg.norm(local_points.reshape(-1, num_fine_samples, 2), axis=-1).min(axis=1)
+    nearest_cell = np.where(is_cell, distances, np.inf).argmin()
+    if not (
+        distances[nearest_cell] < _RESOLVED_FRACTION * samples.radius and np.isfinite(press.indenter.gap(np.zeros(2)))
+    ):
         raise ValueError(
             f"position: the press at {millimetre_text(press.position)} mm touches no skin, or does with less than a "
             "tenth of a "
             "cell's width; move it, or give a wider indenter or a finer mesh."
         )
-    nearest = np.linalg.norm(samples.points[cells[cell]] - press.position, axis=-1).argmin()
-    here, small = np.zeros((1, 1, 2)), (share[0, cell] * samples.area[cells[cell]]).reshape(1, 1)
-    pressure[cell, nearest] = support.spread(DiscIndenter(samples.radius), load, here, small)[0, 0]
+    nearest_sample = np.linalg.norm(samples.points[cells[nearest_cell]] - press.position, axis=-1).argmin()
+    origin, cell_area = (
+        np.zeros((1, 1, 2)),
+        (area_ratios[0, nearest_cell] * samples.area[cells[nearest_cell]]).reshape(1, 1),
+    )
+    pressure[nearest_cell, nearest_sample] = support.spread(DiscIndenter(samples.radius), loads, origin, cell_area)[
+        0, 0
+    ]
     return pressure
 
 
@@ -186,9 +216,9 @@ def _height_below_plane(samples: Samples, fall):
     return None if samples.curved is None else fall
 
 
-def _pad_and_stack(rows: list, pressures: list) -> PressedCells:
-    """Stack the cells and pressures of all touches, padded with zeros to the largest number of cells."""
-    cells, there = pad_rows(rows)
+def _pad_and_stack(rows_of_cells: list, pressures: list) -> PressedCells:
+    """Stack the cells and pressures of all touches. Rows are padded with zeros to the largest number of cells."""
+    cells, is_cell = pad_rows(rows_of_cells)
     pressure = np.zeros((*cells.shape, pressures[0].shape[-1]))
-    pressure[there] = np.concatenate(pressures)
+    pressure[is_cell] = np.concatenate(pressures)
     return PressedCells(cells, pressure)

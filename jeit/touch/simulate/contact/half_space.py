@@ -25,12 +25,12 @@ from jeit.touch.simulate.contact.press import (
 )
 
 # Number of pixels along a side of the raster on which the contact area is located.
-_COARSE = 24
-# Minimum share of a contact's load that must lie on the skin, as the pressure is otherwise not determined; and share of
-# the load carried by the points, above which this check is skipped.
-_LEAST_SHARE, _DOUBTED = 0.2, 0.5
+_NUM_COARSE_PIXELS = 24
+# Minimum fraction of the load of a contact that must lie on the skin, since the pressure is not determined otherwise;
+# and fraction of the load carried by the points, above which this check is skipped.
+_MIN_LOAD_FRACTION, _CHECKED_LOAD_FRACTION = 0.2, 0.5
 # Share of the load moved in a step, below which the iteration stops; and maximum number of steps.
-_TOLERANCE, _MOST_STEPS = 1e-8, 2000
+_TOLERANCE, _MAX_STEPS = 1e-8, 2000
 
 
 class HalfSpace(AbstractSupport):
@@ -77,7 +77,7 @@ class HalfSpace(AbstractSupport):
         def is_pressed(window, num_pixels: int) -> np.ndarray:
             return self._solve_pressure(indenter, load, window, num_pixels)[0] > 0
 
-        window = contact_window(is_pressed, indenter.reach, _COARSE)
+        window = contact_window(is_pressed, indenter.reach, _NUM_COARSE_PIXELS)
         values, approach = self._solve_pressure(indenter, load, window, self.pixels)
         points, pixel = raster(window, self.pixels)
         check_resolved(values > 0, pixel)
@@ -91,12 +91,22 @@ class HalfSpace(AbstractSupport):
         """
         if fall is not None:
             raise ValueError("support: a HalfSpace is flat, and the skin is curved; take a Foundation.")
-        free = [self.pressure(indenter, load) for load in loads]
-        pressures = np.stack([one.at(own) for one, own in zip(free, points, strict=True)])
-        carried = np.sum(pressures * areas, axis=1)
-        for number in np.flatnonzero((carried > 0) & (carried < _DOUBTED * np.asarray(loads))):
-            _check_on_skin(free[number], points[number], areas[number])
-        return pressures * np.where(carried > 0, loads / np.where(carried > 0, carried, 1.0), 0.0)[:, None]
+        unbounded_pressures = [self.pressure(indenter, load) for load in loads]
+        pressures = np.stack(
+            [
+                unbounded_pressure.at(press_points)
+                for unbounded_pressure, press_points in zip(unbounded_pressures, points, strict=True)
+            ]
+        )
+        carried_loads = np.sum(pressures * areas, axis=1)
+        for press_index in np.flatnonzero(
+            (carried_loads > 0) & (carried_loads < _CHECKED_LOAD_FRACTION * np.asarray(loads))
+        ):
+            _check_on_skin(unbounded_pressures[press_index], points[press_index], areas[press_index])
+        return (
+            pressures
+            * np.where(carried_loads > 0, loads / np.where(carried_loads > 0, carried_loads, 1.0), 0.0)[:, None]
+        )
 
     def _solve_pressure(self, indenter: AbstractIndenter, load: float, window, num_pixels: int):
         points, pixel = raster(window, num_pixels)
@@ -109,15 +119,16 @@ class HalfSpace(AbstractSupport):
 def _check_on_skin(pressure: PressureRaster, points, areas) -> None:
     """Check how much of a pressure lies on the skin, given by points and their areas. Raises `ValueError` if it is less
     than a fifth."""
-    there = areas > 0
-    places, pixel = raster(pressure.pixel * len(pressure.values) / 2, len(pressure.values))
-    distance, nearest = KDTree(points[there]).query(places[pressure.values > 0])
+    is_on_skin = areas > 0
+    pixel_centres, pixel = raster(pressure.pixel * len(pressure.values) / 2, len(pressure.values))
+    distances, nearest = KDTree(points[is_on_skin]).query(pixel_centres[pressure.values > 0])
     forces = pressure.values[pressure.values > 0] * pixel.prod()
-    share = forces[distance < np.sqrt(areas[there][nearest])].sum() / pressure.load
-    if share < _LEAST_SHARE:
+    load_fraction = forces[distances < np.sqrt(areas[is_on_skin][nearest])].sum() / pressure.load
+    if load_fraction < _MIN_LOAD_FRACTION:
         raise ValueError(
-            f"position: of {pressure.load:g} N on a half-space, {100 * share:.0f} % of its pressure would lie on the "
-            f"skin, less than {100 * _LEAST_SHARE:.0f} %; press farther from the edge, or take a Foundation."
+            f"position: of {pressure.load:g} N on a half-space, {100 * load_fraction:.0f} % of its pressure would lie "
+            f"on the skin, less than {100 * _MIN_LOAD_FRACTION:.0f} %; press farther from the edge, or take a "
+            "Foundation."
         )
 
 
@@ -128,52 +139,62 @@ def displacement_function(num_pixels: int, pixel, plane_modulus: float):
     The displacement due to a rectangle under uniform pressure is that of Love (1929): Johnson, Contact Mechanics, 1985,
     equation 3.25.
     """
-    along, half = np.arange(2 * num_pixels) - num_pixels, np.asarray(pixel) / 2
-    x, y = np.meshgrid(pixel[0] * along, pixel[1] * along)
+    pixel_indices, half_pixel = np.arange(2 * num_pixels) - num_pixels, np.asarray(pixel) / 2
+    x, y = np.meshgrid(pixel[0] * pixel_indices, pixel[1] * pixel_indices)
 
     def corner_displacement(x, y):
         return x * np.arcsinh(y / np.abs(x)) + y * np.arcsinh(x / np.abs(y))
 
-    influence = sum(i * j * corner_displacement(x + i * half[0], y + j * half[1]) for i in (1, -1) for j in (1, -1)) / (
-        np.pi * plane_modulus
-    )
+    influence = sum(
+        x_sign * y_sign * corner_displacement(x + x_sign * half_pixel[0], y + y_sign * half_pixel[1])
+        for x_sign in (1, -1)
+        for y_sign in (1, -1)
+    ) / (np.pi * plane_modulus)
     spectrum = np.fft.rfft2(np.fft.ifftshift(influence))
 
     def displacements(pressure):
-        padded = np.fft.rfft2(pressure, s=(2 * num_pixels, 2 * num_pixels))
-        return np.fft.irfft2(padded * spectrum, s=(2 * num_pixels, 2 * num_pixels))[:num_pixels, :num_pixels]
+        pressure_spectrum = np.fft.rfft2(pressure, s=(2 * num_pixels, 2 * num_pixels))
+        return np.fft.irfft2(pressure_spectrum * spectrum, s=(2 * num_pixels, 2 * num_pixels))[:num_pixels, :num_pixels]
 
     return displacements
 
 
 def rigid_contact(gap: np.ndarray, displacements, total_pressure: float) -> tuple[np.ndarray, float]:
-    """Find the pressures ≥ 0 with sum `total_pressure` whose displacements, computed by `displacements`, close the
-    `gap`; return them and the approach, metres. The gap is infinite where nothing can touch. Raises `RuntimeError` if
-    the iteration does not converge."""
-    may = np.isfinite(gap)
-    gap = np.where(may, gap, 0.0)
-    pressure = may * (total_pressure / may.sum())
-    direction, last, again = np.zeros_like(gap), 1.0, False
-    for _ in range(_MOST_STEPS):
-        touching = pressure > 0
-        distance = displacements(pressure) + gap
-        distance -= distance[touching].mean()
-        square = np.sum(distance[touching] ** 2)
-        direction = np.where(touching, distance + (square / last if again else 0.0) * direction, 0.0)
-        last = square
-        response = displacements(direction)
-        response -= response[touching].mean()
-        slope = np.sum(response * direction)
-        if square == 0 or slope <= 0:  # converged to rounding errors, or only one pixel is in contact
+    """Find the pressures ≥ 0 with sum `total_pressure` whose displacements close the `gap`, metres; return them and the
+    approach, metres.
+
+    `displacements`: function that computes displacements from pressures. The gap is infinite at pixels that cannot be
+    in contact. Raises `RuntimeError` if the iteration does not converge.
+    """
+    can_touch = np.isfinite(gap)
+    gap = np.where(can_touch, gap, 0.0)
+    pressure = can_touch * (total_pressure / can_touch.sum())
+    direction, previous_square, is_conjugate = np.zeros_like(gap), 1.0, False
+    for _ in range(_MAX_STEPS):
+        is_touching = pressure > 0
+        residual = displacements(pressure) + gap
+        residual -= residual[is_touching].mean()
+        squared_residual = np.sum(residual[is_touching] ** 2)
+        direction = np.where(
+            is_touching, residual + (squared_residual / previous_square if is_conjugate else 0.0) * direction, 0.0
+        )
+        previous_square = squared_residual
+        direction_displacements = displacements(direction)
+        direction_displacements -= direction_displacements[is_touching].mean()
+        curvature = np.sum(direction_displacements * direction)
+        if squared_residual == 0 or curvature <= 0:  # converged to rounding errors, or only one pixel is in contact
             break
-        length = np.sum(distance[touching] * direction[touching]) / slope
-        before, pressure = pressure, np.where(touching, np.maximum(pressure - length * direction, 0.0), 0.0)
-        overlapping = may & (pressure == 0) & (distance < 0)
-        again = not overlapping.any()
-        pressure[overlapping] -= length * distance[overlapping]
+        step_length = np.sum(residual[is_touching] * direction[is_touching]) / curvature
+        previous_pressure, pressure = (
+            pressure,
+            np.where(is_touching, np.maximum(pressure - step_length * direction, 0.0), 0.0),
+        )
+        is_overlapping = can_touch & (pressure == 0) & (residual < 0)
+        is_conjugate = not is_overlapping.any()
+        pressure[is_overlapping] -= step_length * residual[is_overlapping]
         pressure *= total_pressure / pressure.sum()
-        if again and np.abs(pressure - before).sum() < _TOLERANCE * total_pressure:
+        if is_conjugate and np.abs(pressure - previous_pressure).sum() < _TOLERANCE * total_pressure:
             break
     else:
-        raise RuntimeError(f"the contact was not found in {_MOST_STEPS} steps; give the support fewer pixels.")
+        raise RuntimeError(f"the contact was not found in {_MAX_STEPS} steps; give the support fewer pixels.")
     return pressure, float((displacements(pressure) + gap)[pressure > 0].mean())

@@ -19,8 +19,8 @@ from jeit.touch.simulate.contact.indents import IndentDraws, depth_maps, relativ
 # Version of the simulation, to be increased when its results change.
 _VERSION = 2
 # Lock with which only one thread of a worker computes the data shared by all chunks.
-_ONE_THREAD = Lock()
-_MEANINGS = {
+_RESTING_SKIN_LOCK = Lock()
+_UNITS_AND_MEANINGS = {
     "change": ("1", "change of each channel's voltage, relative to the skin at rest"),
     "depth": ("1", "depth of the indentation over the thickness of the skin, row 0 at the least y"),
 }
@@ -47,9 +47,9 @@ class IndentSet:
         skin."""
         check_kind("skin", skin, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
         check_kind("draws", draws, IndentDraws, "IndentDraws([ball_indenter(0.015)], skin.flat_outline, (1e-3, 8e-3))")
-        for name, given in (("number", number), ("chunk", chunk)):
-            if not (isinstance(given, int) and given >= 1):
-                raise ValueError(f"{name} must be a whole number, 1 or more; it is {given!r}.")
+        for name, value in (("number", number), ("chunk", chunk)):
+            if not (isinstance(value, int) and value >= 1):
+                raise ValueError(f"{name} must be a whole number, 1 or more; it is {value!r}.")
         if not (isinstance(seed, int) and 0 <= seed < 2**63):
             raise ValueError(f"seed must be a whole number, 0 or more; it is {describe(seed)}.")
         if draws.depth[1] >= float(skin.thickness):
@@ -71,31 +71,31 @@ class IndentSet:
     def fingerprint(self) -> str:
         """SHA-256 hash of everything that determines the results."""
         model = self.skin.model
-        parts = model.mesh, model.electrodes, model.protocol, self.skin.conductivity, self.skin.thickness, self.draws
-        own = _VERSION, self.number, self.seed, self.chunk, self.shape
-        return _digest(parts, str(own))
+        arrays = model.mesh, model.electrodes, model.protocol, self.skin.conductivity, self.skin.thickness, self.draws
+        settings = _VERSION, self.number, self.seed, self.chunk, self.shape
+        return _digest(arrays, str(settings))
 
     def solve(self, chunk: int) -> dict[str, np.ndarray]:
         """Simulate one chunk of k touches: relative changes of voltages (k, M) and depth maps (k, rows, columns), by
         name as in the store."""
         key = jax.random.fold_in(jax.random.key(self.seed), chunk)
         touches = self.draws.draw(key, len(self.chunks[chunk]))
-        depth = depth_maps(touches, self.places) / float(self.skin.thickness)
-        with _ONE_THREAD:
+        depths = depth_maps(touches, self.places) / float(self.skin.thickness)
+        with _RESTING_SKIN_LOCK:
             resting = _shared_resting_skin(_SkinAndDepth(self.skin, self.draws.depth[1]))
-        return {"change": relative_changes(self.skin, touches, resting), "depth": depth.astype(np.float32)}
+        return {"change": relative_changes(self.skin, touches, resting), "depth": depths.astype(np.float32)}
 
     def contents(self) -> Contents:
         """Description of the arrays in the store of the set."""
 
         def create_arrays(zarr_group: Any) -> None:
             channels = self.skin.model.protocol.num_measurements
-            kinds = {
+            array_types = {
                 "change": ((channels,), ("channel",), "float64"),
                 "depth": (self.shape, ("row", "column"), "float32"),
             }
-            for name, (shape, dimensions, dtype) in kinds.items():
-                unit, meaning = _MEANINGS[name]
+            for name, (shape, dimensions, dtype) in array_types.items():
+                unit, meaning = _UNITS_AND_MEANINGS[name]
                 zarr_group.create_array(
                     name,
                     shape=(self.number, *shape),
@@ -106,7 +106,7 @@ class IndentSet:
                     attributes={"units": unit, "long_name": meaning},
                 )
 
-        names = [*_MEANINGS]
+        names = [*_UNITS_AND_MEANINGS]
         attributes = {"seed": self.seed}
         return Contents(
             "indent set", "simulate_presses", self.fingerprint, self.chunks, names, attributes, create_arrays
@@ -119,13 +119,13 @@ class _SkinAndDepth:
     def __init__(self, skin: Skin, depth: float):
         self.skin, self.depth = skin, depth
         model = skin.model
-        self._all = _digest((model.mesh, model.electrodes, model.protocol, skin.model_conductivity), str(depth))
+        self._digest_text = _digest((model.mesh, model.electrodes, model.protocol, skin.model_conductivity), str(depth))
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _SkinAndDepth) and other._all == self._all
+        return isinstance(other, _SkinAndDepth) and other._digest_text == self._digest_text
 
     def __hash__(self) -> int:
-        return hash(self._all)
+        return hash(self._digest_text)
 
 
 @lru_cache(maxsize=1)
@@ -134,13 +134,13 @@ def _shared_resting_skin(skin_and_depth: _SkinAndDepth) -> RestingSkin | None:
     return resting_skin(skin_and_depth.skin, skin_and_depth.depth)
 
 
-def _digest(parts: Any, text: str) -> str:
+def _digest(arrays: Any, text: str) -> str:
     """SHA-256 hash of a tree of arrays and a text."""
-    leaves, structure = jax.tree.flatten(parts)
-    digest = hashlib.sha256(f"{text} {structure}".encode())
+    leaves, structure = jax.tree.flatten(arrays)
+    hasher = hashlib.sha256(f"{text} {structure}".encode())
     for leaf in leaves:
-        digest.update(np.asarray(leaf).tobytes())
-    return digest.hexdigest()
+        hasher.update(np.asarray(leaf).tobytes())
+    return hasher.hexdigest()
 
 
 def image_places(skin: Skin, columns: int, rows: int) -> np.ndarray:

@@ -88,8 +88,8 @@ class RingIndenter(AbstractIndenter):
 
     def gap(self, points):
         """Zero beneath the wall of the tube, infinite elsewhere."""
-        distance = _distance_from_origin(points)
-        return _flat_gap((distance <= self.outer_diameter / 2) & (distance >= self.inner_diameter / 2))
+        distances = _distance_from_origin(points)
+        return _flat_gap((distances <= self.outer_diameter / 2) & (distances >= self.inner_diameter / 2))
 
     @property
     def reach(self) -> float:
@@ -156,8 +156,8 @@ class PrismIndenter(AbstractIndenter):
 
     def gap(self, points):
         """Height 2 height |y| / width beneath the prism, infinite elsewhere."""
-        slope = 2 * self.height * np.abs(np.asarray(points)[..., 1]) / self.width
-        return np.where(_is_within_rectangle(points, self.length, self.width), slope, np.inf)
+        edge_heights = 2 * self.height * np.abs(np.asarray(points)[..., 1]) / self.width
+        return np.where(_is_within_rectangle(points, self.length, self.width), edge_heights, np.inf)
 
     @property
     def reach(self) -> float:
@@ -187,10 +187,10 @@ class RevolvedIndenter(AbstractIndenter):
 
     def gap(self, points):
         """Depth of the profile in its middle minus that at the points; infinite beyond its reach."""
-        distance = _distance_from_origin(points)
-        deepest = float(self.indentation.depth_at(host.zeros(())))
-        gap = deepest - np.asarray(self.indentation.depth_at(distance))
-        return np.where(distance < self.reach, gap, np.inf)
+        distances = _distance_from_origin(points)
+        max_depth = float(self.indentation.depth_at(host.zeros(())))
+        gaps = max_depth - np.asarray(self.indentation.depth_at(distances))
+        return np.where(distances < self.reach, gaps, np.inf)
 
     @property
     def reach(self) -> float:
@@ -249,11 +249,11 @@ class DepthMapIndenter(AbstractIndenter):
 
     def gap(self, points):
         """Maximum height of the surface minus the height at the points; infinite where there is no surface."""
-        middle = (np.array(self.height.shape) - 1) / 2
-        place = np.moveaxis(np.asarray(points)[..., ::-1] / self.pixel + middle, -1, 0)
-        flat = map_coordinates(self.height, place.reshape(2, -1), order=1, cval=np.nan)
-        height = flat.reshape(place.shape[1:])
-        return np.where(np.isnan(height), np.inf, np.nanmax(self.height) - height)
+        centre_pixel = (np.array(self.height.shape) - 1) / 2
+        pixel_coordinates = np.moveaxis(np.asarray(points)[..., ::-1] / self.pixel + centre_pixel, -1, 0)
+        flat_heights = map_coordinates(self.height, pixel_coordinates.reshape(2, -1), order=1, cval=np.nan)
+        heights = flat_heights.reshape(pixel_coordinates.shape[1:])
+        return np.where(np.isnan(heights), np.inf, np.nanmax(self.height) - heights)
 
     @property
     def reach(self) -> float:

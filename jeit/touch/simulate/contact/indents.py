@@ -25,7 +25,7 @@ from jeit_solvers.engines import as_array
 from jeit_solvers.module import Module
 
 # Number of random places drawn at once for each place needed, of which those on the skin are used.
-_TRIES = 20
+_TRIES_PER_PLACE = 20
 
 
 class PressDraws(Module):
@@ -72,16 +72,16 @@ class PressDraws(Module):
         for number, indenter in enumerate(indenters):
             check_indenter(f"indenters[{number}]", indenter)
         check_kind("outline", outline, Domain, "an outline, such as Disk(0.05)")
-        wanted = "the least and the greatest, positive, in newtons, such as (0.3, 10.0)"
-        span = real_array("load", load, wanted)
-        if span.shape != (2,) or not 0 < span[0] <= span[1] < np.inf:
-            raise ValueError(f"load must be {wanted}; it is {load!r}.")
+        requirement = "the least and the greatest, positive, in newtons, such as (0.3, 10.0)"
+        load_range = real_array("load", load, requirement)
+        if load_range.shape != (2,) or not 0 < load_range[0] <= load_range[1] < np.inf:
+            raise ValueError(f"load must be {requirement}; it is {load!r}.")
         if not (isinstance(at_once, int) and at_once >= 1):
             raise ValueError(f"at_once must be a whole number, 1 or more; it is {at_once!r}.")
         if not (is_number(margin) and margin >= 0):
             raise ValueError(f"margin must be metres, zero or more; it is {describe(margin)}.")
         self.indenters, self.outline, self.at_once = indenters, outline, at_once
-        self.load, self.margin = (float(span[0]), float(span[1])), float(margin)
+        self.load, self.margin = (float(load_range[0]), float(load_range[1])), float(margin)
         if not self._is_inside(self._random_places(np.random.default_rng(0), 1000)).any():
             raise ValueError(f"margin is {1e3 * self.margin:g} mm, which leaves no place on the skin; give less.")
 
@@ -90,19 +90,21 @@ class PressDraws(Module):
         check_key(key)
         if not (isinstance(number, (int, np.integer)) and not isinstance(number, bool) and number >= 0):
             raise ValueError(f"number must be a whole number of touches, 0 or more; it is {describe(number)}.")
-        random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-        counts = random.integers(1, self.at_once, number, endpoint=True)
-        total = counts.sum()
-        which = random.integers(len(self.indenters), size=total)
-        load = np.exp(random.uniform(np.log(self.load[0]), np.log(self.load[1]), total))
-        angle = random.uniform(-np.pi, np.pi, total)
-        place = np.zeros((0, 2))
-        while len(place) < total:
-            tried = self._random_places(random, _TRIES * int(total))
-            place = np.concatenate([place, tried[self._is_inside(tried)]])
+        generator = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        counts = generator.integers(1, self.at_once, number, endpoint=True)
+        num_presses = counts.sum()
+        indenter_indices = generator.integers(len(self.indenters), size=num_presses)
+        loads = np.exp(generator.uniform(np.log(self.load[0]), np.log(self.load[1]), num_presses))
+        angles = generator.uniform(-np.pi, np.pi, num_presses)
+        places = np.zeros((0, 2))
+        while len(places) < num_presses:
+            candidate_places = self._random_places(generator, _TRIES_PER_PLACE * int(num_presses))
+            places = np.concatenate([places, candidate_places[self._is_inside(candidate_places)]])
         presses = [
-            Press(self.indenters[one], float(newtons), where, float(turned))
-            for one, newtons, where, turned in zip(which, load, place[:total], angle, strict=True)
+            Press(self.indenters[indenter_index], float(load), position, float(angle))
+            for indenter_index, load, position, angle in zip(
+                indenter_indices, loads, places[:num_presses], angles, strict=True
+            )
         ]
         ends = np.cumsum(counts)
         return [tuple(presses[end - count : end]) for end, count in zip(ends, counts, strict=True)]
@@ -113,19 +115,19 @@ class PressDraws(Module):
         places = self._random_places(np.random.default_rng(0), 1000)
         return places[np.asarray(self.outline.signed_distance(places)).argmax()]
 
-    def _random_places(self, random: np.random.Generator, count: int) -> np.ndarray:
+    def _random_places(self, generator: np.random.Generator, count: int) -> np.ndarray:
         low_x, high_x, low_y, high_y = map(float, self.outline.extent)
-        return random.uniform((low_x, low_y), (high_x, high_y), (count, 2))
+        return generator.uniform((low_x, low_y), (high_x, high_y), (count, 2))
 
     def _is_inside(self, places: np.ndarray) -> np.ndarray:
         return np.asarray(self.outline.signed_distance(places)) >= self.margin
 
 
-# Lattice of the samples in each cell, see `lattice`; minimum share of the conductivity of a sheet that remains where it
-# is indented through its whole thickness.
-_LATTICE, _LEAST = 2, 1e-3
-# Minimum divisor of relative changes, as a share of the maximum voltage.
-_FLOOR = 1e-3
+# Fineness of the lattice of samples in each cell, see `lattice`; minimum fraction of the conductivity of a sheet that
+# remains where it is indented through its whole thickness.
+_LATTICE_FINENESS, _MIN_CONDUCTIVITY_RATIO = 2, 1e-3
+# Minimum divisor of relative changes, as a fraction of the maximum voltage.
+_MIN_RELATIVE_DIVISOR = 1e-3
 
 
 class Indent(Module):
@@ -157,8 +159,8 @@ class Indent(Module):
     def depth_at(self, points: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "..."]:
         """Depth of the indentation at `points` (…, 2), metres."""
         cos, sin = np.cos(self.angle), np.sin(self.angle)
-        local = (np.asarray(points) - self.position) @ np.array([[cos, -sin], [sin, cos]])
-        return np.maximum(self.depth - self.indenter.gap(local), 0.0)
+        local_points = (np.asarray(points) - self.position) @ np.array([[cos, -sin], [sin, cos]])
+        return np.maximum(self.depth - self.indenter.gap(local_points), 0.0)
 
 
 class IndentDraws(Module):
@@ -193,8 +195,8 @@ class IndentDraws(Module):
         at_once: int = 1,
     ):
         """Create the distribution. Raises `ValueError` as `PressDraws`, and for invalid depths."""
-        for one in depth:
-            check_metres("depth", one, 0.1, "any skin is thick")
+        for depth_limit in depth:
+            check_metres("depth", depth_limit, 0.1, "any skin is thick")
         # The presses hold depths in metres in place of loads in newtons.
         self.presses = PressDraws(indenters, outline, depth, margin=margin, at_once=at_once)
 
@@ -205,8 +207,11 @@ class IndentDraws(Module):
 
     def draw(self, key: Array, number: int) -> list[tuple[Indent, ...]]:
         """Draw `number` touches, each a tuple of indents. Raises `ValueError` for an invalid key or number."""
-        drawn = self.presses.draw(key, number)
-        return [tuple(Indent(one.indenter, one.load, one.position, one.angle) for one in touch) for touch in drawn]
+        press_touches = self.presses.draw(key, number)
+        return [
+            tuple(Indent(press.indenter, press.load, press.position, press.angle) for press in touch)
+            for touch in press_touches
+        ]
 
 
 def depth_maps(
@@ -226,11 +231,11 @@ def depth_maps(
     print(depths.shape)  # (1, 64)
     ```
     """
-    maps = np.zeros((len(touches), *places.shape[:-1]))
-    for number, touch in enumerate(touches):
+    depths = np.zeros((len(touches), *places.shape[:-1]))
+    for touch_index, touch in enumerate(touches):
         for indent in touch:
-            maps[number] = np.maximum(maps[number], indent.depth_at(places))
-    return maps
+            depths[touch_index] = np.maximum(depths[touch_index], indent.depth_at(places))
+    return depths
 
 
 def indented_cells(skin: Skin, touches: Sequence[Sequence[Indent]]) -> TouchedCells:
@@ -242,33 +247,33 @@ def indented_cells(skin: Skin, touches: Sequence[Sequence[Indent]]) -> TouchedCe
     """
     check_kind("skin", skin, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
     mesh, thickness = skin.model.mesh, float(skin.thickness)
-    deepest = max((one.depth for touch in touches for one in touch), default=0.0)
-    if deepest >= thickness:
+    max_depth = max((indent.depth for touch in touches for indent in touch), default=0.0)
+    if max_depth >= thickness:
         raise ValueError(
-            f"depth is {1e3 * deepest:.3g} mm, and the skin {1e3 * thickness:.3g} mm thick; indent it less."
+            f"depth is {1e3 * max_depth:.3g} mm, and the skin {1e3 * thickness:.3g} mm thick; indent it less."
         )
-    samples = lattice(np.asarray(mesh.points)[np.asarray(mesh.cells)], _LATTICE)
-    below = samples[..., 2].max() - samples[..., 2] if skin.num_layers else None
-    middles = np.asarray(centroids(mesh))[:, :2]
-    radius = float(np.linalg.norm(samples[..., :2] - middles[:, None], axis=-1).max())
-    tree = KDTree(middles)
-    rows, changes = [], []
+    samples = lattice(np.asarray(mesh.points)[np.asarray(mesh.cells)], _LATTICE_FINENESS)
+    sample_depths = samples[..., 2].max() - samples[..., 2] if skin.num_layers else None
+    cell_centres = np.asarray(centroids(mesh))[:, :2]
+    radius = float(np.linalg.norm(samples[..., :2] - cell_centres[:, None], axis=-1).max())
+    tree = KDTree(cell_centres)
+    rows_of_cells, changes = [], []
     for touch in touches:
-        near = [tree.query_ball_point(one.position, one.indenter.reach + radius) for one in touch]
-        cells = np.unique(np.concatenate([np.zeros(1, int), *(np.asarray(one, int) for one in near)]))
-        depth = depth_maps([touch], samples[cells, :, :2])[0]
-        if below is None:
-            share = np.minimum(depth.mean(axis=1) / thickness, 1 - _LEAST)
+        nearby_cells = [tree.query_ball_point(indent.position, indent.indenter.reach + radius) for indent in touch]
+        cells = np.unique(np.concatenate([np.zeros(1, int), *(np.asarray(indices, int) for indices in nearby_cells)]))
+        depths = depth_maps([touch], samples[cells, :, :2])[0]
+        if sample_depths is None:
+            fractions = np.minimum(depths.mean(axis=1) / thickness, 1 - _MIN_CONDUCTIVITY_RATIO)
         else:
-            share = (depth > below[cells]).mean(axis=1)
-        kept = share > 0
-        rows.append(cells[kept])
-        changes.append(-share[kept])
-    cells, there = pad_rows(rows)
-    change = np.zeros(cells.shape)
-    change[there] = np.concatenate(changes)
+            fractions = (depths > sample_depths[cells]).mean(axis=1)
+        is_indented = fractions > 0
+        rows_of_cells.append(cells[is_indented])
+        changes.append(-fractions[is_indented])
+    cells, is_entry = pad_rows(rows_of_cells)
+    padded_changes = np.zeros(cells.shape)
+    padded_changes[is_entry] = np.concatenate(changes)
     places = np.array([touch[0].position if touch else np.zeros(2) for touch in touches])
-    return TouchedCells(as_array(places), as_array(cells), as_array(change), mesh.num_cells)
+    return TouchedCells(as_array(places), as_array(cells), as_array(padded_changes), mesh.num_cells)
 
 
 def relative_changes(
@@ -293,23 +298,23 @@ def relative_changes(
     """
     touched = indented_cells(skin, touches)
     if resting is not None:
-        rest = np.asarray(resting.rest)
-        return relative_to(rest, rest + resting.changes(touched))
+        rest_voltages = np.asarray(resting.voltages)
+        return relative_to(rest_voltages, rest_voltages + resting.changes(touched))
     # The choice of material does not matter: only exact voltages are used, without gains and noise.
     pressed = PressedSkin(jax.random.key(0), skin.model, material("hydrogel"), conductivity=skin.model_conductivity)
-    rest = np.asarray(skin.model.voltages(skin.model_conductivity))
-    return relative_to(rest, pressed.voltages_under(touched))
+    rest_voltages = np.asarray(skin.model.voltages(skin.model_conductivity))
+    return relative_to(rest_voltages, pressed.voltages_under(touched))
 
 
 def resting_skin(skin: Skin, depth: float) -> RestingSkin | None:
     """Prepare data of a skin at rest for indents up to a `depth` in metres; None if they would need too much memory."""
     mesh = skin.model.mesh
-    touchable = np.ones(mesh.num_points, bool)
+    is_touchable = np.ones(mesh.num_points, bool)
     if skin.num_layers:
-        height = lattice(np.asarray(mesh.points)[np.asarray(mesh.cells)], _LATTICE)[..., 2]
-        touchable[:] = False
-        touchable[np.asarray(mesh.cells)[(height.max() - height < depth).any(axis=1)]] = True
-    return RestingSkin.create(skin.model, skin.model_conductivity, touchable)
+        sample_heights = lattice(np.asarray(mesh.points)[np.asarray(mesh.cells)], _LATTICE_FINENESS)[..., 2]
+        is_touchable[:] = False
+        is_touchable[np.asarray(mesh.cells)[(sample_heights.max() - sample_heights < depth).any(axis=1)]] = True
+    return RestingSkin.create(skin.model, skin.model_conductivity, is_touchable)
 
 
 def relative_to(reference: Float[np.ndarray, " M"], voltages: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n M"]:
@@ -317,5 +322,5 @@ def relative_to(reference: Float[np.ndarray, " M"], voltages: Float[np.ndarray, 
 
     The divisor is at least a thousandth of the maximum reference voltage.
     """
-    size = np.abs(reference)
-    return (voltages - reference) / np.maximum(size, _FLOOR * size.max())
+    magnitudes = np.abs(reference)
+    return (voltages - reference) / np.maximum(magnitudes, _MIN_RELATIVE_DIVISOR * magnitudes.max())

@@ -33,7 +33,7 @@ from jeit_solvers.module import Module
 
 # Minimum conductance between the sheets, relative to σ₂ divided by the area of the skin, which fixes the potential of
 # an upper sheet without contact.
-_LEAST = 1e-9
+_MIN_RELATIVE_CONDUCTANCE = 1e-9
 
 
 class TwoSheets(Module):
@@ -60,11 +60,13 @@ class TwoSheets(Module):
         check_model(model)
         if model.mesh.dimension != 2 or model.electrodes.is_point:
             raise ValueError("model must be of a sheet (2-D mesh), with electrodes that have a contact impedance.")
-        number = model.mesh.num_points
-        lower = np.asarray(model.mesh.cells)
-        nodes = [np.asarray(one) for one in model.electrodes.contact_nodes(model.mesh)]
+        num_nodes = model.mesh.num_points
+        lower_cells = np.asarray(model.mesh.cells)
+        contact_nodes = [np.asarray(nodes) for nodes in model.electrodes.contact_nodes(model.mesh)]
         self.model = model
-        self.pattern = SparsityPattern.from_elements([np.hstack([lower, lower + number]), *nodes], size=2 * number)
+        self.pattern = SparsityPattern.from_elements(
+            [np.hstack([lower_cells, lower_cells + num_nodes]), *contact_nodes], size=2 * num_nodes
+        )
         self.plan = analyse(self.pattern, np.tile(np.asarray(model.mesh.points), (2, 1)))
 
     def voltages(
@@ -72,37 +74,42 @@ class TwoSheets(Module):
     ) -> Float[np.ndarray, " M"]:
         """Voltages (M,) of the channels of the lower sheet.
 
-        `conductivity`: of the lower sheet, and `upper_conductivity`: of the upper sheet, S, one value or one per cell;
-        `conductance`: between the sheets per area, S/m², one value or one per cell (m,). Raises `ValueError` for other
-        shapes, conductivities that are not positive, and negative conductances.
+        `conductivity` and `upper_conductivity`: conductivities of the lower and of the upper sheet, S, one value or one
+        per cell; `conductance`: conductance between the sheets per area, S/m², one value or one per cell (m,). Raises
+        `ValueError` for other shapes, conductivities that are not positive, and negative conductances.
         """
         mesh, electrodes = on_host((self.model.mesh, self.model.electrodes))
-        sheets = [
-            cell_conductivity(mesh, host.asarray(check_conductivity(mesh, one)))
-            for one in (conductivity, upper_conductivity)
+        conductivities = [
+            cell_conductivity(mesh, host.asarray(check_conductivity(mesh, sheet_conductivity)))
+            for sheet_conductivity in (conductivity, upper_conductivity)
         ]
-        lower, upper = (_symmetric_matrices(np.asarray(stiffness(mesh, one))) for one in sheets)
-        area = np.asarray(measures(mesh))
-        between = np.maximum(_check_conductance(conductance, mesh.num_cells), _LEAST * sheets[1] / area.sum())
-        coupling = (between * area / 12)[:, None, None] * (1 + np.eye(3))
-        element = host.block([[lower + coupling, -coupling], [-coupling, upper + coupling]])
+        lower_matrices, upper_matrices = (
+            _symmetric_matrices(np.asarray(stiffness(mesh, sheet_conductivity)))
+            for sheet_conductivity in conductivities
+        )
+        areas = np.asarray(measures(mesh))
+        conductances = np.maximum(
+            _check_conductance(conductance, mesh.num_cells), _MIN_RELATIVE_CONDUCTANCE * conductivities[1] / areas.sum()
+        )
+        coupling = (conductances * areas / 12)[:, None, None] * (1 + np.eye(3))
+        element_matrices = host.block([[lower_matrices + coupling, -coupling], [-coupling, upper_matrices + coupling]])
         contact = electrodes.contact(mesh)
-        load = host.concatenate([contact.load, np.zeros_like(contact.load)])
-        matrix = self.pattern.assemble(element, *[None] * len(contact.mass))
-        ground = ground_conductance(self.pattern.diagonal(matrix), load)
+        loads = host.concatenate([contact.load, np.zeros_like(contact.load)])
+        matrix = self.pattern.assemble(element_matrices, *[None] * len(contact.mass))
+        ground_conductances = ground_conductance(self.pattern.diagonal(matrix), loads)
         matrix = matrix + self.pattern.assemble(None, *contact.mass)
-        matrix[: len(ground)] += ground
-        product = quadratic_form(self.plan, factorise(self.plan, matrix), with_ground(load, ground))
-        impedance = electrode_impedance(product, contact_resistance(electrodes, contact))
+        matrix[: len(ground_conductances)] += ground_conductances
+        admittance = quadratic_form(self.plan, factorise(self.plan, matrix), with_ground(loads, ground_conductances))
+        impedance = electrode_impedance(admittance, contact_resistance(electrodes, contact))
         return np.asarray(channel_voltages(on_host(self.model.protocol), impedance))
 
 
 def _symmetric_matrices(packed: Float[np.ndarray, "6 m"]) -> Float[np.ndarray, "m 3 3"]:
     """Symmetric matrices (m, 3, 3) from the six entries of their lower triangles."""
     rows, columns = np.tril_indices(3)
-    full = np.zeros((packed.shape[1], 3, 3))
-    full[:, rows, columns] = full[:, columns, rows] = packed.T
-    return full
+    matrices = np.zeros((packed.shape[1], 3, 3))
+    matrices[:, rows, columns] = matrices[:, columns, rows] = packed.T
+    return matrices
 
 
 def _check_conductance(conductance, num_cells: int) -> Float[np.ndarray, " m"]:
@@ -173,8 +180,8 @@ class JoinedIndenters(AbstractIndenter):
                 "parts: give one indenter at least, such as JoinedIndenters(DiscIndenter(0.01), "
                 "PlacedIndenter(DiscIndenter(0.01), (0.02, 0)))"
             )
-        for number, part in enumerate(parts):
-            check_indenter(f"part {number}", part)
+        for part_index, part in enumerate(parts):
+            check_indenter(f"part {part_index}", part)
         self.parts = parts
 
     def gap(self, points):
@@ -190,10 +197,10 @@ class JoinedIndenters(AbstractIndenter):
 def check_position(position, *, in_space: bool = False) -> Float[np.ndarray, " d"]:
     """Convert a place (x, y) in metres to an array; if `in_space`, (x, y, z) is allowed, too. Raises `ValueError` for
     anything else."""
-    where = real_array("position", position, "(x, y) in metres")
-    if where.shape not in ((2,), (3,))[: 1 + in_space] or not np.isfinite(where).all():
+    coordinates = real_array("position", position, "(x, y) in metres")
+    if coordinates.shape not in ((2,), (3,))[: 1 + in_space] or not np.isfinite(coordinates).all():
         raise ValueError(f"position: give (x, y) in metres, not {position!r}.")
-    return where
+    return coordinates
 
 
 def check_angle(angle) -> float:

@@ -22,7 +22,7 @@ from jeit_solvers.module import Module
 
 # Number of pixels along a side of the raster on which the contact is located, and of the raster on which the load is
 # balanced.
-_COARSE, _FINE = 24, 96
+_NUM_COARSE_PIXELS, _NUM_FINE_PIXELS = 24, 96
 
 
 class FoundationPressure(AbstractPressure):
@@ -84,9 +84,9 @@ class Foundation(AbstractSupport):
             gap, approach = balance_load(window, num_pixels)
             return gap < approach
 
-        window = contact_window(is_pressed, indenter.reach, _COARSE)
-        gap, approach = balance_load(window, _FINE)
-        points, pixel = raster(window, _FINE)
+        window = contact_window(is_pressed, indenter.reach, _NUM_COARSE_PIXELS)
+        gap, approach = balance_load(window, _NUM_FINE_PIXELS)
+        points, pixel = raster(window, _NUM_FINE_PIXELS)
         check_resolved(gap < approach, pixel)
         self._check_approach(approach, load)
         reach = float(np.linalg.norm(points[gap < approach], axis=-1).max() + np.hypot(*pixel))
@@ -95,11 +95,11 @@ class Foundation(AbstractSupport):
     def spread(self, indenter: AbstractIndenter, loads, points, areas, fall=None):
         """Pressures (n, q) with the approach that balances each load on the given points. On a curved skin, `fall` is
         added to the gaps. Raises `ValueError` for a load that presses through the layer."""
-        gap = indenter.gap(points) if fall is None else indenter.gap(points) + fall
-        approach = water_level(gap, areas, loads / self.stiffness)
-        deepest = approach.argmax()
-        self._check_approach(approach[deepest], loads[deepest])
-        return self.stiffness * np.maximum(approach[:, None] - gap, 0.0)
+        gaps = indenter.gap(points) if fall is None else indenter.gap(points) + fall
+        approaches = water_level(gaps, areas, loads / self.stiffness)
+        deepest_press = approaches.argmax()
+        self._check_approach(approaches[deepest_press], loads[deepest_press])
+        return self.stiffness * np.maximum(approaches[:, None] - gaps, 0.0)
 
     def _check_approach(self, approach: float, load: float) -> None:
         if approach >= self.thickness:
@@ -121,12 +121,14 @@ def water_level(
     order = np.argsort(gap, axis=-1)
     heights = np.take_along_axis(gap, order, axis=-1)
     areas = np.where(np.isfinite(heights), np.take_along_axis(area, order, axis=-1), 0.0)
-    lifted = areas * np.where(areas > 0, heights, 0.0)
-    ground, covered = np.cumsum(lifted, axis=-1), np.cumsum(areas, axis=-1)
-    levels = (np.asarray(volume)[..., None] + ground) / np.where(covered > 0, covered, np.inf)
-    above = np.concatenate([heights[..., 1:], np.full((*heights.shape[:-1], 1), np.inf)], axis=-1)
-    first = np.argmax((levels <= above) & (covered > 0), axis=-1)
-    return np.take_along_axis(levels, first[..., None], axis=-1)[..., 0]
+    weighted_heights = areas * np.where(areas > 0, heights, 0.0)
+    cumulative_heights, cumulative_areas = np.cumsum(weighted_heights, axis=-1), np.cumsum(areas, axis=-1)
+    levels = (np.asarray(volume)[..., None] + cumulative_heights) / np.where(
+        cumulative_areas > 0, cumulative_areas, np.inf
+    )
+    next_heights = np.concatenate([heights[..., 1:], np.full((*heights.shape[:-1], 1), np.inf)], axis=-1)
+    first_level = np.argmax((levels <= next_heights) & (cumulative_areas > 0), axis=-1)
+    return np.take_along_axis(levels, first_level[..., None], axis=-1)[..., 0]
 
 
 def check_modulus(modulus) -> None:
@@ -206,12 +208,14 @@ def _check_number(name: str, value, is_valid: Callable[[float], bool], requireme
 def _are_branches(creep) -> bool:
     """Whether `creep` consists of pairs (share, seconds) whose shares have a sum below 1."""
     if not isinstance(creep, (tuple, list)) or not all(
-        isinstance(one, (tuple, list)) and len(one) == 2 for one in creep
+        isinstance(branch, (tuple, list)) and len(branch) == 2 for branch in creep
     ):
         return False
-    if not all(is_number(share) and is_number(seconds) and share >= 0 and seconds > 0 for share, seconds in creep):
+    if not all(
+        is_number(fraction) and is_number(seconds) and fraction >= 0 and seconds > 0 for fraction, seconds in creep
+    ):
         return False
-    return sum(share for share, _ in creep) < 1
+    return sum(fraction for fraction, _ in creep) < 1
 
 
 # Values from papers are cited; all others are assumptions, chosen so that skins differ as described by their authors.

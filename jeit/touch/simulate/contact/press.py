@@ -72,36 +72,39 @@ class PressureRaster(AbstractPressure):
 
     def at(self, points):
         """Pressure at points, pascals, interpolated linearly between pixels; zero outside the raster."""
-        place = np.moveaxis((np.asarray(points) / self.pixel)[..., ::-1] + (len(self.values) - 1) / 2, -1, 0)
-        flat = map_coordinates(self.values, place.reshape(2, -1), order=1, mode="grid-constant")
-        return flat.reshape(place.shape[1:])
+        pixel_coordinates = np.moveaxis(
+            (np.asarray(points) / self.pixel)[..., ::-1] + (len(self.values) - 1) / 2, -1, 0
+        )
+        flat_pressures = map_coordinates(self.values, pixel_coordinates.reshape(2, -1), order=1, mode="grid-constant")
+        return flat_pressures.reshape(pixel_coordinates.shape[1:])
 
 
 def raster(half_widths, num_pixels: int) -> tuple[Float[np.ndarray, "N N 2"], Float[np.ndarray, "2"]]:
     """Centres (N, N, 2) of the N × N pixels of a rectangle around the origin, and the sides of a pixel (2,), metres.
     `half_widths`: half the sides of the rectangle; `num_pixels`: N."""
     pixel = 2 * np.asarray(half_widths, float) / num_pixels
-    along = np.arange(num_pixels) - (num_pixels - 1) / 2
-    return np.stack(np.meshgrid(pixel[0] * along, pixel[1] * along), axis=-1), pixel
+    pixel_indices = np.arange(num_pixels) - (num_pixels - 1) / 2
+    return np.stack(np.meshgrid(pixel[0] * pixel_indices, pixel[1] * pixel_indices), axis=-1), pixel
 
 
 def contact_window(is_pressed, reach: float, num_pixels: int) -> Float[np.ndarray, "2"]:
     """Half the sides, in metres, of a rectangle around the origin that encloses the contact closely.
 
-    `pressed(half_widths, number)`: (N, N), whether each pixel of a raster over that rectangle is in contact. Starting
-    from `reach`, the rectangle shrinks until the contact fills more than half of both its sides, since a light load on
-    a ball touches only a small part of it. If the contact lies between the pixels, the last rectangle is returned.
+    `is_pressed(half_widths, num_pixels)`: function that returns an array (N, N): whether each pixel of a raster over a
+    rectangle is in contact. Starting from `reach`, the rectangle shrinks until the contact fills more than half of both
+    its sides, since a light load on a ball touches only a small part of it. If the contact lies between the pixels, the
+    last rectangle is returned.
     """
-    window = np.full(2, reach)
+    half_widths = np.full(2, reach)
     while True:
-        points, pixel = raster(window, num_pixels)
-        touched = points[is_pressed(window, num_pixels)]
-        if not len(touched):
-            return window
-        extent = np.abs(touched).max(axis=0) + pixel
-        if (extent > window / 2).all():
+        points, pixel = raster(half_widths, num_pixels)
+        touched_points = points[is_pressed(half_widths, num_pixels)]
+        if not len(touched_points):
+            return half_widths
+        extent = np.abs(touched_points).max(axis=0) + pixel
+        if (extent > half_widths / 2).all():
             return extent + pixel
-        window = np.minimum(window, extent + pixel)
+        half_widths = np.minimum(half_widths, extent + pixel)
 
 
 def check_load(load) -> None:
@@ -115,7 +118,7 @@ def check_resolved(contact: Bool[np.ndarray, "N N"], pixel) -> None:
     `ValueError` otherwise."""
     if not contact.any():
         raise ValueError(
-            f"indenter: what touches of it is thinner than a pixel, {1e3 * np.max(pixel):.2g} mm, of the raster that "
+            f"indenter: its contact is thinner than a pixel, {1e3 * np.max(pixel):.2g} mm, of the raster that "
             "pressure is found on; give a wider one, or one with its middle nearer to its frame's origin."
         )
 
@@ -189,9 +192,9 @@ class MovingPress(Module):
                 f"position must be (x, y) in metres, one or one a frame (T, 2); it has shape {position.shape}."
             )
         try:
-            (number,) = np.broadcast_shapes(load.shape, position.shape[:-1], angle.shape)
-            load, angle = np.broadcast_to(load, number), np.broadcast_to(angle, number)
-            position = np.broadcast_to(position, (number, position.shape[-1]))
+            (num_frames,) = np.broadcast_shapes(load.shape, position.shape[:-1], angle.shape)
+            load, angle = np.broadcast_to(load, num_frames), np.broadcast_to(angle, num_frames)
+            position = np.broadcast_to(position, (num_frames, position.shape[-1]))
         except ValueError:
             raise ValueError(
                 "load, position and angle must be (T,), (T, 2) and (T,) for T frames, or one for all; they have shapes "
@@ -215,16 +218,16 @@ def touches_of(presses) -> list[tuple[Press, ...]]:
     if not presses:
         raise ValueError("presses: give one at least.")
     touches = []
-    for number, touch in enumerate(presses):
-        wanted = "a Press, or a tuple of those that are there at once"
-        check_kind(f"presses[{number}]", touch, (Press, tuple), wanted)
+    for touch_index, touch in enumerate(presses):
+        requirement = "a Press, or a tuple of those that are there at once"
+        check_kind(f"presses[{touch_index}]", touch, (Press, tuple), requirement)
         touches.append((touch,) if isinstance(touch, Press) else touch)
         for press in touches[-1]:
-            check_kind(f"presses[{number}]", press, Press, wanted)
+            check_kind(f"presses[{touch_index}]", press, Press, requirement)
     return touches
 
 
-def motions_of(motions, frames: int) -> list[MovingPress]:
+def motions_of(motions, num_frames: int) -> list[MovingPress]:
     """List the motions of a recording, given as one motion or as a list, which is empty for an untouched skin.
 
     Raises `ValueError` for anything else, for another number of frames, and for motions without any load.
@@ -233,10 +236,10 @@ def motions_of(motions, frames: int) -> list[MovingPress]:
     check_kind(
         "motions", motions, (list, tuple), "a MovingPress, or a list of those that are there at once, [] for none"
     )
-    for number, motion in enumerate(motions):
-        check_kind(f"motions[{number}]", motion, MovingPress, "a MovingPress")
-        if len(motion.load) != frames:
-            raise ValueError(f"motions[{number}] has {len(motion.load)} frames, and seconds {frames} times.")
+    for motion_index, motion in enumerate(motions):
+        check_kind(f"motions[{motion_index}]", motion, MovingPress, "a MovingPress")
+        if len(motion.load) != num_frames:
+            raise ValueError(f"motions[{motion_index}] has {len(motion.load)} frames, and seconds {num_frames} times.")
     if motions and not any(motion.load.any() for motion in motions):
         raise ValueError("motions: no press has any load; give some, in newtons, or [] for an untouched skin.")
     return list(motions)

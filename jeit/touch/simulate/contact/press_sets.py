@@ -27,7 +27,7 @@ from jeit.touch.simulate.contact.pressed_skin import PressedSkin, check_seconds
 
 # Version of the simulation, to be increased when its results change.
 _VERSION = 1
-_MEANINGS = {
+_UNITS_AND_MEANINGS = {
     "voltages": ("V", "what the channels read"),
     "position": ("m", "where the presses are, NaN where there are fewer"),
     "force": ("N", "loads of the presses"),
@@ -76,17 +76,17 @@ class PressSet:
             PressDraws,
             "PressDraws, such as PressDraws([ball_indenter(0.015)], Disk(0.05), (0.1, 10.0))",
         )
-        for name, given in (("number", number), ("chunk", chunk)):
-            if not (isinstance(given, int) and given >= 1):
-                raise ValueError(f"{name} must be a whole number, 1 or more; it is {given!r}.")
+        for name, value in (("number", number), ("chunk", chunk)):
+            if not (isinstance(value, int) and value >= 1):
+                raise ValueError(f"{name} must be a whole number, 1 or more; it is {value!r}.")
         if not (isinstance(seed, int) and 0 <= seed < 2**63):
             raise ValueError(f"seed must be a whole number, 0 or more; it is {describe(seed)}.")
         check_seconds("held", held)
         check_seconds("elapsed", elapsed)
         self.skin, self.draws, self.number, self.seed = skin, draws, number, seed
         self.held, self.elapsed, self.chunk = held, elapsed, chunk
-        middle = draws.innermost()
-        skin.touched([Press(indenter, draws.load[1], middle) for indenter in draws.indenters])
+        innermost_place = draws.innermost()
+        skin.touched([Press(indenter, draws.load[1], innermost_place) for indenter in draws.indenters])
 
     @property
     def chunks(self) -> list[range]:
@@ -96,26 +96,34 @@ class PressSet:
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 hash of everything that determines the results."""
-        model, number = self.skin.model, (_VERSION, self.number, self.seed, self.held, self.elapsed, self.chunk)
-        parts = model.mesh, model.electrodes, model.protocol, self.skin.material, self.skin.conductivity
-        leaves, structure = jax.tree.flatten((parts, self.skin.gain, self.draws))
-        digest = hashlib.sha256(f"{number} {structure}".encode())
+        model, settings = self.skin.model, (_VERSION, self.number, self.seed, self.held, self.elapsed, self.chunk)
+        arrays = model.mesh, model.electrodes, model.protocol, self.skin.material, self.skin.conductivity
+        leaves, structure = jax.tree.flatten((arrays, self.skin.gain, self.draws))
+        hasher = hashlib.sha256(f"{settings} {structure}".encode())
         for leaf in leaves:
-            digest.update(np.asarray(leaf).tobytes())
-        return digest.hexdigest()
+            hasher.update(np.asarray(leaf).tobytes())
+        return hasher.hexdigest()
 
     def solve(self, chunk: int) -> dict[str, np.ndarray]:
         """Simulate one chunk of k touches: arrays (k, …) by name as in the store, NaN where a touch has fewer presses
         than `at_once`."""
-        for_draws, for_frames = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), chunk))
-        touches = self.draws.draw(for_draws, len(self.chunks[chunk]))
+        draw_key, frame_key = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), chunk))
+        touches = self.draws.draw(draw_key, len(self.chunks[chunk]))
         results = {name: np.full((len(touches), *shape), np.nan) for name, (shape, _) in self._shapes().items()}
-        results["voltages"] = self.skin.frames(for_frames, touches, held=self.held, elapsed=self.elapsed)
-        kinds = {id(indenter): kind for kind, indenter in enumerate(self.draws.indenters)}
-        for row, touch in enumerate(touches):
-            for column, press in enumerate(touch):
-                results["position"][row, column], results["force"][row, column] = press.position, press.load
-                results["angle"][row, column], results["indenter"][row, column] = press.angle, kinds[id(press.indenter)]
+        results["voltages"] = self.skin.frames(frame_key, touches, held=self.held, elapsed=self.elapsed)
+        indenter_numbers = {
+            id(indenter): indenter_number for indenter_number, indenter in enumerate(self.draws.indenters)
+        }
+        for touch_index, touch in enumerate(touches):
+            for press_index, press in enumerate(touch):
+                results["position"][touch_index, press_index], results["force"][touch_index, press_index] = (
+                    press.position,
+                    press.load,
+                )
+                results["angle"][touch_index, press_index], results["indenter"][touch_index, press_index] = (
+                    press.angle,
+                    indenter_numbers[id(press.indenter)],
+                )
         return results
 
     def contents(self) -> Contents:
@@ -123,7 +131,7 @@ class PressSet:
 
         def create_arrays(zarr_group: Any) -> None:
             for name, (shape, dimensions) in self._shapes().items():
-                unit, meaning = _MEANINGS[name]
+                unit, meaning = _UNITS_AND_MEANINGS[name]
                 zarr_group.create_array(
                     name,
                     shape=(self.number, *shape),
@@ -142,13 +150,13 @@ class PressSet:
 
     def _shapes(self) -> dict[str, tuple[tuple[int, ...], tuple[str, ...]]]:
         """Shape and dimensions of each array for one touch, by name."""
-        each = (self.draws.at_once,), ("press",)
+        per_press = (self.draws.at_once,), ("press",)
         return {
             "voltages": ((self.skin.model.protocol.num_measurements,), ("channel",)),
             "position": ((self.draws.at_once, 2), ("press", "axis")),
-            "force": each,
-            "angle": each,
-            "indenter": each,
+            "force": per_press,
+            "angle": per_press,
+            "indenter": per_press,
         }
 
 
@@ -182,10 +190,10 @@ def simulate_presses(
     need_extra("cluster", "a set of touches")
     check_kind("presses", presses, (PressSet, IndentSet), "a PressSet(skin, draws, number), or an IndentSet")
     with writing(presses.contents(), path) as store:
-        done = set(store.sound())
-        left = [number for number in range(len(presses.chunks)) if number not in done]
-        report = ProgressReporter(presses.chunks, done, progress)
-        for number, results in _solve_chunks(presses, left, client):
+        finished_chunks = set(store.sound())
+        remaining_chunks = [number for number in range(len(presses.chunks)) if number not in finished_chunks]
+        report = ProgressReporter(presses.chunks, finished_chunks, progress)
+        for number, results in _solve_chunks(presses, remaining_chunks, client):
             store.write(number, results)
             report.finished(number)
     return open_presses(presses, path)
@@ -214,10 +222,10 @@ def open_presses(presses: PressSet | IndentSet, path: str | Path):
     """
     need_extra("cluster", "a set of touches")
     store = Store(presses.contents(), path, create=False)
-    finished = np.zeros(presses.number, bool)
+    is_finished = np.zeros(presses.number, bool)
     for number in store.sound():
-        finished[list(presses.chunks[number])] = True
-    return store.open_dataset().assign_coords(finished=("touch", finished))
+        is_finished[list(presses.chunks[number])] = True
+    return store.open_dataset().assign_coords(finished=("touch", is_finished))
 
 
 def solve_presses(presses: PressSet | IndentSet, chunk: int) -> dict[str, np.ndarray]:

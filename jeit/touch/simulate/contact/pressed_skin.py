@@ -46,8 +46,8 @@ from jeit_solvers.module import Module
 def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     """Draw standard normal numbers with `jax.random.normal`. The number of draws is rounded up to a power of two, so
     that fewer programs are compiled for records of different lengths."""
-    number = math.prod(shape)
-    return np.asarray(jax.random.normal(key, (1 << max(number - 1, 0).bit_length(),)))[:number].reshape(shape)
+    num_draws = math.prod(shape)
+    return np.asarray(jax.random.normal(key, (1 << max(num_draws - 1, 0).bit_length(),)))[:num_draws].reshape(shape)
 
 
 def random_walk(
@@ -55,9 +55,11 @@ def random_walk(
 ) -> Float[np.ndarray, "T k"]:
     """Logarithms (T, k) of `count` = k drifting quantities, 0 at time 0: a common `trend` per second, and an
     independent random walk with standard `deviation` per √s for each. `seconds`: (T,), in ascending order."""
-    steps = np.diff(seconds, prepend=0.0)
-    normal = standard_normal(key, (len(steps), count))
-    return trend * np.asarray(seconds)[:, None] + deviation * np.cumsum(np.sqrt(steps)[:, None] * normal, axis=0)
+    time_steps = np.diff(seconds, prepend=0.0)
+    normal_draws = standard_normal(key, (len(time_steps), count))
+    return trend * np.asarray(seconds)[:, None] + deviation * np.cumsum(
+        np.sqrt(time_steps)[:, None] * normal_draws, axis=0
+    )
 
 
 def draw_gains(key: Array, spread: float, num_channels: int) -> Float[np.ndarray, " M"]:
@@ -71,11 +73,11 @@ def white_noise(key: Array, deviation: float, shape: tuple[int, ...]) -> Float[n
 
 
 class MaterialState(NamedTuple):
-    """State of a material at m points, in pascals. **Fields**: `held`: (m,), output w of the hysteresis; `late`: (k,
-    m), states y of the delayed branches."""
+    """State of a material at m points, in pascals. **Fields**: `hysteresis_output`: (m,), output w of the hysteresis;
+    `branch_states`: (k, m), states y of the delayed branches."""
 
-    held: Float[np.ndarray, " m"]
-    late: Float[np.ndarray, "k m"]
+    hysteresis_output: Float[np.ndarray, " m"]
+    branch_states: Float[np.ndarray, "k m"]
 
 
 def unloaded_state(material: Material, num_points: int) -> MaterialState:
@@ -88,15 +90,16 @@ def advance_state(
 ) -> tuple[MaterialState, Float[np.ndarray, " m"]]:
     """Advance the state `state` by a time step in `seconds` to `pressure` (m,); return the new state and the effective
     pressure (m,), pascals."""
-    held = np.maximum(pressure, np.minimum(state.held, pressure / (1 - material.hysteresis)))
+    output = np.maximum(pressure, np.minimum(state.hysteresis_output, pressure / (1 - material.hysteresis)))
     shares, times = _branches(material)
-    late = state.late
+    branch_states = state.branch_states
     if seconds > 0:
-        passed = seconds / times
-        kept = np.exp(-passed)
-        slope = 1 + np.expm1(-passed) / passed
-        late = kept * late + (1 - kept) * state.held + slope * (held - state.held)
-    return MaterialState(held, late), (1 - shares.sum()) * held + np.sum(shares * late, axis=0)
+        relative_times = seconds / times
+        decay_factors = np.exp(-relative_times)
+        ramp_weights = 1 + np.expm1(-relative_times) / relative_times
+        branch_states = decay_factors * branch_states + (1 - decay_factors) * state.hysteresis_output
+        branch_states += ramp_weights * (output - state.hysteresis_output)
+    return MaterialState(output, branch_states), (1 - shares.sum()) * output + np.sum(shares * branch_states, axis=0)
 
 
 def held_pressure(material: Material, pressure: Float[np.ndarray, "..."], seconds: float) -> Float[np.ndarray, "..."]:
@@ -112,10 +115,10 @@ def _branches(material: Material) -> tuple[np.ndarray, np.ndarray]:
 
 
 # Number of touches processed at once; numbers of cells that separate groups of touches; and ratio of the extent of a
-# touch to the root of its area, above which its contacts are taken to be apart.
-_AT_ONCE, _CELLS, _APART = 1024, (128, 512, 2048), 3.0
+# touch to the square root of its area, above which it is assumed to consist of separate contacts.
+_TOUCHES_AT_ONCE, _GROUP_NUM_CELLS, _MIN_SEPARATION = 1024, (128, 512, 2048), 3.0
 # Changes below this share of the maximum change of a touch are neglected.
-_LEAST = 1e-6
+_MIN_RELATIVE_CHANGE = 1e-6
 
 
 class PressedSkin(Module):
@@ -176,7 +179,7 @@ class PressedSkin(Module):
 
     def rest(self) -> Float[np.ndarray, " M"]:
         """Voltages (M,) of the untouched skin with gains, but without drift and noise."""
-        return self.gain * self._exact_rest
+        return self.gain * self._rest_voltages
 
     def frames(
         self,
@@ -197,8 +200,8 @@ class PressedSkin(Module):
         check_key(key)
         check_seconds("held", held)
         check_seconds("elapsed", elapsed)
-        exact = self.voltages_under(self.touched(presses, held=held, progress=progress), progress=progress)
-        return self.read(key, exact, np.array([float(elapsed)]))
+        exact_voltages = self.voltages_under(self.touched(presses, held=held, progress=progress), progress=progress)
+        return self.read(key, exact_voltages, np.array([float(elapsed)]))
 
     def touched(
         self,
@@ -211,9 +214,9 @@ class PressedSkin(Module):
         Raises `ValueError` as `frames`."""
         touches = touches_of(presses)
         pressed = pressed_cells(Samples.from_mesh(self.model.mesh, self.face), self.material.support, touches, progress)
-        change = self.material.change(held_pressure(self.material, pressed.pressure, held)).mean(axis=-1)
+        changes = self.material.change(held_pressure(self.material, pressed.pressure, held)).mean(axis=-1)
         places = np.array([touch[0].position if touch else np.zeros(self._dimension) for touch in touches])
-        return _collect_changes(places, pressed.cells, change, self.model.mesh.num_cells)
+        return _collect_changes(places, pressed.cells, changes, self.model.mesh.num_cells)
 
     def record(
         self,
@@ -231,8 +234,10 @@ class PressedSkin(Module):
         """
         check_key(key)
         seconds = _check_times(seconds)
-        exact = self.voltages_under(self.touched_in_time(motions, seconds, progress=progress), progress=progress)
-        return self.read(key, exact, seconds)
+        exact_voltages = self.voltages_under(
+            self.touched_in_time(motions, seconds, progress=progress), progress=progress
+        )
+        return self.read(key, exact_voltages, seconds)
 
     def record_each(
         self,
@@ -247,19 +252,29 @@ class PressedSkin(Module):
         faster than one by one. Raises `ValueError` for elements that are not pairs, and as `record`.
         """
         check_key(key)
-        wanted = "a list of pairs of motions and seconds, one for each recording"
-        check_kind("recordings", recordings, (list, tuple), wanted)
-        for number, pair in enumerate(recordings):
+        requirement = "a list of pairs of motions and seconds, one for each recording"
+        check_kind("recordings", recordings, (list, tuple), requirement)
+        for recording_index, pair in enumerate(recordings):
             if not (isinstance(pair, tuple) and len(pair) == 2):
-                raise ValueError(f"recordings[{number}]: give {wanted}; it is {describe(pair)}.")
+                raise ValueError(f"recordings[{recording_index}]: give {requirement}; it is {describe(pair)}.")
         if not recordings:
             return []
         times = [_check_times(seconds) for _, seconds in recordings]
-        each = [self.touched_in_time(motions, own) for (motions, _), own in zip(recordings, times, strict=True)]
-        exact = self.voltages_under(_concatenate(each), progress=progress)
-        parts = np.split(exact, np.cumsum([len(own) for own in times])[:-1])
-        keys = jax.random.split(key, len(times))
-        return [self.read(one, part, own) for one, part, own in zip(keys, parts, times, strict=True)]
+        touched_of_recordings = [
+            self.touched_in_time(motions, recording_times)
+            for (motions, _), recording_times in zip(recordings, times, strict=True)
+        ]
+        exact_voltages = self.voltages_under(_concatenate(touched_of_recordings), progress=progress)
+        voltages_of_recordings = np.split(
+            exact_voltages, np.cumsum([len(recording_times) for recording_times in times])[:-1]
+        )
+        recording_keys = jax.random.split(key, len(times))
+        return [
+            self.read(recording_key, recording_voltages, recording_times)
+            for recording_key, recording_voltages, recording_times in zip(
+                recording_keys, voltages_of_recordings, times, strict=True
+            )
+        ]
 
     def touched_in_time(
         self,
@@ -272,22 +287,22 @@ class PressedSkin(Module):
         Arguments as in `record`. Raises `ValueError` as `record`."""
         seconds = _check_times(seconds)
         motions = motions_of(motions, len(seconds))
-        found = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
-        touches = [tuple(press for press in some if press is not None) for some in found]
+        presses_of_frames = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
+        touches = [tuple(press for press in frame_presses if press is not None) for frame_presses in presses_of_frames]
         pressed = pressed_cells(Samples.from_mesh(self.model.mesh, self.face), self.material.support, touches, progress)
-        there = [own.any(axis=-1) for own in pressed.pressure]
-        cells = np.unique(pressed.cells[np.array(there)]) if motions else np.zeros(1, int)
-        place = np.searchsorted(cells, pressed.cells)
+        is_pressed = [frame_pressure.any(axis=-1) for frame_pressure in pressed.pressure]
+        cells = np.unique(pressed.cells[np.array(is_pressed)]) if motions else np.zeros(1, int)
+        cell_positions = np.searchsorted(cells, pressed.cells)
         shape = len(cells), pressed.pressure.shape[-1]
-        strain, before = unloaded_state(self.material, cells.size * shape[1]), seconds[0]
-        change = np.zeros((len(seconds), len(cells)))
-        for frame, now in enumerate(seconds):
+        state, previous_time = unloaded_state(self.material, cells.size * shape[1]), seconds[0]
+        changes = np.zeros((len(seconds), len(cells)))
+        for frame, time in enumerate(seconds):
             pressure = np.zeros(shape)
-            pressure[place[frame][there[frame]]] = pressed.pressure[frame][there[frame]]
-            strain, effective = advance_state(self.material, strain, pressure.ravel(), now - before)
-            change[frame], before = self.material.change(effective.reshape(shape)).mean(axis=-1), now
+            pressure[cell_positions[frame][is_pressed[frame]]] = pressed.pressure[frame][is_pressed[frame]]
+            state, effective = advance_state(self.material, state, pressure.ravel(), time - previous_time)
+            changes[frame], previous_time = self.material.change(effective.reshape(shape)).mean(axis=-1), time
         places = np.array([touch[0].position if touch else np.zeros(self._dimension) for touch in touches])
-        return _collect_changes(places, np.broadcast_to(cells, change.shape), change, self.model.mesh.num_cells)
+        return _collect_changes(places, np.broadcast_to(cells, changes.shape), changes, self.model.mesh.num_cells)
 
     def voltages_under(
         self, touched: TouchedCells, *, progress: Callable[[str], None] | None = None
@@ -296,19 +311,23 @@ class PressedSkin(Module):
 
         `progress` is called with the number of touches done. Raises as `touch_changes`.
         """
-        done = 0
-        voltages = np.tile(self._exact_rest, (len(touched.places), 1))
-        places, cells, change = (np.asarray(one) for one in (touched.places, touched.cells, touched.change))
-        for alike in _groups_of_similar_cost(self.model.mesh, cells, change):
-            for some in np.split(alike, range(_AT_ONCE, len(alike), _AT_ONCE)):
-                even = some[np.minimum(np.arange(_round_up(len(some))), len(some) - 1)]
-                own = slice(0, _round_up(int(np.count_nonzero(change[some], axis=1).max())))
-                arrays = as_array(places[even]), as_array(cells[even, own]), as_array(change[even, own])
+        num_done = 0
+        voltages = np.tile(self._rest_voltages, (len(touched.places), 1))
+        places, cells, changes = (np.asarray(array) for array in (touched.places, touched.cells, touched.change))
+        for group in _groups_of_similar_cost(self.model.mesh, cells, changes):
+            for chunk in np.split(group, range(_TOUCHES_AT_ONCE, len(group), _TOUCHES_AT_ONCE)):
+                padded_chunk = chunk[np.minimum(np.arange(_round_up(len(chunk))), len(chunk) - 1)]
+                used_columns = slice(0, _round_up(int(np.count_nonzero(changes[chunk], axis=1).max())))
+                arrays = (
+                    as_array(places[padded_chunk]),
+                    as_array(cells[padded_chunk, used_columns]),
+                    as_array(changes[padded_chunk, used_columns]),
+                )
                 rows = TouchedCells(*arrays, num_cells=touched.num_cells)
-                voltages[some] += np.asarray(touch_changes(self.model, self.conductivity, rows))[: len(some)]
-                done += len(some)
+                voltages[chunk] += np.asarray(touch_changes(self.model, self.conductivity, rows))[: len(chunk)]
+                num_done += len(chunk)
                 if progress is not None:
-                    progress(f"voltages: {done} of {len(voltages)}")
+                    progress(f"voltages: {num_done} of {len(voltages)}")
         return voltages
 
     def read(
@@ -320,15 +339,21 @@ class PressedSkin(Module):
         The effect of contacts is linearised about the skin at rest. Raises `ValueError` for an invalid key.
         """
         check_key(key)
-        for_conductivity, for_contacts, for_noise = jax.random.split(key, 3)
-        own = self.material
-        drift = random_walk(for_conductivity, seconds, own.conductivity_trend, own.conductivity_walk, 1)
-        if drift.any() or own.contact_trend or own.contact_walk:
-            number = self.model.electrodes.num_electrodes
-            contacts = random_walk(for_contacts, seconds, own.contact_trend, own.contact_walk, number)
-            exact = (exact + (contacts + drift) @ self._contact_slope) * np.exp(-drift)
-        deviation = own.noise * float(np.sqrt(np.mean(self._exact_rest**2)))
-        return self.gain * (exact + white_noise(for_noise, deviation, exact.shape))
+        conductivity_key, contact_key, noise_key = jax.random.split(key, 3)
+        material = self.material
+        conductivity_drift = random_walk(
+            conductivity_key, seconds, material.conductivity_trend, material.conductivity_walk, 1
+        )
+        if conductivity_drift.any() or material.contact_trend or material.contact_walk:
+            num_electrodes = self.model.electrodes.num_electrodes
+            contact_drift = random_walk(
+                contact_key, seconds, material.contact_trend, material.contact_walk, num_electrodes
+            )
+            exact = (exact + (contact_drift + conductivity_drift) @ self._contact_derivative) * np.exp(
+                -conductivity_drift
+            )
+        deviation = material.noise * float(np.sqrt(np.mean(self._rest_voltages**2)))
+        return self.gain * (exact + white_noise(noise_key, deviation, exact.shape))
 
     @property
     def _dimension(self) -> int:
@@ -336,43 +361,45 @@ class PressedSkin(Module):
         return 3 if is_curved(self.model.mesh) else 2
 
     @cached_property
-    def _exact_rest(self) -> Float[np.ndarray, " M"]:
+    def _rest_voltages(self) -> Float[np.ndarray, " M"]:
         """Voltages (M,) of the model at rest."""
         return np.asarray(self.model.voltages(self.conductivity))
 
     @cached_property
-    def _contact_slope(self) -> Float[np.ndarray, "L M"]:
+    def _contact_derivative(self) -> Float[np.ndarray, "L M"]:
         """Derivative ∂v/∂log z (L, M) of the voltages at rest by the logarithms of the contact impedances, volts; zero
         for point electrodes."""
         electrodes, protocol = self.model.electrodes, self.model.protocol
         if electrodes.is_point:
             return np.zeros((electrodes.num_electrodes, protocol.num_measurements))
-        fields, impedance = (np.asarray(one) for one in self.model.fields(self.conductivity))
-        slope = ContactSensitivity(self.model.mesh, electrodes)(fields, impedance, electrodes.contact_impedance)
-        return np.stack([select_channels(protocol, one) for one in slope])
+        fields, impedance = (np.asarray(array) for array in self.model.fields(self.conductivity))
+        derivative = ContactSensitivity(self.model.mesh, electrodes)(fields, impedance, electrodes.contact_impedance)
+        return np.stack([select_channels(protocol, matrix) for matrix in derivative])
 
 
-def _collect_changes(places, cells, change, num_cells: int) -> TouchedCells:
+def _collect_changes(places, cells, changes, num_cells: int) -> TouchedCells:
     """Collect the changes that are not negligible as `TouchedCells`, padded with zeros at the end of each row."""
-    kept = np.abs(change) > _LEAST * np.abs(change).max(axis=1, keepdims=True)
-    rows, there = pad_rows([row[one] for row, one in zip(cells, kept, strict=True)])
-    wide = _round_up(rows.shape[1]) - rows.shape[1]
-    changes = np.zeros(rows.shape)
-    changes[there] = change[kept]
-    rows, changes = (np.pad(array, ((0, 0), (0, wide))) for array in (rows, changes))
-    return TouchedCells(as_array(places), as_array(rows), as_array(changes), num_cells)
+    is_significant = np.abs(changes) > _MIN_RELATIVE_CHANGE * np.abs(changes).max(axis=1, keepdims=True)
+    rows, is_entry = pad_rows([row[is_kept] for row, is_kept in zip(cells, is_significant, strict=True)])
+    num_padding = _round_up(rows.shape[1]) - rows.shape[1]
+    significant_changes = np.zeros(rows.shape)
+    significant_changes[is_entry] = changes[is_significant]
+    rows, significant_changes = (np.pad(array, ((0, 0), (0, num_padding))) for array in (rows, significant_changes))
+    return TouchedCells(as_array(places), as_array(rows), as_array(significant_changes), num_cells)
 
 
-def _concatenate(each: Sequence[TouchedCells]) -> TouchedCells:
+def _concatenate(touched_of_recordings: Sequence[TouchedCells]) -> TouchedCells:
     """Concatenate the touched cells of several recordings, padded with zeros at the end of each row."""
-    wide = max(one.cells.shape[1] for one in each)
+    max_num_cells = max(touched.cells.shape[1] for touched in touched_of_recordings)
 
     def concatenate(name: str) -> Array:
-        arrays = [np.asarray(getattr(one, name)) for one in each]
-        return as_array(np.concatenate([np.pad(one, ((0, 0), (0, wide - one.shape[1]))) for one in arrays]))
+        arrays = [np.asarray(getattr(touched, name)) for touched in touched_of_recordings]
+        return as_array(
+            np.concatenate([np.pad(touched, ((0, 0), (0, max_num_cells - touched.shape[1]))) for touched in arrays])
+        )
 
-    places = as_array(np.concatenate([np.asarray(one.places) for one in each]))
-    return TouchedCells(places, concatenate("cells"), concatenate("change"), each[0].num_cells)
+    places = as_array(np.concatenate([np.asarray(touched.places) for touched in touched_of_recordings]))
+    return TouchedCells(places, concatenate("cells"), concatenate("change"), touched_of_recordings[0].num_cells)
 
 
 def _groups_of_similar_cost(
@@ -380,17 +407,22 @@ def _groups_of_similar_cost(
 ) -> list[np.ndarray]:
     """Group touches by similar cost, and return the numbers of the touches in each group.
 
-    Groups differ in the number of touched cells, and in whether these are close together or form contacts that are
-    apart. Touches without changes are left out.
+    Groups differ in the number of touched cells, and in whether these are close together or form separate contacts.
+    Touches without changes are left out.
     """
-    there = change != 0
-    number = there.sum(axis=1)
-    middles = np.asarray(centroids(mesh))[:, : 3 if is_curved(mesh) else 2][cells]
-    low, high = (find(np.where(there[..., None], middles, far), axis=1) for find, far in ((np.min, 1), (np.max, -1)))
-    area = np.sum(np.where(there, np.asarray(measures(mesh))[cells], 0.0), axis=1)
-    apart = np.linalg.norm(high - low, axis=1) > _APART * np.sqrt(area)
-    kinds = np.where(number > 0, 1 + 2 * np.searchsorted(_CELLS, number) + apart, 0)
-    return [np.flatnonzero(kinds == kind) for kind in np.unique(kinds[kinds > 0])]
+    is_changed = change != 0
+    num_changed = is_changed.sum(axis=1)
+    cell_centres = np.asarray(centroids(mesh))[:, : 3 if is_curved(mesh) else 2][cells]
+    lower_corners, upper_corners = (
+        extreme(np.where(is_changed[..., None], cell_centres, padding), axis=1)
+        for extreme, padding in ((np.min, 1), (np.max, -1))
+    )
+    areas = np.sum(np.where(is_changed, np.asarray(measures(mesh))[cells], 0.0), axis=1)
+    is_separate = np.linalg.norm(upper_corners - lower_corners, axis=1) > _MIN_SEPARATION * np.sqrt(areas)
+    group_numbers = np.where(num_changed > 0, 1 + 2 * np.searchsorted(_GROUP_NUM_CELLS, num_changed) + is_separate, 0)
+    return [
+        np.flatnonzero(group_numbers == group_number) for group_number in np.unique(group_numbers[group_numbers > 0])
+    ]
 
 
 def _round_up(count: int) -> int:

@@ -15,17 +15,17 @@ from jeit.mesh import Mesh, check_flat, measures
 from jeit.mesh.geodesic import Triangles
 from jeit.touch.simulate.contact.press import Press
 
-# Lattice n of the samples in a cell: barycentric coordinates are (i + 1/k) / (n + 1) with integers i of sum n, for a
-# cell with k corners.
-_LATTICE = 2
+# Fineness n of the lattice of samples in a cell: barycentric coordinates are (i + 1/k) / (n + 1) with integers i of sum
+# n, for a cell with k corners.
+_LATTICE_FINENESS = 2
 # Minimum cosine of the angle between the normal of a curved skin and that at the press, for the skin to be beneath the
 # indenter. On a ball, the distance of a point from the place pressed is then at most 1 / cos(60° / 2) times its
 # distance from the axis of the press.
-_BENEATH, _CHORD = 0.5, 1.2
+_MIN_NORMAL_COSINE, _MAX_CHORD_RATIO = 0.5, 1.2
 # Minimum z component of a normal, above which "up" in the tangent plane of a curved skin is along y.
-_LEVEL = 0.866
+_MIN_VERTICAL_COMPONENT = 0.866
 # Maximum distance of a press from the surface, relative to the root of the area of its largest triangle.
-_OFF = 0.5
+_MAX_RELATIVE_DISTANCE = 0.5
 
 
 class CurvedGeometry(NamedTuple):
@@ -58,31 +58,31 @@ class Samples(NamedTuple):
         """Create the samples of a sheet or a layer. The cells of a layer are pressed like the surface above them, in a
         curved layer like its `face`."""
         if is_curved(mesh):
-            return cls._of_curved(mesh, face)
+            return cls._from_curved_mesh(mesh, face)
         check_flat(mesh, "these presses")
         corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
         thickness = np.ptp(corners[..., 2]) if mesh.dimension == 3 else 1.0
         corners = corners[..., :2]
-        points = lattice(corners, _LATTICE)
-        area = np.asarray(measures(mesh)) / thickness / points.shape[1]
-        return cls(points, area, _largest_cell_radius(corners), corners)
+        points = lattice(corners, _LATTICE_FINENESS)
+        areas = np.asarray(measures(mesh)) / thickness / points.shape[1]
+        return cls(points, areas, _largest_cell_radius(corners), corners)
 
     @classmethod
-    def _of_curved(cls, mesh: Mesh, face: str) -> "Samples":
-        surface, cells, size = touched_surface(mesh, face), np.asarray(mesh.cells), np.asarray(measures(mesh))
-        feet = surface.nearest(np.asarray(mesh.points))
-        corners, normals = feet.points[cells], surface.normals_at(feet)[cells]
-        above = surface.nearest(corners.mean(axis=1)).triangle
-        points = _curved_lattice(corners, normals, _LATTICE)
+    def _from_curved_mesh(cls, mesh: Mesh, face: str) -> "Samples":
+        surface, cells, cell_measures = touched_surface(mesh, face), np.asarray(mesh.cells), np.asarray(measures(mesh))
+        nearest_points = surface.nearest(np.asarray(mesh.points))
+        corners, normals = nearest_points.points[cells], surface.normals_at(nearest_points)[cells]
+        triangle_indices = surface.nearest(corners.mean(axis=1)).triangle
+        points = _curved_lattice(corners, normals, _LATTICE_FINENESS)
         # In a layer, the area of a triangle of the surface is divided among the cells beneath it by their volumes.
-        share = size / np.bincount(above, size, len(surface.cells))[above]
-        area = share * surface.areas[above] / points.shape[1]
+        area_shares = cell_measures / np.bincount(triangle_indices, cell_measures, len(surface.cells))[triangle_indices]
+        sample_areas = area_shares * surface.areas[triangle_indices] / points.shape[1]
         return cls(
             points,
-            area,
+            sample_areas,
             _largest_cell_radius(corners),
             corners,
-            CurvedGeometry(surface, normals, surface.normals[above]),
+            CurvedGeometry(surface, normals, surface.normals[triangle_indices]),
         )
 
     def lattice_points(self, cells: Int[np.ndarray, " c"], fineness: int) -> Float[np.ndarray, "c s d"]:
@@ -94,39 +94,43 @@ class Samples(NamedTuple):
     def check(self, presses: Sequence[Press]) -> None:
         """Check the positions of presses. Raises `ValueError` for positions with another number of coordinates, and for
         positions off a curved skin."""
-        dimension, kind = self.points.shape[-1], "flat" if self.curved is None else "curved"
+        dimension, skin_kind = self.points.shape[-1], "flat" if self.curved is None else "curved"
         for press in presses:
             if len(press.position) != dimension:
                 raise ValueError(
-                    f"position: a press on a {kind} skin is at {'(x, y)' if dimension == 2 else '(x, y, z) on it'}, in "
-                    f"metres; this one has {len(press.position)} coordinates."
+                    f"position: a press on a {skin_kind} skin is at "
+                    f"{'(x, y)' if dimension == 2 else '(x, y, z) on it'}, in metres; this one has "
+                    f"{len(press.position)} coordinates."
                 )
         if self.curved is None:
             return
-        position = np.array([press.position for press in presses])
-        away = self.curved.surface.nearest(position).away
-        lost = np.flatnonzero(away > _OFF * np.sqrt(self.curved.surface.areas.max()))
-        if lost.size:
+        positions = np.array([press.position for press in presses])
+        distances = self.curved.surface.nearest(positions).away
+        invalid_presses = np.flatnonzero(distances > _MAX_RELATIVE_DISTANCE * np.sqrt(self.curved.surface.areas.max()))
+        if invalid_presses.size:
             raise ValueError(
-                f"position: {lost.size} of {len(presses)} presses lie off the skin, the first at "
-                f"{millimetre_text(position[lost[0]])} mm, by {1e3 * away[lost[0]]:.3g} mm; places are in metres, on "
-                "the touched "
-                "face."
+                f"position: {invalid_presses.size} of {len(presses)} presses lie off the skin, the first at "
+                f"{millimetre_text(positions[invalid_presses[0]])} mm, by {1e3 * distances[invalid_presses[0]]:.3g} "
+                "mm; places are in metres, on the touched face."
             )
 
     def facing_cells(self, presses: Sequence[Press], cells: Sequence) -> list[Int[np.ndarray, " c"]]:
-        """Select the cells of each press that face it, unlike the far side of a sleeve."""
+        """Select the cells of each press whose normals point towards the indenter. Cells on the opposite side of a tube
+        are left out."""
+        arrays = [np.asarray(indices, int) for indices in cells]
         if self.curved is None:
-            return [np.asarray(own, int) for own in cells]
-        towards = _indenter_axes(self.curved.surface, presses)[1][:, 2]
-        own = [np.asarray(one, int) for one in cells]
-        return [some[self.curved.cells[some] @ axis > _BENEATH] for some, axis in zip(own, towards, strict=True)]
+            return arrays
+        axes = _indenter_axes(self.curved.surface, presses)[1][:, 2]
+        normals = self.curved.cells
+        return [
+            indices[normals[indices] @ axis > _MIN_NORMAL_COSINE] for indices, axis in zip(arrays, axes, strict=True)
+        ]
 
     @property
     def chord(self) -> float:
         """Maximum ratio of the distance of a point from the place pressed to its distance from the axis of the
         press."""
-        return 1.0 if self.curved is None else _CHORD
+        return 1.0 if self.curved is None else _MAX_CHORD_RATIO
 
     def to_indenter_frames(
         self, presses: Sequence[Press], cells: Int[np.ndarray, "b c"], points: Float[np.ndarray, "b q d"]
@@ -140,12 +144,12 @@ class Samples(NamedTuple):
         cos, sin = (function([press.angle for press in presses])[:, None] for function in (np.cos, np.sin))
         if self.curved is None:
             x, y = np.moveaxis(points - np.array([press.position for press in presses])[:, None], -1, 0)
-            fall, share = np.zeros(points.shape[:-1]), np.ones(cells.shape)
+            depths, area_ratios = np.zeros(points.shape[:-1]), np.ones(cells.shape)
         else:
-            origin, axes = _indenter_axes(self.curved.surface, presses)
-            x, y, up = np.moveaxis(np.einsum("bqd,bad->bqa", points - origin[:, None], axes), -1, 0)
-            fall, share = -up, np.einsum("bcd,bd->bc", self.curved.cells[cells], axes[:, 2])
-        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1), fall, share
+            origins, axes = _indenter_axes(self.curved.surface, presses)
+            x, y, heights = np.moveaxis(np.einsum("bqd,bad->bqa", points - origins[:, None], axes), -1, 0)
+            depths, area_ratios = -heights, np.einsum("bcd,bd->bc", self.curved.cells[cells], axes[:, 2])
+        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1), depths, area_ratios
 
 
 def lattice(corners: Float[np.ndarray, "m k d"], fineness: int) -> Float[np.ndarray, "m s d"]:
@@ -154,8 +158,10 @@ def lattice(corners: Float[np.ndarray, "m k d"], fineness: int) -> Float[np.ndar
 
 
 def _barycentric_weights(num_corners: int, fineness: int) -> Float[np.ndarray, "s k"]:
-    steps = [each for each in itertools.product(range(fineness + 1), repeat=num_corners) if sum(each) == fineness]
-    return (np.array(steps) + 1 / num_corners) / (fineness + 1)
+    lattice_integers = [
+        integers for integers in itertools.product(range(fineness + 1), repeat=num_corners) if sum(integers) == fineness
+    ]
+    return (np.array(lattice_integers) + 1 / num_corners) / (fineness + 1)
 
 
 def _curved_lattice(corners, normals, fineness: int) -> Float[np.ndarray, "m s 3"]:
@@ -173,21 +179,25 @@ def project_to_curved_surface(points, weights, corners, normals) -> Float[np.nda
     Points are moved half of the way to the interpolated projections onto the tangent planes at the corners, which is
     exact to second order (Boubekeur and Alexa, Phong tessellation, ACM Transactions on Graphics 27(5), 2008, at 1/2).
     """
-    below = np.sum((corners - points[..., None, :]) * normals, axis=-1)
-    return points + np.einsum("...k,...k,...kd->...d", weights / 2, below, normals)
+    plane_distances = np.sum((corners - points[..., None, :]) * normals, axis=-1)
+    return points + np.einsum("...k,...k,...kd->...d", weights / 2, plane_distances, normals)
 
 
 def _indenter_axes(surface: Triangles, presses: Sequence[Press]):
     """Points pressed (b, 3) and axes of the frames there (b, 3, 3): right, up and outwards, as seen from outside with z
     upwards."""
-    at = surface.nearest(np.array([press.position for press in presses]))
-    corners = surface.cells[at.triangle]
-    origin = project_to_curved_surface(at.points, at.weights, surface.points[corners], surface.node_normals[corners])
-    out = surface.normals_at(at)
-    up = np.where(np.abs(out[:, 2:]) > _LEVEL, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
-    up -= np.sum(up * out, axis=1, keepdims=True) * out
-    up /= np.linalg.norm(up, axis=1, keepdims=True)
-    return origin, np.stack([np.cross(up, out), up, out], axis=1)
+    nearest_points = surface.nearest(np.array([press.position for press in presses]))
+    corners = surface.cells[nearest_points.triangle]
+    origins = project_to_curved_surface(
+        nearest_points.points, nearest_points.weights, surface.points[corners], surface.node_normals[corners]
+    )
+    outward_axes = surface.normals_at(nearest_points)
+    up_axes = np.where(
+        np.abs(outward_axes[:, 2:]) > _MIN_VERTICAL_COMPONENT, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    )
+    up_axes -= np.sum(up_axes * outward_axes, axis=1, keepdims=True) * outward_axes
+    up_axes /= np.linalg.norm(up_axes, axis=1, keepdims=True)
+    return origins, np.stack([np.cross(up_axes, outward_axes), up_axes, outward_axes], axis=1)
 
 
 def _largest_cell_radius(corners) -> float:

@@ -17,7 +17,7 @@ from jeit.touch.simulate.contact import Material
 from jeit_solvers.module import Module
 
 # Maximum number of random cuts that are tried; minimum and maximum angle of a bend, in radians.
-_TRIES, _LEAST_BEND, _MOST_BEND = 400, 0.35, 1.2
+_MAX_TRIES, _MIN_BEND, _MAX_BEND = 400, 0.35, 1.2
 
 
 class Cut(Module):
@@ -69,11 +69,11 @@ class Cut(Module):
         """Points (n, 2) on the path, at most `step` metres apart. Raises `ValueError` for a step that is not
         positive."""
         check_metres("step", step)
-        pieces = [
+        segments_points = [
             np.linspace(start, end, max(2, int(np.ceil(np.linalg.norm(end - start) / step)) + 1))
             for start, end in itertools.pairwise(self.path)
         ]
-        return np.concatenate([piece[:-1] for piece in pieces] + [self.path[-1:]])
+        return np.concatenate([segment_points[:-1] for segment_points in segments_points] + [self.path[-1:]])
 
     def cells(self, mesh: Mesh) -> Int[np.ndarray, " c"]:
         """Numbers of the cells that the cut crosses, seen from above; in a layer, down to the depth of the cut.
@@ -83,16 +83,18 @@ class Cut(Module):
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the skin")
         check_flat(mesh, "cuts")
         points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
-        there = np.zeros(len(cells), bool)
+        is_crossed = np.zeros(len(cells), bool)
         for start, end in itertools.pairwise(self.path):
-            for a, b in itertools.combinations(range(cells.shape[1]), 2):
-                there |= _segments_cross(start, end, points[cells[:, a], :2], points[cells[:, b], :2])
+            for first_corner, second_corner in itertools.combinations(range(cells.shape[1]), 2):
+                is_crossed |= _segments_cross(
+                    start, end, points[cells[:, first_corner], :2], points[cells[:, second_corner], :2]
+                )
         if mesh.dimension == 3:
             top = points[:, 2].max()
-            there &= np.asarray(centroids(mesh))[:, 2] > top - self.depth * (top - points[:, 2].min())
-        if not there.any():
+            is_crossed &= np.asarray(centroids(mesh))[:, 2] > top - self.depth * (top - points[:, 2].min())
+        if not is_crossed.any():
             raise ValueError("cut: it crosses no cell of the mesh; are both in metres, with the same origin?")
-        return np.flatnonzero(there)
+        return np.flatnonzero(is_crossed)
 
     def conductivity(
         self, mesh: Mesh, conductivity: ArrayLike, thickness: float | None = None
@@ -108,7 +110,7 @@ class Cut(Module):
         if values.ndim > 1 or np.iscomplexobj(values) or values.size not in (1, mesh.num_cells):
             raise ValueError("conductivity must be real, one number or one for each cell.")
         values = np.broadcast_to(values, mesh.num_cells).astype(float)
-        cells, left = self.cells(mesh), self.residual
+        cells, residual = self.cells(mesh), self.residual
         if mesh.dimension == 2 and self.depth < 1:
             if thickness is None:
                 raise ValueError(
@@ -116,9 +118,9 @@ class Cut(Module):
                 )
             check_metres("thickness", thickness)
             width = float(np.asarray(measures(mesh))[cells].sum()) / self.length
-            longer = -4 * thickness / np.pi * np.log(np.sin(np.pi * (1 - self.depth) / 2))
-            left = max(left, width / (width + longer))
-        values[cells] *= left
+            additional_length = -4 * thickness / np.pi * np.log(np.sin(np.pi * (1 - self.depth) / 2))
+            residual = max(residual, width / (width + additional_length))
+        values[cells] *= residual
         return values
 
 
@@ -153,34 +155,45 @@ def draw_cut(
     """
     check_key(key)
     check_kind("outline", outline, Domain, "an outline, such as Disk(0.05)")
-    span = real_array("length", length, "the least and the greatest, metres")
-    if span.shape != (2,) or not 0 < span[0] <= span[1] < np.inf:
+    length_range = real_array("length", length, "the least and the greatest, metres")
+    if length_range.shape != (2,) or not 0 < length_range[0] <= length_range[1] < np.inf:
         raise ValueError(f"length must be the least and the greatest, metres, such as (0.02, 0.06); it is {length!r}.")
     if not (is_number(bent) and 0 <= bent <= 1):
         raise ValueError(f"bent must be a probability, from 0 to 1; it is {describe(bent)}.")
     if not (is_number(margin) and margin >= 0):
         raise ValueError(f"margin must be metres, zero or more; it is {describe(margin)}.")
-    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    generator = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     low_x, high_x, low_y, high_y = map(float, outline.extent)
-    whole, turned = random.uniform(*span), random.random() < bent
-    for _ in range(_TRIES):
-        start, angle = random.uniform((low_x, low_y), (high_x, high_y)), random.uniform(-np.pi, np.pi)
-        share, turn = random.uniform(0.3, 0.7), random.choice((-1, 1)) * random.uniform(_LEAST_BEND, _MOST_BEND)
-        steps = [(share, angle), (1 - share, angle + turn)] if turned else [(1.0, angle)]
-        moves = [part * whole * np.array([np.cos(one), np.sin(one)]) for part, one in steps]
-        cut = Cut(np.cumsum([start, *moves], axis=0), depth)
-        if (np.asarray(outline.signed_distance(cut.along(whole / 20))) > margin).all():
+    cut_length, is_bent = generator.uniform(*length_range), generator.random() < bent
+    for _ in range(_MAX_TRIES):
+        start, angle = generator.uniform((low_x, low_y), (high_x, high_y)), generator.uniform(-np.pi, np.pi)
+        length_fraction, bend_angle = (
+            generator.uniform(0.3, 0.7),
+            generator.choice((-1, 1)) * generator.uniform(_MIN_BEND, _MAX_BEND),
+        )
+        segments = [(length_fraction, angle), (1 - length_fraction, angle + bend_angle)] if is_bent else [(1.0, angle)]
+        segment_vectors = [
+            segment_fraction * cut_length * np.array([np.cos(segment_angle), np.sin(segment_angle)])
+            for segment_fraction, segment_angle in segments
+        ]
+        cut = Cut(np.cumsum([start, *segment_vectors], axis=0), depth)
+        if (np.asarray(outline.signed_distance(cut.along(cut_length / 20))) > margin).all():
             return cut
     raise ValueError(
-        f"length: no cut of {1e3 * whole:.3g} mm was found that lies within the skin; give a shorter length."
+        f"length: no cut of {1e3 * cut_length:.3g} mm was found that lies within the skin; give a shorter length."
     )
 
 
 def _segments_cross(start, end, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Whether the segments from `first` to `second` (m, 2) cross the segment from `start` to `end`."""
-    along, edge = end - start, second - first
-    one, other = _orientation(along, first - start), _orientation(along, second - start)
-    return (one * other <= 0) & (_orientation(edge, start - first) * _orientation(edge, end - first) <= 0)
+    direction, second_direction = end - start, second - first
+    first_orientation, second_orientation = (
+        _orientation(direction, first - start),
+        _orientation(direction, second - start),
+    )
+    return (first_orientation * second_orientation <= 0) & (
+        _orientation(second_direction, start - first) * _orientation(second_direction, end - first) <= 0
+    )
 
 
 def _orientation(first, second) -> np.ndarray:
@@ -220,6 +233,8 @@ def mend_cut(
     check_kind("material", material, Material, 'a Material, such as material("hydrogel")')
     if not (is_number(share) and share > 0):
         raise ValueError(f"share must be positive, about 0.9 to 1.1; it is {describe(share)}.")
-    values = np.array(np.broadcast_to(np.asarray(check_conductivity(mesh, conductivity)), mesh.num_cells), float)
-    values[cut.cells(mesh)] *= share
-    return values, dataclasses.replace(material, hysteresis=min(0.9, _HYSTERESIS_FACTOR * material.hysteresis))
+    conductivities = np.array(
+        np.broadcast_to(np.asarray(check_conductivity(mesh, conductivity)), mesh.num_cells), float
+    )
+    conductivities[cut.cells(mesh)] *= share
+    return conductivities, dataclasses.replace(material, hysteresis=min(0.9, _HYSTERESIS_FACTOR * material.hysteresis))

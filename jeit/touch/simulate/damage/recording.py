@@ -21,12 +21,12 @@ FaultKind = Literal["dead", "loose", "torn"]
 FAULTS: tuple[FaultKind, ...] = ("dead", "loose", "torn")
 # Factor of the contact impedance of a dead electrode; and limit of the source's voltage, relative to its maximum for
 # the skin at rest.
-_DEAD, _RAIL = 1e7, 5.0
+_DEAD_CONTACT_FACTOR, _MAX_VOLTAGE_RATIO = 1e7, 5.0
 # Minimum and maximum factor of the impedance of a loose contact; time constant of the fluctuations of its logarithm, in
 # seconds; number of levels for which voltages are solved.
-_LOOSE, _FLUCTUATION_TIME, _LEVELS = (10.0, 1000.0), 0.5, 7
+_LOOSE_CONTACT_FACTORS, _FLUCTUATION_TIME, _NUM_LEVELS = (10.0, 1000.0), 0.5, 7
 # Voltage picked up by a disconnected wire, relative to the root mean square of all voltages.
-_STRAY = 0.02
+_STRAY_FRACTION = 0.02
 
 
 class ElectrodeFault(Module):
@@ -75,60 +75,73 @@ class ElectrodeFault(Module):
         if self.electrode >= protocol.num_electrodes:
             raise ValueError(f"electrode {self.electrode}: the model has {protocol.num_electrodes}, counted from 0.")
         seconds = real_array("seconds", seconds, "times (T,) of the frames")
-        for_wandering, for_strays = jax.random.split(key)
-        rest = np.asarray(model.voltages(conductivity))
+        fluctuation_key, stray_key = jax.random.split(key)
+        rest_voltages = np.asarray(model.voltages(conductivity))
         if self.kind == "loose":
-            return self._loose_contact_voltages(for_wandering, model, conductivity, seconds) - rest
-        stray = (
-            _STRAY * np.sqrt(np.mean(rest**2)) * np.asarray(jax.random.normal(for_strays, (len(seconds), rest.size)))
+            return self._loose_contact_voltages(fluctuation_key, model, conductivity, seconds) - rest_voltages
+        stray_voltages = (
+            _STRAY_FRACTION
+            * np.sqrt(np.mean(rest_voltages**2))
+            * np.asarray(jax.random.normal(stray_key, (len(seconds), rest_voltages.size)))
         )
-        driving = np.asarray(protocol.channel_drive)[:, self.electrode] != 0
-        reading = np.asarray(protocol.channel_measurement)[:, self.electrode] != 0
+        is_driven = np.asarray(protocol.channel_drive)[:, self.electrode] != 0
+        is_measured = np.asarray(protocol.channel_measurement)[:, self.electrode] != 0
         if self.kind == "torn":
-            silent = np.broadcast_to(stray if self.rail is None else self.rail, stray.shape)
-            return np.where(driving | reading, silent - rest, 0.0)
-        dead = self._dead_electrode_voltages(model, conductivity)
-        changed = np.where(reading & ~driving, stray - rest, dead - rest)
-        return np.where(driving | reading, changed, (dead - rest) * np.ones_like(stray))
+            torn_readings = np.broadcast_to(stray_voltages if self.rail is None else self.rail, stray_voltages.shape)
+            return np.where(is_driven | is_measured, torn_readings - rest_voltages, 0.0)
+        dead_voltages = self._dead_electrode_voltages(model, conductivity)
+        measured_changes = np.where(
+            is_measured & ~is_driven, stray_voltages - rest_voltages, dead_voltages - rest_voltages
+        )
+        return np.where(
+            is_driven | is_measured, measured_changes, (dead_voltages - rest_voltages) * np.ones_like(stray_voltages)
+        )
 
     def _with_contact_factor(self, model: ForwardModel, factor: float) -> ForwardModel:
-        impedance = np.array(np.broadcast_to(model.electrodes.contact_impedance, model.protocol.num_electrodes), float)
-        impedance[self.electrode] *= factor
-        worse = eqx.tree_at(lambda one: one.contact_impedance, model.electrodes, jax.numpy.asarray(impedance))
-        return model.with_electrodes(worse)
+        impedances = np.array(np.broadcast_to(model.electrodes.contact_impedance, model.protocol.num_electrodes), float)
+        impedances[self.electrode] *= factor
+        faulty_electrodes = eqx.tree_at(
+            lambda electrodes: electrodes.contact_impedance, model.electrodes, jax.numpy.asarray(impedances)
+        )
+        return model.with_electrodes(faulty_electrodes)
 
     def _dead_electrode_voltages(self, model: ForwardModel, conductivity) -> Float[np.ndarray, " M"]:
         """Voltages (M,) with a dead electrode and a source of limited voltage."""
-        before, after = (
-            np.asarray(one.transfer_impedance(conductivity)) for one in (model, self._with_contact_factor(model, _DEAD))
+        initial_impedance, faulty_impedance = (
+            np.asarray(state.transfer_impedance(conductivity))
+            for state in (model, self._with_contact_factor(model, _DEAD_CONTACT_FACTOR))
         )
-        drive = np.asarray(model.protocol.drive)
-        spans = [np.ptp(np.where(drive != 0, drive @ z.T, 0.0), axis=1) for z in (before, after)]
-        current = np.minimum(1.0, _RAIL * spans[0].max() / spans[1])
-        voltages = np.asarray(select_channels(model.protocol, after))
-        return voltages * current[np.asarray(model.protocol.drive_index)]
+        drives = np.asarray(model.protocol.drive)
+        voltage_ranges = [
+            np.ptp(np.where(drives != 0, drives @ impedance.T, 0.0), axis=1)
+            for impedance in (initial_impedance, faulty_impedance)
+        ]
+        relative_currents = np.minimum(1.0, _MAX_VOLTAGE_RATIO * voltage_ranges[0].max() / voltage_ranges[1])
+        voltages = np.asarray(select_channels(model.protocol, faulty_impedance))
+        return voltages * relative_currents[np.asarray(model.protocol.drive_index)]
 
     def _loose_contact_voltages(self, key: Array, model: ForwardModel, conductivity, seconds: np.ndarray) -> np.ndarray:
         """Voltages (T, M) for a fluctuating contact impedance, interpolated between solutions at a few levels of its
         logarithm."""
-        low, high = np.log(_LOOSE)
-        levels = np.linspace(low, high, _LEVELS)
-        solved = [
-            np.asarray(self._with_contact_factor(model, float(np.exp(one))).voltages(conductivity)) for one in levels
+        log_min, log_max = np.log(_LOOSE_CONTACT_FACTORS)
+        levels = np.linspace(log_min, log_max, _NUM_LEVELS)
+        level_voltages = [
+            np.asarray(self._with_contact_factor(model, float(np.exp(log_factor))).voltages(conductivity))
+            for log_factor in levels
         ]
-        normal = np.asarray(jax.random.normal(key, (len(seconds),)))
-        place, steps = np.empty(len(seconds)), np.diff(seconds, prepend=seconds[:1])
-        now = 0.0
-        for number, (step, one) in enumerate(zip(steps, normal, strict=True)):
-            kept = np.exp(-step / _FLUCTUATION_TIME) if number else 0.0
-            now = kept * now + np.sqrt(1 - kept**2) * one
-            place[number] = now
+        normal_draws = np.asarray(jax.random.normal(key, (len(seconds),)))
+        fluctuation, time_steps = np.empty(len(seconds)), np.diff(seconds, prepend=seconds[:1])
+        fluctuation_value = 0.0
+        for frame, (time_step, log_factor) in enumerate(zip(time_steps, normal_draws, strict=True)):
+            decay = np.exp(-time_step / _FLUCTUATION_TIME) if frame else 0.0
+            fluctuation_value = decay * fluctuation_value + np.sqrt(1 - decay**2) * log_factor
+            fluctuation[frame] = fluctuation_value
         # The distribution function of the normal variable makes the logarithm uniformly distributed.
-        share = np.asarray(jax.scipy.stats.norm.cdf(place)) * (_LEVELS - 1)
-        below = np.minimum(share.astype(int), _LEVELS - 2)
-        part = (share - below)[:, None]
-        table = np.array(solved)
-        return (1 - part) * table[below] + part * table[below + 1]
+        level_positions = np.asarray(jax.scipy.stats.norm.cdf(fluctuation)) * (_NUM_LEVELS - 1)
+        lower_levels = np.minimum(level_positions.astype(int), _NUM_LEVELS - 2)
+        upper_weights = (level_positions - lower_levels)[:, None]
+        table = np.array(level_voltages)
+        return (1 - upper_weights) * table[lower_levels] + upper_weights * table[lower_levels + 1]
 
 
 def check_fault(name: str, value) -> None:
@@ -161,8 +174,8 @@ class DamageEvent(Module):
         if self.skin is not None:
             check_kind("skin", self.skin, PressedSkin, "a PressedSkin, that with the damage")
         check_kind("faults", self.faults, tuple, "a tuple of them")
-        for number, fault in enumerate(self.faults):
-            check_fault(f"faults[{number}]", fault)
+        for fault_index, fault in enumerate(self.faults):
+            check_fault(f"faults[{fault_index}]", fault)
 
 
 def record_damage(
@@ -197,28 +210,32 @@ def record_damage(
     check_key(key)
     check_kind("skin", skin, PressedSkin, "a PressedSkin")
     check_kind("events", events, (list, tuple), "a list of them, [] for none")
-    for number, one in enumerate(events):
-        check_kind(f"events[{number}]", one, DamageEvent, "a DamageEvent(time, skin)")
-        if one.skin is not None and one.skin.gain.shape != skin.gain.shape:
-            raise ValueError(f"events[{number}] has a skin of {one.skin.gain.size} channels, not of {skin.gain.size}.")
+    for event_index, event in enumerate(events):
+        check_kind(f"events[{event_index}]", event, DamageEvent, "a DamageEvent(time, skin)")
+        if event.skin is not None and event.skin.gain.shape != skin.gain.shape:
+            raise ValueError(
+                f"events[{event_index}] has a skin of {event.skin.gain.size} channels, not of {skin.gain.size}."
+            )
     seconds = np.asarray(seconds, float)
-    ends = [*(one.time for one in events), np.inf]
+    ends = [*(event.time for event in events), np.inf]
     if list(ends) != sorted(ends):
         raise ValueError("events must be in order of their times.")
     stages = [DamageEvent(0.0, skin), *events]
-    found, now = np.zeros((len(seconds), skin.gain.size)), skin
-    for number, (stage, end) in enumerate(zip(stages, ends, strict=True)):
-        now = now if stage.skin is None else stage.skin
-        there = (seconds >= stage.time if number else seconds >= 0) & (seconds < end)
-        if not there.any():
+    voltages, current_skin = np.zeros((len(seconds), skin.gain.size)), skin
+    for event_index, (stage, end) in enumerate(zip(stages, ends, strict=True)):
+        current_skin = current_skin if stage.skin is None else stage.skin
+        is_stage_frame = (seconds >= stage.time if event_index else seconds >= 0) & (seconds < end)
+        if not is_stage_frame.any():
             continue
-        exact = exact_record(now, motions, seconds, there)
-        for fault_key, fault in enumerate(stage.faults):
-            own = jax.random.fold_in(jax.random.fold_in(key, number), fault_key)
-            exact[there] += fault.changes(own, now.model, now.conductivity, seconds[there])
+        exact_voltages = exact_record(current_skin, motions, seconds, is_stage_frame)
+        for fault_index, fault in enumerate(stage.faults):
+            stage_fault_key = jax.random.fold_in(jax.random.fold_in(key, event_index), fault_index)
+            exact_voltages[is_stage_frame] += fault.changes(
+                stage_fault_key, current_skin.model, current_skin.conductivity, seconds[is_stage_frame]
+            )
         # The same key for all stages, so that drift and noise continue through the recording.
-        found[there] = now.read(key, exact, seconds)[there]
-    return found
+        voltages[is_stage_frame] = current_skin.read(key, exact_voltages, seconds)[is_stage_frame]
+    return voltages
 
 
 def exact_record(
@@ -233,10 +250,10 @@ def exact_record(
     if not np.any([np.any(motion.load) for motion in ([motions] if isinstance(motions, MovingPress) else motions)]):
         return voltages
     touched = skin.touched_in_time(motions, seconds)
-    cells, change = np.asarray(touched.cells), np.asarray(touched.change)
-    rest = np.array(np.broadcast_to(skin.conductivity, skin.model.mesh.num_cells))
-    for row in np.flatnonzero(selected_frames & (change != 0).any(axis=1)):
-        conductivity = rest.copy()
-        np.multiply.at(conductivity, cells[row], 1 + change[row])
-        voltages[row] = np.asarray(skin.model.voltages(conductivity))
+    cells, changes = np.asarray(touched.cells), np.asarray(touched.change)
+    rest_conductivity = np.array(np.broadcast_to(skin.conductivity, skin.model.mesh.num_cells))
+    for frame in np.flatnonzero(selected_frames & (changes != 0).any(axis=1)):
+        conductivity = rest_conductivity.copy()
+        np.multiply.at(conductivity, cells[frame], 1 + changes[frame])
+        voltages[frame] = np.asarray(skin.model.voltages(conductivity))
     return voltages

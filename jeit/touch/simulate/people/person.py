@@ -34,7 +34,7 @@ _DURATION = {"short": (0.15, 0.3), "med-long": (1.2, 0.4)}
 # Standard deviation of the logarithm of speed and path among people.
 _PATH_SPREAD = 0.35
 # Standard deviation of the logarithm of each parameter among touches of one person.
-_WITHIN = 0.25
+_TOUCH_SPREAD = 0.25
 
 
 @dataclass(frozen=True)
@@ -54,17 +54,17 @@ class Manner:
     @property
     def medians(self) -> Float[np.ndarray, " 5"]:
         """Medians of `TRAITS` among people, in SI units; speed and path are 0 for gestures that do not move."""
-        return np.array([*(one[0] for one in self._word_parameters), self.speed, self.path])
+        return np.array([*(parameters[0] for parameters in self._word_parameters), self.speed, self.path])
 
     @property
     def spread(self) -> Float[np.ndarray, " 5"]:
         """Standard deviations of the logarithms of `TRAITS` among people."""
-        return np.array([*(one[1] for one in self._word_parameters), _PATH_SPREAD, _PATH_SPREAD])
+        return np.array([*(parameters[1] for parameters in self._word_parameters), _PATH_SPREAD, _PATH_SPREAD])
 
     @property
-    def within(self) -> float:
+    def touch_spread(self) -> float:
         """Standard deviation of the logarithms of `TRAITS` among touches of one person."""
-        return _WITHIN
+        return _TOUCH_SPREAD
 
     @property
     def moves(self) -> bool:
@@ -90,17 +90,18 @@ GESTURES = tuple(MANNERS)
 """Names of the gestures."""
 
 
-# Time recorded before a touch and minimum time after it, in seconds; the number of frames is a multiple of `_EVEN`.
-_BEFORE, _AFTER, _EVEN = 0.1, 0.5, 16
+# Time recorded before a touch and minimum time after it, in seconds; the number of frames is a multiple of
+# `_FRAME_MULTIPLE`.
+_TIME_BEFORE, _TIME_AFTER, _FRAME_MULTIPLE = 0.1, 0.5, 16
 # Maximum mean pressure of a hand, Pa; minimum distance of its path from the edge of the skin, m; maximum path of a hand
 # that does not move along the skin but rolls, m; share of a long touch in which the load rises, and in which it falls;
 # relative amplitude of fluctuations of the load.
-_MOST_PRESSURE, _MARGIN, _ROLL, _RAMP, _WOBBLE = 120e3, 15e-3, 2e-3, 0.15, 0.08
+_MAX_PRESSURE, _EDGE_MARGIN, _MAX_ROLL, _RAMP_FRACTION, _FLUCTUATION_AMPLITUDE = 120e3, 15e-3, 2e-3, 0.15, 0.08
 # Number of fingertips of a scratch, their distance divided by their radius, and relative reduction of the load at the
 # turning points.
-_TIPS, _APART, _LIGHTER = 3, 2.6, 0.4
+_NUM_FINGERTIPS, _FINGERTIP_SPACING, _LOAD_REDUCTION = 3, 2.6, 0.4
 # Number of random places tried for a path on the skin, and factor by which the path is then shortened.
-_TRIES, _SHORTER = 20, 0.8
+_MAX_TRIES, _SHORTENING_FACTOR = 20, 0.8
 
 
 def gesture_motion(
@@ -113,57 +114,59 @@ def gesture_motion(
     """
     force, radius, duration, speed, path = traits
     manner = MANNERS[gesture]
-    force = min(force, _MOST_PRESSURE * np.pi * radius**2)
-    frames = int(np.ceil((_BEFORE + duration + _AFTER) * rate))
-    seconds = np.arange(_EVEN * -(-frames // _EVEN)) / rate
+    force = min(force, _MAX_PRESSURE * np.pi * radius**2)
+    num_frames = int(np.ceil((_TIME_BEFORE + duration + _TIME_AFTER) * rate))
+    seconds = np.arange(_FRAME_MULTIPLE * -(-num_frames // _FRAME_MULTIPLE)) / rate
     # Touches begin at a random time between two frames.
-    share = (seconds - _BEFORE - rng.uniform(0, 1) / rate) / duration
-    within = (share > 0) & (share < 1)
-    share = np.clip(share, 0, 1)
-    sweeps = max(1, round(speed * duration / path)) if manner.moves else 1
-    load = force * np.where(within, _relative_loads(rng, share, gesture, sweeps), 0.0)
-    length = path if manner.moves else _ROLL * rng.uniform(0, 1)
-    middle, angle, length = _random_path(rng, outline, length)
-    along = (1 - np.abs((sweeps * share) % 2 - 1) - 0.5) * length
-    place = middle + along[:, None] * np.array([np.cos(angle), np.sin(angle)])
+    progress = (seconds - _TIME_BEFORE - rng.uniform(0, 1) / rate) / duration
+    is_touching = (progress > 0) & (progress < 1)
+    progress = np.clip(progress, 0, 1)
+    num_sweeps = max(1, round(speed * duration / path)) if manner.moves else 1
+    loads = force * np.where(is_touching, _relative_loads(rng, progress, gesture, num_sweeps), 0.0)
+    length = path if manner.moves else _MAX_ROLL * rng.uniform(0, 1)
+    path_centre, angle, length = _random_path(rng, outline, length)
+    path_offsets = (1 - np.abs((num_sweeps * progress) % 2 - 1) - 0.5) * length
+    positions = path_centre + path_offsets[:, None] * np.array([np.cos(angle), np.sin(angle)])
     indenter: DiscIndenter | JoinedIndenters = DiscIndenter(2 * radius)
     if gesture == "scratch":
-        tip = radius / np.sqrt(_TIPS)
-        offsets = _APART * tip * (np.arange(_TIPS) - (_TIPS - 1) / 2)
-        indenter = JoinedIndenters(*(PlacedIndenter(DiscIndenter(2 * tip), (0.0, offset)) for offset in offsets))
+        fingertip_radius = radius / np.sqrt(_NUM_FINGERTIPS)
+        offsets = _FINGERTIP_SPACING * fingertip_radius * (np.arange(_NUM_FINGERTIPS) - (_NUM_FINGERTIPS - 1) / 2)
+        indenter = JoinedIndenters(
+            *(PlacedIndenter(DiscIndenter(2 * fingertip_radius), (0.0, offset)) for offset in offsets)
+        )
     # The hand may extend over the edge of the skin, but its path lies on the skin.
-    return MovingPress(indenter, load, place, angle), seconds
+    return MovingPress(indenter, loads, positions, angle), seconds
 
 
-def _relative_loads(rng: np.random.Generator, share: np.ndarray, gesture: str, sweeps: int) -> np.ndarray:
-    """Load relative to its nominal value, at times given as shares of the duration."""
+def _relative_loads(rng: np.random.Generator, progress: np.ndarray, gesture: str, num_sweeps: int) -> np.ndarray:
+    """Loads (T,) relative to the nominal value, at times `progress` (T,) as fractions of the duration."""
     if MANNERS[gesture].duration == "short":
-        return np.sin(np.pi * share)
-    ramp = np.clip(np.minimum(share, 1 - share) / _RAMP, 0, 1)
-    load = np.sin(np.pi / 2 * ramp) ** 2
+        return np.sin(np.pi * progress)
+    ramp_factors = np.clip(np.minimum(progress, 1 - progress) / _RAMP_FRACTION, 0, 1)
+    loads = np.sin(np.pi / 2 * ramp_factors) ** 2
     cycles, phase = rng.uniform(0.5, 4, 3), rng.uniform(0, 2 * np.pi, 3)
-    load = load * (1 + _WOBBLE * np.sin(2 * np.pi * share[:, None] * cycles + phase).sum(axis=1))
+    loads = loads * (1 + _FLUCTUATION_AMPLITUDE * np.sin(2 * np.pi * progress[:, None] * cycles + phase).sum(axis=1))
     if gesture == "scratch":
-        load = load * (1 - _LIGHTER + _LIGHTER * np.abs(np.sin(np.pi * sweeps * share)))
-    return load
+        loads = loads * (1 - _LOAD_REDUCTION + _LOAD_REDUCTION * np.abs(np.sin(np.pi * num_sweeps * progress)))
+    return loads
 
 
 def _random_path(rng: np.random.Generator, outline: Domain, length: float) -> tuple[np.ndarray, float, float]:
-    """Draw the middle, angle and length of a straight path on the skin; the length is reduced if no place is found."""
+    """Draw the centre, angle and length of a straight path on the skin; the length is reduced if no place is found."""
     low_x, high_x, low_y, high_y = map(float, outline.extent)
     while True:
-        for _ in range(_TRIES):
-            middle = rng.uniform((low_x, low_y), (high_x, high_y))
+        for _ in range(_MAX_TRIES):
+            centre = rng.uniform((low_x, low_y), (high_x, high_y))
             angle = rng.uniform(0, 2 * np.pi)
-            half = length / 2 * np.array([np.cos(angle), np.sin(angle)])
-            ends = np.stack([middle - half, middle, middle + half])
-            if (np.asarray(outline.signed_distance(ends)) >= _MARGIN).all():
-                return middle, float(angle), length
-        length *= _SHORTER
+            half_vector = length / 2 * np.array([np.cos(angle), np.sin(angle)])
+            path_points = np.stack([centre - half_vector, centre, centre + half_vector])
+            if (np.asarray(outline.signed_distance(path_points)) >= _EDGE_MARGIN).all():
+                return centre, float(angle), length
+        length *= _SHORTENING_FACTOR
 
 
 # Minimum width and height of a skin for a hand, in metres.
-_LEAST_SIDE = 0.06
+_MIN_SKIN_SIDE = 0.06
 
 
 class Person(Module):
@@ -195,10 +198,10 @@ class Person(Module):
         """Draw a random person, whose medians are log-normally distributed about those of each gesture. Raises
         `ValueError` for an invalid key."""
         check_key(key)
-        normal = np.asarray(jax.random.normal(key, (len(GESTURES), len(TRAITS))))
+        normal_draws = np.asarray(jax.random.normal(key, (len(GESTURES), len(TRAITS))))
         manners = MANNERS.values()
-        medians, spread = (np.stack([getattr(one, name) for one in manners]) for name in ("medians", "spread"))
-        return cls(medians * np.exp(spread * normal))
+        medians, spreads = (np.stack([getattr(manner, name) for manner in manners]) for name in ("medians", "spread"))
+        return cls(medians * np.exp(spreads * normal_draws))
 
     def touch(
         self, key: Array, gesture: str, outline: Domain, *, rate: float = 60.0
@@ -215,9 +218,9 @@ class Person(Module):
         if not (is_number(rate) and rate > 0):
             raise ValueError(f"rate must be frames per second, positive; it is {describe(rate)}.")
         low_x, high_x, low_y, high_y = map(float, outline.extent)
-        if min(high_x - low_x, high_y - low_y) < _LEAST_SIDE:
-            raise ValueError(f"outline must be {1e3 * _LEAST_SIDE:g} mm wide and high at least, for a hand.")
+        if min(high_x - low_x, high_y - low_y) < _MIN_SKIN_SIDE:
+            raise ValueError(f"outline must be {1e3 * _MIN_SKIN_SIDE:g} mm wide and high at least, for a hand.")
         rng = np.random.default_rng(np.asarray(jax.random.bits(key, (4,))).tolist())
-        own = MANNERS[gesture].within * rng.normal(size=len(TRAITS))
-        traits = self.medians[GESTURES.index(gesture)] * np.exp(own)
+        log_deviations = MANNERS[gesture].touch_spread * rng.normal(size=len(TRAITS))
+        traits = self.medians[GESTURES.index(gesture)] * np.exp(log_deviations)
         return gesture_motion(rng, gesture, traits, outline, float(rate))

@@ -18,9 +18,9 @@ from jeit.touch.simulate.people.person import GESTURES, Person
 
 # Maximum time since the reference, during which the skin drifts, in seconds; number of frames of the reference; number
 # of recordings of the untouched skin, each with its own drift; and number of frames of each.
-_LATEST, _REFERENCE, _DRIFTS, _FRAMES = 60.0, 60, 40, 16
+_MAX_DRIFT_TIME, _NUM_REFERENCE_FRAMES, _NUM_UNTOUCHED_RECORDINGS, _NUM_UNTOUCHED_FRAMES = 60.0, 60, 40, 16
 # Number of recordings simulated at once.
-_AT_ONCE = 120
+_RECORDINGS_AT_ONCE = 120
 
 
 def simulate_gestures(
@@ -61,36 +61,46 @@ def simulate_gestures(
     check_key(key)
     check_kind("skin", skin, PressedSkin, "a PressedSkin")
     check_kind("people", people, (list, tuple), "a list of them, such as [Person.draw(key)]")
-    for number, person in enumerate(people):
-        check_kind(f"people[{number}]", person, Person, "a Person, such as of Person.draw(key)")
+    for index, person in enumerate(people):
+        check_kind(f"people[{index}]", person, Person, "a Person, such as of Person.draw(key)")
     if not people:
         raise ValueError("people: give one at least, such as [Person.draw(key)].")
     check_kind("gestures", gestures, (list, tuple), "a list of names, such as ['tap', 'slap']")
-    for number, gesture in enumerate(gestures):
-        check_name(f"gestures[{number}]", gesture, GESTURES)
+    for index, gesture in enumerate(gestures):
+        check_name(f"gestures[{index}]", gesture, GESTURES)
     if not (isinstance(each, int) and each >= 1):
         raise ValueError(f"each must be a number of touches, 1 or more; it is {describe(each)}.")
-    before, quiet, touched, late = jax.random.split(key, 4)
-    reference = skin.record(before, [], np.arange(_REFERENCE) / rate).mean(axis=0)
-    later = np.random.default_rng(np.asarray(jax.random.bits(late, (4,))).tolist())
-    still = [([], np.arange(_FRAMES) / rate + later.uniform(0, _LATEST)) for _ in range(_DRIFTS)]
-    untouched = skin.record_each(quiet, still)
-    rows = [(person, gesture) for person in range(len(people)) for gesture in gestures for _ in range(each)]
+    reference_key, untouched_key, touch_key, time_key = jax.random.split(key, 4)
+    reference = skin.record(reference_key, [], np.arange(_NUM_REFERENCE_FRAMES) / rate).mean(axis=0)
+    generator = np.random.default_rng(np.asarray(jax.random.bits(time_key, (4,))).tolist())
+    untouched_motions = [
+        ([], np.arange(_NUM_UNTOUCHED_FRAMES) / rate + generator.uniform(0, _MAX_DRIFT_TIME))
+        for _ in range(_NUM_UNTOUCHED_RECORDINGS)
+    ]
+    untouched = skin.record_each(untouched_key, untouched_motions)
+    person_gesture_pairs = [
+        (person, gesture) for person in range(len(people)) for gesture in gestures for _ in range(each)
+    ]
     seconds, voltages = [], []
-    for first in range(0, len(rows), _AT_ONCE):
-        made, keys = [], jax.random.split(jax.random.fold_in(touched, first), _AT_ONCE + 1)
-        for one, (person, gesture) in zip(keys[1:], rows[first : first + _AT_ONCE], strict=False):
-            motion, times = people[person].touch(one, gesture, outline, rate=rate)
-            made.append((motion, times + later.uniform(0, _LATEST)))
+    for first_row in range(0, len(person_gesture_pairs), _RECORDINGS_AT_ONCE):
+        motions_and_times, row_keys = (
+            [],
+            jax.random.split(jax.random.fold_in(touch_key, first_row), _RECORDINGS_AT_ONCE + 1),
+        )
+        for row_key, (person, gesture) in zip(
+            row_keys[1:], person_gesture_pairs[first_row : first_row + _RECORDINGS_AT_ONCE], strict=False
+        ):
+            motion, times = people[person].touch(row_key, gesture, outline, rate=rate)
+            motions_and_times.append((motion, times + generator.uniform(0, _MAX_DRIFT_TIME)))
             seconds.append(times)
-        found = skin.record_each(keys[0], made)
-        voltages += [one.astype(np.float32) for one in found]
+        recordings = skin.record_each(row_keys[0], motions_and_times)
+        voltages += [recording.astype(np.float32) for recording in recordings]
         if progress is not None:
-            progress(f"gestures: {len(voltages)} of {len(rows)}")
+            progress(f"gestures: {len(voltages)} of {len(person_gesture_pairs)}")
     return GestureSet(
-        gesture=np.array([gesture for _, gesture in rows]),
-        person=np.array([person for person, _ in rows]),
-        start=np.concatenate([[0], np.cumsum([len(one) for one in seconds])]),
+        gesture=np.array([gesture for _, gesture in person_gesture_pairs]),
+        person=np.array([person for person, _ in person_gesture_pairs]),
+        start=np.concatenate([[0], np.cumsum([len(times) for times in seconds])]),
         seconds=np.concatenate(seconds),
         voltages=np.concatenate(voltages),
         reference=reference,
@@ -99,7 +109,7 @@ def simulate_gestures(
 
 
 # Time before the first gesture, in seconds.
-_FIRST = 2.0
+_TIME_BEFORE_FIRST = 2.0
 
 
 @dataclass(frozen=True)
@@ -163,24 +173,26 @@ def simulate_gesture_stream(
         raise ValueError(f"number must be a number of gestures, 1 or more; it is {describe(number)}.")
     if not (is_number(pause) and pause >= 0):
         raise ValueError(f"pause must be seconds, zero or more; it is {describe(pause)}.")
-    for_draws, for_touches, for_frames = jax.random.split(key, 3)
-    rng = np.random.default_rng(np.asarray(jax.random.bits(for_draws, (4,))).tolist())
-    gesture, person = rng.choice(GESTURES, number), rng.integers(len(people), size=number)
-    made, first, begin = [], int(_FIRST * rate), []
-    for own, one, who in zip(jax.random.split(for_touches, number), gesture, person, strict=True):
-        motion, times = people[who].touch(own, str(one), outline, rate=rate)
-        made.append(motion)
-        begin.append(first)
-        first += len(times) + int(rng.uniform(1, 2) * pause * rate)
-    seconds = np.arange(first) / rate
+    draw_key, touch_key, frame_key = jax.random.split(key, 3)
+    rng = np.random.default_rng(np.asarray(jax.random.bits(draw_key, (4,))).tolist())
+    gestures, person_indices = rng.choice(GESTURES, number), rng.integers(len(people), size=number)
+    touch_motions, next_frame, first_frames = [], int(_TIME_BEFORE_FIRST * rate), []
+    for motion_key, gesture, person_index in zip(
+        jax.random.split(touch_key, number), gestures, person_indices, strict=True
+    ):
+        motion, times = people[person_index].touch(motion_key, str(gesture), outline, rate=rate)
+        touch_motions.append(motion)
+        first_frames.append(next_frame)
+        next_frame += len(times) + int(rng.uniform(1, 2) * pause * rate)
+    seconds = np.arange(next_frame) / rate
     motions, onset, offset = [], [], []
-    for motion, start in zip(made, begin, strict=True):
-        load, place, angle = np.zeros(first), np.zeros((first, 2)), np.zeros(first)
-        own = slice(start, start + len(motion.load))
-        load[own], place[own], angle[own] = motion.load, motion.position, motion.angle
-        motions.append(MovingPress(motion.indenter, load, place, angle))
-        pressed = np.flatnonzero(load)
-        onset.append(seconds[pressed[0]] if pressed.size else seconds[start])
-        offset.append(seconds[pressed[-1]] if pressed.size else seconds[start])
-    voltages = skin.record(for_frames, motions, seconds)
-    return GestureStream(seconds, voltages, gesture, person, np.array(onset), np.array(offset))
+    for motion, first_frame in zip(touch_motions, first_frames, strict=True):
+        loads, positions, angles = np.zeros(next_frame), np.zeros((next_frame, 2)), np.zeros(next_frame)
+        touch_frames = slice(first_frame, first_frame + len(motion.load))
+        loads[touch_frames], positions[touch_frames], angles[touch_frames] = motion.load, motion.position, motion.angle
+        motions.append(MovingPress(motion.indenter, loads, positions, angles))
+        pressed_frames = np.flatnonzero(loads)
+        onset.append(seconds[pressed_frames[0]] if pressed_frames.size else seconds[first_frame])
+        offset.append(seconds[pressed_frames[-1]] if pressed_frames.size else seconds[first_frame])
+    voltages = skin.record(frame_key, motions, seconds)
+    return GestureStream(seconds, voltages, gestures, person_indices, np.array(onset), np.array(offset))
