@@ -104,12 +104,16 @@ Interval = tuple[float | None, float | None]
 
 
 def interval_text(interval: Interval, format_end: Callable[[float], str]) -> str:
-    """An interval as text, whose ends `format_end` formats. Where one end is open, "at least" or "at most" the known
-    end, or "beyond" it if it is a decrease, of which "at most -90 %" might mean a smaller one."""
-    low, high = interval
-    if low is None:
-        return "not determined" if high is None else f"{'beyond' if high < 0 else 'at most'} {format_end(high)}"
-    return f"at least {format_end(low)}" if high is None else f"{format_end(low)} to {format_end(high)}"
+    """Text of an interval, whose ends `format_end` formats. If one end is open, "at least" or "at most" the known end,
+    or "beyond" it if it is a decrease, because "at most -90 %" might mean a smaller one."""
+    lower_end, upper_end = interval
+    if lower_end is None:
+        if upper_end is None:
+            return "not determined"
+        return f"{'beyond' if upper_end < 0 else 'at most'} {format_end(upper_end)}"
+    if upper_end is None:
+        return f"at least {format_end(lower_end)}"
+    return f"{format_end(lower_end)} to {format_end(upper_end)}"
 
 
 # Maximum reading of any instrument, in volts or fractions of volts; squares of such numbers do not overflow.
@@ -186,17 +190,17 @@ def listed(names: Iterable[Any], max_names: int = 8) -> str:
     return (", ".join(shown_texts) or "nothing") + remainder
 
 
-def check_has_values(name: str, tree: Any, use: str, instead: str) -> None:
+def check_has_values(name: str, tree: Any, purpose: str, instead: str) -> None:
     """Raise `ValueError` with the argument's `name` for a pytree that contains values traced by `jax.jit`, `jax.vmap`
-    or a derivative; `use` says what the values are needed for, `instead` what to give or do."""
+    or a derivative; `purpose` describes what the values are needed for, `instead` what to give or do."""
     if not has_values(tree):
         raise ValueError(
-            f"{name} is traced, inside jax.jit, jax.vmap or a derivative, and {use} its values: {instead}."
+            f"{name} is traced, inside jax.jit, jax.vmap or a derivative, and {purpose} its values: {instead}."
         )
 
 
 def brief(describe_object: Callable[[], str], instance: Any) -> str:
-    """The text of an object from `describe_object`, or its class alone where it cannot be described: JAX
+    """Return the text of an object from `describe_object`, or only its class if it cannot be described: JAX
     temporarily replaces arrays by other objects."""
     try:
         return describe_object()

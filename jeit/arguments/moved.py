@@ -107,10 +107,10 @@ def with_moved_names(page: str, find: Callable[[str], Any] | None = None) -> Cal
 
     Modules of the package that have moved as a whole can still be imported.
     """
-    for below in _MOVED_PAGES:
-        if below.rpartition(".")[0] == page:
-            sys.modules[below] = module = ModuleType(below)
-            vars(module)["__getattr__"] = with_moved_names(below)
+    for old_module in _MOVED_PAGES:
+        if old_module.rpartition(".")[0] == page:
+            sys.modules[old_module] = module = ModuleType(old_module)
+            vars(module)["__getattr__"] = with_moved_names(old_module)
 
     def find_or_forward(name: str) -> Any:
         old = f"{page}.{name}"

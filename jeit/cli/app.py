@@ -170,14 +170,14 @@ def _one_line(message: str) -> str:
 
 def _create_warning_printer() -> Callable[..., None]:
     """Create a function that prints each warning only once, since the same objects are often created repeatedly."""
-    printed: set[str] = set()
+    printed_texts: set[str] = set()
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:
         text = str(message)
         if issubclass(category, _DEVELOPER_WARNINGS) and not os.environ.get("JEIT_DEBUG"):
             return
-        if text not in printed and not discarded_damaged(text):
-            printed.add(text)
+        if text not in printed_texts and not discarded_damaged(text):
+            printed_texts.add(text)
             print(f"jeit: warning: {_one_line(text)}", file=sys.stderr)
 
     return show

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 
 # Maximum width of a table, in characters.
 _MAX_TABLE_WIDTH = 80
-# Seconds from which a step shows how long it has taken.
+# Minimum duration of a step, in seconds, for which the elapsed time is shown.
 _MIN_SHOWN_SECONDS = 2.0
-# Parts done of a step, and their share from which the time left is estimated. "12 of at most 60" states none.
+# Number of completed parts of a step in its progress text, and minimum completed share for an estimate of the remaining
+# time. Texts such as "12 of at most 60" do not match.
 _PROGRESS, _MIN_SHARE = re.compile(r"(\d[\d,]*) of (\d[\d,]*)"), 0.05
 _PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
@@ -62,8 +63,8 @@ class Steps:
         return self._step
 
     def report(self, detail: str) -> None:
-        """Show the progress within the current step beside its spinner; of a `detail` such as "frame 12 of 100" the
-        time that is left, too."""
+        """Show the progress within the current step beside its spinner; for a `detail` such as "frame 12 of 100", also
+        the remaining time."""
         if self._status is not None:
             match = _PROGRESS.search(detail)
             num_done, num_parts = (int(digits.replace(",", "")) for digits in match.groups()) if match else (0, 0)
@@ -89,8 +90,8 @@ class Steps:
 
 @dataclass(frozen=True)
 class _StepLine:
-    """Line beside the spinner: a step, and the seconds since its `start`, once it takes some; and those that are left
-    at the same pace, where `num_done` of its `num_parts` parts are known to be done."""
+    """Line beside the spinner: the step, the seconds since its `start` after the first seconds, and, if `num_done` of
+    its `num_parts` parts are done, an estimate of the remaining time."""
 
     step: str
     start: float
@@ -126,7 +127,7 @@ def pairs(title: str, rows: list[tuple[str, str]]) -> Table:
 
 
 def say_written(console: Console, first: Path, *others: str) -> None:
-    """Print the names of the files written: the `first` with its folder, the others by name alone."""
+    """Print the names of the written files: the `first` with its folder, the others without it."""
     console.print(Text("Written:", "dim"), ", ".join([str(first), *others]), soft_wrap=True)
 
 
@@ -159,8 +160,8 @@ def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, *, background:
     share_columns = ["of back-\nground"] if background else []
     rows = []
     for inclusion, peak in zip(inclusions, peaks, strict=True):
-        share = [percent(inclusion.peak / background)] if background else []
-        rows.append([f"{1e6 * inclusion.area:.{digits}f}", peak, *share])
+        share_cells = [percent(inclusion.peak / background)] if background else []
+        rows.append([f"{1e6 * inclusion.area:.{digits}f}", peak, *share_cells])
     return _inclusion_table_with(inclusions, [f"{noun}\n/ {size_unit}", f"peak change\n/ {unit}", *share_columns], rows)
 
 
@@ -174,8 +175,10 @@ def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Tabl
     rows = []
     for inclusion in inclusions:
         size = with_interval(inclusion.area, inclusion.area_interval, lambda value: _three_digits(1e6 * value))
-        share = inclusion.peak / background
-        change = with_interval(share, inclusion.contrast_interval, lambda value: _three_digits(100 * value, "+"))
+        relative_change = inclusion.peak / background
+        change = with_interval(
+            relative_change, inclusion.contrast_interval, lambda value: _three_digits(100 * value, "+")
+        )
         strength = with_interval(
             inclusion.strength, inclusion.strength_interval, lambda value: _three_digits(1e6 * value)
         )

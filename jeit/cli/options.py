@@ -159,13 +159,13 @@ def read_pair(
 def reference_of_frames(measurement: "Measurement", frames: str) -> "Measurement":
     """Return the `frames` of a measurement that --reference-frames names, such as "0-17" or "5"."""
     match = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", frames.strip())
-    first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
-    if not first <= last < measurement.num_frames:
+    first_frame, last_frame = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
+    if not first_frame <= last_frame < measurement.num_frames:
         raise ValueError(
             f"--reference-frames: give FIRST-LAST, such as 0-17, or one number, of the frames 0 to "
             f"{measurement.num_frames - 1} of '{measurement.name}'; it is {frames!r}."
         )
-    return measurement.frames(slice(first, last + 1))
+    return measurement.frames(slice(first_frame, last_frame + 1))
 
 
 def in_options(message: str, options: dict[str, str]) -> str:

@@ -94,19 +94,23 @@ class Stopping:
 
     def __enter__(self) -> "Stopping":
         if threading.current_thread() is threading.main_thread():
-            handled_signals = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
-            self._earlier_handlers = {number: signal.signal(number, self._stop) for number in handled_signals}
+            handled_signals = [
+                signal_number for signal_number in _SIGNALS if signal.getsignal(signal_number) is not signal.SIG_IGN
+            ]
+            self._earlier_handlers = {
+                signal_number: signal.signal(signal_number, self._stop) for signal_number in handled_signals
+            }
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_) -> None:
-        for number, handler in self._earlier_handlers.items():
-            signal.signal(number, handler)
+        for signal_number, handler in self._earlier_handlers.items():
+            signal.signal(signal_number, handler)
         if kind is KeyboardInterrupt and self.signal is not None:
             self._end("")
 
-    def _stop(self, number: int, _) -> None:
+    def _stop(self, signal_number: int, _) -> None:
         at_once = self.signal is not None or self._waiting or not self._streaming
-        self.signal, self._waiting = number, False
+        self.signal, self._waiting = signal_number, False
         if at_once:
             raise KeyboardInterrupt
 
@@ -115,8 +119,8 @@ class FrameCounter:
     """Counter of frames that reports the number received a few times per second. `number`: total number of frames, if
     known."""
 
-    def __init__(self, step: Steps, number: int | None = None):
-        self._step, self._total_text = step, "" if number is None else f" of {number:,}"
+    def __init__(self, step: Steps, num_frames: int | None = None):
+        self._step, self._total_text = step, "" if num_frames is None else f" of {num_frames:,}"
         self.number, self._last_report = 0, 0.0
 
     def one_more(self) -> None:

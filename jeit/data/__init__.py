@@ -1,6 +1,6 @@
 """Measured data: readers for files, checks of the measurements, and export.
 
-`read(path)` returns a `Measurement`, which holds voltages, mask, protocol, electrodes and body. `check_imageable`
+`read(path)` returns a `Measurement`, which contains voltages, mask, protocol, electrodes and body. `check_imageable`
 checks whether a frame can be imaged against a reference.
 """
 

@@ -254,15 +254,15 @@ def _positions(table: PlacedTable, body: Body | None, origin: str) -> np.ndarray
     )
 
 
-def _edge_positions(table: PlacedTable, outline: Domain, number: int) -> np.ndarray:
+def _edge_positions(table: PlacedTable, outline: Domain, num_electrodes: int) -> np.ndarray:
     """Positions (L, 2) along the edge of an outline."""
     if table.layout == "perimeter":
-        return perimeter(outline, number, start=table.start)
+        return perimeter(outline, num_electrodes, start=table.start)
     if not isinstance(outline, Disk):
         raise ValueError('layout = "ring" needs a disk or a cylinder; use "perimeter" for other shapes.')
     return ring(
         outline.radius,
-        number,
+        num_electrodes,
         start_angle=np.radians(table.start_angle_degrees),
         clockwise=table.clockwise,
         centre=outline.centre,

@@ -151,8 +151,8 @@ def _current_amplitude(table: DrivenTable, path: Path) -> float:
 
 
 def number_in_name(pattern: str, name: str) -> float | None:
-    """The first number, such as 30 or 0.5, in a file `name` at the place where the `pattern` has {current}; * in the
-    pattern matches any text. None if the name does not match."""
+    """Return the first number, such as 30 or 0.5, in the file `name` at the position of {current} in the `pattern`; *
+    in the pattern matches any text. None if the name does not match."""
     prefix, _, suffix = pattern.partition("{current}")
     start = 0
     while start < len(name):
@@ -176,7 +176,7 @@ def _number_end(text: str, start: int) -> int:
 
 
 def _matches(pattern: str, text: str) -> bool:
-    """Whether a text matches a pattern in which * stands for any text. Each part is matched at its earliest place, so
+    """Whether a text matches a pattern in which * stands for any text. Each part is matched at its first occurrence, so
     no part is searched for twice."""
     first_part, *later_parts = pattern.split("*")
     if not later_parts:

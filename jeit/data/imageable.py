@@ -103,8 +103,8 @@ def check_same_setup(measurement: Measurement, reference: Measurement) -> None:
         )
     if not ours.same_patterns(theirs):
         ratio = float(np.linalg.norm(ours.channel_drive) / np.linalg.norm(theirs.channel_drive))
-        scaled = ratio * np.asarray(theirs.channel_drive)
-        if np.allclose(ours.channel_drive, scaled, rtol=1e-6, atol=1e-12) and np.allclose(
+        scaled_drive = ratio * np.asarray(theirs.channel_drive)
+        if np.allclose(ours.channel_drive, scaled_drive, rtol=1e-6, atol=1e-12) and np.allclose(
             ours.channel_measurement, theirs.channel_measurement, rtol=1e-6
         ):
             raise ValueError(
@@ -127,11 +127,11 @@ def check_same_setup(measurement: Measurement, reference: Measurement) -> None:
                 f"{prefix}'{each_measurement.name}' has no usable voltage: each is NaN, infinite, or masked for what "
                 "its notes say. Give another frame."
             )
-    common = np.asarray(measurement.mask).any(axis=0) & np.asarray(reference.mask).any(axis=0)
-    if not common.any():
+    common_channels = np.asarray(measurement.mask).any(axis=0) & np.asarray(reference.mask).any(axis=0)
+    if not common_channels.any():
         raise ValueError(f"'{measurement.name}' and the reference '{reference.name}' have no usable channel in common.")
     sizes = [
-        np.median(np.abs(np.asarray(compared.mean_frame().voltages)[0, common]))
+        np.median(np.abs(np.asarray(compared.mean_frame().voltages)[0, common_channels]))
         for compared in (measurement, reference)
     ]
     ratio = sizes[0] / sizes[1] if sizes[1] > 0 else np.inf
@@ -227,7 +227,7 @@ def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool 
 
     - `measurement`: the frames.
     - `reference`: frames of the undisturbed body, from the same set-up.
-    - `fill`: replace spikes by what the other channels determine, and mask only those that they do not.
+    - `fill`: replace spikes by the values that the other channels determine, and mask only the remaining ones.
 
     **Example:**
 
@@ -241,11 +241,11 @@ def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool 
         relative_noise(as_array(np.abs(np.where(known_channels, base_voltages, 0))), as_array(known_channels))
     )
     voltages, masks = np.array(measurement.voltages), np.asarray(measurement.mask)
-    spikes, filled = np.zeros(masks.shape, bool), np.zeros(masks.shape, bool)
-    distinct_masks, mask_index, count = np.unique(
+    spikes, is_filled = np.zeros(masks.shape, bool), np.zeros(masks.shape, bool)
+    distinct_masks, mask_index, num_frames = np.unique(
         masks & known_channels, axis=0, return_inverse=True, return_counts=True
     )
-    for index in np.argsort(-count)[:_MAX_MASKS]:
+    for index in np.argsort(-num_frames)[:_MAX_MASKS]:
         mask = distinct_masks[index]
         basis = _possible_changes(measurement, weight, mask)
         if basis is None:
@@ -258,18 +258,18 @@ def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool 
             if fill and is_spike.any():
                 # Rows of the basis that those of the other channels span are determined by them.
                 weights = basis[is_spike] @ np.linalg.pinv(basis[~is_spike])
-                determined = np.linalg.norm(weights @ basis[~is_spike] - basis[is_spike], axis=1) < _MIN_FREE_SHARE
-                determined_channels = np.flatnonzero(mask)[is_spike][determined]
+                is_determined = np.linalg.norm(weights @ basis[~is_spike] - basis[is_spike], axis=1) < _MIN_FREE_SHARE
+                determined_channels = np.flatnonzero(mask)[is_spike][is_determined]
                 voltages[frame, determined_channels] = (
                     base_voltages[determined_channels]
-                    + weight[determined_channels] * (weights @ change[~is_spike])[determined]
+                    + weight[determined_channels] * (weights @ change[~is_spike])[is_determined]
                 )
-                filled[frame, determined_channels] = True
+                is_filled[frame, determined_channels] = True
     reason = f"spikes, which contradict the other channels ({_listed_spikes(spikes)})."
-    if filled.any():
-        note = f"{counted(int(filled.sum()), 'voltage')} replaced by what others determine: {reason}"
+    if is_filled.any():
+        note = f"{counted(int(is_filled.sum()), 'voltage')} replaced by what others determine: {reason}"
         measurement = replace(measurement, voltages=voltages, notes=(*measurement.notes, note))
-    return measurement.masked(~spikes | filled, reason) if (spikes & ~filled).any() else measurement
+    return measurement.masked(~spikes | is_filled, reason) if (spikes & ~is_filled).any() else measurement
 
 
 def _listed_spikes(spikes: Bool[np.ndarray, "F M"]) -> str:
@@ -288,12 +288,12 @@ def _possible_changes(
     """Orthonormal basis (n, r) of the changes of the n usable channels, divided by `weight`, that a symmetric transfer
     impedance can give; None if that is all of them, or takes too long to find."""
     drive = np.asarray(measurement.protocol.channel_drive)[mask]
-    read = np.asarray(measurement.protocol.channel_measurement)[mask]
+    measurements = np.asarray(measurement.protocol.channel_measurement)[mask]
     row, column = np.triu_indices(drive.shape[1])
     if len(drive) * len(row) * min(len(drive), len(row)) > _MAX_OPERATIONS or not len(drive):
         return None
     drive = drive / np.abs(drive).max()
-    products = drive[:, row] * read[:, column] + drive[:, column] * read[:, row]
+    products = drive[:, row] * measurements[:, column] + drive[:, column] * measurements[:, row]
     basis, size, _ = np.linalg.svd(products / weight[mask, None], full_matrices=False)
     basis = basis[:, size > 1e-9 * size[0]]
     return basis if basis.shape[1] < len(drive) else None
@@ -307,11 +307,11 @@ def _spikes(
     A channel that may read anything adds its unit vector to the basis. The power that this vector explains, `gain`, is
     compared with the power that was unexplained before.
     """
-    unexplained, free = change - basis @ (basis.T @ change), 1 - np.sum(basis**2, axis=1)
+    residual, free_share = change - basis @ (basis.T @ change), 1 - np.sum(basis**2, axis=1)
     is_remaining, faulty, spikes = np.ones(len(change), bool), [], []
     for _ in range(_MAX_SPIKES):
-        is_contradicted = is_remaining & (free > _MIN_FREE_SHARE)
-        size = np.where(is_contradicted, np.abs(unexplained) / np.sqrt(np.maximum(free, _MIN_FREE_SHARE)), 0)
+        is_contradicted = is_remaining & (free_share > _MIN_FREE_SHARE)
+        size = np.where(is_contradicted, np.abs(residual) / np.sqrt(np.maximum(free_share, _MIN_FREE_SHARE)), 0)
         worst_channels = np.flatnonzero(size > (1 - _MIN_FREE_SHARE) * size.max())
         if not 0 < len(worst_channels) <= 2:
             break
@@ -323,10 +323,10 @@ def _spikes(
         for _ in range(2):  # twice, for orthogonality
             direction = direction - basis @ (basis.T @ direction)
         direction = direction / np.linalg.norm(direction)
-        unexplained_power, gain = float(np.sum(np.abs(unexplained) ** 2)), float(np.abs(direction @ unexplained) ** 2)
-        deviation_size = float((size[worst_channels] / np.sqrt(free[worst_channels])).max())
+        unexplained_power, gain = float(np.sum(np.abs(residual) ** 2)), float(np.abs(direction @ residual) ** 2)
+        deviation_size = float((size[worst_channels] / np.sqrt(free_share[worst_channels])).max())
         basis = np.column_stack([basis, direction])
-        unexplained, free = unexplained - direction * (direction @ unexplained), free - direction**2
+        residual, free_share = residual - direction * (direction @ residual), free_share - direction**2
         faulty += _faulty_channels(change, worst_channels)
         is_remaining[worst_channels] = False
         typical_change = float(np.sqrt(np.mean(np.abs(change[is_remaining]) ** 2)))

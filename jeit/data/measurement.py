@@ -232,8 +232,8 @@ class Measurement(Module):
         mask = self.mask & usable_array
         note = reason
         if has_values(mask):
-            number = int(self.mask.sum() - mask.sum())
-            note = f"{counted(number, 'voltage')} masked: {reason}"
+            num_masked = int(self.mask.sum() - mask.sum())
+            note = f"{counted(num_masked, 'voltage')} masked: {reason}"
         return self._replace(self.voltages, mask, notes=(*self.notes, note))
 
     def without_electrodes(self, electrodes: int | Sequence[int]) -> "Measurement":
@@ -295,6 +295,6 @@ def _rows(voltages, mask, index):
 @either_engine
 def _mean(voltages, mask):
     xp = namespace(voltages, mask)
-    count = mask.sum(axis=0)
-    total = xp.where(mask, voltages, 0).sum(axis=0)
-    return xp.where(count > 0, total / xp.maximum(count, 1), xp.nan), count > 0
+    num_usable = mask.sum(axis=0)
+    voltage_sum = xp.where(mask, voltages, 0).sum(axis=0)
+    return xp.where(num_usable > 0, voltage_sum / xp.maximum(num_usable, 1), xp.nan), num_usable > 0

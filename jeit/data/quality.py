@@ -227,7 +227,7 @@ def rounding_deviation(voltages: Float[np.ndarray, " M"], mask: Bool[np.ndarray,
 
     Voltages may be rounded to a number of significant digits, or to multiples of a step, such as that of a converter.
     The coarsest rounding that agrees with all usable voltages is taken; its error is uniform within ± half a step.
-    Reciprocal voltages are rounded alike, so reciprocity does not show this error.
+    Reciprocal voltages are rounded in the same way, so reciprocity does not show this error.
     """
     voltage_magnitudes, mask = np.abs(np.real(np.asarray(voltages))), np.asarray(mask)
     values = voltage_magnitudes[mask & (voltage_magnitudes > 0)]
@@ -246,7 +246,7 @@ def rounding_deviation(voltages: Float[np.ndarray, " M"], mask: Bool[np.ndarray,
 
 
 def _are_multiples(values: np.ndarray, step: np.ndarray) -> bool:
-    """Whether values are multiples of their steps, of which none has more than `_MAX_DIGITS` digits."""
+    """Whether values are multiples of their steps, with quotients of at most `_MAX_DIGITS` digits."""
     quotients = values / step
     remainders = np.abs(quotients - np.round(quotients))
     return bool(
@@ -281,16 +281,20 @@ def _asymmetry(
             deviation,
         )
         row, column = np.nonzero(np.triu(is_known & is_known.T, k=1))
-        upper, lower = transfer[:, row, column], transfer[:, column, row]
+        upper_entries, lower_entries = transfer[:, row, column], transfer[:, column, row]
         noise = np.hypot(gain[row, column], gain[column, row])
-        size = np.sqrt((np.abs(upper) ** 2 + np.abs(lower) ** 2) / 2)
+        size = np.sqrt((np.abs(upper_entries) ** 2 + np.abs(lower_entries) ** 2) / 2)
         diagonal_drives = np.flatnonzero(np.diag(is_known))
         # In ‖T‖² a diagonal entry counts once, and an off-diagonal pair, which is one entry here, counts twice.
         diagonal = np.abs(transfer[:, diagonal_drives, diagonal_drives]) / np.sqrt(2)
         if deviation is not None:
             size, diagonal = size / noise, diagonal / (np.sqrt(2) * gain[diagonal_drives, diagonal_drives])
         mask_results.append(
-            (upper - lower, np.broadcast_to(noise, upper.shape), np.concatenate([size, diagonal], axis=1))
+            (
+                upper_entries - lower_entries,
+                np.broadcast_to(noise, upper_entries.shape),
+                np.concatenate([size, diagonal], axis=1),
+            )
         )
     error, noise, signal = (np.concatenate([arrays[k].ravel() for arrays in mask_results]) for k in range(3))
     return error, noise, signal
@@ -314,9 +318,9 @@ def order_note(measurement: Measurement) -> str | None:
     order = boundary_order(measurement)
     if order is None or len(order) < 4 or follows(order):
         return None
-    listed = ", ".join(str(number + 1) for number in _starting_at_first(order)[:_MAX_LISTED])
+    electrode_list = ", ".join(str(number + 1) for number in _starting_at_first(order)[:_MAX_LISTED])
     ellipsis = " …" if len(order) > _MAX_LISTED else ""
-    note = f"going round the edge, the positions of the electrodes come in the order {listed}{ellipsis}"
+    note = f"going round the edge, the positions of the electrodes come in the order {electrode_list}{ellipsis}"
     position_signs, number_signs = (
         impossible_signs(measurement, electrode_order) for electrode_order in (order, np.arange(len(order)))
     )

@@ -20,7 +20,7 @@ _MEMORY_FACTOR = 4
 class Format:
     """A file format. **Fields**: `module`: name of the module that reads it; `endings`: suffixes of its files;
     `described`: whether a description may accompany a file; `borrows`: whether a file may use the description of
-    another measurement; `own_protocol`: whether files state their protocol, and a description the body alone;
+    another measurement; `own_protocol`: whether files state their protocol, so that a description states only the body;
     `bundled`: name of the bundled description that always applies, or None.
 
     The module is imported only when a file has one of the suffixes.

@@ -117,14 +117,16 @@ def _hint_of_number(number: int, channels: int) -> str:
     if 0 < channels - number <= channels // 4:
         return f" They are {number} numbers, {channels - number} fewer than a frame has: is a line missing?"
     counts = {
-        electrodes * (electrodes - 3) // share: (electrodes, said)
+        electrodes * (electrodes - 3) // share: (electrodes, pair_text)
         for electrodes in range(64, 3, -1)
-        for share, said in ((2, "half of the adjacent pairs"), (1, "adjacent pairs"))
+        for share, pair_text in ((2, "half of the adjacent pairs"), (1, "adjacent pairs"))
     } | {electrodes * (electrodes - 1) // 2: (electrodes, "all pairs") for electrodes in range(4, 65)}
     if number not in counts:
         return ""
-    electrodes, said = counts[number]
-    return f" {number} numbers are what {electrodes} electrodes give with {said}: is the number of electrodes right?"
+    electrodes, pair_text = counts[number]
+    return (
+        f" {number} numbers are what {electrodes} electrodes give with {pair_text}: is the number of electrodes right?"
+    )
 
 
 def _as_frames(voltages, protocol: Protocol, name: str) -> np.ndarray:

@@ -33,26 +33,26 @@ def fitting_protocol(
     """The protocol among `protocols`, the described one first, that has as many channels as the frames and obeys
     reciprocity; and a note if it is not the described one. None if there is none.
 
-    The described one is kept unless it breaks reciprocity and another does not. With a measurement of the same sensor,
-    `like`, its protocol comes first: what was found of the reference holds for the frames.
+    The described protocol is used unless it violates reciprocity and another one does not. With a measurement `like` of
+    the same sensor, its protocol comes first, because properties detected in the reference apply to the frames.
     """
     if not protocols:
         return None, ()
-    fitting = [candidate for candidate in protocols if candidate[0].num_measurements == frames.shape[-1]]
-    if not fitting:
+    candidates = [candidate for candidate in protocols if candidate[0].num_measurements == frames.shape[-1]]
+    if not candidates:
         return protocols[0][0], ()
     reason = f"for {counted(frames.shape[-1], 'number')} are in a frame"
     if like is not None and (
-        same_protocols := [candidate for candidate in fitting if candidate[0].same_patterns(like.protocol)]
+        same_protocols := [candidate for candidate in candidates if candidate[0].same_patterns(like.protocol)]
     ):
-        fitting, reason = [*same_protocols, *fitting], f"as of '{like.name}'"
-    chosen_protocol, options = fitting[0]
+        candidates, reason = [*same_protocols, *candidates], f"as of '{like.name}'"
+    chosen_protocol, options = candidates[0]
     first_error = _mean_frame_error(frames, chosen_protocol)
     if _MAX_TRUSTED_ERROR < first_error < np.inf:
-        errors = [_mean_frame_error(frames, candidate) for candidate, _ in fitting]
+        errors = [_mean_frame_error(frames, candidate) for candidate, _ in candidates]
         best_index = int(np.argmin(errors))
         if errors[best_index] < min(_MAX_TRUSTED_ERROR, _MAX_ERROR_RATIO * first_error):
-            chosen_protocol, options = fitting[best_index]
+            chosen_protocol, options = candidates[best_index]
             best_error = percent(errors[best_index])
             reason = f"for reciprocity is broken by {best_error} so, by {percent(first_error)} in the usual order"
     return chosen_protocol, (f"[protocol] {options} is taken, {reason}.",) if options else ()
@@ -82,11 +82,13 @@ def with_signs(measurement: Measurement, like: Measurement | None = None) -> Mea
     or the opposite sign of those of the same sensor, `like`; with a note if any is changed."""
     values, usable = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     if like is not None and like.protocol.same_patterns(measurement.protocol):
-        common = usable.all(axis=0) & np.asarray(like.mask).all(axis=0)
-        ours, theirs = (np.real(np.asarray(each.voltages)).mean(axis=0)[common] for each in (measurement, like))
+        common_channels = usable.all(axis=0) & np.asarray(like.mask).all(axis=0)
+        ours, theirs = (
+            np.real(np.asarray(compared.voltages)).mean(axis=0)[common_channels] for compared in (measurement, like)
+        )
         size = np.linalg.norm(ours) * np.linalg.norm(theirs)
         if size and ours @ theirs > -_OPPOSITE_COSINE * size:
-            return measurement  # as of the reference, whatever that says of the sign
+            return measurement  # the signs agree with the reference
         if size and ours @ theirs < _OPPOSITE_COSINE * size:
             note = f"the voltages are reversed, to agree with '{like.name}' (polarity = \"reversed\")."
             return _with_voltages(measurement, -values, note)
@@ -95,16 +97,16 @@ def with_signs(measurement: Measurement, like: Measurement | None = None) -> Mea
     signs = _signs(measurement)
     if signs is None or not has_one_sign or not (signs[usable.any(axis=0)] != 0).all() or not known_voltages.any():
         return measurement
-    changed = np.abs(np.real(values)) * signs
-    if (changed[usable] == np.real(values)[usable]).all():
+    signed_values = np.abs(np.real(values)) * signs
+    if (signed_values[usable] == np.real(values)[usable]).all():
         return measurement
-    if (changed[usable] == -np.real(values)[usable]).all():
+    if (signed_values[usable] == -np.real(values)[usable]).all():
         note = 'all voltages have one sign, the opposite of what a body gives: it is reversed (polarity = "reversed").'
         return _with_voltages(measurement, -values, note)
     if np.iscomplexobj(values):
         return measurement
     return _with_voltages(
-        measurement, changed, "the voltages are magnitudes: they are given the signs that a body gives."
+        measurement, signed_values, "the voltages are magnitudes: they are given the signs that a body gives."
     )
 
 

@@ -103,7 +103,7 @@ def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) 
 
 
 def _further_faults(keys: Sequence[str], num_faults: int, max_keys: int) -> list[str]:
-    """Text about `num_faults` further faults, of which at most `max_keys` are named by their keys."""
+    """Sentences about `num_faults` further faults; at most `max_keys` of them are named by their keys."""
     named_keys = keys[:max_keys]
     sentences = [f"Wrong too: {', '.join(named_keys)}."] if named_keys else []
     return [*sentences, f"And {num_faults - len(named_keys)} more."] if num_faults > len(named_keys) else sentences

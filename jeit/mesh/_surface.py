@@ -50,10 +50,10 @@ def _near_pairs(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
     classes = [np.flatnonzero(size_class == value) for value in np.unique(size_class)]
     for k, members in enumerate(classes):
         tree = KDTree(centroids[members])
-        larger = np.concatenate(classes[k:])
+        same_or_larger = np.concatenate(classes[k:])
         batch_size = max(1, _PAIRS_PER_BATCH // 64)
-        for start in range(0, len(larger), batch_size):
-            queried = larger[start : start + batch_size]
+        for start in range(0, len(same_or_larger), batch_size):
+            queried = same_or_larger[start : start + batch_size]
             neighbours = tree.query_ball_point(centroids[queried], radii[queried] + radii[members].max() + tolerance)
             num_neighbours = np.fromiter(map(len, neighbours), int, len(neighbours))
             first = np.repeat(queried, num_neighbours)
@@ -70,9 +70,11 @@ def _intersect(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, toleran
     """Whether the two triangles of each pair intersect (p,); the triangles have no node in common."""
     first, second = points[cells[pairs[:, 0]]], points[cells[pairs[:, 1]]]
     is_crossing = _overlap_in_plane(first, second, tolerance)
-    for edged, pierced in ((first, second), (second, first)):
+    for segment_triangles, face_triangles in ((first, second), (second, first)):
         for k in range(3):
-            is_crossing |= _pierces(edged[:, k], edged[:, _NEXT_CORNER[k]], pierced, tolerance)
+            is_crossing |= _pierces(
+                segment_triangles[:, k], segment_triangles[:, _NEXT_CORNER[k]], face_triangles, tolerance
+            )
     return is_crossing
 
 
@@ -80,11 +82,13 @@ def _cross_opposite(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, to
     """Whether two triangles with one common node intersect elsewhere (p,): the edge of either triangle that is opposite
     to the common node pierces the other triangle."""
     is_crossing = np.zeros(len(pairs), bool)
-    for edged, pierced in (pairs.T, pairs.T[::-1]):
-        edged_cells = cells[edged]
-        common = (edged_cells[:, :, None] == cells[pierced][:, None, :]).any(axis=2).argmax(axis=1)
-        start, end = (points[edged_cells[np.arange(len(edged_cells)), (common + step) % 3]] for step in (1, 2))
-        is_crossing |= _pierces(start, end, points[cells[pierced]], tolerance)
+    for segment_triangles, face_triangles in (pairs.T, pairs.T[::-1]):
+        segment_cells = cells[segment_triangles]
+        common_corner = (segment_cells[:, :, None] == cells[face_triangles][:, None, :]).any(axis=2).argmax(axis=1)
+        start, end = (
+            points[segment_cells[np.arange(len(segment_cells)), (common_corner + step) % 3]] for step in (1, 2)
+        )
+        is_crossing |= _pierces(start, end, points[cells[face_triangles]], tolerance)
     return is_crossing
 
 
@@ -130,11 +134,11 @@ def _overlap_in_plane(first: np.ndarray, second: np.ndarray, tolerance: float) -
     is_overlapping = np.abs(height).max(axis=1) <= tolerance
     first, second, unit = first[is_overlapping], second[is_overlapping], unit[is_overlapping]
     is_separated = np.zeros(len(first), bool)
-    for edged in (first, second):
+    for edge_triangles in (first, second):
         for k in range(3):
-            outward = np.cross(edged[:, _NEXT_CORNER[k]] - edged[:, k], unit)
-            outward = outward / np.linalg.norm(outward, axis=1, keepdims=True)
-            spans = [np.einsum("pki,pi->pk", corners, outward) for corners in (first, second)]
+            edge_normals = np.cross(edge_triangles[:, _NEXT_CORNER[k]] - edge_triangles[:, k], unit)
+            edge_normals = edge_normals / np.linalg.norm(edge_normals, axis=1, keepdims=True)
+            spans = [np.einsum("pki,pi->pk", corners, edge_normals) for corners in (first, second)]
             gap = np.maximum(spans[0].min(axis=1) - spans[1].max(axis=1), spans[1].min(axis=1) - spans[0].max(axis=1))
             is_separated |= gap > tolerance
     is_overlapping[is_overlapping] = ~is_separated
@@ -159,17 +163,17 @@ def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
     _check_node_contacts(cells, first, second)
     if np.count_nonzero(is_turned) * 2 > len(cells):
         is_turned = ~is_turned
-    closed = 2 * len(first) == 3 * len(cells)
+    is_closed = 2 * len(first) == 3 * len(cells)
     oriented = np.where(is_turned[:, None], cells[:, [0, 2, 1]], cells)
     if points is None:
         return oriented
     if (pair := first_crossing(points, cells)) is not None:
-        middle = points[cells[pair[0]]].mean(axis=0).round(6).tolist()
+        crossing_centre = points[cells[pair[0]]].mean(axis=0).round(6).tolist()
         raise ValueError(
-            f"cells: the surface crosses or touches itself: triangles {pair[0]} and {pair[1]} meet, at {middle} m. "
-            "Move the nodes apart, or unite what overlaps where the surface was made."
+            f"cells: the surface crosses or touches itself: triangles {pair[0]} and {pair[1]} meet, at "
+            f"{crossing_centre} m. Move the nodes apart, or unite what overlaps where the surface was made."
         )
-    if closed and enclosed_volume(points, oriented) < 0:
+    if is_closed and enclosed_volume(points, oriented) < 0:
         if not is_turned.any():
             warnings.warn(
                 "cells: the surface is closed and inside out, every triangle faces inwards; they have been turned. "

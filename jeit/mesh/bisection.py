@@ -148,7 +148,8 @@ class _SplitMesh:
             return Mesh.create(self.points, self.cells, tags=named)
 
     def split(self, edges: Int[np.ndarray, "e 2"], middles: Float[np.ndarray, "e s"]) -> tuple[_SplitMesh, np.ndarray]:
-        """Split `edges`, of which no cell may have two, at their `middles`, metres. Returns the new division, and for
+        """Split `edges` at their `middles`, metres; no cell may contain two of the edges. Returns the new division, and
+        for
         each of its cells the index of the cell that contains it."""
         new_nodes = len(self.points) + np.arange(len(edges))
         cells, origin = _split_simplices(self.cells, edges, new_nodes, len(self.points))
@@ -204,13 +205,13 @@ def _zero_on_edges(
 ) -> Float[np.ndarray, "e s"]:
     """Locate the point on each edge where the level is zero, by bisection. `first_level` (e,): levels at the first
     ends; the level at the other ends has the opposite sign."""
-    low, high = np.zeros((len(ends), 1)), np.ones((len(ends), 1))
+    lower, upper = np.zeros((len(ends), 1)), np.ones((len(ends), 1))
     start, direction = ends[:, 0], ends[:, 1] - ends[:, 0]
     for _ in range(_BISECTION_STEPS):
-        middle = (low + high) / 2
+        middle = (lower + upper) / 2
         is_same_sign = (level(start + middle * direction) * first_level > 0)[:, None]
-        low, high = np.where(is_same_sign, middle, low), np.where(is_same_sign, high, middle)
-    return start + high * direction
+        lower, upper = np.where(is_same_sign, middle, lower), np.where(is_same_sign, upper, middle)
+    return start + upper * direction
 
 
 def _edges(points, simplices) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "m k"], Int[np.ndarray, " e"]]:

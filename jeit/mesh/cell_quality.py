@@ -109,7 +109,7 @@ def _tetrahedron_measures(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def merge_points(points: np.ndarray, cells: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     """Merge points (n, d) closer than `tolerance` metres to each other, and renumber the cells (m, k).
 
-    The first point of each group is kept. Cells of which two corners are merged are removed.
+    The first point of each group is kept. Cells with two merged corners are removed.
     """
     close_pairs = KDTree(points).query_pairs(tolerance, output_type="ndarray")
     graph = coo_array((np.ones(len(close_pairs)), close_pairs.T), shape=(len(points), len(points)))
@@ -120,8 +120,8 @@ def merge_points(points: np.ndarray, cells: np.ndarray, tolerance: float) -> tup
     new_index = np.empty(len(order), int)
     new_index[order] = np.arange(len(order))
     renumbered = new_index[group_index][cells]
-    ordered = np.sort(renumbered, axis=1)
-    is_valid = (ordered[:, 1:] != ordered[:, :-1]).all(axis=1)
+    sorted_cells = np.sort(renumbered, axis=1)
+    is_valid = (sorted_cells[:, 1:] != sorted_cells[:, :-1]).all(axis=1)
     return points[first_points[order]], renumbered[is_valid]
 
 
@@ -204,7 +204,7 @@ def _parse_obj(content: bytes) -> tuple[np.ndarray, np.ndarray]:
 def _vertex_index(value: bytes, num_vertices: int) -> int:
     """Vertex index of a corner of a face, given as vertex/texture/normal; negative numbers count back from the last
     vertex."""
-    number = int(value.split(b"/")[0])
-    if number == 0 or number < -num_vertices:
-        raise ValueError(f"a face names vertex {number}, and {num_vertices} came before it")
-    return number - 1 if number > 0 else num_vertices + number
+    vertex_number = int(value.split(b"/")[0])
+    if vertex_number == 0 or vertex_number < -num_vertices:
+        raise ValueError(f"a face names vertex {vertex_number}, and {num_vertices} came before it")
+    return vertex_number - 1 if vertex_number > 0 else num_vertices + vertex_number

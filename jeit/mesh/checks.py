@@ -65,20 +65,20 @@ def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray
             f"cells: node indices run from {lowest_index} to {highest_index}, but the mesh has nodes 0 to "
             f"{num_points - 1}.{hint}"
         )
-    ordered = np.sort(array, axis=1)
-    repeated_cells = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
+    sorted_cells = np.sort(array, axis=1)
+    repeated_cells = np.flatnonzero((sorted_cells[:, 1:] == sorted_cells[:, :-1]).any(axis=1))
     if repeated_cells.size:
         raise ValueError(
             f"cells: cell {repeated_cells[0]} uses a node twice: {array[repeated_cells[0]].tolist()}. Remove such "
             "cells."
         )
-    order = np.lexsort(ordered.T[::-1])
-    duplicates = np.flatnonzero((ordered[order][1:] == ordered[order][:-1]).all(axis=1))
+    order = np.lexsort(sorted_cells.T[::-1])
+    duplicates = np.flatnonzero((sorted_cells[order][1:] == sorted_cells[order][:-1]).all(axis=1))
     if duplicates.size:
         pair = np.sort(order[duplicates[0] : duplicates[0] + 2]).tolist()
         raise ValueError(
             f"cells: {duplicates.size} cell(s) are duplicated, first cells {pair[0]} and {pair[1]} with nodes "
-            f"{ordered[order[duplicates[0]]].tolist()}. Keep one of each."
+            f"{sorted_cells[order[duplicates[0]]].tolist()}. Keep one of each."
         )
     unused = np.setdiff1d(np.arange(num_points), array)
     if unused.size:
@@ -126,9 +126,9 @@ def orient(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
             f"cells: {flat_cells.size} cell(s) have no {name}, first cell {flat_cells[0]} with nodes "
             f"{cells[flat_cells[0]].tolist()}: its nodes lie on one line or plane. Remove it or move a node."
         )
-    swapped = cells.copy()
-    swapped[:, [-2, -1]] = cells[:, [-1, -2]]
-    return np.where((measure > 0)[:, None], cells, swapped)
+    swapped_cells = cells.copy()
+    swapped_cells[:, [-2, -1]] = cells[:, [-1, -2]]
+    return np.where((measure > 0)[:, None], cells, swapped_cells)
 
 
 def check_connected(first: np.ndarray, second: np.ndarray, num_cells: int) -> None:

@@ -102,9 +102,9 @@ def _check_numbers(path: Path) -> None:
     numbers = [int(match[2][:20]) for match in _MSH_COUNTS.finditer(content)]
     if binary == b"1":
         for match in _MSH_COUNTS.finditer(content):
-            count = min(int(match[2][:20]), (len(content) - match.end()) // _MSH_NODE.itemsize)
-            if match[1] == b"Nodes" and count:
-                numbers.append(int(np.frombuffer(content, _MSH_NODE, count, match.end())["number"].max()))
+            num_nodes = min(int(match[2][:20]), (len(content) - match.end()) // _MSH_NODE.itemsize)
+            if match[1] == b"Nodes" and num_nodes:
+                numbers.append(int(np.frombuffer(content, _MSH_NODE, num_nodes, match.end())["number"].max()))
     else:
         numbers += [int(match[0][:20]) for match in _LONG_INTEGER.finditer(content)]
     max_number = max(_MAX_NODE_NUMBER, len(content))
@@ -301,11 +301,11 @@ def write(
         options = {"file_format": "gmsh22"}
         physical = [np.full(mesh.num_cells, 1)]
         field_data["domain"] = np.array([1, mesh.dimension])
-        for number, (tag, facet_indices) in enumerate(sorted(mesh.tags.items()), start=2):
+        for group_number, (tag, facet_indices) in enumerate(sorted(mesh.tags.items()), start=2):
             facets = np.asarray(mesh.facets)[np.asarray(facet_indices)]
             blocks.append((_FACET_TYPES[mesh.dimension], facets))
-            physical.append(np.full(len(facets), number))
-            field_data[tag] = np.array([number, mesh.dimension - 1])
+            physical.append(np.full(len(facets), group_number))
+            field_data[tag] = np.array([group_number, mesh.dimension - 1])
         data["gmsh:physical"] = physical
         data["gmsh:geometrical"] = physical
     try:

@@ -35,8 +35,11 @@ def graded_box(outline: Rectangle, height: float, planes: Sequence[Float[np.ndar
     """
     x_min, x_max, y_min, y_max = outline.extent
     ends = [(x_min, x_max), (y_min, y_max), (0.0, height)]
-    stops = [_distinct_positions(positions, low, high) for positions, (low, high) in zip(planes, ends, strict=True)]
-    max_extent = max(high - low for low, high in ends)
+    stops = [
+        _distinct_positions(positions, lower_end, upper_end)
+        for positions, (lower_end, upper_end) in zip(planes, ends, strict=True)
+    ]
+    max_extent = max(upper_end - lower_end for lower_end, upper_end in ends)
     size = _largest_cell_size(
         lambda size: float(np.prod([len(_divide_axis(axis_stops, size)) for axis_stops in stops])),
         num_points,
@@ -77,33 +80,33 @@ def graded_layers(
     return layer(plane, height, heights=heights)
 
 
-def _distinct_positions(planes: Float[np.ndarray, " k"], low: float, high: float) -> Float[np.ndarray, " s"]:
-    """Distinct positions of the planes between `low` and `high`, with these two ends included."""
-    inner_positions = np.sort(planes[(planes > low) & (planes < high)])
-    distinct, min_gap = [low], _MERGE_DISTANCE * (high - low)
+def _distinct_positions(planes: Float[np.ndarray, " k"], lower_end: float, upper_end: float) -> Float[np.ndarray, " s"]:
+    """Distinct positions of the planes between `lower_end` and `upper_end`, with these two ends included."""
+    inner_positions = np.sort(planes[(planes > lower_end) & (planes < upper_end)])
+    distinct_positions, min_gap = [lower_end], _MERGE_DISTANCE * (upper_end - lower_end)
     for position in inner_positions:
-        if position - distinct[-1] > min_gap and high - position > min_gap:
-            distinct.append(float(position))
-    return np.array([*distinct, high])
+        if position - distinct_positions[-1] > min_gap and upper_end - position > min_gap:
+            distinct_positions.append(float(position))
+    return np.array([*distinct_positions, upper_end])
 
 
 def _divide_axis(stops: Float[np.ndarray, " s"], max_size: float) -> Float[np.ndarray, " n"]:
     """Positions of nodes along an axis: the planes `stops`, and nodes between them at distances that grow away from
     these planes up to `max_size`, metres."""
     node_positions = [stops[:1]]
-    for low, high in pairwise(stops):
+    for lower, upper in pairwise(stops):
         # Number of cells before each of many positions.
-        samples = np.linspace(low, high, 400)
+        samples = np.linspace(lower, upper, 400)
         midpoints = (samples[1:] + samples[:-1]) / 2
         widths = np.minimum(
-            max_size, _SMALLEST_CELL * max_size + _CELL_GROWTH * np.minimum(midpoints - low, high - midpoints)
+            max_size, _SMALLEST_CELL * max_size + _CELL_GROWTH * np.minimum(midpoints - lower, upper - midpoints)
         )
         cumulative_count = np.concatenate([[0.0], np.cumsum(np.diff(samples) / widths)])
         num_cells = max(1, round(cumulative_count[-1]))
         node_positions.append(
             np.interp(np.arange(1, num_cells + 1) * (cumulative_count[-1] / num_cells), cumulative_count, samples)
         )
-        node_positions[-1][-1] = high
+        node_positions[-1][-1] = upper
     return np.concatenate(node_positions)
 
 

@@ -61,12 +61,14 @@ class Solid(Body):
 
         Tags: 'bottom', 'top', 'side', and those of the outline's mesh. Raises `ValueError` as `jeit.mesh.box` does.
         """
-        from jeit.mesh.solids import choose_layers, in_plane, layer
+        from jeit.mesh.solids import base_counter, choose_layers, layer
 
-        number, layers = choose_layers(float(self.outline.area), self.thickness, num_points, cell_size, None)
-        with nodes_of_solid(num_points, in_plane(float(self.outline.area), self.thickness, None)):
-            plane = self.outline.mesh(num_points=number, cell_size=cell_size, refine=refine)
-        return layer(plane, self.thickness, layers)
+        num_base_points, num_layers = choose_layers(
+            float(self.outline.area), self.thickness, num_points, cell_size, None
+        )
+        with nodes_of_solid(num_points, base_counter(float(self.outline.area), self.thickness, None)):
+            plane = self.outline.mesh(num_points=num_base_points, cell_size=cell_size, refine=refine)
+        return layer(plane, self.thickness, num_layers)
 
 
 class OwnMesh(Body):

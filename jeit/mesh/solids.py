@@ -163,10 +163,12 @@ def stacked_cells(cells: np.ndarray, num_nodes: int, num_layers: int) -> np.ndar
 
 def stacked_wall(edges: np.ndarray, num_nodes: int, num_layers: int) -> np.ndarray:
     """Triangles (2 e num_layers, 3) of the wall above edges (e, 2), divided like the prisms in `stacked_cells`."""
-    low, high = np.sort(edges.astype(np.int64), axis=1).T
-    lower = np.stack([low, high, high + num_nodes], axis=1)
-    upper = np.stack([low, low + num_nodes, high + num_nodes], axis=1)
-    return np.concatenate([face + k * num_nodes for k in range(num_layers) for face in (lower, upper)])
+    lower_nodes, upper_nodes = np.sort(edges.astype(np.int64), axis=1).T
+    lower_triangles = np.stack([lower_nodes, upper_nodes, upper_nodes + num_nodes], axis=1)
+    upper_triangles = np.stack([lower_nodes, lower_nodes + num_nodes, upper_nodes + num_nodes], axis=1)
+    return np.concatenate(
+        [face + k * num_nodes for k in range(num_layers) for face in (lower_triangles, upper_triangles)]
+    )
 
 
 # In a solid, 'bottom' and 'top' are the horizontal faces, so the sides of a rectangle with these names are renamed.
@@ -213,21 +215,25 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
     unstructured.check_total(num_nodes * (num_layers + 1), "num_layers")
     points = np.column_stack([np.tile(plane, (num_layers + 1, 1)), np.repeat(levels, num_nodes)])
 
-    solid = stacked_cells(cells, num_nodes, num_layers)
+    tetrahedra = stacked_cells(cells, num_nodes, num_layers)
 
-    def wall(edges: np.ndarray) -> np.ndarray:
+    def wall_triangles(edges: np.ndarray) -> np.ndarray:
         return stacked_wall(edges, num_nodes, num_layers)
 
-    tags: dict[str, ArrayLike] = {"bottom": cells, "top": cells + num_layers * num_nodes, "side": wall(facets)}
+    tags: dict[str, ArrayLike] = {
+        "bottom": cells,
+        "top": cells + num_layers * num_nodes,
+        "side": wall_triangles(facets),
+    }
     for name, index in mesh.tags.items():
         new_name = _RENAMED_TAGS.get(name, name)
         if new_name in tags:
             raise ValueError(
                 f"mesh: its tag {name!r} would be called {new_name!r} in the layer, which is taken. Rename it."
             )
-        tags[new_name] = wall(facets[np.asarray(index)])
+        tags[new_name] = wall_triangles(facets[np.asarray(index)])
     with size_checked():
-        return Mesh.create(points, solid, tags=tags)
+        return Mesh.create(points, tetrahedra, tags=tags)
 
 
 def _check_heights(thickness: float, num_layers: int, heights: ArrayLike | None) -> np.ndarray:
@@ -279,7 +285,7 @@ def box(
     width, depth = check_length("width", width), check_length("depth", depth)
     height = check_length("height", height)
     base_points, layers = choose_layers(width * depth, height, num_points, cell_size, num_layers)
-    with size_checked(), nodes_of_solid(num_points, in_plane(width * depth, height, num_layers)):
+    with size_checked(), nodes_of_solid(num_points, base_counter(width * depth, height, num_layers)):
         base = rectangle(width, depth, num_points=base_points, cell_size=cell_size, refine=refine)
         return layer(base, height, layers)
 
@@ -317,7 +323,7 @@ def cylinder(
     """
     radius, height = check_length("radius", radius, 2), check_length("height", height)
     base_points, layers = choose_layers(np.pi * radius**2, height, num_points, cell_size, num_layers)
-    with size_checked(), nodes_of_solid(num_points, in_plane(np.pi * radius**2, height, num_layers)):
+    with size_checked(), nodes_of_solid(num_points, base_counter(np.pi * radius**2, height, num_layers)):
         base = disk(
             radius,
             num_points=base_points,
@@ -329,7 +335,7 @@ def cylinder(
         return layer(base, height, layers)
 
 
-def in_plane(area: float, height: float, num_layers: int | None) -> Callable[[int], int]:
+def base_counter(area: float, height: float, num_layers: int | None) -> Callable[[int], int]:
     """Function that returns how many nodes the base of a solid has, given the number of nodes of the solid."""
     return lambda num_points: choose_layers(area, height, num_points, None, num_layers)[0] or num_points
 

@@ -41,8 +41,8 @@ def match_facets(facets: np.ndarray, num_points: int) -> tuple[np.ndarray, np.nd
     `crowded` contains its rows, and no pairs are returned."""
     key = facet_keys(facets, num_points)
     order = np.argsort(key, kind="stable")
-    ordered = key[order]
-    is_same = ordered[1:] == ordered[:-1]
+    sorted_keys = key[order]
+    is_same = sorted_keys[1:] == sorted_keys[:-1]
     triple_positions = np.flatnonzero(is_same[1:] & is_same[:-1])
     if triple_positions.size:
         return order[:0], order[:0], order[triple_positions[0] : triple_positions[0] + 3]

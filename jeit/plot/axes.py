@@ -98,15 +98,15 @@ def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
 
 
 def draw_colour_bar(
-    ax: Axes, mappable: ScalarMappable, label: str, *, signed: bool = False, position: Axes | None = None
+    ax: Axes, mappable: ScalarMappable, label: str, *, show_sign: bool = False, position: Axes | None = None
 ) -> None:
-    """Draw a slim colour bar at the right of `ax`, or on the axes `position`; `signed`: whether tick labels have a
+    """Draw a slim colour bar at the right of `ax`, or on the axes `position`; `show_sign`: whether tick labels have a
     sign, for differences."""
     placement: dict[str, Any] = (
         {"ax": ax, "shrink": 0.72, "aspect": 28, "pad": 0.02} if position is None else {"cax": position}
     )
     bar = ax.figure.colorbar(mappable, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]), **placement)
-    if signed:
+    if show_sign:
         bar.ax.yaxis.set_major_formatter(
             lambda value, _: "0" if abs(value) < 1e-12 else f"{value:+g}".replace("-", "−")
         )
@@ -205,7 +205,7 @@ class FittedScale(Module):
     def draw_bar(self, ax: Axes, mappable: ScalarMappable) -> None:
         """Draw the colour bar of `mappable` beside `ax`, unless the scale has none."""
         if self.scale.bar:
-            draw_colour_bar(ax, mappable, self.label, signed=self.scale.difference)
+            draw_colour_bar(ax, mappable, self.label, show_sign=self.scale.difference)
 
 
 def check_scale(scale: ColourScale) -> None:

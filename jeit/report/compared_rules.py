@@ -131,12 +131,12 @@ def draw_choice(result: ComparedRules):
 
     outcomes = result.outcomes
     figure = Figure(figsize=(max(2.1 * len(outcomes), 8.4), 8.2), layout="constrained")
-    upper, lower = np.asarray(figure.subfigures(2, 1, height_ratios=(1, 1.6)))
-    columns = np.atleast_1d(upper.subplots(1, len(outcomes)))
+    images_figure, curves_figure = np.asarray(figure.subfigures(2, 1, height_ratios=(1, 1.6)))
+    columns = np.atleast_1d(images_figure.subplots(1, len(outcomes)))
     for ax, (name, outcome) in zip(columns, outcomes.items(), strict=True):
         _draw_outcome(ax, name, outcome, result.prepared.mesh)
     choices = {name: outcome.choice for name, outcome in outcomes.items()}
-    plot_choice(choices, ax=lower.subplots())
+    plot_choice(choices, ax=curves_figure.subplots())
     figure.suptitle(f"{result.prepared.measurement.name}: change of conductivity by every rule, and how each chose λ")
     return figure
 

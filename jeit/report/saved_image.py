@@ -171,11 +171,11 @@ def _other_file_hint(path: Path) -> str:
 
 
 def _to_saved_image(mesh: Mesh, arrays: dict[str, np.ndarray]) -> SavedImage:
-    def per_cell(name: str, kinds: str) -> np.ndarray | None:
+    def per_cell(name: str, dtype_kinds: str) -> np.ndarray | None:
         if name not in arrays:
             return None
         values = arrays[name]
-        if values.shape != (mesh.num_cells,) or values.dtype.kind not in kinds:
+        if values.shape != (mesh.num_cells,) or values.dtype.kind not in dtype_kinds:
             raise ValueError(f"'{name}' is {describe(values)}; there are {counted(mesh.num_cells, 'cell')}.")
         if not np.isfinite(values).all():
             raise ValueError(f"'{name}' has values that are not finite.")

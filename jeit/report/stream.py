@@ -91,8 +91,8 @@ def write_stream(
         raise ValueError(f"rate must be positive, frames in a second; it is {describe(rate)}.")
     file_names = ("frames.csv", "images.npz", "frames.png", *([] if film is None else [film]))
     folder = results_folder(folder, file_names)
-    for earlier in file_names[1:]:
-        (folder / earlier).unlink(missing_ok=True)  # it belongs to an earlier stream
+    for earlier_name in file_names[1:]:
+        (folder / earlier_name).unlink(missing_ok=True)  # it belongs to an earlier stream
     clear_unfinished(folder)
     report = drawing or (lambda task: None)
     mesh, summary = calibration.model.mesh, _StreamSummary(calibration)

@@ -158,8 +158,8 @@ def electrode_of_nodes(mesh: Mesh, electrodes: AbstractElectrodes) -> Int[np.nda
         load = load * np.asarray(electrodes.contact_impedance)
         facets = np.asarray(contact.nodes[0])
         if len(contact.nodes) == 1 and facets.shape == np.shape(mesh.facets):
-            share = np.repeat(np.asarray(facet_measures(mesh)) / facets.shape[1], facets.shape[1])
-            node_measures = np.bincount(facets.ravel(), share, mesh.num_points)
+            facet_shares = np.repeat(np.asarray(facet_measures(mesh)) / facets.shape[1], facets.shape[1])
+            node_measures = np.bincount(facets.ravel(), facet_shares, mesh.num_points)
             load = load / np.where(node_measures > 0, node_measures, np.inf)[:, None]
         else:
             load = load / load.max(axis=0)
@@ -184,7 +184,7 @@ def _checked_frames(
     """Check the times and values of a series, and return them as arrays. Raises `ValueError` if they do not fit."""
     check_kind("mesh", mesh, Mesh, "a Mesh, such as Disk(0.05).mesh()")
     seconds: Sequence | np.ndarray = np.atleast_1d(np.asarray(times, dtype=object))
-    if len(seconds) == 0 or not all(is_number(number) for number in seconds):
+    if len(seconds) == 0 or not all(is_number(time) for time in seconds):
         raise ValueError(f"times must be a time for each frame, seconds; they are {describe(times)}.")
     seconds = np.asarray(seconds, float)
     if not (np.diff(seconds) > 0).all():

@@ -61,7 +61,7 @@ def test_nearer_pieces_are_drawn_later(ax):
     points = np.array([[0, 0, z] for z in (0.3, 0.1, 0.2)])[:, None] + [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
     scene = Scene(Camera(0, 90))
     for k, colour in enumerate(np.eye(3)):
-        scene.add_triangles(points[k], np.array([[0, 1, 2]]), np.array([[*colour, 1.0]]), lit=False)
+        scene.add_triangles(points[k], np.array([[0, 1, 2]]), np.array([[*colour, 1.0]]), is_lit=False)
     scene.draw(ax)
     np.testing.assert_allclose(pieces(ax).get_facecolor()[:, :3], np.eye(3)[[1, 2, 0]])
 

@@ -65,11 +65,13 @@ def choose(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        measurement, base = read_pair(data, reference, reference_frames, format, description, (key, reference_key))
+        measurement, reference_measurement = read_pair(
+            data, reference, reference_frames, format, description, (key, reference_key)
+        )
         frame_selector = None if frame is None else number_or_name(frame, int)
         with naming_options({"rules": "--rule"}):
             result = compare_on_data(
-                measurement, base, settings, rules=rule or None, frame=frame_selector, progress=step
+                measurement, reference_measurement, settings, rules=rule or None, frame=frame_selector, progress=step
             )
         step("write")
         write_choice(result, output)

@@ -124,11 +124,13 @@ def describe(
         )
         return
     with Steps(console, quiet=quiet) as step:
-        base = read(data if reference is None else reference, description=target, key=reference_key)
-        measured = read(data, description=target, like=base, key=key)
-        imageable_frames = [k for k, quality in enumerate(assess(measured, base.mean_frame())) if quality.imageable]
+        reference_measurement = read(data if reference is None else reference, description=target, key=reference_key)
+        measured = read(data, description=target, like=reference_measurement, key=key)
+        imageable_frames = [
+            k for k, quality in enumerate(assess(measured, reference_measurement.mean_frame())) if quality.imageable
+        ]
         result = image_difference(
-            measured, base, frame=imageable_frames[0] if imageable_frames else None, progress=step
+            measured, reference_measurement, frame=imageable_frames[0] if imageable_frames else None, progress=step
         )
         step("write the first image")
         write_image(result, output)

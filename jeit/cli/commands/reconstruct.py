@@ -152,9 +152,11 @@ def reconstruct(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        measurement, base = read_pair(data, reference, reference_frames, format, description, (key, reference_key))
+        measurement, reference_measurement = read_pair(
+            data, reference, reference_frames, format, description, (key, reference_key)
+        )
         frame_number = None if frame is None else number_or_name(frame, int)
-        result = image_difference(measurement, base, settings, frame=frame_number, progress=step)
+        result = image_difference(measurement, reference_measurement, settings, frame=frame_number, progress=step)
         step("write")
         write_image(result, output)
     if not quiet:

@@ -113,7 +113,9 @@ def series(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        measured, base = read_pair(data, reference, reference_frames, format, description, (key, reference_key))
+        measured, reference_measurement = read_pair(
+            data, reference, reference_frames, format, description, (key, reference_key)
+        )
         with naming_options({"rate": "--rate"}):
             measured = measured if rate is None else measured.at_rate(rate)
         with naming_options({"frequency": "--frequency"}):
@@ -123,7 +125,7 @@ def series(
                 for band in bands:
                     oscillation(np.zeros((measured.num_frames, 1)), measured.times, band)
         regions = {text: partial(_region_mask, text, parsed) for text, parsed in parsed_regions.items()}
-        sequence = image_sequence(measured, base, settings, regions=regions, progress=step)
+        sequence = image_sequence(measured, reference_measurement, settings, regions=regions, progress=step)
         with naming_options({"frequency": "--frequency"}):
             oscillations = [oscillation(sequence.series.changes, sequence.series.times, band) for band in bands]
         step("write")
@@ -134,7 +136,9 @@ def series(
     rate_text = "" if report["frame_rate"] is None else f", {report['frame_rate']:.4g} a second"
     untimed = "" if measured.times is not None else "; no times are known (--rate gives them), frames are numbered"
     console.print(f"\n{frames}{rate_text}, {report['refused']} refused{untimed}")
-    for note in dict.fromkeys((*sequence.prepared.measurement.notes, *(() if base is None else base.notes))):
+    for note in dict.fromkeys(
+        (*sequence.prepared.measurement.notes, *(() if reference_measurement is None else reference_measurement.notes))
+    ):
         console.print(f"  {note}", style="dim")
     for entry in report["oscillations"]:
         console.print(f"{entry['frequency']:.4g} Hz (resolution {entry['resolution']:.2g} Hz):")

@@ -2,8 +2,8 @@
 
 `<Header>N bytes</Header>` gives the offset of the first segment. A segment begins with six little-endian integers of
 four bytes: its type, a channel, the number of its frame from 0, the bytes per item, the number of items, and one of
-unknown meaning; the items follow. Type 3 is a frame of 256 numbers of four bytes, of which the 208 from the 48th on are
-the adjacent voltages; type 7 is an image of 912 numbers; other types are waveforms.
+unknown meaning; the items follow. Type 3 is a frame of 256 numbers of four bytes; the 208 numbers from the 48th on are
+the adjacent voltages. Type 7 is an image of 912 numbers. Other types are waveforms.
 """
 
 from __future__ import annotations

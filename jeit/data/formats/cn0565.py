@@ -1,10 +1,10 @@
 """Reader of what Analog Devices' CN0565 kit sends over its serial line, as terminals and programs record it.
 
-A frame is a line that begins with "!V": whole numbers of 32 bits in hexadecimal digits, separated by commas, the real
-and the imaginary part of each voltage in turn. Each electrode drives in turn, against the one at the force distance;
-for each drive the electrodes sense in the order of their numbers, each against the one at the sense distance, without
-the pairs that touch a driven electrode. With 8, 16 or 32 electrodes and both distances 1, which the kit's programs take
-unless asked otherwise, that is 40, 208 or 928 voltages. Other lines are answers to commands and messages.
+A frame is a line that begins with "!V": integers of 32 bits in hexadecimal digits, separated by commas, alternately the
+real and the imaginary part of a voltage. The electrodes drive one after another, each against the electrode at the
+force distance; for each drive the electrodes sense in the order of their numbers, each against the one at the sense
+distance, without the pairs that contain a driven electrode. With 8, 16 or 32 electrodes and both distances 1, the
+default of the kit's programs, there are 40, 208 or 928 voltages. Other lines are answers to commands and messages.
 """
 
 from __future__ import annotations

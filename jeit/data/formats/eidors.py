@@ -102,7 +102,8 @@ def read(
 def _keys(
     shapes: dict[str, tuple[int, ...]], sensor_description: Description, counts: list[int], path: Path
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Names of the arrays to read, names of their frames, and a note if an array was chosen for its shape."""
+    """Return the names of the arrays to read, the names of their frames, and a note if an array was selected by its
+    shape."""
     if sensor_description.layout.keys:
         return sensor_description.layout.keys, (), ()
     reference_names = [name for name in REFERENCE_NAMES if name in shapes]

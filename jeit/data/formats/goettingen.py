@@ -79,9 +79,9 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
 def _recorded_rate(path: Path) -> float | None:
     """Frame rate in frames per second from the record beside a file; None if there is no record, or no rate in it."""
     for suffix in (".prl", ".PRL"):
-        record = path.with_suffix(suffix)
-        if record.is_file():
-            with record.open("rb") as file:
+        record_path = path.with_suffix(suffix)
+        if record_path.is_file():
+            with record_path.open("rb") as file:
                 match = _RATE.search(file.read(_MAX_TEXT_BYTES))
             if match and float(match[1]) > 0:
                 return float(match[1])

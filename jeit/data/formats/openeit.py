@@ -32,7 +32,7 @@ from jeit.protocol import Protocol
 DESCRIPTION = "lines of an OpenEIT device ('magnitudes: …'), of 8, 16 or 32 electrodes"
 _FRAME_WORD = re.compile(rb"\s{0,40}magnitudes\s{0,40}:", re.IGNORECASE)
 _NUMBER = re.compile(rb"\d{1,30}(?:\.\d{0,30})?(?:[eE][-+]?\d{1,3})?")
-# Bytes in which the first word stands, and from which a file is recognised.
+# Number of bytes that must contain the first word, and number of bytes from which a file is recognised.
 _WORD_SEARCH_BYTES, _HEAD_BYTES = 4096, 2_000_000
 _ASSUMED_CURRENT = 1e-3
 # Tables [protocol] of the firmware by their number of channels.
@@ -108,43 +108,44 @@ def numbers(path: Path) -> tuple[Float[np.ndarray, "F M"], tuple[str, ...]]:
     content = content_of(path)
     frames = list(frames_in(content))
     lengths = [len(frame) for frame in frames]
-    count = _usual_length(lengths)
+    frame_length = _usual_length(lengths)
     if not frames:
         raise ValueError(f"{path.name}: no frame begins with 'magnitudes:', as those of an OpenEIT device do.")
-    if count not in _PROTOCOL_TABLES:
+    if frame_length not in _PROTOCOL_TABLES:
         known_counts = listed(
             [f"{channels} ({table['number']} electrodes)" for channels, table in _PROTOCOL_TABLES.items()]
         )
         raise ValueError(
-            f"{path.name}: most frames have {counted(count, 'number')}; the firmware sends {known_counts}. Read it as "
-            "a table."
+            f"{path.name}: most frames have {counted(frame_length, 'number')}; the firmware sends {known_counts}. Read "
+            "it as a table."
         )
-    if other_counts := [number for number in _PROTOCOL_TABLES if number != count and lengths.count(number) > 1]:
+    if other_counts := [number for number in _PROTOCOL_TABLES if number != frame_length and lengths.count(number) > 1]:
         raise ValueError(
-            f"{path.name}: {lengths.count(count)} frames have {count} numbers, and {lengths.count(other_counts[0])} "
-            f"have {other_counts[0]}: give the recordings of different devices in a file each."
+            f"{path.name}: {lengths.count(frame_length)} frames have {frame_length} numbers, and "
+            f"{lengths.count(other_counts[0])} have {other_counts[0]}: give the recordings of different devices in a "
+            "file each."
         )
     notes = []
     first_word = _FRAME_WORD.search(content)
     prefix = content[: first_word.start()].strip(b"\xef\xbb\xbf \r\n\t") if first_word is not None else b""
     if prefix:
         notes.append(f"{counted(len(prefix), 'character')} before the first 'magnitudes:' are left out.")
-    if len(frames) > 1 and lengths[-1] < count:
+    if len(frames) > 1 and lengths[-1] < frame_length:
         notes.append(f"the last frame is cut off after {counted(lengths[-1], 'number')}, and left out.")
         del frames[-1], lengths[-1]
-    elif content[-1:].isdigit() and lengths[-1] == count:
+    elif content[-1:].isdigit() and lengths[-1] == frame_length:
         frames[-1][-1] = np.nan
         notes.append("nothing follows the last number, which may be cut off: masked.")
     # Frames between which a word is lost appear as one long frame; its length gives the number of frames, so that
     # later frames keep their index in time.
-    frame_indices = np.cumsum([0, *(max(1, round(length / count)) for length in lengths)])
+    frame_indices = np.cumsum([0, *(max(1, round(length / frame_length)) for length in lengths)])
     is_complete = np.zeros(frame_indices[-1], bool)
     is_complete[
-        [frame_index for frame_index, length in zip(frame_indices[:-1], lengths, strict=True) if length == count]
+        [frame_index for frame_index, length in zip(frame_indices[:-1], lengths, strict=True) if length == frame_length]
     ] = True
     damaged_frames = [str(number) for number in np.flatnonzero(~is_complete)]
-    values = np.full((len(is_complete), count), np.nan)
-    values[is_complete] = [frame for frame in frames if len(frame) == count]
+    values = np.full((len(is_complete), frame_length), np.nan)
+    values[is_complete] = [frame for frame in frames if len(frame) == frame_length]
     if damaged_frames:
         notes.append(f"characters are lost in frame{'s' * (len(damaged_frames) > 1)} {listed(damaged_frames)}: masked.")
     values = np.where(values == 0, np.nan, values)
@@ -166,7 +167,7 @@ def frames_in(content: bytes) -> Iterator[array]:
 
 
 def _usual_length(lengths: list[int]) -> int:
-    """Length of most frames, of which the last may be cut off."""
+    """Most common length of the frames except the last, which may be cut off."""
     return Counter(lengths[:-1] or lengths).most_common(1)[0][0] if lengths else 0
 
 

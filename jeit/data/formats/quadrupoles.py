@@ -1,14 +1,14 @@
-"""Reader of text with a line for each measurement: the numbers of its four electrodes, and what was read.
+"""Reader of text with a line for each measurement: the numbers of its four electrodes, and the measured values.
 
-Loggers write them as a table, of which the heading names the columns: electrodes `a, b, m, n` (current enters at a and
-leaves at b, the voltage is that of m less that of n), or `f_plus, f_minus, s_plus, s_minus` and similar names; `real`
-and `imag`, `u`, or `r` and `i`; `frame`, `time` if there are several. So does geoelectrics in its unified data format
-(pyGIMLi, BERT, ResIPy; .ohm, .shm, .dat): the number of electrodes, a line with the coordinates of each, the number of
+Loggers write a table whose heading names the columns: electrodes `a, b, m, n` (current enters at a and leaves at b; the
+voltage is the potential at m minus that at n), or `f_plus, f_minus, s_plus, s_minus` and similar names; `real` and
+`imag`, `u`, or `r` and `i`; `frame`, `time` if there are several. Geoelectric programs (pyGIMLi, BERT, ResIPy) write
+the unified data format (.ohm, .shm, .dat): the number of electrodes, a line with the coordinates of each, the number of
 measurements, a comment with the names of the columns, and a line for each measurement, electrodes counted from 1. Units
 follow a name: `u/mV`, `i [mA]`.
 
-Channels are in the order of their electrodes, whatever that of the lines. Channels of a reference of the same sensor
-are those of the frames, too: a line that is missing is masked.
+Channels are sorted by their electrodes; the order of the lines has no effect. With a reference of the same sensor,
+frames have its channels; channels without a line are masked.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ _ASSUMED_CURRENT = 1e-3
 
 
 class _QuadrupoleTable(NamedTuple):
-    """Content of a file: names of the columns, `scales` of each, the numbers in rows, coordinates of the electrodes, if
-    it has them, whether it is of the unified data format, and notes."""
+    """Content of a file: `names` and `scales` of the columns; `rows` of numbers; `positions` of the electrodes, or
+    None; whether the file has the unified data format, `is_unified`; and `notes`."""
 
     names: list[str]
     scales: list[float]
@@ -95,7 +95,7 @@ def read(
     path: Path, description: str | Path | None = None, like: Measurement | None = None, key: str | None = None
 ) -> Measurement:
     """Read all frames. A description, given or beside the file, states the body; its `[electrodes]` may leave out
-        positions that the file has. `[protocol]` states the current, where the file does not.
+        positions that the file has. `[protocol]` states the current if the file does not.
 
     Raises `ValueError`, with the line, for lines that are not as the heading says, and for a `key`, because there are
     no arrays.
@@ -165,7 +165,14 @@ def _parse_column_name(cell: str) -> tuple[str, float]:
 
 def _electrode_columns(names: Sequence[str]) -> list[int] | None:
     """Indices of the columns with the four electrodes, or None."""
-    return next(([names.index(name) for name in four] for four in _ELECTRODE_NAMES if set(four) <= set(names)), None)
+    return next(
+        (
+            [names.index(name) for name in electrode_names]
+            for electrode_names in _ELECTRODE_NAMES
+            if set(electrode_names) <= set(names)
+        ),
+        None,
+    )
 
 
 def _read_table(path: Path) -> _QuadrupoleTable:
@@ -181,8 +188,10 @@ def _read_table(path: Path) -> _QuadrupoleTable:
             "resistance r."
         )
     heading_index, names, scales = heading
-    preceding_lines = [(number, line.split("#")[0].split()) for number, line in enumerate(text[:heading_index], 1)]
-    preceding_lines = [(number, cells) for number, cells in preceding_lines if cells]
+    preceding_lines = [
+        (line_number, line.split("#")[0].split()) for line_number, line in enumerate(text[:heading_index], 1)
+    ]
+    preceding_lines = [(line_number, cells) for line_number, cells in preceding_lines if cells]
     is_unified = (
         len(preceding_lines) > 1 and preceding_lines[-1][1][0].isdecimal() and preceding_lines[0][1][0].isdecimal()
     )
@@ -192,7 +201,7 @@ def _read_table(path: Path) -> _QuadrupoleTable:
     used_columns = [k for k, name in enumerate(names) if name in known_names or k in (electrode_columns or ())]
     rows: list[list[float]] = []
     notes: tuple[str, ...] = ()
-    for number, line in enumerate(text[heading_index + 1 :], heading_index + 2):
+    for line_number, line in enumerate(text[heading_index + 1 :], heading_index + 2):
         if not (line.split("#")[0].strip() and (num_stated is None or len(rows) < num_stated)):
             continue
         cells = _split_cells(line.split("#")[0])
@@ -200,12 +209,12 @@ def _read_table(path: Path) -> _QuadrupoleTable:
             row = np.full(len(names), np.nan)
             row[used_columns] = [float(cells[k].replace(",", ".") or "nan") for k in used_columns]
         except (ValueError, IndexError):
-            if number == len(text) and rows:
-                notes = (f"line {number}, the last, is cut off, and left out.",)
+            if line_number == len(text) and rows:
+                notes = (f"line {line_number}, the last, is cut off, and left out.",)
                 break
             raise ValueError(
-                f"{path.name}, line {number}: {line.strip()[:40]!r} is not {counted(len(names), 'column')} of numbers, "
-                "as the heading says; where a value is missing write nan."
+                f"{path.name}, line {line_number}: {line.strip()[:40]!r} is not {counted(len(names), 'column')} of "
+                "numbers, as the heading says; where a value is missing write nan."
             ) from None
         rows.append(row.tolist())
     if not rows:
@@ -252,7 +261,8 @@ def _describe_body(path: Path, description: str | Path | None, positions: np.nda
 def _electrode_indices(
     path: Path, table: _QuadrupoleTable, num_described: int | None
 ) -> tuple[Int[np.ndarray, "R 4"], tuple[str, ...]]:
-    """Electrodes of each line, counted from 0, and notes. Raises `ValueError` for what is no electrode."""
+    """Return the electrodes of each line, counted from 0, and notes. Raises `ValueError` for invalid electrode
+    numbers."""
     numbers = table.rows[:, _electrode_columns(table.names) or []]
     if not (np.isfinite(numbers).all() and (numbers == numbers.round()).all() and np.abs(numbers).max() < 1e6):
         raise ValueError(f"{path.name}: electrodes must be whole numbers.")
@@ -371,7 +381,7 @@ def _arrange_frames(
 def _frame_of_lines(
     path: Path, stated_frames: np.ndarray | None, channel_of_line: Int[np.ndarray, " R"], num_channels: int
 ) -> tuple[Int[np.ndarray, " R"], tuple[str, ...]]:
-    """Number of the frame of each line, from 0, and notes. Raises `ValueError` if nothing separates frames."""
+    """Return the frame number of each line, from 0, and notes. Raises `ValueError` if frames cannot be separated."""
     if stated_frames is not None and np.isfinite(stated_frames).all():
         return np.unique(stated_frames, return_inverse=True)[1].ravel(), ()
     rows = np.arange(len(channel_of_line))

@@ -29,7 +29,8 @@ class Recording:
 
     - `voltages`: (F, M), real or complex; `protocol`: protocol of the M channels; `usable`: (M,) mask, None if all
       channels are usable.
-    - `times`: (F,) seconds, or None; `frame_names`: one name per frame, or empty; `notes`: what the format leaves open.
+    - `times`: (F,) seconds, or None; `frame_names`: one name per frame, or empty; `notes`: properties that the format
+      does not define.
     """
 
     voltages: Inexact[np.ndarray, "F M"]
@@ -47,14 +48,14 @@ def content_of(path: Path) -> bytes:
 
 
 def description_of(path: Path, description: str | Path | None) -> Description:
-    """The description given, else the one beside the file, else an empty one. Raises `ValueError` if it is not
+    """Return the given description, else the one beside the file, else an empty one. Raises `ValueError` if it is not
     valid."""
     description_source = find_description(path) if description is None else description
     return parse_description({}, path.name) if description_source is None else load_description(description_source)
 
 
 def measurement_of(path: Path, recording: Recording, sensor_description: Description) -> Measurement:
-    """Convert a recording to a measurement of the body described. Protocol, times and frame names of the description
+    """Convert a recording to a measurement of the described body. Protocol, times and frame names of the description
     take precedence over those of the recording.
 
     Raises `ValueError` if protocol and channels, or names and frames, do not match.

@@ -107,7 +107,7 @@ def read(
 
 
 Protocols = Sequence[tuple[Protocol, str]]
-"""Protocols that may be meant, the described one first, each with what a description would have to say of it."""
+"""Candidate protocols, the described one first, each with the options that a description would have to state."""
 
 
 def channel_counts(protocols: Protocols) -> list[int]:
@@ -123,7 +123,7 @@ def measurement_in(
     mask: np.ndarray | None = None,
     like: Measurement | None = None,
 ) -> Measurement:
-    """The measurement of frames that were found in a file, with notes on what was found out; arguments as for
+    """Create the measurement from frames found in a file, with notes on detected properties; arguments as for
     `measurement_from` and `read`."""
     layout = replace(sensor_description.layout, frames_in="rows")
     frames = frames_from(file_frames.table, layout, path.name)
@@ -201,8 +201,10 @@ def measurement_from(
     notes, frames = sensor_description.notes, _without_gains(frames, protocol, sensor_description)
     if sensor_description.mean_removed and frames.shape[-1] == protocol.num_measurements:
         frames, mean = subtract_mean(np.atleast_2d(frames), protocol.num_electrodes)
-        said = f"the potentials had a mean, {mean * sensor_description.layout.scale:.3g} V at most; it is subtracted."
-        notes = (*notes, said) if mean else notes
+        mean_note = (
+            f"the potentials had a mean, {mean * sensor_description.layout.scale:.3g} V at most; it is subtracted."
+        )
+        notes = (*notes, mean_note) if mean else notes
     frame_names, num_frames = sensor_description.layout.frame_names, len(np.atleast_2d(frames))
     if frame_names and len(frame_names) != num_frames:
         raise ValueError(
@@ -334,8 +336,8 @@ def frames_of(values: np.ndarray, axes: tuple[str, ...], name: str) -> Inexact[n
         raise ValueError(
             f"{name}: the voltages have shape {values.shape}; {', '.join(axis_names)} are {len(axis_names)} axes."
         )
-    ordered = np.transpose(values, [axis_names.index(axis) for axis in ("frames", "patterns", "electrodes")])
-    return ordered.reshape(len(ordered), -1)
+    transposed = np.transpose(values, [axis_names.index(axis) for axis in ("frames", "patterns", "electrodes")])
+    return transposed.reshape(len(transposed), -1)
 
 
 def subtract_mean(frames: Inexact[np.ndarray, "F M"], num_electrodes: int) -> tuple[Inexact[np.ndarray, "F M"], float]:

@@ -1,7 +1,7 @@
-"""Numbers in text files, of which separators, headings and the words before a line are found out; and frames in tables
-whose arrangement is found out: rows or columns, a column of times, frames wrapped over lines.
+"""Reading of numbers from text files, with detection of separators, headings and words before each line; and of frames
+from tables, with detection of their arrangement: rows or columns, a column of times, frames wrapped over lines.
 
-Understood are cells separated by commas, semicolons, tabs or spaces, also several of these at once; decimal commas;
+Accepted are cells separated by commas, semicolons, tabs or spaces, also several of these at once; decimal commas;
 complex numbers ("1+2j", "(1-2j)"); brackets around lines, as Python and NumPy print lists and arrays; comments (# or
 %), headings, and lines like those of the heading between frames; a word before the numbers of each line ("magnitudes :
 1.2, 3.4"); separators at the end of lines; and lines of unequal length, of frames that are wrapped over several lines.
@@ -23,7 +23,7 @@ from jeit.arguments import counted
 from jeit.data.description import TableLayout
 from jeit.files import check_memory
 
-# Bytes of memory per byte of text: a number may take two characters, and is held twice.
+# Bytes of memory per byte of text: a number may take two characters, and is stored twice.
 _MEMORY_FACTOR = 8
 # Number of lines from which separators are detected, and maximum number of lines of a heading.
 _NUM_SAMPLE_LINES, _MAX_HEADING_LINES = 40, 100
@@ -44,8 +44,8 @@ _MIN_MILLISECOND_STEP = 5
 
 
 class Text(NamedTuple):
-    """**Fields**: `values`: all numbers; `lengths`: how many stand in each line; `heading`: cells of the last line of a
-    heading; `notes`: what was found out."""
+    """**Fields**: `values`: all numbers; `lengths`: number of values in each line; `heading`: cells of the last line of
+    a heading; `notes`: detected properties."""
 
     values: Inexact[np.ndarray, " n"]
     lengths: np.ndarray
@@ -91,7 +91,8 @@ _NUMBER_FORMATS = (
 
 
 class LineNumbers:
-    """Numbers of lines that come one after another. Separators are found from a line, and kept as long as they fit."""
+    """Parser of successive lines of numbers. Separators are detected in one line, and used for later lines as long as
+    they fit."""
 
     def __init__(self):
         self._format: _NumberFormat | None = None
@@ -114,8 +115,8 @@ class LineNumbers:
 
 
 def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = None) -> Text:
-    """The numbers of a text file. `delimiter` and `skip_rows`, the number of lines of a heading, are found out unless
-    given.
+    """Read the numbers of a text file. `delimiter` and `skip_rows`, the number of heading lines, are detected if they
+    are not given.
 
     Raises `ValueError`, with the line, for a file that holds anything but numbers or was cut off.
     """
@@ -226,7 +227,7 @@ def _heading_length(number_format: _NumberFormat, lines: Sequence[str]) -> int:
     """Return the number of heading lines at the start. A line belongs to the heading if at least half of its cells are
     words, if it has another length than the lines of numbers, or if it numbers the columns, as saved data frames do."""
     row_lengths = {len(row) for line in lines if (row := number_format.numbers(line))}
-    for number, line in enumerate(lines):
+    for line_index, line in enumerate(lines):
         cells = number_format.cells(line)
         column_names = cells[1:] if cells and not cells[0] else cells
         first_number = 1 if column_names[:1] == ["1"] else 0
@@ -236,7 +237,7 @@ def _heading_length(number_format: _NumberFormat, lines: Sequence[str]) -> int:
             continue
         num_numeric = sum(map(_is_number, cells))
         if num_numeric == len(cells) or (2 * num_numeric > len(cells) and len(cells) in row_lengths):
-            return number
+            return line_index
     return 0
 
 
@@ -246,9 +247,9 @@ def _content_lines(path: Path, num_skipped: int) -> Iterator[tuple[int, str]]:
         is_utf16 = file.read(2) in (b"\xff\xfe", b"\xfe\xff")  # as spreadsheets write "Unicode text"
     try:
         with path.open(encoding="utf-16" if is_utf16 else "utf-8-sig") as file:
-            for number, line in enumerate(file, start=1):
-                if number > num_skipped and line.strip() and not line.lstrip().startswith(_COMMENT_MARKS):
-                    yield number, line
+            for line_number, line in enumerate(file, start=1):
+                if line_number > num_skipped and line.strip() and not line.lstrip().startswith(_COMMENT_MARKS):
+                    yield line_number, line
     except UnicodeError:
         raise ValueError(f"{path.name} is not a text file. If it is a spreadsheet, export it as CSV.") from None
 
@@ -286,8 +287,8 @@ def _is_number(cell: str) -> bool:
 
 
 class Frames(NamedTuple):
-    """**Fields**: `table`: frames in rows; `times`: of the rows, seconds, if a column has them; `notes`: what was found
-    out."""
+    """**Fields**: `table`: frames in rows; `times`: times of the rows in seconds, or None; `notes`: detected
+    properties."""
 
     table: Inexact[np.ndarray, "F M"]
     times: Float[np.ndarray, " F"] | None = None
@@ -300,8 +301,8 @@ def frames_in_text(text: Text, counts: Sequence[int], layout: TableLayout, name:
     A last line or frame that is cut off is left out. Raises `ValueError` for lines of unequal length that are not
     frames wrapped over several lines.
     """
-    if layout.frames_in is None and (wrapped := _wrapped_frames(text, counts)) is not None:
-        num_channels, num_left_over = wrapped
+    if layout.frames_in is None and (wrapped_counts := _wrapped_frames(text, counts)) is not None:
+        num_channels, num_left_over = wrapped_counts
         num_frames = len(text.values) // num_channels
         notes = (
             f"each frame is wrapped over lines: {counted(num_channels, 'number')} are a frame.",
@@ -332,15 +333,16 @@ def _wrapped_frames(text: Text, counts: Sequence[int]) -> tuple[int, int] | None
         shape = len(text.lengths), int(text.lengths[0])
         if any(count in shape or count + 1 in shape for count in counts):
             return None
-    fitting = []
+    candidates = []
     for index, count in enumerate(counts):
-        num_frames, num_left = divmod(int(line_ends[-1]), count)
-        # A remainder beside frames of another length than the described one: rather a line is missing.
-        if index and num_left:
+        num_frames, num_left_over = divmod(int(line_ends[-1]), count)
+        # Numbers left over from frames of another length than the described one mean that a line is missing.
+        if index and num_left_over:
             continue
         if num_frames and text.lengths[0] < count and np.isin(count * np.arange(1, num_frames + 1), line_ends).all():
-            fitting.append((count, num_left))
-    return min(fitting, key=lambda candidate: candidate[1] > 0, default=None)  # prefer one that leaves no numbers over
+            candidates.append((count, num_left_over))
+    # Prefer a number of channels that leaves no numbers over.
+    return min(candidates, key=lambda candidate: candidate[1] > 0, default=None)
 
 
 def _truncation_notes(num_numbers: int) -> tuple[str, ...]:
@@ -375,9 +377,9 @@ def _are_columns(shape: tuple[int, int], counts: Sequence[int], default_axis: st
     """Whether columns, not rows, are frames: the first number of channels that one of the two has decides."""
     for num_extra in (0, 1):
         for count in counts:
-            fits = [shape[1] == count + num_extra, shape[0] == count + num_extra]
-            if any(fits):
-                return fits[1] and (default_axis == "columns" or not fits[0])
+            axis_fits = [shape[1] == count + num_extra, shape[0] == count + num_extra]
+            if any(axis_fits):
+                return axis_fits[1] and (default_axis == "columns" or not axis_fits[0])
     return default_axis == "columns"
 
 

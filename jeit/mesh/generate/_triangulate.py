@@ -45,18 +45,19 @@ class Front:
         return self.num_outline + len(self.fixed)
 
     def points(self) -> np.ndarray:
-        """All nodes (n, 2): nodes of each curve in turn, then fixed nodes, then free nodes."""
+        """All nodes (n, 2): the nodes of the first curve, of the second curve and so on, then fixed nodes, then free
+        nodes."""
         on_curves = [curve.at(stops) for curve, stops in zip(self.curves, self.stops, strict=True)]
         return np.concatenate([*on_curves, self.fixed, self.free])
 
     def segments(self) -> np.ndarray:
         """Outline segments as pairs of nodes (s, 2), in the order of their first nodes."""
-        pieces, offset = [], 0
+        segments, offset = [], 0
         for stops in self.stops:
             index = np.arange(offset, offset + len(stops))
-            pieces.append(np.stack([index, np.roll(index, -1)], axis=1))
+            segments.append(np.stack([index, np.roll(index, -1)], axis=1))
             offset += len(stops)
-        return np.concatenate(pieces)
+        return np.concatenate(segments)
 
     def guarded(self) -> np.ndarray:
         """Whether each node on the outline is a sharp corner (num_outline,)."""
@@ -185,8 +186,8 @@ def missing_segments(front: Front, cells: np.ndarray, num_points: int) -> np.nda
     """Indices of the outline segments that are not an edge of any cell."""
     edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]]).astype(np.int64)
     segments = front.segments().astype(np.int64)
-    present = np.isin(segments[:, 0] * num_points + segments[:, 1], edges[:, 0] * num_points + edges[:, 1])
-    return np.flatnonzero(~present)
+    is_present = np.isin(segments[:, 0] * num_points + segments[:, 1], edges[:, 0] * num_points + edges[:, 1])
+    return np.flatnonzero(~is_present)
 
 
 def polish(front: Front, passes: int = 4) -> None:
@@ -315,9 +316,11 @@ _SMOOTHING_STEPS = 14
 _SHARP_CORNER = np.radians(75.0)
 
 
-def outline_nodes(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size, guard: float) -> Front:
-    """Place nodes on the outline and cut off sharp corners at a distance of `guard` times the local cell size."""
-    all_stops, guards = [], []
+def outline_nodes(
+    curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size, guard_ratio: float
+) -> Front:
+    """Place nodes on the outline and cut off sharp corners at a distance of `guard_ratio` times the local cell size."""
+    all_stops, guarded_lengths = [], []
     for curve, required_stops in zip(curves, stops, strict=True):
         stop_lengths = np.unique(np.concatenate([curve.corners, required_stops % curve.length]))
         sharp_corners = np.flatnonzero(curve.angles < _SHARP_CORNER)
@@ -327,12 +330,12 @@ def outline_nodes(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarra
             gap_ahead = np.min((stop_lengths - corner_length - 1e-12 * curve.length) % curve.length)
             gap_behind = np.min((corner_length - stop_lengths - 1e-12 * curve.length) % curve.length)
             cut_length = min(
-                guard * float(size(curve.at(np.array([corner_length])))[0]), 0.45 * gap_ahead, 0.45 * gap_behind
+                guard_ratio * float(size(curve.at(np.array([corner_length])))[0]), 0.45 * gap_ahead, 0.45 * gap_behind
             )
             added_stops += [(corner_length + cut_length) % curve.length, (corner_length - cut_length) % curve.length]
         all_stops.append(divide(curve, np.concatenate([stop_lengths, added_stops]), size))
-        guards.append(curve.corners[sharp_corners])
-    return Front(curves, all_stops, guards, fixed, np.zeros((0, 2)))
+        guarded_lengths.append(curve.corners[sharp_corners])
+    return Front(curves, all_stops, guarded_lengths, fixed, np.zeros((0, 2)))
 
 
 def fill(front: Front, size: Size) -> None:
@@ -366,17 +369,17 @@ def smooth(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
         radii = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
         offset *= np.minimum(1.0, radii / np.maximum(np.linalg.norm(offset, axis=1), 1e-300))[:, None]
         weight = doubled_areas(points, cells) / size(centroids) ** 3
-        weighted = weight[:, None] * np.concatenate([centroids + offset, np.ones((len(cells), 1))], axis=1)
-        summed = np.stack(
+        weighted_centres = weight[:, None] * np.concatenate([centroids + offset, np.ones((len(cells), 1))], axis=1)
+        node_sums = np.stack(
             [
                 np.bincount(cells.ravel(), np.repeat(weight_column, 3), minlength=len(points))
-                for weight_column in weighted.T
+                for weight_column in weighted_centres.T
             ],
             axis=1,
         )[num_held:]
-        has_cells = summed[:, 2] > 0
+        has_cells = node_sums[:, 2] > 0
         target = np.where(
-            has_cells[:, None], summed[:, :2] / np.where(has_cells, summed[:, 2], 1.0)[:, None], front.free
+            has_cells[:, None], node_sums[:, :2] / np.where(has_cells, node_sums[:, 2], 1.0)[:, None], front.free
         )
         is_clear = clear_of_outline(front, points, target, 0.45 * size(target))
         front.free = np.where(is_clear[:, None], target, front.free)
@@ -392,9 +395,9 @@ def generate(
     are skipped. Node 0 is the first node of the first curve. Raises `ValueError` if no mesh with the guaranteed minimum
     angle is found.
     """
-    for guard in (1.0, 0.5, 0.25):
+    for guard_ratio in (1.0, 0.5, 0.25):
         if front is None:
-            front = outline_nodes(curves, stops, fixed, size, guard)
+            front = outline_nodes(curves, stops, fixed, size, guard_ratio)
             fill(front, size)
         smooth(front, size)
         polish(front)

@@ -63,15 +63,15 @@ def smooth(length: float, at: Callable[[np.ndarray], np.ndarray], num_chords: in
 
 def closed_line(vertices: np.ndarray) -> Curve:
     """A closed polygon; arc length starts at the first vertex, and the domain lies to the left."""
-    closed = np.concatenate([vertices, vertices[:1]])
-    stops = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    closed_vertices = np.concatenate([vertices, vertices[:1]])
+    stops = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed_vertices, axis=0), axis=1))])
 
     def at(arc_length: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(arc_length, stops, closed[:, axis]) for axis in range(2)], axis=-1)
+        return np.stack([np.interp(arc_length, stops, closed_vertices[:, axis]) for axis in range(2)], axis=-1)
 
     def distance(points: np.ndarray) -> np.ndarray:
         result = np.full(len(points), np.inf)
-        for start, end in pairwise(closed):
+        for start, end in pairwise(closed_vertices):
             result = np.minimum(result, topology.distance(points, start[None], end[None])[:, 0])
         return result
 
@@ -114,11 +114,11 @@ def divide(curve: Curve, stops: np.ndarray, size: Size) -> np.ndarray:
     cumulative_count = np.concatenate([[0.0], np.cumsum(np.diff(samples) * density)])
     stop_counts = np.interp(np.append(stops, stops[0] + curve.length), samples, cumulative_count)
     min_pieces = max(1, -(-3 // len(stops)))
-    pieces = []
+    node_lengths = []
     for start, start_count, end_count in zip(stops, stop_counts[:-1], stop_counts[1:], strict=True):
         num_pieces = max(min_pieces, round(end_count - start_count))
         inner_stops = np.interp(
             start_count + (end_count - start_count) * np.arange(1, num_pieces) / num_pieces, cumulative_count, samples
         )
-        pieces.append(np.append(start, inner_stops))
-    return np.sort(np.concatenate(pieces) % curve.length)
+        node_lengths.append(np.append(start, inner_stops))
+    return np.sort(np.concatenate(node_lengths) % curve.length)

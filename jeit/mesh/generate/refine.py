@@ -33,11 +33,11 @@ class TooFewNodes(ValueError):
 
 
 @contextmanager
-def nodes_of_solid(num_requested: int | None, in_plane: Callable[[int], int]) -> Iterator[None]:
+def nodes_of_solid(num_requested: int | None, count_base_nodes: Callable[[int], int]) -> Iterator[None]:
     """Convert a `TooFewNodes` error raised within into a `ValueError` about the number of nodes of a solid.
 
-    `num_requested`: number of nodes requested for the solid; `in_plane`: function that returns how many of a solid's
-    nodes lie in its base.
+    `num_requested`: number of nodes requested for the solid; `count_base_nodes`: function that returns how many of a
+    solid's nodes lie in its base.
     """
     try:
         yield
@@ -45,7 +45,7 @@ def nodes_of_solid(num_requested: int | None, in_plane: Callable[[int], int]) ->
         if num_requested is None:
             raise
         num_points = float(num_requested)
-        while in_plane(round(num_points)) < error.min_points and num_points < _MAX_TRIAL_NODES:
+        while count_base_nodes(round(num_points)) < error.min_points and num_points < _MAX_TRIAL_NODES:
             num_points *= _TRIAL_FACTOR
         min_points = float(f"{num_points:.2g}")
         raise ValueError(f"num_points: {error.solid.format(asked=num_requested, least=f'{min_points:.0f}')}") from None

@@ -210,10 +210,10 @@ def _interior_samples(curves: list[Curve]) -> np.ndarray:
 def _estimate_num_nodes(curves: list[Curve], size: Size, area: float) -> float:
     """Estimate the number of nodes of a mesh with this size function, from samples inside the domain and along its
     outline."""
-    total = area * float(np.mean(1.0 / size(_interior_samples(curves)) ** 2))
+    num_nodes = area * float(np.mean(1.0 / size(_interior_samples(curves)) ** 2))
     for curve in curves:
-        total += curve.length * float(np.mean(1.0 / size(curve.at(np.linspace(0, curve.length, 400)))))
-    return total
+        num_nodes += curve.length * float(np.mean(1.0 / size(curve.at(np.linspace(0, curve.length, 400)))))
+    return num_nodes
 
 
 def _fit_cell_size(

@@ -77,11 +77,11 @@ class Geodesics(Module):
         triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
         cells, points = triangles.cells, triangles.points
         node, start, end = (np.roll(cells, -shift, axis=1).ravel() for shift in range(3))
-        local = _triangle_coordinates(points[start], points[end], points[node])
+        corner_coordinates = _triangle_coordinates(points[start], points[end], points[node])
         ends = np.concatenate([start, end])
         order = np.argsort(ends, kind="stable")
         first = np.concatenate([[0], np.cumsum(np.bincount(ends, minlength=len(points)))])
-        corners = _Corners(node, start, end, *local)
+        corners = _Corners(node, start, end, *corner_coordinates)
         return cls(triangles, corners, _gaussian_curvature(triangles, corners), first, order % len(node))
 
     def distances(
@@ -149,15 +149,17 @@ class Geodesics(Module):
         length = np.linalg.norm(self.surface.points[nodes] - source_places.points[:, None], axis=-1)
         lengths, owner = np.full(len(self.surface.points), np.inf), np.full(len(self.surface.points), -1)
         source_index = np.repeat(np.arange(len(nodes)), 3)
-        changed = _lower_distances(lengths, owner, nodes.ravel(), length.ravel(), source_index)
-        while changed.size:
-            _, corner = self._opposite_corners(changed, np.zeros_like(changed))
+        changed_nodes = _lower_distances(lengths, owner, nodes.ravel(), length.ravel(), source_index)
+        while changed_nodes.size:
+            _, corner = self._opposite_corners(changed_nodes, np.zeros_like(changed_nodes))
             start, end, node = self.corners.start[corner], self.corners.end[corner], self.corners.node[corner]
             local = (coordinates[corner] for coordinates in self.corners[3:])
             new_lengths, by_start = _distances_across(
                 lengths[start], lengths[end], *local, same_source=owner[start] == owner[end]
             )
-            changed = _lower_distances(lengths, owner, node, new_lengths, np.where(by_start, owner[start], owner[end]))
+            changed_nodes = _lower_distances(
+                lengths, owner, node, new_lengths, np.where(by_start, owner[start], owner[end])
+            )
         return owner, lengths
 
     def _distances_to_nodes(self, sources: SurfacePlaces, limit: float):
@@ -168,9 +170,11 @@ class Geodesics(Module):
         nodes = self.surface.cells[sources.triangle]
         entries = (np.arange(len(nodes))[:, None] * num_nodes + nodes).ravel()
         lengths[entries] = np.linalg.norm(self.surface.points[nodes] - sources.points[:, None], axis=-1).ravel()
-        changed = entries
-        while changed.size:
-            source, corner = self._opposite_corners(changed % num_nodes, changed - changed % num_nodes)
+        changed_entries = entries
+        while changed_entries.size:
+            source, corner = self._opposite_corners(
+                changed_entries % num_nodes, changed_entries - changed_entries % num_nodes
+            )
             start, end = source + self.corners.start[corner], source + self.corners.end[corner]
             local = (coordinates[corner] for coordinates in self.corners[3:])
             mean_curvature = (curvatures[start] + curvatures[end]) / 2
@@ -188,7 +192,7 @@ class Geodesics(Module):
                 fraction * mean_curvature[is_lower] + (1 - fraction) * self.curvature[node]
             )[is_smallest]
             # Nodes beyond the limit are not propagated.
-            changed = np.unique(entries[lengths[entries] <= limit])
+            changed_entries = np.unique(entries[lengths[entries] <= limit])
         return lengths.reshape(-1, num_nodes), curvatures.reshape(-1, num_nodes)
 
     def _opposite_corners(self, nodes, values):
@@ -342,6 +346,6 @@ def _lower_distances(lengths, owner, nodes, new_lengths, owner_index) -> np.ndar
     is_lower = new_lengths < (1 - _MIN_DECREASE) * lengths[nodes]
     nodes, new_lengths, owner_index = nodes[is_lower], new_lengths[is_lower], owner_index[is_lower]
     order = np.lexsort((new_lengths, nodes))
-    changed, first_entries = np.unique(nodes[order], return_index=True)
-    lengths[changed], owner[changed] = new_lengths[order][first_entries], owner_index[order][first_entries]
-    return changed
+    changed_nodes, first_entries = np.unique(nodes[order], return_index=True)
+    lengths[changed_nodes], owner[changed_nodes] = new_lengths[order][first_entries], owner_index[order][first_entries]
+    return changed_nodes

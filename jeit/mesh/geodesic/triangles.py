@@ -71,8 +71,8 @@ class Triangles(Module):
             if face not in mesh.tags:
                 raise ValueError(f"face: the mesh has the tags {sorted(mesh.tags)}, and '{face}' is none of them.")
             cells = np.asarray(mesh.facets)[np.asarray(mesh.tags[face])]
-        used, renumbered = np.unique(cells, return_inverse=True)
-        return cls(points[used], renumbered.reshape(cells.shape))
+        used_nodes, renumbered = np.unique(cells, return_inverse=True)
+        return cls(points[used_nodes], renumbered.reshape(cells.shape))
 
     @property
     def corners(self) -> Float[np.ndarray, "m 3 3"]:
@@ -166,14 +166,14 @@ def _nearest_in_triangles(corners: Float[np.ndarray, "... 3 3"], points: Float[n
     a, b = (offset * first).sum(-1), (offset * second).sum(-1)
     area = aa * bb - ab**2
     u, v = (bb * a - ab * b) / area, (aa * b - ab * a) / area
-    inside = np.stack([1 - u - v, u, v], axis=-1)
-    nearest_weights = np.where((inside >= 0).all(axis=-1, keepdims=True), inside, np.nan)
+    weights_in_plane = np.stack([1 - u - v, u, v], axis=-1)
+    nearest_weights = np.where((weights_in_plane >= 0).all(axis=-1, keepdims=True), weights_in_plane, np.nan)
     min_distance = np.where(np.isnan(nearest_weights[..., 0]), np.inf, 0.0)
     for start, end in ((0, 1), (1, 2), (2, 0)):
         side = corners[..., end, :] - corners[..., start, :]
         fraction = np.clip(((points - corners[..., start, :]) * side).sum(-1) / (side**2).sum(-1), 0, 1)
         distance = np.linalg.norm(corners[..., start, :] + fraction[..., None] * side - points, axis=-1)
-        weights = np.zeros_like(inside)
+        weights = np.zeros_like(weights_in_plane)
         weights[..., start], weights[..., end] = 1 - fraction, fraction
         is_nearer = distance < min_distance
         min_distance, nearest_weights = (

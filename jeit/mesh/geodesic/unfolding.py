@@ -84,23 +84,23 @@ def unfold(mesh: Mesh, places: Float[Array, "L 3"], max_distance: Float[Array, "
     normal = xp.cross(first, second)
     normal = normal / xp.sqrt((normal**2).sum(axis=1, keepdims=True))
     axes = xp.stack([first_axis, xp.cross(normal, first_axis)], axis=1)
-    local = xp.einsum("mid,mad->mia", corners - corners[:, :1], axes)
+    plane_corners = xp.einsum("mid,mad->mia", corners - corners[:, :1], axes)
     frames = corners[:, 0], axes, normal
-    root = _containing_triangles(undifferentiated(places), *undifferentiated((frames, local)))
+    root = _containing_triangles(undifferentiated(places), *undifferentiated((frames, plane_corners)))
     squared_distance = undifferentiated(((places[:, None] - corners.mean(axis=1)) ** 2).sum(axis=-1))
     # If the values are known, compute on the host: XLA would take seconds to evaluate a sort of constants.
     opposite, cell = xp.asarray(_opposite_sides(on_host(mesh.cells))), xp.arange(len(corners))
     reached, side = _connect(opposite // 3, squared_distance <= undifferentiated(max_distance) ** 2, root)
     side_index = 3 * cell + side
     previous = xp.where(side < 0, cell, opposite[side_index] // 3)
-    turn, shift = (transform[side_index] for transform in _transforms_across_sides(local, opposite))
+    turn, shift = (transform[side_index] for transform in _transforms_across_sides(plane_corners, opposite))
     has_previous = (side >= 0)[..., None]
     turn, shift = xp.where(has_previous, turn, xp.array([1.0, 0.0])), xp.where(has_previous, shift, 0.0)
     turn, shift, end_triangle = _compose_transforms(previous, turn, shift)
     place = xp.einsum("ld,lad->la", places - corners[root, 0], axes[root])
-    is_curved = _is_curved(undifferentiated(local), mesh.cells, opposite, mesh.num_points)
+    is_curved = _is_curved(undifferentiated(plane_corners), mesh.cells, opposite, mesh.num_points)
     is_invalid = reached & (is_curved | (end_triangle != root[:, None]))
-    return Unfolding(local, turn, shift, place, reached, ~is_invalid.any(axis=1))
+    return Unfolding(plane_corners, turn, shift, place, reached, ~is_invalid.any(axis=1))
 
 
 def _rotate(turn, points):
@@ -110,17 +110,19 @@ def _rotate(turn, points):
     return namespace(turn, points).stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
-def _containing_triangles(places, frames, local) -> Int[Array, " L"]:
+def _containing_triangles(positions, frames, plane_corners) -> Int[Array, " L"]:
     """Index of the triangle that contains each point: the nearest one, by height above its plane and distance outside
     it."""
-    xp = namespace(places, local)
+    xp = namespace(positions, plane_corners)
     origin, axes, normal = frames
-    offset = places[:, None] - origin
+    offset = positions[:, None] - origin
     x, y = xp.moveaxis(xp.einsum("lmd,mad->lma", offset, axes), -1, 0)
-    third = y / local[:, 2, 1]
-    second = (x - third * local[:, 2, 0]) / local[:, 1, 0]
-    outside = xp.maximum(-xp.minimum(xp.minimum(second, third), 1 - second - third), 0) * local[:, 1, 0]
-    return ((offset * normal).sum(axis=-1) ** 2 + outside**2).argmin(axis=1)
+    third = y / plane_corners[:, 2, 1]
+    second = (x - third * plane_corners[:, 2, 0]) / plane_corners[:, 1, 0]
+    distance_outside = (
+        xp.maximum(-xp.minimum(xp.minimum(second, third), 1 - second - third), 0) * plane_corners[:, 1, 0]
+    )
+    return ((offset * normal).sum(axis=-1) ** 2 + distance_outside**2).argmin(axis=1)
 
 
 def _opposite_sides(cells) -> Int[Array, " h"]:
@@ -159,11 +161,11 @@ def _connect(neighbour, is_near: Bool[Array, "L m"], root):
     return reached, side
 
 
-def _transforms_across_sides(local, opposite):
+def _transforms_across_sides(plane_corners, opposite):
     """Rotation (h, 2), as cosine and sine, and translation (h, 2) for each half-edge (a side of one triangle), from the
     plane of its triangle into that of the triangle on the other side."""
-    xp = namespace(local)
-    start, end = local.reshape(-1, 2), xp.roll(local, -1, axis=1).reshape(-1, 2)
+    xp = namespace(plane_corners)
+    start, end = plane_corners.reshape(-1, 2), xp.roll(plane_corners, -1, axis=1).reshape(-1, 2)
     side, opposite_side = end - start, start[opposite] - end[opposite]
     turn = xp.stack(
         [(side * opposite_side).sum(axis=1), side[:, 0] * opposite_side[:, 1] - side[:, 1] * opposite_side[:, 0]],
@@ -187,10 +189,13 @@ def _compose_transforms(previous, turn, shift):
     return turn, shift, previous
 
 
-def _is_curved(local, cells, opposite, num_nodes: int) -> Bool[Array, " m"]:
+def _is_curved(plane_corners, cells, opposite, num_nodes: int) -> Bool[Array, " m"]:
     """For each triangle, whether the angles around one of its corners inside the surface do not sum to a full turn."""
-    xp = namespace(local, cells)
-    next_edges, previous_edges = xp.roll(local, -1, axis=1) - local, xp.roll(local, 1, axis=1) - local
+    xp = namespace(plane_corners, cells)
+    next_edges, previous_edges = (
+        xp.roll(plane_corners, -1, axis=1) - plane_corners,
+        xp.roll(plane_corners, 1, axis=1) - plane_corners,
+    )
     angle = xp.arctan2(
         next_edges[..., 0] * previous_edges[..., 1] - next_edges[..., 1] * previous_edges[..., 0],
         (next_edges * previous_edges).sum(axis=-1),

@@ -102,11 +102,11 @@ def unroll(surface: Triangles | Mesh, face: str | None = None, *, cut: ArrayLike
     triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
     cells, nodes = _cut_to_disk(triangles, cut)
     corners = triangles.corners
-    local = _plane_corners(corners)
-    points = _conformal_map(cells, local, len(nodes))
-    points = _flatten_rigidly(cells, local, points)
+    plane_corners = _plane_corners(corners)
+    points = _conformal_map(cells, plane_corners, len(nodes))
+    points = _flatten_rigidly(cells, plane_corners, points)
     points = _turn_upright(points, triangles.points[nodes])
-    deformation = _edges(points[cells]) @ np.linalg.inv(_edges(local))
+    deformation = _edges(points[cells]) @ np.linalg.inv(_edges(plane_corners))
     return Unrolled(triangles, cells, points, nodes, np.linalg.svd(deformation, compute_uv=False)[:, ::-1])
 
 
@@ -124,32 +124,39 @@ def _edges(triangles: Float[np.ndarray, "m 3 2"]) -> Float[np.ndarray, "m 2 2"]:
     return np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=2)
 
 
-def _conformal_map(cells, local, num_nodes: int) -> np.ndarray:
+def _conformal_map(cells, plane_corners, num_nodes: int) -> np.ndarray:
     """Least-squares conformal map, which preserves angles as well as possible; the two farthest nodes are fixed."""
-    held_nodes = _farthest_nodes(cells, local, num_nodes)
-    side_vectors = np.stack([local[:, 2] - local[:, 1], local[:, 0] - local[:, 2], local[:, 1] - local[:, 0]], axis=1)
-    side_vectors = side_vectors / np.sqrt(np.abs(np.linalg.det(_edges(local))))[:, None, None]
+    held_nodes = _farthest_nodes(cells, plane_corners, num_nodes)
+    side_vectors = np.stack(
+        [
+            plane_corners[:, 2] - plane_corners[:, 1],
+            plane_corners[:, 0] - plane_corners[:, 2],
+            plane_corners[:, 1] - plane_corners[:, 0],
+        ],
+        axis=1,
+    )
+    side_vectors = side_vectors / np.sqrt(np.abs(np.linalg.det(_edges(plane_corners))))[:, None, None]
     row = np.repeat(np.arange(len(cells)), 3)
     real, imaginary = (
         scipy.sparse.csr_array((component.ravel(), (row, cells.ravel())), shape=(len(cells), num_nodes))
         for component in (side_vectors[..., 0], side_vectors[..., 1])
     )
     matrix = scipy.sparse.block_array([[real, -imaginary], [imaginary, real]]).tocsc()
-    fixed = np.array([held_nodes[0], held_nodes[1], held_nodes[0] + num_nodes, held_nodes[1] + num_nodes])
+    fixed_coordinates = np.array([held_nodes[0], held_nodes[1], held_nodes[0] + num_nodes, held_nodes[1] + num_nodes])
     values = np.array([0.0, held_nodes[2], 0.0, 0.0])
-    free = np.setdiff1d(np.arange(2 * num_nodes), fixed)
-    free_columns, right_side = matrix[:, free], -(matrix[:, fixed] @ values)
+    free_coordinates = np.setdiff1d(np.arange(2 * num_nodes), fixed_coordinates)
+    free_columns, right_side = matrix[:, free_coordinates], -(matrix[:, fixed_coordinates] @ values)
     coordinates = np.zeros(2 * num_nodes)
-    coordinates[fixed] = values
-    coordinates[free] = scipy.sparse.linalg.spsolve(
+    coordinates[fixed_coordinates] = values
+    coordinates[free_coordinates] = scipy.sparse.linalg.spsolve(
         (free_columns.T @ free_columns).tocsc(), free_columns.T @ right_side
     )
     return coordinates.reshape(2, -1).T
 
 
-def _farthest_nodes(cells, local, num_nodes: int):
+def _farthest_nodes(cells, plane_corners, num_nodes: int):
     """Two nodes far from each other, and their distance along edges."""
-    length = np.linalg.norm(local[:, [1, 2, 0]] - local, axis=2)
+    length = np.linalg.norm(plane_corners[:, [1, 2, 0]] - plane_corners, axis=2)
     start, end = cells.ravel(), cells[:, [1, 2, 0]].ravel()
     graph = scipy.sparse.csr_array((length.ravel(), (start, end)), shape=(num_nodes, num_nodes))
     first = int(np.argmax(dijkstra(graph, directed=False, indices=0)))
@@ -157,13 +164,16 @@ def _farthest_nodes(cells, local, num_nodes: int):
     return first, int(np.argmax(lengths)), float(lengths.max())
 
 
-def _flatten_rigidly(cells, local, points: np.ndarray) -> np.ndarray:
+def _flatten_rigidly(cells, plane_corners, points: np.ndarray) -> np.ndarray:
     """Flatten as rigidly as possible: alternately fit a rotation of each triangle to the map, and the nodes to the
     rotated triangles."""
     num_nodes = len(points)
     next_corner, previous_corner = [1, 2, 0], [2, 0, 1]
-    edge = local[:, next_corner] - local  # side k runs from corner k to the next
-    first_leg, second_leg = local - local[:, previous_corner], local[:, next_corner] - local[:, previous_corner]
+    edge = plane_corners[:, next_corner] - plane_corners  # side k runs from corner k to the next
+    first_leg, second_leg = (
+        plane_corners - plane_corners[:, previous_corner],
+        plane_corners[:, next_corner] - plane_corners[:, previous_corner],
+    )
     cross = first_leg[..., 0] * second_leg[..., 1] - first_leg[..., 1] * second_leg[..., 0]
     weight = (first_leg * second_leg).sum(-1) / cross / 2  # half the cotangent of the angle opposite to side k
     start, end = cells, cells[:, next_corner]
@@ -241,7 +251,7 @@ def _cut_to_disk(surface: Triangles, cut) -> tuple[np.ndarray, np.ndarray]:
         axis = int(np.argmax(np.ptp(points, axis=0)))
         ends = np.array([points[:, axis].argmin()]), np.array([points[:, axis].argmax()])
     path = _path_along_edges(points, edges, ends, cut, border)
-    return _split_along_path(cells, path, num_nodes, closed=num_loops == 0)
+    return _split_along_path(cells, path, num_nodes, is_closed=num_loops == 0)
 
 
 def _border_loops(border, num_nodes: int):
@@ -257,10 +267,10 @@ def _border_loops(border, num_nodes: int):
 def _path_along_edges(points, edges, ends, cut, border) -> list[int]:
     """Nodes of a path along edges from one end to the other, near the requested side and off the border."""
     centre = points.mean(axis=0)
-    goal = np.asarray(cut, float) if cut is not None else None
+    cut_position = np.asarray(cut, float) if cut is not None else None
     spread = np.ptp(points, axis=0).max()
     midpoints = points[edges].mean(axis=1)
-    if goal is None:
+    if cut_position is None:
         # Edges away from the side of the smallest x cost more, which yields a straight line along that side.
         x_offsets = (midpoints[:, 0] - points[:, 0].min()) / spread
         y_offsets = np.abs(midpoints[:, 1] - centre[1]) / spread
@@ -268,7 +278,7 @@ def _path_along_edges(points, edges, ends, cut, border) -> list[int]:
     else:
         axis = points[ends[1]].mean(axis=0) - points[ends[0]].mean(axis=0)
         axis = axis / np.linalg.norm(axis)
-        offsets = midpoints - goal
+        offsets = midpoints - cut_position
         cost = 1 + 20 * np.linalg.norm(offsets - (offsets @ axis)[:, None] * axis, axis=1) / spread
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) * cost
     if len(border):
@@ -281,10 +291,10 @@ def _path_along_edges(points, edges, ends, cut, border) -> list[int]:
     return path
 
 
-def _split_along_path(cells, path: list[int], num_nodes: int, *, closed: bool):
+def _split_along_path(cells, path: list[int], num_nodes: int, *, is_closed: bool):
     """Duplicate the nodes along a path for the triangles on one side of it. On a closed surface, the ends of the path
     are not duplicated."""
-    doubled_nodes = path[1:-1] if closed else path
+    doubled_nodes = path[1:-1] if is_closed else path
     path_edges = set(itertools.pairwise(path))
     path_nodes = set(path)
     new_nodes = {node: num_nodes + k for k, node in enumerate(doubled_nodes)}

@@ -156,13 +156,13 @@ def check_length(name: str, value: Any, size_factor: float = 1.0) -> Any:
     if not has_values(value):
         return value
     try:
-        number = np.nan if isinstance(value, str) else float(value)
+        length = np.nan if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: expected one length in metres, got {value!r}.") from None
-    if not np.isfinite(number) or number <= 0:
+    if not np.isfinite(length) or length <= 0:
         raise ValueError(f"{name}: expected a positive length in metres, got {describe(value)}.")
-    warn_large(number, name, size_factor)
-    return number
+    warn_large(length, name, size_factor)
+    return length
 
 
 def check_near_origin(name: str, coordinates: Any, size: Any) -> None:

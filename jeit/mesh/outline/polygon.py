@@ -71,8 +71,11 @@ class Polygon(Domain):
     @property
     def extent(self) -> tuple[float, float, float, float]:
         """Bounding box (x_min, x_max, y_min, y_max) in metres."""
-        low, high = np.min(np.asarray(self.vertices), axis=0), np.max(np.asarray(self.vertices), axis=0)
-        return (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+        lower_corner, upper_corner = (
+            np.min(np.asarray(self.vertices), axis=0),
+            np.max(np.asarray(self.vertices), axis=0),
+        )
+        return (float(lower_corner[0]), float(upper_corner[0]), float(lower_corner[1]), float(upper_corner[1]))
 
     def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
         """Points (…, 2) on the outer outline at `arc_length` (…) in metres from the first vertex."""

@@ -39,10 +39,10 @@ def along(loop: Loop, arc_length: ArrayLike) -> Float[Array, "... 2"]:
     """Points (…, 2) on a loop at `arc_length` (…) in metres from its first vertex, taken modulo the length of the
     loop."""
     xp = namespace(loop)
-    closed = xp.concatenate([loop, loop[:1]])
+    closed_loop = xp.concatenate([loop, loop[:1]])
     stops = xp.concatenate([xp.zeros(1), xp.cumsum(_side_lengths(loop))])
-    wrapped = xp.mod(xp.asarray(arc_length, dtype=stops.dtype), stops[-1])
-    return xp.stack([xp.interp(wrapped, stops, closed[:, axis]) for axis in range(2)], axis=-1)
+    wrapped_length = xp.mod(xp.asarray(arc_length, dtype=stops.dtype), stops[-1])
+    return xp.stack([xp.interp(wrapped_length, stops, closed_loop[:, axis]) for axis in range(2)], axis=-1)
 
 
 @either_engine
@@ -52,10 +52,10 @@ def contains(loops: Sequence[Loop], points: ArrayLike) -> Bool[Array, "..."]:
         point_array = np.asarray(points)
         return enclosed(point_array.reshape(-1, 2), loops).reshape(point_array.shape[:-1])  # pyright: ignore
     points = jnp.asarray(points)
-    inside = jnp.zeros(points.shape[:-1], bool)
+    is_inside = jnp.zeros(points.shape[:-1], bool)
     for loop in loops:
-        inside = inside ^ _is_inside(loop, points)
-    return inside
+        is_inside = is_inside ^ _is_inside(loop, points)
+    return is_inside
 
 
 def signed_distance(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, " p"]:
@@ -101,12 +101,12 @@ def _shoelace(loop: Loop) -> Float[Array, ""]:
 def _is_inside(loop: Loop, points: Float[Array, "... 2"]) -> Bool[Array, "..."]:
     """Even-odd rule: count the sides that a ray towards +x crosses."""
 
-    def crosses(inside: Array, side: Array) -> tuple[Array, None]:
+    def toggle_at_crossing(is_inside: Array, side: Array) -> tuple[Array, None]:
         (x0, y0), (x1, y1) = side
-        spans = (y0 > points[..., 1]) != (y1 > points[..., 1])
-        height = jnp.where(spans, y1 - y0, 1.0)
-        x = x0 + (points[..., 1] - y0) * (x1 - x0) / height
-        return inside ^ (spans & (points[..., 0] < x)), None
+        spans_point = (y0 > points[..., 1]) != (y1 > points[..., 1])
+        side_height = jnp.where(spans_point, y1 - y0, 1.0)
+        x = x0 + (points[..., 1] - y0) * (x1 - x0) / side_height
+        return is_inside ^ (spans_point & (points[..., 0] < x)), None
 
     sides = jnp.stack([loop, jnp.roll(loop, -1, axis=0)], axis=1)
-    return jax.lax.scan(crosses, jnp.zeros(points.shape[:-1], bool), sides)[0]
+    return jax.lax.scan(toggle_at_crossing, jnp.zeros(points.shape[:-1], bool), sides)[0]

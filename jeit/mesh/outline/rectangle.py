@@ -68,8 +68,8 @@ class Rectangle(Domain):
     @property
     def vertices(self) -> Float[Array, "4 2"]:
         """Corners (4, 2) in metres, counter-clockwise from the lower left one."""
-        left, right, low, high = self.extent
-        return as_array([[left, low], [right, low], [right, high], [left, high]])
+        x_min, x_max, y_min, y_max = self.extent
+        return as_array([[x_min, y_min], [x_max, y_min], [x_max, y_max], [x_min, y_max]])
 
     def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
         """Points (…, 2) on the outline at `arc_length` (…) in metres, counter-clockwise from the lower left."""
@@ -129,11 +129,11 @@ class Rectangle(Domain):
         return Mesh(mesh.points, mesh.cells, mesh.facets, self._side_facets(mesh))
 
     def _mesh_rows(self, target: Target) -> Mesh:
-        left, _, bottom, _ = self.extent
+        x_min, _, y_min, _ = self.extent
         rows = structured.choose_rows(self.width, self.height, target.num_points, target.cell_size)
         check_total(rows[0] * rows[1], "cell_size")
         points, cells = structured.row_rectangle(self.width, self.height, *rows)
-        return Mesh.create(points + np.array([left, bottom]), cells)
+        return Mesh.create(points + np.array([x_min, y_min]), cells)
 
     def _side_facets(self, mesh: Mesh) -> dict:
         """Indices of the facets on each side, by the name of the side."""

@@ -180,8 +180,8 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
 def _fold_positions(positions: np.ndarray, corners: np.ndarray, bent_axis: int, num_folds: int | None) -> np.ndarray:
     """Coordinates in metres, across the sheet, of the lines along which it is bent, its two borders included."""
     width = np.ptp(positions)
-    ordered = np.sort(positions)
-    rows = ordered[np.concatenate([[True], np.diff(ordered) > _LINE_TOLERANCE * width])]
+    sorted_positions = np.sort(positions)
+    rows = sorted_positions[np.concatenate([[True], np.diff(sorted_positions) > _LINE_TOLERANCE * width])]
     coordinates = corners[..., bent_axis]
     first_row, last_row = (
         np.searchsorted(rows, side - _LINE_TOLERANCE * width)
@@ -191,7 +191,7 @@ def _fold_positions(positions: np.ndarray, corners: np.ndarray, bent_axis: int, 
         return rows
     mean_edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
     lines = np.linspace(rows[0], rows[-1], 1 + (num_folds or max(1, round(width / mean_edge))))
-    nearest = ordered[np.abs(ordered - lines[:, None]).argmin(axis=1)]
+    nearest = sorted_positions[np.abs(sorted_positions - lines[:, None]).argmin(axis=1)]
     is_near = np.abs(nearest - lines) < _FOLD_SNAP_DISTANCE * (lines[1] - lines[0])
     return np.where(is_near, nearest, lines)
 
@@ -244,9 +244,9 @@ def _cut_cells(
 def _roll_coordinates(positions: np.ndarray, folds: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
     """Horizontal and vertical coordinates of positions (n,) on the sheet after bending. The `folds` lie on a circle;
     the middle of the sheet stays at 0."""
-    middle = (folds[0] + folds[-1]) / 2
+    sheet_centre = (folds[0] + folds[-1]) / 2
     if np.isinf(radius):
-        return positions - middle, np.zeros_like(positions)
+        return positions - sheet_centre, np.zeros_like(positions)
     strip_widths = np.diff(folds)
     size = abs(radius)
     too_wide = strip_widths.max() > 2 * size
@@ -259,7 +259,7 @@ def _roll_coordinates(positions: np.ndarray, folds: np.ndarray, radius: float) -
             "jeit.mesh.tube."
         )
     angle = np.concatenate([[0.0], np.cumsum(fold_angles)])
-    angle -= np.interp(middle, folds, angle)
+    angle -= np.interp(sheet_centre, folds, angle)
     horizontal, vertical = size * np.sin(angle), size * (np.cos(angle) - 1) * np.sign(radius)
     return np.interp(positions, folds, horizontal), np.interp(positions, folds, vertical)
 
@@ -311,7 +311,7 @@ def shell(
     unstructured.check_total(num_nodes * (num_layers + 1), "num_layers")
     directions = node_normals(surface) if normals is None else _check_normals(normals, num_nodes)
     directions = directions if outward else -directions
-    solid = stacked_cells(cells, num_nodes, num_layers)
+    tetrahedra = stacked_cells(cells, num_nodes, num_layers)
     # Sorting the corners inverted some prisms, and the second of the three tetrahedra has the opposite orientation.
     orientation = np.where(odd_permutation(cells) ^ (not outward), -1.0, 1.0)
     tetrahedron_signs = np.tile(np.outer(orientation, (1, -1, 1)).ravel(), num_layers)
@@ -319,7 +319,7 @@ def shell(
     def layer_points(height: float) -> np.ndarray:
         return np.concatenate([points + k * height / num_layers * directions for k in range(num_layers + 1)])
 
-    _check_upright(layer_points, solid, tetrahedron_signs, thickness, len(cells))
+    _check_upright(layer_points, tetrahedra, tetrahedron_signs, thickness, len(cells))
     tags: dict[str, ArrayLike] = {"inner": cells, "outer": cells + num_layers * num_nodes}
     if not outward:
         tags = {"outer": tags["inner"], "inner": tags["outer"]}
@@ -329,7 +329,7 @@ def shell(
         if name in _SHELL_TAGS:
             raise ValueError(f"surface: its tag {name!r} is taken in a shell. Rename it.")
         tags[name] = stacked_wall(facets[np.asarray(index)], num_nodes, num_layers)
-    mesh = Mesh.create(layer_points(thickness), solid, tags=tags)
+    mesh = Mesh.create(layer_points(thickness), tetrahedra, tags=tags)
     _check_apart(mesh, thickness)
     return mesh
 
@@ -343,15 +343,15 @@ def _check_normals(normals: ArrayLike, num_nodes: int) -> np.ndarray:
     return directions
 
 
-def _volumes(points: np.ndarray, solid: np.ndarray, tetrahedron_signs: np.ndarray) -> np.ndarray:
-    edges = points[solid[:, 1:]] - points[solid[:, :1]]
+def _volumes(points: np.ndarray, tetrahedra: np.ndarray, tetrahedron_signs: np.ndarray) -> np.ndarray:
+    edges = points[tetrahedra[:, 1:]] - points[tetrahedra[:, :1]]
     return tetrahedron_signs * np.linalg.det(edges) / 6
 
 
 def _check_upright(
-    layer_points, solid: np.ndarray, tetrahedron_signs: np.ndarray, thickness: float, num_triangles: int
+    layer_points, tetrahedra: np.ndarray, tetrahedron_signs: np.ndarray, thickness: float, num_triangles: int
 ) -> None:
-    volume = _volumes(layer_points(thickness), solid, tetrahedron_signs)
+    volume = _volumes(layer_points(thickness), tetrahedra, tetrahedron_signs)
     if volume.min() > 0:
         return
     if thickness > (size := float(np.ptp(layer_points(0.0), axis=0).max())):
@@ -363,11 +363,11 @@ def _check_upright(
     lower, upper = 0.0, thickness
     for _ in range(_BISECTION_STEPS):
         middle = (lower + upper) / 2
-        is_upright = _volumes(layer_points(middle), solid, tetrahedron_signs).min() > 0
+        is_upright = _volumes(layer_points(middle), tetrahedra, tetrahedron_signs).min() > 0
         lower, upper = (middle, upper) if is_upright else (lower, middle)
-    worst_tetrahedron = int(np.argmin(_volumes(layer_points(upper), solid, tetrahedron_signs)))
+    worst_tetrahedron = int(np.argmin(_volumes(layer_points(upper), tetrahedra, tetrahedron_signs)))
     triangle = worst_tetrahedron // 3 % num_triangles
-    position = layer_points(0.0)[solid[worst_tetrahedron, 0]].round(6).tolist()
+    position = layer_points(0.0)[tetrahedra[worst_tetrahedron, 0]].round(6).tolist()
     max_thickness = (1 - 5e-4) * lower  # does not exceed `lower` after rounding to four digits
     raise ValueError(
         f"thickness: {thickness:.4g} m is more than the radius of curvature of the surface at triangle {triangle}, "

@@ -88,8 +88,8 @@ def forearm(
     girth = float(np.mean([_arc_lengths(*end)[-1] for end in ends]))
     slant = float(np.hypot(length, np.abs(ends[1] - ends[0]).mean()))
     num_per_ring, rows = _node_counts(girth, slant, num_points, cell_size, num_around)
-    share = np.linspace(0, 1, rows + 1)[:, None]
-    return _sleeve_mesh(length, (1 - share) * ends[0] + share * ends[1], num_per_ring)
+    fractions = np.linspace(0, 1, rows + 1)[:, None]
+    return _sleeve_mesh(length, (1 - fractions) * ends[0] + fractions * ends[1], num_per_ring)
 
 
 def _semi_axes(name: str, radii: float | Sequence[float]) -> np.ndarray:
@@ -147,7 +147,10 @@ def _sleeve_mesh(height: float, semi_axes: np.ndarray, num_per_ring: int) -> Mes
     points = np.concatenate(rings)
     points[:, 2] /= len(semi_axes) - 1
     node_index = np.arange(len(points)).reshape(len(semi_axes), num_per_ring)
-    cells = [_triangles_between_rings(low, high, row % 2) for row, (low, high) in enumerate(pairwise(node_index))]
+    cells = [
+        _triangles_between_rings(lower_ring, upper_ring, row % 2)
+        for row, (lower_ring, upper_ring) in enumerate(pairwise(node_index))
+    ]
 
     def loop(ring: np.ndarray) -> np.ndarray:
         return np.stack([ring, np.roll(ring, -1)], axis=1)
@@ -155,13 +158,17 @@ def _sleeve_mesh(height: float, semi_axes: np.ndarray, num_per_ring: int) -> Mes
     return Mesh.create(points, np.concatenate(cells), tags={"bottom": loop(node_index[0]), "top": loop(node_index[-1])})
 
 
-def _triangles_between_rings(low: np.ndarray, high: np.ndarray, lower_is_ahead: int) -> np.ndarray:
+def _triangles_between_rings(lower_ring: np.ndarray, upper_ring: np.ndarray, lower_is_ahead: int) -> np.ndarray:
     """Triangles between two rings with equal numbers of nodes, offset by half the node spacing; `lower_is_ahead`:
     whether the lower ring is ahead."""
-    next_low, next_high = np.roll(low, -1), np.roll(high, -1)
+    next_low, next_high = np.roll(lower_ring, -1), np.roll(upper_ring, -1)
     if lower_is_ahead:
-        return np.concatenate([np.stack([low, next_low, next_high], 1), np.stack([low, next_high, high], 1)])
-    return np.concatenate([np.stack([low, next_low, high], 1), np.stack([next_low, next_high, high], 1)])
+        return np.concatenate(
+            [np.stack([lower_ring, next_low, next_high], 1), np.stack([lower_ring, next_high, upper_ring], 1)]
+        )
+    return np.concatenate(
+        [np.stack([lower_ring, next_low, upper_ring], 1), np.stack([next_low, next_high, upper_ring], 1)]
+    )
 
 
 def sphere(radius: float, *, num_points: int | None = None, cell_size: float | None = None) -> Mesh:
@@ -243,12 +250,12 @@ def cap(
         raise ValueError(
             f"angle: expected radians from the pole, more than 0 and less than 2.98, got {describe(angle)}."
         )
-    flat = disk(radius * float(angle), num_points=num_points, cell_size=cell_size, refine=refine)
-    x, y = np.asarray(flat.points).T
+    flat_disk = disk(radius * float(angle), num_points=num_points, cell_size=cell_size, refine=refine)
+    x, y = np.asarray(flat_disk.points).T
     distance = np.hypot(x, y)
     radial_factor = np.sinc(distance / radius / np.pi)  # sin(d / R) / (d / R)
     points = np.stack([x * radial_factor, y * radial_factor, radius * np.cos(distance / radius)], axis=1)
-    return Mesh.create(points, flat.cells, tags={"edge": np.arange(flat.num_facets)})
+    return Mesh.create(points, flat_disk.cells, tags={"edge": np.arange(flat_disk.num_facets)})
 
 
 def _orient_outward(points: np.ndarray, cells: np.ndarray) -> np.ndarray:

@@ -51,9 +51,9 @@ def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
     bodies are dashed. Beside each stands the 68 % interval of its change of conductivity, if it is known."""
     ax = axes_or_new(ax)
     for sign, _, style, name in _STYLES:
-        for number, star in enumerate(star for star in stars if star.sign == sign):
-            closed = np.concatenate([star.outline, star.outline[:1]])
-            ax.plot(*closed.T, color=INK, linewidth=1.4, linestyle=style, label=None if number else name)
+        for index, star in enumerate(star for star in stars if star.sign == sign):
+            closed_outline = np.concatenate([star.outline, star.outline[:1]])
+            ax.plot(*closed_outline.T, color=INK, linewidth=1.4, linestyle=style, label=None if index else name)
     _label_intervals(ax, [star for star in stars if star.quantities is not None])
     return ax
 

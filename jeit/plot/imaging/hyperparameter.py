@@ -144,7 +144,7 @@ def _draw_l_curve(ax: Axes, curve: Choice, choices: list[Choice]) -> None:
 
 
 def _draw_criterion(ax: Axes, choice: Choice, *, is_small: bool = False) -> None:
-    label, scale, aim = _CRITERIA.get(choice.rule, ("criterion", "linear", ""))
+    label, scale, aim_text = _CRITERIA.get(choice.rule, ("criterion", "linear", ""))
     value = float(choice.hyperparameter)
     ax.set_xscale("log")
     ax.set_yscale(scale)
@@ -154,7 +154,7 @@ def _draw_criterion(ax: Axes, choice: Choice, *, is_small: bool = False) -> None
     ax.plot(
         value, choice.read(choice.criterion), clip_on=False, zorder=3, **_marker_style(choice, 6 if is_small else 8)
     )
-    text = f"{label}, {aim}" if aim else label
+    text = f"{label}, {aim_text}" if aim_text else label
     if is_small:
         ax.set_title(f"{choice.rule}: {text}", fontsize=8.5, loc="left", pad=3, color=_rule_colour(choice))
         ax.tick_params(labelsize=7.5)

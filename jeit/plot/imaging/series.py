@@ -72,8 +72,8 @@ class FramePicture:
         electrodes: AbstractElectrodes | None,
         fitted: FittedScale,
         *,
-        number: bool = True,
-        bar: bool = True,
+        show_numbers: bool = True,
+        show_scale_bar: bool = True,
         height: float | None = None,
     ):
         self.ax, self.fitted = ax, fitted
@@ -87,9 +87,9 @@ class FramePicture:
         else:
             draw_slice_outline(body, extent, ax)
         if electrodes is not None:
-            draw_electrodes(mesh, electrodes, numbers=number, ax=ax)
-        hide_axes(ax, extent, numbered=number and electrodes is not None)
-        if bar:
+            draw_electrodes(mesh, electrodes, numbers=show_numbers, ax=ax)
+        hide_axes(ax, extent, numbered=show_numbers and electrodes is not None)
+        if show_scale_bar:
             draw_scale_bar(ax, extent)
         centre = (extent[0] + extent[1]) / 2, (extent[2] + extent[3]) / 2
         style = {"ha": "center", "va": "center", "color": INK, "fontsize": 10, "zorder": 5}
@@ -108,10 +108,10 @@ class FramePicture:
 def fit_scale(changes: Float[np.ndarray, "F m"], mesh: Mesh, scale: ColourScale = CHANGE) -> FittedScale:
     """Fit one colour scale to all imaged frames. Raises `ValueError` if all frames were refused."""
     check_scale(scale)
-    finite = changes[np.isfinite(changes)]
-    if not finite.size:
+    finite_changes = changes[np.isfinite(changes)]
+    if not finite_changes.size:
         raise ValueError("changes: every frame was refused; there is nothing to draw.")
-    return scale.of(finite, "S" if mesh.dimension == 2 else "S/m")
+    return scale.of(finite_changes, "S" if mesh.dimension == 2 else "S/m")
 
 
 def plot_frames(
@@ -159,12 +159,18 @@ def plot_frames(
     pictures = []
     for panel_index, frame in enumerate(selected):
         ax = figure.add_subplot(grid[panel_index // columns, panel_index % columns])
-        pictures.append(FramePicture(ax, mesh, electrodes, fitted_scale, number=False, bar=panel_index == 0))
+        pictures.append(
+            FramePicture(ax, mesh, electrodes, fitted_scale, show_numbers=False, show_scale_bar=panel_index == 0)
+        )
         pictures[-1].show(values[frame], frame_titles[frame])
     if scale.bar:
         colour_bar_axes = figure.add_subplot(grid[:, -1])
         draw_colour_bar(
-            colour_bar_axes, pictures[0].mappable, fitted_scale.label, signed=scale.difference, position=colour_bar_axes
+            colour_bar_axes,
+            pictures[0].mappable,
+            fitted_scale.label,
+            show_sign=scale.difference,
+            position=colour_bar_axes,
         )
     if count is None:
         refused = [title for title, row in zip(frame_titles, values, strict=True) if not np.isfinite(row).all()]
@@ -232,7 +238,7 @@ def plot_series(
     factor, unit = with_si_prefix(largest or 1.0, series.unit)
     spectra = {name: _spectrum(factor * mean, series.times) for name, mean in means.items()} if series.timed else {}
     drawn_spectra = {name: spectrum for name, spectrum in spectra.items() if spectrum is not None}
-    # Without oscillations, curves stand beside the functional image.
+    # Without oscillations, curves are drawn beside the functional image.
     curves_grid = (grid[num_rows, :] if num_rows else grid[0, 1:]).subgridspec(1, 2, width_ratios=[1.6, 1.0])
     curves_position = curves_grid[0] if drawn_spectra else curves_grid[:]
     _draw_curves(maps_figure.add_subplot(curves_position), means, series, factor, unit)
@@ -250,13 +256,19 @@ def _draw_frames(
     for panel_index, frame in enumerate(selected):
         ax = figure.add_subplot(grid[panel_index // _FRAMES_PER_ROW, panel_index % _FRAMES_PER_ROW])
         picture = FramePicture(
-            ax, series.mesh, electrodes, fitted_scale, number=False, bar=panel_index == 0, height=height
+            ax,
+            series.mesh,
+            electrodes,
+            fitted_scale,
+            show_numbers=False,
+            show_scale_bar=panel_index == 0,
+            height=height,
         )
         picture.show(series.changes[frame], series.titles[frame])
         if panel_index == 0:
             colour_bar_axes = figure.add_subplot(grid[:, -1])
             draw_colour_bar(
-                colour_bar_axes, picture.mappable, fitted_scale.label, signed=True, position=colour_bar_axes
+                colour_bar_axes, picture.mappable, fitted_scale.label, show_sign=True, position=colour_bar_axes
             )
 
 

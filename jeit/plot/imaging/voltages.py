@@ -46,28 +46,34 @@ def plot_voltages(
     misfit = np.linalg.norm((modelled - measured)[is_drawn]) / np.linalg.norm(measured[is_drawn])
     ax = axes_or_new(ax, (8.4, 5.0))
     ax.set_axis_off()
-    upper = ax.inset_axes((0, 0.42, 1, 0.58))
-    lower = ax.inset_axes((0, 0, 1, 0.36), sharex=upper)
+    voltage_axes = ax.inset_axes((0, 0.42, 1, 0.58))
+    difference_axes = ax.inset_axes((0, 0, 1, 0.36), sharex=voltage_axes)
     marker_size = float(np.clip(500 / channel.size, 0.8, 3))
-    upper.plot(channel, factor * measured[is_drawn], "o", color=MEASURED, markersize=2 * marker_size, label="measured")
-    upper.plot(channel, factor * modelled[is_drawn], "o", color=MODELLED, markersize=marker_size, label="modelled")
-    upper.set_ylabel(f"Voltage ({unit})")
-    upper.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.1, markerscale=2)
-    upper.set_title(title or f"Relative misfit {100 * misfit:.2g} %", loc="left", fontsize=11)
-    upper.tick_params(labelbottom=False)
+    voltage_axes.plot(
+        channel, factor * measured[is_drawn], "o", color=MEASURED, markersize=2 * marker_size, label="measured"
+    )
+    voltage_axes.plot(
+        channel, factor * modelled[is_drawn], "o", color=MODELLED, markersize=marker_size, label="modelled"
+    )
+    voltage_axes.set_ylabel(f"Voltage ({unit})")
+    voltage_axes.legend(
+        frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.1, markerscale=2
+    )
+    voltage_axes.set_title(title or f"Relative misfit {100 * misfit:.2g} %", loc="left", fontsize=11)
+    voltage_axes.tick_params(labelbottom=False)
     residual = 100 * (modelled - measured)[is_drawn] / rms_voltage
-    lower.axhline(0, color=SOFT, linewidth=0.8)
-    lower.vlines(channel, 0, residual, color=INK, linewidth=0.6)
-    lower.plot(channel, residual, "o", color=INK, markersize=marker_size)
-    lower.set_ylabel("Difference\n(% of rms)")
-    lower.set_xlabel("Channel")
+    difference_axes.axhline(0, color=SOFT, linewidth=0.8)
+    difference_axes.vlines(channel, 0, residual, color=INK, linewidth=0.6)
+    difference_axes.plot(channel, residual, "o", color=INK, markersize=marker_size)
+    difference_axes.set_ylabel("Difference\n(% of rms)")
+    difference_axes.set_xlabel("Channel")
     if protocol is not None:
         drive_starts = np.flatnonzero(np.diff(np.asarray(protocol.drive_index)) != 0) + 1
-        for axes in (upper, lower):
+        for axes in (voltage_axes, difference_axes):
             axes.vlines(
                 drive_starts - 0.5, 0, 1, transform=axes.get_xaxis_transform(), color="#e6e8eb", linewidth=0.6, zorder=0
             )
-    for axes in (upper, lower):
+    for axes in (voltage_axes, difference_axes):
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_xlim(-1, measured.size)
     return ax

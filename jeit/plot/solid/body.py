@@ -35,7 +35,7 @@ def size_of(mesh: Mesh) -> float:
 def add_hull(scene: Scene, mesh: Mesh) -> None:
     """Add the translucent boundary of a solid to a scene, with its edges and its outline."""
     points, triangles = np.asarray(mesh.points), surface_triangles(mesh)
-    scene.add_triangles(points, triangles, np.array(to_rgba(BODY, _HULL_OPACITY)), smooth=True, lit=False)
+    scene.add_triangles(points, triangles, np.array(to_rgba(BODY, _HULL_OPACITY)), smooth=True, is_lit=False)
     scene.add_lines(points[visible_edges(points, triangles, scene.camera.toward)], SOFT, 0.9)
 
 
@@ -63,25 +63,27 @@ def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarr
     return np.concatenate([edges[shared_rows[is_drawn]], edges[is_boundary]])
 
 
-def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes, *, through: bool = False) -> None:
+def add_electrodes(
+    scene: Scene, points, triangles, shapes: ElectrodeShapes, *, translucent_in_front: bool = False
+) -> None:
     """Add electrodes on a surface to a scene: in front of the surface on the side facing the viewer, behind it on the
     other side.
 
-    `through`: whether the electrodes in front become translucent if they would hide much of the body.
+    `translucent_in_front`: whether the electrodes in front become translucent if they would hide much of the body.
     """
     surface, size = ProjectionSurface(points, triangles), float(np.ptp(points, axis=0).max())
     polygons = shapes.polygons()
     normals = surface.normals(np.array([corners.mean(axis=0) for corners in polygons]))
     rims = _rims(polygons, shapes.electrode, 1e-6 * size)
     front_polygons = [
-        polygon for polygon, outward in zip(polygons, normals, strict=True) if outward @ scene.camera.toward > 0
+        polygon for polygon, normal in zip(polygons, normals, strict=True) if normal @ scene.camera.toward > 0
     ]
     hides_body = (
-        through
+        translucent_in_front
         and sum(_visible_area(scene, polygon) for polygon in front_polygons)
         > _MAX_COVERED_SHARE * _visible_area(scene, points[triangles]) / 2
     )
-    for corners, outward, rim in zip(polygons, normals, rims, strict=True):
+    for corners, normal, rim in zip(polygons, normals, rims, strict=True):
         if len(corners) == 1:
             angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
             _, first_axis, second_axis = surface.frames(corners)[0]
@@ -89,9 +91,9 @@ def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes, *, 
                 np.outer(np.cos(angle), first_axis) + np.outer(np.sin(angle), second_axis)
             )
             rim = np.ones(12, bool)
-        facing = float(np.sign(outward @ scene.camera.toward))
-        colour = to_rgba(METAL, _TRANSLUCENT_OPACITY if hides_body and facing > 0 else 1.0)
-        scene.add_polygon(corners, colour, before=_ELECTRODE_OFFSET * size * facing, rim=rim)
+        facing_sign = float(np.sign(normal @ scene.camera.toward))
+        colour = to_rgba(METAL, _TRANSLUCENT_OPACITY if hides_body and facing_sign > 0 else 1.0)
+        scene.add_polygon(corners, colour, depth_offset=_ELECTRODE_OFFSET * size * facing_sign, rim=rim)
 
 
 def _visible_area(scene: Scene, corners: Float[np.ndarray, "*m k 3"]) -> float:
@@ -114,10 +116,10 @@ def _rims(polygons, electrode, offset: float) -> list[np.ndarray]:
 
 
 def number_electrodes(
-    ax: Axes, scene: Scene, points, triangles, shapes: ElectrodeShapes, *, behind: bool = True
+    ax: Axes, scene: Scene, points, triangles, shapes: ElectrodeShapes, *, number_hidden: bool = True
 ) -> None:
     """Draw the numbers of electrodes, from 1, outwards of each electrode. Numbers on the side facing away are faint, or
-    are left out unless `behind`.
+    are left out unless `number_hidden`.
 
     Electrodes seen close to each other share one text.
     """
@@ -129,7 +131,7 @@ def number_electrodes(
     front_positions, min_distance = positions[~is_faint], _MIN_NUMBER_DISTANCE * float(np.ptp(points, axis=0).max())
     horizontal = scene.camera.on_page(points)[:, 0]
     left_limit, right_limit = horizontal.min() + min_distance, horizontal.max() - min_distance
-    for draws_faint in (False, True) if behind else (False,):
+    for draws_faint in (False, True) if number_hidden else (False,):
         electrode_indices = np.flatnonzero(is_faint == draws_faint)
         for group in group_coincident(positions[electrode_indices], min_distance):
             position = positions[electrode_indices[group]].mean(axis=0)
@@ -140,14 +142,16 @@ def number_electrodes(
                 and np.linalg.norm(front_positions - position, axis=1).min() <= min_distance
             ):
                 continue
-            outward = "right" if position[0] < left_limit else "left" if position[0] > right_limit else "center"
-            alignment = outward if len(group) > 1 else "center"
+            alignment_outward = (
+                "right" if position[0] < left_limit else "left" if position[0] > right_limit else "center"
+            )
+            alignment = alignment_outward if len(group) > 1 else "center"
             draw_number(
                 ax,
                 position,
                 _number_text((electrode_indices[group] + 1).tolist()),
                 fontsize=fontsize,
-                faint=draws_faint,
+                is_faint=draws_faint,
                 align=alignment,
             )
 

@@ -72,10 +72,10 @@ def plot_curved_skin(
     # Pieces are sorted by the depth of their centres, so discs are moved in front of the triangles on which they lie.
     depth_offset = float(np.sqrt(np.asarray(measures(mesh)).max()))
     for corners in shapes_of(mesh, layout.discs(1.0)).polygons():
-        (outward,) = surface.normals(corners.mean(axis=0)[None])
-        cosine = abs(float(outward @ camera.toward))
+        (normal,) = surface.normals(corners.mean(axis=0)[None])
+        cosine = abs(float(normal @ camera.toward))
         rim = np.ones(len(corners), bool)
-        scene.add_polygon(corners, METAL, before=depth_offset / max(cosine, 0.1), rim=rim)
+        scene.add_polygon(corners, METAL, depth_offset=depth_offset / max(cosine, 0.1), rim=rim)
     scene.draw(ax)
     triangles = Triangles.of(mesh)
     for (name, mark_points), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):

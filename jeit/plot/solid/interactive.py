@@ -60,10 +60,10 @@ def view_solid(
     check_drawn(mesh, electrodes, scale)
     surfaces = level_surfaces(mesh, values, levels, is_signed=scale.difference)
     pv: Any = optional("pyvista", "the interactive view", "Pictures without it: jeit.plot.plot_solid.")
-    fitted = scale.of(np.asarray(values), "S/m")
+    fitted_scale = scale.of(np.asarray(values), "S/m")
     colour_options: dict[str, Any] = {
-        "cmap": fitted.keywords["cmap"],
-        "clim": (fitted.keywords["vmin"], fitted.keywords["vmax"]),
+        "cmap": fitted_scale.keywords["cmap"],
+        "clim": (fitted_scale.keywords["vmin"], fitted_scale.keywords["vmax"]),
     }
     points = 1e3 * np.asarray(mesh.points)
     plotter = pv.Plotter(off_screen=off_screen, window_size=list(_WINDOW_SIZE))
@@ -73,18 +73,18 @@ def view_solid(
     hull = pv.PolyData.from_regular_faces(points, np.asarray(mesh.facets))
     plotter.add_mesh(hull, color=BODY, opacity=0.12, name="hull")
     plotter.add_mesh(hull.extract_feature_edges(30), color=INK, line_width=1.5, name="edges")
-    for k, (value, share, surface) in enumerate(surfaces):
+    for k, (value, level, surface) in enumerate(surfaces):
         if not len(surface.triangles):
             continue
         shell = pv.PolyData.from_regular_faces(1e3 * surface.points, surface.triangles)
-        shell["value"] = np.full(shell.n_points, fitted.factor * value)
-        opacity = 1.0 if share == max(levels) else OUTER
+        shell["value"] = np.full(shell.n_points, fitted_scale.factor * value)
+        opacity = 1.0 if level == max(levels) else OUTER
         options = {"smooth_shading": True, "show_scalar_bar": False, "name": f"isosurface {k}"}
         plotter.add_mesh(shell, scalars="value", opacity=opacity, **options, **colour_options)
     grid = pv.UnstructuredGrid({pv.CellType.TETRA: np.asarray(mesh.cells)}, points)
-    grid.cell_data["value"] = fitted.factor * cell_values(mesh, values)
+    grid.cell_data["value"] = fitted_scale.factor * cell_values(mesh, values)
     # The label has two lines, since VTK cuts off text wider than the bar, such as the unit.
-    quantity, bracket, unit = fitted.label.rpartition(" (")
+    quantity, bracket, unit = fitted_scale.label.rpartition(" (")
     bar = {
         "title": f"{quantity}\n{bracket.strip()}{unit}",
         "color": INK,
@@ -99,11 +99,11 @@ def view_solid(
         _add_electrodes(plotter, pv, shapes)
     for k, inclusion in enumerate(inclusions):
         if inclusion.form is None:
-            form = pv.Sphere(radius=1e3 * inclusion.radius, center=1e3 * np.array(inclusion.centroid))
+            body_surface = pv.Sphere(radius=1e3 * inclusion.radius, center=1e3 * np.array(inclusion.centroid))
         else:
             surface = inclusion.form.surface()
-            form = pv.PolyData.from_regular_faces(1e3 * surface.points, surface.triangles)
-        plotter.add_mesh(form, style="wireframe", color=INK, opacity=0.15, name=f"inclusion {k}")
+            body_surface = pv.PolyData.from_regular_faces(1e3 * surface.points, surface.triangles)
+        plotter.add_mesh(body_surface, style="wireframe", color=INK, opacity=0.15, name=f"inclusion {k}")
     plotter.add_axes()  # pyright: ignore[reportCallIssue]
     plotter.camera_position = [(-1, -1.7, 1), (0, 0, 0), (0, 0, 1)]
     plotter.reset_camera()  # pyright: ignore[reportCallIssue]
@@ -145,16 +145,18 @@ def _add_electrodes(plotter: pyvista.Plotter, pv: Any, shapes: ElectrodeShapes) 
     """Add electrodes to the plotter as polygons in the colour of metal, or as balls if they are points, with their
     numbers."""
     size = 1e3 * float(np.ptp(shapes.corners, axis=0).max())
-    pieces = []
+    electrode_surfaces = []
     for corners in shapes.polygons():
         if len(corners) == 1:
-            pieces.append(pv.Sphere(radius=0.012 * size, center=1e3 * corners[0]))
+            electrode_surfaces.append(pv.Sphere(radius=0.012 * size, center=1e3 * corners[0]))
         else:
             # Triangles around the centre, since a patch on a curved wall is not a plane polygon.
             ring = np.arange(len(corners))
             fan = np.stack([ring, np.roll(ring, -1), np.full(len(ring), len(ring))], axis=1)
-            pieces.append(pv.PolyData.from_regular_faces(1e3 * np.vstack([corners, corners.mean(axis=0)]), fan))
-    plotter.add_mesh(pv.merge(pieces), color=METAL, name="electrodes", ambient=0.35)
+            electrode_surfaces.append(
+                pv.PolyData.from_regular_faces(1e3 * np.vstack([corners, corners.mean(axis=0)]), fan)
+            )
+    plotter.add_mesh(pv.merge(electrode_surfaces), color=METAL, name="electrodes", ambient=0.35)
     numbers = [str(k + 1) for k in range(shapes.number)]
     style: dict[str, Any] = {"font_size": 14, "text_color": INK, "shape_opacity": 0.6, "show_points": False}
     plotter.add_point_labels(1e3 * shapes.middles(), numbers, always_visible=True, shape_color="white", **style)

@@ -102,11 +102,18 @@ def plot_isosurfaces(
     ```
     """
     check_drawn(mesh, electrodes, scale)
-    fitted = scale.of(np.asarray(values), "S/m")
+    fitted_scale = scale.of(np.asarray(values), "S/m")
     ax = draw_in_space(
-        axes_or_new(ax), mesh, values, electrodes, levels=levels, inclusions=inclusions, camera=camera, fitted=fitted
+        axes_or_new(ax),
+        mesh,
+        values,
+        electrodes,
+        levels=levels,
+        inclusions=inclusions,
+        camera=camera,
+        fitted=fitted_scale,
     )
-    fitted.draw_bar(ax, mappable(fitted))
+    fitted_scale.draw_bar(ax, mappable(fitted_scale))
     return ax
 
 
@@ -141,7 +148,7 @@ def draw_in_space(
     shapes = shapes_of(mesh, electrodes) if isinstance(electrodes, AbstractElectrodes) else electrodes
     points, facets = np.asarray(mesh.points), np.asarray(mesh.facets)
     if shapes is not None:
-        add_electrodes(scene, points, facets, shapes, through=bool(surfaces))
+        add_electrodes(scene, points, facets, shapes, translucent_in_front=bool(surfaces))
     scene.draw(ax)
     hide_axes_in_space(ax, camera, points, numbered=shapes is not None)
     if shapes is not None:

@@ -56,7 +56,7 @@ def plot_solid(
     """
     check_drawn(mesh, electrodes, scale)
     image = cell_values(mesh, values)
-    fitted = scale.of(image, "S/m")
+    fitted_scale = scale.of(image, "S/m")
     shapes = electrodes
     if isinstance(electrodes, AbstractElectrodes):
         shapes = shapes_of(mesh, electrodes)
@@ -66,20 +66,28 @@ def plot_solid(
     grid = figure.add_gridspec(2, 4, width_ratios=(1.75, 1, 1, 0.045))
     space = figure.add_subplot(grid[:, 0])
     draw_in_space(
-        space, mesh, values, shapes, levels=levels, inclusions=inclusions, camera=camera, fitted=fitted, planes=planes
+        space,
+        mesh,
+        values,
+        shapes,
+        levels=levels,
+        inclusions=inclusions,
+        camera=camera,
+        fitted=fitted_scale,
+        planes=planes,
     )
     half_size = size_of(mesh) / 2
     for plane, grid_cell in zip(planes, (grid[0, 1], grid[0, 2], grid[1, 1]), strict=True):
         panel = figure.add_subplot(grid_cell)
-        draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted)
+        draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted_scale)
         page_points = plane.on_page(np.asarray(mesh.points))
         x, y = (page_points.min(axis=0) + page_points.max(axis=0)) / 2
         # All slices have the same scale of lengths.
-        finish_slice(panel, plane, (x - half_size, x + half_size, y - half_size, y + half_size), cross=True)
+        finish_slice(panel, plane, (x - half_size, x + half_size, y - half_size, y + half_size), draw_cross=True)
     _caption(figure.add_subplot(grid[1, 2]), common_point, levels, inclusions, difference=scale.difference)
     if scale.bar:
         bar = figure.add_subplot(grid[:, 3])
-        draw_colour_bar(space, mappable(fitted), fitted.label, signed=scale.difference, position=bar)
+        draw_colour_bar(space, mappable(fitted_scale), fitted_scale.label, show_sign=scale.difference, position=bar)
     return figure
 
 

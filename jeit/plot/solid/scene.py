@@ -78,7 +78,7 @@ class Camera:
 
     def light(self, normals: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
         """Brightness (m,) of surfaces with the given normals of any length, from `_MIN_BRIGHTNESS` to 1; both sides of
-        a surface are lit alike."""
+        a surface have the same brightness."""
         length = np.maximum(np.linalg.norm(normals, axis=-1), 1e-300)
         direction = normals / length[:, None]
         direction = direction * np.where(direction @ self.toward < 0, -1.0, 1.0)[:, None]
@@ -118,12 +118,12 @@ class Scene:
         colours: Float[np.ndarray, "m 4"],
         *,
         smooth: bool = False,
-        lit: bool = True,
-        before: Float[np.ndarray, "m"] | float = 0.0,
+        is_lit: bool = True,
+        depth_offset: Float[np.ndarray, "m"] | float = 0.0,
     ) -> None:
-        """Add triangles with colours (m, 4). `smooth`: whether to light them as a smooth surface; `lit`: whether to
-        darken triangles turned away from the light; `before`: distance in metres by which they are moved towards the
-        viewer when sorted by depth."""
+        """Add triangles with colours (m, 4). `smooth`: whether to light them as a smooth surface; `is_lit`: whether to
+        darken triangles turned away from the light; `depth_offset`: distance in metres by which they are moved towards
+        the viewer when sorted by depth."""
         corners = points[triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         if smooth:
@@ -133,9 +133,9 @@ class Scene:
             )
             normals = node_normals[triangles].sum(axis=1)
         face_colours = np.array(np.broadcast_to(colours, (len(triangles), 4)), dtype=float)
-        if lit:
+        if is_lit:
             face_colours[:, :3] *= self.camera.light(normals)[:, None]
-        nearness = self.camera.nearness(corners.mean(axis=1)) + before
+        nearness = self.camera.nearness(corners.mean(axis=1)) + depth_offset
         # Edges in the colour of their face close gaps. Translucent triangles have none, as they would be visible as a
         # net.
         is_opaque = face_colours[:, 3] > 0.99
@@ -148,9 +148,9 @@ class Scene:
         )
 
     def add_polygon(
-        self, corners: Float[np.ndarray, "k 3"], colour, *, before: float, rim: Bool[np.ndarray, " k"]
+        self, corners: Float[np.ndarray, "k 3"], colour, *, depth_offset: float, rim: Bool[np.ndarray, " k"]
     ) -> None:
-        """Add a convex polygon on a surface, divided into pieces that are sorted separately; `before` as in
+        """Add a convex polygon on a surface, divided into pieces that are sorted separately; `depth_offset` as in
         `add_triangles`. Edges on the `rim` are drawn as lines."""
         centre = corners.mean(axis=0)
         corner_index = np.arange(len(corners))
@@ -167,14 +167,14 @@ class Scene:
                 np.stack([inner_nodes, next_corner + num_corners, np.full(num_corners, 2 * num_corners)], axis=1),
             ]
         )
-        self.add_triangles(points, triangles, np.array(to_rgba(colour)), before=before)
+        self.add_triangles(points, triangles, np.array(to_rgba(colour)), depth_offset=depth_offset)
         edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)[rim]
-        self.add_lines(edges, INK, 0.5, before=before + abs(before) * 0.05)
+        self.add_lines(edges, INK, 0.5, depth_offset=depth_offset + abs(depth_offset) * 0.05)
 
-    def add_lines(self, ends: Float[np.ndarray, "s 2 3"], colour, width: float, *, before: float = 0.0) -> None:
-        """Add lines between pairs of `ends`, `width` in points; `before` as in `add_triangles`."""
+    def add_lines(self, ends: Float[np.ndarray, "s 2 3"], colour, width: float, *, depth_offset: float = 0.0) -> None:
+        """Add lines between pairs of `ends`, `width` in points; `depth_offset` as in `add_triangles`."""
         edge = np.broadcast_to(to_rgba(colour), (len(ends), 4))
-        nearness = self.camera.nearness(ends.mean(axis=1)) + before
+        nearness = self.camera.nearness(ends.mean(axis=1)) + depth_offset
         self._add(ends[:, [0, 1, 1, 0]], nearness, np.zeros((len(ends), 4)), edge, np.full(len(ends), width))
 
     def _add(self, corners, nearness, face, edge, width) -> None:
@@ -246,12 +246,12 @@ def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], origin: tupl
 
 
 def draw_number(
-    ax: Axes, position: Float[np.ndarray, "2"], text: str, *, fontsize: float, faint: bool, align: str = "center"
+    ax: Axes, position: Float[np.ndarray, "2"], text: str, *, fontsize: float, is_faint: bool, align: str = "center"
 ) -> None:
     """Draw a number on the page with a white rim; `align`: horizontal alignment relative to `position`."""
     x, y = position
     ax.text(
-        x, y, text, ha=align, va="center", fontsize=fontsize, color=INK, alpha=0.45 if faint else 1.0,
+        x, y, text, ha=align, va="center", fontsize=fontsize, color=INK, alpha=0.45 if is_faint else 1.0,
         path_effects=_RIM, zorder=4,
     )  # fmt: skip
 

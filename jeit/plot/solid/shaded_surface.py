@@ -72,7 +72,7 @@ def plot_surface(
     scene.draw(ax)
     hide_axes_in_space(ax, camera, point_array, numbered=electrodes is not None)
     if electrodes is not None:
-        number_electrodes(ax, scene, point_array, triangle_array, electrodes, behind=False)
+        number_electrodes(ax, scene, point_array, triangle_array, electrodes, number_hidden=False)
     if title is not None:
         ax.set_title(title)
     if fitted_scale is not None:

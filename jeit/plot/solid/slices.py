@@ -59,11 +59,11 @@ def plot_slice(
     """
     check_drawn(mesh, electrodes, scale)
     image = cell_values(mesh, values)
-    fitted = scale.of(image, "S/m")
+    fitted_scale = scale.of(image, "S/m")
     ax = axes_or_new(ax)
-    mappable = draw_slice(ax, mesh, image, plane, electrodes, inclusions=inclusions, fitted=fitted)
-    finish_slice(ax, plane, window_of(ax), cross=True)
-    fitted.draw_bar(ax, mappable)
+    mappable = draw_slice(ax, mesh, image, plane, electrodes, inclusions=inclusions, fitted=fitted_scale)
+    finish_slice(ax, plane, window_of(ax), draw_cross=True)
+    fitted_scale.draw_bar(ax, mappable)
     return ax
 
 
@@ -98,7 +98,7 @@ def plot_slices(
     check_drawn(mesh, electrodes, scale)
     planes = planes_along(mesh, axis, at)
     image = cell_values(mesh, values)
-    fitted = scale.of(image, "S/m")
+    fitted_scale = scale.of(image, "S/m")
     shapes = _electrode_shapes(mesh, electrodes)
     points = planes[0].on_page(np.asarray(mesh.points))
     (left, low), (right, high) = points.min(axis=0), points.max(axis=0)
@@ -114,11 +114,11 @@ def plot_slices(
     grid = figure.add_gridspec(rows, columns + 1, width_ratios=[1] * columns + [0.05])
     panels = [figure.add_subplot(grid[divmod(k, columns)]) for k in range(len(planes))]
     for panel, plane in zip(panels, planes, strict=True):
-        mappable = draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted)
-        finish_slice(panel, plane, (left, right, low, high), cross=panel is panels[0])
+        mappable = draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted_scale)
+        finish_slice(panel, plane, (left, right, low, high), draw_cross=panel is panels[0])
         if scale.bar and panel is panels[-1]:
             bar = figure.add_subplot(grid[:, columns])
-            draw_colour_bar(panel, mappable, fitted.label, signed=scale.difference, position=bar)
+            draw_colour_bar(panel, mappable, fitted_scale.label, show_sign=scale.difference, position=bar)
     return figure
 
 
@@ -168,8 +168,8 @@ def draw_slice(
     return cells
 
 
-def finish_slice(ax: Axes, plane: Plane, window: tuple[float, float, float, float], *, cross: bool) -> None:
-    """Set equal scales over a `window` (left, right, low, high), and draw a title and, if `cross`, a scale bar and
+def finish_slice(ax: Axes, plane: Plane, window: tuple[float, float, float, float], *, draw_cross: bool) -> None:
+    """Set equal scales over a `window` (left, right, low, high), and draw a title and, if `draw_cross`, a scale bar and
     arrows of the axes."""
     left, right, low, high = window
     size = max(right - left, high - low)
@@ -178,7 +178,7 @@ def finish_slice(ax: Axes, plane: Plane, window: tuple[float, float, float, floa
     ax.set_xlim(left - margin, right + margin)
     ax.set_ylim(low - 0.2 * size, high + margin)
     ax.set_axis_off()
-    if cross:
+    if draw_cross:
         draw_scale_bar(ax, (left, right, low, high))
         directions = np.stack([plane.right, plane.up], axis=1)
         draw_axes_cross(ax, directions, (right - 0.05 * size, low - 0.15 * size), 0.07 * size)
@@ -211,7 +211,7 @@ def _electrode_shapes(mesh: Mesh, electrodes) -> ElectrodeShapes | None:
     return shapes_of(mesh, electrodes)
 
 
-def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, distance: float, middle) -> None:
+def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, distance: float, section_centre) -> None:
     """Draw a thick line where a plane intersects an electrode, and the number of the electrode outwards of it."""
     lines_by_electrode: dict[int, list[np.ndarray]] = {}
     for corners, electrode_index in zip(shapes.polygons(), shapes.electrode, strict=True):
@@ -230,9 +230,9 @@ def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, distan
         if np.ptp(ends, axis=0).max() < 0.1 * distance:
             continue  # only a corner of the electrode is cut
         # The number is placed perpendicular to the line, away from the middle of the section.
-        outward = np.linalg.svd(ends - position)[2][1]
-        position = position + distance * outward * np.sign(outward @ (position - middle))
-        draw_number(ax, position, str(electrode_index + 1), fontsize=7, faint=False)
+        normal = np.linalg.svd(ends - position)[2][1]
+        position = position + distance * normal * np.sign(normal @ (position - section_centre))
+        draw_number(ax, position, str(electrode_index + 1), fontsize=7, is_faint=False)
 
 
 def _num_columns(num_panels: int, aspect_ratio: float) -> int:

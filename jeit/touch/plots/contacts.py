@@ -135,7 +135,7 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     region_image = _draw_pixels(axes[0], factor * stages.region, stages, colour_options)
     # The colour bar is as tall as its image, whatever the height of the axes.
     colour_bar_axes = axes[0].inset_axes((1.02, 0.1, 0.035, 0.8))
-    draw_colour_bar(axes[0], region_image, f"Change ({with_prefix})", signed=True, position=colour_bar_axes)
+    draw_colour_bar(axes[0], region_image, f"Change ({with_prefix})", show_sign=True, position=colour_bar_axes)
     grey_options = {"cmap": "gray", "vmin": 0, "vmax": 255}
     grey_images = (stages.grey, 255.0 * stages.threshold, 255.0 * stages.opened, stages.grey)
     for ax, pixels in zip(axes[1:5], grey_images, strict=True):
