@@ -86,7 +86,7 @@ def _simulated(people: int, each: int, seed: int) -> SoundSet:
         person.append(clip.person)
     count = len(parts[0.0, 25][0])
     return SoundSet(
-        {one: SoundImages.joined(own) for one, own in parts.items()},
+        {one: SoundImages.concatenate(own) for one, own in parts.items()},
         np.repeat(right, count),
         np.repeat(person, count),
         np.repeat(np.arange(len(right)), count),
