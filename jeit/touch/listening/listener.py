@@ -185,10 +185,10 @@ class Listener:
         """
         check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
         notes = []
-        original = recording
+        original_recording = recording
         if self.channels == 1 and len(recording.samples) > 1:
             recording = mix_channels(recording)
-            notes.append(f"{len(original.samples)} channels were mixed to one, as the listener has it.")
+            notes.append(f"{len(original_recording.samples)} channels were mixed to one, as the listener has it.")
         if len(recording.samples) != self.channels:
             raise ValueError(
                 f"{recording.name} has {counted(len(recording.samples), 'microphone')}, and the listener was learnt "
@@ -204,7 +204,10 @@ class Listener:
         if num_not_finite:
             notes.append(f"{counted(num_not_finite, 'sample')} not finite: taken for silence.")
         dead_channels = np.flatnonzero(
-            [len(np.unique(channel[np.isfinite(channel)][:_MAX_CHECKED_SAMPLES])) < 2 for channel in original.samples]
+            [
+                len(np.unique(channel[np.isfinite(channel)][:_MAX_CHECKED_SAMPLES])) < 2
+                for channel in original_recording.samples
+            ]
         )
         if dead_channels.size:
             notes.append(f"microphones that never move: {', '.join(map(str, dead_channels))}.")
@@ -225,7 +228,7 @@ class Listener:
         if is_quiet.all() and loudness.max() > 0:
             notes.append("all of it is quieter than anything learnt from: is the gain another?")
         positions, deviations = (
-            (None, None) if calibration is None else _estimate_positions(original, calibration, times)
+            (None, None) if calibration is None else _estimate_positions(original_recording, calibration, times)
         )
         class_probabilities = probabilities(odds, self.sharpness)
         return SoundLabels(

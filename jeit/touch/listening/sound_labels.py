@@ -70,8 +70,8 @@ class SoundLabels:
     @property
     def named(self) -> np.ndarray:
         """The most likely class of each window (W,); "" for windows that are quiet or not finite."""
-        likeliest = np.array([*self.names, ""])[self.probabilities.argmax(axis=1)]
-        return np.where(self.quiet | ~self.known, "", likeliest)
+        likeliest_names = np.array([*self.names, ""])[self.probabilities.argmax(axis=1)]
+        return np.where(self.quiet | ~self.known, "", likeliest_names)
 
     @property
     def probability(self) -> Float[np.ndarray, " W"]:
@@ -103,8 +103,8 @@ class SoundLabels:
             self.times[-1:] + WINDOW_INTERVAL / 2,
         ]
         edges = np.maximum(np.concatenate(edge_parts), 0).tolist()
-        cuts = np.flatnonzero(names[1:] != names[:-1]) + 1
-        for indices in np.split(np.arange(len(names)), cuts):
+        boundaries = np.flatnonzero(names[1:] != names[:-1]) + 1
+        for indices in np.split(np.arange(len(names)), boundaries):
             if not indices.size:
                 continue
             place = None

@@ -31,8 +31,8 @@ class Levels:
         """Compute the conversion from windows of the training set."""
         loudest, mean, deviation = [], [], []
         for power in (images.intensity, images.spectrum):
-            max_level = _decibels(np.quantile(power, _LOUDEST_QUANTILE), -np.inf)
-            levels = _decibels(power, float(max_level) - _LEVEL_RANGE)
+            max_level = _to_decibels(np.quantile(power, _LOUDEST_QUANTILE), -np.inf)
+            levels = _to_decibels(power, float(max_level) - _LEVEL_RANGE)
             loudest.append(float(max_level))
             mean.append(float(levels.mean(dtype=float)))
             deviation.append(float(levels.std(dtype=float)) or 1.0)
@@ -54,13 +54,13 @@ class Levels:
         order = np.argsort(-images.intensity.sum(axis=2), axis=1, kind="stable")
         intensity = np.take_along_axis(images.intensity, order[..., None], axis=1)
         level_images = [
-            (_decibels(power, self.loudest[index] - _LEVEL_RANGE) - self.mean[index]) / self.deviation[index]
+            (_to_decibels(power, self.loudest[index] - _LEVEL_RANGE) - self.mean[index]) / self.deviation[index]
             for index, power in enumerate((intensity, images.spectrum))
         ]
         return np.concatenate(level_images, axis=1).astype(np.float32)
 
 
-def _decibels(power, min_level: float) -> np.ndarray:
+def _to_decibels(power, min_level: float) -> np.ndarray:
     """Convert powers to decibels, clipped from below at `min_level`. Silence has the level −300 dB."""
     return np.maximum(10 * np.log10(np.maximum(power, 1e-30)), min_level)
 
