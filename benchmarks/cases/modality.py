@@ -23,7 +23,7 @@ from jeit.acoustic import Recording
 from jeit.acoustic.simulate.people import MODALITIES
 from jeit.touch.listening import Levels, ModalityNetwork, SoundImages, sound_images
 from jeit.touch.listening.learners import LEARNERS, NetworkListener, TrainingSet
-from jeit.touch.listening.modality_network import COPIES
+from jeit.touch.listening.modality_network import NUM_COPIES
 
 # Where sets and training states are kept from one run to the next.
 STORE = Path(tempfile.gettempdir()) / "jeit-modality"
@@ -85,8 +85,8 @@ class Experiment:
     def as_the_paper(self, method: str) -> float:
         """Fraction right of a tenth of all copies, drawn at random: windows are copied with noise first."""
         sounds, rng = self.sounds, np.random.default_rng(0)
-        copies = [_noisy(sounds.images[0.0, 25], rng) for _ in range(COPIES)]
-        images, right = SoundImages.joined(copies), np.tile(sounds.right, COPIES)
+        copies = [_noisy(sounds.images[0.0, 25], rng) for _ in range(NUM_COPIES)]
+        images, right = SoundImages.concatenate(copies), np.tile(sounds.right, NUM_COPIES)
         deal = rng.permutation(len(right))
         part = np.empty(len(right), int)
         part[deal] = np.arange(len(right)) * 10 // len(right)

@@ -80,13 +80,13 @@ def _simulated(people: int, each: int, seed: int) -> SoundSet:
     right, person = [], []
     for clip in simulate_sound_clips(for_clips, skin, drawn, each):
         for louder, number in parts:
-            received = clip.noisier(louder)[list(FEWER[number])]
+            received = clip.with_louder_noise(louder)[list(FEWER[number])]
             parts[louder, number].append(sound_images(Recording(received, skin.rate))[::_EVERY])
         right.append(MODALITIES.index(clip.modality))
         person.append(clip.person)
     count = len(parts[0.0, 25][0])
     return SoundSet(
-        {one: SoundImages.joined(own) for one, own in parts.items()},
+        {one: SoundImages.concatenate(own) for one, own in parts.items()},
         np.repeat(right, count),
         np.repeat(person, count),
         np.repeat(np.arange(len(right)), count),

@@ -65,7 +65,7 @@ def draw_calibration(fit: CalibrationFit):
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
 # Number of pixels along each side of a map, and number of frames whose maps are computed at once.
-_PIXELS, _FRAMES = 100, 256
+_NUM_PIXELS, _NUM_CHUNK_FRAMES = 100, 256
 
 
 def write_track(found: LocatedTouches, folder: str | Path) -> None:
@@ -182,12 +182,14 @@ def _overlay_maps(touches: LocatedTouches) -> np.ndarray | None:
     if not located_frames.size:
         return None
     microphone_array, use, _ = microphones_in_use(intensities, touches.calibration)
-    localiser = Localiser.create(microphone_array, method=touches.method, map_shape=(_PIXELS, _PIXELS), compiled=False)
+    localiser = Localiser.create(
+        microphone_array, method=touches.method, map_shape=(_NUM_PIXELS, _NUM_PIXELS), compiled=False
+    )
     times = locations.times[located_frames]
     time_constant = max(0.3, 0.5 * float(times[-1] - times[0]))
-    image = np.zeros((_PIXELS, _PIXELS))
-    for start in range(0, located_frames.size, _FRAMES):
-        chunk = located_frames[start : start + _FRAMES]
+    image = np.zeros((_NUM_PIXELS, _NUM_PIXELS))
+    for start in range(0, located_frames.size, _NUM_CHUNK_FRAMES):
+        chunk = located_frames[start : start + _NUM_CHUNK_FRAMES]
         brightness = map_brightness(localiser.maps(intensities.power[chunk], use[chunk]), method=touches.method)
         image = np.maximum(
             image, last_overlay_image(brightness, locations.times[chunk], time=times[-1], time_constant=time_constant)

@@ -112,20 +112,23 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
 
 def _touch_intervals(times, has_position, gap: float) -> list[tuple[int, int]]:
     """Indices of the first and last located frame of each touch."""
-    index = np.flatnonzero(has_position)
-    if not index.size:
+    located_indices = np.flatnonzero(has_position)
+    if not located_indices.size:
         return []
-    breaks = np.flatnonzero(np.diff(times[index]) > gap)
-    firsts, lasts = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [index.size - 1]])
-    return [(int(index[first]), int(index[last])) for first, last in zip(firsts, lasts, strict=True)]
+    breaks = np.flatnonzero(np.diff(times[located_indices]) > gap)
+    firsts, lasts = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [located_indices.size - 1]])
+    return [
+        (int(located_indices[first]), int(located_indices[last])) for first, last in zip(firsts, lasts, strict=True)
+    ]
 
 
 def _smooth_touch(time_steps, measured, covariances, has_position, densities) -> tuple[np.ndarray, ...]:
-    """Call `_smooth`: with NumPy for a touch with few frames; otherwise compiled, with frames padded to a power of
+    """Call `_smooth_positions`: with NumPy for a touch with few frames; otherwise compiled, with frames padded to a
+    power of
     two."""
     num_frames, dimension = measured.shape
     if num_frames <= MAX_NUMPY_FRAMES:
-        return at_once(_smooth, time_steps, measured, covariances, has_position, densities)
+        return at_once(_smooth_positions, time_steps, measured, covariances, has_position, densities)
     padding = (1 << (num_frames - 1).bit_length()) - num_frames
     arrays = (
         np.pad(time_steps, (0, padding)),
@@ -133,17 +136,17 @@ def _smooth_touch(time_steps, measured, covariances, has_position, densities) ->
         np.concatenate([covariances, np.broadcast_to(np.eye(dimension), (padding, dimension, dimension))]),
         np.pad(has_position, (0, padding)),
     )
-    return tuple(np.asarray(array)[:num_frames] for array in jax.jit(_smooth)(*arrays, densities))
+    return tuple(np.asarray(array)[:num_frames] for array in jax.jit(_smooth_positions)(*arrays, densities))
 
 
-def _smooth(time_steps, measured, measured_covariance, has_position, densities):
+def _smooth_positions(time_steps, measured, measured_covariance, has_position, densities):
     """Smooth the positions of one touch with n frames, for the most likely of the densities.
 
     Returns the states (n, 2 d), position and velocity; their covariances (n, 2 d, 2 d); and the mask (n,) of accepted
     positions.
     """
     xp, dimension = namespace(measured), measured.shape[1]
-    score, filtered = _filter(time_steps, measured, measured_covariance, has_position, densities)
+    score, filtered = _kalman_filter(time_steps, measured, measured_covariance, has_position, densities)
     best_index = xp.argmax(score)
     mean, covariance, predicted_mean, predicted_covariance, is_accepted = (array[:, best_index] for array in filtered)
 
@@ -166,7 +169,7 @@ def _smooth(time_steps, measured, measured_covariance, has_position, densities):
     return means, covariances, is_accepted
 
 
-def _filter(step, measured, measured_covariance, has_position, densities):
+def _kalman_filter(step, measured, measured_covariance, has_position, densities):
     """Run the Kalman filter for Q spectral densities at once.
 
     Returns the log-likelihood (Q,) of each density; and for every frame and density the filtered mean and covariance of

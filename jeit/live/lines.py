@@ -45,9 +45,9 @@ class LineBuffer:
         lines = []
         *complete_parts, remainder = _LINE_ENDS.split(data)
         for part in complete_parts:
-            self._add(part)
+            self._append_data(part)
             lines += _split_at_words(self.take_remainder())
-        self._add(remainder)
+        self._append_data(remainder)
         word_starts = [match.start() for match in _FRAME_WORD.finditer(self._line)]
         if word_starts and word_starts[-1] > 0:
             lines += _split_at_words(bytes(self._line[: word_starts[-1]]))
@@ -61,7 +61,7 @@ class LineBuffer:
         self._is_truncated = False
         return line
 
-    def _add(self, data: bytes) -> None:
+    def _append_data(self, data: bytes) -> None:
         num_free = self.max_bytes - len(self._line)
         self._is_truncated = self._is_truncated or len(data) > num_free
         self._line += data[: max(num_free, 0)]

@@ -122,17 +122,19 @@ class QualityWatch:
         with self._lock:
             self._medians.append(medians)
             past_medians = np.array(self._medians)
-        readable = np.isfinite(expected) & (expected != 0)
-        change = np.abs(medians - expected) / np.abs(np.where(readable, expected, 1.0))
-        dead = _find_dead(~is_known | (change > _LOST_DIFFERENCE), readable, self.touching)
+        is_readable = np.isfinite(expected) & (expected != 0)
+        change = np.abs(medians - expected) / np.abs(np.where(is_readable, expected, 1.0))
+        dead_electrodes = _find_dead(~is_known | (change > _LOST_DIFFERENCE), is_readable, self.touching)
         if len(past_medians) < _NUM_MEDIANS // 2:
-            return Quality(noise, reciprocity, dead)
-        has_drift_data = np.isfinite(past_medians).all(axis=0) & readable & ~self.touching[dead].any(axis=0)
+            return Quality(noise, reciprocity, dead_electrodes)
+        has_drift_data = (
+            np.isfinite(past_medians).all(axis=0) & is_readable & ~self.touching[dead_electrodes].any(axis=0)
+        )
         drift = np.zeros(len(expected))
         drift[has_drift_data] = np.median(
             np.abs(past_medians[:, has_drift_data] / expected[has_drift_data] - 1), axis=0
         )
-        return Quality(noise, reciprocity, dead, _find_drifting(drift, has_drift_data, self.touching))
+        return Quality(noise, reciprocity, dead_electrodes, _find_drifting(drift, has_drift_data, self.touching))
 
 
 class RateWatch:
@@ -171,12 +173,12 @@ def _relative_noise(frames: Float[np.ndarray, "F M"]) -> float | None:
 
 
 def _find_dead(
-    is_lost: Bool[np.ndarray, " M"], readable: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
+    is_lost: Bool[np.ndarray, " M"], is_readable: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
 ) -> list[int]:
     """Find the electrodes most of whose readings are lost. The worst electrode is found first, and its channels are
     left out in the search for the next."""
-    dead: list[int] = []
-    is_remaining = readable.copy()
+    dead_electrodes: list[int] = []
+    is_remaining = is_readable.copy()
     while is_remaining.any():
         own_channels = touching & is_remaining
         num_channels = own_channels.sum(axis=1)
@@ -186,16 +188,16 @@ def _find_dead(
         worst_electrode = int(lost_shares.argmax())
         if lost_shares[worst_electrode] < _DEAD_SHARE:
             break
-        dead.append(worst_electrode)
+        dead_electrodes.append(worst_electrode)
         is_remaining &= ~touching[worst_electrode]
-    return sorted(dead)
+    return sorted(dead_electrodes)
 
 
 def _find_drifting(
     drift: Float[np.ndarray, " M"], has_drift_data: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
 ) -> list[int]:
     """Find the electrodes whose readings have changed for a long time, and much more than those of the others."""
-    drifting: list[int] = []
+    drifting_electrodes: list[int] = []
     is_remaining = has_drift_data.copy()
     while True:
         own_channels = [touching[mask] & is_remaining for mask in range(len(touching))]
@@ -207,6 +209,6 @@ def _find_drifting(
             or not other_channels.any()
             or median_drifts[worst_electrode] < _DRIFT_RATIO * np.median(drift[other_channels])
         ):
-            return sorted(drifting)
-        drifting.append(worst_electrode)
+            return sorted(drifting_electrodes)
+        drifting_electrodes.append(worst_electrode)
         is_remaining = other_channels

@@ -240,7 +240,7 @@ class _RecordingFiles:
         """Write a complete line. Raises `OSError` if it cannot be written; the file is then unchanged."""
         if name not in self._descriptors:
             self._create_file(name, line)
-        self._append(self._descriptors[name], self._sizes[name], line)
+        self._append_line(self._descriptors[name], self._sizes[name], line)
         self._sizes[name] += len(line)
         self.bytes += len(line)
         self.frames += name.startswith(_FRAMES_PREFIX)
@@ -252,7 +252,7 @@ class _RecordingFiles:
             heading = ("second," + ",".join(f"v{index + 1}" for index in range(line.count(b","))) + "\n").encode()
         descriptor = os.open(self.folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _BINARY, 0o644)
         try:
-            self._append(descriptor, 0, heading)
+            self._append_line(descriptor, 0, heading)
         except OSError:
             os.close(descriptor)
             raise
@@ -262,7 +262,7 @@ class _RecordingFiles:
         self._descriptors[name], self._sizes[name] = descriptor, len(heading)
 
     @staticmethod
-    def _append(descriptor: int, size: int, line: bytes) -> None:
+    def _append_line(descriptor: int, size: int, line: bytes) -> None:
         """Append a line to a file of the given `size`. If that fails, the file is truncated to this size."""
         try:
             num_written = os.write(descriptor, line)

@@ -53,7 +53,7 @@ def serve(
     if token is None and not is_loopback(host):
         token = secrets.token_urlsafe(24)
     hub = Hub(session)
-    server_socket = _listen(host, port)
+    server_socket = _open_socket(host, port)
     with server_socket:
         config = uvicorn.Config(
             make_application(hub, host=host, token=token),
@@ -72,14 +72,14 @@ def serve(
         if not stay:
             threading.Thread(target=_stop_at_end, args=(hub, server), daemon=True).start()
         if opened is not None:
-            opened(_address(host, server_socket.getsockname()[1], token))
+            opened(_page_address(host, server_socket.getsockname()[1], token))
         with contextlib.suppress(KeyboardInterrupt):
             server.run(sockets=[server_socket])
 
 
 def check_port(host: str, port: int) -> None:
     """Raise `OSError` with a remedy if a page cannot be served at `host` and `port`."""
-    _listen(host, port).close()
+    _open_socket(host, port).close()
 
 
 def _stop_at_end(hub: Hub, server: object) -> None:
@@ -87,7 +87,7 @@ def _stop_at_end(hub: Hub, server: object) -> None:
     server.should_exit = True  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _listen(host: str, port: int) -> socket.socket:
+def _open_socket(host: str, port: int) -> socket.socket:
     """Return a socket that listens at a host and port. Raises `OSError` with a remedy if that fails."""
     if not 0 <= port <= 65535:
         raise OSError(f"port: {port} is none; they go from 1 to 65535, and 0 takes a free one")
@@ -107,7 +107,7 @@ def _listen(host: str, port: int) -> socket.socket:
     return server_socket
 
 
-def _address(host: str, port: int, token: str | None) -> str:
+def _page_address(host: str, port: int, token: str | None) -> str:
     """Address of the page. If the host is unspecified (0.0.0.0), the address is the one that other machines reach."""
     displayed_host = host
     try:

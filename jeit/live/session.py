@@ -25,7 +25,7 @@ _MAX_WAIT = 0.05
 # Maximum memory in bytes of the pictures that are kept; maximum number of waiting frames; maximum number of different
 # reasons that are counted.
 _MAX_BYTES, _MAX_WAITING, _MAX_REASONS = 128_000_000, 256, 30
-_NUMBER = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
+_NUMBER_PATTERN = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 # Number of frames over which the latency is computed; time in seconds over which the rate is measured; period in
 # seconds in which the quality of the frames is computed.
 _NUM_LATENCIES, _RATE_SPAN, _QUALITY_PERIOD = 600, 2.0, 0.5
@@ -285,7 +285,7 @@ class Session:
                         self._waiting_frames.popleft()
                         self._num_dropped += 1
                     self._quality_watch.add(frame)
-                    self._collect(frame)
+                    self._collect_reference_frame(frame)
                     self._changed.notify_all()
                 self._compare_length(frame)
         except Exception as error:  # devices and files raise exceptions of many types; the page reports them
@@ -318,7 +318,7 @@ class Session:
             if sentence := self._rate_watch(self._frame_rate()):
                 self.say(sentence)
 
-    def _collect(self, frame: LiveFrame) -> None:
+    def _collect_reference_frame(self, frame: LiveFrame) -> None:
         """Keep a frame for the new reference, if one was requested."""
         if not self._num_requested or isinstance(frame.values, str):
             return
@@ -350,7 +350,7 @@ class Session:
                 picture = self.view.picture(frame)
             except Exception as error:  # an error of a view must not end the recording
                 picture = Picture(None, status=FrameStatus.REFUSED, reason=f"{type(error).__name__}: {error}"[:300])
-            self._publish(Result(frame, picture, time.monotonic() - frame.arrived))
+            self._publish_result(Result(frame, picture, time.monotonic() - frame.arrived))
         self._closed.set()
         with self._changed:
             if self._num_requested:
@@ -381,7 +381,7 @@ class Session:
             self.recorder.renew(time.monotonic() - self.source.begun, frames)
         self.say(f"New reference: mean of {counted(len(frames), 'frame')}.")
 
-    def _publish(self, result: Result) -> None:
+    def _publish_result(self, result: Result) -> None:
         with self._changed:
             self._results.append(result)
             self._num_bytes += _result_size(result)
@@ -405,7 +405,7 @@ class Session:
 
     def _count_reason(self, reason: str) -> None:
         """Count a reason. Reasons that differ only in their numbers are counted together."""
-        pattern = _NUMBER.sub("#", reason)
+        pattern = _NUMBER_PATTERN.sub("#", reason)
         if pattern not in self._reasons and len(self._reasons) >= _MAX_REASONS:
             pattern, reason = "", "other reasons"
         self._reasons.setdefault(pattern, [reason, 0])[1] += 1

@@ -187,15 +187,15 @@ def simulated_skin(rate: float = 60.0, *, limit: int | None = None, seed: int = 
     return SimulatedSensor(name, reference, rest, changes, places, period=period, rate=rate, limit=limit, seed=seed)
 
 
-_KINDS = {"tank": simulated_tank, "skin": simulated_skin}
+_SIMULATED_SENSORS = {"tank": simulated_tank, "skin": simulated_skin}
 
 
 def open_simulated(text: str, rate: float | None = None) -> SimulatedSensor:
     """Create the simulated source that "demo", "demo:tank" or "demo:skin" names. Raises `ValueError` for another
     name."""
     kind = text.partition(":")[2] or "tank"
-    check_name("demo", kind, _KINDS)
-    return _KINDS[kind](60.0 if rate is None else rate)
+    check_name("demo", kind, _SIMULATED_SENSORS)
+    return _SIMULATED_SENSORS[kind](60.0 if rate is None else rate)
 
 
 def _rotate_changes(changes: Float[np.ndarray, "n M"], pitches: int) -> Float[np.ndarray, "n M"]:

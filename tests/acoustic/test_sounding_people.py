@@ -98,7 +98,7 @@ def test_clips_are_determined_by_their_key_alone(skin):
         assert np.isfinite(one.samples).all()
         loudness = (one.touch.samples**2).mean()
         assert (loudness > 0) == (one.modality != "none")
-        np.testing.assert_allclose(one.noisier(20.0) - one.touch.samples, 10 * one.noise)
+        np.testing.assert_allclose(one.with_louder_noise(20.0) - one.touch.samples, 10 * one.noise)
     assert not np.allclose(clips[0].samples, clips[5].samples)
 
 

@@ -30,7 +30,7 @@ def test_the_change_in_an_image_is_at_the_place_of_the_source(source):
     imager, calibration = prepare_imager(source.reference, StreamSettings(solver="one-step", num_points=500))
     cells, sign = np.asarray(centroids(calibration.model.mesh)), -1.0 if "tank" in source.name else 1.0
     seconds = np.arange(0.01, source.period, source.period / 97)
-    frames = [source.states[source._state(one)] for one in seconds]
+    frames = [source.states[source._state_index(one)] for one in seconds]
     images = stream(imager, [source.reference.filled()[0], *frames])
     touched, background = 0, np.asarray(next(images).conductivity)
     for second, image in zip(seconds, images, strict=True):
@@ -48,7 +48,7 @@ def test_none_of_its_electrodes_is_dead_or_drifts(source):
     watch = QualityWatch(source.reference)
     for second in np.arange(0, 30, 0.5):
         for number in range(32):
-            watch.add(LiveFrame(number, 0.0, 0.0, source.states[source._state(second + number / 60)]))
+            watch.add(LiveFrame(number, 0.0, 0.0, source.states[source._state_index(second + number / 60)]))
         quality = watch.assess()
         assert not [*quality.dead, *quality.drifting]
 
@@ -66,7 +66,7 @@ def test_the_channels_that_change_most_are_those_of_the_nearest_electrodes():
     for electrode in range(16):
         angle = (np.pi / 2 - electrode * pitch) % (2 * np.pi)
         second = tank.period * angle / (2 * np.pi) + 0.01
-        change = np.abs(tank.states[tank._state(second)] / rest - 1)
+        change = np.abs(tank.states[tank._state_index(second)] / rest - 1)
         own = [change[reference.protocol.channels_touching(one)].mean() for one in range(16)]
         assert int(np.argmax(own)) == electrode
         x, y = tank.truth(second) or (np.nan, np.nan)

@@ -125,11 +125,11 @@ def fit_together(
     """Fit the values in the mask `free` and the strengths of all taps jointly. Returns the values and the logarithms of
     the strengths."""
 
-    def unpack(unknowns):
+    def unpack_unknowns(unknowns):
         return unknowns[: start.size].reshape(start.shape), unknowns[start.size :]
 
     def expand(unknowns, _):
-        cost, system = _normal_equations(problem, *unpack(unknowns), free)
+        cost, system = _normal_equations(problem, *unpack_unknowns(unknowns), free)
 
         def solve_step(damping):
             value_step, strength_step = _solve_step(system, damping)
@@ -145,7 +145,7 @@ def fit_together(
 
         return cost, solve_step
 
-    return unpack(_SOLVER.at_once(expand, np.concatenate([start.ravel(), strength]), None, _MAX_STEPS)[0])
+    return unpack_unknowns(_SOLVER.at_once(expand, np.concatenate([start.ravel(), strength]), None, _MAX_STEPS)[0])
 
 
 def fit_within(
@@ -225,13 +225,13 @@ def _normal_equations(problem: DecayProblem, values, strengths, free) -> tuple[n
     penalty = _penalty_matrices(problem)
     penalty_gradient = np.einsum("kmn,kn->km", penalty, values)
     jacobian = np.where(free[:, :, None], jacobian, 0.0)
-    weighted = weight * jacobian
+    weighted_jacobian = weight * jacobian
     system = _NormalEquations(
-        matrix=np.einsum("kmt,lmt->mkl", weighted, jacobian),
+        matrix=np.einsum("kmt,lmt->mkl", weighted_jacobian, jacobian),
         penalty=penalty * (free[:, :, None] & free[:, None]),
-        coupling=weighted * signal_share,
+        coupling=weighted_jacobian * signal_share,
         tap_matrix=np.sum(weight * signal_share**2, axis=0),
-        gradient=np.where(free, penalty_gradient, 0.0) - np.sum(weighted * residual, axis=-1),
+        gradient=np.where(free, penalty_gradient, 0.0) - np.sum(weighted_jacobian * residual, axis=-1),
         tap_gradient=-np.sum(weight * signal_share * residual, axis=0),
         free=free,
     )

@@ -113,7 +113,7 @@ def additive_deviations(
 
 
 # Maximum number of iterations of the fit with a shared shape, and of the fit with individual shapes.
-_ALTERNATIONS, _REWEIGHTINGS = 6, 12
+_MAX_SHARED_ITERATIONS, _MAX_INDIVIDUAL_ITERATIONS = 6, 12
 # Degrees of freedom of Student's t distribution, from which the weights of the residuals are derived.
 _T_FREEDOM = 5.0
 # Ratio of the mean square residual of a tap to the median over all taps above which the tap is excluded.
@@ -270,17 +270,17 @@ def fit_taps(
         # The relative error of the initial model is assumed to be at least 20 %.
         weight=1 / np.maximum(_level_variance(fit, np.nan_to_num(np.maximum(power, 0.0))), 0.04),
     )
-    fit = _alternate(fit, _ALTERNATIONS)
-    return _alternate(
+    fit = _alternate_fits(fit, _MAX_SHARED_ITERATIONS)
+    return _alternate_fits(
         replace(fit, spread=_prior_spread(np.full(num_shapes, _INITIAL_SPREAD), np.ones(num_displacements))),
-        _REWEIGHTINGS,
+        _MAX_INDIVIDUAL_ITERATIONS,
         update_spread=True,
     )
 
 
 def refit_without(fit: TapFit, excluded: Bool[np.ndarray, " M"]) -> TapFit:
     """Repeat the fit without the microphones in the mask `excluded`."""
-    return _alternate(replace(fit, dropped=fit.dropped | excluded), _REWEIGHTINGS, update_spread=True)
+    return _alternate_fits(replace(fit, dropped=fit.dropped | excluded), _MAX_INDIVIDUAL_ITERATIONS, update_spread=True)
 
 
 def standard_errors(fit: TapFit) -> Float[np.ndarray, "P M"]:
@@ -299,7 +299,7 @@ def standard_errors(fit: TapFit) -> Float[np.ndarray, "P M"]:
     return np.sqrt(np.maximum(np.diag(covariance), 0)).reshape(free.shape)
 
 
-def _alternate(fit: TapFit, iterations: int, *, update_spread: bool = False) -> TapFit:
+def _alternate_fits(fit: TapFit, iterations: int, *, update_spread: bool = False) -> TapFit:
     """Alternate between the fit of all microphones and the re-estimation of noise and weights, until convergence or for
     `iterations` iterations. If `update_spread`, the `spread` of the parameters is also re-estimated."""
     for _ in range(iterations):
@@ -307,7 +307,7 @@ def _alternate(fit: TapFit, iterations: int, *, update_spread: bool = False) -> 
         values, strength, at_bound = fit_within(fit.problem(), previous_values, fit.strength, has_readings, fit.bounds)
         fit = replace(fit, values=values, strength=strength, at_bound=at_bound)
         strength = fit_strengths(fit.problem(with_outliers=True), fit.values, fit.strength)
-        fit = _reweight(replace(fit, strength=strength))
+        fit = _update_noise_and_weights(replace(fit, strength=strength))
         if update_spread:
             fit = replace(fit, spread=_update_spread(fit))
         if np.abs(fit.values - previous_values)[fit.free].max(initial=0.0) < 1e-9:
@@ -342,7 +342,7 @@ def _update_spread(fit: TapFit) -> Float[np.ndarray, " P"]:
     )
 
 
-def _reweight(fit: TapFit) -> TapFit:
+def _update_noise_and_weights(fit: TapFit) -> TapFit:
     """Re-estimate the noise, the outlying taps and the weights from the residuals."""
     expected = fit.expected()
     received = np.maximum(np.exp(expected) - fit.noise.floor[:, None], 0.0)

@@ -210,24 +210,24 @@ def locate_left_out(
 
 def _microphone_array(fit: TapFit, values, microphones, surface: AbstractSurface) -> MicrophoneArray:
     decay = on_device(fit.kind.from_logarithms(host.asarray(values[: len(fit.kind.parameters)])))
-    displaced = microphones + fit.problem().displacement(values)
-    return MicrophoneArray(as_array(displaced), surface, decay, on_device(fit.noise))
+    displaced_positions = microphones + fit.problem().displacement(values)
+    return MicrophoneArray(as_array(displaced_positions), surface, decay, on_device(fit.noise))
 
 
-def _locate_most_likely(array: MicrophoneArray, coarse: Pixels, power, use):
+def _locate_most_likely(array: MicrophoneArray, raster: Pixels, power, use):
     """Positions (F, d) and covariances (F, d, d) by Fisher scoring from the best two valleys of a raster, within the
     bounding box of the outline. For a rectangular outline, the result is that of a `Localiser` up to rounding."""
     xp = namespace(array, power)
     screening_array = eqx.tree_at(
         lambda tree: tree.noise.relative, array, xp.maximum(array.noise.relative, _SCREENING_ERROR)
     )
-    maps = Likelihood.create(power, use, screening_array).screen(Likelihood.features(screening_array, coarse.chart))
-    first, second, _ = valleys(maps, coarse)
+    maps = Likelihood.create(power, use, screening_array).screen(Likelihood.features(screening_array, raster.chart))
+    first, second, _ = valleys(maps, raster)
     pair_likelihood = Likelihood.create(xp.tile(power, 2), xp.tile(use, 2), array)
     low, high = bounding_box(array.surface)
     surface_length, unbounded = longer_side(array.surface), xp.full(1, xp.inf)
     minimum = minimise_small(
-        lambda x, frames: Likelihood(frames[0], frames[1], frames[2], array).expand(x),
+        lambda unknowns, frames: Likelihood(frames[0], frames[1], frames[2], array).expand(unknowns),
         pair_likelihood.start(xp.concatenate([first, second], axis=1)),
         pair_likelihood.frames,
         lower=xp.concatenate([low, -unbounded])[:, None],
@@ -238,9 +238,9 @@ def _locate_most_likely(array: MicrophoneArray, coarse: Pixels, power, use):
     )
     value = xp.where(xp.isfinite(minimum.value), minimum.value, xp.inf).reshape(2, -1)
     best_index = value.argmin(axis=0) * power.shape[1] + xp.arange(power.shape[1])
-    x = minimum.x[:, best_index]
-    covariance = inverse_small(Likelihood.create(power, use, array).expand(x)[2])[:2, :2]
-    return to_space(array.surface, x[:2], covariance)
+    unknowns = minimum.x[:, best_index]
+    covariance = inverse_small(Likelihood.create(power, use, array).expand(unknowns)[2])[:2, :2]
+    return to_space(array.surface, unknowns[:2], covariance)
 
 
 def _assign_folds(tap_positions: Float[np.ndarray, "T d"]) -> Int[np.ndarray, " T"]:

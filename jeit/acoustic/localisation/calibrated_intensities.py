@@ -50,18 +50,18 @@ def calibrated_intensities(
     if isinstance(recording, Intensities):
         return recording
     settings = intensity or calibration.intensity or IntensitySettings()
-    recorded = intensities(recording, settings)
+    recorded_intensities = intensities(recording, settings)
     if silence is not None:
-        return _replace_floor(recorded, intensities(silence, settings))
+        return _replace_floor(recorded_intensities, intensities(silence, settings))
     # Noise floors can be compared only if band and windows are those of the calibration.
     if settings != calibration.intensity:
         if calibration.intensity is None:
-            return recorded
+            return recorded_intensities
         note = "band or window are not the calibration's: its decay models may not hold; calibrate with the same."
-        return dataclasses.replace(recorded, notes=(note,))
+        return dataclasses.replace(recorded_intensities, notes=(note,))
     calibration_floor = np.asarray(calibration.microphone_array.noise.floor)
     ratio = np.where(
-        calibration.usable, recorded.floor / np.where(calibration_floor > 0, calibration_floor, np.inf), 0.0
+        calibration.usable, recorded_intensities.floor / np.where(calibration_floor > 0, calibration_floor, np.inf), 0.0
     )
     description = (
         f"the noise floor, taken from the quietest windows, is up to {ratio.max():.3g} times the calibration's"
@@ -71,29 +71,33 @@ def calibrated_intensities(
         f"{floor_faults}. If the recording never pauses, touches count as silence: give a recording of the array "
         "untouched (silence=). If gain, unit, surroundings or microphones have changed, calibrate again."
     )
-    return dataclasses.replace(recorded, notes=(note,)) if floor_faults else recorded
+    return dataclasses.replace(recorded_intensities, notes=(note,)) if floor_faults else recorded_intensities
 
 
-def _replace_floor(recorded: Intensities, silence: Intensities) -> Intensities:
+def _replace_floor(recorded_intensities: Intensities, silence: Intensities) -> Intensities:
     """Replace the noise floor of a recording by that of `silence`. Microphones that are unusable in the silence become
     unusable."""
     is_usable = np.asarray(silence.usable.any(axis=0))
-    has_floors = (silence.floor > 0) & (recorded.floor > 0)
-    ratio = float(np.median(silence.floor[has_floors] / recorded.floor[has_floors])) if has_floors.any() else 1.0
+    has_floors = (silence.floor > 0) & (recorded_intensities.floor > 0)
+    ratio = (
+        float(np.median(silence.floor[has_floors] / recorded_intensities.floor[has_floors]))
+        if has_floors.any()
+        else 1.0
+    )
     if ratio > _MAX_FLOOR_RATIO:
         raise ValueError(
-            f"silence '{silence.name}' is {ratio:.3g} times as loud as the quietest windows of '{recorded.name}': "
-            "record the array untouched, at the same gain."
+            f"silence '{silence.name}' is {ratio:.3g} times as loud as the quietest windows of "
+            f"'{recorded_intensities.name}': record the array untouched, at the same gain."
         )
     silence_faults = [
         ("" if is_working else f"in the silence: {fault}")
         for is_working, fault in zip(is_usable, silence.faults, strict=True)
     ]
-    faults = ["; ".join(filter(None, pair)) for pair in zip(recorded.faults, silence_faults, strict=True)]
+    faults = ["; ".join(filter(None, pair)) for pair in zip(recorded_intensities.faults, silence_faults, strict=True)]
     return dataclasses.replace(
-        recorded,
-        power=recorded.power + recorded.floor - silence.floor,
+        recorded_intensities,
+        power=recorded_intensities.power + recorded_intensities.floor - silence.floor,
         floor=silence.floor,
-        usable=recorded.usable & is_usable,
+        usable=recorded_intensities.usable & is_usable,
         faults=faults,
     )

@@ -191,7 +191,7 @@ def find_minima(objective, first, second, try_second):
     start and end (2, 2, F) of the side of the outline to which the position was moved, NaN for positions inside.
     """
     surface = objective.microphone_array.surface
-    first_minimum = _minimise(objective, objective.start(first), None)
+    first_minimum = _minimise_in_plane(objective, objective.start(first), None)
     unknowns, converged = first_minimum.x, first_minimum.converged
     xp = namespace(objective, unknowns)
     value = xp.where(xp.isfinite(first_minimum.value), first_minimum.value, xp.inf)
@@ -199,9 +199,9 @@ def find_minima(objective, first, second, try_second):
     rival_excess, lowest_value = xp.full(value.shape, xp.inf), value
     if try_second is not None:
         # After a few steps, the minimisation continues only in promising second valleys.
-        trial_minimum = _minimise(objective, objective.start(second), ~try_second, max_steps=_TRIAL_STEPS)
+        trial_minimum = _minimise_in_plane(objective, objective.start(second), ~try_second, max_steps=_TRIAL_STEPS)
         try_second = try_second & (trial_minimum.value < value + _MAX_EXCESS)
-        second_minimum = _minimise(objective, trial_minimum.x, ~try_second)
+        second_minimum = _minimise_in_plane(objective, trial_minimum.x, ~try_second)
         second_value = xp.where(try_second & xp.isfinite(second_minimum.value), second_minimum.value, xp.inf)
         second_is_inside = surface.outline.contains(second_minimum.x[:2].T)
         is_distinct = xp.linalg.norm(second_minimum.x[:2] - unknowns[:2], axis=0) > _MIN_VALLEY_DISTANCE * longer_side(
@@ -250,7 +250,7 @@ def find_minima(objective, first, second, try_second):
     return unknowns, excess, rival_excess, converged, side
 
 
-def _minimise(objective, start, skip, *, max_steps: int | None = None) -> Minimum:
+def _minimise_in_plane(objective, start, skip, *, max_steps: int | None = None) -> Minimum:
     """Minimise the objective within the bounding box of the outline, extended by its longer side in all directions. A
     step is at most a quarter of that side, and a factor of ten in strength.
 

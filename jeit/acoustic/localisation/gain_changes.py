@@ -59,12 +59,12 @@ class GainChanges(NamedTuple):
         """Return the array with the changed gains, and with the variances of the changes added to its noise."""
         logarithms = on_host(microphone_array.decay).logarithms()
         # The first parameter of a decay model is a factor of the response.
-        changed = host.concatenate([logarithms[:1] + self.logarithm, logarithms[1:]])
+        changed_logarithms = host.concatenate([logarithms[:1] + self.logarithm, logarithms[1:]])
         relative = np.sqrt(np.asarray(microphone_array.noise.relative) ** 2 + np.diag(self.covariance))
         return eqx.tree_at(
             lambda array: (array.decay, array.noise.relative),
             microphone_array,
-            (on_device(type(microphone_array.decay).from_logarithms(changed)), as_array(relative)),
+            (on_device(type(microphone_array.decay).from_logarithms(changed_logarithms)), as_array(relative)),
         )
 
 
@@ -166,7 +166,7 @@ def covariance_with_gains(
     )
     has_position = np.isfinite(unknowns).all(axis=0)
     unknowns = host.where(has_position, unknowns, 0.0)
-    likelihood, jacobian, signal_share, weight = _linearise(array, power, use, unknowns)
+    likelihood, jacobian, signal_share, weight = _linearise_levels(array, power, use, unknowns)
     inverse_fisher = _inverse_fisher(likelihood.expand(unknowns)[2])
     gain_derivatives = np.einsum("klf,lmf->kmf", inverse_fisher[:2], weight * signal_share * jacobian)
     total_covariance = inverse_fisher[:2, :2] + host.einsum(
@@ -188,7 +188,9 @@ def _unknowns_of_sources(
     return np.concatenate([chart, np.log(np.asarray(sources.strength))[None, frames]])
 
 
-def _linearise(array: MicrophoneArray, power, use, unknowns) -> tuple[Likelihood, np.ndarray, np.ndarray, np.ndarray]:
+def _linearise_levels(
+    array: MicrophoneArray, power, use, unknowns
+) -> tuple[Likelihood, np.ndarray, np.ndarray, np.ndarray]:
     """Likelihood of the frames, derivatives J (3, M, F) of the levels, shares s (M, F), and weights W (M, F)."""
     use = use.T & (power.T + array.noise.floor[:, None] > 0)
     likelihood = Likelihood.create(power.T, use, array)
@@ -199,25 +201,25 @@ def _linearise(array: MicrophoneArray, power, use, unknowns) -> tuple[Likelihood
 
 def _normal_equations(array: MicrophoneArray, power, use, unknowns) -> tuple[np.ndarray, np.ndarray]:
     """Matrix (M, M) and right-hand side (M,) of the changes of the gains, without the prior."""
-    likelihood, jacobian, signal_share, weight = _linearise(array, power, use, unknowns)
+    likelihood, jacobian, signal_share, weight = _linearise_levels(array, power, use, unknowns)
     cell_size = _CELL_SIZE * float(longer_side(array.surface))
     _, cell_indices, frames_per_cell = np.unique(
         np.floor(unknowns[:2] / cell_size), axis=1, return_inverse=True, return_counts=True
     )
     weight = weight / frames_per_cell[cell_indices.ravel()]
     residual = likelihood.level - array.expected(unknowns)[0]
-    weighted = weight * signal_share
-    coupling = weighted * jacobian
+    share_weights = weight * signal_share
+    coupling = share_weights * jacobian
     inverse_fisher = _inverse_fisher(np.einsum("kmf,lmf->klf", weight * jacobian, jacobian))
-    eliminated = np.einsum("klf,lmf->kmf", inverse_fisher, coupling)
-    matrix = np.diag((weighted * signal_share).sum(axis=1)) - np.einsum("kmf,knf->mn", coupling, eliminated)
-    right_hand_side = (weighted * residual).sum(axis=1) - np.einsum(
-        "kmf,kf->m", eliminated, (weight * jacobian * residual).sum(axis=1)
+    source_response = np.einsum("klf,lmf->kmf", inverse_fisher, coupling)
+    matrix = np.diag((share_weights * signal_share).sum(axis=1)) - np.einsum("kmf,knf->mn", coupling, source_response)
+    right_hand_side = (share_weights * residual).sum(axis=1) - np.einsum(
+        "kmf,kf->m", source_response, (weight * jacobian * residual).sum(axis=1)
     )
     return matrix, right_hand_side
 
 
 def _inverse_fisher(fisher) -> np.ndarray:
     """Inverses of Fisher matrices (3, 3, F), also of singular ones: their ridge makes them definite."""
-    definite = fisher + _RIDGE * np.maximum(np.trace(fisher), 1.0) * np.eye(len(fisher))[:, :, None]
-    return np.asarray(inverse_small(definite))
+    regularised_fisher = fisher + _RIDGE * np.maximum(np.trace(fisher), 1.0) * np.eye(len(fisher))[:, :, None]
+    return np.asarray(inverse_small(regularised_fisher))

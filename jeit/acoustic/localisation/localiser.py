@@ -118,13 +118,13 @@ class Localiser(Module):
         if np.shape(map_shape) != (2,) or min(map_shape) < 2:
             raise ValueError(f"map_shape must be (rows, columns) of at least two each; it is {map_shape!r}.")
         pixels = Pixels.create(microphone_array.surface, int(map_shape[1]), int(map_shape[0]))
-        features = _features(METHODS[method], microphone_array, pixels.chart)
+        features = _compute_features(METHODS[method], microphone_array, pixels.chart)
         return cls(microphone_array, coarse_grid, pixels, features, method, compiled)
 
     def __call__(self, power: ArrayLike, use: ArrayLike | None = None) -> SourceEstimate:
         """Locate the source of each frame. `power` (F, M): intensities minus the floor. `use` (F, M): mask of the
         intensities to use; by default all finite ones. Frames with fewer than three usable microphones give NaN."""
-        return self._call_validated(_locate, power, use)
+        return self._call_validated(_locate_sources, power, use)
 
     def maps(self, power: ArrayLike, use: ArrayLike | None = None) -> Float[Array, "F rows columns"]:
         """Compute the map of each frame: the negative log-likelihood with the best strength at each pixel, up to a
@@ -135,7 +135,7 @@ class Localiser(Module):
         """
         if self.pixels is None:
             raise ValueError("this Localiser has no maps; create it with map_shape=(rows, columns).")
-        return self._call_validated(_maps, power, use)
+        return self._call_validated(_compute_maps, power, use)
 
     def with_maps(
         self, power: ArrayLike, use: ArrayLike | None = None
@@ -178,28 +178,28 @@ def _apply_in_chunks(function, max_frames: int, *arrays):
 
     xp = namespace(arrays)
 
-    def split(array):
+    def split_array(array):
         return xp.pad(array, padding).reshape(num_chunks, chunk_size, -1).transpose(0, 2, 1)
 
-    _, results = scan(lambda _, chunk: (None, function(*chunk)), None, tuple(split(array) for array in arrays))
+    _, results = scan(lambda _, chunk: (None, function(*chunk)), None, tuple(split_array(array) for array in arrays))
     return jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[:num_frames], results)
 
 
 @either_engine
-def _features(objective, microphone_array: MicrophoneArray, chart) -> Array:
+def _compute_features(objective, microphone_array: MicrophoneArray, chart) -> Array:
     return objective.features(microphone_array, chart)
 
 
-def _raster(localiser: Localiser, microphone_array: MicrophoneArray) -> tuple[Pixels, Array]:
+def _map_raster(localiser: Localiser, microphone_array: MicrophoneArray) -> tuple[Pixels, Array]:
     """Return the raster of the maps, or the coarse grid if there are no maps, and the features of its pixels."""
     if localiser.pixels is not None and localiser.features is not None:
         return localiser.pixels, localiser.features
     return localiser.coarse, METHODS[localiser.method].features(microphone_array, localiser.coarse.chart)
 
 
-def _maps(localiser: Localiser, power, use) -> Array:
+def _compute_maps(localiser: Localiser, power, use) -> Array:
     """Compute the maps of all frames (F, rows, columns) at once by matrix products."""
-    pixels, features = _raster(localiser, localiser.microphone_array)
+    pixels, features = _map_raster(localiser, localiser.microphone_array)
     use = _usable_readings(localiser, power, use)
     maps = METHODS[localiser.method].create(power.T, use.T, localiser.microphone_array).screen(features)
     return (maps if pixels.full else namespace(maps).where(pixels.inside, maps, np.nan)).reshape(-1, *pixels.shape)
@@ -209,7 +209,7 @@ def _starting_positions(localiser: Localiser, power, use):
     """Starting positions of the minimisation: those of the first valley (F, 2) and the second valley (F, 2), and the
     mask (F,) of the frames whose second valley is worth a minimisation."""
     constant_array = undifferentiated(localiser.microphone_array)
-    pixels, features = _raster(localiser, constant_array)
+    pixels, features = _map_raster(localiser, constant_array)
     # The valleys of a very accurate model are narrower than the grid spacing, so a minimum relative error is assumed.
     constant_array = eqx.tree_at(
         lambda tree: tree.noise.relative,
@@ -217,13 +217,13 @@ def _starting_positions(localiser: Localiser, power, use):
         namespace(constant_array).maximum(constant_array.noise.relative, _SCREENING_ERROR),
     )
 
-    def screen(power, use):
+    def screen_chunk(power, use):
         maps = METHODS[localiser.method].create(power, use, constant_array).screen(features)
         first, second, try_second = valleys(maps, pixels)
         return first.T, second.T, try_second
 
     max_frames = _MAX_CHUNK_FRAMES if localiser.pixels is None else _MAX_MAP_FRAMES
-    return _apply_in_chunks(screen, max_frames, undifferentiated(power), use)
+    return _apply_in_chunks(screen_chunk, max_frames, undifferentiated(power), use)
 
 
 def _usable_readings(localiser: Localiser, power, use):
@@ -231,17 +231,17 @@ def _usable_readings(localiser: Localiser, power, use):
     return use & (power + localiser.microphone_array.noise.floor > 0)
 
 
-def _locate(localiser: Localiser, power, use) -> SourceEstimate:
+def _locate_sources(localiser: Localiser, power, use) -> SourceEstimate:
     use = _usable_readings(localiser, power, use)
     first, second, try_second = _starting_positions(localiser, power, use)
 
-    def refine(power, use, first, second, try_second):
-        return _refine(localiser, power, use, first, second, try_second[0])
+    def refine_chunk(power, use, first, second, try_second):
+        return _refine_positions(localiser, power, use, first, second, try_second[0])
 
-    return _apply_in_chunks(refine, _MAX_CHUNK_FRAMES, power, use, first, second, try_second[:, None])
+    return _apply_in_chunks(refine_chunk, _MAX_CHUNK_FRAMES, power, use, first, second, try_second[:, None])
 
 
-def _refine(localiser: Localiser, power, use, first, second, try_second) -> SourceEstimate:
+def _refine_positions(localiser: Localiser, power, use, first, second, try_second) -> SourceEstimate:
     """Minimise the objective of each frame from the starting positions `first` and `second` (2, F). `power`, `use`: (M,
     F)."""
     microphone_array = localiser.microphone_array

@@ -225,11 +225,13 @@ def _fit_two_sources(
             np.asarray(two_sources.misfit)[: tried_frames.size],
             np.asarray(two_sources.freedom)[: tried_frames.size],
         )
-        stronger, weaker = np.asarray(two_sources.strength)[: tried_frames.size].T
+        stronger_strengths, weaker_strengths = np.asarray(two_sources.strength)[: tried_frames.size].T
         is_much_better = (misfit < _MAX_MISFIT_RATIO * result["misfit"][tried_frames]) & (
             misfit < _MAX_MISFIT * freedom
         )
-        is_accepted = (~_exceeds_noise(misfit, freedom) | is_much_better) & (weaker > _MIN_STRENGTH_RATIO * stronger)
+        is_accepted = (~_exceeds_noise(misfit, freedom) | is_much_better) & (
+            weaker_strengths > _MIN_STRENGTH_RATIO * stronger_strengths
+        )
         accepted_frames, accepted_indices = tried_frames[is_accepted], np.flatnonzero(is_accepted)
         status[accepted_frames] = LocationStatus.TWO_TOUCHES
         result["misfit"][accepted_frames], result["freedom"][accepted_frames] = (

@@ -313,8 +313,8 @@ def _draw_receptive_field(panel: Axes, fit: CalibrationFit, index: int, relative
     panel.text(0.05, 0.97, str(index), ha="left", fontsize=fontsize, fontweight="bold", color=INK, **text_style)
     if reason:
         short_reason = textwrap.shorten(reason.split(" (")[0], 60, placeholder=" …")
-        wrapped = textwrap.fill(short_reason, 24 if columns <= 5 else 18)
-        panel.text(0.97, 0.97, wrapped, ha="right", fontsize=fontsize - 1, color=ESTIMATE_COLOUR, **text_style)
+        wrapped_reason = textwrap.fill(short_reason, 24 if columns <= 5 else 18)
+        panel.text(0.97, 0.97, wrapped_reason, ha="right", fontsize=fontsize - 1, color=ESTIMATE_COLOUR, **text_style)
     elif columns <= 6:
         half_distance = distance[np.argmin(np.abs(curve / curve[0] - 0.5))]
         panel.text(

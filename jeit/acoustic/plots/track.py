@@ -19,8 +19,8 @@ from jeit.acoustic.tracking import Touch, Track
 from jeit.arguments import check_kind
 from jeit.plot.axes import INK, SOFT, axes_or_new, draw_colour_bar
 
-_GLOW = LinearSegmentedColormap.from_list("glow", ["#ffffff", "#bccddf", "#6a8aae"])
-_TIME = LinearSegmentedColormap.from_list("time", ["#0d0887", "#7e03a8", "#cc4778", "#f89540", "#fbd724"])
+_OVERLAY_COLOURS = LinearSegmentedColormap.from_list("glow", ["#ffffff", "#bccddf", "#6a8aae"])
+_TIME_COLOURS = LinearSegmentedColormap.from_list("time", ["#0d0887", "#7e03a8", "#cc4778", "#f89540", "#fbd724"])
 # Markers of located frames whose status is not "touch".
 _STATUS_MARKERS = {
     LocationStatus.TWO_TOUCHES: "D",
@@ -90,7 +90,7 @@ def plot_track(
     path = view.chart(track.position, "track")
     ax = axes_or_new(ax)
     if image is not None:
-        style: dict[str, Any] = {"interpolation": "bilinear", "cmap": _GLOW, "clim": (0, 1)}
+        style: dict[str, Any] = {"interpolation": "bilinear", "cmap": _OVERLAY_COLOURS, "clim": (0, 1)}
         image_artist = ax.imshow(np.nan_to_num(image), extent=view.extent, origin="lower", **style)
         image_artist.set_clip_path(outline_of(view), ax.transData)
     handles = draw_surface(ax, view, faint=True)
@@ -103,7 +103,7 @@ def plot_track(
         return ax
     start_time, end_time = track.touches[0].onset, track.touches[-1].offset
     time_colours = ScalarMappable(
-        Normalize(start_time, end_time if end_time > start_time else start_time + 1e-3), _TIME
+        Normalize(start_time, end_time if end_time > start_time else start_time + 1e-3), _TIME_COLOURS
     )
     for touch in track.touches:
         handles += _draw_touch(

@@ -39,24 +39,24 @@ def sample_faults(
     Hz. `full_scale`: largest possible magnitude of a sample, or None if unknown.
     """
     codes = np.zeros(samples.shape, np.uint8)
-    finite = np.isfinite(samples)
-    all_finite = bool(finite.all())
+    is_finite = np.isfinite(samples)
+    all_finite = bool(is_finite.all())
     if not all_finite:
-        codes[~finite] = NOT_FINITE
-        if not finite.any():
+        codes[~is_finite] = NOT_FINITE
+        if not is_finite.any():
             return codes, "dead: every sample is NaN or infinite"
-        samples = np.where(finite, samples, np.nan)
+        samples = np.where(is_finite, samples, np.nan)
     lowest, highest = np.fmin.reduce(samples), np.fmax.reduce(samples)
     if lowest == highest:
         return codes, f"dead: every {'' if all_finite else 'finite '}sample is {lowest:g}"
-    stuck = _stuck_samples(samples, rate, float(highest - lowest))
+    is_stuck = _stuck_samples(samples, rate, float(highest - lowest))
     # A channel that stays at one end of its range is stuck, not clipping.
-    moving_samples = samples if stuck is None else np.where(stuck, np.nan, samples)
-    clipping = _clipped_samples(moving_samples, full_scale)
-    if clipping is not None:
-        codes[clipping] = CLIPPING
-    if stuck is not None:
-        codes[stuck] = STUCK
+    moving_samples = samples if is_stuck is None else np.where(is_stuck, np.nan, samples)
+    is_clipped = _clipped_samples(moving_samples, full_scale)
+    if is_clipped is not None:
+        codes[is_clipped] = CLIPPING
+    if is_stuck is not None:
+        codes[is_stuck] = STUCK
     return codes, ""
 
 
@@ -153,20 +153,20 @@ def _stuck_samples(samples: np.ndarray, rate: float, extent: float) -> Bool[np.n
     is_long = stop - start + 1 >= min_length
     if not is_long.any():
         return None
-    stuck = np.zeros(samples.shape, bool)
-    for first, last in zip(start[is_long], stop[is_long], strict=True):
-        stuck[first : last + 1] = True
+    is_stuck = np.zeros(samples.shape, bool)
+    for first_flag, last_flag in zip(start[is_long], stop[is_long], strict=True):
+        is_stuck[first_flag : last_flag + 1] = True
     # Silence can be constant too: with a coarse converter, or in a simulation without noise. The sound then fades into
     # silence, so that some other blocks are almost constant. In a stuck channel with noise no other block is.
-    is_moving = ~stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(block_ranges)
+    is_moving = ~is_stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(block_ranges)
     rest_range = max(_REST_STEPS * _converter_step(samples), _REST_RANGE * extent)
-    return None if is_moving.any() and block_ranges[is_moving].min() <= rest_range else stuck
+    return None if is_moving.any() and block_ranges[is_moving].min() <= rest_range else is_stuck
 
 
 def _clipped_samples(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray, " S"] | None:
     """Mask of the samples at an end of the channel's range, if its peaks are cut off there; None if they are not."""
     lowest, highest = np.fmin.reduce(samples), np.fmax.reduce(samples)
-    clipped = None
+    is_clipped = None
     step = samples_per_value = 0.0
     for sign, peak in ((1.0, highest), (-1.0, -lowest)):
         heights = [_TOP_RANGE * (highest - lowest)]
@@ -181,14 +181,14 @@ def _clipped_samples(samples: np.ndarray, full_scale: float | None) -> Bool[np.n
         for height in heights:
             near_top = distance_below_top <= height + step
             if _has_clipped_peak(distance_below_top, near_top, height + 2 * step, samples_per_value):
-                clipped = near_top if clipped is None else clipped | near_top
-    return clipped
+                is_clipped = near_top if is_clipped is None else is_clipped | near_top
+    return is_clipped
 
 
 def _has_clipped_peak(
-    distance_below_top: np.ndarray, near: Bool[np.ndarray, " S"], height: float, samples_per_value: float
+    distance_below_top: np.ndarray, near_top: Bool[np.ndarray, " S"], height: float, samples_per_value: float
 ) -> bool:
-    """Whether any run of samples `near` the top is a clipped peak.
+    """Whether any run of samples in the mask `near_top` is a clipped peak.
 
     `distance_below_top` (S,): distance of each sample below the top. `samples_per_value`: number of samples per
     converted value. An unclipped peak is nearly a parabola: if n successive converted values stay within `height` of
@@ -196,10 +196,10 @@ def _has_clipped_peak(
     much more, about the height that was cut off. Slow or loud peaks are thus accepted, however many samples they have
     near the top, and so is a single value that the converter holds for several samples.
     """
-    start, stop = _true_runs(near)
-    conversions = (stop - start) / samples_per_value
-    for run_index in np.flatnonzero(conversions >= _MIN_FLAT_VALUES):
-        num_values, first, last = conversions[run_index], start[run_index], stop[run_index]
+    start, stop = _true_runs(near_top)
+    values_per_run = (stop - start) / samples_per_value
+    for run_index in np.flatnonzero(values_per_run >= _MIN_FLAT_VALUES):
+        num_values, first, last = values_per_run[run_index], start[run_index], stop[run_index]
         num_values_beyond = max(1, int(num_values) // 2)
         num_samples_beyond = int(num_values_beyond * samples_per_value)
         sides = (

@@ -258,8 +258,8 @@ class SoundClip:
         """Recorded samples: the sum of touch and noise."""
         return self.touch.samples + self.noise
 
-    def noisier(self, decibels: float) -> Float[np.ndarray, "M S"]:
-        """Samples with the level of the noise raised by a number of decibels."""
+    def with_louder_noise(self, decibels: float) -> Float[np.ndarray, "M S"]:
+        """Return the samples (M, S) with the level of the noise raised by a number of decibels."""
         return self.touch.samples + 10 ** (decibels / 20) * self.noise
 
 
@@ -311,9 +311,9 @@ def simulate_sound_clips(
     return _generate_clips(key, skin, people, each, tuple(modalities), duration)
 
 
-def _generate_clips(key, skin, people, each, modalities, duration) -> Iterator[SoundClip]:
+def _generate_clips(key, skin, people, num_each, modalities, duration) -> Iterator[SoundClip]:
     num_samples = len(sample_times(skin, duration))
-    labels = [(person, modality) for person in range(len(people)) for modality in modalities for _ in range(each)]
+    labels = [(person, modality) for person in range(len(people)) for modality in modalities for _ in range(num_each)]
     for clip_index, (person, modality) in enumerate(labels):
         touch_key, noise_key, room_key, level_key = jax.random.split(jax.random.fold_in(key, clip_index), 4)
         touch = people[person].touch(touch_key, modality, skin, duration=duration)

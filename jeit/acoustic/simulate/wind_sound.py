@@ -82,7 +82,7 @@ def simulate_wind(
     )
     times = sample_times(skin, duration)
     amplitude = np.exp(gusts * _slow_noise(gust_key, len(times), gust_time * skin.rate) - gusts**2)
-    density = _density(skin, slope, _received_power(skin, jnp.asarray(eddy_positions), _frequency_grid(skin)))
+    density = _spectral_density(skin, slope, _received_power(skin, jnp.asarray(eddy_positions), _frequency_grid(skin)))
     samples = strength * amplitude * _coloured_noise(skin, wind_key, density, len(times))
     if noise:
         samples = samples + microphone_noise(skin, noise_key, len(times))
@@ -122,7 +122,9 @@ def simulate_room_sound(
         raise ValueError(f"level_db must be finite, in decibels; it is {level_db}.")
     times = sample_times(skin, duration)
     power = float(np.median(noise_power(skin) / np.asarray(skin.noise_factor))) * 10 ** (level_db / 10)
-    room_signal = _coloured_noise(skin, key, power * _density(skin, slope, np.ones((1, _NUM_FREQUENCIES))), len(times))
+    room_signal = _coloured_noise(
+        skin, key, power * _spectral_density(skin, slope, np.ones((1, _NUM_FREQUENCIES))), len(times)
+    )
     samples = np.asarray(skin.gain)[:, None] * room_signal
     return SimulatedSound(samples, skin.rate, np.zeros((0, 2)), np.zeros(0), np.zeros(len(times)), False)
 
@@ -145,7 +147,7 @@ def _received_power(skin: SoundingSkin, positions: Array, frequencies: Array) ->
     return jax.lax.fori_loop(0, len(positions), add_source, total) / len(positions)
 
 
-def _density(skin: SoundingSkin, slope: float, received: ArrayLike) -> Float[np.ndarray, "M G"]:
+def _spectral_density(skin: SoundingSkin, slope: float, received: ArrayLike) -> Float[np.ndarray, "M G"]:
     """Power spectral densities (M, G) at the microphones, in 1/Hz, for sources of total mean square 1. `received` (M,
     G): received power divided by source power."""
     grid = _frequency_grid(skin)

@@ -164,7 +164,7 @@ def live(
     recorder = Recorder(output, reference=prepared.reference)
     if record:
         recorder.start()
-    with _handle_sigterm() as terminated:
+    with _handle_sigterm() as received_signals:
         with Session(prepared.source, prepared.view, recorder=recorder) as session:
             serve(
                 session,
@@ -179,7 +179,7 @@ def live(
     if until_end and not state["imaged"]:
         first = next(iter(state["reasons"]), "the source ended before the first")
         raise ValueError(f"{counted(state['read'], 'frame')}, and none could be imaged: {first}")
-    if terminated:
+    if received_signals:
         raise typer.Exit(128 + signal.SIGTERM)
 
 

@@ -140,27 +140,27 @@ class Hub:
             if result is not None:
                 last_number = result.frame.number
                 self._newest = result
-                self._wake()
+                self._wake_pages()
             if now - state_time >= _STATE_PERIOD:
                 state_time = now
                 self._state = self.session.state()
                 if self._state.get("connection") == "ended":
                     self.ended.set()
-                self._wake(state=True)
+                self._wake_pages(state=True)
             if result is None and self.ended.is_set():
                 self._closing.wait(0.1)
 
-    def _wake(self, *, state: bool = False) -> None:
+    def _wake_pages(self, *, state: bool = False) -> None:
         """Wake the pages in the event loop. Several pictures that arrive meanwhile wake them only once."""
         if self._loop is None or (self._is_woken and not state):
             return
         self._is_woken = True
         try:
-            self._loop.call_soon_threadsafe(self._notify, state)
+            self._loop.call_soon_threadsafe(self._notify_viewers, state)
         except RuntimeError:  # the loop has been closed
             self._closing.set()
 
-    def _notify(self, state: bool) -> None:
+    def _notify_viewers(self, state: bool) -> None:
         self._is_woken = False
         for viewer in self.viewers:
             viewer.state_due = viewer.state_due or state

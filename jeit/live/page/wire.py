@@ -124,8 +124,8 @@ def to_json(kind: str, content: Mapping[str, Any]) -> str:
 
 def _curve_lists(curves: Sequence[np.ndarray]) -> list[list[list[float]]]:
     """Convert curves to lists of at most 2,000 points each, rounded to tenths of a micrometre."""
-    thinned = [np.asarray(curve, float)[:: 1 + len(curve) // _MAX_CURVE_POINTS] for curve in curves]
-    return [np.round(curve, 7).tolist() for curve in thinned]
+    thinned_curves = [np.asarray(curve, float)[:: 1 + len(curve) // _MAX_CURVE_POINTS] for curve in curves]
+    return [np.round(curve, 7).tolist() for curve in thinned_curves]
 
 
 def scene_message(scene: Scene) -> str:
@@ -166,11 +166,11 @@ def _encode_pixels(picture: Picture) -> _EncodedArray:
     if picture.pixels is None or picture.pixels.ndim != 2 or not picture.pixels.size:
         return _EncodedArray({"shape": None, "scale": 0.0}, b"")
     pixels = np.asarray(picture.pixels, np.float32)
-    valid = np.isfinite(pixels)
-    largest = float(np.abs(pixels, where=valid, out=np.zeros_like(pixels)).max())
-    scale = largest / 32767 if largest > 0 else 1.0
+    is_valid = np.isfinite(pixels)
+    largest_magnitude = float(np.abs(pixels, where=is_valid, out=np.zeros_like(pixels)).max())
+    scale = largest_magnitude / 32767 if largest_magnitude > 0 else 1.0
     integers = np.full(pixels.shape, NO_PIXEL, "<i2")
-    integers[valid] = np.rint(pixels[valid] / scale)
+    integers[is_valid] = np.rint(pixels[is_valid] / scale)
     return _EncodedArray({"shape": list(pixels.shape), "scale": scale}, integers.tobytes())
 
 

@@ -54,7 +54,7 @@ class SoundView(AbstractView):
         self.calibration, self.method = calibration, method
         self.floor, self.freedom = floor, freedom
         self._silent_power = np.zeros(calibration.num_microphones)
-        array, _, _ = microphones_in_use(self._intensities(self._silent_power, 0.0), calibration)
+        array, _, _ = microphones_in_use(self._to_intensities(self._silent_power, 0.0), calibration)
         low, high = (np.asarray(corner, float) for corner in bounding_box(array.surface))
         size = (high - low).max() / _NUM_PIXELS
         columns, rows = (max(2, round(side / size)) for side in (high - low).tolist())
@@ -85,7 +85,7 @@ class SoundView(AbstractView):
             reason = f"The frame is {content}, not {len(self._silent_power)} intensities."
             return Picture(None, status=FrameStatus.REFUSED, reason=reason)
         try:
-            intensities = self._intensities(values - self._silent_power, frame.second)
+            intensities = self._to_intensities(values - self._silent_power, frame.second)
             locations = locate(intensities, self.calibration, method=self.method, gain_drift=0.0, compiled=False)
         except ValueError as error:
             return Picture(None, status=FrameStatus.REFUSED, reason=str(error))
@@ -98,7 +98,7 @@ class SoundView(AbstractView):
         if self.method == _LIKELIHOOD:
             loss = np.sqrt(2 * (loss - np.nanmin(loss)))
         reason = "" if status == LocationStatus.TOUCH else f"{status}: see the statuses of jeit locate.".capitalize()
-        return Picture(loss.astype(np.float32), self._markers(locations), reason=reason)
+        return Picture(loss.astype(np.float32), self._touch_markers(locations), reason=reason)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
         """Take the mean of frames (N, M) without a touch as silence, which is subtracted from later frames.
@@ -110,7 +110,7 @@ class SoundView(AbstractView):
             raise ValueError(f"reference: give intensities of all {len(self._silent_power)} microphones.")
         self._silent_power = np.where(np.isfinite(mean), mean, 0.0)
 
-    def _intensities(self, power: Float[np.ndarray, " M"], second: float) -> Intensities:
+    def _to_intensities(self, power: Float[np.ndarray, " M"], second: float) -> Intensities:
         usable = np.isfinite(power)[None]
         return Intensities(
             [second],
@@ -122,7 +122,7 @@ class SoundView(AbstractView):
             name="live",
         )
 
-    def _markers(self, locations) -> tuple[Marker, ...]:
+    def _touch_markers(self, locations) -> tuple[Marker, ...]:
         """Markers of the touch, and of the second touch if there are two."""
         project = self._localiser.microphone_array.surface.project
         deviation = float(np.sqrt(np.trace(locations.covariance[0]) / 2))

@@ -24,16 +24,16 @@ from scipy.optimize import brentq
 from jeit.acoustic import Recording
 from jeit.arguments import check_kind, describe, is_number
 
-BANDS, FRAMES = 64, 41
+NUM_BANDS, NUM_FRAMES = 64, 41
 # Duration of a frame, time from frame to frame, and time from window to window, seconds.
-FRAME, HOP, EVERY = 0.0128, 0.012, 0.1
-LENGTH = FRAME + (FRAMES - 1) * HOP
+FRAME_DURATION, FRAME_INTERVAL, WINDOW_INTERVAL = 0.0128, 0.012, 0.1
+WINDOW_DURATION = FRAME_DURATION + (NUM_FRAMES - 1) * FRAME_INTERVAL
 """Duration of a window, seconds."""
 # Maximum of `highest` for which all bands are as wide as a bin; minimum of `highest`, below which fewer than 8 bins
 # would be left; hertz.
-EVEN, LOWEST = 5000.0, 625.0
+MAX_EVEN_FREQUENCY, MIN_HIGHEST = 5000.0, 625.0
 # Number of windows whose images are computed at once.
-_AT_ONCE = 128
+_MAX_BLOCK_WINDOWS = 128
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ class SoundImages:
         """Number of windows."""
         return len(self.times)
 
-    def __getitem__(self, some) -> "SoundImages":
+    def __getitem__(self, selection) -> "SoundImages":
         """Select windows by a slice, indices or a boolean mask."""
-        return SoundImages(*(getattr(self, name)[some] for name in self.__dataclass_fields__))
+        return SoundImages(*(getattr(self, name)[selection] for name in self.__dataclass_fields__))
 
     @property
     def loudness(self) -> Float[np.ndarray, " W"]:
@@ -66,22 +66,23 @@ class SoundImages:
         return self.intensity.sum(axis=1).max(axis=1)
 
     @property
-    def levelled(self) -> "SoundImages":
+    def normalised(self) -> "SoundImages":
         """The same windows, with powers divided by the `loudness` of each window; silent windows are unchanged."""
-        least = np.where(self.loudness > 0, self.loudness, 1.0)[:, None, None]
-        return replace(self, intensity=self.intensity / least, spectrum=self.spectrum / least)
+        divisor = np.where(self.loudness > 0, self.loudness, 1.0)[:, None, None]
+        return replace(self, intensity=self.intensity / divisor, spectrum=self.spectrum / divisor)
 
     @classmethod
-    def joined(cls, parts: "list[SoundImages]") -> "SoundImages":
+    def concatenate(cls, blocks: "list[SoundImages]") -> "SoundImages":
         """Concatenate the windows of several recordings; times remain relative to the start of each recording."""
-        return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in cls.__dataclass_fields__))
+        return cls(*(np.concatenate([getattr(block, name) for block in blocks]) for name in cls.__dataclass_fields__))
 
 
 def check_highest(highest: float) -> float:
-    """Check the maximum frequency of sound images, Hz. Raises `ValueError` if it is no number or too low."""
-    if not (is_number(highest) and LOWEST <= highest < np.inf):
+    """Return the maximum frequency of sound images in Hz as a float. Raises `ValueError` if it is not a number, or too
+    low."""
+    if not (is_number(highest) and MIN_HIGHEST <= highest < np.inf):
         raise ValueError(
-            f"highest must be a frequency in Hz, {LOWEST:g} or more, of the features; it is {describe(highest)}."
+            f"highest must be a frequency in Hz, {MIN_HIGHEST:g} or more, of the features; it is {describe(highest)}."
         )
     return float(highest)
 
@@ -91,17 +92,17 @@ def band_edges(highest: float) -> Float[np.ndarray, " 65"]:
 
     Up to `highest` = 5 kHz, all bands have the same width; at 5 kHz, `highest` is the middle of the last band.
     """
-    bin_width = 1 / FRAME
-    if highest <= EVEN:
-        return bin_width * (0.5 + np.arange(BANDS + 1))
+    bin_width = 1 / FRAME_DURATION
+    if highest <= MAX_EVEN_FREQUENCY:
+        return bin_width * (0.5 + np.arange(NUM_BANDS + 1))
     # The edges are half a bin plus a (e^(bk) - 1), where a b is the width of a bin; `brentq` finds b such that the last
     # edge is half a bin above `highest`.
-    number = np.arange(BANDS + 1)
-    factor: Any = brentq(lambda b: bin_width * np.expm1(b * BANDS) / b - highest, 1e-9, 1.0)
-    return bin_width * (0.5 + np.expm1(factor * number) / factor)
+    band_index = np.arange(NUM_BANDS + 1)
+    factor: Any = brentq(lambda b: bin_width * np.expm1(b * NUM_BANDS) / b - highest, 1e-9, 1.0)
+    return bin_width * (0.5 + np.expm1(factor * band_index) / factor)
 
 
-def sound_images(recording: Recording, highest: float = EVEN) -> SoundImages:
+def sound_images(recording: Recording, highest: float = MAX_EVEN_FREQUENCY) -> SoundImages:
     """Compute the feature images of all windows of a recording, every 0.1 s.
 
     Bands above half the sampling rate are empty. A recording shorter than 0.5 s is padded with 0.3 s of silence before
@@ -112,7 +113,7 @@ def sound_images(recording: Recording, highest: float = EVEN) -> SoundImages:
     - `recording`: samples of one or several microphones.
     - `highest`: frequency above which sound is left out, Hz.
 
-    Raises `ValueError` if `recording` is no recording of samples, its rate is below 1250 Hz, or `highest` is invalid.
+    Raises `ValueError` if `recording` is not a `Recording`, its rate is below 1250 Hz, or `highest` is invalid.
 
     **Example:**
 
@@ -121,56 +122,59 @@ def sound_images(recording: Recording, highest: float = EVEN) -> SoundImages:
     print(feature_images.times)
     ```
     """
-    return SoundImages.joined(list(image_blocks(recording, highest)))
+    return SoundImages.concatenate(list(image_blocks(recording, highest)))
 
 
-def image_blocks(recording: Recording, highest: float = EVEN) -> Iterator[SoundImages]:
+def image_blocks(recording: Recording, highest: float = MAX_EVEN_FREQUENCY) -> Iterator[SoundImages]:
     """Compute the images of `sound_images` in blocks of windows, for recordings of any length.
 
     Raises `ValueError` as `sound_images` does.
     """
     check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
     check_highest(highest)
-    if recording.rate < 2 * LOWEST:
+    if recording.rate < 2 * MIN_HIGHEST:
         raise ValueError(
             f"{recording.name}: at {recording.rate:g} samples a second there is no sound above "
-            f"{recording.rate / 2:g} Hz; record {2 * LOWEST:g} a second or more."
+            f"{recording.rate / 2:g} Hz; record {2 * MIN_HIGHEST:g} a second or more."
         )
-    return _image_blocks(recording, highest)
+    return _compute_image_blocks(recording, highest)
 
 
-def _image_blocks(recording: Recording, highest: float) -> Iterator[SoundImages]:
+def _compute_image_blocks(recording: Recording, highest: float) -> Iterator[SoundImages]:
     rate, samples = recording.rate, recording.samples
-    length, hop = round(FRAME * rate), round(HOP * rate)
-    whole = length + (FRAMES - 1) * hop
-    before = 0
-    if samples.shape[1] < whole:
-        before = round(0.3 * rate)
-        after = max(before, whole - before - samples.shape[1])
-        samples = np.pad(samples, ((0, 0), (before, after)))
-    frames = 1 + (samples.shape[1] - length) // hop
-    number = 1 + int((frames - FRAMES + 0.5) * hop / (EVERY * rate))
+    length, hop = round(FRAME_DURATION * rate), round(FRAME_INTERVAL * rate)
+    window_length = length + (NUM_FRAMES - 1) * hop
+    padding_before = 0
+    if samples.shape[1] < window_length:
+        padding_before = round(0.3 * rate)
+        padding_after = max(padding_before, window_length - padding_before - samples.shape[1])
+        samples = np.pad(samples, ((0, 0), (padding_before, padding_after)))
+    num_frames = 1 + (samples.shape[1] - length) // hop
+    num_windows = 1 + int((num_frames - NUM_FRAMES + 0.5) * hop / (WINDOW_INTERVAL * rate))
     # Each window begins with the frame nearest to its time.
-    starts = np.minimum(np.round(EVERY * rate * np.arange(number) / hop).astype(int), frames - FRAMES)
+    starts = np.minimum(
+        np.round(WINDOW_INTERVAL * rate * np.arange(num_windows) / hop).astype(int), num_frames - NUM_FRAMES
+    )
     weights = _band_weights(length, rate, highest)
     taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
     scale = 2 / (length * (taper**2).sum())
-    wide = np.maximum(weights.sum(axis=0), 1.0)
-    for first in range(0, number, _AT_ONCE):
-        own = starts[first : first + _AT_ONCE]
-        part = samples[:, own[0] * hop : (own[-1] + FRAMES - 1) * hop + length]
-        finite = np.isfinite(part)
-        lost = 0.0 if finite.all() else 1 - _finite_share(finite, length, hop).mean(axis=0)
+    bins_per_band = np.maximum(weights.sum(axis=0), 1.0)
+    for first_window in range(0, num_windows, _MAX_BLOCK_WINDOWS):
+        block_starts = starts[first_window : first_window + _MAX_BLOCK_WINDOWS]
+        block_samples = samples[:, block_starts[0] * hop : (block_starts[-1] + NUM_FRAMES - 1) * hop + length]
+        finite = np.isfinite(block_samples)
+        missing_share = 0.0 if finite.all() else 1 - _finite_share(finite, length, hop).mean(axis=0)
         power = (
-            np.stack([_band_powers(channel, taper, hop, weights) for channel in np.where(finite, part, 0.0)]) * scale
+            np.stack([_band_powers(channel, taper, hop, weights) for channel in np.where(finite, block_samples, 0.0)])
+            * scale
         )
-        within = own[:, None] - own[0] + np.arange(FRAMES)
-        intensity = power.sum(axis=-1)[:, within].transpose(1, 0, 2)
+        frame_indices = block_starts[:, None] - block_starts[0] + np.arange(NUM_FRAMES)
+        intensity = power.sum(axis=-1)[:, frame_indices].transpose(1, 0, 2)
         strongest = intensity.sum(axis=2).argmax(axis=1)
-        spectrum = (power / wide)[strongest[:, None], within].transpose(0, 2, 1)
-        known = np.broadcast_to(lost, power.shape[1])[within].mean(axis=1) < 0.5
-        times = (own * hop + whole / 2 - before) / rate
-        yield SoundImages(times, intensity.astype(np.float32), spectrum.astype(np.float32), strongest, known)
+        spectrum = (power / bins_per_band)[strongest[:, None], frame_indices].transpose(0, 2, 1)
+        is_known = np.broadcast_to(missing_share, power.shape[1])[frame_indices].mean(axis=1) < 0.5
+        times = (block_starts * hop + window_length / 2 - padding_before) / rate
+        yield SoundImages(times, intensity.astype(np.float32), spectrum.astype(np.float32), strongest, is_known)
 
 
 def _band_powers(channel: np.ndarray, taper: np.ndarray, hop: int, weights: np.ndarray) -> Float[np.ndarray, "F 64"]:
@@ -194,7 +198,7 @@ def _band_weights(length: int, rate: float, highest: float) -> Float[np.ndarray,
     edges = band_edges(highest)
     width = rate / length
     low = (np.arange(length // 2 + 1) - 0.5) * width
-    high = np.minimum(low + width, highest + 0.5 / FRAME)
-    inside = np.clip(np.minimum(high[:, None], edges[1:]) - np.maximum(low[:, None], edges[:-1]), 0, None) / width
-    inside[0] = 0.0
-    return inside
+    high = np.minimum(low + width, highest + 0.5 / FRAME_DURATION)
+    shares = np.clip(np.minimum(high[:, None], edges[1:]) - np.maximum(low[:, None], edges[:-1]), 0, None) / width
+    shares[0] = 0.0
+    return shares

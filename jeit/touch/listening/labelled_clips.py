@@ -13,15 +13,15 @@ from numpy.typing import ArrayLike
 
 from jeit.acoustic import Intensities, Recording, read_recording
 from jeit.arguments import check_kind, counted
-from jeit.touch.listening.feature_images import LOWEST
+from jeit.touch.listening.feature_images import MIN_HIGHEST
 
 # Maximum number of unread files that a note describes.
-_NAMED = 4
-# Relative difference of sampling rates below which they count as equal.
-_SAME_RATE = 1e-3
+_MAX_DESCRIBED = 4
+# Relative difference of sampling rates below which they are considered equal.
+_RATE_TOLERANCE = 1e-3
 
 
-class _Files(Sequence):
+class _RecordingFiles(Sequence):
     """Recordings read from files on access, so that they need not all fit into memory at once."""
 
     def __init__(self, paths: list[Path]):
@@ -77,40 +77,46 @@ class LabelledClips:
         """Create labelled clips from `recordings` and their classes `labels`.
 
         `groups`: the group of each clip; by default each clip is a group of its own. Clips with different numbers of
-        channels are mixed to one channel. `notes` are stored together with those made here. Raises `ValueError` if
-        there is not one label and group for each recording, for anything but recordings of samples, and for fewer than
-        two classes.
+        channels are mixed to one channel. `notes` are stored together with those created here. Raises `ValueError` if
+        the numbers of recordings, labels and groups differ, for recordings that are not recordings of samples, and for
+        fewer than two classes.
         """
         check_kind("recordings", recordings, Sequence, "a list of Recording, as of read_recording(path)")
-        named = np.asarray(labels)
-        own = np.arange(len(recordings)).astype(str) if groups is None else np.asarray(groups).astype(str)
-        if not (named.shape == own.shape == (len(recordings),)) or (named.size and named.dtype.kind not in "UT"):
+        class_names = np.asarray(labels)
+        group_names = np.arange(len(recordings)).astype(str) if groups is None else np.asarray(groups).astype(str)
+        if not (class_names.shape == group_names.shape == (len(recordings),)) or (
+            class_names.size and class_names.dtype.kind not in "UT"
+        ):
             raise ValueError(f"labels and groups must be one name for each of the {len(recordings)} recordings.")
-        classes = np.unique(named)
+        classes = np.unique(class_names)
         if len(classes) < 2:
             raise ValueError(
                 f"labels: there {'is one class only, ' + repr(str(classes[0])) if len(classes) else 'are no clips'}; "
                 "give clips of two classes or more."
             )
         channels, rates = [], []
-        for number in range(len(recordings)):
-            one = recordings[number]
-            check_kind(f"recordings[{number}]", one, Recording, "a Recording of samples, as of read_recording(path)")
-            channels.append(len(one.samples))
-            rates.append(one.rate)
-        said, several = list(notes), sorted(set(channels))
-        if len(several) > 1:
-            said.append(f"clips have {' or '.join(map(str, several))} channels: all were mixed to one.")
-        low, high = min(rates), max(rates)
-        if high > low * (1 + _SAME_RATE):
-            few = sum(rate < high * (1 - _SAME_RATE) for rate in rates)
-            said.append(
-                f"{few} of {counted(len(rates), 'clip')} have fewer than {high:g} samples a second, the fewest "
-                f"'{recordings[int(np.argmin(rates))].name}': nothing above {low / 2:g} Hz is used, which all of them "
-                "have."
+        for index in range(len(recordings)):
+            recording = recordings[index]
+            check_kind(
+                f"recordings[{index}]", recording, Recording, "a Recording of samples, as of read_recording(path)"
             )
-        width = several[0] if len(several) == 1 else 1
-        return cls(recordings, named.astype(str), own, width, low / 2, tuple(said), name)
+            channels.append(len(recording.samples))
+            rates.append(recording.rate)
+        all_notes, channel_counts = list(notes), sorted(set(channels))
+        if len(channel_counts) > 1:
+            all_notes.append(f"clips have {' or '.join(map(str, channel_counts))} channels: all were mixed to one.")
+        lowest_rate, highest_rate = min(rates), max(rates)
+        if highest_rate > lowest_rate * (1 + _RATE_TOLERANCE):
+            num_lower = sum(rate < highest_rate * (1 - _RATE_TOLERANCE) for rate in rates)
+            all_notes.append(
+                f"{num_lower} of {counted(len(rates), 'clip')} have fewer than {highest_rate:g} samples a second, the "
+                f"fewest '{recordings[int(np.argmin(rates))].name}': nothing above {lowest_rate / 2:g} Hz is used, "
+                "which all of them have."
+            )
+        num_channels = channel_counts[0] if len(channel_counts) == 1 else 1
+        return cls(
+            recordings, class_names.astype(str), group_names, num_channels, lowest_rate / 2, tuple(all_notes), name
+        )
 
     @classmethod
     def of(cls, *arguments: Any, **keywords: Any) -> "LabelledClips":
@@ -155,63 +161,72 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
     folder = Path(folder)
     if not folder.is_dir():
         raise ValueError(f"'{folder}' is no folder; give one with a sub-folder of clips for each class.")
-    classes = sorted(one for one in folder.iterdir() if one.is_dir() and not one.name.startswith("."))
-    if len(classes) < 2:
-        held = f"only '{classes[0].name}'" if classes else "none"
-        raise ValueError(f"'{folder}' must have a sub-folder of clips for each of two classes or more; it has {held}.")
-    beside = [one.name for one in folder.iterdir() if one.is_file() and not one.name.startswith(".")]
-    read, labels, groups, failed = [], [], [], []
-    for one in classes:
-        files = sorted(path for path in one.rglob("*") if path.is_file() and not _is_hidden(path.relative_to(folder)))
-        before = len(read)
+    class_folders = sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
+    if len(class_folders) < 2:
+        description = f"only '{class_folders[0].name}'" if class_folders else "none"
+        raise ValueError(
+            f"'{folder}' must have a sub-folder of clips for each of two classes or more; it has {description}."
+        )
+    stray_files = [entry.name for entry in folder.iterdir() if entry.is_file() and not entry.name.startswith(".")]
+    paths, labels, groups, failures = [], [], [], []
+    for class_folder in class_folders:
+        files = sorted(
+            path for path in class_folder.rglob("*") if path.is_file() and not _is_hidden(path.relative_to(folder))
+        )
+        num_before = len(paths)
         for path in files:
             try:
                 _check_clip(read_recording(path), path.name)
             except (ValueError, OSError) as error:
-                failed.append((path.suffix.lower() or "no suffix", str(error).rstrip(".")))
+                failures.append((path.suffix.lower() or "no suffix", str(error).rstrip(".")))
                 continue
-            within = path.relative_to(one).parts[:-1]
-            read.append(path)
-            labels.append(one.name)
-            groups.append("/".join(within) if within else f"{one.name}/{path.name}")
+            group_parts = path.relative_to(class_folder).parts[:-1]
+            paths.append(path)
+            labels.append(class_folder.name)
+            groups.append("/".join(group_parts) if group_parts else f"{class_folder.name}/{path.name}")
             if progress is not None:
-                progress(f"{counted(len(read), 'clip')}")
-        if len(read) == before:
-            why = failed[-1][1] if files else "it is empty"
-            raise ValueError(f"'{one}': there is no clip in it that can be read ({why}).")
-    notes = [_describe_unread(failed)] if failed else []
-    if beside:
-        notes.append(f"{counted(len(beside), 'file')} of no class, beside their folders, left out ('{min(beside)}').")
-    return LabelledClips.from_recordings(_Files(read), labels, groups, notes=notes, name=folder.name or str(folder))
+                progress(f"{counted(len(paths), 'clip')}")
+        if len(paths) == num_before:
+            reason = failures[-1][1] if files else "it is empty"
+            raise ValueError(f"'{class_folder}': there is no clip in it that can be read ({reason}).")
+    notes = [_describe_unread(failures)] if failures else []
+    if stray_files:
+        notes.append(
+            f"{counted(len(stray_files), 'file')} of no class, beside their folders, left out ('{min(stray_files)}')."
+        )
+    return LabelledClips.from_recordings(
+        _RecordingFiles(paths), labels, groups, notes=notes, name=folder.name or str(folder)
+    )
 
 
-def _describe_unread(failed: list[tuple[str, str]]) -> str:
-    """Describe how many files were not read, and why; reasons for files of different formats come first."""
-    seen: dict[str, int] = {}
-    order = []
-    for place, (kind, why) in enumerate(failed):
-        seen[kind] = seen.get(kind, -1) + 1
-        order.append((seen[kind], place, why))
-    said = [why for *_, why in sorted(order)]
-    more = f"; and {len(said) - _NAMED} more" if len(said) > _NAMED else ""
-    return f"{counted(len(said), 'file')} not read: {'; '.join(said[:_NAMED])}{more}"
+def _describe_unread(failures: list[tuple[str, str]]) -> str:
+    """Describe how many files were not read, and for which reasons. Reasons of files of different formats come
+    first."""
+    num_previous: dict[str, int] = {}
+    entries = []
+    for index, (suffix, reason) in enumerate(failures):
+        num_previous[suffix] = num_previous.get(suffix, -1) + 1
+        entries.append((num_previous[suffix], index, reason))
+    reasons = [reason for *_, reason in sorted(entries)]
+    omitted = f"; and {len(reasons) - _MAX_DESCRIBED} more" if len(reasons) > _MAX_DESCRIBED else ""
+    return f"{counted(len(reasons), 'file')} not read: {'; '.join(reasons[:_MAX_DESCRIBED])}{omitted}"
 
 
 def _check_clip(clip: Recording | Intensities, name: str) -> None:
-    """Raise `ValueError` for a clip that is of no use for training."""
+    """Raise `ValueError` for a clip that cannot be used for training."""
     if not isinstance(clip, Recording):
         raise ValueError(f"{name}: it holds intensities, not samples.")
-    known = clip.samples[np.isfinite(clip.samples)]
-    if not known.size:
+    finite_samples = clip.samples[np.isfinite(clip.samples)]
+    if not finite_samples.size:
         raise ValueError(f"{name}: none of its samples is a number.")
-    if clip.rate < 2 * LOWEST:
-        raise ValueError(f"{name}: {clip.rate:g} samples a second are too few; give {2 * LOWEST:g} or more.")
-    if known.min() == known.max():
-        raise ValueError(f"{name}: it is silent, all of its samples are {known[0]:g}.")
+    if clip.rate < 2 * MIN_HIGHEST:
+        raise ValueError(f"{name}: {clip.rate:g} samples a second are too few; give {2 * MIN_HIGHEST:g} or more.")
+    if finite_samples.min() == finite_samples.max():
+        raise ValueError(f"{name}: it is silent, all of its samples are {finite_samples[0]:g}.")
 
 
 def mix_channels(recording: Recording) -> Recording:
-    """Mix all channels of a recording to one channel, their mean."""
+    """Mix all channels of a recording to one channel by averaging."""
     if len(recording.samples) == 1:
         return recording
     mean = recording.samples.mean(axis=0, keepdims=True)

@@ -30,27 +30,27 @@ from jeit.touch.listening.window_features import Levels, sound_features, spectru
 from jeit.touch.training import TrainingPlan
 
 # Number of boosting rounds; number of leaves of a tree; minimum number of windows in a leaf if the set is large.
-_ROUNDS, _LEAVES, _IN_A_LEAF = 100, 15, 10
+_NUM_ROUNDS, _NUM_LEAVES, _MIN_LEAF_WINDOWS = 100, 15, 10
 BATCHES = 1500
 """Default of the maximum number of training batches."""
-# Limits for small sets: maximum number of passes through the windows, and the number of batches that are allowed even
-# if they make more passes than that.
-_MOST_PASSES, _FEWEST = 40, 100
+# Limits for small sets: maximum number of passes through the windows, and number of batches that are allowed even if
+# they require more passes.
+_MAX_PASSES, _MIN_BATCHES = 40, 100
 # One in this number of groups of each class is held out for early stopping of the network's training.
-_STOPPING = 6
+_STOPPING_RATIO = 6
 
 
 class TrainingSet(NamedTuple):
     """A training set of windows, and the settings of a training.
 
-    `images`: the windows; `right` (W,): their true classes, 0 … C − 1; `classes`: the number of classes C; `groups`
+    `images`: the windows; `labels` (W,): their true classes, 0 … C − 1; `classes`: the number of classes C; `groups`
     (W,): numbers that are equal for windows recorded together; `key`: draws the initial weights of networks; `batches`:
     maximum number of training batches; `checkpoint`: file in which an unfinished training is stored; `progress`: is
     called with a description of the progress.
     """
 
     images: SoundImages
-    right: Int[np.ndarray, " W"]
+    labels: Int[np.ndarray, " W"]
     groups: Int[np.ndarray, " W"]
     classes: int
     key: Array
@@ -88,30 +88,32 @@ class NetworkLearner:
 
     plan: Callable[..., TrainingPlan]
 
-    def learn(self, lesson: TrainingSet) -> NetworkListener:
+    def learn(self, training_set: TrainingSet) -> NetworkListener:
         """Train a network with early stopping, by the loss on held-out groups.
 
         One in six groups of each class is held out, if it has enough groups.
         """
-        held = stopping_rows(lesson.right, lesson.groups)
-        levels = Levels.from_images(lesson.images[~held])
-        shown = levels(lesson.images)
-        if lesson.checkpoint is not None:
-            lesson.checkpoint.parent.mkdir(parents=True, exist_ok=True)
-        number = int((~held).sum())
-        enough = max(_FEWEST, _MOST_PASSES * number // 64)
-        plan = self.plan(number, batches=min(lesson.batches, enough))
-        trained = train_network(
-            shown[~held],
-            lesson.right[~held],
-            (shown[held], lesson.right[held]) if held.any() else (shown, lesson.right),
-            classes=lesson.classes,
-            key=lesson.key,
+        is_held_out = stopping_rows(training_set.labels, training_set.groups)
+        levels = Levels.from_images(training_set.images[~is_held_out])
+        level_images = levels(training_set.images)
+        if training_set.checkpoint is not None:
+            training_set.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        num_windows = int((~is_held_out).sum())
+        max_batches = max(_MIN_BATCHES, _MAX_PASSES * num_windows // 64)
+        plan = self.plan(num_windows, batches=min(training_set.batches, max_batches))
+        result = train_network(
+            level_images[~is_held_out],
+            training_set.labels[~is_held_out],
+            (level_images[is_held_out], training_set.labels[is_held_out])
+            if is_held_out.any()
+            else (level_images, training_set.labels),
+            classes=training_set.classes,
+            key=training_set.key,
             plan=plan,
-            checkpoint=lesson.checkpoint,
-            progress=lesson.progress,
+            checkpoint=training_set.checkpoint,
+            progress=training_set.progress,
         )
-        return NetworkListener.from_network(trained.network, levels)
+        return NetworkListener.from_network(result.network, levels)
 
     @staticmethod
     def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
@@ -133,22 +135,22 @@ class TreesListener:
     forest: Forest
 
     @classmethod
-    def learn(cls, lesson: TrainingSet) -> "TreesListener":
+    def learn(cls, training_set: TrainingSet) -> "TreesListener":
         """Fit the trees; the minimum number of windows in a leaf is lower in small sets."""
         from sklearn.ensemble import HistGradientBoostingClassifier
 
-        fewest = int(np.bincount(lesson.right, minlength=lesson.classes).min())
+        min_class_windows = int(np.bincount(training_set.labels, minlength=training_set.classes).min())
         model = HistGradientBoostingClassifier(
-            max_iter=_ROUNDS,
-            max_leaf_nodes=_LEAVES,
-            min_samples_leaf=int(np.clip(fewest // 4, 1, _IN_A_LEAF)),
+            max_iter=_NUM_ROUNDS,
+            max_leaf_nodes=_NUM_LEAVES,
+            min_samples_leaf=int(np.clip(min_class_windows // 4, 1, _MIN_LEAF_WINDOWS)),
             l2_regularization=1.0,
             class_weight="balanced",
             early_stopping=False,  # pyright: ignore[reportArgumentType]
             random_state=0,
         )
         with one_thread():
-            model.fit(sound_features(lesson.images), lesson.right)
+            model.fit(sound_features(training_set.images), training_set.labels)
         return cls(Forest.from_boosted_classifier(model))
 
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
@@ -157,21 +159,21 @@ class TreesListener:
 
     def to_stored(self) -> tuple[dict[str, Any], Any]:
         """Return the header and the arrays to store in a file."""
-        own = self.forest
-        head = {"trees": own.value.shape[0], "nodes": own.value.shape[1], "depth": own.depth}
-        arrays = [own.feature, own.left, own.right, own.threshold, own.value, own.start]
-        return head, [np.asarray(one, np.int32 if place < 3 else np.float32) for place, one in enumerate(arrays)]
+        forest = self.forest
+        head = {"trees": forest.value.shape[0], "nodes": forest.value.shape[1], "depth": forest.depth}
+        arrays = [forest.feature, forest.left, forest.right, forest.threshold, forest.value, forest.start]
+        return head, [np.asarray(array, np.int32 if index < 3 else np.float32) for index, array in enumerate(arrays)]
 
     @staticmethod
     def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
         """Create arrays with the shapes of the stored ones."""
-        shape = (int(head["trees"]), int(head["nodes"]))
-        shapes = [(shape, np.int32)] * 3 + [
-            (shape, np.float32),
-            ((*shape, classes), np.float32),
+        node_shape = (int(head["trees"]), int(head["nodes"]))
+        shapes = [(node_shape, np.int32)] * 3 + [
+            (node_shape, np.float32),
+            ((*node_shape, classes), np.float32),
             ((classes,), np.float32),
         ]
-        return [jax.numpy.zeros(one, kind) for one, kind in shapes]
+        return [jax.numpy.zeros(shape, dtype) for shape, dtype in shapes]
 
     @classmethod
     def from_stored(cls, head: dict[str, Any], arrays: Any) -> "TreesListener":
@@ -179,10 +181,10 @@ class TreesListener:
 
         Raises `ValueError` for trees with features or nodes that do not exist.
         """
-        feature, left, right, threshold, value, start = (np.asarray(one) for one in arrays)
-        nodes = value.shape[1]
-        sound = (feature >= 0).all() and (feature < num_features()).all() and 0 < int(head["depth"]) < 1000
-        if not (sound and all(((one >= 0) & (one < nodes)).all() for one in (left, right))):
+        feature, left, right, threshold, value, start = (np.asarray(array) for array in arrays)
+        num_nodes = value.shape[1]
+        has_valid_features = (feature >= 0).all() and (feature < num_features()).all() and 0 < int(head["depth"]) < 1000
+        if not (has_valid_features and all(((child >= 0) & (child < num_nodes)).all() for child in (left, right))):
             raise ValueError("its trees refer to features or nodes that do not exist")
         return cls(
             Forest(
@@ -217,7 +219,7 @@ class LinearListener:
 
     def to_stored(self) -> tuple[dict[str, Any], Any]:
         """Return the header and the arrays to store in a file."""
-        return {}, [np.asarray(one, np.float32) for one in (self.mean, self.deviation, self.weights, self.offset)]
+        return {}, [np.asarray(array, np.float32) for array in (self.mean, self.deviation, self.weights, self.offset)]
 
 
 @dataclass(frozen=True)
@@ -226,31 +228,34 @@ class LinearLearner:
 
     features: Callable[[SoundImages], Float[np.ndarray, "W k"]]
 
-    def learn(self, lesson: TrainingSet) -> LinearListener:
+    def learn(self, training_set: TrainingSet) -> LinearListener:
         """Fit the discriminant; all classes have the same prior probability, whatever their number of windows."""
-        features = self.features(lesson.images)
+        features = self.features(training_set.images)
         mean, deviation = features.mean(axis=0), features.std(axis=0)
         # Features that are constant except for rounding errors carry no information, and would make the covariance
         # singular.
-        varies = deviation > 1e-5
-        deviation = np.where(varies, deviation, 1.0)
-        model = CLASSIFIERS["linear-discriminant"](((features - mean) / deviation)[:, varies], lesson.right)
-        share = np.log(model.priors_)
+        is_variable = deviation > 1e-5
+        deviation = np.where(is_variable, deviation, 1.0)
+        model = CLASSIFIERS["linear-discriminant"](((features - mean) / deviation)[:, is_variable], training_set.labels)
+        log_priors = np.log(model.priors_)
         weights = np.zeros((len(mean), len(model.coef_)))
-        weights[varies] = model.coef_.T
-        offset = model.intercept_ - (share if len(share) > 2 else share[1] - share[0])
+        weights[is_variable] = model.coef_.T
+        offset = model.intercept_ - (log_priors if len(log_priors) > 2 else log_priors[1] - log_priors[0])
         if weights.shape[1] == 1:  # two classes: only the log-odds of the second are given
             weights, offset = np.hstack([-weights, weights]) / 2, np.concatenate([-offset, offset]) / 2
         return LinearListener(self.features, mean, deviation, weights, offset)
 
     def stored_shapes(self, head: dict[str, Any], classes: int, rows: int) -> Any:
         """Create arrays with the shapes of the stored ones."""
-        number = self.features(_NOTHING).shape[1]
-        return [jax.numpy.zeros(one, np.float32) for one in ((number,), (number,), (number, classes), (classes,))]
+        num_inputs = self.features(_NO_WINDOWS).shape[1]
+        return [
+            jax.numpy.zeros(shape, np.float32)
+            for shape in ((num_inputs,), (num_inputs,), (num_inputs, classes), (classes,))
+        ]
 
     def from_stored(self, head: dict[str, Any], arrays: Any) -> LinearListener:
         """Restore a classifier from the header and arrays of `LinearListener.to_stored`."""
-        return LinearListener(self.features, *(np.asarray(one, float) for one in arrays))
+        return LinearListener(self.features, *(np.asarray(array, float) for array in arrays))
 
 
 LEARNERS: dict[str, Any] = {
@@ -260,36 +265,41 @@ LEARNERS: dict[str, Any] = {
     "spectrum": LinearLearner(spectrum_features),
     "linear": LinearLearner(sound_features),
 }
-"""Learners by name, the simplest last, which is chosen among equally accurate ones; the network is trained by the
-schedule of the paper, or by this library's."""
+"""Learners by name. The simplest is last, and is selected among equally accurate ones. The network is trained by the
+schedule of the paper, or by that of this library."""
 
 
 def num_features() -> int:
     """Number of hand-made features."""
-    return sound_features(_NOTHING).shape[1]
+    return sound_features(_NO_WINDOWS).shape[1]
 
 
-_NOTHING = SoundImages(np.zeros(0), np.zeros((0, 1, 41)), np.zeros((0, 64, 41)), np.zeros(0, int), np.zeros(0, bool))
+_NO_WINDOWS = SoundImages(np.zeros(0), np.zeros((0, 1, 41)), np.zeros((0, 64, 41)), np.zeros(0, int), np.zeros(0, bool))
 
 
 def stopping_rows(window_classes: Int[np.ndarray, " W"], groups: Int[np.ndarray, " W"]) -> np.ndarray:
-    """Choose the windows (W,) that are held out for early stopping: whole groups, spread over the classes.
+    """Return the mask (W,) of the windows that are held out for early stopping: whole groups, distributed over the
+    classes.
 
-    No group is held out of a class that has fewer than three.
+    No group is held out of a class with fewer than three groups.
     """
-    held = np.zeros(len(window_classes), bool)
-    chosen: set[int] = set()
-    for one in np.unique(window_classes):
-        own = np.unique(groups[window_classes == one])
-        wanted = len(own) // _STOPPING if len(own) >= _STOPPING else int(len(own) >= 3)
-        already = chosen & set(own.tolist())
-        rest = [group for group in own.tolist() if group not in chosen]
-        order = np.random.default_rng(int(one)).permutation(len(rest))
-        chosen |= {rest[place] for place in order[: max(0, wanted - len(already))]}
-    held = np.isin(groups, sorted(chosen))
+    is_held_out = np.zeros(len(window_classes), bool)
+    held_out_groups: set[int] = set()
+    for class_index in np.unique(window_classes):
+        class_groups = np.unique(groups[window_classes == class_index])
+        num_wanted = (
+            len(class_groups) // _STOPPING_RATIO
+            if len(class_groups) >= _STOPPING_RATIO
+            else int(len(class_groups) >= 3)
+        )
+        already_held_out = held_out_groups & set(class_groups.tolist())
+        candidates = [group for group in class_groups.tolist() if group not in held_out_groups]
+        order = np.random.default_rng(int(class_index)).permutation(len(candidates))
+        held_out_groups |= {candidates[index] for index in order[: max(0, num_wanted - len(already_held_out))]}
+    is_held_out = np.isin(groups, sorted(held_out_groups))
     # Every class must remain in the training set, otherwise nothing is held out.
     return (
-        held
-        if set(window_classes[~held].tolist()) == set(window_classes.tolist())
+        is_held_out
+        if set(window_classes[~is_held_out].tolist()) == set(window_classes.tolist())
         else np.zeros(len(window_classes), bool)
     )

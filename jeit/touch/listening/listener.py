@@ -17,25 +17,25 @@ from jeit.arguments.extras import need_extra
 from jeit.files import reason
 from jeit.touch.learnt.answers import Standing
 from jeit.touch.learnt.methods import fit_sharpness, probabilities
-from jeit.touch.listening.feature_images import BANDS, EVERY, image_blocks
+from jeit.touch.listening.feature_images import NUM_BANDS, WINDOW_INTERVAL, image_blocks
 from jeit.touch.listening.labelled_clips import LabelledClips, mix_channels
 from jeit.touch.listening.learners import BATCHES, LEARNERS
 from jeit.touch.listening.sound_labels import SoundLabels
-from jeit.touch.listening.windows import LOUD, Windows, held_out_folds
+from jeit.touch.listening.windows import MIN_RELATIVE_LOUDNESS, Windows, held_out_folds
 from jeit.touch.training import read_model, write_model
 
 METHODS = ("auto", *LEARNERS)
-# Methods that "auto" tries: the paper's schedule is left out, since this library's gives an equally good network in
-# fewer batches.
-_TRIED = tuple(name for name in LEARNERS if name != "paper-network")
+# Methods that "auto" tries. The paper's schedule is left out, since that of this library gives an equally good network
+# in fewer batches.
+_AUTO_METHODS = tuple(name for name in LEARNERS if name != "paper-network")
 # Maximum number of folds in which clips are held out; power below which a window is quiet, relative to that of the
 # quietest training window.
-_FOLDS, _QUIET = 3, 0.25
+_MAX_FOLDS, _QUIET_RATIO = 3, 0.25
 # Minimum loudness of a recording with a lower gain than the clips, relative to that of the softest clip; minimum number
 # of windows for which a network is tried.
-_SOFTER, _FOR_NETWORKS = 1 / 16, 3000
+_MIN_GAIN, _MIN_NETWORK_WINDOWS = 1 / 16, 3000
 # Number of samples within which the readings of a working microphone change.
-_LOOKED_AT = 100_000
+_MAX_CHECKED_SAMPLES = 100_000
 _KIND, _VERSION = "a jeit listener", 2
 
 
@@ -103,64 +103,73 @@ class Listener:
         check_name("method", method, METHODS)
         key = jax.random.key(0) if key is None else key
         check_key(key)
-        report = progress or (lambda said: None)
+        report = progress or (lambda step: None)
         windows = Windows.from_clips(clips, report)
-        fold = held_out_folds(windows.right_of_clip, windows.group_of_clip, _FOLDS)
+        clip_folds = held_out_folds(windows.clip_labels, windows.clip_groups, _MAX_FOLDS)
         notes = [*clips.notes, *windows.notes]
-        alone = np.array(windows.names)[np.unique(windows.right_of_clip[fold < 0])]
-        if alone.size:
+        untested_classes = np.array(windows.names)[np.unique(windows.clip_labels[clip_folds < 0])]
+        if untested_classes.size:
             notes.append(
-                f"{', '.join(alone)}: clips of one group only, which are never held out; their accuracy is not known."
+                f"{', '.join(untested_classes)}: clips of one group only, which are never held out; their accuracy is "
+                "not known."
             )
-        names = _TRIED if method == "auto" else (method,)
-        if method == "auto" and len(windows.clip) < _FOR_NETWORKS:
+        names = _AUTO_METHODS if method == "auto" else (method,)
+        if method == "auto" and len(windows.clip) < _MIN_NETWORK_WINDOWS:
             names = tuple(name for name in names if name != "network")
             notes.append(
-                f"no network was tried: {len(windows.clip)} windows are few for one, and {_FOR_NETWORKS} would not be."
+                f"no network was tried: {len(windows.clip)} windows are few for one, and {_MIN_NETWORK_WINDOWS} would "
+                "not be."
             )
-        loud = windows.images.loudness
-        of_clips = np.maximum.reduceat(loud, np.flatnonzero(np.diff(windows.clip, prepend=-1)))
+        window_loudness = windows.images.loudness
+        clip_loudness = np.maximum.reduceat(window_loudness, np.flatnonzero(np.diff(windows.clip, prepend=-1)))
         if loudness is None:
-            loudness = _is_loudness_useful(windows, fold, key, report)
+            loudness = _is_loudness_useful(windows, clip_folds, key, report)
         if not loudness:
-            windows = windows.levelled
-        found = []
+            windows = windows.normalised
+        method_odds = []
         for name in names:
-            found.append((name, _held_out_odds(name, windows, fold, key, batches, folder, report)))
-        kept = [(windows.errors(odds), place, name, odds) for place, (name, odds) in enumerate(found)]
+            method_odds.append((name, _held_out_odds(name, windows, clip_folds, key, batches, folder, report)))
+        ranked_methods = [(windows.errors(odds), order, name, odds) for order, (name, odds) in enumerate(method_odds)]
         # Methods are listed with the simplest last, which is chosen among methods with equal errors.
-        kept.sort(key=lambda one: (*one[0], -one[1]))
-        (_, _, chosen, odds) = kept[0]
-        report(f"{chosen}, all clips")
-        everything = windows.training_set(
-            np.ones(len(windows.clip), bool), key, batches, _checkpoint_path(folder, chosen), report
+        ranked_methods.sort(key=lambda entry: (*entry[0], -entry[1]))
+        (_, _, best_method, odds) = ranked_methods[0]
+        report(f"{best_method}, all clips")
+        full_set = windows.training_set(
+            np.ones(len(windows.clip), bool), key, batches, _checkpoint_path(folder, best_method), report
         )
-        model = LEARNERS[chosen].learn(everything)
-        out = np.isfinite(odds).all(axis=1)
+        model = LEARNERS[best_method].learn(full_set)
+        is_held_out = np.isfinite(odds).all(axis=1)
         standing = None
-        if out.any():
-            said, right = windows.predict_clips(odds)
-            tried = [(name, errors[0]) for errors, _, name, _ in kept]
-            standing = Standing(chosen, tried, np.array(windows.names)[said], np.array(windows.names)[right])
+        if is_held_out.any():
+            predicted_classes, true_classes = windows.predict_clips(odds)
+            method_errors = [(name, errors[0]) for errors, _, name, _ in ranked_methods]
+            standing = Standing(
+                best_method,
+                method_errors,
+                np.array(windows.names)[predicted_classes],
+                np.array(windows.names)[true_classes],
+            )
         else:
             notes.append(
                 "no class has clips of two groups: nothing could be held out, and nobody knows how good it is."
             )
         # If all of a few held-out clips are classified correctly, the likelihood alone does not limit the confidence;
         # `doubt`, from the rule of succession, does.
-        sharpness = min(1.0, fit_sharpness(odds[out], windows.right[out])) if out.any() else 1.0
-        asked = 0 if standing is None else len(standing.right)
+        sharpness = (
+            min(1.0, fit_sharpness(odds[is_held_out], windows.labels[is_held_out])) if is_held_out.any() else 1.0
+        )
+        num_held_out = 0 if standing is None else len(standing.right)
         return cls(
             windows.names,
-            chosen,
+            best_method,
             model,
             clips.channels,
             clips.highest,
             loudness,
-            float(loud.min()),
-            (float(of_clips.min()), float(of_clips.max())),
+            float(window_loudness.min()),
+            (float(clip_loudness.min()), float(clip_loudness.max())),
             sharpness,
-            1 / (asked + 2),
+            1 / (num_held_out + 2),
             standing,
             tuple(notes),
             clips.name,
@@ -171,15 +180,15 @@ class Listener:
 
         A shorter recording is padded with silence. With a `calibration` of the microphones, places are estimated where
         the localiser finds them. If the listener has one channel, the channels of the recording are mixed.
-        Raises `ValueError` if `recording` is no recording of samples, has another number of microphones, or no sound up
-        to the frequency `highest`, and as `locate_touches` does.
+        Raises `ValueError` if `recording` is not a `Recording`, has another number of microphones, or no sound up to
+        the frequency `highest`, and as `locate_touches` does.
         """
         check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
         notes = []
-        whole = recording
+        original_recording = recording
         if self.channels == 1 and len(recording.samples) > 1:
             recording = mix_channels(recording)
-            notes.append(f"{len(whole.samples)} channels were mixed to one, as the listener has it.")
+            notes.append(f"{len(original_recording.samples)} channels were mixed to one, as the listener has it.")
         if len(recording.samples) != self.channels:
             raise ValueError(
                 f"{recording.name} has {counted(len(recording.samples), 'microphone')}, and the listener was learnt "
@@ -191,40 +200,49 @@ class Listener:
                 f"the listener uses sound up to {self.highest:g} Hz; record {2 * self.highest:g} a second or more, "
                 "or train a listener on clips of this rate."
             )
-        bad = int((~np.isfinite(recording.samples)).sum())
-        if bad:
-            notes.append(f"{counted(bad, 'sample')} not finite: taken for silence.")
-        dead = np.flatnonzero([len(np.unique(one[np.isfinite(one)][:_LOOKED_AT])) < 2 for one in whole.samples])
-        if dead.size:
-            notes.append(f"microphones that never move: {', '.join(map(str, dead))}.")
-        parts = [
+        num_not_finite = int((~np.isfinite(recording.samples)).sum())
+        if num_not_finite:
+            notes.append(f"{counted(num_not_finite, 'sample')} not finite: taken for silence.")
+        dead_channels = np.flatnonzero(
+            [
+                len(np.unique(channel[np.isfinite(channel)][:_MAX_CHECKED_SAMPLES])) < 2
+                for channel in original_recording.samples
+            ]
+        )
+        if dead_channels.size:
+            notes.append(f"microphones that never move: {', '.join(map(str, dead_channels))}.")
+        block_results = [
             (
-                one.times,
-                one.loudness,
-                one.known,
-                one.strongest,
-                self.model.log_odds(one if self.loudness else one.levelled),
+                block.times,
+                block.loudness,
+                block.known,
+                block.strongest,
+                self.model.log_odds(block if self.loudness else block.normalised),
             )
-            for one in image_blocks(recording, self.highest)
+            for block in image_blocks(recording, self.highest)
         ]
-        times, loudness, known, strongest, odds = (np.concatenate(own) for own in zip(*parts, strict=True))
-        quiet = loudness < self._quiet_threshold(float(loudness.max()))
-        if quiet.all() and loudness.max() > 0:
+        times, loudness, is_known, strongest, odds = (
+            np.concatenate(columns) for columns in zip(*block_results, strict=True)
+        )
+        is_quiet = loudness < self._quiet_threshold(float(loudness.max()))
+        if is_quiet.all() and loudness.max() > 0:
             notes.append("all of it is quieter than anything learnt from: is the gain another?")
-        place, std = (None, None) if calibration is None else _estimate_places(whole, calibration, times)
-        share = probabilities(odds, self.sharpness)
+        positions, deviations = (
+            (None, None) if calibration is None else _estimate_positions(original_recording, calibration, times)
+        )
+        class_probabilities = probabilities(odds, self.sharpness)
         return SoundLabels(
             times,
-            (1 - self.doubt) * share + self.doubt / share.shape[1],
+            (1 - self.doubt) * class_probabilities + self.doubt / class_probabilities.shape[1],
             self.names,
-            quiet,
-            known,
+            is_quiet,
+            is_known,
             strongest,
-            (loudness >= LOUD * loudness.max()) & (loudness > 0),
+            (loudness >= MIN_RELATIVE_LOUDNESS * loudness.max()) & (loudness > 0),
             recording.name,
             tuple(notes),
-            place,
-            std,
+            positions,
+            deviations,
         )
 
     def _quiet_threshold(self, loudest: float) -> float:
@@ -233,17 +251,21 @@ class Listener:
         If loudness is not a feature, the recording's gain may differ from that of the clips: up to 12 dB lower, or any
         amount higher.
         """
-        softest, greatest = self.clips_loudness
-        gain = 1.0 if self.loudness else float(np.clip(loudest / softest, _SOFTER, 1)) * max(1.0, loudest / greatest)
-        return _QUIET * self.quietest * gain
+        softest_clip, loudest_clip = self.clips_loudness
+        gain = (
+            1.0
+            if self.loudness
+            else float(np.clip(loudest / softest_clip, _MIN_GAIN, 1)) * max(1.0, loudest / loudest_clip)
+        )
+        return _QUIET_RATIO * self.quietest * gain
 
     def write(self, path: str | Path) -> None:
         """Write the listener, without its `standing`, to one file that consists of a JSON header and arrays.
 
         Raises `ValueError` if `path` is a folder.
         """
-        own, arrays = self.model.to_stored()
-        head = {
+        model_header, arrays = self.model.to_stored()
+        header = {
             "names": list(self.names),
             "method": self.method,
             "channels": self.channels,
@@ -255,13 +277,13 @@ class Listener:
             "doubt": self.doubt,
             "notes": list(self.notes),
             "name": self.name,
-            "model": own,
+            "model": model_header,
         }
-        write_model(path, _KIND, _VERSION, head, arrays)
+        write_model(path, _KIND, _VERSION, header, arrays)
 
     @classmethod
     def read(cls, path: str | Path) -> "Listener":
-        """Read a listener from a file that `write` wrote, or from the folder that `jeit listen fit` made.
+        """Read a listener from a file that `write` wrote, or from the folder that `jeit listen fit` wrote.
 
         Nothing in the file is executed. Raises `FileNotFoundError`, and `ValueError` for files of another kind.
         """
@@ -271,29 +293,31 @@ class Listener:
         if not path.is_file():
             raise FileNotFoundError(f"'{path}': there is no such file; `jeit listen fit` makes one.")
 
-        def make(head: dict[str, Any]) -> Any:
-            check_name("its method", head["method"], tuple(LEARNERS))
-            return LEARNERS[head["method"]].stored_shapes(head["model"], len(head["names"]), head["channels"] + BANDS)
+        def create_arrays(header: dict[str, Any]) -> Any:
+            check_name("its method", header["method"], tuple(LEARNERS))
+            return LEARNERS[header["method"]].stored_shapes(
+                header["model"], len(header["names"]), header["channels"] + NUM_BANDS
+            )
 
-        head, arrays = read_model(path, _KIND, _VERSION, make)
+        header, arrays = read_model(path, _KIND, _VERSION, create_arrays)
         try:
-            model = LEARNERS[head["method"]].from_stored(head["model"], arrays)
-            numbers = (float(head[name]) for name in ("highest_Hz", "quietest", "sharpness", "doubt"))
-            highest, quietest, sharpness, doubt = numbers
-            softest, greatest = map(float, head["clips_loudness"])
-            names, notes, name = tuple(map(str, head["names"])), tuple(map(str, head["notes"])), str(head["name"])
-            channels, loudness = int(head["channels"]), bool(head["loudness_counts"])
+            model = LEARNERS[header["method"]].from_stored(header["model"], arrays)
+            values = (float(header[name]) for name in ("highest_Hz", "quietest", "sharpness", "doubt"))
+            highest, quietest, sharpness, doubt = values
+            softest_clip, loudest_clip = map(float, header["clips_loudness"])
+            names, notes, name = tuple(map(str, header["names"])), tuple(map(str, header["notes"])), str(header["name"])
+            channels, loudness = int(header["channels"]), bool(header["loudness_counts"])
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise ValueError(f"'{path}' is not {_KIND} that can be read: {reason(error)}.") from None
         return cls(
             names,
-            head["method"],
+            header["method"],
             model,
             channels,
             highest,
             loudness,
             quietest,
-            (softest, greatest),
+            (softest_clip, loudest_clip),
             sharpness,
             doubt,
             notes=notes,
@@ -302,53 +326,55 @@ class Listener:
 
 
 def _held_out_odds(
-    name: str, windows: Windows, fold: np.ndarray, key: Array, batches: int, folder, report
+    name: str, windows: Windows, clip_folds: np.ndarray, key: Array, batches: int, folder, report
 ) -> np.ndarray:
-    """Compute the log-odds (W, C) of windows by models that are fitted without the fold of their clip.
-
-    They are NaN for windows that are never held out.
-    """
+    """Compute the log-odds (W, C) of windows by models that are fitted without the fold of their clip; NaN for windows
+    that are never held out."""
     odds = np.full((len(windows.images), windows.classes), np.nan)
-    for number in range(int(fold.max()) + 1):
-        report(f"{name}, fold {number + 1} of {int(fold.max()) + 1}")
-        out = (fold == number)[windows.clip]
-        lesson = windows.training_set(~out, key, batches, _checkpoint_path(folder, f"{name}-{number}"), report)
-        odds[out] = LEARNERS[name].learn(lesson).log_odds(windows.images[out])
+    for fold_index in range(int(clip_folds.max()) + 1):
+        report(f"{name}, fold {fold_index + 1} of {int(clip_folds.max()) + 1}")
+        is_held_out = (clip_folds == fold_index)[windows.clip]
+        training_set = windows.training_set(
+            ~is_held_out, key, batches, _checkpoint_path(folder, f"{name}-{fold_index}"), report
+        )
+        odds[is_held_out] = LEARNERS[name].learn(training_set).log_odds(windows.images[is_held_out])
     return odds
 
 
-def _is_loudness_useful(windows: Windows, fold: np.ndarray, key: Array, report) -> bool:
+def _is_loudness_useful(windows: Windows, clip_folds: np.ndarray, key: Array, report) -> bool:
     """Determine whether loudness improves a linear discriminant by more than one standard deviation of chance.
 
     If no clip can be held out, loudness is used if there are several microphones, which share one gain.
     """
-    if fold.max() < 0:
+    if clip_folds.max() < 0:
         return windows.images.intensity.shape[1] > 1
-    right = []
-    for own in (windows, windows.levelled):
-        said, truth = own.predict_clips(_held_out_odds("linear", own, fold, key, 1, None, report))
-        right.append(said == truth)
-    more, fewer = (right[0] & ~right[1]).sum(), (right[1] & ~right[0]).sum()
-    return bool(more - fewer > np.sqrt(more + fewer))
+    is_correct = []
+    for window_set in (windows, windows.normalised):
+        predicted_classes, true_classes = window_set.predict_clips(
+            _held_out_odds("linear", window_set, clip_folds, key, 1, None, report)
+        )
+        is_correct.append(predicted_classes == true_classes)
+    num_improved, num_worsened = (is_correct[0] & ~is_correct[1]).sum(), (is_correct[1] & ~is_correct[0]).sum()
+    return bool(num_improved - num_worsened > np.sqrt(num_improved + num_worsened))
 
 
 def _checkpoint_path(folder: str | Path | None, name: str) -> Path | None:
     return None if folder is None else Path(folder) / f"{name}.training"
 
 
-def _estimate_places(
+def _estimate_positions(
     recording: Recording, calibration: Calibration, times: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate the touched places (W, d) and their standard deviations, metres, around the middle of each window.
+    """Estimate the touched positions (W, d) and their standard deviations in metres, around the middle of each window.
 
-    They are means over the frames of the smoothed track, NaN if there are none.
+    They are means over the frames of the smoothed track; NaN if there are none.
     """
-    found = locate_touches(recording, calibration)
-    place, spread = found.track.position, np.sqrt(np.diagonal(found.track.covariance, axis1=1, axis2=2))
-    near = np.abs(found.locations.times - times[:, None]) <= EVERY / 2
-    near &= np.isfinite(place).all(axis=1)
-    count = near.sum(axis=1, keepdims=True)
+    located = locate_touches(recording, calibration)
+    positions, deviations = located.track.position, np.sqrt(np.diagonal(located.track.covariance, axis1=1, axis2=2))
+    is_near = np.abs(located.locations.times - times[:, None]) <= WINDOW_INTERVAL / 2
+    is_near &= np.isfinite(positions).all(axis=1)
+    num_frames = is_near.sum(axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):
-        return (near @ np.nan_to_num(place)) / np.where(count, count, np.nan), (
-            near @ np.nan_to_num(spread)
-        ) / np.where(count, count, np.nan)
+        return (is_near @ np.nan_to_num(positions)) / np.where(num_frames, num_frames, np.nan), (
+            is_near @ np.nan_to_num(deviations)
+        ) / np.where(num_frames, num_frames, np.nan)

@@ -25,15 +25,15 @@ from numpy.lib.stride_tricks import sliding_window_view
 from jeit.touch.training import TrainingObjective, TrainingPlan, TrainingResult, fit_network
 from jeit_solvers.module import Module
 
-# For the two layers: sizes of kernels and of pools, in pixels, and numbers of channels.
-_KERNELS, _POOLS, _CHANNELS = (5, 3), (3, 2), (32, 64)
-# Weight of a batch's mean and variance in the running ones; constant added to variances.
+# Sizes of the kernels and of the pools in pixels, and numbers of channels, of the two layers.
+_KERNEL_SIZES, _POOL_SIZES, _NUM_CHANNELS = (5, 3), (3, 2), (32, 64)
+# Weight of the mean and variance of a batch in the update of the running ones; constant added to variances.
 _RUNNING_WEIGHT, _VARIANCE_FLOOR = 0.05, 1e-5
-NOISE, COPIES = 0.2, 5
+NOISE_DEVIATION, NUM_COPIES = 0.2, 5
 """Standard deviation of the normal noise added to images, whose own standard deviation is 1; number of noisy copies of
 each image in an epoch, as in the paper."""
 # Number of windows evaluated at once.
-_AT_ONCE = 32
+_MAX_BLOCK_WINDOWS = 32
 
 
 class ModalityNetwork(Module):
@@ -58,17 +58,23 @@ class ModalityNetwork(Module):
 
         Kernels are drawn from normal distributions with the variance of He et al. (2015).
         """
-        for size, pool in zip(_KERNELS, _POOLS, strict=True):
+        for size, pool in zip(_KERNEL_SIZES, _POOL_SIZES, strict=True):
             rows, columns = ((side - size + 1) // pool for side in (rows, columns))
         keys = jax.random.split(key, 3)
-        one, two = _KERNELS
-        shapes = (one, one, 1, _CHANNELS[0]), (two, two, *_CHANNELS), (rows * columns * _CHANNELS[1], classes)
-        first, second, dense = (
-            jax.random.normal(one, shape, jnp.float32) * jnp.float32(np.sqrt(2 / np.prod(shape[:-1])))
-            for one, shape in zip(keys, shapes, strict=True)
+        size_1, size_2 = _KERNEL_SIZES
+        shapes = (
+            (size_1, size_1, 1, _NUM_CHANNELS[0]),
+            (size_2, size_2, *_NUM_CHANNELS),
+            (rows * columns * _NUM_CHANNELS[1], classes),
         )
-        few, many = _CHANNELS
-        ones, zeros = ((jnp.full(few, own, jnp.float32), jnp.full(many, own, jnp.float32)) for own in (1.0, 0.0))
+        first, second, dense = (
+            jax.random.normal(layer_key, shape, jnp.float32) * jnp.float32(np.sqrt(2 / np.prod(shape[:-1])))
+            for layer_key, shape in zip(keys, shapes, strict=True)
+        )
+        num_first, num_second = _NUM_CHANNELS
+        ones, zeros = (
+            (jnp.full(num_first, value, jnp.float32), jnp.full(num_second, value, jnp.float32)) for value in (1.0, 0.0)
+        )
         dense, bias = 0.1 * dense, jnp.zeros(classes, jnp.float32)
         return cls(first, second, ones, zeros, zeros, ones, dense, bias)
 
@@ -83,13 +89,13 @@ class ModalityNetwork(Module):
 
         Also returns the network with updated running means and variances.
         """
-        said, means, variances = self._forward(images, None, None)
-        kept = jax.tree.map(
+        log_odds, means, variances = self._forward(images, None, None)
+        running = jax.tree.map(
             lambda old, new: (1 - _RUNNING_WEIGHT) * old + _RUNNING_WEIGHT * jax.lax.stop_gradient(new),
             (self.mean, self.variance),
             (means, variances),
         )
-        return said, eqx.tree_at(lambda one: (one.mean, one.variance), self, kept)
+        return log_odds, eqx.tree_at(lambda tree: (tree.mean, tree.variance), self, running)
 
     def _forward(self, images, mean, variance):
         values, means, variances = images[..., None], [], []
@@ -98,51 +104,59 @@ class ModalityNetwork(Module):
                 values, kernel, (1, 1), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
             )
             if mean is None:
-                middle = values.mean((0, 1, 2))
-                own = middle, (values**2).mean((0, 1, 2)) - middle**2
+                batch_mean = values.mean((0, 1, 2))
+                statistics = batch_mean, (values**2).mean((0, 1, 2)) - batch_mean**2
             else:
-                own = mean[layer], variance[layer]
-            means.append(own[0])
-            variances.append(own[1])
-            factor = self.gain[layer] / jnp.sqrt(own[1] + _VARIANCE_FLOOR)
-            values = values * factor + (self.shift[layer] - own[0] * factor)
-            values = _max_pool(jnp.maximum(values, 0), _POOLS[layer], jnp)
+                statistics = mean[layer], variance[layer]
+            means.append(statistics[0])
+            variances.append(statistics[1])
+            factor = self.gain[layer] / jnp.sqrt(statistics[1] + _VARIANCE_FLOOR)
+            values = values * factor + (self.shift[layer] - statistics[0] * factor)
+            values = _max_pool(jnp.maximum(values, 0), _POOL_SIZES[layer], jnp)
         return values.reshape(len(images), -1) @ self.dense + self.bias, tuple(means), tuple(variances)
 
 
 def _max_pool(values, pool_size: int, namespace):
-    """Maximum of every `pool_size` × `pool_size` block (b, h, w, c); rows and columns that do not fill a block are left
-    out."""
+    """Maximum of every `pool_size` × `pool_size` block of values (b, h, w, c). Rows and columns that do not fill a
+    block
+    are left out."""
     height, width = (side // pool_size * pool_size for side in values.shape[1:3])
     values = values[:, :height, :width]
-    taller = reduce(namespace.maximum, [values[:, row::pool_size] for row in range(pool_size)])
-    return reduce(namespace.maximum, [taller[:, :, column::pool_size] for column in range(pool_size)])
+    row_maxima = reduce(namespace.maximum, [values[:, row::pool_size] for row in range(pool_size)])
+    return reduce(namespace.maximum, [row_maxima[:, :, column::pool_size] for column in range(pool_size)])
 
 
 class NetworkAnswers:
     """A trained network that is evaluated in NumPy: a few milliseconds for one window, without compilation."""
 
     def __init__(self, network: ModalityNetwork):
-        whole = jax.tree.map(np.asarray, network)
+        host_network = jax.tree.map(np.asarray, network)
         # The normalisation is a factor and an offset for each channel; the factor is merged into the kernels.
-        factors = [gain / np.sqrt(own + _VARIANCE_FLOOR) for gain, own in zip(whole.gain, whole.variance, strict=True)]
+        factors = [
+            gain / np.sqrt(variance + _VARIANCE_FLOOR)
+            for gain, variance in zip(host_network.gain, host_network.variance, strict=True)
+        ]
         self.kernels = [
             np.ascontiguousarray((kernel * factor).transpose(2, 0, 1, 3).reshape(-1, kernel.shape[-1]))
-            for kernel, factor in zip((whole.first, whole.second), factors, strict=True)
+            for kernel, factor in zip((host_network.first, host_network.second), factors, strict=True)
         ]
         self.offsets = [
-            shift - factor * mean for shift, factor, mean in zip(whole.shift, factors, whole.mean, strict=True)
+            shift - factor * mean
+            for shift, factor, mean in zip(host_network.shift, factors, host_network.mean, strict=True)
         ]
-        self.dense, self.bias = whole.dense, whole.bias
+        self.dense, self.bias = host_network.dense, host_network.bias
 
     def log_odds(self, images: Float[np.ndarray, "W rows columns"]) -> Float[np.ndarray, "W C"]:
         """Compute the log-odds (W, C) of the classes."""
-        parts = [self._evaluate_block(images[first : first + _AT_ONCE]) for first in range(0, len(images), _AT_ONCE)]
-        return np.concatenate([np.zeros((0, len(self.bias)), np.float32), *parts]).astype(float)
+        blocks = [
+            self._evaluate_block(images[start : start + _MAX_BLOCK_WINDOWS])
+            for start in range(0, len(images), _MAX_BLOCK_WINDOWS)
+        ]
+        return np.concatenate([np.zeros((0, len(self.bias)), np.float32), *blocks]).astype(float)
 
     def _evaluate_block(self, images: np.ndarray) -> np.ndarray:
         values = images[..., None]
-        for kernel, offset, size, pool in zip(self.kernels, self.offsets, _KERNELS, _POOLS, strict=True):
+        for kernel, offset, size, pool in zip(self.kernels, self.offsets, _KERNEL_SIZES, _POOL_SIZES, strict=True):
             patches = sliding_window_view(values, (size, size), axis=(1, 2))
             values = patches.reshape(*patches.shape[:3], -1) @ kernel
             values += offset
@@ -154,17 +168,17 @@ def paper_plan(windows: int, *, batches: int, batch: int = 64) -> TrainingPlan:
     """Training schedule of the paper for a training set of `windows` windows.
 
     Training has at most `batches`, but at least one pass through the windows. Noise is drawn anew in every batch, so
-    that no image is repeated; `COPIES` passes through the windows correspond to one epoch of noisy copies.
+    that no image is repeated; `NUM_COPIES` passes through the windows correspond to one epoch of noisy copies.
     """
-    least = min(batch, windows)
+    batch_size = min(batch, windows)
     return TrainingPlan(
         rate=2e-4,
-        batch=least,
-        epochs=max(1, round(batches / (windows // least))),
+        batch=batch_size,
+        epochs=max(1, round(batches / (windows // batch_size))),
         patience=20,
         look_every=50,
         decay=0.1,
-        decay_epochs=5 * COPIES,
+        decay_epochs=5 * NUM_COPIES,
     )
 
 
@@ -179,45 +193,47 @@ def library_plan(windows: int, *, batches: int, batch: int = 64) -> TrainingPlan
 
 def train_network(
     images: Float[np.ndarray, "N rows 41"],
-    right: Int[np.ndarray, " N"],
-    held: tuple[Float[np.ndarray, "n rows 41"], Int[np.ndarray, " n"]],
+    labels: Int[np.ndarray, " N"],
+    held_out: tuple[Float[np.ndarray, "n rows 41"], Int[np.ndarray, " n"]],
     *,
     classes: int,
     key: Array,
     plan: TrainingPlan,
-    noise: float = NOISE,
+    noise: float = NOISE_DEVIATION,
     checkpoint: str | Path | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> TrainingResult:
-    """Train a network on images of the classes `right`, until its loss on held-out images no longer decreases.
+    """Train a network on images with the classes `labels`, until its loss on held-out images no longer decreases.
 
-    `held`: the held-out images and their classes; `plan`: as from `library_plan`; `noise`: standard deviation of the
-    noise added to images; `checkpoint` and `progress` as in `jeit.touch.fit_network`, whose errors are raised. The
+    `held_out`: the held-out images and their classes; `plan`: as from `library_plan`; `noise`: standard deviation of
+    the noise added to images; `checkpoint` and `progress` as in `jeit.touch.fit_network`, whose errors are raised. The
     same `key` gives identical results.
     """
-    drawn, trained = jax.random.split(key)
-    network = ModalityNetwork.draw(drawn, images.shape[1], images.shape[2], classes)
-    moving = eqx.tree_at(
-        lambda one: (one.mean, one.variance), jax.tree.map(lambda _: True, network), ((False, False), (False, False))
+    draw_key, training_key = jax.random.split(key)
+    network = ModalityNetwork.draw(draw_key, images.shape[1], images.shape[2], classes)
+    is_running = eqx.tree_at(
+        lambda tree: (tree.mean, tree.variance), jax.tree.map(lambda _: True, network), ((False, False), (False, False))
     )
 
     def loss(network: ModalityNetwork, batch: Any, key: Array):
-        shown, label = batch
-        said, after = network.log_odds_in_training(shown + noise * jax.random.normal(key, shown.shape, jnp.float32))
-        return _cross_entropy(said, label).mean(), after
+        batch_images, batch_labels = batch
+        log_odds, updated_network = network.log_odds_in_training(
+            batch_images + noise * jax.random.normal(key, batch_images.shape, jnp.float32)
+        )
+        return _cross_entropy(log_odds, batch_labels).mean(), updated_network
 
-    def held_out(network: ModalityNetwork, batch: Any):
+    def validation_loss(network: ModalityNetwork, batch: Any):
         return _cross_entropy(network.log_odds(batch[0]), batch[1])
 
-    data = (np.asarray(images, np.float32), np.asarray(right, np.int32))
-    validation = (np.asarray(held[0], np.float32), np.asarray(held[1], np.int32))
+    data = (np.asarray(images, np.float32), np.asarray(labels, np.int32))
+    validation = (np.asarray(held_out[0], np.float32), np.asarray(held_out[1], np.int32))
     return fit_network(
         network,
-        TrainingObjective(loss, held_out, moving),
+        TrainingObjective(loss, validation_loss, is_running),
         data,
         validation,
         plan,
-        key=trained,
+        key=training_key,
         checkpoint=checkpoint,
         progress=progress,
     )

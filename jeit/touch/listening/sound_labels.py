@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jeit.touch.listening.feature_images import EVERY
+from jeit.touch.listening.feature_images import WINDOW_INTERVAL
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,8 @@ class SoundLabels:
 
     - `times` (W,): middles of the windows, seconds.
     - `probabilities` (W, C): probabilities of the classes `names` (C,).
-    - `quiet` (W,): whether a window is quieter than all in the training set, so that its probabilities do not count.
+    - `quiet` (W,): whether a window is quieter than all windows of the training set, so that its probabilities are not
+      meaningful.
     - `known` (W,): whether a window's samples are finite.
     - `strongest` (W,): index of the loudest microphone.
     - `loud` (W,): whether a window is at most 20 dB below the loudest of the recording, for `whole`.
@@ -69,8 +70,8 @@ class SoundLabels:
     @property
     def named(self) -> np.ndarray:
         """The most likely class of each window (W,); "" for windows that are quiet or not finite."""
-        likeliest = np.array([*self.names, ""])[self.probabilities.argmax(axis=1)]
-        return np.where(self.quiet | ~self.known, "", likeliest)
+        likeliest_names = np.array([*self.names, ""])[self.probabilities.argmax(axis=1)]
+        return np.where(self.quiet | ~self.known, "", likeliest_names)
 
     @property
     def probability(self) -> Float[np.ndarray, " W"]:
@@ -84,35 +85,39 @@ class SoundLabels:
         The probability is the geometric mean over the windows, so that overlapping windows are not counted as
         independent; the class is "" if all windows are quiet.
         """
-        some = self.loud & self.known & ~self.quiet
-        if not some.any():
+        is_used = self.loud & self.known & ~self.quiet
+        if not is_used.any():
             return "", 0.0
-        mean = np.exp(np.log(np.maximum(self.probabilities[some], 1e-9)).mean(axis=0))
-        share = mean / mean.sum()
-        return self.names[int(share.argmax())], float(share.max())
+        mean = np.exp(np.log(np.maximum(self.probabilities[is_used], 1e-9)).mean(axis=0))
+        class_probabilities = mean / mean.sum()
+        return self.names[int(class_probabilities.argmax())], float(class_probabilities.max())
 
     @property
     def events(self) -> tuple[Event, ...]:
         """Events: intervals of consecutive windows of the same class."""
-        names, found = self.named, []
-        # An event extends half way to the window after it, and to the one before.
-        steps = [self.times[:1] - EVERY / 2, (self.times[1:] + self.times[:-1]) / 2, self.times[-1:] + EVERY / 2]
-        edges = np.maximum(np.concatenate(steps), 0).tolist()
-        cuts = np.flatnonzero(names[1:] != names[:-1]) + 1
-        for some in np.split(np.arange(len(names)), cuts):
-            if not some.size:
+        names, events = self.named, []
+        # An event extends half way to the previous and to the next window.
+        edge_parts = [
+            self.times[:1] - WINDOW_INTERVAL / 2,
+            (self.times[1:] + self.times[:-1]) / 2,
+            self.times[-1:] + WINDOW_INTERVAL / 2,
+        ]
+        edges = np.maximum(np.concatenate(edge_parts), 0).tolist()
+        boundaries = np.flatnonzero(names[1:] != names[:-1]) + 1
+        for indices in np.split(np.arange(len(names)), boundaries):
+            if not indices.size:
                 continue
             place = None
             if self.position is not None:
-                located = self.position[some][np.isfinite(self.position[some]).all(axis=1)]
-                place = located.mean(axis=0) if len(located) else None
-            found.append(
+                positions = self.position[indices][np.isfinite(self.position[indices]).all(axis=1)]
+                place = positions.mean(axis=0) if len(positions) else None
+            events.append(
                 Event(
-                    edges[some[0]],
-                    edges[some[-1] + 1],
-                    str(names[some[0]]),
-                    float(self.probability[some].mean()),
+                    edges[indices[0]],
+                    edges[indices[-1] + 1],
+                    str(names[indices[0]]),
+                    float(self.probability[indices].mean()),
                     place,
                 )
             )
-        return tuple(found)
+        return tuple(events)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from jeit.touch.listening.feature_images import BANDS, FRAMES, HOP, SoundImages
+from jeit.touch.listening.feature_images import FRAME_INTERVAL, NUM_BANDS, NUM_FRAMES, SoundImages
 
 # Range of levels below the loudest, decibels; quantile of the powers that counts as the loudest.
-_RANGE, _LOUDEST = 60.0, 0.999
+_LEVEL_RANGE, _LOUDEST_QUANTILE = 60.0, 0.999
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Levels:
         """Compute the conversion from windows of the training set."""
         loudest, mean, deviation = [], [], []
         for power in (images.intensity, images.spectrum):
-            top = _decibels(np.quantile(power, _LOUDEST), -np.inf)
-            levels = _decibels(power, float(top) - _RANGE)
-            loudest.append(float(top))
+            max_level = _to_decibels(np.quantile(power, _LOUDEST_QUANTILE), -np.inf)
+            levels = _to_decibels(power, float(max_level) - _LEVEL_RANGE)
+            loudest.append(float(max_level))
             mean.append(float(levels.mean(dtype=float)))
             deviation.append(float(levels.std(dtype=float)) or 1.0)
         return cls(np.array(loudest), np.array(mean), np.array(deviation))
@@ -53,24 +53,24 @@ class Levels:
         """
         order = np.argsort(-images.intensity.sum(axis=2), axis=1, kind="stable")
         intensity = np.take_along_axis(images.intensity, order[..., None], axis=1)
-        parts = [
-            (_decibels(power, self.loudest[part] - _RANGE) - self.mean[part]) / self.deviation[part]
-            for part, power in enumerate((intensity, images.spectrum))
+        level_images = [
+            (_to_decibels(power, self.loudest[index] - _LEVEL_RANGE) - self.mean[index]) / self.deviation[index]
+            for index, power in enumerate((intensity, images.spectrum))
         ]
-        return np.concatenate(parts, axis=1).astype(np.float32)
+        return np.concatenate(level_images, axis=1).astype(np.float32)
 
 
-def _decibels(power, least: float) -> np.ndarray:
-    """Convert powers to decibels, at least `least`; silence, which has no level, is 300 dB below full scale."""
-    return np.maximum(10 * np.log10(np.maximum(power, 1e-30)), least)
+def _to_decibels(power, min_level: float) -> np.ndarray:
+    """Convert powers to decibels, clipped from below at `min_level`. Silence has the level −300 dB."""
+    return np.maximum(10 * np.log10(np.maximum(power, 1e-30)), min_level)
 
 
 # Minimum prominence of a peak, decibels.
-_PROMINENT = 6.0
-# Number of bands of the mean spectrum; number of bands that are followed in time; number of frames after the loudest
-# one over which the decay is measured.
-_COLOURS, _FEW, _AFTER = 16, 4, 8
-_MODULATIONS = 8
+_MIN_PROMINENCE = 6.0
+# Number of bands of the mean spectrum; number of bands whose decay is measured; number of frames after the loudest one
+# over which the decay is measured.
+_NUM_SPECTRUM_BANDS, _NUM_DECAY_BANDS, _NUM_DECAY_FRAMES = 16, 4, 8
+_NUM_MODULATIONS = 8
 
 
 def sound_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
@@ -93,14 +93,23 @@ def sound_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
     ```
     """
     if not len(images):
-        return np.zeros((0, len(_loudness_features(np.zeros((1, FRAMES)))[0]) + _COLOURS + 2 * _FEW + 8 + 8))
-    loud = _relative_decibels(images.intensity.sum(axis=1))
-    parts = [
-        _loudness_features(loud),
-        _spectral_features(images.spectrum.astype(float), loud),
+        return np.zeros(
+            (
+                0,
+                len(_loudness_features(np.zeros((1, NUM_FRAMES)))[0])
+                + _NUM_SPECTRUM_BANDS
+                + 2 * _NUM_DECAY_BANDS
+                + 8
+                + 8,
+            )
+        )
+    level = _relative_decibels(images.intensity.sum(axis=1))
+    feature_groups = [
+        _loudness_features(level),
+        _spectral_features(images.spectrum.astype(float), level),
         _microphone_features(images.intensity.astype(float)),
     ]
-    return np.concatenate(parts, axis=1)
+    return np.concatenate(feature_groups, axis=1)
 
 
 def spectrum_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
@@ -111,121 +120,154 @@ def spectrum_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
     """
     level = _relative_decibels(images.spectrum.astype(float))
     level -= level.max(axis=(1, 2), keepdims=True, initial=-np.inf)
-    at = images.intensity.sum(axis=1).argmax(axis=1)
+    loudest_frame = images.intensity.sum(axis=1).argmax(axis=1)
     rows = np.arange(len(level))
-    after = [level[rows, :, np.minimum(at + step, FRAMES - 1)] for step in range(_AFTER)]
-    bands = [level.mean(axis=2), level.max(axis=2), level.std(axis=2), np.mean(after[:3], 0), np.mean(after[3:], 0)]
-    return np.hstack([sound_features(images), *bands])
+    later_levels = [
+        level[rows, :, np.minimum(loudest_frame + step, NUM_FRAMES - 1)] for step in range(_NUM_DECAY_FRAMES)
+    ]
+    statistics = [
+        level.mean(axis=2),
+        level.max(axis=2),
+        level.std(axis=2),
+        np.mean(later_levels[:3], 0),
+        np.mean(later_levels[3:], 0),
+    ]
+    return np.hstack([sound_features(images), *statistics])
 
 
 def _relative_decibels(power: np.ndarray) -> np.ndarray:
     """Convert powers to levels in decibels (W, …), clipped at 60 dB below the maximum of each window."""
     level = 10 * np.log10(np.maximum(power, 1e-30))
-    return np.maximum(level, level.max(axis=tuple(range(1, level.ndim)), keepdims=True) - _RANGE)
+    return np.maximum(level, level.max(axis=tuple(range(1, level.ndim)), keepdims=True) - _LEVEL_RANGE)
 
 
-def _loudness_features(loud: Float[np.ndarray, "W 41"]) -> np.ndarray:
-    top = loud.max(axis=1)
-    below = top[:, None] - loud
-    at = loud.argmax(axis=1)
-    rows = np.arange(len(loud))
-    peaks = _loudness_peaks(loud)
-    count = peaks.sum(axis=1)
-    which = np.arange(FRAMES)
-    first = np.where(count > 0, np.argmax(peaks, axis=1), 0)
-    last = np.where(count > 0, FRAMES - 1 - np.argmax(peaks[:, ::-1], axis=1), 0)
-    interval = np.where(count > 1, (last - first) / np.maximum(count - 1, 1), FRAMES)
-    swing = np.abs(np.fft.rfft(loud - loud.mean(axis=1, keepdims=True), axis=1))[:, 1 : _MODULATIONS + 1]
-    step = np.diff(loud, axis=1)
-    after = loud[rows, np.minimum(at + _AFTER, FRAMES - 1)] - top
-    soon = loud[rows, np.minimum(at + _AFTER // 4, FRAMES - 1)] - top
-    before = loud[rows, np.maximum(at - _AFTER // 4, 0)] - top
+def _loudness_features(level: Float[np.ndarray, "W 41"]) -> np.ndarray:
+    """Compute the features (W, k) of the loudness over time, in decibels."""
+    max_level = level.max(axis=1)
+    level_below_max = max_level[:, None] - level
+    loudest_frame = level.argmax(axis=1)
+    rows = np.arange(len(level))
+    peaks = _loudness_peaks(level)
+    num_peaks = peaks.sum(axis=1)
+    frame_index = np.arange(NUM_FRAMES)
+    first_peak = np.where(num_peaks > 0, np.argmax(peaks, axis=1), 0)
+    last_peak = np.where(num_peaks > 0, NUM_FRAMES - 1 - np.argmax(peaks[:, ::-1], axis=1), 0)
+    interval = np.where(num_peaks > 1, (last_peak - first_peak) / np.maximum(num_peaks - 1, 1), NUM_FRAMES)
+    modulation = np.abs(np.fft.rfft(level - level.mean(axis=1, keepdims=True), axis=1))[:, 1 : _NUM_MODULATIONS + 1]
+    level_change = np.diff(level, axis=1)
+    late_decay = level[rows, np.minimum(loudest_frame + _NUM_DECAY_FRAMES, NUM_FRAMES - 1)] - max_level
+    early_decay = level[rows, np.minimum(loudest_frame + _NUM_DECAY_FRAMES // 4, NUM_FRAMES - 1)] - max_level
+    level_before = level[rows, np.maximum(loudest_frame - _NUM_DECAY_FRAMES // 4, 0)] - max_level
     return np.column_stack(
         [
-            loud.mean(axis=1),
-            top,
-            loud.min(axis=1),
-            loud.std(axis=1),
-            *((below <= decibels).mean(axis=1) for decibels in (3, 6, 10, 20)),
-            count,
-            interval * HOP,
-            at * HOP,
-            (which * 10 ** (-below / 10)).sum(axis=1) / (10 ** (-below / 10)).sum(axis=1),
-            after,
-            soon,
-            before,
-            step.max(axis=1),
-            step.min(axis=1),
-            np.abs(step).mean(axis=1),
-            swing / FRAMES,
-            swing.argmax(axis=1),
+            level.mean(axis=1),
+            max_level,
+            level.min(axis=1),
+            level.std(axis=1),
+            *((level_below_max <= decibels).mean(axis=1) for decibels in (3, 6, 10, 20)),
+            num_peaks,
+            interval * FRAME_INTERVAL,
+            loudest_frame * FRAME_INTERVAL,
+            (frame_index * 10 ** (-level_below_max / 10)).sum(axis=1) / (10 ** (-level_below_max / 10)).sum(axis=1),
+            late_decay,
+            early_decay,
+            level_before,
+            level_change.max(axis=1),
+            level_change.min(axis=1),
+            np.abs(level_change).mean(axis=1),
+            modulation / NUM_FRAMES,
+            modulation.argmax(axis=1),
         ]
     )
 
 
-def _loudness_peaks(loud: np.ndarray) -> np.ndarray:
+def _loudness_peaks(level: np.ndarray) -> np.ndarray:
     """Find the frames (W, 41) that are peaks.
 
     A peak is the loudest of five frames, and at least 6 dB above the minimum of the ten frames before it, and of the
     ten after it.
     """
-    padded = np.pad(loud, ((0, 0), (10, 10)), mode="edge")
-    near = np.lib.stride_tricks.sliding_window_view(padded, 21, axis=1)
-    top = near[..., 8:13].max(axis=-1)
-    low = np.maximum(near[..., :11].min(axis=-1), near[..., 10:].min(axis=-1))
+    padded = np.pad(level, ((0, 0), (10, 10)), mode="edge")
+    neighbourhoods = np.lib.stride_tricks.sliding_window_view(padded, 21, axis=1)
+    local_max = neighbourhoods[..., 8:13].max(axis=-1)
+    surrounding_min = np.maximum(neighbourhoods[..., :11].min(axis=-1), neighbourhoods[..., 10:].min(axis=-1))
     # If consecutive frames are equally loud, only the first is a peak.
-    return (loud >= top) & (loud > np.pad(loud, ((0, 0), (1, 0)), mode="constant")[:, :-1]) & (loud - low >= _PROMINENT)
+    return (
+        (level >= local_max)
+        & (level > np.pad(level, ((0, 0), (1, 0)), mode="constant")[:, :-1])
+        & (level - surrounding_min >= _MIN_PROMINENCE)
+    )
 
 
-def _spectral_features(spectrum: Float[np.ndarray, "W 64 41"], loud: np.ndarray) -> np.ndarray:
+def _spectral_features(spectrum: Float[np.ndarray, "W 64 41"], level: np.ndarray) -> np.ndarray:
+    """Compute the features (W, k) of the spectrogram. `level` (W, 41): loudness in decibels."""
     rows = np.arange(len(spectrum))
     power = spectrum.mean(axis=2) + 1e-30
-    share = power / power.sum(axis=1, keepdims=True)
-    band = np.arange(BANDS)
-    colours = _relative_decibels(power.reshape(len(power), _COLOURS, -1).mean(axis=2))
-    colours = colours - colours.max(axis=1, keepdims=True)
-    middle = share @ band
-    width = np.sqrt(np.maximum(share @ band**2 - middle**2, 0))
-    flat = np.exp(np.log(power).mean(axis=1)) / power.mean(axis=1)
-    each = spectrum.sum(axis=1) + 1e-30
-    moving = np.einsum("wbt,b->wt", spectrum, band) / each
-    weight = each / each.sum(axis=1, keepdims=True)
-    mean = (moving * weight).sum(axis=1)
-    wanders = np.sqrt(np.maximum((moving**2 * weight).sum(axis=1) - mean**2, 0))
-    few = _relative_decibels(spectrum.reshape(len(power), _FEW, -1, FRAMES).mean(axis=2))
-    at = loud.argmax(axis=1)
-    top, later = few[rows, :, at], few[rows, :, np.minimum(at + _AFTER, FRAMES - 1)]
-    flux = np.abs(np.diff(_relative_decibels(spectrum.reshape(len(power), _COLOURS, -1, FRAMES).mean(axis=2)), axis=2))
-    steep = np.polyfit(np.log(np.arange(1, _COLOURS + 1)), colours.T, 1)[0]
-    numbers = [middle, width, flat, mean, wanders, flux.mean(axis=(1, 2)), flux.max(axis=2).mean(axis=1), steep]
-    return np.column_stack([colours, *numbers, later - top, few.std(axis=2)])
+    band_shares = power / power.sum(axis=1, keepdims=True)
+    band_index = np.arange(NUM_BANDS)
+    spectrum_levels = _relative_decibels(power.reshape(len(power), _NUM_SPECTRUM_BANDS, -1).mean(axis=2))
+    spectrum_levels = spectrum_levels - spectrum_levels.max(axis=1, keepdims=True)
+    centroid = band_shares @ band_index
+    width = np.sqrt(np.maximum(band_shares @ band_index**2 - centroid**2, 0))
+    flatness = np.exp(np.log(power).mean(axis=1)) / power.mean(axis=1)
+    frame_power = spectrum.sum(axis=1) + 1e-30
+    frame_centroid = np.einsum("wbt,b->wt", spectrum, band_index) / frame_power
+    frame_weight = frame_power / frame_power.sum(axis=1, keepdims=True)
+    mean_centroid = (frame_centroid * frame_weight).sum(axis=1)
+    centroid_deviation = np.sqrt(np.maximum((frame_centroid**2 * frame_weight).sum(axis=1) - mean_centroid**2, 0))
+    decay_levels = _relative_decibels(spectrum.reshape(len(power), _NUM_DECAY_BANDS, -1, NUM_FRAMES).mean(axis=2))
+    loudest_frame = level.argmax(axis=1)
+    max_levels, later_levels = (
+        decay_levels[rows, :, loudest_frame],
+        decay_levels[rows, :, np.minimum(loudest_frame + _NUM_DECAY_FRAMES, NUM_FRAMES - 1)],
+    )
+    flux = np.abs(
+        np.diff(
+            _relative_decibels(spectrum.reshape(len(power), _NUM_SPECTRUM_BANDS, -1, NUM_FRAMES).mean(axis=2)), axis=2
+        )
+    )
+    slope = np.polyfit(np.log(np.arange(1, _NUM_SPECTRUM_BANDS + 1)), spectrum_levels.T, 1)[0]
+    scalar_features = [
+        centroid,
+        width,
+        flatness,
+        mean_centroid,
+        centroid_deviation,
+        flux.mean(axis=(1, 2)),
+        flux.max(axis=2).mean(axis=1),
+        slope,
+    ]
+    return np.column_stack([spectrum_levels, *scalar_features, later_levels - max_levels, decay_levels.std(axis=2)])
 
 
 def _microphone_features(intensity: Float[np.ndarray, "W M 41"]) -> np.ndarray:
-    mean = intensity.mean(axis=2) + 1e-30
-    share = mean / mean.sum(axis=1, keepdims=True)
-    ordered = np.sort(share, axis=1)[:, ::-1]
-    even = -(share * np.log(share)).sum(axis=1) / np.log(max(share.shape[1], 2))
+    """Compute the features (W, k) of the distribution of the intensity over the microphones."""
+    mean_power = intensity.mean(axis=2) + 1e-30
+    power_shares = mean_power / mean_power.sum(axis=1, keepdims=True)
+    sorted_shares = np.sort(power_shares, axis=1)[:, ::-1]
+    evenness = -(power_shares * np.log(power_shares)).sum(axis=1) / np.log(max(power_shares.shape[1], 2))
     level = _relative_decibels(intensity)
-    own = level - level.mean(axis=2, keepdims=True)
+    level_deviation = level - level.mean(axis=2, keepdims=True)
     # Correlation of each microphone's level over time with that of the loudest one.
-    loudest = own[np.arange(len(own)), share.argmax(axis=1)]
-    size = np.sqrt((own**2).sum(axis=2) * (loudest**2).sum(axis=1)[:, None]) + 1e-9
-    alike = np.einsum("wmt,wt->wm", own, loudest) / size
-    first, last = (intensity[..., part].mean(axis=2) + 1e-30 for part in (slice(FRAMES // 2), slice(FRAMES // 2, None)))
-    first, last = (np.sqrt(one / one.sum(axis=1, keepdims=True)) for one in (first, last))
-    moved = 1 - (first * last).sum(axis=1)
-    where = level.argmax(axis=1)
-    changes = (np.diff(where, axis=1) != 0).mean(axis=1)
+    loudest_deviation = level_deviation[np.arange(len(level_deviation)), power_shares.argmax(axis=1)]
+    norms = np.sqrt((level_deviation**2).sum(axis=2) * (loudest_deviation**2).sum(axis=1)[:, None]) + 1e-9
+    correlations = np.einsum("wmt,wt->wm", level_deviation, loudest_deviation) / norms
+    first, last = (
+        intensity[..., half].mean(axis=2) + 1e-30 for half in (slice(NUM_FRAMES // 2), slice(NUM_FRAMES // 2, None))
+    )
+    first, last = (np.sqrt(distribution / distribution.sum(axis=1, keepdims=True)) for distribution in (first, last))
+    distribution_change = 1 - (first * last).sum(axis=1)
+    loudest_microphone = level.argmax(axis=1)
+    change_rate = (np.diff(loudest_microphone, axis=1) != 0).mean(axis=1)
     return np.column_stack(
         [
-            ordered[:, 0],
-            ordered[:, : max(1, share.shape[1] // 6)].sum(axis=1),
-            even,
-            alike.mean(axis=1),
-            np.sort(alike, axis=1)[:, share.shape[1] // 2],
-            moved,
-            changes,
+            sorted_shares[:, 0],
+            sorted_shares[:, : max(1, power_shares.shape[1] // 6)].sum(axis=1),
+            evenness,
+            correlations.mean(axis=1),
+            np.sort(correlations, axis=1)[:, power_shares.shape[1] // 2],
+            distribution_change,
+            change_rate,
             level.mean(axis=2).std(axis=1),
         ]
     )

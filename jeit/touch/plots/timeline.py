@@ -28,7 +28,7 @@ from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import draw_outline
 from jeit.touch.gestures.touch_watch import NamedTouch
 from jeit.touch.listening import SoundLabels
-from jeit.touch.listening.feature_images import EVERY
+from jeit.touch.listening.feature_images import WINDOW_INTERVAL
 
 # Gap between frames, as a multiple of the median interval, at which a curve is interrupted; maximum number of points of
 # a curve; minimum length of a bar, as a share of the whole time; maximum number of touches with numbers.
@@ -258,7 +258,7 @@ def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes
     ax = axes_or_new(ax, (8.0, 3.2))
     names, times = labels.names, labels.times
     shown_probabilities = np.where((labels.named != "")[:, None], labels.probabilities, np.nan).T
-    extent = (float(times[0]) - EVERY / 2, float(times[-1]) + EVERY / 2, -0.5, len(names) - 0.5)
+    extent = (float(times[0]) - WINDOW_INTERVAL / 2, float(times[-1]) + WINDOW_INTERVAL / 2, -0.5, len(names) - 0.5)
     probability_image = ax.imshow(
         100 * shown_probabilities,
         aspect="auto",

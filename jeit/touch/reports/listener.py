@@ -9,7 +9,7 @@ import numpy as np
 
 from jeit.report.folder import as_plain_values, results, version_of, write_json, write_rows
 from jeit.touch.listening import Listener, SoundLabels
-from jeit.touch.listening.feature_images import EVERY, LENGTH
+from jeit.touch.listening.feature_images import WINDOW_DURATION, WINDOW_INTERVAL
 
 LISTENER_FILES = ("listener.jeit", "report.json", "learning.png")
 SOUND_LABEL_FILES = ("events.csv", "report.json", "timeline.png")
@@ -115,8 +115,8 @@ def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
             "recording": labels.name,
             "model": model,
             "windows": len(labels),
-            "window_s": LENGTH,
-            "every_s": EVERY,
+            "window_s": WINDOW_DURATION,
+            "every_s": WINDOW_INTERVAL,
             "whole": {"sound": recording_class or None, "probability": probability if recording_class else None},
             "windows_of_each": {name or "quiet": count for name, count in zip(names, counts, strict=True)},
             "events": events,

@@ -5,7 +5,7 @@ import pytest
 
 from jeit.acoustic import Recording
 from jeit.touch.listening import Levels, SoundImages, sound_features, sound_images
-from jeit.touch.listening.feature_images import LENGTH, band_edges, image_blocks
+from jeit.touch.listening.feature_images import WINDOW_DURATION, band_edges, image_blocks
 
 
 def sine(frequency: float, rate: float, seconds: float = 1.0, amplitude: float = 0.5) -> Recording:
@@ -68,9 +68,9 @@ def test_bands_widen_above_5_khz():
 def test_windows_are_a_tenth_of_a_second_apart():
     images = sound_images(noise(2, seconds=3.0))
     assert len(images) == 26
-    np.testing.assert_allclose(images.times, LENGTH / 2 + 0.1 * np.arange(26), atol=0.0061)
+    np.testing.assert_allclose(images.times, WINDOW_DURATION / 2 + 0.1 * np.arange(26), atol=0.0061)
     # One after the other, or some at a time, as for recordings of hours.
-    again = SoundImages.joined(list(image_blocks(noise(2, seconds=30.0))))
+    again = SoundImages.concatenate(list(image_blocks(noise(2, seconds=30.0))))
     assert len(again) == 296
     np.testing.assert_array_equal(
         again.intensity[:26, :, :10], sound_images(noise(2, seconds=30.0)).intensity[:26, :, :10]

@@ -10,7 +10,7 @@ from made_clips import MATERIALS, struck
 from jeit.acoustic import Recording
 from jeit.touch.learnt.methods import CLASSIFIERS
 from jeit.touch.listening import LabelledClips, Listener
-from jeit.touch.listening.feature_images import LENGTH, SoundImages
+from jeit.touch.listening.feature_images import WINDOW_DURATION, SoundImages
 from jeit.touch.listening.learners import LEARNERS, LinearLearner, TrainingSet, stopping_rows
 from jeit.touch.listening.windows import _split_pieces, held_out_folds
 
@@ -55,7 +55,7 @@ def test_the_best_method_on_held_out_clips_is_selected(learnt, tmp_path, monkeyp
     call continues to the same bits.
     """
     few = clips(5)
-    monkeypatch.setattr("jeit.touch.listening.listener._FOR_NETWORKS", 0)
+    monkeypatch.setattr("jeit.touch.listening.listener._MIN_NETWORK_WINDOWS", 0)
 
     class Killed(Exception):
         pass
@@ -179,7 +179,7 @@ def test_a_continuous_sound_is_split_without_samples_on_both_sides():
     pieces = _split_pieces(times)
     assert len(pieces) == 8
     for one, other in pairwise(pieces):
-        assert times[other[0]] - times[one[-1]] > LENGTH - 1e-9
+        assert times[other[0]] - times[one[-1]] > WINDOW_DURATION - 1e-9
     two = np.concatenate([times[:5], times[30:40]])
     assert [len(piece) for piece in _split_pieces(two)] == [5, 10]
 

@@ -62,7 +62,7 @@ def test_a_small_training_generalises_to_a_new_person():
         parts.append(sound_images(Recording(clip.samples, skin.rate))[::2])
         right += [MODALITIES.index(clip.modality)] * len(parts[-1])
         person += [clip.person] * len(parts[-1])
-    images, right, person = SoundImages.joined(parts), np.array(right), np.array(person)
+    images, right, person = SoundImages.concatenate(parts), np.array(right), np.array(person)
     out = person == 4
 
     def share(method: str, labels) -> float:
