@@ -64,7 +64,8 @@ _VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
 
 @dataclass(frozen=True)
 class TableLayout:
-    """Arrangement of the numbers in a data file (section `[data]`). None: it is detected from the numbers."""
+    """Arrangement of the numbers in a data file, from the section `[data]` of its description. None: it is detected
+    from the numbers."""
 
     frames_in: str | None = None
     delimiter: str | None = None

@@ -259,7 +259,8 @@ def random_selections(key: Array, num_candidates: int, number: int, count: int) 
 
 
 def nearest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N"]:
-    """Find the `number` pairs of electrodes with the shortest distance, as indices of channels of `two_terminal(L)`.
+    """Find the `number` pairs of electrodes with the shortest distance, as indices of channels of `two_terminal(L)`,
+    the protocol that measures all pairs of L electrodes.
 
     `centres`: (L, d) metres. `lengths`: distances (L, L) between the electrodes, metres, such as those along a surface
     from `SurfaceLayout.lengths`; by default the straight distances. Every position is then measured by electrodes close

@@ -46,7 +46,8 @@ class Taxels(Module):
     @property
     @either_engine
     def members(self) -> Bool[Array, "*layouts k n"]:
-        """Mask of the positions that each taxel covers. Taxels may overlap, and a position may be covered by none."""
+        """Mask of the positions that each taxel, a tactile pixel, covers. Taxels may overlap, and a position may be
+        covered by none."""
         return self.similarity >= self.threshold
 
     @property

@@ -209,7 +209,8 @@ def challenge_score(labels: Int[np.ndarray, "256 256"], truth: Int[np.ndarray, "
 
     `labels`, `truth`: 0 background, 1 resistive, 2 conductive; 256 × 256 pixels, as in the challenge. Means, variances
     and covariance are taken in Gaussian windows with a standard deviation of 80 pixels, cut off at ±160 pixels and
-    normalised at the border; c1 = 1e-4, c2 = 9e-4; mean over all pixels. A class absent from both images scores 1.
+    normalised at the border; the constants of the structural similarity are c1 = 1e-4 and c2 = 9e-4; its mean over all
+    pixels is the score. A class absent from both images scores 1.
     Raises `ValueError` for images of another shape or with other labels. Räsänen et al., KTC2023, doi
     10.5281/zenodo.8252370.
     """

@@ -255,8 +255,8 @@ def _pair_coefficients(protocol: Protocol, channels) -> Float[np.ndarray, "K e"]
 
 
 def _linear_forms(protocol: Protocol, channels) -> Float[np.ndarray, "K f"]:
-    """Coefficients (K, f) of the channels as linear forms of the upper triangle, including the diagonal, of a symmetric
-    matrix between electrodes."""
+    """Coefficients (K, f) by which the voltages of K channels depend linearly on the symmetric matrix of transfer
+    impedances between electrodes, of which f entries are in the upper triangle and on the diagonal."""
     drive = np.asarray(protocol.drive)[np.asarray(protocol.drive_index)[channels]]
     measurement = np.asarray(protocol.measurement)[np.asarray(protocol.measurement_index)[channels]]
     rows, columns = np.triu_indices(protocol.num_electrodes)

@@ -25,7 +25,8 @@ _WRITERS = {".csv": write_csv, ".dxf": write_dxf, ".svg": write_svg}
 
 
 def read_layout(path: str | Path, *, outline: Domain | None = None) -> Layout:
-    """Read a layout from a file. The format is determined by the suffix; the name of the layout is that of the file.
+    """Read a layout of electrodes from a file. The format is determined by the suffix; the name of the layout is that
+    of the file.
 
     - `.csv`: one line per electrode, with the columns `x_mm`, `y_mm`, `diameter_mm` and optionally `label` and
       `contact_impedance_ohm_m2`. Lengths may also be in `cm` or `m`. Columns are separated by commas, or by semicolons

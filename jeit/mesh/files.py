@@ -64,7 +64,7 @@ _MAX_NODE_NUMBER = 10**7
 _reading_lock = threading.Lock()
 
 
-def check_foreign(path: Path) -> str:
+def meshio_format_of(path: Path) -> str:
     """Name that meshio uses for the format of a file. Raises `ValueError` if the format is not in `FORMATS`, or if the
     file refers to other files, declares entities, or is too large for memory."""
     kind = FORMATS.get(path.suffix.lower())
@@ -241,7 +241,7 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
         raise ValueError(f"scale: expected the file's unit in metres, such as 1e-3 for millimetres, got {scale!r}.")
     if not path.stat().st_size:
         raise ValueError(f"path: {path.name[:80]} does not work as a mesh file: it is empty.")
-    kind = None if trusted else check_foreign(path)
+    kind = None if trusted else meshio_format_of(path)
     if path.suffix.lower() in _UNCONNECTED:
         points, cells = read_leniently(path, path.name[:80])
         return _create_mesh(points * float(scale), cells, {})

@@ -39,7 +39,7 @@ _MAX_RESIDUAL_MEAN = 0.01
 
 
 def recognises(path: Path) -> bool:
-    """True for the suffix of a table."""
+    """Whether the suffix of a file is that of a table of numbers, such as .csv."""
     return path.suffix.lower() in SUFFIXES
 
 

@@ -262,8 +262,8 @@ def _make_feasible(variables: Variables, constraints: Constraints, start_variabl
 
 @eqx.filter_jit
 def _penalty_and_gradient(all_variables, variables: Variables, constraints: Constraints):
-    """Penalty of each start (S,) and its gradient (S, v), scaled by a large factor so that the minimisation ends at
-    zero and not near it."""
+    """Penalty for violated constraints of each of S starts (S,), and its gradient by the v variables (S, v). Both are
+    scaled by a large factor, so that the minimisation stops only where the penalty is zero."""
     return jax.vmap(
         jax.value_and_grad(
             lambda start_variables: 1e6 * _penalty(variables, constraints, start_variables, _CONSTRAINT_MARGIN)

@@ -137,6 +137,7 @@ def greit_noise_figure(target: float, eigenvalues, signal, data_ratio: float, im
     The noise figure is the signal-to-noise ratio of the data divided by that of the image, for one target (Adler et
     al., Physiol. Meas. 30, S35, 2009); in contrast, `noise_figure` draws signals from the prior.
 
+    The columns of X are the desired images of training targets, those of Y their data, and λ is the hyperparameter.
     With the eigendecomposition YYᵀ = VΛVᵀ, the image of data y is XYᵀV (Λ + λ²)⁻¹ Vᵀy. `signal`: Vᵀy; `image_modes`:
     XYᵀV; `data_ratio`: signal-to-noise ratio of the data; `measure`: areas of the cells. White noise of unit variance
     in the data gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².

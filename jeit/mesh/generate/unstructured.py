@@ -71,7 +71,7 @@ def check_total(num_points: float, name: str) -> None:
 
 
 def check_positions(name: str, positions: ArrayLike) -> np.ndarray:
-    """Convert to finite numbers (k,). Raises `ValueError` if that is impossible."""
+    """Convert `positions` to finite numbers (k,). Raises `ValueError` for anything else."""
     array = np.asarray(positions, dtype=float)
     if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
         raise ValueError(

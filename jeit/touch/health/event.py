@@ -152,8 +152,9 @@ def change_size(scaled_changes: Float[np.ndarray, "... M"]) -> Float[np.ndarray,
 def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M"], limit: float) -> Step | None:
     """Find a lasting step between two windows of frames (2w, M).
 
-    `scale` (M,): healthy change of each channel. Returns None unless the step is larger than the `limit`, is sharp, and
-    lasts for all of the second window.
+    `scale` (M,): healthy change of each channel. The first w frames are the first window, the others the second.
+    Returns None unless the step from one to the other is larger than the `limit`, is sharp, and lasts for all of the
+    second window.
     """
     change = window_change(frames)
     size = float(change_size(change / scale))

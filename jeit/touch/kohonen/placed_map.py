@@ -316,7 +316,7 @@ def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:
 
     - `path`: path of the file.
 
-    Raises `FileNotFoundError`, and `ValueError` for any other file.
+    Raises `FileNotFoundError` if there is no such file, and `ValueError` for a file that holds no map.
 
     **Example:**
 

@@ -176,7 +176,7 @@ def learn_quantities(
 ) -> tuple[dict[str, Any], dict[str, Standing], list[str]]:
     """Learn models of `place`, `force`, `label` and `keys`, each None if the presses lack its quantity.
 
-    Returns the models, their accuracies, and notes.
+    Returns the models of these quantities, their accuracies for held-out presses, and notes for the user.
     """
     notes, standing = [], {}
     models: dict[str, Any] = dict.fromkeys(("place", "force", "label", "keys"))
