@@ -212,7 +212,7 @@ def test_drift_is_that_of_another_skin(model):
     recorded = skin.record(KEY, MovingPress(DiscIndenter(0.01), [0.0, 1.0]), [300.0, 301.0])[0]
     np.testing.assert_allclose(recorded, found, rtol=1e-12)
     alone = np.asarray(other.voltages(skin.conductivity)) - skin.rest()
-    slope = skin._contact_slope.sum(axis=0)
+    slope = skin._contact_derivative.sum(axis=0)
     assert np.linalg.norm(-0.03 * slope - alone) < 0.05 * np.linalg.norm(alone)
 
 
