@@ -242,9 +242,9 @@ def _doubt_of_lengths(imaged: ImagedDifference) -> str:
 def _doubt_of_order(imaged: ImagedDifference) -> str:
     """Whether the frame fits an undisturbed body much better than the reference does; empty if not."""
     misfit = float(imaged.calibration.misfit)
-    if not misfit > _MIN_SUSPICIOUS_MISFIT:
-        return ""
     usable = np.asarray(imaged.measurement.mask)[0] & np.asarray(imaged.reference.mask)[0]
+    if not (misfit > _MIN_SUSPICIOUS_MISFIT and usable.any()):
+        return ""
     frame = np.asarray(imaged.measurement.voltages)[0][usable]
     predicted = np.asarray(imaged.calibration.voltages)[usable]
     scale = np.vdot(predicted, frame) / np.vdot(predicted, predicted)

@@ -155,15 +155,20 @@ class ReadAhead(AbstractSource):
 
     def _read_source(self) -> None:
         num_lost = 0
+
+        def report_loss() -> None:
+            if num_lost:
+                self._source.say(f"{num_lost} frames were lost: the program did not read them.")
+
         try:
             for frame in self._source:
                 if self._queue.qsize() >= _MAX_AHEAD:
                     num_lost += 1
                     continue
-                if num_lost:
-                    self._source.say(f"{num_lost} frames were lost: the program did not read them.")
-                    num_lost = 0
+                report_loss()
+                num_lost = 0
                 self._queue.put(frame)
         except Exception as error:  # raised where the frames are read
             self._queue.put(error)
+        report_loss()
         self._queue.put(None)

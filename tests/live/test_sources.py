@@ -157,6 +157,20 @@ def test_frames_beyond_those_that_can_wait_are_counted(monkeypatch):
 
 
 @posix
+def test_a_loss_at_the_end_is_reported_too(monkeypatch):
+    monkeypatch.setattr(line_source, "_MAX_AHEAD", 4)
+    read, write = os.pipe()
+    os.write(write, b"".join(map(line, FRAMES)))
+    os.close(write)
+    source = ReadAhead(LineSource("-", StandardInput(read), LineReading()))
+    while source.connection != "ended":
+        time.sleep(0.005)
+    assert [frame.number for frame in source] == [0, 1, 2, 3]
+    assert any("8 frames were lost" in text for _, text in source.messages)
+    os.close(read)
+
+
+@posix
 def test_available_lines_are_replayed_at_a_rate():
     read, write = os.pipe()
     os.write(write, b"".join(map(line, FRAMES)))
