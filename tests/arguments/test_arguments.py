@@ -15,6 +15,7 @@ from jeit.arguments import (
     check_name,
     describe,
     did_you_mean,
+    interval_text,
     is_number,
     real_array,
 )
@@ -151,3 +152,10 @@ def test_check_metres():
 def test_check_metres_rejects_values_that_are_no_lengths(value):
     with pytest.raises(ValueError, match=r"^thickness must be a positive length in metres; it is "):
         check_metres("thickness", value)
+
+
+def test_open_intervals_name_the_known_end():
+    """A decrease beyond its limit: "at most -90" might mean a smaller one."""
+    texts = {(1.0, 2.0): "1 to 2", (1.0, None): "at least 1", (None, 2.0): "at most 2", (None, -90.0): "beyond -90"}
+    assert {ends: interval_text(ends, lambda value: f"{value:g}") for ends in texts} == texts
+    assert interval_text((None, None), str) == "not determined"

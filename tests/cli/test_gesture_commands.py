@@ -96,6 +96,10 @@ def test_noise_has_no_contacts_and_too_few_untouched_frames_are_refused(files, r
     status, _, error = run(*asked, "--rate", RATE, "--untouched", 0.01)
     assert status == 1
     assert "--untouched: the first 0.01 s" in error
+    skin = ("--skin", folder / "skin.toml", "--reference", folder / "rest.csv", "--output", tmp_path)
+    status, _, error = run("touch", "contacts", folder / "broken.npz", *skin)
+    assert status == 1
+    assert "could be imaged" in error
 
 
 @pytest.fixture(scope="module")

@@ -49,6 +49,9 @@ def test_tank6cm_frames_of_weak_current_are_refused(data_folder, run, tmp_path):
     assert status == 1
     assert "too noisy" in error
     assert error.count("\n") == 1
+    status, output, _ = run("info", file)
+    assert status == 0
+    assert "so many impossible signs are those of noise" in " ".join(output.split())
 
 
 KIT4_RADIUS = 0.14

@@ -60,6 +60,9 @@ def test_the_strongest_region_is_that_of_the_strongest_inclusion():
         assert peak == pytest.approx(sign, rel=0.05)
     place, _ = strongest(bump(0.04, 0.02) + 0.8 * bump(0.052, 0.02, width=0.003))
     assert np.linalg.norm(place - [0.04, 0.02]) < 0.006
+    # A faint tail to one side, below half of the peak, is no part of the region.
+    place, _ = strongest(bump(0.0, 0.0) + 0.35 * bump(0.055, 0.0, width=0.02))
+    assert np.linalg.norm(place) < 3e-3
     solid = box(0.2, 0.2, 0.2, num_points=2000)
     place, _ = StrongestRegion(solid)(ball(solid, [0.02, 0.0, 0.1], 0.05).astype(float))
     np.testing.assert_allclose(place, [0.02, 0.0, 0.1], atol=4e-3)

@@ -226,6 +226,17 @@ def track_contacts(
     return tracker.touches
 
 
+def without_side_lobes(touches: list[TouchPath], weakest: float) -> list[TouchPath]:
+    """Return the touches whose strongest change is not less than `weakest` times that of any touch at the same time: a
+    linear image of a contact has side lobes, which look like weaker contacts."""
+
+    def strongest_beside(touch: TouchPath) -> float:
+        beside = [one for one in touches if one.onset <= touch.offset and touch.onset <= one.offset]
+        return max(float(np.abs(one.peak).max()) for one in beside)
+
+    return [touch for touch in touches if np.abs(touch.peak).max() >= weakest * strongest_beside(touch)]
+
+
 def _update_touch(touch: _TrackedTouch, time: float, contact: Contact) -> _TrackedTouch:
     """Return the state of a touch after a frame in which it is seen as this contact."""
     velocity_error = (contact.centroid - touch.predicted_position(time)) / (time - touch.time)

@@ -27,7 +27,7 @@ from jeit.touch import (
     find_contacts,
     track_contacts,
 )
-from jeit.touch.contacts.tracker import TouchPath
+from jeit.touch.contacts.tracker import TouchPath, without_side_lobes
 from jeit.touch.gestures.gesture_model import GESTURE_FILE
 
 GESTURE_FILES = (GESTURE_FILE, "report.json", "gestures.png")
@@ -338,12 +338,14 @@ def find_recorded_contacts(
     noise = None
     if len(still) >= _FEWEST_UNTOUCHED and (still != still[0]).any():
         noise = ImageNoise.of_images(still)
+    if not np.isfinite(changes).all(axis=1).any():
+        raise ValueError(f"frames: none of the {counted(len(frames), 'frame')} could be imaged.")
     all_contacts = [find_contacts(finder, one, noise) if np.isfinite(one).all() else [] for one in changes]
     contacts = []
     for candidates in all_contacts:
         strongest = max((abs(contact.peak) for contact in candidates), default=0.0)
         contacts.append([contact for contact in candidates if abs(contact.peak) >= weakest * strongest])
-    touches = _without_side_lobes(track_contacts(seconds, contacts), weakest)
+    touches = without_side_lobes(track_contacts(seconds, contacts), weakest)
     notes = []
     if noise is None:
         notes.append(
@@ -362,16 +364,6 @@ def find_recorded_contacts(
     if single := sum(map(len, contacts)) - sum(len(path.times) for path in touches):
         notes.append(f"{counted(single, 'contact')} of brief or weak appearance belong to no touch")
     return RecordedContacts(seconds, changes, contacts, touches, tuple(notes))
-
-
-def _without_side_lobes(touches: list[TouchPath], weakest: float) -> list[TouchPath]:
-    """The touches whose strongest change is not less than `weakest` times that of a touch at the same time."""
-
-    def strongest_beside(touch: TouchPath) -> float:
-        beside = [one for one in touches if one.onset <= touch.offset and touch.onset <= one.offset]
-        return max(float(np.abs(one.peak).max()) for one in beside)
-
-    return [touch for touch in touches if np.abs(touch.peak).max() >= weakest * strongest_beside(touch)]
 
 
 def write_contacts(found: RecordedContacts, images: TouchImages, folder: str | Path, *, name: str) -> None:

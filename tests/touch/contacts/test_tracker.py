@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.touch.contacts import Contact, ContactTracker, track_contacts
+from jeit.touch.contacts.tracker import TouchPath, without_side_lobes
 
 TIMES = np.arange(60) / 60
 
@@ -124,3 +125,17 @@ def test_bad_input():
     for options in ({"gap": 0.0}, {"reach": -1.0}, {"fastest": -1.0}, {"least": 0}):
         with pytest.raises(ValueError, match=next(iter(options))):
             ContactTracker(**options)
+
+
+def test_paths_beside_a_much_stronger_touch_are_side_lobes():
+    """At the same time only: a light touch that is alone stays."""
+
+    def path(number, onset, offset, peak):
+        times = np.array([onset, offset])
+        return TouchPath(number, times, np.zeros((2, 2)), np.full(2, peak), np.ones(2))
+
+    strong, beside = path(0, 0.0, 1.0, 1.0), path(1, 0.5, 2.0, 0.3)
+    alone, negative = path(2, 3.0, 4.0, 0.2), path(3, 0.0, 1.0, -0.9)
+    remaining = without_side_lobes([strong, beside, alone, negative], 0.4)
+    assert [touch.number for touch in remaining] == [0, 2, 3]
+    assert len(without_side_lobes([strong, beside], 0.3)) == 2

@@ -116,6 +116,7 @@ def test_an_electrode_that_fails_is_named_and_left_out(health, kind, reading):
     after = watch(health, frames)
     (event,) = after.events
     assert (event.electrode, event.kind) == (5, kind)
+    assert event.reason.endswith("channels of electrode 6.")  # sentences count from 1
     np.testing.assert_array_equal(after.trusted, ~own)
     np.testing.assert_array_equal(after.usable, ~own)
     assert after.status == WatchStatus.PARTIAL
