@@ -12,7 +12,7 @@ from .contacts import (
 from .gestures import GestureModel, StreamTouch, TouchLevel, TouchStream, find_touches, touch_features
 from .gestures.gesture_learning import LearntGestures, learn_gestures
 from .gestures.logit_boost import LogitBoostClassifier
-from .gestures.touch_images import TouchImages, untouched_frames
+from .gestures.touch_images import RecordedContacts, TouchImages, find_recorded_contacts, untouched_frames
 from .gestures.touch_watch import NamedTouch, TouchWatch, WatchedFrame
 from .health import HealthEvent, SkinHealth, watch
 from .health.health_learning import doubts_of, learn_health
@@ -116,6 +116,7 @@ __all__ = [
     "Presses",
     "PrismIndenter",
     "RasterFinder",
+    "RecordedContacts",
     "RevolvedIndenter",
     "RingIndenter",
     "SelfOrganisingMap",
@@ -138,6 +139,7 @@ __all__ = [
     "doubts_of",
     "draw_cut",
     "find_contacts",
+    "find_recorded_contacts",
     "find_touches",
     "fit_network",
     "learn_gestures",

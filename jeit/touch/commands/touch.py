@@ -79,8 +79,8 @@ def contacts(
     from jeit.arguments import counted
     from jeit.cli.console import Steps, plain_console, say_written
     from jeit.data import load_description, read_frame_recording
-    from jeit.touch import TouchImages, untouched_frames
-    from jeit.touch.reports.touch_watch import CONTACT_FILES, find_recorded_contacts, write_contacts
+    from jeit.touch import TouchImages, find_recorded_contacts, untouched_frames
+    from jeit.touch.reports.touch_watch import CONTACT_FILES, write_contacts
 
     check_positive({"--untouched": untouched} | ({} if rate is None else {"--rate": rate}))
     if not 0 <= weakest <= 1:

@@ -1,4 +1,5 @@
-"""`TouchImages`: images of the change of a skin's conductivity from its untouched state, frame by frame.
+"""`TouchImages`: images of the change of a skin's conductivity from its untouched state, frame by frame, and the
+contacts in those of a recording.
 
 Each image is one linear reconstruction step on a coarse mesh, by default with the NOSER prior of Silvera Tawil et al.
 (2011). As in every stream, invalid frames are refused, and the channels of a dead electrode are left out.
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -21,9 +23,11 @@ from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear.solvers import OneStep
 from jeit.inverse.streaming.stream import FrameImage
 from jeit.mesh import Mesh
+from jeit.touch.contacts import CellFinder, Contact, ImageNoise, find_contacts, track_contacts
+from jeit.touch.contacts.tracker import TouchPath, without_side_lobes
 
-# Minimum number of frames of an untouched skin.
-_MIN_UNTOUCHED_FRAMES = 3
+# Minimum number of frames of an untouched skin, and of those from which the noise of images is estimated.
+_MIN_UNTOUCHED_FRAMES, _MIN_NOISE_FRAMES = 3, 10
 
 TOUCH_IMAGES = StreamSettings(solver=OneStep(), prior="noser")
 """Default settings for imaging touches."""
@@ -137,3 +141,103 @@ def untouched_frames(
             f"untouched skin. Give a longer time, or a reference.{hint}"
         )
     return frames_with_readings
+
+
+@dataclass(frozen=True)
+class RecordedContacts:
+    """Contacts of a recording.
+
+    **Fields**: `seconds` (F,): times of the frames; `changes` (F, m): change of conductivity, S, NaN for refused
+    frames; `contacts`: those of each frame; `touches`: paths of the touches, which last for two frames or more;
+    `notes`: reasons to doubt them.
+
+    **Example:**
+
+    ```python
+    found = find_recorded_contacts(images, film, np.arange(len(film)) / 30, empty)
+    print(isinstance(found, RecordedContacts), [touch.position[0] for touch in found.touches])
+    ```
+    """
+
+    seconds: Float[np.ndarray, " F"]
+    changes: Float[np.ndarray, "F m"]
+    contacts: list[list[Contact]]
+    touches: list[TouchPath]
+    notes: tuple[str, ...]
+
+    def number_of(self, frame: int, contact: Contact) -> int | None:
+        """The number of the touch to which a contact of a frame belongs; None for a contact in a single frame."""
+        return self._numbers.get((float(self.seconds[frame]), *contact.centroid.tolist()))
+
+    @cached_property
+    def _numbers(self) -> dict[tuple[float, ...], int]:
+        return {
+            (time, *place): path.number
+            for path in self.touches
+            for time, place in zip(path.times.tolist(), path.position.tolist(), strict=True)
+        }
+
+
+def find_recorded_contacts(
+    images: TouchImages,
+    frames: Float[np.ndarray, "F M"],
+    seconds: Float[np.ndarray, " F"],
+    untouched: Float[np.ndarray, "u M"],
+    *,
+    sign: int = 1,
+    weakest: float = 0.4,
+) -> RecordedContacts:
+    """Find and track the contacts in the frames of a recording.
+
+    **Arguments:**
+
+    - `images`: imager of the skin.
+    - `frames`: frames (F, M), volts.
+    - `seconds`: their increasing times (F,), seconds.
+    - `untouched`: frames (u, M) of the untouched skin, volts, which give the noise of images if there are ten or more.
+    - `sign`: 1 if touched skin conducts better, -1 if worse.
+    - `weakest`: minimum peak of a contact, relative to the strongest of its frame. A linear image of a contact has side
+      lobes of up to a third of its peak.
+
+    Raises `ValueError` if no frame can be imaged, and as `track_contacts` does.
+
+    **Example:**
+
+    ```python
+    found = find_recorded_contacts(images, film, np.arange(len(film)) / 30, empty)
+    for touch in found.touches:
+        print(touch.onset, touch.position[0], touch.peak.max())
+    ```
+    """
+    finder = CellFinder(images.mesh, sign=sign)
+    changes, still = images.changes(frames), images.changes(untouched)
+    still = still[np.isfinite(still).all(axis=1)]
+    noise = None
+    if len(still) >= _MIN_NOISE_FRAMES and (still != still[0]).any():
+        noise = ImageNoise.of_images(still)
+    if not np.isfinite(changes).all(axis=1).any():
+        raise ValueError(f"frames: none of the {counted(len(frames), 'frame')} could be imaged.")
+    all_contacts = [find_contacts(finder, change, noise) if np.isfinite(change).all() else [] for change in changes]
+    contacts = []
+    for candidates in all_contacts:
+        strongest = max((abs(contact.peak) for contact in candidates), default=0.0)
+        contacts.append([contact for contact in candidates if abs(contact.peak) >= weakest * strongest])
+    touches = without_side_lobes(track_contacts(seconds, contacts), weakest)
+    notes = []
+    if noise is None:
+        notes.append(
+            f"noise is estimated from each image, because fewer than {_MIN_NOISE_FRAMES} different frames of the "
+            "untouched skin are known: contacts may be missed"
+        )
+    elif len(still) < 3 * _MIN_NOISE_FRAMES:
+        notes.append(f"noise is estimated from {len(still)} untouched frames; a hundred give fewer false contacts")
+    if num_refused := int((~np.isfinite(changes).all(axis=1)).sum()):
+        notes.append(f"{counted(num_refused, 'frame')} could not be imaged")
+    if num_left_out := sum(map(len, all_contacts)) - sum(map(len, contacts)):
+        notes.append(
+            f"{counted(num_left_out, 'contact')} with less than {100 * weakest:.0f} % of the strongest change of the "
+            "frame may be side lobes of the image, and are left out"
+        )
+    if num_single := sum(map(len, contacts)) - sum(len(path.times) for path in touches):
+        notes.append(f"{counted(num_single, 'contact')} of brief or weak appearance belong to no touch")
+    return RecordedContacts(seconds, changes, contacts, touches, tuple(notes))

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +14,7 @@ from jaxtyping import Float
 from jeit.arguments import counted
 from jeit.report.folder import as_plain_values, results, results_folder, version_of, write_json, write_rows
 from jeit.report.growing import GrowingTable
-from jeit.touch import (
-    CellFinder,
-    Contact,
-    ImageNoise,
-    LearntGestures,
-    NamedTouch,
-    TouchImages,
-    TouchWatch,
-    WatchedFrame,
-    find_contacts,
-    track_contacts,
-)
-from jeit.touch.contacts.tracker import TouchPath, without_side_lobes
+from jeit.touch import LearntGestures, NamedTouch, RecordedContacts, TouchImages, TouchWatch, WatchedFrame
 from jeit.touch.gestures.gesture_model import GESTURE_FILE
 
 GESTURE_FILES = (GESTURE_FILE, "report.json", "gestures.png")
@@ -282,88 +269,9 @@ def _path_rows(touch: NamedTouch) -> list[list[object]]:
 
 
 CONTACT_FILES = ("contacts.csv", "report.json", "contacts.png")
-_CONTACTS = ("frame", "time_s", "touch", "x_m", "y_m", "deviation_m", "area_m2", "peak_S")
-# Minimum number of untouched frames from which noise is estimated; maximum number of paths that have a number in the
-# picture.
-_FEWEST_UNTOUCHED, _MOST_NUMBERED = 10, 20
-
-
-@dataclass(frozen=True)
-class RecordedContacts:
-    """Contacts of a recording.
-
-    **Fields**: `seconds` (F,): times of the frames; `changes` (F, m): change of conductivity, S, NaN for refused
-    frames; `contacts`: those of each frame; `touches`: paths of the touches, which last for two frames or more;
-    `notes`: reasons to doubt them.
-    """
-
-    seconds: Float[np.ndarray, " F"]
-    changes: Float[np.ndarray, "F m"]
-    contacts: list[list[Contact]]
-    touches: list[TouchPath]
-    notes: tuple[str, ...]
-
-    def number_of(self, frame: int, contact: Contact) -> int | None:
-        """The number of the touch to which a contact of a frame belongs; None for a contact in a single frame."""
-        return self._numbers.get((float(self.seconds[frame]), *contact.centroid.tolist()))
-
-    @cached_property
-    def _numbers(self) -> dict[tuple[float, ...], int]:
-        return {
-            (time, *place): path.number
-            for path in self.touches
-            for time, place in zip(path.times.tolist(), path.position.tolist(), strict=True)
-        }
-
-
-def find_recorded_contacts(
-    images: TouchImages,
-    frames: Float[np.ndarray, "F M"],
-    seconds: Float[np.ndarray, " F"],
-    untouched: Float[np.ndarray, "u M"],
-    *,
-    sign: int = 1,
-    weakest: float = 0.4,
-) -> RecordedContacts:
-    """Find and track the contacts in frames (F, M), volts, that were recorded at increasing times (F,).
-
-    `untouched` (u, M): frames of the untouched skin, which give the noise of images if there are ten or more; `sign`: 1
-    if touched skin conducts better, -1 if worse; `weakest`: least peak of a contact, relative to the strongest of its
-    frame: a linear image of a contact has side lobes of up to a third of its peak. Raises `ValueError` as
-    `track_contacts` does.
-    """
-    finder = CellFinder(images.mesh, sign=sign)
-    changes, still = images.changes(frames), images.changes(untouched)
-    still = still[np.isfinite(still).all(axis=1)]
-    noise = None
-    if len(still) >= _FEWEST_UNTOUCHED and (still != still[0]).any():
-        noise = ImageNoise.of_images(still)
-    if not np.isfinite(changes).all(axis=1).any():
-        raise ValueError(f"frames: none of the {counted(len(frames), 'frame')} could be imaged.")
-    all_contacts = [find_contacts(finder, one, noise) if np.isfinite(one).all() else [] for one in changes]
-    contacts = []
-    for candidates in all_contacts:
-        strongest = max((abs(contact.peak) for contact in candidates), default=0.0)
-        contacts.append([contact for contact in candidates if abs(contact.peak) >= weakest * strongest])
-    touches = without_side_lobes(track_contacts(seconds, contacts), weakest)
-    notes = []
-    if noise is None:
-        notes.append(
-            f"noise is estimated from each image, because fewer than {_FEWEST_UNTOUCHED} different frames of the "
-            "untouched skin are known: contacts may be missed"
-        )
-    elif len(still) < 3 * _FEWEST_UNTOUCHED:
-        notes.append(f"noise is estimated from {len(still)} untouched frames; a hundred give fewer false contacts")
-    if refused := int((~np.isfinite(changes).all(axis=1)).sum()):
-        notes.append(f"{counted(refused, 'frame')} could not be imaged")
-    if left_out := sum(map(len, all_contacts)) - sum(map(len, contacts)):
-        notes.append(
-            f"{counted(left_out, 'contact')} with less than {100 * weakest:.0f} % of the strongest change of the frame "
-            "may be side lobes of the image, and are left out"
-        )
-    if single := sum(map(len, contacts)) - sum(len(path.times) for path in touches):
-        notes.append(f"{counted(single, 'contact')} of brief or weak appearance belong to no touch")
-    return RecordedContacts(seconds, changes, contacts, touches, tuple(notes))
+_CONTACT_COLUMNS = ("frame", "time_s", "touch", "x_m", "y_m", "deviation_m", "area_m2", "peak_S")
+# Maximum number of paths that have a number in the picture.
+_MAX_NUMBERED = 20
 
 
 def write_contacts(found: RecordedContacts, images: TouchImages, folder: str | Path, *, name: str) -> None:
@@ -379,7 +287,7 @@ def write_contacts(found: RecordedContacts, images: TouchImages, folder: str | P
         for contact in contacts
     )
     with results(folder, CONTACT_FILES) as made:
-        write_rows(made / "contacts.csv", _CONTACTS, rows)
+        write_rows(made / "contacts.csv", _CONTACT_COLUMNS, rows)
         write_json(_report_contacts(found, images, name), made / "report.json")
         _draw_contacts(found, images).savefig(made / "contacts.png", dpi=130)
 
@@ -434,7 +342,7 @@ def _draw_contacts(found: RecordedContacts, images: TouchImages):
     for path in found.touches:
         (line,) = right.plot(*path.position.T, linewidth=1.6)
         right.plot(*path.position[0], marker="o", markersize=5, color=line.get_color())
-        if len(found.touches) <= _MOST_NUMBERED:
+        if len(found.touches) <= _MAX_NUMBERED:
             right.annotate(str(path.number), path.position[0], (5, 3), textcoords="offset points", fontsize=9)
     hide_axes(right, extent)
     draw_scale_bar(right, extent)
