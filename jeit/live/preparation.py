@@ -102,23 +102,34 @@ def prepare(
         )
     measured = reference if isinstance(reference, Measurement | None) else read(reference, None, description)
     opened_source = open_source(source, rate=rate, description=description, reference=measured)
-    measured = getattr(opened_source, "reference", None) if measured is None else measured
-    if measured is None:
-        if loaded_description is None:
-            raise ValueError(
-                "reference is missing: give a measured file of the undisturbed sensor, or a description, and the first "
-                "frames are the reference."
-            )
-        reference_frames, opened_source = first_frames(opened_source, untouched, report_step, rate=rate)
-        measured = described_reference(loaded_description, reference_frames)
-    else:
-        reference_frames = frames_of(measured)
-    conductivity_view = ConductivityView.prepare(measured, settings, progress=progress)
-    if not contacts:
-        return Prepared(opened_source, conductivity_view, measured)
-    from jeit.live.views.contacts import ContactsView
+    with _closed_on_failure(opened_source):
+        measured = getattr(opened_source, "reference", None) if measured is None else measured
+        if measured is None:
+            if loaded_description is None:
+                raise ValueError(
+                    "reference is missing: give a measured file of the undisturbed sensor, or a description, and the "
+                    "first frames are the reference."
+                )
+            reference_frames, opened_source = first_frames(opened_source, untouched, report_step, rate=rate)
+            measured = described_reference(loaded_description, reference_frames)
+        else:
+            reference_frames = frames_of(measured)
+        conductivity_view = ConductivityView.prepare(measured, settings, progress=progress)
+        if not contacts:
+            return Prepared(opened_source, conductivity_view, measured)
+        from jeit.live.views.contacts import ContactsView
 
-    return Prepared(opened_source, ContactsView(conductivity_view, reference_frames), measured)
+        return Prepared(opened_source, ContactsView(conductivity_view, reference_frames), measured)
+
+
+@contextmanager
+def _closed_on_failure(source: AbstractSource) -> Iterator[None]:
+    """Close a source, which may be read by a thread of its own, if what is prepared for it fails."""
+    try:
+        yield
+    except BaseException:
+        source.close()
+        raise
 
 
 def first_frames(
@@ -178,13 +189,9 @@ def _read_first_frames(
             initial_frames.append(frame)
     if num_frames is None and (measured_rate := _arrival_rate(initial_frames)) is not None:
         num_frames = max(round(measured_rate * seconds), _MIN_FRAMES)
-    try:
-        reference_frames = _frames_of_usual_length(
-            [frame.values for frame in initial_frames[:num_frames] if not isinstance(frame.values, str)], seconds
-        )
-    except ValueError:
-        source.close()
-        raise
+    reference_frames = _frames_of_usual_length(
+        [frame.values for frame in initial_frames[:num_frames] if not isinstance(frame.values, str)], seconds
+    )
     if (relative_change := change_during(reference_frames)) is not None:
         source.say(
             f"The sensor changed by {100 * relative_change:.2g} % in the first {seconds:g} s, which are the reference: "
@@ -289,28 +296,31 @@ def _prepare_model(
         reference_frames = (
             frames_of(measured) if reference_frames is None and measured is not None else reference_frames
         )
-    if reference_frames is None and not (isinstance(model, LearntSkin) and model.mean_reference is None):
-        reference_frames, opened_source = first_frames(opened_source, untouched, report_step, rate=rate)
-    if isinstance(model, LearntSkin):
-        from jeit.live.views.learnt import LearntSkinView
+    with _closed_on_failure(opened_source):
+        if reference_frames is None and not (isinstance(model, LearntSkin) and model.mean_reference is None):
+            reference_frames, opened_source = first_frames(opened_source, untouched, report_step, rate=rate)
+        if isinstance(model, LearntSkin):
+            from jeit.live.views.learnt import LearntSkinView
 
-        return Prepared(
-            opened_source, LearntSkinView(model, reference_frames, description=loaded_description), measured
-        )
-    assert reference_frames is not None
-    if isinstance(model, GestureModel):
-        from jeit.live.views.contacts import GestureView
+            return Prepared(
+                opened_source, LearntSkinView(model, reference_frames, description=loaded_description), measured
+            )
+        assert reference_frames is not None
+        if isinstance(model, GestureModel):
+            from jeit.live.views.contacts import GestureView
 
-        assert loaded_description is not None
-        view: AbstractView = GestureView(loaded_description, model, reference_frames, rate=rate, progress=report_step)
-        return Prepared(
-            opened_source,
-            view,
-            described_reference(loaded_description, reference_frames) if measured is None else measured,
-        )
-    from jeit.live.views.learnt import DepthView
+            assert loaded_description is not None
+            view: AbstractView = GestureView(
+                loaded_description, model, reference_frames, rate=rate, progress=report_step
+            )
+            return Prepared(
+                opened_source,
+                view,
+                described_reference(loaded_description, reference_frames) if measured is None else measured,
+            )
+        from jeit.live.views.learnt import DepthView
 
-    return Prepared(opened_source, DepthView(model, reference_frames), measured)
+        return Prepared(opened_source, DepthView(model, reference_frames), measured)
 
 
 def _read_model(path: Path):

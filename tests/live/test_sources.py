@@ -11,7 +11,7 @@ import pytest
 from small_sensor import CHANNELS, measured, noisy
 
 from jeit.data import write_table
-from jeit.live import folder_source, line_source
+from jeit.live import folder_source, line_source, preparation
 from jeit.live.connections import SerialPort, Server, StandardInput, connection_to
 from jeit.live.folder_source import WatchedFolder
 from jeit.live.line_source import LineSource, ReadAhead
@@ -134,6 +134,27 @@ def test_frames_that_wait_for_the_program_keep_the_time_of_their_arrival():
     frames = list(source)
     np.testing.assert_array_equal([frame.values for frame in frames], FRAMES[:3])
     assert np.diff([frame.arrived for frame in frames]).min() > 0.05
+    os.close(read)
+
+
+@posix
+def test_a_source_is_closed_if_what_is_prepared_for_it_fails(monkeypatch):
+    """Too few lines for a reference; and no description, so that nothing is known of the sensor."""
+    read, write = os.pipe()
+    os.write(write, line(FRAMES[0]))
+    os.close(write)
+    sources = []
+
+    def opened(*_, **__):
+        sources.append(ReadAhead(LineSource("-", StandardInput(read), LineReading())))
+        return sources[-1]
+
+    monkeypatch.setattr(preparation, "open_source", opened)
+    with pytest.raises(ValueError, match="1 frame of numbers; 3 are needed"):
+        preparation.prepare("-", description="tank6cm")
+    with pytest.raises(ValueError, match="reference is missing"):
+        preparation.prepare("-")
+    assert all(source.closing.is_set() for source in sources)
     os.close(read)
 
 
