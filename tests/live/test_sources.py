@@ -155,6 +155,8 @@ def test_a_source_is_closed_if_what_is_prepared_for_it_fails(monkeypatch):
     with pytest.raises(ValueError, match="reference is missing"):
         preparation.prepare("-")
     assert all(source.closing.is_set() for source in sources)
+    while any(source.connection != "ended" for source in sources):  # their threads may still read the pipe
+        time.sleep(0.005)
     os.close(read)
 
 
