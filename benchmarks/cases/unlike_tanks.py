@@ -22,18 +22,21 @@ TANKS, FIRST = 270, 900_000
 SOLIDS, FIRST_SOLID = 30, 910_000
 HEADER = [
     "kind of error", "tanks", "bodies", "median place / R", "worst", "missed", "spurious", "with intervals",
-    "hold change", "hold area", "hold strength", "median width of change", "median error of the peak",
+    "hold place", "hold change", "hold area", "hold strength", "median radius of place / R", "median width of change",
+    "median error of the peak",
 ]  # fmt: skip
 
 
 class Outcome(NamedTuple):
-    """**Fields**: `distance` of a body's inclusion, in units of R, infinite if it is missed. `holds` (3,): whether the
-    intervals of change, area and strength contain the truth, None without intervals. `width` of the interval of the
-    logarithm of conductivity, NaN where it is open. `error` of the logarithm of conductivity at the peak.
+    """**Fields**: `distance` of a body's inclusion, in units of R, infinite if it is missed. `holds` (4,): whether the
+    circle of the place and the intervals of change, area and strength contain the truth, None without intervals.
+    `radius` of the circle of the place, in units of R. `width` of the interval of the logarithm of conductivity, NaN
+    where it is open. `error` of the logarithm of conductivity at the peak.
     """
 
     distance: float
-    holds: tuple[bool, bool, bool] | None
+    holds: tuple[bool, bool, bool, bool] | None
+    radius: float
     width: float
     error: float
 
@@ -61,7 +64,7 @@ def run(options: Options) -> Result:
     names = [name for name in (*SET_ON, *KEPT_BACK, "set on", "kept back", "sheets", "solids", "all") if name in rows]
     asked = []
     for name in names:
-        for what, share in zip(("change", "area", "strength"), _coverage(rows[name]), strict=True):
+        for what, share in zip(("place", "change", "area", "strength"), _coverage(rows[name]), strict=True):
             if np.isfinite(share):
                 asked.append(judged(f"{name}: {what} held in 60 to 80 %", f"{share:.0%}", bool(0.6 <= share <= 0.8)))
     every = [one for outcomes, _ in rows.get("all", []) for one in outcomes]
@@ -82,20 +85,22 @@ def run(options: Options) -> Result:
 def outcome(tank: Tank, body: Body, one: Inclusion | None, background: float) -> Outcome:
     """The estimate of a `body` of a tank. `background`: conductivity of the reference."""
     if one is None:
-        return Outcome(np.inf, None, np.nan, np.nan)
+        return Outcome(np.inf, None, np.nan, np.nan, np.nan)
     distance = float(np.linalg.norm(np.array(one.centroid) - body.centre)) / tank.size
     ratio = max(1 + one.peak / background, 1e-3)
     error = abs(float(np.log(ratio / (1 + body.change))))
     if one.contrast_interval is None:
-        return Outcome(distance, None, np.nan, error)
+        return Outcome(distance, None, np.nan, np.nan, error)
     assert one.area_interval is not None
+    assert one.centroid_radius is not None
     assert one.strength_interval is not None
     truth = (body.change, body.measure, body.strength)
     intervals = (one.contrast_interval, one.area_interval, one.strength_interval)
     change, area, strength = (_holds(value, interval) for value, interval in zip(truth, intervals, strict=True))
     low, high = one.contrast_interval
     width = np.nan if low is None or high is None else float(np.log((1 + high) / (1 + low)))
-    return Outcome(distance, (change, area, strength), width, error)
+    radius = one.centroid_radius / tank.size
+    return Outcome(distance, (distance <= radius, change, area, strength), radius, width, error)
 
 
 def _holds(value: float, interval: tuple[float | None, float | None]) -> bool:
@@ -104,9 +109,9 @@ def _holds(value: float, interval: tuple[float | None, float | None]) -> bool:
 
 
 def _coverage(rows) -> np.ndarray:
-    """Fractions of bodies with intervals whose change, area and strength they contain."""
+    """Fractions of bodies with intervals whose place, change, area and strength they contain."""
     held = [one.holds for outcomes, _ in rows for one in outcomes if one.holds is not None]
-    return np.mean(held, axis=0) if held else np.full(3, np.nan)
+    return np.mean(held, axis=0) if held else np.full(4, np.nan)
 
 
 def _row(name: str, rows) -> list[str]:
@@ -118,8 +123,10 @@ def _row(name: str, rows) -> list[str]:
     counts = [str(np.isinf(places).sum()), str(sum(one for _, one in rows))]
     given = sum(one.holds is not None for one in every)
     shares = [f"{share:.0%}" if np.isfinite(share) else "" for share in _coverage(rows)]
+    radii = np.array([one.radius for one in every])
+    radius = f"{np.nanmedian(radii):.3f}" if np.isfinite(radii).any() else ""
     spreads = [f"× {np.exp(np.nanmedian(one)):.2f}" if np.isfinite(one).any() else "" for one in (widths, errors)]
-    return [name, str(len(rows)), str(len(every)), *figures, *counts, str(given), *shares, *spreads]
+    return [name, str(len(rows)), str(len(every)), *figures, *counts, str(given), *shares, radius, *spreads]
 
 
 def _line(tank: Tank, outcomes: list[Outcome]) -> str:

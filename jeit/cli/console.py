@@ -166,7 +166,8 @@ def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, *, background:
 
 
 def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Table:
-    """Create a table of fitted bodies with 68 % intervals of their size, change of conductivity and strength.
+    """Create a table of fitted bodies with 68 % intervals of their size, change of conductivity and strength, and the
+    68 % radius of their place.
 
     `background`: conductivity of the reference, S/m (2-D: S). If the data leave an end of an interval open, only the
     other end is given.
@@ -184,7 +185,7 @@ def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Tabl
         )
         rows.append([size, change, strength])
     table = _inclusion_table_with(inclusions, [f"{noun}\n/ {unit}", "change\n/ %", f"strength\n/ {unit}"], rows)
-    table.caption = "below size, change and strength their 68 % intervals; places have none"
+    table.caption = "below: the 68 % radius of the place, and 68 % intervals"
     table.caption_justify = "left"
     return table
 
@@ -221,7 +222,10 @@ def _inclusion_table_with(inclusions: "Sequence[Inclusion]", columns: list[str],
             column.justify = "right"
         for inclusion, row in zip(inclusions, rows, strict=True):
             kind = f"{inclusion.kind}{separator}column" if inclusion.is_column else inclusion.kind
-            table.add_row(kind, *(f"{1e3 * value:.1f}" for value in inclusion.centroid), *row)
+            place = [f"{1e3 * value:.1f}" for value in inclusion.centroid]
+            if inclusion.centroid_radius is not None:
+                place[-1] += f"\n±{1e3 * inclusion.centroid_radius:.2g}"
+            table.add_row(kind, *place, *row)
         return table
 
     table_on_one_line = table_of(" ")

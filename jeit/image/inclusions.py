@@ -80,7 +80,9 @@ class Inclusion(Module):
     whether the region lies on a surface in space, so that it has an area although its centroid has three coordinates;
     `form`: shape of an inclusion that was fitted to data as a body in a solid, else None. Where they were estimated:
     `contrast_interval`: 68 % interval of the change relative to the background; `area_interval`: of the area, m²,
-    or volume, m³; `strength` and `strength_interval`: see `jeit.inverse.shapes.Quantities`.
+    or volume, m³; `strength` and `strength_interval`: see `jeit.inverse.shapes.Quantities`; `centroid_radius`: radius,
+    metres, of the circle (in a solid, of the ball) about `centroid` that holds the true centroid with a probability of
+    68 %.
 
     **Example:**
 
@@ -100,6 +102,7 @@ class Inclusion(Module):
     area_interval: Interval | None = None
     strength: float | None = None
     strength_interval: Interval | None = None
+    centroid_radius: float | None = None
 
     @property
     def is_solid(self) -> bool:

@@ -412,6 +412,7 @@ def _body_inclusion(body: Star | Ellipsoid, background: float) -> Inclusion:
             area_interval=quantities.measure_interval,
             strength=quantities.strength,
             strength_interval=quantities.strength_interval,
+            centroid_radius=quantities.centroid_radius,
         )
     inclusion = Inclusion(body.sign, centroid, body.measure, body.sign * body.contrast, form=_form(body))
     return _with_change(inclusion, background)

@@ -290,10 +290,13 @@ def _inclusion_report(result: ImagedDifference, inclusion: Inclusion) -> dict[st
 
 
 def _interval_report(inclusion: Inclusion) -> dict[str, Any]:
-    """68 % intervals of the estimated properties of a body, None at an open end; empty if none were estimated."""
+    """68 % radius of the place of a body, and 68 % intervals of its properties, None at an open end; empty if none were
+    estimated."""
     if inclusion.contrast_interval is None:
         return {}
     return {
+        "centroid_radius": inclusion.centroid_radius,
+        "centroid_radius_unit": "m",
         "contrast_interval": inclusion.contrast_interval,
         "volume_interval" if inclusion.is_solid else "area_interval": inclusion.area_interval,
         "strength": inclusion.strength,

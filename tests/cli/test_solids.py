@@ -82,6 +82,7 @@ def test_from_description_to_picture(body, run, tmp_path):
     assert found["kind"] == "conductive"
     size = {"volume", "volume_unit"} if body == "solid" else {"area", "area_unit", "area_interval"}
     assert {key for key in found if key.startswith(("area", "volume"))} == size
+    assert ("centroid_radius" in found) == (body == "mesh")
     assert found.get("volume_unit", found.get("area_unit")) == ("m³" if body == "solid" else "m²")
     assert (tmp_path / "out" / "image.vtu").is_file() == (body == "solid")
     assert ("image.vtu" in printed) == (body == "solid")

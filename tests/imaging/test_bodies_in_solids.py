@@ -1,6 +1,7 @@
 """A strong ball in a tank with plate electrodes, fitted beside a smooth field, with its conductivity and interval."""
 
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -87,6 +88,8 @@ def test_a_ball_is_fitted_beside_a_smooth_field(monkeypatch):
     known, (one,) = body.quantities, result.inclusions
     np.testing.assert_allclose([low, high], background * np.array(known.change_interval))
     assert (one.area, one.area_interval) == (body.volume, known.measure_interval)
+    assert one.centroid_radius == known.centroid_radius
+    assert np.linalg.norm(body.centroid - BALL) < 3 * one.centroid_radius < 0.01
     ratio = 1 + known.change
     assert known.strength == pytest.approx(body.volume * (ratio - 1) / (ratio + 2), rel=0.05)
 
@@ -267,12 +270,15 @@ def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_an
     )
     whole = SimpleNamespace(measurement=frame, reference=frame, mesh=SimpleNamespace(dimension=3))
     image: Any = SimpleNamespace(shapes=shapes, reconstruction=shapes, calibration=calibration, **vars(whole))
-    own = Quantities(2.0, (1.7, 2.3), 3e-5, (2e-5, None), 1.5e-5, (1.4e-5, 1.6e-5))
-    known = include_deviation(own, body(False, np.log(6)), 0.5)
+    own = Quantities(2.0, (1.7, 2.3), 3e-5, (2e-5, None), 1.5e-5, (1.4e-5, 1.6e-5), 1e-3)
+    elsewhere = replace(body(False, np.log(6)), centroid=BALL + np.array([0.0, 0.0, 0.005]))
+    known = include_deviation(own, body(True, np.log(3)), elsewhere, 0.5)
+    assert known.centroid_radius == pytest.approx(0.005)
+    assert include_deviation(own, body(True, np.log(3)), body(False, np.log(6)), 0.5).centroid_radius == 1e-3
     np.testing.assert_allclose(known.change_interval, (1.7, 6 * np.exp(0.5) - 1))
     assert known.measure_interval == (2e-5, None)
     np.testing.assert_allclose(known.strength_interval, (1.4e-5, 3e-5 * 5 / 8))
-    assert include_deviation(own, None, np.nan) == own
+    assert include_deviation(own, body(True, np.log(3)), None, np.nan) == own
     (doubt,) = ImagedDifference.doubts.fget(image)  # pyright: ignore
     assert "x 12 mm, y -25 mm may as well be no column but an ellipsoid, of 6 times the background and 30 cm³" in doubt
     bodies = image_report._shapes_report(image)["bodies"]  # pyright: ignore

@@ -1,6 +1,7 @@
-"""Contrast, area and strength of bodies with their intervals, in tanks that differ from their description."""
+"""Place, contrast, area and strength of bodies with their intervals, in tanks that differ from their description."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from jeit.inverse.channels import Data
 from jeit.inverse.placement import ModelError
 from jeit.inverse.shapes import Accuracy, StarPrior, ellipsoid, reconstruct_shapes
 from jeit.inverse.shapes.problem import ShapeProblem, SmoothField
-from jeit.inverse.shapes.quantities import _FixedContrastFit, _summary
+from jeit.inverse.shapes.quantities import _FixedContrastFit, _summary, centroid_radius
 from jeit.inverse.shapes.search import _FitSetting
 from jeit.mesh import centroids, measures
 
@@ -54,7 +55,7 @@ def test_quantities_of_a_fitted_body_and_wider_intervals_by_model_errors(monkeyp
     inside = np.linalg.norm(middle - [0.02, 0.035], axis=1) < radius
     voltages = np.asarray(model.voltages(SIGMA * np.where(inside, 3.0, 1.0)))
     noise = 0.003 * np.abs(voltages)
-    widths = []
+    widths, radii = [], []
     for error in (None, ModelError(np.diag(np.repeat([1e-3, 0.3], 16)))):
         found = reconstruct_shapes(
             model, voltages, SIGMA, start=[(1, (0.02, 0.03), 0.02)], noise=noise, prior=StarPrior(modes=1),
@@ -68,7 +69,41 @@ def test_quantities_of_a_fitted_body_and_wider_intervals_by_model_errors(monkeyp
         assert one.contrast == pytest.approx(np.log1p(one.quantities.change))
         low, high = one.quantities.change_interval
         widths.append(high - low)
+        radii.append(one.quantities.centroid_radius)
     assert widths[1] > 1.2 * widths[0]
+    assert radii[1] > 1.2 * radii[0] > 0
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_radius_of_a_place_holds_68_percent_of_a_posterior(dimension):
+    """Of centroids that depend linearly on the coefficients of the second of two bodies, against samples; with an error
+    of 10 % of the distance from the middle of the mesh, and about another centre."""
+    random = np.random.default_rng(dimension)
+    size, number = 5, 11
+    factor, slope = random.normal(size=(number, number)), 1e-3 * random.normal(size=(dimension, size))
+    middle, centroid, shown = 0.3, 0.3 + 0.02 * np.arange(1, dimension + 1), np.full(dimension, 2e-3)
+
+    def body(k, coefficients):
+        assert k == 1
+        return SimpleNamespace(centroid=centroid + slope @ coefficients[1 + size :])
+
+    covariance = factor @ factor.T
+    problem = SimpleNamespace(
+        model=SimpleNamespace(mesh=SimpleNamespace(points=middle + np.array([[-1.0] * dimension, [1.0] * dimension]))),
+        covariance=lambda fit: covariance,
+        deviations=lambda fit: np.sqrt(np.diag(covariance)),
+    )
+    bodies = SimpleNamespace(body=body, prior=SimpleNamespace(size=size), span=2.0)
+    fit = SimpleNamespace(bodies=bodies, coefficients=np.zeros(number))
+    samples = random.normal(size=(100_000, number)) @ factor.T
+    offsets = samples[:, 1 + size :] @ slope.T + 0.1 * random.normal(size=(100_000, 1)) * (centroid - middle)
+    accuracy = Accuracy(np.ones(1), None, size=0.1, strength=0.0)  # pyright: ignore
+    radius = centroid_radius(problem, fit, 1, centroid, accuracy)  # pyright: ignore
+    assert np.mean(np.linalg.norm(offsets, axis=1) < radius) == pytest.approx(0.68, abs=0.015)
+    displaced = centroid_radius(problem, fit, 1, centroid - shown, accuracy)  # pyright: ignore
+    assert displaced == pytest.approx(np.hypot(radius, np.linalg.norm(shown)))
+    wider = centroid_radius(problem, fit, 1, centroid, accuracy._replace(strength=0.1))  # pyright: ignore
+    assert wider > 1.02 * radius
 
 
 @pytest.mark.slow
@@ -118,7 +153,8 @@ def test_quantities_in_a_tank_that_differs_from_its_description(change, radius):
     """Within twice their intervals. Without model errors they were wrong by up to two orders of magnitude."""
     result = imaged(change, radius)
     (one,) = result.inclusions
-    assert np.linalg.norm(np.array(one.centroid) - [0.02, 0.035]) < 0.02 * RADIUS
+    distance = np.linalg.norm(np.array(one.centroid) - [0.02, 0.035])
+    assert distance < min(0.02 * RADIUS, 2 * one.centroid_radius)
     area = np.pi * radius**2
     for value, interval in (
         (change, one.contrast_interval),

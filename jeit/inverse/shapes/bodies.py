@@ -91,12 +91,13 @@ class Quantities:
     **Fields**: `change`, `change_interval`: change of conductivity relative to the background; `measure`,
     `measure_interval`: area, m², or volume, m³; `strength`, `strength_interval`: `measure` times (ρ - 1) / (ρ + n - 1),
     where ρ is the conductivity relative to the background and n the number of axes along which the body is bounded (2
-    in a sheet and for a column, else 3), negative for resistive bodies.
+    in a sheet and for a column, else 3), negative for resistive bodies; `centroid_radius`: radius, metres, of the
+    circle (in a solid, of the ball) about the centroid that holds the true centroid with a probability of 68 %.
 
     **Example:**
 
     ```python
-    known = Quantities(1.0, (0.8, 1.3), 2.8e-3, (2.2e-3, 3.5e-3), 9e-4, (8e-4, 1e-3))
+    known = Quantities(1.0, (0.8, 1.3), 2.8e-3, (2.2e-3, 3.5e-3), 9e-4, (8e-4, 1e-3), centroid_radius=5e-4)
     known.change_interval
     ```
     """
@@ -107,6 +108,7 @@ class Quantities:
     measure_interval: Interval
     strength: float
     strength_interval: Interval
+    centroid_radius: float = float("nan")
 
 
 TINY = 1e-30

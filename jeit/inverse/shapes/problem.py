@@ -193,9 +193,13 @@ class ShapeProblem:
         """-log evidence of the bodies of a fit, up to a constant, including the prior odds against their kinds."""
         return fit.cost + 0.5 * float(np.linalg.slogdet(self._hessian(fit))[1]) + fit.bodies.odds
 
+    def covariance(self, fit: Fit) -> Float[np.ndarray, "n n"]:
+        """Posterior covariance of the coefficients, from Laplace's approximation."""
+        return np.linalg.inv(self._hessian(fit))
+
     def deviations(self, fit: Fit) -> Float[np.ndarray, " n"]:
         """Posterior standard deviations of the coefficients, from Laplace's approximation."""
-        return np.sqrt(np.diag(np.linalg.inv(self._hessian(fit))))
+        return np.sqrt(np.diag(self.covariance(fit)))
 
     def _hessian(self, fit: Fit) -> Float[np.ndarray, "n n"]:
         """Hessian H at the minimum of the cost."""

@@ -1,4 +1,4 @@
-"""Contrast, area or volume, and strength of bodies, with credible intervals.
+"""Place, contrast, area or volume, and strength of bodies, with credible intervals.
 
 To first order a small body's voltages depend on its strength alone: its area times (ρ - 1) / (ρ + 1), ρ being its
 conductivity relative to the background, or in a solid its volume times (ρ - 1) / (ρ + 2). Contrast and size are
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.interpolate import PchipInterpolator
-from scipy.special import ndtri
+from scipy.special import chdtri, ndtri
 
 from jeit.arguments.checks import Interval
 from jeit.inverse.placement import ModelError, Uncertainty
@@ -42,6 +42,13 @@ _FIT_LIMITS, _LOG_POSTERIOR_DROP = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0
 _OPEN_END_RISE = 1.0
 # Probabilities of the ends of an interval, and numbers of contrasts and of normal deviates of the posterior's sample.
 _INTERVAL_PROBABILITIES, _NUM_CONTRASTS, _NUM_NORMAL_DEVIATES = (0.16, 0.84), 240, 31
+# Probability that the circle about a centroid holds the true one; and the step of the finite differences of a centroid,
+# in standard deviations of a coefficient.
+_CENTROID_PROBABILITY, _CENTROID_STEP = 0.68, 0.1
+# Standard deviation of a body's place due to an error of the fields, as a share of half the width of the domain times
+# the relative error: a body's voltages change by a factor of about e² over half the width, and a fifth of the error is
+# assumed to resemble a displacement.
+_FIELD_DISPLACEMENT = 0.1
 
 
 class Accuracy(NamedTuple):
@@ -75,13 +82,51 @@ def with_quantities(
         conductivity = problem.background * np.exp(fit.bodies.image(fit.coefficients).image)
         rows = accuracy.model_error.voltages(problem.model, conductivity, problem.background)
         problem = problem.with_errors(np.asarray(problem.data.weight)[:, None] * rows)
+    shown_centroids = [fit.bodies.body(int(k), fit.coefficients).centroid for k in order]
     fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
-    return [quantify(problem, fit, int(k), float(unmodelled[k]), accuracy) for k in order]
+    return [
+        replace(
+            quantify(problem, fit, int(k), float(unmodelled[k]), accuracy),
+            centroid_radius=centroid_radius(problem, fit, int(k), centroid, accuracy),
+        )
+        for k, centroid in zip(order, shown_centroids, strict=True)
+    ]
 
 
-def include_deviation(quantities: Quantities, other: Ellipsoid | None, deviation: float) -> Quantities:
-    """Widen the intervals of the `quantities` so that they include those of the `other` description of the body, if
-    there is one, whose contrast has this standard deviation."""
+def centroid_radius(
+    problem: ShapeProblem, fit: Fit, k: int, shown_centroid: Float[np.ndarray, " d"], accuracy: Accuracy
+) -> float:
+    """Radius, metres, about the `shown_centroid` of body k that holds the true centroid with a probability of 68 %.
+
+    The posterior of the centroid is that of the coefficients of a `fit`, linearised. Errors of the described lengths
+    and of the fields are added. The distribution of the squared distance is approximated by a scaled χ² distribution
+    with the same mean and variance (Satterthwaite, Biometrics Bulletin 2 (1946) 110).
+    """
+    bodies, prior_size = fit.bodies, fit.bodies.prior.size
+    indices = np.arange(1 + k * prior_size, 1 + (k + 1) * prior_size)
+    deviations = problem.deviations(fit)
+    slopes = []
+    for index in indices:
+        step = np.zeros(len(fit.coefficients))
+        step[index] = _CENTROID_STEP * deviations[index]
+        ends = [bodies.body(k, fit.coefficients + direction * step).centroid for direction in (-1, 1)]
+        slopes.append((ends[1] - ends[0]) / (2 * step[index]))
+    slope = np.stack(slopes, axis=1)
+    centroid = bodies.body(k, fit.coefficients).centroid
+    points = np.asarray(problem.model.mesh.points)
+    scaling_error = accuracy.size * (centroid - (points.min(axis=0) + points.max(axis=0)) / 2)
+    field_error = _FIELD_DISPLACEMENT * accuracy.strength * bodies.span / 2
+    covariance = slope @ problem.covariance(fit)[np.ix_(indices, indices)] @ slope.T
+    covariance += np.outer(scaling_error, scaling_error) + field_error**2 * np.eye(len(centroid))
+    variances = np.linalg.eigvalsh(covariance)
+    scale = np.sum(variances**2) / np.sum(variances)
+    squared_radius = scale * chdtri(np.sum(variances) / scale, 1 - _CENTROID_PROBABILITY)
+    return float(np.sqrt(squared_radius + np.sum((centroid - shown_centroid) ** 2)))
+
+
+def include_deviation(quantities: Quantities, body: Ellipsoid, other: Ellipsoid | None, deviation: float) -> Quantities:
+    """Widen the intervals of the `quantities` of a `body` so that they include those of the `other` description of the
+    body, if there is one, whose contrast has this standard deviation."""
     if other is None:
         return quantities
     changes = np.expm1(other.sign * (other.contrast + deviation * np.array([-1, 1]))).tolist()
@@ -91,6 +136,7 @@ def include_deviation(quantities: Quantities, other: Ellipsoid | None, deviation
         change_interval=_interval_hull(quantities.change_interval, changes),
         measure_interval=_interval_hull(quantities.measure_interval, [other.volume]),
         strength_interval=_interval_hull(quantities.strength_interval, [strength]),
+        centroid_radius=max(quantities.centroid_radius, float(np.linalg.norm(other.centroid - body.centroid))),
     )
 
 

@@ -227,8 +227,8 @@ def reconstruct_shapes(
         unmodelled = unmodelled_deviations(problem, fitted, free_fit)
         quantities = with_quantities(setting.weighted(exact_data).problem(level), fitted, accuracy, unmodelled, order)
         quantities = [
-            include_deviation(values, alternates[k][0], alternates[k][1])
-            for values, k in zip(quantities, order, strict=True)
+            include_deviation(values, body, *alternates[k])
+            for values, body, k in zip(quantities, found_bodies, order, strict=True)
         ]
         found_bodies = [body.with_quantities(values) for body, values in zip(found_bodies, quantities, strict=True)]
     return ShapeReconstruction(
