@@ -64,8 +64,7 @@ def random_walk(
 
 
 def draw_gains(key: Array, spread: float, num_channels: int) -> Float[np.ndarray, " M"]:
-    """Draw log-normal gains of `num_channels` channels, with median 1; `spread`: standard deviation of the
-    logarithm."""
+    """Draw log-normal gains of channels (M,), with median 1; `spread`: standard deviation of the logarithm."""
     return np.exp(spread * standard_normal(key, (num_channels,)))
 
 

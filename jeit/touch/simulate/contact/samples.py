@@ -88,8 +88,7 @@ class Samples(NamedTuple):
         )
 
     def lattice_points(self, cells: Int[np.ndarray, " c"], fineness: int) -> Float[np.ndarray, "c s d"]:
-        """Return sample points (c, s, d) in the given cells, on a lattice whose number of points grows with
-        `fineness`."""
+        """Return sample points (c, s, d) in the given cells, on a lattice whose points increase with `fineness`."""
         if self.curved is None:
             return lattice(self.corners[cells], fineness)
         return _curved_lattice(self.corners[cells], self.curved.corners[cells], fineness)
@@ -138,12 +137,11 @@ class Samples(NamedTuple):
     def to_indenter_frames(
         self, presses: Sequence[Press], cells: Int[np.ndarray, "b c"], points: Float[np.ndarray, "b q d"]
     ):
-        """Transform points (b, q, d) to the frames of b indenters, which move along the inward normal at the place
-        pressed.
+        """Transform points (b, q, d) to the frames of b indenters.
 
-        Returns the coordinates of the points in the frames (b, q, 2); the distance (b, q) of the points below the
-        tangent plane at the place pressed, 0 on a flat skin; and the ratio (b, c) of each cell's area projected along
-        this normal to its area.
+        An indenter moves along the inward normal at the place pressed. Returns the coordinates of the points in the
+        frames (b, q, 2); the distance (b, q) of the points below the tangent plane at the place pressed, 0 on a flat
+        skin; and the ratio (b, c) of each cell's area projected along this normal to its area.
         """
         cos, sin = (function([press.angle for press in presses])[:, None] for function in (np.cos, np.sin))
         if self.curved is None:
@@ -157,8 +155,7 @@ class Samples(NamedTuple):
 
 
 def lattice(corners: Float[np.ndarray, "m k d"], fineness: int) -> Float[np.ndarray, "m s d"]:
-    """Return evenly spaced points (m, s, d) in cells with `corners` (m, k, d); their number s increases with
-    `fineness`."""
+    """Return evenly spaced points (m, s, d) in cells with `corners` (m, k, d); s increases with `fineness`."""
     return np.einsum("sk,mkd->msd", _barycentric_weights(corners.shape[1], fineness), corners)
 
 
