@@ -1,3 +1,3 @@
-"""Commands for touches, and for models learnt from them."""
+"""Commands of `jeit` that find and classify touches, and train models of touches."""
 
 from __future__ import annotations
