@@ -240,8 +240,8 @@ def touch_attributes(
 ) -> TouchAttributes:
     """Measure the resolution of a real or simulated skin: its five attributes of touch.
 
-    Discs press on the skin, most of them with the usual diameter and load, some with up to four times the diameter, or
-    with a quarter to four times the load.
+    Discs press on the skin, most of them with the usual diameter and load, some with a quarter to four times the load,
+    or with up to four times the diameter under the same pressure.
 
     **Arguments:**
 

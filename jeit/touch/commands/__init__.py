@@ -1,3 +1,3 @@
-"""Commands of `jeit` that find and classify touches, and train models of touches."""
+"""Commands that find or classify touches, or train models for that purpose."""
 
 from __future__ import annotations

@@ -65,8 +65,7 @@ class AbstractFinder(Module):
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Return the smoothed image of changes (m,), and a copy of this image that is zero below the noise floor."""
         change = self.smoothing @ change
-        # `smoothing @ deviation` is an upper bound of a smoothed cell's standard deviation, however cells are
-        # correlated.
+        # Upper bound of the standard deviation of a cell of the smoothed image, however cells are correlated.
         return change, np.where(change > self.floor * (self.smoothing @ noise.deviation), change, 0.0)
 
 

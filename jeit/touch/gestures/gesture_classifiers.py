@@ -69,8 +69,7 @@ class Scale:
 
     @classmethod
     def from_features(cls, values: Float[np.ndarray, "n k"]) -> "Scale":
-        """Estimate the transform from n samples of k features (n, k); `size` is the median of |x|. Constant features
-        become zero."""
+        """Estimate the transform from features (n, k); `size` is the median of |x|. Constant features become zero."""
         size = np.median(np.abs(values), axis=0)
         size = np.where(size > 0, size, np.maximum(np.abs(values).max(axis=0), 1e-300))
         logs = np.sign(values) * np.log1p(np.abs(values) / size)

@@ -124,9 +124,9 @@ class TouchWatch:
         """Create a watch for a skin whose frames come at `rate`, frames/s.
 
         `untouched` (u, M): first frames of the skin, untouched, volts. The touch level is that stored in `model`; if
-        more than a tenth of the untouched frames exceed this level, it is estimated from these frames. Raises
-        `ValueError` for a model that was learnt on another skin or does not say on which, for untouched frames from
-        which no level can be estimated, and for rates and patience that are not positive.
+        more than a tenth of the untouched frames exceed this level, a higher level is estimated from these frames.
+        Raises `ValueError` for a model that was learnt on another skin or does not say on which, for untouched frames
+        from which no level can be estimated, and for rates and patience that are not positive.
         """
         check_kind("images", images, TouchImages, "TouchImages, as of TouchImages.prepare(description, untouched)")
         check_kind("model", model, GestureModel, "a GestureModel, as of GestureModel.read(path)")

@@ -77,9 +77,9 @@ class LabelledClips:
         """Create labelled clips from `recordings` and their classes `labels`.
 
         `groups`: the group of each clip; by default each clip is a group of its own. Clips with different numbers of
-        channels are mixed to one channel. `notes` are stored together with remarks on such mixing. Raises `ValueError`
-        if the numbers of recordings, labels and groups differ, for recordings that are not recordings of samples, and
-        for fewer than two classes.
+        channels are mixed to one channel. `notes` are stored together with remarks on mixed channels and on sampling
+        rates that differ. Raises `ValueError` if the numbers of recordings, labels and groups differ, for recordings
+        that are not recordings of samples, and for fewer than two classes.
         """
         check_kind("recordings", recordings, Sequence, "a list of Recording, as of read_recording(path)")
         class_names = np.asarray(labels)

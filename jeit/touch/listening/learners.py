@@ -1,8 +1,8 @@
 """Classifiers of sound windows: a network, boosted trees on hand-made features, and linear discriminants.
 
 The discriminants use the hand-made features alone, or with the spectrum in all bands. The method `learn` of each
-learner returns a classifier. The classifier's `log_odds` computes log-odds of the classes 0 … C − 1, and its
-`to_stored` the arrays that are stored in a file.
+learner returns a classifier. Its `log_odds` are those of the classes 0 … C − 1; its `to_stored` returns arrays to store
+in a file.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ from jeit.touch.listening.modality_network import (
 from jeit.touch.listening.window_features import Levels, sound_features, spectrum_features
 from jeit.touch.training import TrainingPlan
 
-# Boosted trees: number of rounds; number of leaves of a tree; minimum number of windows in a leaf for large training
-# sets.
+# Boosted trees: number of rounds; number of leaves of a tree; minimum number of windows in a leaf in large sets.
 _NUM_ROUNDS, _NUM_LEAVES, _MIN_LEAF_WINDOWS = 100, 15, 10
 BATCHES = 1500
 """Default of the maximum number of training batches."""
@@ -63,7 +62,7 @@ class TrainingSet(NamedTuple):
 
 @dataclass(frozen=True)
 class NetworkListener:
-    """A trained network that classifies sound windows, and the `levels` that compute its input from feature images."""
+    """Trained network that classifies sound windows; `levels` converts feature images to its input."""
 
     network: ModalityNetwork
     levels: Levels
@@ -75,18 +74,18 @@ class NetworkListener:
         return cls(network, levels, NetworkAnswers(network))
 
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
-        """Compute the log-odds (W, C) of the C classes in W windows, given by their feature images."""
+        """Compute the log-odds (W, C) of C classes for W windows."""
         return self.answers.log_odds(self.levels(images))
 
     def to_stored(self) -> tuple[dict[str, Any], Any]:
-        """Return what is stored of the classifier in a file: a header and arrays."""
+        """Return the header and the arrays to store in a classifier's file."""
         levels = {name: getattr(self.levels, name).tolist() for name in Levels.__dataclass_fields__}
         return {"levels": levels}, self.network
 
 
 @dataclass(frozen=True)
 class NetworkLearner:
-    """Trains a network by the schedule that `plan(windows, batches=)` returns for a number of windows."""
+    """Trains a network by the schedule that `plan(windows, batches=)` returns."""
 
     plan: Callable[..., TrainingPlan]
 
@@ -119,7 +118,7 @@ class NetworkLearner:
 
     @staticmethod
     def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of the classifier's arrays in a file, whose header is `head`."""
+        """Create arrays with the shapes of those in a file with the header `head`."""
         return ModalityNetwork.draw(jax.random.key(0), rows, 41, classes)
 
     @staticmethod
@@ -156,11 +155,11 @@ class TreesListener:
         return cls(Forest.from_boosted_classifier(model))
 
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
-        """Compute the log-odds (W, C) of the C classes in W windows, given by their feature images."""
+        """Compute the log-odds (W, C) of C classes for W windows."""
         return self.forest.decision_function(sound_features(images))
 
     def to_stored(self) -> tuple[dict[str, Any], Any]:
-        """Return what is stored of the classifier in a file: a header and arrays."""
+        """Return the header and the arrays to store in a classifier's file."""
         forest = self.forest
         head = {"trees": forest.value.shape[0], "nodes": forest.value.shape[1], "depth": forest.depth}
         arrays = [forest.feature, forest.left, forest.right, forest.threshold, forest.value, forest.start]
@@ -168,7 +167,7 @@ class TreesListener:
 
     @staticmethod
     def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of the classifier's arrays in a file, whose header is `head`."""
+        """Create arrays with the shapes of those in a file with the header `head`."""
         node_shape = (int(head["trees"]), int(head["nodes"]))
         shapes = [(node_shape, np.int32)] * 3 + [
             (node_shape, np.float32),
@@ -206,8 +205,8 @@ class TreesListener:
 class LinearListener:
     """Classifies sound windows by a linear discriminant with Ledoit-Wolf shrinkage of the covariance.
 
-    `features`: function that computes k features (W, k) of W windows; `weights` (k, C) and `offset` (C,) of the C
-    classes apply to features standardised by their `mean` (k,) and `deviation` (k,).
+    `features` computes k features (W, k) of W windows; `weights` (k, C) and `offset` (C,) apply to features
+    standardised by their `mean` (k,) and `deviation` (k,).
     """
 
     features: Callable[[SoundImages], Float[np.ndarray, "W k"]]
@@ -217,22 +216,22 @@ class LinearListener:
     offset: Float[np.ndarray, " C"]
 
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
-        """Compute the log-odds (W, C) of the C classes in W windows, given by their feature images."""
+        """Compute the log-odds (W, C) of C classes for W windows."""
         return (self.features(images) - self.mean) / self.deviation @ self.weights + self.offset
 
     def to_stored(self) -> tuple[dict[str, Any], Any]:
-        """Return what is stored of the classifier in a file: a header and arrays."""
+        """Return the header and the arrays to store in a classifier's file."""
         return {}, [np.asarray(array, np.float32) for array in (self.mean, self.deviation, self.weights, self.offset)]
 
 
 @dataclass(frozen=True)
 class LinearLearner:
-    """Fits a linear discriminant to sound windows, on the features (W, k) that `features` computes of W windows."""
+    """Fits a linear discriminant to the features of sound windows that `features` computes."""
 
     features: Callable[[SoundImages], Float[np.ndarray, "W k"]]
 
     def learn(self, training_set: TrainingSet) -> LinearListener:
-        """Fit a linear discriminant; all classes have the same prior probability, whatever their number of windows."""
+        """Fit the discriminant to a training set; all classes have the same prior probability, however many windows."""
         features = self.features(training_set.images)
         mean, deviation = features.mean(axis=0), features.std(axis=0)
         # Features that are constant except for rounding errors carry no information, and would make the covariance
@@ -249,7 +248,7 @@ class LinearLearner:
         return LinearListener(self.features, mean, deviation, weights, offset)
 
     def stored_shapes(self, head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of the classifier's arrays in a file, whose header is `head`."""
+        """Create arrays with the shapes of those in a file with the header `head`."""
         num_inputs = self.features(_NO_WINDOWS).shape[1]
         return [
             jax.numpy.zeros(shape, np.float32)

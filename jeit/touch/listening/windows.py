@@ -86,8 +86,10 @@ class Windows:
 
     @classmethod
     def from_clips(cls, clips: LabelledClips, report: Callable[[str], None]) -> "Windows":
-        """Select the windows of each clip that are at most 20 dB below its loudest. Raises `ValueError` for clips
-        without finite samples."""
+        """Select the loud windows of each clip, at most 20 dB below its loudest frame.
+
+        Raises `ValueError` for clips without finite samples.
+        """
         names, clip_labels = np.unique(clips.labels, return_inverse=True)
         clip_groups = np.unique(clips.groups, return_inverse=True)[1]
         single_group_labels = {
@@ -162,8 +164,7 @@ class Windows:
         return TrainingSet(self.images[rows], self.labels[rows], groups, self.classes, key, batches, checkpoint, report)
 
     def predict_clips(self, odds: Float[np.ndarray, "W C"]) -> tuple[np.ndarray, np.ndarray]:
-        """Predict the class of each held-out clip from the log-odds of its windows; return predicted and true
-        classes."""
+        """Predict the class of each held-out clip from the log-odds of its windows; return it and the true class."""
         is_held_out = np.isfinite(odds).all(axis=1)
         log_probabilities = odds[is_held_out] - np.logaddexp.reduce(odds[is_held_out], axis=1, keepdims=True)
         clips, clip_rows = np.unique(self.clip[is_held_out], return_inverse=True)

@@ -86,7 +86,10 @@ def plot_timeline(
 
     **Example:**
 
-    ```python ax = plot_timeline(named_touches, gestures.names) ax.figure.savefig("timeline.png") ```
+    ```python
+    ax = plot_timeline(named_touches, gestures.names)
+    ax.figure.savefig("timeline.png")
+    ```
     """
     check_named_touches(touches)
     ax = axes_or_new(ax, (9.0, 2.6))

@@ -98,8 +98,8 @@ def draw_learnt_images(learnt: LearntImages):
 class DeepestFrame(NamedTuple):
     """The frame of a recording in which the skin is indented most.
 
-    **Fields**: `number`: number of the frame in the file; `depth`: maximum depth of indentation in the frame, metres;
-    `middle` (2,): centroid of the indentation, metres, NaN if no depth exceeds the noise floor.
+    **Fields**: `number`: number of the frame in the file; `depth`: maximum depth in the frame, metres; `middle` (2,):
+    centroid of the indentation, metres, NaN if no depth exceeds the noise floor.
     """
 
     number: int
@@ -112,8 +112,8 @@ class WrittenDepths:
     """Summary of the depth maps that `write_depths` has written.
 
     **Fields**: `number`: number of frames; `imaged`: number of frames that were imaged; `deepest`: the frame with the
-    largest depth; `latency` (K,): computing time of K imaged frames, seconds: of all frames, or, for many frames, of an
-    evenly spaced sample.
+    largest depth; `latency` (K,): computing time of K imaged frames, seconds; for many frames, of an evenly spaced
+    sample.
     """
 
     number: int
@@ -131,7 +131,7 @@ def write_depths(
     progress: Callable[[FrameDepth], None] | None = None,
     drawing: Callable[[str], None] | None = None,
 ) -> WrittenDepths:
-    """Write the depth maps that a network estimated from frames to a folder: a table, arrays, a picture and a report.
+    """Write the depth maps that a network estimated from the frames of a recording to a folder.
 
     `frames.csv` gets a line for each frame as it comes: `x_m`, `y_m`, the centroid of the indentation, and `depth_m`,
     its maximum depth. At the end, `depth.npz` with all maps, `depth.png` and `report.json` are written. The number of
@@ -139,9 +139,9 @@ def write_depths(
 
     `frame_depths`: the frames that `stream_depths` yields; `name`: name of the recording. Maps of refused frames are
     NaN; if no depth exceeds the noise floor, the centroid is left empty. `progress` is called with every frame;
-    `drawing` is called with what is written at the end, before it is written. Each file is written completely or not at
-    all. Raises `ValueError` if `folder` cannot be a folder, and if no frame was imaged, in which case no file remains;
-    `OSError` on a full disk.
+    `drawing` is called with the name of each step at the end, as by `write_stream`. Each file is written completely or
+    not at all. Raises `ValueError` if `folder` cannot be a folder, and if no frame was imaged, in which case no file
+    remains; `OSError` on a full disk.
     """
     result_folder = results_folder(folder, DEPTH_FILES)
     for file_name in DEPTH_FILES[1:]:
@@ -238,8 +238,7 @@ class _FrameStatistics:
 def _draw_depths(
     maps: Float[np.ndarray, "k rows columns"], numbers: Int[np.ndarray, " k"], deepest: float, network: ImageNetwork
 ):
-    """Draw k depth maps (k, rows, columns) of the frames `numbers` (k,); `deepest`: maximum depth in the recording,
-    m."""
+    """Draw the depth maps of k frames with the given `numbers`; `deepest`: maximum depth of all frames, metres."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_depth_map

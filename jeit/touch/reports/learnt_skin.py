@@ -16,9 +16,9 @@ _PACKAGES = ("jeit", "numpy", "scikit-learn", "skops")
 
 
 def write_learnt_skin(skin: LearntSkin, folder: str | Path) -> None:
-    """Write a learnt skin, a report and a picture of its errors into `folder`, which is created if needed.
+    """Write a learnt skin and its errors into `folder`: `skin.skops`, `report.json` and `learning.png`.
 
-    The files are `skin.skops`, `report.json` and `learning.png`. Raises `ValueError` if `folder` cannot be a folder.
+    Raises `ValueError` if `folder` cannot be a folder.
     """
     with results(folder, SKIN_FILES) as result_folder:
         write_skin(skin, result_folder / "skin.skops")
@@ -29,11 +29,11 @@ def write_learnt_skin(skin: LearntSkin, folder: str | Path) -> None:
 def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str) -> None:
     """Write the touches that a learnt skin predicts from frames to `touches.csv`, `report.json` and `touches.png`.
 
-    `skin`, `name`: names of the skin and of the frames. The table `touches.csv` has a line for each frame, numbered
-    from 0, with columns for the quantities that the skin has learnt: `x_m`, `y_m` (`z_m`), their standard deviations,
-    `force_N`, `std_force_N`, `label`, `probability`, `key_0` … (1 where pressed) with `probability_0` …. The column
-    `unlike` is 1 for frames unlike all frames of the training set, for which nothing is predicted. Raises `ValueError`
-    if `folder` cannot be a folder.
+    `skin`, `name`: names of the skin and the frames. `touches.csv` has a line for each frame, numbered from 0, with
+    columns for the quantities that the skin has learnt: `x_m`, `y_m` (`z_m`), their standard deviations, `force_N`,
+    `std_force_N`, `label`, `probability`, `key_0` … (1 where pressed) with `probability_0` …. The column `unlike` is 1
+    for frames unlike all frames of the training set, for which nothing is predicted. Raises `ValueError` if `folder`
+    cannot be a folder.
     """
     columns = _table_columns(touches)
     dead_channels = np.flatnonzero(~touches.alive.any(axis=0))
@@ -57,7 +57,7 @@ def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str)
 
 
 def report_learnt_skin(skin: LearntSkin) -> dict[str, Any]:
-    """Report the errors of a learnt skin on held-out presses as plain numbers, strings, lists and dictionaries."""
+    """Report a learnt skin's errors on held-out presses as plain numbers, strings, lists and dictionaries."""
     return as_plain_values(
         {
             "presses": skin.name,
@@ -73,7 +73,7 @@ def report_learnt_skin(skin: LearntSkin) -> dict[str, Any]:
 
 
 def summary(name: str, standing: Standing) -> str:
-    """Summarise in one line how well a learnt skin predicts the quantity `name`: place, force, label or keys."""
+    """Summarise in one line how well a skin has learnt the quantity `name`, such as "place"."""
     statistics = _error_statistics(name, standing)
     if name == "place":
         mean, median, high_error, guess_error = (
@@ -121,7 +121,7 @@ def draw_touches(touches: Touches):
 
 
 def _error_statistics(name: str, standing: Standing) -> dict[str, Any]:
-    """Compute error statistics of the quantity `name`, such as "place", on held-out presses."""
+    """Compute error statistics of the quantity `name` on held-out presses."""
     statistics: dict[str, Any] = {"method": standing.method, "presses": len(standing.right)}
     if name in ("place", "force"):
         unit = "m" if name == "place" else "N"

@@ -72,8 +72,7 @@ def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -
 
 
 def report_listener(listener: Listener) -> dict[str, Any]:
-    """Report how accurate a sound classifier is on held-out clips, as plain numbers, strings, lists and
-    dictionaries."""
+    """Report a sound classifier's accuracy on held-out clips as plain numbers, strings, lists and dictionaries."""
     standing, held_out = listener.standing, None
     if standing is not None:
         is_right = standing.held_out == standing.right

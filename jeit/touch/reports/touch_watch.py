@@ -21,8 +21,7 @@ _LEARNING_PACKAGES = ("jeit", "numpy", "scikit-learn", "skops")
 
 
 def write_gestures(learnt: LearntGestures, folder: str | Path, *, name: str = "recordings") -> None:
-    """Write a trained gesture classifier, its report and its confusion matrix into `folder`, which is created if
-    needed.
+    """Write a trained gesture classifier, its accuracy and its confusion matrix into `folder`, created if needed.
 
     The files are `gestures.skops`, `report.json` and `gestures.png`. `name`: name of the recordings. Raises
     `ValueError` if `folder` cannot be a folder.
@@ -58,8 +57,7 @@ def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:
 
 
 def draw_gestures(learnt: LearntGestures):
-    """Draw a gesture classifier's confusion matrix, and the accuracy of each classifier that was tried, as a
-    `Figure`."""
+    """Draw a gesture classifier's confusion matrix, and the accuracy of all classifiers tried, as a `Figure`."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_confusion, plot_tried
@@ -164,8 +162,7 @@ def write_watch(
 
 
 def report_watch(written: WrittenWatch, watch: TouchWatch, name: str) -> dict[str, Any]:
-    """Report classified touches of a stream as plain numbers, strings, lists and dictionaries; unknown values are
-    None."""
+    """Report classified touches as plain numbers, strings, lists and dictionaries; unknown values are None."""
     names, counts = np.unique([touch.gesture for touch in written.touches if not touch.unlike], return_counts=True)
     latencies = written.latency
     return as_plain_values(

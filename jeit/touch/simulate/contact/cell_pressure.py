@@ -149,8 +149,7 @@ def _reach_bounds(support: AbstractSupport, presses: Sequence[Press], indenter_n
 
 
 def _pressures_of_equal_indenters(samples: Samples, support: AbstractSupport, presses: Sequence[Press], cells, is_cell):
-    """Compute pressures (b, c, s) of b presses with the same indenter at the s samples of each of the `cells` (b,
-    c)."""
+    """Compute pressures (b, c, s) of b presses with the same indenter at the s samples of the `cells` (b, c)."""
     points = samples.points[cells]
     sample_shape = points.shape[:-1]
     local_points, fall, area_ratios = samples.to_indenter_frames(

@@ -27,11 +27,10 @@ _UNITS_AND_MEANINGS = {
 
 
 class IndentSet:
-    """A set of `number` random touches drawn from `draws`, with the noise-free voltages of `skin`, determined by
-    `seed`.
+    """A set of `number` random touches drawn from `draws`, with the noise-free voltages of a `skin`.
 
-    `shape`: (rows, columns) of the maps of indentation depth over the skin. `chunk`: number of touches that are
-    simulated and written at once; it also affects the random numbers.
+    `seed`: random seed, which determines the touches. `shape`: (rows, columns) of the maps of indentation depth over
+    the skin. `chunk`: number of touches that are simulated and written at once; it also affects the random numbers.
     """
 
     def __init__(

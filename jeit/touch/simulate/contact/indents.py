@@ -1,5 +1,4 @@
-"""Indents, which are presses of bodies into a skin to a given depth, and distributions of random presses and
-indents."""
+"""Indents, which are presses of bodies into a skin to a given depth; distributions of random presses and indents."""
 
 from __future__ import annotations
 
@@ -229,8 +228,10 @@ def depth_maps(
 
     **Example:**
 
-    ```python depths = depth_maps([[Indent(DiscIndenter(0.02), 2e-3)]], grid(0.06, 0.06, 8, 8)) print(depths.shape) #
-    (1, 64) ```
+    ```python
+    depths = depth_maps([[Indent(DiscIndenter(0.02), 2e-3)]], grid(0.06, 0.06, 8, 8))
+    print(depths.shape)  # (1, 64)
+    ```
     """
     depths = np.zeros((len(touches), *places.shape[:-1]))
     for touch_index, touch in enumerate(touches):

@@ -134,7 +134,7 @@ def water_level(
 
 
 def check_modulus(modulus) -> None:
-    """Raise `ValueError` unless a Young's modulus, pascals, is positive."""
+    """Raise `ValueError` unless an elastic modulus, pascals, is positive."""
     if not (is_number(modulus) and modulus > 0):
         raise ValueError(f"modulus must be positive, in pascals (1e6 for a soft rubber); it is {describe(modulus)}.")
 
@@ -142,7 +142,9 @@ def check_modulus(modulus) -> None:
 class Material(Module):
     """Material of a skin: its mechanical and electrical properties, in SI units.
 
-    To change values: `dataclasses.replace(material("velostat"), noise=0.0)`. **Fields**
+    To change values: `dataclasses.replace(material("velostat"), noise=0.0)`.
+
+    **Fields**
 
     - `conductivity`, `thickness`: conductivity, S/m, and thickness, metres, of the conductor at rest.
     - `support`: mechanical support that carries the load.

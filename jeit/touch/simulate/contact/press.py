@@ -166,9 +166,11 @@ class Press(Module):
 class MovingPress(Module):
     """An indenter that moves over a skin: its load, position and angle in each of T frames.
 
-    Constant values may be given once. **Fields**: `indenter`: the indenter; `load` (T,): load, newtons, 0 while lifted;
-    `position` (T, 2), or (T, 3) on a curved skin: position of the indenter's origin, metres; `angle` (T,): angle by
-    which the indenter is rotated, radians.
+    Constant values may be given once.
+
+    **Fields**: `indenter`: the indenter; `load` (T,): load, newtons, 0 while lifted; `position` (T, 2), or (T, 3) on a
+    curved skin: position of the indenter's origin, metres; `angle` (T,): angle by which the indenter is rotated,
+    radians.
 
     **Example:**
 
@@ -235,8 +237,8 @@ def touches_of(presses) -> list[tuple[Press, ...]]:
 def motions_of(motions, num_frames: int) -> list[MovingPress]:
     """Return the moving presses of a recording as a list; `motions` is one or a list, empty for an untouched skin.
 
-    Raises `ValueError` for anything but moving presses, for a number of frames other than `num_frames`, and if all
-    loads are 0.
+    Raises `ValueError` for anything but moving presses, for a number of frames other than `num_frames`, and for motions
+    without any load.
     """
     motions = [motions] if isinstance(motions, MovingPress) else motions
     check_kind(

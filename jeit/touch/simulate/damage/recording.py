@@ -64,11 +64,10 @@ class ElectrodeFault(Module):
     def changes(
         self, key: Array, model: ForwardModel, conductivity: ArrayLike, seconds: Float[np.ndarray, " T"]
     ) -> Float[np.ndarray, "T M"]:
-        """Compute the changes (T, M) of the voltages of a skin at rest due to the fault, at times `seconds` (T,),
-        volts.
+        """Compute the changes (T, M), volts, of the voltages of a skin at rest due to the fault.
 
-        `conductivity`: conductivity of the skin, S/m (2-D: S). Raises `ValueError` for invalid arguments, and for an
-        electrode that the model does not have.
+        `seconds`: times (T,) of the frames; `conductivity`: conductivity of the skin, S/m (2-D: S). Raises `ValueError`
+        for invalid arguments, and for an electrode that the model does not have.
         """
         check_key(key)
         check_model(model)

@@ -54,8 +54,7 @@ class Manner:
 
     @property
     def medians(self) -> Float[np.ndarray, " 5"]:
-        """Medians (5,) of the parameters `TRAITS` among people, SI units; the last two are 0 for gestures at one
-        place."""
+        """Medians (5,) of the parameters `TRAITS` among people, in SI units; speed and path may be 0."""
         return np.array([*(parameters[0] for parameters in self._word_parameters), self.speed, self.path])
 
     @property
