@@ -1,4 +1,4 @@
-"""Estimate from frames where and how hard a skin is touched, and with which object.
+"""Estimate from frames of voltages where and how hard a skin is touched, and with which object.
 
 There are functions and classes for contacts (detection in images, tracking, loads in newtons), learnt skins (from
 recorded presses, without a model), self-organising maps, gestures, the health of a skin (cuts, failing electrodes,

@@ -1,7 +1,7 @@
 """Five measures of a skin's resolution: the attributes of touch of Silvera Tawil et al. 2011, section IV-A.
 
-Each is computed from recordings of a skin. `touch_attributes` requests all the touches that are needed, from a robot or
-a simulated skin, and computes all five.
+Each measure is computed from recordings of a skin. `touch_attributes` requests all the touches that are needed, from a
+robot or a simulated skin, and computes all five measures.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.touch.contacts import Contact, ImageNoise, find_contacts
 from jeit.touch.contacts.finder import AbstractFinder
 
-# Minimum number of different loads; minimum number of touches with each.
+# Minimum number of different loads; minimum number of touches with each load.
 _MIN_LOADS, _MIN_REPETITIONS = 3, 3
 # Fractions of the maximum response between which rise and fall times are measured.
 _RISE_START, _RISE_END = 0.1, 0.9
@@ -40,7 +40,7 @@ class Localisation(NamedTuple):
 
 
 class ContactArea(NamedTuple):
-    """Linear relation between contact areas: the estimated area is `least` + `gain` × the true area, m².
+    """Linear relation between contact areas: the estimated area is `least` + `gain` × the true area, all in m².
 
     `least`: estimated area of a contact at a point, a measure of the skin's blur, m²; `correlation`: correlation of the
     estimated with the true areas.
@@ -55,10 +55,11 @@ def weber_ratio(load: ArrayLike, response: ArrayLike) -> tuple[Float[np.ndarray,
     """Compute Weber's ratio at each of k loads: the smallest relative change of load that can be detected.
 
     A change of load is detected if it changes the response by one standard deviation (d′ = 1). So the ratio is the
-    standard deviation of the response, divided by the slope of the response against the load, and by the load. It is
-    infinite where the response does not rise. `load` (n,), newtons: three or more different loads, each applied three
-    times or more; `response` (n,), in any unit, such as the peak of an image. Returns the loads (k,), newtons, and the
-    ratios (k,). Raises `ValueError` for fewer loads, loads that are not positive, arrays of different lengths, and NaN.
+    standard deviation of the response, divided by the slope of the response against the load, and by the load. The
+    ratio is infinite at loads where the response does not rise with the load. `load` (n,), newtons: three or more
+    different loads, each applied three times or more; `response` (n,), in any unit, such as the peak of an image.
+    Returns the loads (k,), newtons, and the ratios (k,). Raises `ValueError` for fewer loads than three, loads that are
+    not positive, arrays of different lengths, and NaN.
     """
     load, response = _check_pair("load", load, "response", response)
     if (load <= 0).any():
@@ -94,11 +95,12 @@ def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
 
 
 def least_detected(amount: ArrayLike, detected: ArrayLike) -> float:
-    """Compute the smallest amount that is detected in half of the trials, in its unit; infinite if there is none.
+    """Compute the smallest amount, such as a distance, that is detected in half of the trials.
 
     An amount may be the separation of two points that are distinguished, or the gap between two touches. `amount` (n,):
-    the amount in each trial; `detected` (n,): whether it was detected, true or false. The share of detections is
-    assumed to rise with the amount (isotonic regression), and is interpolated linearly between amounts.
+    amount in each of n trials, in any unit, which is that of the result; `detected` (n,): whether the amount was
+    detected, true or false. The result is infinite if no amount is detected in half of the trials. The share of
+    detections is assumed to rise with the amount (isotonic regression), and is interpolated linearly between amounts.
     Raises `ValueError` for arrays of different lengths, and NaN.
     """
     from scipy.optimize import isotonic_regression
@@ -135,9 +137,10 @@ def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, floa
     """Compute the rise time and the fall time, seconds, of the response to a touch that begins and ends abruptly.
 
     `seconds` (T,): times of the frames; `response` (T,): the response at these times. Nothing touches the skin before
-    the first frame. The rise time is from 10 to 90 % of the maximum; the fall time is from the last value above 90 % to
-    10 %, and infinite if the recording ends before. Raises `ValueError` for arrays of different lengths, times that do
-    not increase, NaN, and a response that is nowhere positive.
+    the first frame. The rise time is that in which the response rises from 10 to 90 % of its maximum. The fall time is
+    that from the last value above 90 % until the response is below 10 %; it is infinite if the recording ends before.
+    Raises `ValueError` for arrays of different lengths, times that do not increase, NaN, and a response that is nowhere
+    positive.
     """
     seconds, response = _check_pair("seconds", seconds, "response", response)
     if (np.diff(seconds) <= 0).any():
@@ -197,13 +200,13 @@ class DiscTouch(NamedTuple):
 
 
 class TouchAttributes(NamedTuple):
-    """The attributes of touch of a skin.
+    """Five measures of a skin's resolution, the attributes of touch, as `touch_attributes` computes them.
 
-    **Fields**: `load` (k,): loads, newtons; `weber` (k,): smallest relative change of each load that is detected;
-    `localisation`: error of places, metres; `two_points`: distance between the centres of two discs that are
-    distinguished in half of the trials, metres; `area`: relation of estimated to true contact areas; `rise` and `fall`:
-    rise and fall time of the response to a touch that begins and ends abruptly, seconds, None if no such touch was
-    recorded.
+    **Fields**: `load` (k,): k loads, newtons; `weber` (k,): smallest relative change of each load that is detected;
+    `localisation`: error of the estimated places of touches, metres; `two_points`: distance between the centres of two
+    discs that are distinguished in half of the trials, metres; `area`: relation of estimated to true contact areas;
+    `rise` and `fall`: rise and fall time of the response to a touch that begins and ends abruptly, seconds, None if no
+    such touch was recorded.
 
     **Example:**
 
@@ -235,26 +238,28 @@ def touch_attributes(
     recording: tuple[ArrayLike, ArrayLike] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> TouchAttributes:
-    """Measure the attributes of touch of a real or simulated skin.
+    """Measure the resolution of a real or simulated skin: its five attributes of touch.
 
-    Discs press on the skin, some of them with other diameters, or with a quarter to four times the load.
+    Discs press on the skin, most of them with the usual diameter and load, some with a quarter to four times the load,
+    or with up to four times the diameter under the same pressure.
 
     **Arguments:**
 
     - `key`: random key that draws places and directions.
-    - `press`: function of n touches, each a list of simultaneous discs, empty for an untouched skin, that returns their
-      frames (n, M), volts; it commands a robot with discs, or simulates a skin.
-    - `linear`: computes images of the changes.
-    - `finder`: finds the contacts in them.
-    - `middle`: middle (x, y) of the region in which touches are, metres.
+    - `press`: function that presses discs on the skin: it commands a robot, or simulates a skin. Its argument is a list
+      of n touches, each a list of simultaneous discs, empty for an untouched skin. It returns their frames (n, M),
+      volts, of M channels.
+    - `linear`: linear reconstruction that computes images of the changes of frames.
+    - `finder`: finder that finds the contacts in these images.
+    - `middle`: middle (x, y) of the region of the touches, metres.
     - `within`: radius of this region, metres.
     - `load`: usual load, newtons.
     - `diameter`: usual diameter of a disc, metres.
     - `recording`: times (T,), seconds, and frames (T, M), volts, of a touch that begins and ends abruptly.
-    - `progress`: called with what is being measured.
+    - `progress`: function that is called with the name of each measurement, such as "two points", when it begins.
 
-    Raises `ValueError` for an invalid key, images or finder, sizes and loads that are not positive, frames of another
-    shape, and a skin on which no touch is found.
+    Raises `ValueError` for an invalid key, `linear` or `finder`, sizes and loads that are not positive, frames of
+    another shape, and a skin on which no touch is found.
 
     **Example:**
 
@@ -329,7 +334,7 @@ def touch_attributes(
 
 
 def _check_frames(frames_given, num_touches: int, linear: LinearReconstruction) -> Float[np.ndarray, "n M"]:
-    """Convert frames to an array. Raises `ValueError` unless there is one for each touch, finite, with M channels."""
+    """Convert frames to an array. Raises `ValueError` unless they are finite (touches, M channels)."""
     frames, required_shape = real_array("frames", frames_given, "volts (n, M)"), (num_touches, linear.num_measurements)
     if frames.shape != required_shape or not np.isfinite(frames).all():
         raise ValueError(

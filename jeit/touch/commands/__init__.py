@@ -1,3 +1,3 @@
-"""Commands for touches, and for models learnt from them."""
+"""Commands that find or classify touches, or train models for that purpose."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`jeit listen`: classify the sounds of a recording; and `jeit listen fit`: learn from labelled clips."""
+"""`jeit listen`: classify the sounds of a recording; `jeit listen fit`: train the classifier on labelled clips."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _LOUDNESS_CHOICES = {"auto": None, "counts": True, "ignored": False}
 
 
 class _GroupNamedCommand(TyperCommand):
-    """Command that help texts and error messages call by the name of its group: `jeit listen`."""
+    """Command that help texts and error messages call by the name of its group of commands: `jeit listen`."""
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
         return super().make_context(parent.info_name, args, parent=parent.parent, **extra)
 
 
 class _DefaultCommandGroup(TyperGroup):
-    """Group that runs its first command unless the first argument is --help or the name of another command."""
+    """Command group that runs its first command unless the first argument is --help or the name of a command."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if args and args[0] != "--help" and args[0] not in self.commands:
@@ -211,7 +211,7 @@ def fit(
 
 
 def _print_summary(console, result: "SoundLabels") -> None:
-    """Print the class of the whole recording, and a line for each event."""
+    """Print the class of the whole recording, and a line for each sound in it."""
     from rich.table import Table
 
     from jeit.cli.console import pairs

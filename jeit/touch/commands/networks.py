@@ -1,4 +1,4 @@
-"""Commands for networks that image touches: train a network, and image frames with it."""
+"""Commands for networks that image indentation depth: train a network, and image frames with it."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def image_by_network(
 ) -> None:
     """Image frames by the network in the file or folder `model`, and write the results to the folder `output`.
 
-    `inputs`: data file, or "-" for standard input; file of the reference; format of both; and description of the skin
-    that the network was trained for, or of a measurement. A table with one frame in each row needs neither format nor
-    description. `frame`: number of the frame to image, by default the first; if `streamed`, all frames are imaged.
-    `unused_options`: values of command-line options that do not apply to networks, None if not given. Raises
-    `ValueError` if one of them was given, without a model or a reference, for another method, for data of another skin
-    or protocol, and if no frame could be imaged.
+    `inputs`: data file, or "-" for standard input; file of reference frames; format of both files; and description of
+    the skin that the network was trained for, or of a measurement. A table with one frame in each row needs neither
+    format nor description. `frame`: number of the frame to image, by default the first; if `streamed`, all frames are
+    imaged. `unused_options`: values of command-line options that do not apply to networks, None if not given. Raises
+    `ValueError` if such an option was given, without a model or a reference, if `method` is not "network", for data of
+    another skin or protocol, and if no frame could be imaged.
     """
     import numpy as np
 
@@ -135,10 +135,11 @@ def _read_frame_file(
     is_table: bool,
     same_format_as: Path | None = None,
 ) -> _FrameFile:
-    """Read all frames of a file, or only the one with the number `frame`.
+    """Read all frames of a file, or only the frame with the number `frame`.
 
     A table without a description has one frame in each row, with its channels in the order of the network; so has every
-    file if `is_table`. Its units and columns are those of the file `same_format_as`, if that has a description.
+    file if `is_table`. The units and columns of the table are those of the file `same_format_as`, if that file has a
+    description.
     """
     import numpy as np
 

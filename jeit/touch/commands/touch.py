@@ -1,4 +1,4 @@
-"""`jeit touch`: skins that learn from recorded presses, their predictions for frames, and gestures."""
+"""`jeit touch`: find contacts, train skins on recorded presses, predict touches with them, and classify gestures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ touch.command()(watch)
 touch.command()(health)
 
 
-# Number of nodes of the mesh for images; contacts are located more finely than its cells.
+# Number of nodes of the mesh for images; contacts are located more finely than the mesh's cells.
 _NUM_NODES = 400
 # Frame rate of a recording without times, in frames/s.
 _USUAL_RATE = 10.0

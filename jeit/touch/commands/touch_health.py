@@ -56,7 +56,7 @@ def health(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Detect cuts, failing electrodes and repairs by comparing a recording with one of the healthy skin.
+    """Detect cuts, failing electrodes and repairs by comparing a recording with a recording of the healthy skin.
 
     Writes events.csv, report.json and health.png. The skin may have any number of channels, in any unit.
     """

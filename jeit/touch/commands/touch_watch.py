@@ -122,11 +122,11 @@ def watch(
     quiet: Quiet = False,
     as_is: AsIs = False,
 ) -> None:
-    """Name touches as they end: when, where, which gesture, and how probable that is.
+    """Name the gestures of touches as they end: when, where, which gesture, and how probable it is.
 
     Writes events.csv and paths.csv line by line, and at the end report.json and timeline.png. With standard input, a
-    line is printed with the first frame after a touch; if the touch continues within 100 ms, it is named anew. Ctrl-C
-    and SIGTERM end it, and all is written.
+    line is printed with the first frame after a touch; if the touch continues within 100 ms, its gesture is named anew.
+    Ctrl-C and SIGTERM end the command, and all files are written.
     """
     from dataclasses import replace
 
@@ -191,7 +191,7 @@ def watch(
 
 
 def _print_summary(console, written, live_frames, output: Path) -> None:
-    """Print a summary of the touches."""
+    """Print a summary of the classified touches, the delays and the refused frames of a stream."""
     import numpy as np
 
     from jeit.arguments import counted
@@ -214,7 +214,7 @@ def _print_summary(console, written, live_frames, output: Path) -> None:
 
 
 def _read_recording(path: Path, description, untouched, span: float, rate: float):
-    """Return the frames of a file with their times, the frames of the untouched skin, and the frame rate."""
+    """Read a recording: return its frames with their times, the frames of the untouched skin, and the frame rate."""
     import numpy as np
 
     from jeit.data import read_frame_recording

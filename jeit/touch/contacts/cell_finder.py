@@ -23,9 +23,9 @@ _RELATIVE_SMOOTHING = 0.03
 def gaussian_means(mesh: Mesh, length: float | None) -> sparse.csr_array:
     """Compute the matrix (m, m) that smooths an image: Gaussian means over the neighbourhood of each cell.
 
-    Cells are weighted by their areas and by a Gaussian of the distance between centroids. `length`: its standard
-    deviation, metres; None: 3 % of the square root of the mesh's area; 0: no smoothing. Raises `ValueError` if the
-    length is negative, or not less than the square root of the mesh's area.
+    Cells are weighted by their areas and by a Gaussian of the distance between centroids. `length`: standard deviation
+    of the Gaussian, metres; None: 3 % of the square root of the mesh's area; 0: no smoothing. Raises `ValueError` if
+    `length` is negative, or not less than the square root of the mesh's area.
     """
     centres, areas = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
     skin_size = float(np.sqrt(areas.sum()))
@@ -45,7 +45,7 @@ def gaussian_means(mesh: Mesh, length: float | None) -> sparse.csr_array:
 
 
 def outline_of_cells(points: Float[np.ndarray, "n d"], cells: Int[np.ndarray, "c 3"]) -> Float[np.ndarray, "k d"]:
-    """Outline of a set of cells: vertices (k, d), metres, of the longest loop of its boundary edges.
+    """Return the outline of a set of c cells: k vertices (k, d), metres, of the longest loop of its boundary edges.
 
     Boundary edges belong to only one of the `cells` (c, 3). All cells must have the same orientation, so that boundary
     edges follow one another. Where the set touches itself in a node, the loop may continue either way.
@@ -69,28 +69,29 @@ def outline_of_cells(points: Float[np.ndarray, "n d"], cells: Int[np.ndarray, "c
 
 
 class CellFinder(AbstractFinder):
-    """Find every peak of an image, with the cells around it that exceed a share of the peak.
+    """Finds contacts in images on a mesh: every peak, with the cells around it that exceed a share of its height.
 
-    The centroid is weighted by the excess above this threshold, which is zero at the region's edge, so that the
-    centroid does not jump when a cell joins or leaves the region. Peaks that are weak, or rise little above the saddle
-    to a higher peak, are artefacts or shoulders, and are left out.
+    In the centroid of a contact, cells are weighted by their excess above this share of the peak. The excess is zero at
+    the contact's edge, so that the centroid does not jump when a cell joins or leaves the contact. Peaks that are weak,
+    or rise little above the saddle to a higher peak, are artefacts or shoulders, and are left out.
 
-    The defaults give the smallest error on simulated skins (`python -m benchmarks contacts`).
+    The default arguments give the smallest error of places on simulated skins (`python -m benchmarks contacts`).
 
     **Arguments:**
 
     - `mesh`: mesh of the images: a flat sheet, or a surface in space; on a surface, centroids are points (3,) on it.
     - `smoothing`: standard deviation of the Gaussian that smooths images first, metres; by default 3 % of the square
       root of the mesh's area.
-    - `level`: share of the peak that cells of a contact exceed.
+    - `level`: share of the peak's height that cells of a contact exceed.
     - `least_peak`: minimum height of a peak, as a share of the strongest peak.
     - `least_prominence`: minimum rise of a peak above the saddle to a higher peak, as a share of its own height.
     - `floor`: number of standard deviations of the noise that a cell must exceed to belong to a contact.
     - `sign`: 1 if touched skin conducts better, -1 if it conducts worse.
 
-    **Fields**: the thresholds; `smoothing` (m, m): matrix that smooths images; `cells` (m, 3), `points` (n, d): the
-    mesh; `centres` (m, d), `areas` (m,): centroids and areas of the cells; `shared` (m, 3): numbers of the facets that
-    each cell shares with another; `surface`: the surface of a mesh in space, otherwise None.
+    **Fields**: `level`, `least_peak`, `least_prominence`, `floor`, `sign`: as given; `smoothing` (m, m): matrix that
+    smooths images of m cells; `cells` (m, 3), `points` (n, d): cells and n nodes of the mesh; `centres` (m, d), `areas`
+    (m,): centroids and areas of the cells; `shared` (m, 3): numbers of the facets that each cell shares with another;
+    `surface`: the surface of a mesh in space, otherwise None.
 
     **Example:**
 
@@ -142,7 +143,7 @@ class CellFinder(AbstractFinder):
         self.floor, self.sign = float(floor), int(sign)
 
     def find(self, change, noise):
-        """See `find_contacts`."""
+        """Find the contacts in an image; see `find_contacts`."""
         change, clear_change = self.above_noise(change, noise)
         basin_peaks = basins(clear_change, self.shared, floor=0.0, least_prominence=self.least_prominence)
         peaks = np.unique(basin_peaks[basin_peaks >= 0])

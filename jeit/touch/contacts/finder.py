@@ -18,9 +18,10 @@ class Contact(Module):
 
     **Fields**: `centroid`: (x, y), or (x, y, z) on a surface in space, metres; `area`: area of the region, m²; `peak`:
     strongest change in the region, with its sign, in the unit of the image; `integral`: integral of the change over the
-    region, in that unit times m²; `contour` (k, d): outline of the region, metres, in which the first point is not
-    repeated; `deviation`: root mean square displacement of the centroid by noise of the image (see `ImageNoise`), to
-    first order, metres. It includes neither the blur of the image nor systematic errors.
+    region, in the unit of the image times m²; `contour` (k, d): k points of the region's outline, metres, of which the
+    first is not repeated at the end; `deviation`: root mean square displacement of the centroid by noise of the image
+    (see `ImageNoise`), to first order, metres. The deviation includes neither the blur of the image nor systematic
+    errors.
 
     **Example:**
 
@@ -42,7 +43,8 @@ class AbstractFinder(Module):
     """Finds contacts in images on one mesh; everything that does not depend on the image is computed in advance.
 
     **Fields**: `smoothing` (m, m): matrix that smooths images first; `sign`: 1 if touched skin conducts better, -1 if
-    it conducts worse; `floor`: number of standard deviations that a cell must exceed to belong to a contact.
+    it conducts worse; `floor`: number of standard deviations of the noise that a cell must exceed to belong to a
+    contact.
     """
 
     smoothing: eqx.AbstractVar[sparse.csr_array]
@@ -56,14 +58,14 @@ class AbstractFinder(Module):
 
     @abstractmethod
     def find(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> list[Contact]:
-        """Find contacts in a `change` (m,) whose sign makes contacts positive."""
+        """Find contacts in an image of changes `change` (m cells,), whose sign makes contacts positive."""
 
     def above_noise(
         self, change: Float[np.ndarray, " m"], noise: ImageNoise
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """Return the smoothed change (m,), and a copy of it that is zero below the noise floor."""
+        """Return the smoothed image of changes (m,), and a copy of this image that is zero below the noise floor."""
         change = self.smoothing @ change
-        # Upper bound of the standard deviation of a smoothed cell, whatever the correlation between cells.
+        # Upper bound of the standard deviation of a cell of the smoothed image, however cells are correlated.
         return change, np.where(change > self.floor * (self.smoothing @ noise.deviation), change, 0.0)
 
 
@@ -76,9 +78,9 @@ def find_contacts(
 
     - `finder`: `CellFinder(mesh)` or `RasterFinder(mesh)` for the mesh of the image.
     - `image`: change of conductivity (m,) in every cell, S (3-D: S/m), as `LinearReconstruction.image` computes it.
-    - `noise`: noise of these images, by default estimated from the image itself (see `ImageNoise.of_image`).
+    - `noise`: noise of images on this mesh, by default estimated from the image itself (see `ImageNoise.of_image`).
 
-    Raises `ValueError` for an image of another mesh, NaN, and noise of another mesh.
+    Raises `ValueError` for an image or noise of another mesh than the finder's, and for NaN.
 
     **Example:**
 
@@ -93,7 +95,7 @@ def find_contacts(
 
 
 def restore_sign(finder: AbstractFinder, contacts: list[Contact]) -> list[Contact]:
-    """Restore the original sign of contacts found in a change that makes them positive; sort them, strongest first."""
+    """Give contacts found in a sign-changed image the sign of the original image; sort them, strongest first."""
     if finder.sign < 0:
         contacts = [
             eqx.tree_at(lambda contact: (contact.peak, contact.integral), contact, (-contact.peak, -contact.integral))
@@ -103,9 +105,9 @@ def restore_sign(finder: AbstractFinder, contacts: list[Contact]) -> list[Contac
 
 
 def noise_or_estimate(change: Float[np.ndarray, " m"], noise: ImageNoise | None) -> ImageNoise:
-    """Return the `noise` of a change (m,), estimated from the change if None.
+    """Return the noise of an image `change` (m,): `noise` as given, or estimated from the image if it is None.
 
-    Raises `ValueError` for noise of another mesh, and for anything but `ImageNoise`.
+    Raises `ValueError` unless `noise` is None or an `ImageNoise` of as many cells as the image.
     """
     if noise is None:
         return ImageNoise.of_image(change)

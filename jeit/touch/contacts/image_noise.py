@@ -58,9 +58,9 @@ class ImageNoise(Module):
     def of_frames(cls, reconstruction: LinearReconstruction, frames: Float[np.ndarray, "n M"]) -> "ImageNoise":
         """Estimate the noise from at least ten repeated frames (n, M), volts, of the untouched skin.
 
-        The deviations of the frames from their mean are imaged. The noise includes drift only if the frames span as
-        long a time as later readings. Raises `ValueError` for fewer frames, another number of channels, NaN, and frames
-        that are all the same.
+        Images are computed of the deviations of the frames from their mean. The noise includes drift only if the frames
+        span as long a time as later readings. Raises `ValueError` for fewer than ten frames, a number of channels other
+        than M of the reconstruction, NaN, and frames that are all the same.
         """
         check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
         frames = real_array("frames", frames, "voltages (n, M)")
@@ -76,8 +76,8 @@ class ImageNoise(Module):
 
     @classmethod
     def of_images(cls, images: Float[np.ndarray, "n m"]) -> "ImageNoise":
-        """Estimate the noise from at least ten images (n, m) of the untouched skin. Raises `ValueError` for fewer
-        images, NaN, and images that are all the same."""
+        """Estimate the noise from at least ten images (n, m) of the untouched skin. Raises `ValueError` for fewer than
+        ten images, NaN, and images that are all the same."""
         images = real_array("images", images, "changes of conductivity (n, m)")
         if images.ndim != 2 or len(images) < _MIN_NUM_FRAMES or not np.isfinite(images).all():
             raise ValueError(
@@ -108,8 +108,8 @@ class ImageNoise(Module):
     def of_image(cls, image: Float[np.ndarray, " m"]) -> "ImageNoise":
         """Estimate the noise from an image (m,) alone, with or without contacts, by sigma clipping.
 
-        All cells get the same standard deviation: that of the cells that remain after removing, repeatedly, those more
-        than three standard deviations from the median. Artefacts of a contact all over the image, and ringing, count as
+        Cells more than three standard deviations from the median are removed, repeatedly. The standard deviation of the
+        remaining cells is taken as that of every cell. Artefacts of a contact all over the image, and ringing, count as
         noise, so that weak contacts beside strong ones are missed. Cells that are noisier than most are mistaken for
         contacts. Raises `ValueError` for an image that is not (m,), finite and real.
         """
@@ -123,7 +123,7 @@ class ImageNoise(Module):
         return cls(np.sqrt((factor**2).sum(axis=0)), factor)
 
     def distance(self, slope: Float[np.ndarray, "m 2"]) -> float:
-        """Root mean square displacement, metres, of a position by the noise.
+        """Compute the root mean square displacement, metres, of a position that is computed from a noisy image.
 
         `slope` (m, 2): derivative of the position with respect to the image, metres per unit of the image. If the
         covariance of the cells is unknown, the result is an upper bound.
@@ -143,9 +143,9 @@ class ImageNoise(Module):
 
 
 def _clipped_deviation(values: Float[np.ndarray, " m"]) -> float:
-    """Standard deviation of the values within three standard deviations of the median.
+    """Standard deviation of the values (m,) without outliers, those beyond three standard deviations of the median.
 
-    For clipping, the standard deviation is estimated from the median distance from the median.
+    To decide which values are outliers, the standard deviation is estimated from the median distance from the median.
     """
     remaining_values = values
     for _ in range(_MAX_ROUNDS):

@@ -4,9 +4,10 @@ The peak is modelled as a function of the load F,
 
 peak = s exp(b ρ² + c ρ⁴) F / (F + F½),
 
-where ρ is the distance of the contact from the middle of the skin, divided by the skin's radius. The peak rises with
-the load and saturates, as conductivity under pressure does, and is larger near the electrodes. A calibration is valid
-for one indenter, or similar ones: a wider contact under the same load has another peak.
+where s, b, c and F½ are fitted, and ρ is the distance of the contact from the middle of the skin, divided by the skin's
+radius. The peak rises with the load and saturates, as conductivity under pressure does, and is larger near the
+electrodes. A calibration is valid for one indenter, or similar indenters: a wider contact under the same load has
+another peak.
 """
 
 from __future__ import annotations
@@ -41,12 +42,13 @@ class Load(Module):
 
 
 class LoadCalibration(Module):
-    """Fitted relation between peaks and loads.
+    """Fitted relation between the loads of contacts and their peaks in images.
 
     **Fields**: `centre` (2,), `radius`: centre and radius of the skin, metres; `parameters` (4,): log s, b, c and log
-    F½; `covariance` (4, 4): covariance of the parameters; `sign`: sign of the peaks, 1 or -1; `scatter`: standard
-    deviation of the logarithm of a peak about the curve; `loads`: minimum and maximum load of the calibrated contacts,
-    newtons; `farthest`: their maximum ρ; `highest`: their maximum ratio of a peak to the saturated peak.
+    F½ in peak = s exp(b ρ² + c ρ⁴) F / (F + F½), for a load F at ρ radii from the centre; `covariance` (4, 4):
+    covariance of the parameters; `sign`: sign of the peaks, 1 or -1; `scatter`: standard deviation of the logarithm of
+    a peak about the curve; `loads`: minimum and maximum load of the calibrated contacts, newtons; `farthest`: maximum ρ
+    of these contacts; `highest`: their maximum ratio of a peak to the saturated peak.
 
     **Example:**
 
@@ -70,11 +72,11 @@ class LoadCalibration(Module):
     def fit(
         cls, contacts: Sequence[Contact], loads: ArrayLike, *, radius: float, centre: ArrayLike = (0.0, 0.0)
     ) -> "LoadCalibration":
-        """Fit the relation to at least eight `contacts` (n) under known `loads` (n,), newtons, at several places.
+        """Fit the relation to the peaks of eight or more `contacts` (n) under known `loads` (n,), newtons.
 
-        The logarithms of the peaks are fitted by least squares. `radius`, `centre`: radius and centre of the skin,
-        metres. Raises `ValueError` for fewer contacts, loads that are not positive or all the same, peaks of both
-        signs, and a curve that does not fit.
+        The contacts should lie at several places. The logarithms of the peaks are fitted by least squares. `radius`,
+        `centre`: radius and centre of the skin, metres. Raises `ValueError` for fewer than eight contacts, loads that
+        are not positive or all the same, peaks of both signs, and a curve that does not fit.
         """
         check_metres("radius", radius)
         check_kind("contacts", contacts, (list, tuple), "a list of them, one for each load")
@@ -132,9 +134,9 @@ class LoadCalibration(Module):
         """Estimate the load of a contact, newtons, and its standard deviation.
 
         The standard deviation includes the uncertainty of the parameters and the scatter of peaks about the curve, but
-        no change of the skin since calibration: if all gains are g times as large, so are peaks. Raises `ValueError`
-        for a peak above the calibrated ones, where the curve does not determine the load, for a peak of the other sign,
-        and for a contact farther from the centre than the calibrated ones.
+        no change of the skin since calibration: if all gains are g times as large, the peaks are g times as large too.
+        Raises `ValueError` for a peak above the calibrated peaks, where the curve does not determine the load, for a
+        peak of the opposite sign, and for a contact farther from the centre than the calibrated contacts.
         """
         check_kind("contact", contact, Contact, "a Contact, as of find_contacts")
         if contact.peak * self.sign <= 0:
@@ -150,15 +152,15 @@ class LoadCalibration(Module):
             )
         log_scale, quadratic, quartic, log_half_load = self.parameters
         saturation = abs(contact.peak) / np.exp(log_scale + quadratic * distance**2 + quartic * distance**4)
-        # A peak less than two standard deviations above the calibrated ones is no evidence of a larger load.
+        # A peak less than two standard deviations above the calibrated peaks is no evidence of a larger load.
         if saturation > min(self.highest * np.exp(2 * self.scatter), max(self.highest, _MAX_SATURATION)):
             raise ValueError(
                 f"contact: its peak {describe(contact.peak)} is {saturation / self.highest:.2f} times the highest "
                 f"that was calibrated there, by {self.loads[1]:g} N; calibrate with greater loads."
             )
         force = float(np.exp(log_half_load) * saturation / (1 - saturation))
-        # Derivatives of log F with respect to log peak: 1 / (1 − saturation); with respect to log s, b and c: minus
-        # that, times the derivative of log peak; with respect to log F½: 1.
+        # Derivatives of log F with respect to log peak: 1 / (1 − saturation); with respect to log s, b and c: −1 / (1 −
+        # saturation), times the derivative of log peak; with respect to log F½: 1.
         sensitivity = 1 / (1 - saturation)
         derivatives = np.array([-sensitivity, -sensitivity * distance**2, -sensitivity * distance**4, 1.0])
         variance = derivatives @ self.covariance @ derivatives + (sensitivity * self.scatter) ** 2

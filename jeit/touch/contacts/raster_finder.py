@@ -1,8 +1,9 @@
 """Find contacts on a raster with OpenCV: region of interest, grey levels, threshold, opening, contours, centroids.
 
 The steps are those of Chen et al., "New flexible tactile sensor based on electrical impedance tomography",
-Micromachines 13 (2022) 185. The paper does not state sizes. Those used here give smaller errors on simulated skins than
-a constant of 10, an opening of 5 pixels and no smoothing (`python -m benchmarks contacts`).
+Micromachines 13 (2022) 185. The paper does not state the sizes of its steps. The sizes used here give smaller errors on
+simulated skins than a constant of 10 grey levels, an opening of 5 pixels and no smoothing (`python -m benchmarks
+contacts`).
 """
 
 from __future__ import annotations
@@ -31,17 +32,17 @@ from jeit.touch.contacts.finder import (
 from jeit.touch.contacts.image_noise import ImageNoise
 from jeit_solvers.module import Module
 
-# Width in pixels of the band along a contact's edge in which cells may join or leave the contact.
+# Width in pixels of the band along a contact's edge in which noise may add cells to the contact, or remove them.
 _EDGE_WIDTH = 15
 # Maximum number of pixels along a side: more would need much memory, and no image has as many cells.
 _MAX_PIXELS = 4096
 
 
 class RasterStages(Module):
-    """Results of the steps of `RasterFinder`; arrays are (rows, columns), with row 0 at the top.
+    """Results of the steps by which `RasterFinder` finds contacts; arrays are (rows, columns), with row 0 at the top.
 
     **Fields**: `region`: change on the pixels of the skin, NaN beside the skin; `grey`: grey levels, 0 to 255;
-    `threshold`: whether each pixel is above the adaptive threshold; `opened`: whether it remains after opening;
+    `threshold`: whether each pixel is above the adaptive threshold; `opened`: whether the pixel remains after opening;
     `contacts`: the contacts found; `extent`: (x_min, x_max, y_min, y_max), metres.
     """
 
@@ -57,22 +58,24 @@ class RasterFinder(AbstractFinder):
     """Finds contacts by an adaptive threshold on a raster.
 
     Grey levels are proportional to the change, up to 255 for the image's maximum; pixels below the noise floor are
-    black. Pixels are kept if they are some levels above the Gaussian mean of the block around them. They are then
-    opened with an ellipse. Each external contour is a contact, whose centroid is that of the enclosed pixels.
+    black. Pixels are kept if they exceed the Gaussian mean of the block of pixels around them by `constant` grey
+    levels. A morphological opening with an ellipse then removes small spots. Each external contour is a contact, whose
+    centroid is that of the enclosed pixels.
 
     **Arguments:**
 
     - `mesh`: mesh of the images.
     - `pixels`: number of pixels along a side of the raster.
     - `smoothing`: standard deviation of the Gaussian that smooths images first, metres; see `CellFinder`.
-    - `block`: width of the block, an odd number of pixels.
-    - `constant`: number of grey levels.
-    - `opening`: width of the ellipse, an odd number of pixels.
+    - `block`: width of the block with whose mean a pixel is compared, an odd number of pixels.
+    - `constant`: number of grey levels by which a kept pixel exceeds the mean of its block.
+    - `opening`: width of the ellipse of the opening, an odd number of pixels.
     - `floor`: number of standard deviations of the noise that a cell must exceed to belong to a contact; without a
       floor, contacts would be found in images without any.
     - `sign`: 1 if touched skin conducts better, -1 if it conducts worse.
 
-    **Fields**: the settings; `raster`: raster of the mesh; `smoothing` (m, m): matrix that smooths images.
+    **Fields**: `block`, `constant`, `opening`, `floor`, `sign`: as given; `raster`: raster of the mesh; `smoothing` (m,
+    m): matrix that smooths images.
 
     **Example:**
 
@@ -125,12 +128,12 @@ class RasterFinder(AbstractFinder):
         self.floor, self.sign = float(floor), int(sign)
 
     def find(self, change, noise):
-        """See `find_contacts`."""
+        """Find the contacts in an image; see `find_contacts`."""
         _, clear_change = self.above_noise(change, noise)
         return self._stages(change, noise).contacts if clear_change.any() else []
 
     def stages(self, image: Float[np.ndarray, " m"], noise: ImageNoise | None = None) -> RasterStages:
-        """Compute the results of all steps for an image (m,) and its noise; arguments and errors are those of
+        """Compute the grey levels, threshold, opening and contacts of an image (m,); arguments and errors: see
         `find_contacts`."""
         change = signed_image(self, image)
         stages = self._stages(change, noise_or_estimate(change, noise))
@@ -230,12 +233,13 @@ class RasterFinder(AbstractFinder):
     def _membership_noise(
         self, cell_indices: np.ndarray, excess: np.ndarray, noise: ImageNoise
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Uncertainty of the membership of every cell: slope (m,) with respect to its value, and independent part (m,).
+        """Uncertainty of whether cells belong to a contact: slope (m,) against the cell's value, independent part (m,).
 
-        Whole cells are inside or outside a contact. A cell whose smoothed value exceeds the threshold by `excess` on
-        average, with standard deviation σ, is inside with probability p = Φ(z), z = above / σ. On average, its
-        membership changes with its value at the rate φ(z) / σ; the remaining part has the standard deviation
-        √(p (1 − p) − φ(z)²), independently for each cell.
+        A cell is wholly inside or outside a contact (membership 1 or 0). A cell whose smoothed value exceeds the
+        threshold by `excess` on average, with standard deviation σ, is inside with probability p = Φ(z), z = excess /
+        σ, where Φ and φ are the normal distribution and its density. On average, its membership changes with its value
+        at the rate φ(z) / σ; the remaining part of the membership has the standard deviation √(p (1 − p) − φ(z)²),
+        independently for each cell.
         """
         num_pixels = np.bincount(cell_indices, minlength=self.num_cells)
         mean_excess = np.bincount(cell_indices, excess, minlength=self.num_cells) / np.maximum(num_pixels, 1)

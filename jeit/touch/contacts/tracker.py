@@ -12,18 +12,19 @@ from jeit.arguments import check_kind, check_metres, describe, is_number, real_a
 from jeit.touch.contacts.finder import Contact
 from jeit_solvers.module import Module
 
-# Fraction of a contact's prediction error that corrects the velocity: one half averages the noise of two frames.
+# Share of the error of a touch's predicted velocity by which the velocity is corrected: one half averages the noise of
+# two frames.
 _VELOCITY_GAIN = 0.5
-# Number of gaps for which a touch is kept while it is hidden by another touch's contact.
+# Number of times the duration `gap` for which a touch is kept while it is hidden by another touch's contact.
 _HIDDEN_GAPS = 4
 
 
 class TouchPath(Module):
-    """Path of one touch.
+    """Path of one touch over the skin.
 
-    **Fields**: `number`: position in order of onset; `times` (T,): times of the frames in which the touch was seen,
-    seconds; `position` (T, 2): centroids, metres; `peak` (T,): peaks, in the unit of the images; `area` (T,): areas,
-    m².
+    **Fields**: `number`: rank of the touch in order of onset, from 0; `times` (T,): times of the T frames in which the
+    touch was seen, seconds; `position` (T, 2): centroids, metres; `peak` (T,): peaks, in the unit of the images; `area`
+    (T,): areas, m².
     """
 
     number: int
@@ -51,9 +52,9 @@ class TouchPath(Module):
 class _TrackedTouch(Module):
     """State of a touch that is being tracked.
 
-    **Fields**: `number`: position in order of onset; `time`: time of the last frame, seconds; `place`: position at that
-    time, metres; `velocity`: m/s; `observations`: times and contacts so far; `is_hidden`: whether the contact of
-    another touch may hide it now.
+    **Fields**: `number`: rank of the touch in order of onset, from 0; `time`: time of the last frame, seconds;
+    `position`: position at this time, metres; `velocity`: m/s; `observations`: times and contacts so far; `is_hidden`:
+    whether the contact of another touch may hide it now.
     """
 
     number: int
@@ -64,29 +65,30 @@ class _TrackedTouch(Module):
     is_hidden: bool = False
 
     def predicted_position(self, time: float) -> np.ndarray:
-        """Predicted position at a `time` in seconds, metres."""
+        """Return the position predicted for `time`, seconds, at constant velocity, metres."""
         return self.position + (time - self.time) * self.velocity
 
     def path(self) -> TouchPath:
-        """Return the path so far."""
+        """Return the path of the touch until the last frame."""
         times, contacts = zip(*self.observations, strict=True)
         columns = ([getattr(contact, name) for contact in contacts] for name in ("centroid", "peak", "area"))
         return TouchPath(self.number, np.array(times), *map(np.array, columns))
 
 
 class ContactTracker(Module):
-    """State of the tracking of touches.
+    """State of the tracking of touches from frame to frame.
 
-    `tracker.follow(time, contacts)` returns the state after the next frame; this one is not changed. Contacts are
+    `tracker.follow(time, contacts)` returns the state after the next frame; `tracker` is not changed. Contacts are
     assigned to the touches whose predicted positions (position + velocity · time) are nearest, with the minimum sum of
-    distances. No distance may exceed `reach` metres, which allows for noise of positions, plus the distance that a
-    touch of the maximum speed `fastest`, m/s, covers between two frames. A touch without a contact is kept for `gap`
-    seconds from the first frame without one. If it may be hidden in another touch's contact, as when two fingers cross,
-    it is assumed to continue with its velocity, for four gaps at most.
+    distances. A contact may be at most `reach` metres, which allows for noise of positions, plus the distance that a
+    touch of the maximum speed `fastest`, m/s, covers between two frames, from the predicted position of its touch. A
+    touch without a contact is kept for `gap` seconds from the first frame without a contact. If the touch may be hidden
+    in another touch's contact, as when two fingers cross, the touch is assumed to continue with its velocity, for 4
+    `gap` at most.
 
-    **Fields**: `gap`, `reach`, `fastest`: as above; `least`: minimum number of frames of a touch, shorter ones are not
-    reported; `time`: time of the last frame, -inf before the first; `open`, `closed`: current touches, and touches that
-    have ended; `number`: number of touches that have begun.
+    **Fields**: `gap`, `reach`, `fastest`: as above; `least`: minimum number of frames of a touch, shorter touches are
+    not reported; `time`: time of the last frame, -inf before the first; `open`, `closed`: current touches, and touches
+    that have ended; `number`: number of touches that have begun.
 
     **Example:**
 
@@ -120,9 +122,9 @@ class ContactTracker(Module):
             raise ValueError(f"least must be a number of frames, 1 or more; it is {describe(self.least)}.")
 
     def follow(self, time: float, contacts: Sequence[Contact]) -> "ContactTracker":
-        """Return the tracker after a frame with these contacts at `time`, seconds.
+        """Return the tracker after a frame at `time`, seconds, in which `contacts` were found.
 
-        Raises `ValueError` if the time is not later than that of the last frame.
+        Raises `ValueError` unless `time` is later than the time of the last frame.
         """
         if not (is_number(time) and time > self.time):
             raise ValueError(f"time must be later than the frame before, {self.time:g} s; it is {describe(time)}.")
@@ -143,7 +145,8 @@ class ContactTracker(Module):
         contact_positions = np.array([contact.centroid for contact in contacts])
         distances = np.linalg.norm(predicted_positions.reshape(-1, 1, 2) - contact_positions.reshape(1, -1, 2), axis=-1)
         max_distance = self.reach + self.fastest * interval if current_touches else 0.0
-        # Pairs beyond the maximum distance all cost the same, so that no pair within it is given up for them.
+        # Pairs of a touch and a contact beyond the maximum distance all cost the same, so that no nearer pair is given
+        # up for them.
         rows, columns = linear_sum_assignment(np.where(distances <= max_distance, distances, 1e3 * max_distance))
         # Index of the contact that is assigned to each touch, by the index of the touch.
         assigned_contacts = {
@@ -193,15 +196,15 @@ class ContactTracker(Module):
 def track_contacts(
     times: Float[np.ndarray, " F"], contacts: Sequence[Sequence[Contact]], tracker: ContactTracker | None = None
 ) -> list[TouchPath]:
-    """Track the touches of a recording.
+    """Track touches: join the contacts in the frames of a recording to the paths of touches.
 
     **Arguments:**
 
     - `times`: increasing times (F,), seconds.
     - `contacts`: contacts of every frame, as from `find_contacts`.
-    - `tracker`: initial state, by default `ContactTracker()`.
+    - `tracker`: tracker before the first frame, by default `ContactTracker()`.
 
-    Raises `ValueError` for a different number of times, and as `ContactTracker.follow` does.
+    Raises `ValueError` if there are more or fewer times than frames, and as `ContactTracker.follow` does.
 
     **Example:**
 
@@ -227,8 +230,10 @@ def track_contacts(
 
 
 def without_side_lobes(touches: list[TouchPath], weakest: float) -> list[TouchPath]:
-    """Return the touches whose strongest change is not less than `weakest` times that of any touch at the same time: a
-    linear image of a contact has side lobes, which look like weaker contacts."""
+    """Leave out touches whose maximum peak is less than `weakest` times that of another touch at the same time.
+
+    A linear image of a contact has side lobes, which look like weaker contacts.
+    """
 
     def strongest_beside(touch: TouchPath) -> float:
         beside = [one for one in touches if one.onset <= touch.offset and touch.onset <= one.offset]

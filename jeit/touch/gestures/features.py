@@ -1,5 +1,4 @@
-"""Features of touches: the seven of Silvera Tawil et al. (2011), table II, and further ones of a touch's time
-course."""
+"""Features of touches: the seven features of Silvera Tawil et al. (2011), and features of a touch's time course."""
 
 from __future__ import annotations
 
@@ -45,7 +44,8 @@ SEQUENCE_FEATURES = (
 class TouchFeatures:
     """Features of n touches.
 
-    **Fields**: `values` (n, k): one column for each feature; `names`: names of the k features; `units`: their units.
+    **Fields**: `values` (n, k): values of k features, a row for each touch; `names`, `units`: names and units of the
+    features.
     """
 
     values: Float[np.ndarray, "n k"]
@@ -58,13 +58,13 @@ class TouchFeatures:
 
 
 def touch_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
-    """Compute the seven features of n touches.
+    """Compute the seven features of n touches by Silvera Tawil et al. (2011), table II and section IV-A.
 
-    Let x_e be the change of element e, P(t) = max_e x_e the maximum change at time t, and t* the time at which P is
-    largest. The features, in the order of `FEATURES`, are: P at t*; minimum of x_e over all elements and frames of the
-    touch; fraction of the elements with x_e ≥ P / 2 at t*; mean of x_e at t* over the elements above the touch level;
-    duration from the first to the last frame above the level, s; mean of |dP/dt|, 0 for a single frame; distance
-    between the first and the last centroid, m. Silvera Tawil et al. (2011), table II and section IV-A.
+    Let x_e be the change of conductivity of mesh element e, P(t) = max_e x_e the maximum change at time t, and t* the
+    time at which P is largest. The features, in the order of `FEATURES`, are: P at t*; minimum of x_e over all elements
+    and frames of the touch; fraction of the elements with x_e ≥ P / 2 at t*; mean of x_e at t* over the elements above
+    the touch level; duration from the first to the last frame above the level, s; mean of |dP/dt|, 0 for a single
+    frame; distance between the first and the last centroid, m.
 
     **Arguments:**
 
@@ -85,13 +85,14 @@ def touch_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Touc
 
 
 def course_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
-    """Compute the features `COURSE_FEATURES` of n touches: the seven of `touch_features` and further ones.
+    """Compute the features `COURSE_FEATURES` of n touches: those of `touch_features`, and features of the time course.
 
-    These are: mean of the contact area, and its standard deviation divided by the mean; length of the centroid's path,
-    maximum distance of the centroid from its start, mean speed, 90 % quantile of the speed, and displacement divided by
-    path length; number of peaks of P above half its maximum; time from onset to the maximum of P, and from there to the
-    end; total variation of P / max P; fraction of frames with P below half its maximum; mean and standard deviation of
-    time, divided by the duration and weighted by P; P / max P at instants evenly spaced in time. Raises `ValueError` if
+    P(t) is the maximum change of conductivity over the skin at time t. The features of the time course are: mean of the
+    contact area, and its standard deviation divided by the mean; length of the centroid's path, maximum distance of the
+    centroid from its start, mean speed, 90 % quantile of the speed, and displacement divided by path length; number of
+    peaks of P above half its maximum; time from onset to the maximum of P, and from this maximum to the end; total
+    variation of P / max P; fraction of frames with P below half its maximum; mean and standard deviation of time,
+    divided by the duration and weighted by P; P / max P at instants evenly spaced in time. Raises `ValueError` if
     `touches` is not a list of touches.
     """
     courses = _time_courses(touches)
@@ -106,10 +107,11 @@ def course_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Tou
 def sequence_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
     """Compute the features `SEQUENCE_FEATURES` of n touches: those of `course_features`, and a sampled time course.
 
-    The following quantities are sampled at instants evenly spaced in time: P; P / max P; mean change in contact;
-    contact area; fraction of elements above half of P; speed of the centroid; distance of the centroid from its start;
-    position of the centroid along its main direction of movement, with the sign that makes the largest displacement
-    positive. Raises `ValueError` if `touches` is not a list of touches.
+    The following quantities are sampled at instants evenly spaced in time: P, the maximum change of conductivity over
+    the skin; P / max P; mean change of the elements in contact; contact area; fraction of elements above half of P;
+    speed of the centroid; distance of the centroid from its start; position of the centroid along its main direction of
+    movement, with the sign that makes the largest displacement positive. Raises `ValueError` if `touches` is not a list
+    of touches.
     """
     courses = _time_courses(touches)
     course_values = course_features(touches)
@@ -127,7 +129,7 @@ def _time_courses(touches) -> list[ChangeCourse]:
 
 
 def _seven_features(course: ChangeCourse) -> list[float]:
-    """Compute the features of one touch, in the order of `FEATURES`."""
+    """Compute the seven features of one touch from its time course, in the order of `FEATURES`."""
     peak_frame = int(course.peak.argmax())
     intervals = np.diff(course.seconds)
     rate = np.mean(np.abs(np.diff(course.peak)) / intervals) if intervals.size else 0.0
@@ -143,7 +145,7 @@ def _seven_features(course: ChangeCourse) -> list[float]:
 
 
 def _further_features(course: ChangeCourse) -> list[float]:
-    """Compute the features of one touch that `COURSE_FEATURES` adds to the seven, in its order."""
+    """Compute the features of one touch in `COURSE_FEATURES` after the first seven, in the order of that list."""
     has_centroid = np.isfinite(course.centroid[:, 0])  # a frame below the level has no centroid
     centroids, seconds = course.centroid[has_centroid], course.seconds[has_centroid]
     steps = np.linalg.norm(np.diff(centroids, axis=0), axis=1)

@@ -1,4 +1,4 @@
-"""Classifiers of gestures by name, and their cross-validation."""
+"""Classifiers of gestures: functions that fit them, listed by name, and their cross-validation."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from jeit.touch.learnt.temporal_network import TemporalNetwork
 
 
 def fit_logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest:
-    """Fit a `LogitBoostClassifier()`, as Silvera Tawil et al. (2011) do, and convert it to a forest, which is
-    faster."""
+    """Fit LogitBoost to touch features (n, k), as Silvera Tawil et al. (2011) do, and convert the classifier to a
+    forest, which predicts faster."""
     from jeit.touch.gestures.logit_boost import LogitBoostClassifier
 
     return Forest.from_stumps(LogitBoostClassifier().fit(features, label))
@@ -51,7 +51,7 @@ FEATURE_FORMS: dict[str, Callable[..., Any]] = {
 
 
 def feature_forms(method: str) -> tuple[str, ...]:
-    """Return the names in `FEATURE_FORMS` of the features that a classifier can be fitted to."""
+    """Return the names in `FEATURE_FORMS` of the sets of features that the classifier `method` can be fitted to."""
     return ("sequence",) if method == "temporal-network" else ("seven", "course")
 
 
@@ -69,7 +69,7 @@ class Scale:
 
     @classmethod
     def from_features(cls, values: Float[np.ndarray, "n k"]) -> "Scale":
-        """Estimate the scale from features (n, k); `size` is the median of |x|. Constant features become zero."""
+        """Estimate the transform from features (n, k); `size` is the median of |x|. Constant features become zero."""
         size = np.median(np.abs(values), axis=0)
         size = np.where(size > 0, size, np.maximum(np.abs(values).max(axis=0), 1e-300))
         logs = np.sign(values) * np.log1p(np.abs(values) / size)
@@ -77,7 +77,7 @@ class Scale:
         return cls(size, logs.mean(axis=0), np.where(deviation > 1e-12, deviation, 1.0))
 
     def __call__(self, values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-        """Scale features (n, k)."""
+        """Transform features (n, k) to the common scale."""
         return (np.sign(values) * np.log1p(np.abs(values) / self.size) - self.mean) / self.deviation
 
 
@@ -86,10 +86,10 @@ def held_out_odds(
 ) -> Float[np.ndarray, "n C"]:
     """Compute log-odds (n, C) of the classes of n touches by cross-validation.
 
-    The touches of each fold are classified by the classifier `method`, fitted to all other folds. `features` (n, k):
-    features; `true_classes` (n,): true classes, 0 … C − 1; `folds` (n,): number of the fold of each touch. The log-odds
-    are those of `log_odds`; a class that the other folds lack has −1000. Raises `ValueError` if the other folds contain
-    only one class.
+    The touches of each fold are classified by the classifier `method`, fitted to all other folds. `features` (n, k): k
+    features of each touch; `true_classes` (n,): true classes, 0 … C − 1; `folds` (n,): number of the fold of each
+    touch. The log-odds are those of `log_odds`; a class that occurs in no other fold has −1000. Raises `ValueError` if
+    the other folds contain only one class.
     """
     odds = np.full((len(true_classes), true_classes.max() + 1), -1e3)
 
@@ -110,7 +110,8 @@ def held_out_odds(
 def random_folds(true_classes: np.ndarray, num_folds: int, seed: int = 0) -> Int[np.ndarray, " n"]:
     """Assign touches to `num_folds` folds at random, with the touches of each class spread evenly.
 
-    Returns the number of the fold of each touch (n,). With fewer touches than `num_folds`, there are fewer folds.
+    Returns the number of the fold of each touch (n,). If there are fewer touches than `num_folds`, each touch is a
+    fold.
     """
     rng = np.random.default_rng(seed)
     folds, num_assigned = np.empty(len(true_classes), int), 0

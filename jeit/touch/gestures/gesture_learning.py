@@ -16,7 +16,7 @@ from jeit.touch.gestures import GestureModel, StreamTouch, TouchLevel, find_touc
 from jeit.touch.gestures.gesture_model import METHODS, Reading, check_labels
 from jeit.touch.gestures.touch_images import TouchImages
 
-# Maximum number of recordings used to determine the sign of touches.
+# Maximum number of recordings used to determine whether touches raise or lower the conductivity.
 _MAX_RECORDINGS_FOR_SIGN = 60
 
 
@@ -24,8 +24,8 @@ _MAX_RECORDINGS_FOR_SIGN = 60
 class LearntGestures:
     """A gesture classifier trained on recordings.
 
-    **Fields**: `model`: the classifier; `images`: the imager of the skin; `without_touch`: numbers of the recordings in
-    which no touch was found.
+    **Fields**: `model`: the classifier; `images`: imager that computes images from frames of the skin; `without_touch`:
+    numbers of the recordings in which no touch was found.
 
     **Example:**
 
@@ -48,14 +48,14 @@ def learn_gestures(
     form: str = "auto",
     progress: Callable[[str], None] | None = None,
 ) -> LearntGestures:
-    """Learn the gestures of a described skin from recordings; the longest touch of each recording is used.
+    """Train a gesture classifier on recordings of a described skin, of which the longest touch each is used.
 
     **Arguments:**
 
     - `description`: description of the skin.
     - `recordings`: recordings of one gesture each.
     - `method`, `form`: classifier and its features; see `GestureModel.fit`.
-    - `progress`: called with a description of the progress.
+    - `progress`: function that is called with a description of each step.
 
     Raises `ValueError` as `TouchImages.prepare` and `GestureModel.fit` do, and if most recordings contain no touch.
 
@@ -109,8 +109,8 @@ def learn_gestures(
 
 
 def _touch_level_and_sign(images: TouchImages, untouched: np.ndarray, recordings: GestureSet) -> tuple[TouchLevel, int]:
-    """Determine the sign of touches, and their level: with this sign, touches exceed their level by the larger
-    factor."""
+    """Determine the level of change above which the skin is touched, and the sign of touches: the sign for which
+    touches exceed the level by the larger factor."""
     indices = np.unique(np.linspace(0, len(recordings) - 1, min(_MAX_RECORDINGS_FOR_SIGN, len(recordings))).astype(int))
     changes_of_recordings = [changes for _, changes in _times_and_changes(images, recordings, indices.tolist())]
     candidates = []
@@ -126,7 +126,7 @@ def _touch_level_and_sign(images: TouchImages, untouched: np.ndarray, recordings
 def _times_and_changes(
     images: TouchImages, recordings: GestureSet, indices: Sequence[int]
 ) -> Iterator[tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T m"]]]:
-    """Yield the times and the images of change of the recordings `indices`, all imaged as one stream."""
+    """Yield the times (T,) and images of change (T, m) of each recording in `indices`, imaged as one stream."""
     frames = (frame for index in indices for frame in recordings.recording(index)[1])
     stream = images.stream(frames)
     for index in indices:

@@ -29,7 +29,7 @@ from jeit.touch.learnt.extras import apply_in_parts
 from jeit.touch.learnt.file import read_plain, write_plain
 from jeit.touch.learnt.methods import fit_sharpness, log_odds, probabilities
 
-# Minimum factor between the conductivities of two skins that are considered different, or given in different units.
+# Two skins whose conductivities differ by this factor or more are considered different, or given in different units.
 _MIN_CONDUCTIVITY_RATIO = 5.0
 
 
@@ -39,7 +39,7 @@ class Reading:
 
     **Fields**: `level`: change of conductivity that a touch exceeds, S; `background`: conductivity of the untouched
     skin, S; `sign`: 1 if a touch raises the conductivity, −1 if it lowers it; `rate`: frame rate, frames/s;
-    `num_channels`: number of channels; `protocol`: name of the protocol.
+    `num_channels`: number of channels of a frame; `protocol`: name of the drive and measurement protocol.
     """
 
     level: float
@@ -66,8 +66,8 @@ class Reading:
     def check_same_skin(self, num_channels: int, protocol: str, background: float) -> None:
         """Check that frames are from a skin like the one that gestures were learnt on.
 
-        Raises `ValueError` for another number of channels, another protocol, or a `background`, S, that differs by more
-        than a factor of 5.
+        Raises `ValueError` if the number of channels or the protocol differs, or if the untouched skin's conductivity
+        `background`, S, differs by a factor of 5 or more.
         """
         if num_channels != self.num_channels:
             raise ValueError(
@@ -88,8 +88,8 @@ class Reading:
 
 
 METHODS = ("auto", *GESTURE_CLASSIFIERS)
-# Maximum number of folds when the method is chosen by cross-validation; fraction of held-out touches that are accepted
-# as similar to the training set.
+# Maximum number of folds of the cross-validation of classifiers; fraction of held-out touches that are accepted as
+# similar to the training set.
 _MAX_FOLDS, _SIMILARITY_QUANTILE = 10, 0.99
 # Number of touches whose distances from the training set are computed at once.
 _CHUNK_SIZE = 1000
@@ -102,9 +102,9 @@ _FILE_KIND, _FILE_VERSION = "a jeit gesture model", 3
 class Gestures:
     """Predicted gestures of n touches.
 
-    **Fields**: `gesture` (n,): most probable gesture; `probability` (n,): its probability; `probabilities` (n, C):
-    probabilities of all C gestures; `names`: names of the C gestures; `unlike` (n,): whether the touch is unlike all
-    touches of the training set, so that its prediction is not valid.
+    **Fields**: `gesture` (n,): most probable gesture of each touch; `probability` (n,): probability of this gesture;
+    `probabilities` (n, C): probabilities of all C gestures; `names`: names of the C gestures; `unlike` (n,): whether
+    the touch is unlike all touches of the training set, so that its prediction is not valid.
     """
 
     gesture: np.ndarray
@@ -120,15 +120,16 @@ class Gestures:
 
 @dataclass(frozen=True)
 class GestureModel:
-    """A classifier of touches.
+    """Classifier that predicts the gesture of a touch, such as "stroke".
 
     **Fields**: `names` (C,): names of the gestures; `method`: name of the classifier; `form`: name of its features,
-    "seven" (those of the paper), "course" (those and more of the time course) or "sequence" (all of the time course);
-    `scale`: scale of the features; `model`: fitted classifier; `sharpness`: factor that multiplies its log-odds to give
-    probabilities; `known` (N, k): scaled course features of the training set; `known_scale`: their scale; `farthest`:
-    distance from the nearest touch of the training set beyond which a touch is unlike all of them; `reading`: how the
-    frames were acquired, None if unknown; `standing`: predictions for held-out touches, and error rates of all
-    classifiers tried, best first, None if the model was read from a file; `notes`: remarks on the training.
+    "seven" (`touch_features`), "course" (these, and more of the time course) or "sequence" (these, and the sampled time
+    course); `scale`: transform of the features; `model`: fitted classifier; `sharpness`: factor by which the
+    classifier's log-odds are multiplied before they become probabilities; `known` (N, k): scaled course features of the
+    N touches of the training set; `known_scale`: transform of these features; `farthest`: distance from the nearest
+    touch of the training set beyond which a touch is unlike all of the set; `reading`: how the frames were acquired,
+    None if unknown; `standing`: predictions for held-out touches, and error rates of all classifiers tried, best first,
+    None if the model was read from a file; `notes`: remarks on the training.
 
     **Example:**
 
@@ -167,13 +168,13 @@ class GestureModel:
         """Fit a classifier to touches and their `labels` (n,), the names of gestures.
 
         `people` (n,): names or numbers of the people who made the touches. `method`: one of `METHODS`; `form`: "seven",
-        "course", "sequence" (only for the network) or "auto". "auto" chooses what is most accurate on held-out people:
-        each person in turn, or a tenth of the people if there are more than ten. Without `people`, or with only one
-        person, touches are held out at random, which does not measure the accuracy for other people. `reading` and
-        `notes` are stored in the model. `progress` is called with the name of each combination that is tried. Raises
-        `ValueError` if the numbers of labels, people and touches differ, for empty labels, fewer than two gestures,
-        gestures with fewer than two touches, and unknown names of methods and forms; `ImportError` without the extra
-        `learn`.
+        "course", "sequence" (only for `method` "temporal-network") or "auto". "auto" chooses the classifier and
+        features that are most accurate on held-out people: each person in turn, or a tenth of the people if there are
+        more than ten. Without `people`, or with only one person, touches are held out at random, which does not measure
+        the accuracy for other people. `reading` and `notes` are stored in the model. `progress` is called with the
+        names of each classifier and its features, before they are tried. Raises `ValueError` if the numbers of labels,
+        people and touches differ, for empty labels, fewer than two gestures, gestures with fewer than two touches, and
+        unknown names of methods and forms; `ImportError` without the extra `learn`.
         """
         need_extra("learn", "learning gestures")
         check_name("method", method, METHODS)
@@ -226,8 +227,8 @@ class GestureModel:
     def predict(self, touches: list[StreamTouch]) -> Gestures:
         """Predict the gestures of touches.
 
-        Predictions are less certain for touches that are cut off, of which only a part is known. Raises `ValueError` if
-        `touches` is not a list of touches.
+        Predictions are less certain for touches that are cut off, because only a part of the touch is known. Raises
+        `ValueError` if `touches` is not a list of touches.
         """
         values = FEATURE_FORMS[self.form](touches).values
         if not len(values):
@@ -258,8 +259,8 @@ class GestureModel:
     def read(cls, path: str | Path) -> "GestureModel":
         """Read a model from a file written by `write`, or from the output folder of `jeit touch gestures`.
 
-        Nothing in the file is executed. Raises `FileNotFoundError`, and `ValueError` if the file is of another kind or
-        contains anything but numbers and estimators of scikit-learn.
+        Nothing in the file is executed. Raises `FileNotFoundError` without a file, and `ValueError` if the file is not
+        of a gesture model, or contains anything but numbers and estimators of scikit-learn.
         """
         path = Path(path) / GESTURE_FILE if Path(path).is_dir() else Path(path)
         if not path.is_file():
@@ -313,7 +314,7 @@ def _nearest_distance(training_features: np.ndarray, features: np.ndarray) -> Fl
 
 
 def _held_out_distance(training_features: Float[np.ndarray, "N k"], folds: Int[np.ndarray, " N"]) -> float:
-    """Compute the 99 % quantile of the distance of held-out touches from the nearest touch of the other folds."""
+    """Compute the 99 % quantile of the distance of a fold's touches from the nearest touch of the other folds."""
     distances = [
         _nearest_distance(training_features[folds != fold_index], training_features[folds == fold_index])
         for fold_index in np.unique(folds)

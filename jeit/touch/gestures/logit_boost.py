@@ -15,34 +15,34 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from jeit.arguments import describe
 
-# Maximum magnitude of responses (Friedman et al. 2000, section 4.2; the value of WEKA); minimum weight; maximum number
-# of times that a step is halved.
+# Maximum magnitude of the responses z (Friedman et al. 2000, section 4.2; the value of WEKA); minimum weight of a
+# sample; maximum number of times that a step is halved.
 _MAX_RESPONSE, _MIN_WEIGHT, _MAX_HALVINGS = 3.0, 1e-12, 30
 
 
 class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
     """Multi-class LogitBoost with regression stumps and the defaults of WEKA: 10 rounds, full steps.
 
-    Let p be the current probability of a class, and y = 1 for samples of the class, otherwise 0. In every round, a
-    stump f_j is fitted for each of the J classes to the responses z = (y − p) / (p (1 − p)), clipped at ±3, with the
-    weights w = (y − p) / z, at least 1e-12; without clipping, w = p (1 − p). Then the score F_j grows by (J − 1) / J
-    (f_j − mean f), multiplied by the learning rate, and p becomes the softmax of F. Friedman, Hastie and Tibshirani,
-    Annals of Statistics 28 (2000) 337, algorithm 6; weights as in WEKA's LogitBoost.
+    Let p be the current estimate of the probability of a class, and y = 1 for samples of the class, otherwise 0. In
+    every round, a stump f_j is fitted for each of the J classes to the responses z = (y − p) / (p (1 − p)), clipped at
+    ±3, with the weights w = (y − p) / z, at least 1e-12; without clipping, w = p (1 − p). Then the score F_j grows by
+    (J − 1) / J (f_j − mean f), multiplied by the learning rate, and p becomes the softmax of F. Friedman, Hastie and
+    Tibshirani, Annals of Statistics 28 (2000) 337, algorithm 6; weights as in WEKA's LogitBoost.
 
     A small step increases the likelihood of the training set, but a full step may be too long, although clipping makes
-    this rare. A step is therefore halved until the likelihood is at least that before it. For two classes, the method
-    equals the two-class LogitBoost of that paper.
+    this rare. A step is therefore halved until the likelihood is not less than before the step. For two classes, the
+    method equals the two-class LogitBoost of Friedman et al.
 
     **Arguments:**
 
     - `n_estimators`: number of rounds.
-    - `learning_rate`: factor of every step.
+    - `learning_rate`: factor by which every step is multiplied.
 
-    **Fields** after `fit`: `classes_` (J,): the classes; `feature_` (rounds, J): feature that each stump compares;
-    `threshold_`: threshold of each stump; `below_`, `above_` (rounds, J): values at or below the threshold and above
-    it, multiplied by the step and by (J − 1) / J, before their mean over the classes is subtracted; `step_` (rounds,):
-    step of each round; `log_likelihood_` (rounds + 1,): mean log-likelihood of a sample before the first round and
-    after each round.
+    **Fields** after `fit`: `classes_` (J,): the classes; `feature_` (rounds, J): feature that each stump compares with
+    its threshold; `threshold_` (rounds, J): these thresholds; `below_`, `above_` (rounds, J): values of each stump at
+    or below the threshold and above it, multiplied by the step and by (J − 1) / J, before their mean over the classes
+    is subtracted; `step_` (rounds,): factor of the full step of each round; `log_likelihood_` (rounds + 1,): mean
+    log-likelihood of a sample before the first round and after each round.
 
     **Example:**
 
@@ -104,17 +104,17 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
             yield score
 
     def staged_decision_function(self, X: Any) -> Iterator[np.ndarray]:
-        """Yield `decision_function` after each round."""
+        """Yield the result of `decision_function` after each boosting round."""
         for score in self._staged_scores(X):
             yield score[:, 1] - score[:, 0] if len(self.classes_) == 2 else score
 
     def staged_predict_proba(self, X: Any) -> Iterator[Float[np.ndarray, "n J"]]:
-        """Yield `predict_proba` after each round."""
+        """Yield the probabilities (n, J) of `predict_proba` after each boosting round."""
         for score in self._staged_scores(X):
             yield _softmax(score)
 
     def staged_predict(self, X: Any) -> Iterator[np.ndarray]:
-        """Yield `predict` after each round."""
+        """Yield the classes (n,) of `predict` after each boosting round."""
         for score in self._staged_scores(X):
             yield self.classes_[score.argmax(axis=1)]
 
@@ -136,7 +136,7 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
 
 
 def _fit_stumps(X: np.ndarray, class_indicators: np.ndarray, probability: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Fit a stump for each class; returns features, thresholds, and values below and above the thresholds, each (J,).
+    """Fit a stump for each class; return features, thresholds, and values below and above the thresholds, each (J,).
 
     A stump that finds no split is constant, with an infinite threshold.
     """
@@ -168,7 +168,7 @@ def _fit_stumps(X: np.ndarray, class_indicators: np.ndarray, probability: np.nda
 
 
 def _stump_values(X: np.ndarray, feature, threshold, below, above) -> Float[np.ndarray, "n J"]:
-    """Return the values (n, J) that the stumps of a round add to F."""
+    """Return the values (n, J) that the stumps of a round add to the scores F."""
     values = np.where(X[:, feature] <= threshold, below, above)
     return values - values.mean(axis=1, keepdims=True)
 

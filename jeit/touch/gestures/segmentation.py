@@ -1,8 +1,9 @@
-"""Segment a stream of images into touches, and compute the time course of the change.
+"""Segment a stream of images into touches, and compute the time course of the change of conductivity.
 
-A touch lasts while the maximum change P(t) = max_e x_e over the elements e exceeds a level; interruptions shorter than
-100 ms are bridged. Frames with NaN or infinite values, and frames with the same time as the frame before, are counted
-but not used. If no frame arrives for so long that a touch may have ended in the meantime, the touch is cut off there.
+A touch lasts while the maximum change P(t) = max_e x_e over the mesh elements e exceeds a level; interruptions shorter
+than 100 ms are bridged. Frames with NaN or infinite values, and frames with the same time as the frame before, are
+counted but not used. If no frame arrives for so long that a touch may have ended in the meantime, the touch is cut off
+at its last frame.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ from jeit_solvers.module import Module
 
 # Minimum number of untouched frames for estimating the standard deviation of their peaks.
 _MIN_UNTOUCHED_FRAMES = 10
-# Number of standard deviations by which the level of a touch exceeds the mean peak of untouched frames.
+# Number of standard deviations by which the touch level exceeds the mean peak of untouched frames.
 _LEVEL_DEVIATIONS = 5.0
 
 
 class ChangeCourse(Module):
-    """Time course of T images of the change x_e of elements e, in the unit of the images.
+    """Time course of T images of the change x_e of mesh elements e, in the unit of the images.
 
     **Fields**: `seconds` (T,): times; `peak` (T,): P = max_e x_e; `least` (T,): min_e x_e; `half_share` (T,): fraction
-    of the elements with x_e ≥ P / 2; `mean` (T,): mean of x_e over the elements above the touch level, 0 if there are
-    none; `area` (T,): area of these elements, m²; `centroid` (T, 2): their centroid, metres, weighted by area and by
-    the excess above the level, NaN if there are none.
+    of the elements with x_e ≥ P / 2; `mean` (T,): mean of x_e over the elements above the touch level, 0 without such
+    elements; `area` (T,): area of the elements above the level, m²; `centroid` (T, 2): their centroid, metres, weighted
+    by area and by the excess above the level, NaN without such elements.
     """
 
     seconds: Float[np.ndarray, " T"]
@@ -44,7 +45,7 @@ class ChangeCourse(Module):
         return len(self.seconds)
 
     def select(self, frames: slice | np.ndarray) -> "ChangeCourse":
-        """Return the time course of some of the frames."""
+        """Return the time course of the frames that a slice or an array of indices selects."""
         return ChangeCourse(*(getattr(self, name)[frames] for name in _FIELD_NAMES))
 
     @classmethod
@@ -59,7 +60,7 @@ _FIELD_NAMES = ("seconds", "peak", "least", "half_share", "mean", "area", "centr
 
 
 class TouchLevel(Module):
-    """Level of the maximum change in an image above which the skin is touched.
+    """Threshold of touch: the skin is touched while the maximum change in its image exceeds this level.
 
     **Arguments:**
 
@@ -84,7 +85,7 @@ class TouchLevel(Module):
     def __init__(self, mesh: Mesh, level: float):
         """Set the level for images on a flat 2-D mesh.
 
-        Raises `ValueError` for any other mesh, and for a level that is not positive.
+        Raises `ValueError` for a mesh that is not flat and 2-D, and for a level that is not positive.
         """
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
         check_flat(mesh, "gestures")
@@ -99,9 +100,9 @@ class TouchLevel(Module):
     def of_untouched(cls, mesh: Mesh, images: Float[np.ndarray, "F m"]) -> "TouchLevel":
         """Estimate the level from at least ten images (F, m) of an untouched skin.
 
-        The level is five standard deviations above the mean of max_e x_e; frames with NaN are left out. The level
-        allows for drift only if the frames span as long a time as later recordings. Raises `ValueError` for fewer
-        frames, images of another mesh, and images that are all the same.
+        The level is five standard deviations above the mean of the maxima of the images; images with NaN are left out.
+        The level allows for drift only if the images span as long a time as later recordings. Raises `ValueError` for
+        fewer than ten images, images of another mesh, and images that are all the same.
         """
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
         images = check_images(images, mesh.num_cells)
@@ -117,7 +118,7 @@ class TouchLevel(Module):
     def course(self, seconds: Float[np.ndarray, " F"], images: Float[np.ndarray, "F m"]) -> ChangeCourse:
         """Compute the time course of images (F, m) at times `seconds` (F,).
 
-        Raises `ValueError` for images of another mesh, values that are not finite, and a different number of times.
+        Raises `ValueError` for images of another mesh, values that are not finite, and more or fewer times than images.
         """
         images = check_images(images, len(self.areas))
         seconds = check_seconds(seconds, len(images))
@@ -153,7 +154,7 @@ def check_images(images: Float[np.ndarray, "F m"], num_elements: int) -> Float[n
 def check_seconds(seconds: Float[np.ndarray, " F"], num_frames: int) -> Float[np.ndarray, " F"]:
     """Convert the times of `num_frames` frames to an array (F,).
 
-    Raises `ValueError` if their number differs, if they decrease, or if they are not finite.
+    Raises `ValueError` if the times are not `num_frames`, decrease, or are not finite.
     """
     seconds = real_array("seconds", seconds, f"times ({num_frames},) of the frames")
     if seconds.shape != (num_frames,):
@@ -169,11 +170,11 @@ _MIN_GAP, _MIN_TOUCH_FRAMES, _TIME_TOLERANCE = 0.1, 2, 1e-9
 
 
 class StreamTouch(Module):
-    """One touch of a stream.
+    """One touch in a stream of images.
 
-    **Fields**: `course`: time course from the first to the last frame above the level; `lost`: number of unusable
-    frames in between; `begun_before`, `cut_off`: whether the touch is present in the first, or the last, frame of an
-    uninterrupted part of the stream, so that its true onset, or end, is unknown.
+    **Fields**: `course`: time course of the touch, from the first to the last frame above the touch level; `lost`:
+    number of unusable frames between these frames; `begun_before`, `cut_off`: whether the touch is present in the
+    first, or the last, frame of an uninterrupted part of the stream, so that its true onset, or end, is unknown.
 
     **Example:**
 
@@ -212,15 +213,15 @@ class StreamTouch(Module):
 class TouchStream(Module):
     """State of the segmentation of a stream of images into touches.
 
-    `stream.follow(second, image)` returns the state after the next frame; this one is not changed. A touch has ended
+    `stream.follow(second, image)` returns the state after the next frame; `stream` is not changed. A touch has ended
     when `gap` seconds have passed since its last frame above the level. Touches of fewer than `least` frames are
-    discarded. If frames are `gap` or more seconds apart, all touches are cut off: choose a larger `gap`.
+    discarded. If frames are `gap` or more seconds apart, every touch is cut off after one frame: choose a larger `gap`.
 
     **Fields**: `level`: level of a touch; `gap`: minimum untouched time between two touches, seconds; `least`: minimum
     number of frames of a touch; `second`: time of the last usable frame, -inf before the first; `open`: frames of the
-    current touch; `held`: number of these up to the last one above the level; `lost`: numbers of unusable frames up to
-    that frame and after it; `begun_before`: whether the current touch began before it was first seen; `ended`: touches
-    that have ended.
+    current touch; `held`: number of these frames up to the last frame above the level; `lost`: numbers of unusable
+    frames before and after the last frame above the level; `begun_before`: whether the current touch began before it
+    was first seen; `ended`: touches that have ended.
 
     **Example:**
 
@@ -246,9 +247,9 @@ class TouchStream(Module):
         _check_settings(self.level, self.gap, self.least)
 
     def follow(self, second: float, image: Float[np.ndarray, " m"]) -> "TouchStream":
-        """Return the state after an image (m,) at time `second`.
+        """Return the state of the segmentation after an image (m,) at time `second`, seconds.
 
-        Raises `ValueError` for a time before the last frame, and images of another mesh.
+        Raises `ValueError` for a time before the last frame's, and an image of another mesh.
         """
         if not (is_number(second) and second >= self.second):
             raise ValueError(f"second must not be before the last frame, {self.second:g} s; it is {describe(second)}.")
@@ -290,18 +291,18 @@ def find_touches(
     gap: float = _MIN_GAP,
     least: int = _MIN_TOUCH_FRAMES,
 ) -> list[StreamTouch]:
-    """Find the touches in a series of images, as a `TouchStream` does frame by frame.
+    """Find the touches in a series of images at once; a `TouchStream` finds them image by image.
 
     **Arguments:**
 
     - `level`: level above which the skin is touched.
     - `seconds`: times (F,) of the images, seconds.
-    - `images`: changes (F, m), in the unit of the level.
+    - `images`: images of change (F, m), in the unit of the level.
     - `gap`: minimum untouched time between two touches, seconds.
     - `least`: minimum number of frames of a touch.
 
-    Raises `ValueError` for times that decrease or are not finite, images of another mesh, and frames whose median
-    interval is not below the `gap`.
+    Raises `ValueError` for times that decrease or are not finite, images of another mesh, and images whose median
+    interval is not below `gap`.
 
     **Example:**
 

@@ -1,8 +1,7 @@
-"""`TouchImages`: images of the change of a skin's conductivity from its untouched state, frame by frame, and the
-contacts in those of a recording.
+"""`TouchImages`: images of the change of a skin's conductivity from its untouched state; contacts in a recording.
 
 Each image is one linear reconstruction step on a coarse mesh, by default with the NOSER prior of Silvera Tawil et al.
-(2011). As in every stream, invalid frames are refused, and the channels of a dead electrode are left out.
+(2011). Invalid frames are refused, and the channels of a dead electrode are left out.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from jeit.mesh import Mesh
 from jeit.touch.contacts import CellFinder, Contact, ImageNoise, find_contacts, track_contacts
 from jeit.touch.contacts.tracker import TouchPath, without_side_lobes
 
-# Minimum number of frames of an untouched skin, and of those from which the noise of images is estimated.
+# Minimum number of frames of the untouched skin that are needed, and from which the noise of images is estimated.
 _MIN_UNTOUCHED_FRAMES, _MIN_NOISE_FRAMES = 3, 10
 
 TOUCH_IMAGES = StreamSettings(solver=OneStep(), prior="noser")
@@ -35,10 +34,10 @@ TOUCH_IMAGES = StreamSettings(solver=OneStep(), prior="noser")
 
 @dataclass(frozen=True)
 class TouchImages:
-    """Imager of the touches of a skin.
+    """Computes images of the changes of a skin's conductivity under touches.
 
-    **Fields**: `imager`: reconstructs images from frames; `calibration`: calibrated model of the skin that it uses;
-    `reference`: mean frame of the untouched skin.
+    **Fields**: `imager`: reconstructs images from frames; `calibration`: calibrated model of the skin that the imager
+    uses; `reference`: mean frame of the untouched skin.
 
     **Example:**
 
@@ -63,9 +62,9 @@ class TouchImages:
     ) -> "TouchImages":
         """Prepare imaging of a described skin from frames `untouched` (u, M), volts, of the untouched skin.
 
-        The mean of these frames is the reference. `progress` is called with each step as it begins. Raises `ValueError`
-        for an incomplete description, a three-dimensional skin, another number of channels, and as
-        `jeit.imaging.prepare_imager` does.
+        The mean of these frames is the reference. `progress` is called with the name of each step as it begins. Raises
+        `ValueError` for an incomplete description, a three-dimensional skin, frames whose number of channels is not
+        that of the description, and as `jeit.imaging.prepare_imager` does.
         """
         check_kind("description", description, Description, "a Description, as of load_description('skin.toml')")
         reference = described_reference(description, untouched, name="untouched")
@@ -90,9 +89,10 @@ class TouchImages:
         return self.calibration.model.protocol.num_measurements
 
     def stream(self, frames: Iterable) -> Iterator[tuple[FrameImage, Float[np.ndarray, " m"]]]:
-        """Image frames (M,), volts.
+        """Compute images of frames (M,), volts, one by one.
 
-        Yields the status of each frame, and its change of conductivity (m,), S, which is NaN if the frame was refused.
+        Yields the status of each frame, and its image of the change of conductivity (m,), S, which is NaN if the frame
+        was refused.
         """
         refused_change = np.full(self.mesh.num_cells, np.nan)
         for frame_image in stream(self.imager, frames):
@@ -102,7 +102,7 @@ class TouchImages:
             )
 
     def changes(self, frames: Float[np.ndarray, "F M"]) -> Float[np.ndarray, "F m"]:
-        """Compute changes of conductivity (F, m), S, from frames (F, M), volts; NaN for frames that are refused."""
+        """Compute images of the change of conductivity (F, m), S, of frames (F, M), volts; NaN for refused frames."""
         changes = [change for _, change in self.stream(frames)]
         return np.array(changes).reshape(len(changes), self.mesh.num_cells)
 
@@ -110,16 +110,15 @@ class TouchImages:
 def untouched_frames(
     recording: FrameRecording, seconds: Float[np.ndarray, " F"], span: float
 ) -> Float[np.ndarray, "u M"]:
-    """Return frames (u, M) of the untouched skin: the recording's `reference`, otherwise its first seconds. Frames
-    without any reading are left out.
+    """Return frames (u, M), volts, of the untouched skin: the recording's `reference`, otherwise its first seconds.
 
     **Arguments:**
 
     - `recording`: the recording.
     - `seconds`: times (F,) of its frames, seconds.
-    - `span`: time from the beginning that is untouched, seconds.
+    - `span`: time from the beginning of the recording in which the skin is untouched, seconds.
 
-    Raises `ValueError` if fewer than three frames remain.
+    Of the first seconds, frames without any reading are left out. Raises `ValueError` if fewer than three remain.
 
     **Example:**
 
@@ -145,11 +144,11 @@ def untouched_frames(
 
 @dataclass(frozen=True)
 class RecordedContacts:
-    """Contacts of a recording.
+    """Contacts that were found in a recording.
 
     **Fields**: `seconds` (F,): times of the frames; `changes` (F, m): change of conductivity, S, NaN for refused
-    frames; `contacts`: those of each frame; `touches`: paths of the touches, which last for two frames or more;
-    `notes`: reasons to doubt them.
+    frames; `contacts`: list of the contacts of each frame; `touches`: paths of the touches, which last for two frames
+    or more; `notes`: reasons to doubt contacts and touches.
 
     **Example:**
 
@@ -166,7 +165,7 @@ class RecordedContacts:
     notes: tuple[str, ...]
 
     def number_of(self, frame: int, contact: Contact) -> int | None:
-        """The number of the touch to which a contact of a frame belongs; None for a contact in a single frame."""
+        """Return the number of the touch to which a contact of the frame with index `frame` belongs, or None."""
         return self._numbers.get((float(self.seconds[frame]), *contact.centroid.tolist()))
 
     @cached_property
@@ -193,11 +192,11 @@ def find_recorded_contacts(
 
     - `images`: imager of the skin.
     - `frames`: frames (F, M), volts.
-    - `seconds`: their increasing times (F,), seconds.
+    - `seconds`: increasing times (F,) of the frames, seconds.
     - `untouched`: frames (u, M) of the untouched skin, volts, which give the noise of images if there are ten or more.
     - `sign`: 1 if touched skin conducts better, -1 if worse.
-    - `weakest`: minimum peak of a contact, relative to the strongest of its frame. A linear image of a contact has side
-      lobes of up to a third of its peak.
+    - `weakest`: minimum peak of a contact, relative to that of the strongest contact in its frame. A linear image of a
+      contact has side lobes of up to a third of its peak.
 
     Raises `ValueError` if no frame can be imaged, and as `track_contacts` does.
 

@@ -1,8 +1,9 @@
 """Classify touches of a live skin as they end.
 
-A touch is classified at the first frame below its level, as early as it may have ended; it has ended for good after the
-`gap`. While the skin is untouched, the reference follows it, so that drift is not detected as a touch. A touch that
-lasts longer than the `patience` is reported as held, and becomes part of the reference.
+A touch is classified at the first frame below the touch level, as early as it may have ended; it has ended for good
+when the skin has been untouched for the time `gap`. While the skin is untouched, the reference frame follows its drift,
+so that drift is not detected as a touch. A touch that lasts longer than the time `patience` is reported as held, and
+becomes part of the reference.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from jeit.inverse.streaming.stream import FrameImage
 from jeit.touch.gestures import GestureModel, StreamTouch, TouchLevel, TouchStream
 from jeit.touch.gestures.touch_images import TouchImages
 
-# Minimum untouched time between two touches: seconds, and number of frames, of which the longer applies; untouched time
-# after which the reference follows the skin, seconds; time constant with which it follows, seconds.
+# Minimum untouched time between two touches, in seconds and in frames, of which the longer applies; untouched time
+# after which the reference frame follows the skin's drift, seconds; time constant with which it follows, seconds.
 _MIN_GAP, _MIN_GAP_FRAMES, _SETTLING_TIME, _DRIFT_TIME_CONSTANT = 0.1, 2.5, 0.5, 2.0
-# Maximum fraction of the initial untouched frames that may exceed the learnt level.
+# Maximum fraction of the initial untouched frames that may exceed the touch level of the model.
 _MAX_FRACTION_ABOVE_LEVEL = 0.1
-# Signs that the skin was touched when its reference was recorded: minimum ratio to the level of the largest change, if
-# it is opposite to a touch; minimum time, seconds, for which it lasts.
+# A change opposite to a touch shows that the skin was touched when its reference was recorded: minimum ratio of this
+# change to the touch level; minimum time, seconds, for which it lasts.
 _MIN_OPPOSITE_RATIO, _MIN_OPPOSITE_TIME = 3.0, 0.5
 
 
@@ -34,11 +35,11 @@ _MIN_OPPOSITE_RATIO, _MIN_OPPOSITE_TIME = 3.0, 0.5
 class NamedTouch:
     """A touch and its predicted gesture.
 
-    **Fields**: `number`: position in order of onset, from 1; `touch`: the touch; `gesture`: most probable gesture;
-    `probability`: its probability; `probabilities` (C,): probabilities of all gestures; `unlike`: whether the touch is
-    unlike all touches of the training set, so that the prediction is not valid; `named`: time in the stream at which it
-    was classified, seconds; `latency`: computing time from that frame to the prediction, seconds; `held`: whether it
-    was cut off because it lasted longer than the patience.
+    **Fields**: `number`: rank in order of onset, from 1; `touch`: the touch; `gesture`: most probable gesture;
+    `probability`: probability of this gesture; `probabilities` (C,): probabilities of all C gestures; `unlike`: whether
+    the touch is unlike all touches of the training set, so that the prediction is not valid; `named`: time in the
+    stream at which the touch was classified, seconds; `latency`: computing time from the arrival of the last frame to
+    the prediction, seconds; `held`: whether the touch was cut off because it lasted longer than the watch's `patience`.
 
     **Example:**
 
@@ -61,12 +62,12 @@ class NamedTouch:
 
 @dataclass(frozen=True)
 class WatchedFrame:
-    """The result for one frame.
+    """What a `TouchWatch` finds in one frame: whether the skin is touched, and which touches have ended.
 
-    **Fields**: `second`: time of the frame; `image`: image of the frame, None in the result after the last frame;
-    `peak`: maximum change, S, NaN if the frame was refused; `touched`: whether the skin is touched; `named`: touch that
-    was classified at this frame, which may still continue, or None; `ended`: touches that have ended for good;
-    `latency`: time from the frame to the result, seconds; `note`: remark on the frame, or an empty string.
+    **Fields**: `second`: time of the frame, seconds; `image`: image of the frame, None in the result after the last
+    frame; `peak`: maximum change, S, NaN if the frame was refused; `touched`: whether the skin is touched; `named`:
+    touch that was classified at this frame, which may still continue, or None; `ended`: touches that have ended for
+    good; `latency`: time from the frame to the result, seconds; `note`: remark on the frame, or an empty string.
 
     **Example:**
 
@@ -89,11 +90,11 @@ class WatchedFrame:
 
 @dataclass(frozen=True)
 class TouchWatch:
-    """Settings for classifying the touches of a live skin.
+    """Classifies the touches of a live skin, frame by frame, from fixed settings.
 
-    **Fields**: `images`: imager of the skin; `level`: change that a touch exceeds; `model`: gesture classifier; `gap`:
-    minimum untouched time between two touches, seconds; `patience`: time after which a touch becomes part of the
-    reference, seconds; `notes`: remarks on the untouched skin and the frame rate.
+    **Fields**: `images`: imager of the skin; `level`: change of conductivity that a touch exceeds; `model`: gesture
+    classifier; `gap`: minimum untouched time between two touches, seconds; `patience`: duration after which a touch
+    becomes part of the reference frame, seconds; `notes`: remarks on the untouched skin and the frame rate.
 
     **Example:**
 
@@ -122,10 +123,10 @@ class TouchWatch:
     ) -> "TouchWatch":
         """Create a watch for a skin whose frames come at `rate`, frames/s.
 
-        `untouched` (u, M): first frames of the skin, untouched, volts. The level of a touch is that of the model, or is
-        estimated from the untouched frames if these are noisier. Raises `ValueError` for a model that was learnt on
-        another skin or does not describe its skin, for untouched frames from which no level can be estimated, and for
-        rates and patience that are not positive.
+        `untouched` (u, M): first frames of the skin, untouched, volts. The touch level is that stored in `model`; if
+        more than a tenth of the untouched frames exceed this level, a higher level is estimated from these frames.
+        Raises `ValueError` for a model that was learnt on another skin or does not say on which, for untouched frames
+        from which no level can be estimated, and for rates and patience that are not positive.
         """
         check_kind("images", images, TouchImages, "TouchImages, as of TouchImages.prepare(description, untouched)")
         check_kind("model", model, GestureModel, "a GestureModel, as of GestureModel.read(path)")
@@ -154,7 +155,7 @@ class TouchWatch:
         return cls(images, level, model, max(_MIN_GAP, _MIN_GAP_FRAMES / rate), patience, tuple(notes))
 
     def follow(self, frames: Iterable[tuple[float, Any]]) -> Iterator[WatchedFrame]:
-        """Process frames as they come: pairs of a time in seconds and voltages (M,).
+        """Yield a result for each frame as it comes; a frame is a pair of a time in seconds and voltages (M,).
 
         Frames that are refused, and frames with the same time as the frame before, count as lost. A touch that is
         present at the end is reported as cut off by one more `WatchedFrame`, without an image. Raises `ValueError` for
@@ -173,8 +174,8 @@ class _Session:
         self.touches = TouchStream(watch.level, gap=watch.gap)
         self.reference = np.asarray(watch.images.imager.expected, float)
         self.drift = np.zeros_like(self.reference)
-        # The last frame with the drift subtracted, None if it is invalid; then the clock time at which it came, its
-        # time in the stream, and the time of the last result.
+        # The last frame with the drift subtracted, None if this frame is invalid; then the clock time at which the
+        # frame came, its time in the stream, and the time in the stream of the last result.
         self.frame: np.ndarray | None = None
         self.arrival_time, self.frame_time, self.last_result_time = 0.0, -np.inf, -np.inf
         self.last_touch_time, self.num_ended_touches = -np.inf, 0
@@ -182,7 +183,7 @@ class _Session:
         self.opposite_start: float | None = None
 
     def follow(self, frames: Iterable) -> Iterator[WatchedFrame]:
-        """See `TouchWatch.follow`."""
+        """Yield a result for each frame; see `TouchWatch.follow`."""
         for image, change in self.watch.images.stream(self._frames_without_drift(frames)):
             yield self._frame_result(image, self.sign * change)
         if self.touches.touches:
@@ -244,7 +245,7 @@ class _Session:
         return self.opposite_start is not None and self.frame_time - self.opposite_start >= _MIN_OPPOSITE_TIME
 
     def _reset_reference(self, image: FrameImage) -> tuple[NamedTouch, ...]:
-        """Make the last frame the reference of the untouched skin; returns the touch that this ends, if any."""
+        """Make the last frame the reference of the untouched skin; return the current touch, which ends, if any."""
         ended = tuple(self._ended_touch(touch) for touch in self.touches.touches)
         self.touches = replace(self.touches, open=(), held=0, lost=(0, 0))
         self.opposite_start = None
@@ -258,7 +259,7 @@ class _Session:
             self.drift = self.drift + np.where(is_usable, share * (self.frame - self.reference), 0.0)
 
     def _classify(self, touch: StreamTouch) -> NamedTouch:
-        """Predict the gesture of a touch, with the time since its last frame arrived."""
+        """Predict the gesture of a touch; record the computing time since the last frame arrived."""
         gestures = self.watch.model.predict([touch])
         return NamedTouch(
             number=self.num_ended_touches + 1,
@@ -272,8 +273,8 @@ class _Session:
         )
 
     def _ended_touch(self, touch: StreamTouch) -> NamedTouch:
-        """Return an ended touch with the prediction made when it was over, or with a new one if there is none for all
-        of it."""
+        """Return an ended touch with the prediction that was made at its end, or with a new prediction if that was not
+        made for the whole touch."""
         named_touch, self.last_named_touch = self.last_named_touch, None
         if named_touch is None or len(named_touch.touch.course) != len(touch.course):
             named_touch = self._classify(touch)

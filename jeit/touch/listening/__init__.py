@@ -1,9 +1,9 @@
 """Classify touches, or any other sounds, from microphone recordings, every 0.1 s.
 
-`read_clips` reads clips from folders, one per class. `Listener.fit` trains a classifier on them: a network, boosted
-trees on hand-made features, or a linear discriminant, whichever is most accurate on held-out clips. `Listener.classify`
-classifies the windows of a recording. The features are those of `sound_images`, feature images after Park et al.
-(2022), and `sound_features`.
+`read_clips` reads clips of sound from folders, one per class. `Listener.fit` trains a classifier on clips: a network,
+boosted trees on hand-made features, or a linear discriminant, whichever is most accurate on held-out clips.
+`Listener.classify` classifies the windows of a recording. The network sees feature images of sound after Park et al.
+(2022), which `sound_images` computes; `sound_features` computes the hand-made features.
 """
 
 from __future__ import annotations

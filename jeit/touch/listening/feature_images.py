@@ -1,13 +1,13 @@
-"""Feature images of sound: the intensity of every microphone over time, above the spectrogram of the loudest one.
+"""Feature images of sound: intensity of every microphone over time, above the spectrogram of the loudest microphone.
 
 The images are those of Park et al. (2022): a window of 0.5 s has 41 frames, 12 ms apart; an image has M rows of
 intensity, one for each microphone, and 64 rows of the spectrogram, so that 25 microphones give 89 × 41. At a sampling
 rate of 10 kHz, a frame consists of 128 samples under a Hann window, and begins 120 samples after the previous frame;
 bins 1 to 64 of its Fourier transform are the 64 bands.
 
-At any other rate, frames have the same duration, and bins are assigned to bands by their frequency; sound is not
-resampled. Up to `highest` = 5 kHz, all bands are as wide as a bin, 78 Hz; for a larger `highest`, the lowest band has
-this width, and each band is wider than the one below it by the same factor.
+At any other sampling rate, frames have the same duration, and bins are assigned to bands by their frequency; sound is
+not resampled. The bands end at the frequency `highest`. If it is at most 5 kHz, all bands are as wide as a bin, 78 Hz;
+otherwise, the lowest band has this width, and each band is wider than the band below it by the same factor.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from jeit.acoustic import Recording
 from jeit.arguments import check_kind, describe, is_number
 
 NUM_BANDS, NUM_FRAMES = 64, 41
-# Duration of a frame, time from frame to frame, and time from window to window, seconds.
+# Duration of a frame, time between the starts of two frames, and time between the starts of two windows, seconds.
 FRAME_DURATION, FRAME_INTERVAL, WINDOW_INTERVAL = 0.0128, 0.012, 0.1
 WINDOW_DURATION = FRAME_DURATION + (NUM_FRAMES - 1) * FRAME_INTERVAL
 """Duration of a window, seconds."""
-# Maximum of `highest` for which all bands are as wide as a bin; minimum of `highest`, below which fewer than 8 bins
-# would be left; hertz.
+# Maximum of the frequency `highest` for which all bands are as wide as a bin; minimum of `highest`, below which fewer
+# than 8 bins would be left; hertz.
 MAX_EVEN_FREQUENCY, MIN_HIGHEST = 5000.0, 625.0
 # Number of windows whose images are computed at once.
 _MAX_BLOCK_WINDOWS = 128
@@ -40,10 +40,10 @@ _MAX_BLOCK_WINDOWS = 128
 class SoundImages:
     """Feature images of W windows of one recording.
 
-    `times` (W,): middles of the windows, seconds; `intensity` (W, M, 41): power of each microphone; `strongest` (W,):
-    index of the loudest microphone; `spectrum` (W, 64, 41): power of this microphone in each band, divided by the
-    number of bins in the band. Powers are in the square of the samples' unit. `known` (W,): whether more than half of a
-    window's samples are finite.
+    `times` (W,): middles of the windows, seconds; `intensity` (W, M, 41): power at each of M microphones in 41 frames;
+    `strongest` (W,): index of the loudest microphone; `spectrum` (W, 64, 41): power of this microphone in each of 64
+    bands, divided by the number of bins in the band. Powers are in the square of the samples' unit. `known` (W,):
+    whether more than half of a window's samples are finite.
     """
 
     times: Float[np.ndarray, " W"]
@@ -67,7 +67,7 @@ class SoundImages:
 
     @property
     def normalised(self) -> "SoundImages":
-        """The same windows, with powers divided by the `loudness` of each window; silent windows are unchanged."""
+        """The feature images with powers divided by the `loudness` of each window; silent windows are unchanged."""
         divisor = np.where(self.loudness > 0, self.loudness, 1.0)[:, None, None]
         return replace(self, intensity=self.intensity / divisor, spectrum=self.spectrum / divisor)
 
@@ -78,8 +78,8 @@ class SoundImages:
 
 
 def check_highest(highest: float) -> float:
-    """Return the maximum frequency of sound images in Hz as a float. Raises `ValueError` if it is not a number, or too
-    low."""
+    """Return the maximum frequency of feature images in Hz as a float. Raises `ValueError` if the frequency is not a
+    number, or below 625 Hz."""
     if not (is_number(highest) and MIN_HIGHEST <= highest < np.inf):
         raise ValueError(
             f"highest must be a frequency in Hz, {MIN_HIGHEST:g} or more, of the features; it is {describe(highest)}."
@@ -88,9 +88,10 @@ def check_highest(highest: float) -> float:
 
 
 def band_edges(highest: float) -> Float[np.ndarray, " 65"]:
-    """Compute the edges of the 64 bands, Hz.
+    """Compute the edges of the 64 frequency bands of feature images, Hz.
 
-    Up to `highest` = 5 kHz, all bands have the same width; at 5 kHz, `highest` is the middle of the last band.
+    If `highest`, Hz, is at most 5 kHz, all bands have the same width; at 5 kHz, `highest` is the middle of the last
+    band.
     """
     bin_width = 1 / FRAME_DURATION
     if highest <= MAX_EVEN_FREQUENCY:
@@ -103,7 +104,7 @@ def band_edges(highest: float) -> Float[np.ndarray, " 65"]:
 
 
 def sound_images(recording: Recording, highest: float = MAX_EVEN_FREQUENCY) -> SoundImages:
-    """Compute the feature images of all windows of a recording, every 0.1 s.
+    """Compute feature images of a sound recording: one for each window of 0.5 s, every 0.1 s.
 
     Bands above half the sampling rate are empty. A recording shorter than 0.5 s is padded with 0.3 s of silence before
     and after it. Samples that are not finite count as zero.
@@ -113,7 +114,8 @@ def sound_images(recording: Recording, highest: float = MAX_EVEN_FREQUENCY) -> S
     - `recording`: samples of one or several microphones.
     - `highest`: frequency above which sound is left out, Hz.
 
-    Raises `ValueError` if `recording` is not a `Recording`, its rate is below 1250 Hz, or `highest` is invalid.
+    Raises `ValueError` if `recording` is not a `Recording`, its sampling rate is below 1250 Hz, or `highest` is
+    invalid.
 
     **Example:**
 
@@ -126,7 +128,7 @@ def sound_images(recording: Recording, highest: float = MAX_EVEN_FREQUENCY) -> S
 
 
 def image_blocks(recording: Recording, highest: float = MAX_EVEN_FREQUENCY) -> Iterator[SoundImages]:
-    """Compute the images of `sound_images` in blocks of windows, for recordings of any length.
+    """Compute the feature images of `sound_images` in blocks of windows, for recordings larger than memory.
 
     Raises `ValueError` as `sound_images` does.
     """
@@ -151,7 +153,7 @@ def _compute_image_blocks(recording: Recording, highest: float) -> Iterator[Soun
         samples = np.pad(samples, ((0, 0), (padding_before, padding_after)))
     num_frames = 1 + (samples.shape[1] - length) // hop
     num_windows = 1 + int((num_frames - NUM_FRAMES + 0.5) * hop / (WINDOW_INTERVAL * rate))
-    # Each window begins with the frame nearest to its time.
+    # Each window begins with the frame nearest to a multiple of 0.1 s.
     starts = np.minimum(
         np.round(WINDOW_INTERVAL * rate * np.arange(num_windows) / hop).astype(int), num_frames - NUM_FRAMES
     )
@@ -178,7 +180,7 @@ def _compute_image_blocks(recording: Recording, highest: float) -> Iterator[Soun
 
 
 def _band_powers(channel: np.ndarray, taper: np.ndarray, hop: int, weights: np.ndarray) -> Float[np.ndarray, "F 64"]:
-    """Compute the power in each frame and band (F, 64), before scaling."""
+    """Compute the power (F, 64) of a microphone's samples in each of F frames and 64 bands, not yet scaled."""
     frames = sliding_window_view(channel, len(taper))[::hop]
     # The mean is subtracted, since a constant offset would leak into the lowest band.
     spectrum = np.fft.rfft((frames - frames.mean(axis=1, keepdims=True)) * taper)
@@ -186,12 +188,12 @@ def _band_powers(channel: np.ndarray, taper: np.ndarray, hop: int, weights: np.n
 
 
 def _finite_share(finite: np.ndarray, length: int, hop: int) -> np.ndarray:
-    """Compute the share of each frame's samples that are finite (M, F)."""
+    """Compute the share (M, F) of finite samples in each of F frames of M microphones."""
     return sliding_window_view(finite, length, axis=1)[:, ::hop].mean(axis=-1)
 
 
 def _band_weights(length: int, rate: float, highest: float) -> Float[np.ndarray, "K 64"]:
-    """Compute the share of each bin's frequency interval, (k ± 1/2) rate / length, that lies in each band.
+    """Compute the share (K, 64) of the frequency interval of each bin k, (k ± 1/2) rate / length, in each band.
 
     The share is 0 for bin 0, and for frequencies above half the rate or above `highest`.
     """

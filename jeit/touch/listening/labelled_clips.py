@@ -15,7 +15,7 @@ from jeit.acoustic import Intensities, Recording, read_recording
 from jeit.arguments import check_kind, counted
 from jeit.touch.listening.feature_images import MIN_HIGHEST
 
-# Maximum number of unread files that a note describes.
+# Maximum number of files that could not be read and are described in a note.
 _MAX_DESCRIBED = 4
 # Relative difference of sampling rates below which they are considered equal.
 _RATE_TOLERANCE = 1e-3
@@ -36,17 +36,17 @@ class _RecordingFiles(Sequence):
 
 @dataclass(frozen=True)
 class LabelledClips:
-    """n labelled clips of sound, created by `LabelledClips.from_recordings`.
+    """Clips of sound with the classes to which they belong, created by `LabelledClips.from_recordings`.
 
     **Fields**
 
-    - `recordings`: sequence of n `jeit.acoustic.Recording`.
-    - `labels` (n,): their classes.
-    - `groups` (n,): names of the groups, such as of people or things, in which clips are held out together.
+    - `recordings`: sequence of n clips, each a `jeit.acoustic.Recording`.
+    - `labels` (n,): class of each clip.
+    - `groups` (n,): name of each clip's group, such as a person or thing; clips of a group are held out together.
     - `channels`: number of channels of all clips, 1 if they are mixed.
     - `highest`: frequency up to which all clips have sound, Hz.
     - `notes`: remarks on the clips.
-    - `name`: their name.
+    - `name`: name of the set of clips.
 
     **Example:**
 
@@ -77,9 +77,9 @@ class LabelledClips:
         """Create labelled clips from `recordings` and their classes `labels`.
 
         `groups`: the group of each clip; by default each clip is a group of its own. Clips with different numbers of
-        channels are mixed to one channel. `notes` are stored together with those created here. Raises `ValueError` if
-        the numbers of recordings, labels and groups differ, for recordings that are not recordings of samples, and for
-        fewer than two classes.
+        channels are mixed to one channel. `notes` are stored together with remarks on mixed channels and on sampling
+        rates that differ. Raises `ValueError` if the numbers of recordings, labels and groups differ, for recordings
+        that are not recordings of samples, and for fewer than two classes.
         """
         check_kind("recordings", recordings, Sequence, "a list of Recording, as of read_recording(path)")
         class_names = np.asarray(labels)
@@ -120,13 +120,13 @@ class LabelledClips:
 
     @classmethod
     def of(cls, *arguments: Any, **keywords: Any) -> "LabelledClips":
-        """Former name of `from_recordings`, which goes with the next version."""
+        """Former name of `from_recordings`; the next version no longer has this name."""
         text = "LabelledClips.of is now LabelledClips.from_recordings; the old name goes with the next version."
         warnings.warn(text, DeprecationWarning, stacklevel=2)
         return cls.from_recordings(*arguments, **keywords)
 
     def clip(self, number: int) -> Recording:
-        """Return the clip with this index, mixed to one channel if all clips are."""
+        """Return the clip with index `number`; its channels are mixed to one if `channels` is 1."""
         return self.recordings[number] if self.channels > 1 else mix_channels(self.recordings[number])
 
     def __len__(self) -> int:
@@ -135,17 +135,17 @@ class LabelledClips:
 
 
 def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = None) -> LabelledClips:
-    """Read labelled clips: every sub-folder of a folder is a class, and every file in it a clip of that class.
+    """Read labelled clips of sound: every sub-folder of a folder is a class, and every file in it a clip of the class.
 
     Files are WAV, NPZ, or any format that `soundfile` reads if it is installed. Clips in a folder within the folder of
     a class, such as of one person or day, are one group, together with the clips of other classes in a folder of the
-    same name; any other file is a group of its own. Files that cannot be read are left out and listed in `notes`;
-    hidden files are ignored.
+    same name; a file directly in the folder of a class is a group of its own. Files that cannot be read are left out
+    and listed in `notes`; hidden files are ignored.
 
     **Arguments:**
 
-    - `folder`: the folder.
-    - `progress`: called with a description of the progress.
+    - `folder`: the folder of classes.
+    - `progress`: function that is called with a description of the progress.
 
     Raises `ValueError` if there is no such folder, there are fewer than two classes, or no clip of a class can be read.
 
@@ -200,7 +200,7 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
 
 
 def _describe_unread(failures: list[tuple[str, str]]) -> str:
-    """Describe how many files were not read, and for which reasons. Reasons of files of different formats come
+    """Describe how many files could not be read, and for which reasons. One reason for each format of file comes
     first."""
     num_previous: dict[str, int] = {}
     entries = []
@@ -213,7 +213,7 @@ def _describe_unread(failures: list[tuple[str, str]]) -> str:
 
 
 def _check_clip(clip: Recording | Intensities, name: str) -> None:
-    """Raise `ValueError` for a clip that cannot be used for training."""
+    """Raise `ValueError` for a clip that cannot be used for training: intensities, silence, or a low sampling rate."""
     if not isinstance(clip, Recording):
         raise ValueError(f"{name}: it holds intensities, not samples.")
     finite_samples = clip.samples[np.isfinite(clip.samples)]

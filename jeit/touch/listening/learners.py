@@ -1,7 +1,8 @@
-"""Classifiers of sound windows: the network, boosted trees on hand-made features, and linear discriminants.
+"""Classifiers of sound windows: a network, boosted trees on hand-made features, and linear discriminants.
 
-The discriminants use the hand-made features alone, or with the spectrum in all its bands. The method `learn` of each
-learner returns a classifier, which has `log_odds` of the classes 0 … C − 1, and arrays that are stored in a file.
+The discriminants use the hand-made features alone, or with the spectrum in all bands. The method `learn` of each
+learner returns a classifier. Its `log_odds` are those of the classes 0 … C − 1; its `to_stored` returns arrays to store
+in a file.
 """
 
 from __future__ import annotations
@@ -29,24 +30,24 @@ from jeit.touch.listening.modality_network import (
 from jeit.touch.listening.window_features import Levels, sound_features, spectrum_features
 from jeit.touch.training import TrainingPlan
 
-# Number of boosting rounds; number of leaves of a tree; minimum number of windows in a leaf if the set is large.
+# Boosted trees: number of rounds; number of leaves of a tree; minimum number of windows in a leaf in large sets.
 _NUM_ROUNDS, _NUM_LEAVES, _MIN_LEAF_WINDOWS = 100, 15, 10
 BATCHES = 1500
 """Default of the maximum number of training batches."""
-# Limits for small sets: maximum number of passes through the windows, and number of batches that are allowed even if
-# they require more passes.
+# Limits for small training sets: maximum number of passes through the windows; number of batches that are allowed even
+# if they require more passes.
 _MAX_PASSES, _MIN_BATCHES = 40, 100
-# One in this number of groups of each class is held out for early stopping of the network's training.
+# One in this number of groups of clips of each class is held out for early stopping of the network's training.
 _STOPPING_RATIO = 6
 
 
 class TrainingSet(NamedTuple):
-    """A training set of windows, and the settings of a training.
+    """A training set of sound windows, and the settings of the training.
 
-    `images`: the windows; `labels` (W,): their true classes, 0 … C − 1; `classes`: the number of classes C; `groups`
-    (W,): numbers that are equal for windows recorded together; `key`: draws the initial weights of networks; `batches`:
-    maximum number of training batches; `checkpoint`: file in which an unfinished training is stored; `progress`: is
-    called with a description of the progress.
+    `images`: feature images of W windows; `labels` (W,): their true classes, 0 … C − 1; `classes`: the number of
+    classes C; `groups` (W,): numbers that are equal for windows recorded together; `key`: random key that draws the
+    initial weights of networks; `batches`: maximum number of training batches; `checkpoint`: file in which an
+    unfinished training is stored; `progress`: function that is called with a description of the progress.
     """
 
     images: SoundImages
@@ -61,7 +62,7 @@ class TrainingSet(NamedTuple):
 
 @dataclass(frozen=True)
 class NetworkListener:
-    """A trained network, and the `levels` that compute its images."""
+    """Trained network that classifies sound windows; `levels` converts feature images to its input."""
 
     network: ModalityNetwork
     levels: Levels
@@ -69,29 +70,29 @@ class NetworkListener:
 
     @classmethod
     def from_network(cls, network: ModalityNetwork, levels: Levels) -> "NetworkListener":
-        """Create a listener from a trained network."""
+        """Create a classifier from a trained network and the levels of its input."""
         return cls(network, levels, NetworkAnswers(network))
 
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
-        """Compute the log-odds (W, C) of the classes."""
+        """Compute the log-odds (W, C) of C classes for W windows."""
         return self.answers.log_odds(self.levels(images))
 
     def to_stored(self) -> tuple[dict[str, Any], Any]:
-        """Return the header and the arrays to store in a file."""
+        """Return the header and the arrays to store in a classifier's file."""
         levels = {name: getattr(self.levels, name).tolist() for name in Levels.__dataclass_fields__}
         return {"levels": levels}, self.network
 
 
 @dataclass(frozen=True)
 class NetworkLearner:
-    """Trains a network by the schedule `plan(windows, batches=)`."""
+    """Trains a network by the schedule that `plan(windows, batches=)` returns."""
 
     plan: Callable[..., TrainingPlan]
 
     def learn(self, training_set: TrainingSet) -> NetworkListener:
         """Train a network with early stopping, by the loss on held-out groups.
 
-        One in six groups of each class is held out, if it has enough groups.
+        One in six groups of clips of each class is held out, and one of a class with three to five groups.
         """
         is_held_out = stopping_rows(training_set.labels, training_set.groups)
         levels = Levels.from_images(training_set.images[~is_held_out])
@@ -117,12 +118,12 @@ class NetworkLearner:
 
     @staticmethod
     def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of the stored ones."""
+        """Create arrays with the shapes of those in a file with the header `head`."""
         return ModalityNetwork.draw(jax.random.key(0), rows, 41, classes)
 
     @staticmethod
     def from_stored(head: dict[str, Any], arrays: Any) -> NetworkListener:
-        """Restore a classifier from the header and arrays of `NetworkListener.to_stored`."""
+        """Restore a network from the header and arrays that `NetworkListener.to_stored` returned."""
         return NetworkListener.from_network(
             arrays, Levels(**{name: np.array(value) for name, value in head["levels"].items()})
         )
@@ -130,13 +131,13 @@ class NetworkLearner:
 
 @dataclass(frozen=True)
 class TreesListener:
-    """Boosted trees, scikit-learn's `HistGradientBoostingClassifier`, on `sound_features`."""
+    """Classifies sound windows by boosted trees (`HistGradientBoostingClassifier`) on `sound_features`."""
 
     forest: Forest
 
     @classmethod
     def learn(cls, training_set: TrainingSet) -> "TreesListener":
-        """Fit the trees; the minimum number of windows in a leaf is lower in small sets."""
+        """Fit the trees to a training set; the minimum number of windows in a leaf is lower for small sets."""
         from sklearn.ensemble import HistGradientBoostingClassifier
 
         min_class_windows = int(np.bincount(training_set.labels, minlength=training_set.classes).min())
@@ -154,11 +155,11 @@ class TreesListener:
         return cls(Forest.from_boosted_classifier(model))
 
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
-        """Compute the log-odds (W, C) of the classes."""
+        """Compute the log-odds (W, C) of C classes for W windows."""
         return self.forest.decision_function(sound_features(images))
 
     def to_stored(self) -> tuple[dict[str, Any], Any]:
-        """Return the header and the arrays to store in a file."""
+        """Return the header and the arrays to store in a classifier's file."""
         forest = self.forest
         head = {"trees": forest.value.shape[0], "nodes": forest.value.shape[1], "depth": forest.depth}
         arrays = [forest.feature, forest.left, forest.right, forest.threshold, forest.value, forest.start]
@@ -166,7 +167,7 @@ class TreesListener:
 
     @staticmethod
     def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of the stored ones."""
+        """Create arrays with the shapes of those in a file with the header `head`."""
         node_shape = (int(head["trees"]), int(head["nodes"]))
         shapes = [(node_shape, np.int32)] * 3 + [
             (node_shape, np.float32),
@@ -177,7 +178,7 @@ class TreesListener:
 
     @classmethod
     def from_stored(cls, head: dict[str, Any], arrays: Any) -> "TreesListener":
-        """Restore a classifier from the header and arrays of `to_stored`.
+        """Restore boosted trees from the header and arrays that `to_stored` returned.
 
         Raises `ValueError` for trees with features or nodes that do not exist.
         """
@@ -202,9 +203,10 @@ class TreesListener:
 
 @dataclass(frozen=True)
 class LinearListener:
-    """A linear discriminant with Ledoit-Wolf shrinkage of its covariance, on `features` of images.
+    """Classifies sound windows by a linear discriminant with Ledoit-Wolf shrinkage of the covariance.
 
-    `weights` (k, C) and `offset` (C,) apply to features standardised by their `mean` (k,) and `deviation` (k,).
+    `features` computes k features (W, k) of W windows; `weights` (k, C) and `offset` (C,) apply to features
+    standardised by their `mean` (k,) and `deviation` (k,).
     """
 
     features: Callable[[SoundImages], Float[np.ndarray, "W k"]]
@@ -214,22 +216,22 @@ class LinearListener:
     offset: Float[np.ndarray, " C"]
 
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
-        """Compute the log-odds (W, C) of the classes."""
+        """Compute the log-odds (W, C) of C classes for W windows."""
         return (self.features(images) - self.mean) / self.deviation @ self.weights + self.offset
 
     def to_stored(self) -> tuple[dict[str, Any], Any]:
-        """Return the header and the arrays to store in a file."""
+        """Return the header and the arrays to store in a classifier's file."""
         return {}, [np.asarray(array, np.float32) for array in (self.mean, self.deviation, self.weights, self.offset)]
 
 
 @dataclass(frozen=True)
 class LinearLearner:
-    """Fits a `LinearListener` to `features` of images."""
+    """Fits a linear discriminant to the features of sound windows that `features` computes."""
 
     features: Callable[[SoundImages], Float[np.ndarray, "W k"]]
 
     def learn(self, training_set: TrainingSet) -> LinearListener:
-        """Fit the discriminant; all classes have the same prior probability, whatever their number of windows."""
+        """Fit the discriminant to a training set; all classes have the same prior probability, however many windows."""
         features = self.features(training_set.images)
         mean, deviation = features.mean(axis=0), features.std(axis=0)
         # Features that are constant except for rounding errors carry no information, and would make the covariance
@@ -246,7 +248,7 @@ class LinearLearner:
         return LinearListener(self.features, mean, deviation, weights, offset)
 
     def stored_shapes(self, head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of the stored ones."""
+        """Create arrays with the shapes of those in a file with the header `head`."""
         num_inputs = self.features(_NO_WINDOWS).shape[1]
         return [
             jax.numpy.zeros(shape, np.float32)
@@ -254,7 +256,7 @@ class LinearLearner:
         ]
 
     def from_stored(self, head: dict[str, Any], arrays: Any) -> LinearListener:
-        """Restore a classifier from the header and arrays of `LinearListener.to_stored`."""
+        """Restore a discriminant from the header and arrays that `LinearListener.to_stored` returned."""
         return LinearListener(self.features, *(np.asarray(array, float) for array in arrays))
 
 
@@ -270,7 +272,7 @@ schedule of the paper, or by that of this library."""
 
 
 def num_features() -> int:
-    """Number of hand-made features."""
+    """Return the number of hand-made features that `sound_features` computes for a window."""
     return sound_features(_NO_WINDOWS).shape[1]
 
 
@@ -278,8 +280,7 @@ _NO_WINDOWS = SoundImages(np.zeros(0), np.zeros((0, 1, 41)), np.zeros((0, 64, 41
 
 
 def stopping_rows(window_classes: Int[np.ndarray, " W"], groups: Int[np.ndarray, " W"]) -> np.ndarray:
-    """Return the mask (W,) of the windows that are held out for early stopping: whole groups, distributed over the
-    classes.
+    """Return the mask (W,) of the windows that are held out for early stopping: whole groups of clips of each class.
 
     No group is held out of a class with fewer than three groups.
     """
@@ -297,7 +298,7 @@ def stopping_rows(window_classes: Int[np.ndarray, " W"], groups: Int[np.ndarray,
         order = np.random.default_rng(int(class_index)).permutation(len(candidates))
         held_out_groups |= {candidates[index] for index in order[: max(0, num_wanted - len(already_held_out))]}
     is_held_out = np.isin(groups, sorted(held_out_groups))
-    # Every class must remain in the training set, otherwise nothing is held out.
+    # If a class would not remain in the training set, nothing is held out.
     return (
         is_held_out
         if set(window_classes[~is_held_out].tolist()) == set(window_classes.tolist())

@@ -25,14 +25,14 @@ from jeit.touch.listening.windows import MIN_RELATIVE_LOUDNESS, Windows, held_ou
 from jeit.touch.training import read_model, write_model
 
 METHODS = ("auto", *LEARNERS)
-# Methods that "auto" tries. The paper's schedule is left out, since that of this library gives an equally good network
-# in fewer batches.
+# Methods that "auto" tries. The network with the training schedule of the paper is left out, since the schedule of this
+# library gives an equally good network in fewer batches.
 _AUTO_METHODS = tuple(name for name in LEARNERS if name != "paper-network")
-# Maximum number of folds in which clips are held out; power below which a window is quiet, relative to that of the
-# quietest training window.
+# Maximum number of folds in which clips are held out; power below which a window counts as quiet, relative to the power
+# of the quietest training window.
 _MAX_FOLDS, _QUIET_RATIO = 3, 0.25
-# Minimum loudness of a recording with a lower gain than the clips, relative to that of the softest clip; minimum number
-# of windows for which a network is tried.
+# Minimum loudness that a recording is assumed to have because its gain is lower, relative to the loudness of the
+# softest training clip; minimum number of windows for which a network is tried.
 _MIN_GAIN, _MIN_NETWORK_WINDOWS = 1 / 16, 3000
 # Number of samples within which the readings of a working microphone change.
 _MAX_CHECKED_SAMPLES = 100_000
@@ -41,16 +41,16 @@ _KIND, _VERSION = "a jeit listener", 2
 
 @dataclass(frozen=True)
 class Listener:
-    """A trained classifier of sounds.
+    """A trained classifier of sounds, such as of touches of a skin with microphones.
 
-    **Fields**: `names` (C,): the classes; `method` and the trained `model`; `channels`: number of microphones, 1 if
-    they are mixed; `highest`: maximum frequency used, Hz; `loudness`: whether loudness is a feature, otherwise all
-    windows are scaled to equal loudness; `quietest`: minimum loudness of a training window; `clips_loudness`: loudness
-    of the softest and of the loudest clip; `sharpness`: factor of the log-odds from which probabilities are computed;
-    `doubt`: fraction of the probability that is spread evenly over all classes, 1 / (n + 2) for n held-out clips, since
-    these support no higher confidence. `standing`: predictions for the held-out clips, and errors of all methods that
-    were tried, the best first; None for a listener that was read from a file; `notes`: remarks on the training; `name`:
-    name of the clips.
+    **Fields**: `names` (C,): names of the classes; `method`: name of the method; `model`: trained classifier;
+    `channels`: number of microphones, 1 if they are mixed; `highest`: maximum frequency of sound that is used, Hz;
+    `loudness`: whether loudness is a feature, otherwise all windows are scaled to equal loudness; `quietest`: minimum
+    loudness of a training window; `clips_loudness`: loudness of the softest and of the loudest clip; `sharpness`:
+    factor by which log-odds are multiplied before probabilities are computed; `doubt`: fraction of the probability that
+    is spread evenly over all classes, 1 / (n + 2) for n held-out clips, since n clips support no higher confidence.
+    `standing`: predictions for the held-out clips, and error rates of all methods that were tried, the best first; None
+    for a listener that was read from a file; `notes`: remarks on the training; `name`: name of the clips.
 
     **Example:**
 
@@ -86,17 +86,17 @@ class Listener:
         folder: str | Path | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> "Listener":
-        """Train a listener on labelled clips.
+        """Train a classifier of sounds on labelled clips.
 
-        `method`: one of `METHODS`; "auto" chooses the one that classifies most held-out clips correctly, each as a
+        `method`: one of `METHODS`; "auto" chooses the method that classifies most held-out clips correctly, each as a
         whole. Clips are held out in three folds, together with all clips of their group. The training windows of a clip
-        are those at most 20 dB below its loudest, since the label does not describe the rest; in clips longer than 4 s,
-        every sound counts as a clip. "auto" does not try the network if there are few windows. `loudness`: whether
-        loudness is used as a feature; by default, it is if a linear discriminant then classifies more clips correctly,
-        by more than chance. `key`: draws the initial weights of the networks, each trained for at most `batches`;
-        `folder`: folder for checkpoints, from which an interrupted training can resume; `progress`: is called with a
-        description of the progress. Raises `ValueError` for invalid clips, key or method; `ImportError` without the
-        extra `learn`.
+        are those at most 20 dB below its loudest frame, since the label does not describe the rest; in clips longer
+        than 4 s, every single sound counts as a clip. "auto" does not try the network if there are few windows.
+        `loudness`: whether loudness is used as a feature; by default, it is used if a linear discriminant then
+        classifies more held-out clips correctly, by more than chance. `key`: random key that draws the initial weights
+        of the networks, each trained for at most `batches`; `folder`: folder for checkpoints, from which an interrupted
+        training can resume; `progress`: function that is called with a description of the progress. Raises `ValueError`
+        for invalid clips, key or method; `ImportError` without the extra `learn`.
         """
         need_extra("learn", "learning to classify sounds")
         check_kind("clips", clips, LabelledClips, "clips as of read_clips(folder)")
@@ -178,10 +178,10 @@ class Listener:
     def classify(self, recording: Recording, *, calibration: Calibration | None = None) -> SoundLabels:
         """Classify every window of a recording; windows are 0.5 s long and begin every 0.1 s.
 
-        A shorter recording is padded with silence. With a `calibration` of the microphones, places are estimated where
-        the localiser finds them. If the listener has one channel, the channels of the recording are mixed.
-        Raises `ValueError` if `recording` is not a `Recording`, has another number of microphones, or no sound up to
-        the frequency `highest`, and as `locate_touches` does.
+        A recording shorter than a window is padded with silence. With a `calibration` of the microphones, the places of
+        touches are estimated too, by `locate_touches`. If the listener has one channel, the channels of the recording
+        are mixed. Raises `ValueError` if `recording` is not a `Recording`, has another number of microphones, or no
+        sound up to the frequency `highest`, and as `locate_touches` does.
         """
         check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
         notes = []
@@ -246,10 +246,10 @@ class Listener:
         )
 
     def _quiet_threshold(self, loudest: float) -> float:
-        """Compute the loudness below which windows are quiet, in a recording whose loudest window is `loudest`.
+        """Compute the loudness below which windows count as quiet; `loudest`: that of the recording's loudest window.
 
-        If loudness is not a feature, the recording's gain may differ from that of the clips: up to 12 dB lower, or any
-        amount higher.
+        If loudness is not a feature, the recording's gain may differ from that of the training clips: up to 12 dB
+        lower, or any amount higher.
         """
         softest_clip, loudest_clip = self.clips_loudness
         gain = (
@@ -285,7 +285,8 @@ class Listener:
     def read(cls, path: str | Path) -> "Listener":
         """Read a listener from a file that `write` wrote, or from the folder that `jeit listen fit` wrote.
 
-        Nothing in the file is executed. Raises `FileNotFoundError`, and `ValueError` for files of another kind.
+        Nothing in the file is executed. Raises `FileNotFoundError` without a file, and `ValueError` for a file that is
+        not of a listener.
         """
         path = Path(path)
         if path.is_dir():
@@ -328,8 +329,8 @@ class Listener:
 def _held_out_odds(
     name: str, windows: Windows, clip_folds: np.ndarray, key: Array, batches: int, folder, report
 ) -> np.ndarray:
-    """Compute the log-odds (W, C) of windows by models that are fitted without the fold of their clip; NaN for windows
-    that are never held out."""
+    """Compute the log-odds (W, C) of windows by classifiers that are fitted without the fold of the window's clip; NaN
+    for windows that are never held out."""
     odds = np.full((len(windows.images), windows.classes), np.nan)
     for fold_index in range(int(clip_folds.max()) + 1):
         report(f"{name}, fold {fold_index + 1} of {int(clip_folds.max()) + 1}")
@@ -342,7 +343,7 @@ def _held_out_odds(
 
 
 def _is_loudness_useful(windows: Windows, clip_folds: np.ndarray, key: Array, report) -> bool:
-    """Determine whether loudness improves a linear discriminant by more than one standard deviation of chance.
+    """Determine whether loudness as a feature improves a linear discriminant by more than one standard deviation.
 
     If no clip can be held out, loudness is used if there are several microphones, which share one gain.
     """
@@ -365,9 +366,10 @@ def _checkpoint_path(folder: str | Path | None, name: str) -> Path | None:
 def _estimate_positions(
     recording: Recording, calibration: Calibration, times: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate the touched positions (W, d) and their standard deviations in metres, around the middle of each window.
+    """Estimate the touched position in each of W windows, (W, d), and its standard deviations (W, d), metres.
 
-    They are means over the frames of the smoothed track; NaN if there are none.
+    Both are means over those frames of the smoothed track at most 0.05 s from the middle of the window; NaN without
+    such frames.
     """
     located = locate_touches(recording, calibration)
     positions, deviations = located.track.position, np.sqrt(np.diagonal(located.track.covariance, axis1=1, axis2=2))

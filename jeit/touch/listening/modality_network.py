@@ -1,10 +1,10 @@
 """The network of Park et al. (2022) that classifies touch by its sound: trained with equinox and optax, run in NumPy.
 
-The network has two layers, each a convolution without padding, batch normalisation, rectification and max-pooling:
-5 × 5 to 32 channels, then 3 × 3 to 64. A dense layer and softmax follow. Training uses Adam with a rate of 2e-4,
-divided by ten after every five epochs, and batches of 64; the held-out loss is evaluated every 50 batches, and training
-ends after 20 evaluations without a decrease. This library's own choices are the size of the second convolution and of
-the pools, 3 × 3 and 2 × 2, and the noise added to images.
+The network has two layers, each a convolution without padding, batch normalisation, rectification and max-pooling. The
+convolutions are 5 × 5 to 32 channels, then 3 × 3 to 64 channels. A dense layer and softmax follow. Training uses Adam
+with a learning rate of 2e-4, divided by ten after every five epochs, and batches of 64; the held-out loss is evaluated
+every 50 batches, and training ends after 20 evaluations without a decrease. This library's own choices are the size of
+the second convolution and of the pools, 3 × 3 and 2 × 2, and the noise added to images.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from jeit.touch.training import TrainingObjective, TrainingPlan, TrainingResult, fit_network
 from jeit_solvers.module import Module
 
-# Sizes of the kernels and of the pools in pixels, and numbers of channels, of the two layers.
+# Sizes of the kernels and of the pools in pixels, and numbers of channels, of the first and second layer.
 _KERNEL_SIZES, _POOL_SIZES, _NUM_CHANNELS = (5, 3), (3, 2), (32, 64)
-# Weight of the mean and variance of a batch in the update of the running ones; constant added to variances.
+# Weight of the mean and variance of a batch in the update of the running mean and variance; constant added to
+# variances.
 _RUNNING_WEIGHT, _VARIANCE_FLOOR = 0.05, 1e-5
 NOISE_DEVIATION, NUM_COPIES = 0.2, 5
 """Standard deviation of the normal noise added to images, whose own standard deviation is 1; number of noisy copies of
@@ -37,10 +38,11 @@ _MAX_BLOCK_WINDOWS = 32
 
 
 class ModalityNetwork(Module):
-    """Weights of the network, in single precision.
+    """Convolutional network that classifies feature images of sound: its weights, in single precision.
 
     `first` (5, 5, 1, 32) and `second` (3, 3, 32, 64): kernels of the two convolutions; `gain`, `shift`, running `mean`
-    and `variance`: batch normalisation after the first and the second; `dense` (n, C) and `bias` (C,): the last layer.
+    and `variance`: batch normalisation after the first and the second convolution; `dense` (n, C) and `bias` (C,):
+    weights of the last layer, from n values to C classes.
     """
 
     first: Float[Array, "5 5 1 32"]
@@ -79,13 +81,13 @@ class ModalityNetwork(Module):
         return cls(first, second, ones, zeros, zeros, ones, dense, bias)
 
     def log_odds(self, images: Float[Array, "b rows columns"]) -> Float[Array, "b C"]:
-        """Compute the log-odds (b, C) of the classes, normalised by the running means and variances."""
+        """Compute the log-odds (b, C) of C classes for b images, with batch normalisation by running statistics."""
         return self._forward(images, self.mean, self.variance)[0]
 
     def log_odds_in_training(
         self, images: Float[Array, "b rows columns"]
     ) -> tuple[Float[Array, "b C"], "ModalityNetwork"]:
-        """Compute the log-odds (b, C) of the classes, normalised by the batch's own means and variances.
+        """Compute the log-odds (b, C) of C classes for a batch of b images, normalised by the batch's own statistics.
 
         Also returns the network with updated running means and variances.
         """
@@ -117,9 +119,8 @@ class ModalityNetwork(Module):
 
 
 def _max_pool(values, pool_size: int, namespace):
-    """Maximum of every `pool_size` × `pool_size` block of values (b, h, w, c). Rows and columns that do not fill a
-    block
-    are left out."""
+    """Compute the maximum of every `pool_size` × `pool_size` block of values (b, h, w, c). Rows and columns that do not
+    fill a block are left out."""
     height, width = (side // pool_size * pool_size for side in values.shape[1:3])
     values = values[:, :height, :width]
     row_maxima = reduce(namespace.maximum, [values[:, row::pool_size] for row in range(pool_size)])
@@ -131,7 +132,7 @@ class NetworkAnswers:
 
     def __init__(self, network: ModalityNetwork):
         host_network = jax.tree.map(np.asarray, network)
-        # The normalisation is a factor and an offset for each channel; the factor is merged into the kernels.
+        # Batch normalisation is a factor and an offset for each channel; the factor is merged into the kernels.
         factors = [
             gain / np.sqrt(variance + _VARIANCE_FLOOR)
             for gain, variance in zip(host_network.gain, host_network.variance, strict=True)
@@ -147,7 +148,7 @@ class NetworkAnswers:
         self.dense, self.bias = host_network.dense, host_network.bias
 
     def log_odds(self, images: Float[np.ndarray, "W rows columns"]) -> Float[np.ndarray, "W C"]:
-        """Compute the log-odds (W, C) of the classes."""
+        """Compute the log-odds (W, C) of C classes for W images."""
         blocks = [
             self._evaluate_block(images[start : start + _MAX_BLOCK_WINDOWS])
             for start in range(0, len(images), _MAX_BLOCK_WINDOWS)
@@ -165,10 +166,11 @@ class NetworkAnswers:
 
 
 def paper_plan(windows: int, *, batches: int, batch: int = 64) -> TrainingPlan:
-    """Training schedule of the paper for a training set of `windows` windows.
+    """Return the training schedule of Park et al. (2022) for a training set of `windows` windows.
 
-    Training has at most `batches`, but at least one pass through the windows. Noise is drawn anew in every batch, so
-    that no image is repeated; `NUM_COPIES` passes through the windows correspond to one epoch of noisy copies.
+    Training has at most `batches` batches of `batch` windows, but at least one pass through the windows. Noise is drawn
+    anew in every batch, so that no image is repeated; `NUM_COPIES` passes through the windows correspond to one epoch
+    of noisy copies.
     """
     batch_size = min(batch, windows)
     return TrainingPlan(
@@ -183,9 +185,9 @@ def paper_plan(windows: int, *, batches: int, batch: int = 64) -> TrainingPlan:
 
 
 def library_plan(windows: int, *, batches: int, batch: int = 64) -> TrainingPlan:
-    """Training schedule of this library, which needs fewer batches for the same accuracy on small sets.
+    """Return the library's own training schedule, which needs fewer batches for the same accuracy on small sets.
 
-    The rate is 1e-3, and a tenth of it in the last third of the training.
+    The learning rate is 1e-3, and 1e-4 in the last third of the training.
     """
     plan = paper_plan(windows, batches=batches, batch=batch)
     return replace(plan, rate=1e-3, decay_epochs=max(1, round(2 * plan.epochs / 3)))
@@ -205,9 +207,9 @@ def train_network(
 ) -> TrainingResult:
     """Train a network on images with the classes `labels`, until its loss on held-out images no longer decreases.
 
-    `held_out`: the held-out images and their classes; `plan`: as from `library_plan`; `noise`: standard deviation of
-    the noise added to images; `checkpoint` and `progress` as in `jeit.touch.fit_network`, whose errors are raised. The
-    same `key` gives identical results.
+    `held_out`: the held-out images and their classes; `plan`: training schedule, as from `library_plan`; `noise`:
+    standard deviation of the noise added to images; `checkpoint` and `progress`: see `jeit.touch.fit_network`, whose
+    errors are raised. The same `key` gives identical results.
     """
     draw_key, training_key = jax.random.split(key)
     network = ModalityNetwork.draw(draw_key, images.shape[1], images.shape[2], classes)

@@ -1,4 +1,4 @@
-"""The classified sounds of a recording: a class every 0.1 s, and events of consecutive windows of the same class."""
+"""The classified sounds of a recording: a class every 0.1 s, and events: runs of windows of the same class."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from jeit.touch.listening.feature_images import WINDOW_INTERVAL
 class Event:
     """A sound from `start` to `end`, seconds.
 
-    `name`: its class, "" for quiet; `probability`: mean over its windows; `place` (2,) or (3,), metres: mean of the
-    estimated places, None if there are none.
+    `name`: class of the sound, "" for quiet; `probability`: mean over the windows of the sound of the probability of
+    their class; `place` (2,) or (3,), metres: mean of the places estimated in these windows, None without any.
     """
 
     start: float
@@ -33,15 +33,15 @@ class SoundLabels:
 
     - `times` (W,): middles of the windows, seconds.
     - `probabilities` (W, C): probabilities of the classes `names` (C,).
-    - `quiet` (W,): whether a window is quieter than all windows of the training set, so that its probabilities are not
-      meaningful.
-    - `known` (W,): whether a window's samples are finite.
+    - `quiet` (W,): whether a window is clearly quieter than all windows of the training set, so that its probabilities
+      are not meaningful.
+    - `known` (W,): whether more than half of a window's samples are finite.
     - `strongest` (W,): index of the loudest microphone.
-    - `loud` (W,): whether a window is at most 20 dB below the loudest of the recording, for `whole`.
+    - `loud` (W,): whether a window is at most 20 dB below the loudest window of the recording; `whole` uses these.
     - `name`: name of the recording.
-    - `notes`: remarks on it.
-    - `position` (W, d), `position_std`: estimated place and its standard deviations, metres, NaN if there is none; both
-      are None without a calibration.
+    - `notes`: remarks on the recording.
+    - `position` (W, d), `position_std` (W, d): estimated place of the touch and its standard deviations, metres, NaN in
+      windows without a place; both are None without a calibration of the microphones.
 
     **Example:**
 
@@ -69,7 +69,7 @@ class SoundLabels:
 
     @property
     def named(self) -> np.ndarray:
-        """The most likely class of each window (W,); "" for windows that are quiet or not finite."""
+        """Name of the most likely class of each window (W,); "" for windows that are quiet or not `known`."""
         likeliest_names = np.array([*self.names, ""])[self.probabilities.argmax(axis=1)]
         return np.where(self.quiet | ~self.known, "", likeliest_names)
 
@@ -80,7 +80,7 @@ class SoundLabels:
 
     @property
     def whole(self) -> tuple[str, float]:
-        """The most likely class of the whole recording, from its loud windows together, and its probability.
+        """Most likely class of the whole recording, from its loud windows together, and the probability of this class.
 
         The probability is the geometric mean over the windows, so that overlapping windows are not counted as
         independent; the class is "" if all windows are quiet.
@@ -94,7 +94,7 @@ class SoundLabels:
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """Events: intervals of consecutive windows of the same class."""
+        """Sounds of the recording: intervals of consecutive windows of the same class."""
         names, events = self.named, []
         # An event extends half way to the previous and to the next window.
         edge_parts = [

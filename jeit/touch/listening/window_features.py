@@ -1,4 +1,4 @@
-"""Hand-made features of windows of sound: loudness, spectra, and levels of the microphones."""
+"""Hand-made features of windows of sound: features of loudness, of the spectrogram and of the microphones."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from jaxtyping import Float
 
 from jeit.touch.listening.feature_images import FRAME_INTERVAL, NUM_BANDS, NUM_FRAMES, SoundImages
 
-# Range of levels below the loudest, decibels; quantile of the powers that counts as the loudest.
+# Range of levels below the loudest level, decibels; quantile of the powers that counts as the loudest.
 _LEVEL_RANGE, _LOUDEST_QUANTILE = 60.0, 0.999
 
 
 @dataclass(frozen=True)
 class Levels:
-    """Conversion of powers to standardised levels in decibels; all fields are for intensities, then for spectrograms.
+    """Conversion of the powers in feature images to standardised levels in decibels.
 
     Levels are clipped at 60 dB below `loudest` (2,), the 99.9 % quantile of the training set, then standardised by
-    their `mean` (2,) and `deviation` (2,). All rows are converted alike, so that a louder window has larger values.
+    their `mean` (2,) and `deviation` (2,). The first value of each field is for intensities, the second for
+    spectrograms. All rows of an image are converted alike, so that a louder window has larger values.
     """
 
     loudest: Float[np.ndarray, " 2"]
@@ -28,7 +29,7 @@ class Levels:
 
     @classmethod
     def from_images(cls, images: SoundImages) -> "Levels":
-        """Compute the conversion from windows of the training set."""
+        """Compute the conversion from feature images of the training set."""
         loudest, mean, deviation = [], [], []
         for power in (images.intensity, images.spectrum):
             max_level = _to_decibels(np.quantile(power, _LOUDEST_QUANTILE), -np.inf)
@@ -40,16 +41,16 @@ class Levels:
 
     @classmethod
     def of(cls, images: SoundImages) -> "Levels":
-        """Former name of `from_images`, which goes with the next version."""
+        """Former name of `from_images`; the next version no longer has this name."""
         text = "Levels.of is now Levels.from_images; the old name goes with the next version."
         warnings.warn(text, DeprecationWarning, stacklevel=2)
         return cls.from_images(images)
 
     def __call__(self, images: SoundImages) -> Float[np.ndarray, "W rows 41"]:
-        """Compute feature images (W, M + 64, 41), in single precision: M rows of intensity, then 64 of the spectrogram.
+        """Convert feature images to levels (W, M + 64, 41): M rows of intensity, then 64 rows of the spectrogram.
 
         Microphones are sorted by their loudness in the window, the loudest first, so that a touch looks the same
-        wherever it is; the paper does not state their order.
+        wherever it is. Park et al. do not state the order of microphones. Levels are in single precision.
         """
         order = np.argsort(-images.intensity.sum(axis=2), axis=1, kind="stable")
         intensity = np.take_along_axis(images.intensity, order[..., None], axis=1)
@@ -65,21 +66,21 @@ def _to_decibels(power, min_level: float) -> np.ndarray:
     return np.maximum(10 * np.log10(np.maximum(power, 1e-30)), min_level)
 
 
-# Minimum prominence of a peak, decibels.
+# Minimum prominence of a peak of the loudness, decibels.
 _MIN_PROMINENCE = 6.0
-# Number of bands of the mean spectrum; number of bands whose decay is measured; number of frames after the loudest one
-# over which the decay is measured.
+# Number of bands of the mean spectrum; number of bands whose decay is measured; number of frames after the loudest
+# frame over which the decay is measured.
 _NUM_SPECTRUM_BANDS, _NUM_DECAY_BANDS, _NUM_DECAY_FRAMES = 16, 4, 8
 _NUM_MODULATIONS = 8
 
 
 def sound_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
-    """Compute features (W, k) of windows, with the same k for any number of microphones.
+    """Compute k features (W, k) of windows of sound, with the same k for any number of microphones.
 
     Features of loudness, in decibels: mean, maximum, spread, duration near the maximum, peaks and their intervals, rise
     and decay, and modulation up to 16 Hz. Features of the spectrogram: mean spectrum in 16 bands, centroid, width,
-    flatness, flux, and decay in 4 bands. Features of the microphones: share of the loudest, evenness, correlation
-    between their levels, and change of their distribution over time.
+    flatness, flux, and decay in 4 bands. Features of the microphones: share of the loudest microphone, evenness of the
+    power, correlation between levels, and change of the distribution over time.
 
     **Arguments:**
 
@@ -113,10 +114,10 @@ def sound_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
 
 
 def spectrum_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
-    """Compute the `sound_features`, and statistics of the level in each of the 64 bands.
+    """Compute the `sound_features` of windows of sound, and statistics of the level in each of the 64 bands.
 
-    The statistics of the level, in decibels relative to the loudest of the window, are its mean, maximum and spread
-    over the window, and its means over the loudest frame and the two after it, and over the next five.
+    The level is in decibels relative to the maximum of the window. Its statistics are the mean, maximum and spread over
+    the window, the mean over the loudest frame and the two frames after it, and the mean over the next five frames.
     """
     level = _relative_decibels(images.spectrum.astype(float))
     level -= level.max(axis=(1, 2), keepdims=True, initial=-np.inf)
@@ -142,7 +143,7 @@ def _relative_decibels(power: np.ndarray) -> np.ndarray:
 
 
 def _loudness_features(level: Float[np.ndarray, "W 41"]) -> np.ndarray:
-    """Compute the features (W, k) of the loudness over time, in decibels."""
+    """Compute features (W, k) of the loudness `level` (W, 41), in decibels, over the 41 frames of each window."""
     max_level = level.max(axis=1)
     level_below_max = max_level[:, None] - level
     loudest_frame = level.argmax(axis=1)
@@ -182,10 +183,10 @@ def _loudness_features(level: Float[np.ndarray, "W 41"]) -> np.ndarray:
 
 
 def _loudness_peaks(level: np.ndarray) -> np.ndarray:
-    """Find the frames (W, 41) that are peaks.
+    """Find peaks of the loudness over time: whether each frame (W, 41) is a peak.
 
-    A peak is the loudest of five frames, and at least 6 dB above the minimum of the ten frames before it, and of the
-    ten after it.
+    A peak is the loudest of five frames, and at least 6 dB above the minimum of the ten frames before it, and above
+    that of the ten frames after it.
     """
     padded = np.pad(level, ((0, 0), (10, 10)), mode="edge")
     neighbourhoods = np.lib.stride_tricks.sliding_window_view(padded, 21, axis=1)
@@ -200,7 +201,7 @@ def _loudness_peaks(level: np.ndarray) -> np.ndarray:
 
 
 def _spectral_features(spectrum: Float[np.ndarray, "W 64 41"], level: np.ndarray) -> np.ndarray:
-    """Compute the features (W, k) of the spectrogram. `level` (W, 41): loudness in decibels."""
+    """Compute features (W, k) of the spectrogram (W, 64, 41) of each window; `level` (W, 41): loudness, decibels."""
     rows = np.arange(len(spectrum))
     power = spectrum.mean(axis=2) + 1e-30
     band_shares = power / power.sum(axis=1, keepdims=True)
@@ -241,14 +242,14 @@ def _spectral_features(spectrum: Float[np.ndarray, "W 64 41"], level: np.ndarray
 
 
 def _microphone_features(intensity: Float[np.ndarray, "W M 41"]) -> np.ndarray:
-    """Compute the features (W, k) of the distribution of the intensity over the microphones."""
+    """Compute features (W, k) of the distribution of the power `intensity` over M microphones and 41 frames."""
     mean_power = intensity.mean(axis=2) + 1e-30
     power_shares = mean_power / mean_power.sum(axis=1, keepdims=True)
     sorted_shares = np.sort(power_shares, axis=1)[:, ::-1]
     evenness = -(power_shares * np.log(power_shares)).sum(axis=1) / np.log(max(power_shares.shape[1], 2))
     level = _relative_decibels(intensity)
     level_deviation = level - level.mean(axis=2, keepdims=True)
-    # Correlation of each microphone's level over time with that of the loudest one.
+    # Correlation of each microphone's level over time with the level of the loudest microphone.
     loudest_deviation = level_deviation[np.arange(len(level_deviation)), power_shares.argmax(axis=1)]
     norms = np.sqrt((level_deviation**2).sum(axis=2) * (loudest_deviation**2).sum(axis=1)[:, None]) + 1e-9
     correlations = np.einsum("wmt,wt->wm", level_deviation, loudest_deviation) / norms

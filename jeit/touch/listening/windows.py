@@ -1,4 +1,4 @@
-"""Windows of labelled clips, and cross-validation folds of their groups.
+"""Windows of labelled clips of sound, and cross-validation folds of groups of clips.
 
 A long recording, such as of many taps one after the other, is cut into pieces where it is quiet; each piece counts as a
 clip.
@@ -22,11 +22,11 @@ from jeit.touch.listening.learners import TrainingSet
 def held_out_folds(
     clip_classes: Int[np.ndarray, " N"], groups: Int[np.ndarray, " N"], max_folds: int
 ) -> Int[np.ndarray, " N"]:
-    """Assign each of N clips to the fold (N,) in which it is held out, together with all clips of its group.
+    """Return the cross-validation fold (N,) in which each of N clips is held out, with all clips of its group.
 
     `clip_classes`, `groups`: class and group of each clip. The fold is -1 for clips that are always in the training
-    set, since their class has no other group. Groups are assigned to at most `max_folds` folds in turn, class by class,
-    the largest first, so that every training set contains all classes.
+    set, since no other group has clips of their class. Groups are assigned to at most `max_folds` folds in turn, class
+    by class, the largest first, so that every training set contains all classes.
     """
     fold = np.full(len(clip_classes), -1)
     fold_of_group: dict[int, int] = {}
@@ -47,7 +47,7 @@ def held_out_folds(
                 counts[fold_of_group[group]] += int((groups == group).sum())
     for group, fold_index in fold_of_group.items():
         fold[groups == group] = fold_index
-    # If all groups of a class were in one fold, the class would be tested without being in the training set.
+    # If all groups of a class were in one fold, the class would be tested while it is absent from the training set.
     for label in np.unique(clip_classes):
         in_class = clip_classes == label
         if len(np.unique(fold[in_class])) < 2:
@@ -58,7 +58,7 @@ def held_out_folds(
 
 MIN_RELATIVE_LOUDNESS = 0.01
 """Minimum loudness of a window that is used, relative to the power of the recording's loudest frame."""
-# Maximum number of training windows of one piece, evenly spaced: more windows of one sound add little.
+# Maximum number of training windows of one piece of a clip, evenly spaced: more windows of one sound add little.
 _MAX_PIECE_WINDOWS = 40
 # Duration beyond which a clip is cut into pieces; duration of the pieces of an uninterrupted sound; seconds.
 _MAX_CLIP_DURATION, _PIECE_DURATION = 4.0, 2.0
@@ -69,11 +69,11 @@ _MAX_PIECES, _MAX_PIECE_GROUPS = 60, 6
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows of a training set.
+    """W windows of sound of a training set, and the clips to which they belong.
 
-    `images`: the windows; `clip` (W,): index of the clip, or piece of a longer clip, of each window; `labels` (W,): its
-    class, an index of `names`; `clip_labels` and `clip_groups`: class and group of each clip; `notes`: remarks on the
-    clips.
+    `images`: feature images of the windows; `clip` (W,): index of the clip, or piece of a longer clip, of each window;
+    `labels` (W,): class of each window, an index of `names`; `names`: names of the classes; `clip_labels`,
+    `clip_groups`: class and group of each clip or piece; `notes`: remarks on the clips.
     """
 
     images: SoundImages
@@ -86,7 +86,10 @@ class Windows:
 
     @classmethod
     def from_clips(cls, clips: LabelledClips, report: Callable[[str], None]) -> "Windows":
-        """Select the loud windows of each clip. Raises `ValueError` for clips without finite samples."""
+        """Select the loud windows of each clip, at most 20 dB below its loudest frame.
+
+        Raises `ValueError` for clips without finite samples.
+        """
         names, clip_labels = np.unique(clips.labels, return_inverse=True)
         clip_groups = np.unique(clips.groups, return_inverse=True)[1]
         single_group_labels = {
@@ -147,21 +150,21 @@ class Windows:
 
     @property
     def normalised(self) -> "Windows":
-        """The windows scaled to equal loudness."""
+        """The same windows, scaled to equal loudness."""
         return replace(self, images=self.images.normalised)
 
     @property
     def classes(self) -> int:
-        """The number of classes, C."""
+        """Number C of classes."""
         return len(self.names)
 
     def training_set(self, rows: np.ndarray, key: Array, batches: int, checkpoint: Path | None, report) -> TrainingSet:
-        """Create a training set from the selected windows, `rows` (W,)."""
+        """Create a training set from the windows that the mask `rows` (W,) selects."""
         groups = self.clip_groups[self.clip[rows]]
         return TrainingSet(self.images[rows], self.labels[rows], groups, self.classes, key, batches, checkpoint, report)
 
     def predict_clips(self, odds: Float[np.ndarray, "W C"]) -> tuple[np.ndarray, np.ndarray]:
-        """Predict the class of every held-out clip from the log-odds of its windows; also returns its true class."""
+        """Predict the class of each held-out clip from the log-odds of its windows; return it and the true class."""
         is_held_out = np.isfinite(odds).all(axis=1)
         log_probabilities = odds[is_held_out] - np.logaddexp.reduce(odds[is_held_out], axis=1, keepdims=True)
         clips, clip_rows = np.unique(self.clip[is_held_out], return_inverse=True)
@@ -170,7 +173,7 @@ class Windows:
         return total.argmax(axis=1), self.clip_labels[clips]
 
     def errors(self, odds: Float[np.ndarray, "W C"]) -> tuple[float, float]:
-        """Compute the error rate of held-out clips, and that of held-out windows."""
+        """Compute the error rates of held-out clips and of held-out windows from the log-odds (W, C) of windows."""
         is_held_out = np.isfinite(odds).all(axis=1)
         if not is_held_out.any():
             return 0.0, 0.0
@@ -181,7 +184,7 @@ class Windows:
 
 
 def _split_pieces(times: Float[np.ndarray, " n"]) -> list[np.ndarray]:
-    """Split the loud windows, at `times`, into pieces that share no samples.
+    """Split the loud windows of a clip, at `times`, seconds, into pieces that share no samples: indices of each.
 
     Windows belong to one sound if no gap between them exceeds the length of a window. A longer sound is cut every 2 s;
     windows that extend over a cut are left out.

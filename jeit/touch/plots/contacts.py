@@ -1,4 +1,4 @@
-"""Plots of contacts on an image, and of the stages of their detection."""
+"""Plots of contacts on an image, and of the steps by which `RasterFinder` finds contacts."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ def plot_contacts(
     - `image`: change of conductivity (m,) in every cell, S (3-D: S/m).
     - `contacts`: contacts, as from `find_contacts`.
     - `electrodes`: electrodes to be drawn.
-    - `scale`: mapping from values to colours.
+    - `scale`: mapping from values of the image to colours.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
-    Raises `ValueError` as `jeit.plot.plot_image`, and for elements that are not contacts.
+    Raises `ValueError` as `jeit.plot.plot_image`, and for elements of `contacts` that are not contacts.
 
     **Example:**
 
@@ -66,8 +66,8 @@ def plot_contacts(
 
 
 def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axes:
-    """Draw outlines, centroids and coordinates of contacts, on axes in metres. Raises `ValueError` for elements that
-    are not contacts."""
+    """Draw outlines, centroids and coordinates of contacts, on axes in metres. Raises `ValueError` for elements of
+    `contacts` that are not contacts."""
     check_contacts(contacts)
     ax = axes_or_new(ax)
     for contact in contacts:
@@ -98,7 +98,7 @@ def check_contacts(contacts) -> None:
 
 
 def largest_magnitude(values: np.ndarray) -> float:
-    """Return the maximum magnitude of the finite values; 0 if there are none."""
+    """Return the maximum magnitude of the finite values of an array; 0 without finite values."""
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
@@ -106,8 +106,9 @@ _TITLES = ("region of interest", "grey", "adaptive threshold", "opened", "contou
 
 
 def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarray | None = None) -> np.ndarray:
-    """Draw the result of every step of `RasterFinder` on six axes: the region of interest, grey levels, threshold,
-    opened mask, contours, and centroids in millimetres.
+    """Draw the results of the steps by which `RasterFinder` finds contacts in an image.
+
+    Six axes show the region of interest, grey levels, threshold, opened mask, contours, and centroids in millimetres.
 
     **Arguments:**
 
@@ -115,7 +116,7 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     - `unit`: unit of the image.
     - `axes`: six axes to draw on; by default those of a new figure.
 
-    Raises `ValueError` for stages of another type and another number of axes.
+    Raises `ValueError` if `stages` is not a result of `RasterFinder.stages`, and for another number of axes than six.
 
     **Example:**
 

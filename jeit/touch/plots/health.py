@@ -1,4 +1,4 @@
-"""Plots of the damage of a skin on its sheet, and over time."""
+"""Plots of the damage of a skin: cuts and failed electrodes on the sheet, and changes over time."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def plot_health(
 
     **Arguments:**
 
-    - `health`: the monitored skin, with a model.
-    - `image`: image (m,) that is drawn below, as from `SkinHealth.images`, S (3-D: S/m).
-    - `scale`: mapping from its values to colours.
+    - `health`: health of the monitored skin, with a model of the skin.
+    - `image`: image (m,) that is drawn below the damage, as from `SkinHealth.images`, S (3-D: S/m).
+    - `scale`: mapping from values of the image to colours.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for a skin without a model, and as `jeit.plot.plot_image`.
 
@@ -92,7 +92,7 @@ def _draw_cut(ax: Axes, event: HealthEvent) -> None:
     colour = _MENDED_COLOUR if is_mended else _CUT_COLOUR
     style = (0, (2.5, 1.5)) if is_mended else "-"
     ax.plot(*path.T, color=colour, linestyle=style, linewidth=2.4, zorder=5, path_effects=_HALO)
-    # The deviation is omitted where it rounds to 0 mm.
+    # The standard deviation of the length is omitted where it rounds to 0 mm.
     deviation_text = f" ± {1e3 * event.deviation:.0f}" if 1e3 * event.deviation >= 0.5 else ""
     label = f"{'mended' if is_mended else 'cut'}, {1e3 * event.length:.0f}{deviation_text} mm, at {event.time:.4g} s"
     left_limit, right_limit = ax.get_xlim()
@@ -113,27 +113,27 @@ def _draw_cut(ax: Axes, event: HealthEvent) -> None:
     )
 
 
-# Maximum number of events with labels; minimum upper end of the y axis, as a multiple of the limit.
+# Maximum number of events with labels; minimum upper end of the y axis, as a multiple of the limit of damage.
 _MAX_LABELS, _MIN_AXIS_LIMIT = 12, 1.5
 
 
 def plot_health_course(
     health: SkinHealth, times: ArrayLike, frames: ArrayLike, *, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw the change of frames relative to the healthy skin, and a line at the time of every event.
+    """Draw the change of frames relative to the healthy skin over time, and a line at the time of every event.
 
     The change is given in multiples of the limit above which a lasting change counts as damage. Touches may cause
     changes as large as damage, but only for a time.
 
     **Arguments:**
 
-    - `health`: the monitored skin after these frames.
-    - `times`: times (F,), seconds.
+    - `health`: health of the skin after these frames, as from `watch`.
+    - `times`: times (F,) of the frames, seconds.
     - `frames`: frames (F, M), volts.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
-    Raises `ValueError` for shapes that do not match.
+    Raises `ValueError` unless `frames` has a row for each time and a column for each channel of the skin.
 
     **Example:**
 

@@ -26,7 +26,7 @@ _MAX_TICK_LABELS = 24
 def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the errors of the places estimated for held-out presses, at the true places, in millimetres.
 
-    `place`: the standing `place` of a `LearntSkin`.
+    `place`: accuracy of the places learnt by a `LearntSkin`, its `standing["place"]`.
     """
     ax = axes_or_new(ax)
     errors_mm = 1e3 * np.linalg.norm(place.held_out - place.right, axis=1)
@@ -48,7 +48,7 @@ def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | N
 
 
 def plot_force_errors(force: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the forces estimated for held-out presses against the true forces, in newtons."""
+    """Draw the forces that a learnt skin estimates for held-out presses against the true forces, in newtons."""
     ax = axes_or_new(ax)
     true_forces, estimated_forces = force.right[:, 0], force.held_out[:, 0]
     limits = [min(true_forces.min(), estimated_forces.min()), max(true_forces.max(), estimated_forces.max())]
@@ -73,13 +73,13 @@ def plot_force_errors(force: Standing, *, title: str | None = None, ax: Axes | N
 
 
 def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the confusion matrix of held-out presses, in per cent of the presses of each label.
+    """Draw the confusion matrix of a classifier on held-out presses, in per cent of the presses of each label.
 
     **Arguments:**
 
-    - `label`: accuracy with which labels were learnt.
+    - `label`: true labels of held-out presses, and those that the classifier predicts.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     **Example:**
 
@@ -115,7 +115,7 @@ def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None
 
 
 def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the share of held-out presses in which each key was classified wrongly, in per cent."""
+    """Draw, for each key of a learnt skin, the share of held-out presses in which it was classified wrongly."""
     ax = axes_or_new(ax)
     error_rates = 100 * np.mean(keys.held_out != keys.right, axis=0)
     ax.bar(range(len(error_rates)), error_rates, color=SERIES_COLOURS[0], width=0.7)
@@ -131,7 +131,7 @@ def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None
 
 
 def plot_tried(label: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the accuracy of each method that was tried, on held-out presses, in per cent; the best is at the top."""
+    """Draw the accuracy of each classifier that was tried, on held-out presses, in per cent, the best at the top."""
     ax = axes_or_new(ax)
     names, percentages = [name for name, _ in label.tried], [100 * (1 - error) for _, error in label.tried]
     colours = [SERIES_COLOURS[0] if name == label.method else "#c9d3de" for name in names]

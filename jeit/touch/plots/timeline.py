@@ -1,4 +1,4 @@
-"""Plots over time: changes, named touches and labels of sounds; and paths of touches."""
+"""Plots of changes, classified touches and classified sounds over time, and of the paths of touches."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from jeit.touch.listening import SoundLabels
 from jeit.touch.listening.feature_images import WINDOW_INTERVAL
 
 # Gap between frames, as a multiple of the median interval, at which a curve is interrupted; maximum number of points of
-# a curve; minimum length of a bar, as a share of the whole time; maximum number of touches with numbers.
+# a curve; minimum length of a touch's bar, as a share of the whole time; maximum number of touches with numbers.
 _MIN_GAP_RATIO, _MAX_POINTS, _MIN_BAR_SHARE, _MAX_NUMBERED = 10.0, 3000, 0.003, 60
 _UNLIKE_COLOUR = "#b9bdc4"
 
@@ -45,10 +45,10 @@ def plot_changes(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the maximum change `peaks` (F,) of frames at times `seconds` (F,), and the `level` that touches exceed, both
-    in `unit`.
+    """Draw the maximum change of conductivity over time, and the level that touches exceed.
 
-    Refused frames, which are NaN, leave gaps. Raises `ValueError` for shapes that do not match.
+    `seconds` (F,): times of the frames; `peaks` (F,): maximum change in each frame, in `unit`; `level`: the level, in
+    `unit`. Refused frames, which are NaN, leave gaps. Raises `ValueError` if `seconds` and `peaks` differ in shape.
     """
     times, values = np.asarray(seconds, float), np.asarray(peaks, float)
     if times.shape != values.shape or times.ndim != 1:
@@ -77,12 +77,12 @@ def plot_timeline(
 
     **Arguments:**
 
-    - `touches`: the touches, as from `TouchWatch.follow`.
+    - `touches`: the classified touches, as from `TouchWatch.follow`.
     - `names`: names (C,) of the gestures.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
-    Raises `ValueError` if an item of the list is not a `NamedTouch`.
+    Raises `ValueError` if an item of `touches` is not a `NamedTouch`.
 
     **Example:**
 
@@ -146,19 +146,20 @@ def plot_touch_paths(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the skin and the paths of touches, each a line from a dot at its start, in the colour of its gesture. The
-    number of each touch is written beside it.
+    """Draw the outline of a skin and the paths of touches on it, in the colours of their gestures.
+
+    Each path is a line from a dot at its start. The number of each touch is written beside the dot.
 
     **Arguments:**
 
-    - `mesh`: mesh of the images.
-    - `touches`: the touches, as from `TouchWatch.follow`.
+    - `mesh`: mesh of the images of the skin.
+    - `touches`: the classified touches, as from `TouchWatch.follow`.
     - `names`: names (C,) of the gestures.
     - `electrodes`: electrodes to be drawn.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
-    Raises `ValueError` if an item of the list is not a `NamedTouch`.
+    Raises `ValueError` if an item of `touches` is not a `NamedTouch`.
 
     **Example:**
 
@@ -200,12 +201,12 @@ def plot_touch_paths(
 
 
 def gesture_colour(touch: NamedTouch, names: Sequence[str]) -> str:
-    """Return the colour of a touch's gesture; grey for touches unlike any in the training set."""
+    """Return the colour of a touch's gesture in plots; grey for touches unlike any in the training set."""
     return _UNLIKE_COLOUR if touch.unlike else SERIES_COLOURS[list(names).index(touch.gesture) % len(SERIES_COLOURS)]
 
 
 def check_named_touches(touches) -> None:
-    """Check that `touches` is a list of named touches. Raises `ValueError` otherwise."""
+    """Raise `ValueError` unless `touches` is a list of `NamedTouch`, touches with a predicted gesture."""
     check_kind("touches", touches, (list, tuple), "a list of named touches, as TouchWatch.follow gives them")
     for index, touch in enumerate(touches):
         check_kind(f"touches[{index}]", touch, NamedTouch, "a NamedTouch")
@@ -216,14 +217,14 @@ def _opacity(touch: NamedTouch) -> float:
 
 
 def _interrupt_at_gaps(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Insert NaN into a curve at long gaps between frames, so that it is interrupted."""
+    """Insert NaN into a curve of values over times at long gaps between frames, so that the curve is interrupted."""
     intervals = np.diff(times)
     gaps = 1 + np.flatnonzero(intervals > _MIN_GAP_RATIO * np.median(intervals)) if intervals.size else np.zeros(0, int)
     return np.insert(times, gaps, times[gaps]), np.insert(values, gaps, np.nan)
 
 
 def _reduce_points(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Reduce a curve to about `_MAX_POINTS` points, keeping its extremes."""
+    """Reduce a curve of values over times to about `_MAX_POINTS` points, keeping its extremes."""
     if len(times) <= _MAX_POINTS:
         return times, values
     segments = np.array_split(np.arange(len(times)), _MAX_POINTS // 2)
@@ -239,14 +240,15 @@ def _reduce_points(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, n
 
 
 def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the probability of every name over time, one row per name, with a bar below the chosen name during each
-    sound; quiet windows are blank.
+    """Draw the probability of every class of sound over time, in one row per class.
+
+    A bar in the row of the most likely class marks each sound. Quiet windows of the recording are blank.
 
     **Arguments:**
 
     - `labels`: the classified recording, as from `Listener.classify`.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     **Example:**
 

@@ -1,4 +1,4 @@
-"""Plots of predicted touches, maps of depth, and losses of training."""
+"""Plots of touches that a learnt skin predicts, of maps of indentation depth, and of losses during training."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from jeit.plot.axes import (
 from jeit.touch import Touches
 from jeit.touch.training import TrainingResult
 
-# Maximum number of ellipses, so that they do not hide each other.
+# Maximum number of ellipses that are drawn, so that they do not hide each other.
 _MAX_ELLIPSES = 400
 
 
 def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the estimated places in frames, later ones brighter, with ellipses of one standard deviation.
+    """Draw the touched places that a learnt skin estimates from frames, with ellipses of one standard deviation.
 
-    Raises `ValueError` if the skin did not learn places.
+    Places in later frames are brighter. Raises `ValueError` if the skin did not learn places.
     """
     if touches.position is None:
         raise ValueError("touches have no places: the skin did not learn any.")
@@ -71,7 +71,7 @@ def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None =
 
 
 def plot_answers(touches: Touches, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the predictions for consecutive frames: pressed keys, labels, or forces in newtons."""
+    """Draw what a learnt skin predicts for consecutive frames: pressed keys, labels, or forces in newtons."""
     ax = axes_or_new(ax)
     frame = np.arange(len(touches))
     if touches.touched is not None:
@@ -126,9 +126,9 @@ def plot_depth_map(
     - `most`: depth at the end of the colour scale, metres; by default the maximum of the map.
     - `colour_bar`: whether to draw a colour bar.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
-    Raises `ValueError` for an array of another shape.
+    Raises `ValueError` if `depth` is not a map (rows, columns).
 
     **Example:**
 
@@ -161,9 +161,10 @@ def plot_depth_map(
 
 
 def plot_losses(courses: Mapping[str, TrainingResult], *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the loss on held-out touches during each training, relative to the first evaluation, and mark its minimum.
+    """Draw a network's loss on held-out touches during each training, relative to the first, and mark its minimum.
 
-    `courses`: results of `jeit.touch.fit_network` by name. Raises `ValueError` for anything else.
+    `courses`: results of `jeit.touch.fit_network`, by the names of the trainings. Raises `ValueError` for anything but
+    such results.
     """
     check_kind("courses", courses, Mapping, "trainings by name, such as learnt.courses")
     ax = axes_or_new(ax)

@@ -1,4 +1,4 @@
-"""Write reports, tables and pictures of touches, and of models learnt from them, to a folder."""
+"""Write reports, tables and pictures of touches, and of models learnt from touches, to folders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Write the results of training an image network, and of imaging frames with one, to folders."""
+"""Write the results of training a network that images indentation depth, and of imaging frames with it, to folders."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from jeit.touch.simulate.contact.indent_sets import pixel_places
 LEARNT_FILES = ("network.jeit", "report.json", "learning.png")
 DEPTH_FILES = ("frames.csv", "depth.npz", "depth.png", "report.json")
 _PACKAGES = ("jeit", "jax", "equinox", "optax", "numpy")
-# Maximum number of maps drawn.
+# Maximum number of depth maps that are drawn.
 _MAX_DRAWN_MAPS = 6
 # Maximum number of refused frames that a report lists.
 _MAX_LISTED_FRAMES = 1000
 
 
 def write_learnt_images(learnt: LearntImages, folder: str | Path) -> None:
-    """Write `report.json` and the picture `learning.png` next to the network that `learn_images` wrote.
+    """Write the accuracy and trainings of a network to `report.json` and the picture `learning.png` in its folder.
 
-    Raises `ValueError` if `folder` cannot be a folder.
+    `folder`: folder to which `learn_images` wrote the network. Raises `ValueError` if `folder` cannot be a folder.
     """
     with results(folder, LEARNT_FILES) as result_folder:
         write_json(report_learnt_images(learnt), result_folder / "report.json")
@@ -40,7 +40,7 @@ def write_learnt_images(learnt: LearntImages, folder: str | Path) -> None:
 
 
 def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
-    """Report the accuracy and the trainings of a network as plain numbers, strings, lists and dictionaries."""
+    """Report the accuracy and the trainings of an image network as plain numbers, strings, lists and dictionaries."""
     network = learnt.network
     trainings = {
         name: {
@@ -70,7 +70,7 @@ def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
 
 
 def draw_learnt_images(learnt: LearntImages):
-    """Draw the training losses, and maps of test touches: true maps above, estimated maps below.
+    """Draw the losses in training of an image network, and true (above) and estimated depth maps of test touches.
 
     Returns a matplotlib `Figure` that needs no display.
     """
@@ -96,10 +96,10 @@ def draw_learnt_images(learnt: LearntImages):
 
 
 class DeepestFrame(NamedTuple):
-    """The deepest frame of a recording.
+    """The frame of a recording in which the skin is indented most.
 
-    **Fields**: `number`: its number in the file; `depth`: its maximum depth, metres; `middle` (2,): centroid of the
-    indentation, metres, NaN if no depth exceeds the noise floor.
+    **Fields**: `number`: number of the frame in the file; `depth`: maximum depth in the frame, metres; `middle` (2,):
+    centroid of the indentation, metres, NaN if no depth exceeds the noise floor.
     """
 
     number: int
@@ -109,10 +109,11 @@ class DeepestFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class WrittenDepths:
-    """Summary of what `write_depths` has written.
+    """Summary of the depth maps that `write_depths` has written.
 
-    **Fields**: `number`: number of frames; `imaged`: number of frames that were imaged; `deepest`: the deepest frame;
-    `latency` (K,): time taken by each imaged frame, seconds; for many frames, an evenly spaced sample of them.
+    **Fields**: `number`: number of frames; `imaged`: number of frames that were imaged; `deepest`: the frame with the
+    largest depth; `latency` (K,): computing time of K imaged frames, seconds; for many frames, of an evenly spaced
+    sample.
     """
 
     number: int
@@ -130,16 +131,17 @@ def write_depths(
     progress: Callable[[FrameDepth], None] | None = None,
     drawing: Callable[[str], None] | None = None,
 ) -> WrittenDepths:
-    """Write the depth maps that a network estimated from the frames `name`.
+    """Write the depth maps that a network estimated from the frames of a recording to a folder.
 
-    `frames.csv` has a line for each frame as it comes: `x_m`, `y_m`, the centroid of the indentation, and `depth_m`,
+    `frames.csv` gets a line for each frame as it comes: `x_m`, `y_m`, the centroid of the indentation, and `depth_m`,
     its maximum depth. At the end, `depth.npz` with all maps, `depth.png` and `report.json` are written. The number of
-    frames is not limited: their maps are kept on disk, not in memory.
+    frames is not limited: maps are kept on disk, not in memory.
 
-    `frame_depths`: the frames that `stream_depths` yields. Maps of refused frames are NaN; if no depth exceeds the
-    noise floor, the centroid is left empty. `progress` is called with every frame, and `drawing` as by `write_stream`.
-    Each file is written completely or not at all. Raises `ValueError` if `folder` cannot be a folder, and if no frame
-    was imaged, in which case no file remains; `OSError` on a full disk.
+    `frame_depths`: the frames that `stream_depths` yields; `name`: name of the recording. Maps of refused frames are
+    NaN; if no depth exceeds the noise floor, the centroid is left empty. `progress` is called with every frame;
+    `drawing` is called with the name of each step at the end, as by `write_stream`. Each file is written completely or
+    not at all. Raises `ValueError` if `folder` cannot be a folder, and if no frame was imaged, in which case no file
+    remains; `OSError` on a full disk.
     """
     result_folder = results_folder(folder, DEPTH_FILES)
     for file_name in DEPTH_FILES[1:]:
@@ -184,7 +186,7 @@ def write_depths(
 
 
 class _FrameStatistics:
-    """Statistics of the frames that a network imaged, in memory that does not grow with their number."""
+    """Statistics of the frames that a network imaged, in memory that does not grow with the number of frames."""
 
     def __init__(self, network: ImageNetwork):
         self.network, self._places = network, pixel_places(network.extent, network.shape)
@@ -215,7 +217,7 @@ class _FrameStatistics:
         return [frame.number, *texts], frame.depth
 
     def report(self, name: str, num_frames: int) -> dict[str, Any]:
-        """Report the statistics as plain numbers, strings, lists and dictionaries."""
+        """Report the statistics of the imaged frames as plain numbers, strings, lists and dictionaries."""
         network = self.network
         return as_plain_values(
             {
@@ -236,7 +238,7 @@ class _FrameStatistics:
 def _draw_depths(
     maps: Float[np.ndarray, "k rows columns"], numbers: Int[np.ndarray, " k"], deepest: float, network: ImageNetwork
 ):
-    """Draw depth maps of the frames `numbers`; `deepest`: maximum depth of all frames, metres."""
+    """Draw the depth maps of k frames with the given `numbers`; `deepest`: maximum depth of all frames, metres."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_depth_map

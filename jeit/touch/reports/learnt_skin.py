@@ -1,4 +1,4 @@
-"""Write a learnt skin, and its predictions for frames, to folders."""
+"""Write a learnt skin, and the touches that it predicts from frames, to folders."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _PACKAGES = ("jeit", "numpy", "scikit-learn", "skops")
 
 
 def write_learnt_skin(skin: LearntSkin, folder: str | Path) -> None:
-    """Write `skin.skops`, `report.json` and the picture `learning.png` into `folder`, which is created if needed.
+    """Write a learnt skin and its errors into `folder`: `skin.skops`, `report.json` and `learning.png`.
 
     Raises `ValueError` if `folder` cannot be a folder.
     """
@@ -27,12 +27,13 @@ def write_learnt_skin(skin: LearntSkin, folder: str | Path) -> None:
 
 
 def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str) -> None:
-    """Write `touches.csv`, `report.json` and the picture `touches.png` of a `skin`'s predictions for the frames `name`.
+    """Write the touches that a learnt skin predicts from frames to `touches.csv`, `report.json` and `touches.png`.
 
-    The table has a line for each frame, numbered from 0, with columns for the quantities that the skin has learnt:
-    `x_m`, `y_m` (`z_m`), their standard deviations, `force_N`, `std_force_N`, `label`, `probability`, `key_0` … (1
-    where pressed) with `probability_0` …. The column `unlike` is 1 for frames unlike all frames of the training set,
-    for which nothing is predicted. Raises `ValueError` if `folder` cannot be a folder.
+    `skin`, `name`: names of the skin and the frames. `touches.csv` has a line for each frame, numbered from 0, with
+    columns for the quantities that the skin has learnt: `x_m`, `y_m` (`z_m`), their standard deviations, `force_N`,
+    `std_force_N`, `label`, `probability`, `key_0` … (1 where pressed) with `probability_0` …. The column `unlike` is 1
+    for frames unlike all frames of the training set, for which nothing is predicted. Raises `ValueError` if `folder`
+    cannot be a folder.
     """
     columns = _table_columns(touches)
     dead_channels = np.flatnonzero(~touches.alive.any(axis=0))
@@ -56,7 +57,7 @@ def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str)
 
 
 def report_learnt_skin(skin: LearntSkin) -> dict[str, Any]:
-    """Report how well a skin has learnt, as plain numbers, strings, lists and dictionaries."""
+    """Report a learnt skin's errors on held-out presses as plain numbers, strings, lists and dictionaries."""
     return as_plain_values(
         {
             "presses": skin.name,
@@ -72,7 +73,7 @@ def report_learnt_skin(skin: LearntSkin) -> dict[str, Any]:
 
 
 def summary(name: str, standing: Standing) -> str:
-    """Summarise in one line how well one quantity was learnt."""
+    """Summarise in one line how well a skin has learnt the quantity `name`, such as "place"."""
     statistics = _error_statistics(name, standing)
     if name == "place":
         mean, median, high_error, guess_error = (
@@ -91,7 +92,7 @@ def summary(name: str, standing: Standing) -> str:
 
 
 def draw_learning(skin: LearntSkin):
-    """Draw the errors on held-out presses, as a matplotlib `Figure` that needs no display."""
+    """Draw the errors of a learnt skin on held-out presses, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_confusion, plot_force_errors, plot_key_errors, plot_place_errors
@@ -105,7 +106,7 @@ def draw_learning(skin: LearntSkin):
 
 
 def draw_touches(touches: Touches):
-    """Draw the predictions for frames, as a matplotlib `Figure` that needs no display."""
+    """Draw the touches predicted from frames, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_answers, plot_places
@@ -120,7 +121,7 @@ def draw_touches(touches: Touches):
 
 
 def _error_statistics(name: str, standing: Standing) -> dict[str, Any]:
-    """Compute error statistics of held-out presses."""
+    """Compute error statistics of the quantity `name` on held-out presses."""
     statistics: dict[str, Any] = {"method": standing.method, "presses": len(standing.right)}
     if name in ("place", "force"):
         unit = "m" if name == "place" else "N"
@@ -148,7 +149,7 @@ def _error_statistics(name: str, standing: Standing) -> dict[str, Any]:
 
 
 def _table_columns(touches: Touches) -> dict[str, list]:
-    """Return the columns of `touches.csv`, by name."""
+    """Return the columns of the table `touches.csv`, by name."""
     columns: dict[str, list] = {"frame": list(range(len(touches)))}
     if touches.position is not None and touches.position_std is not None:
         axes = "xyz"[: touches.position.shape[1]]

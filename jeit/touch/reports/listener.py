@@ -1,4 +1,4 @@
-"""Write a sound classifier, and its predictions for a recording, to folders."""
+"""Write a sound classifier, and the sounds that it classifies in a recording, to folders."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ _PACKAGES = ("jeit", "jax", "numpy", "scipy", "scikit-learn")
 
 
 def write_listener(listener: Listener, folder: str | Path) -> None:
-    """Write `listener.jeit`, `report.json` and the picture `learning.png` into a folder.
+    """Write a trained sound classifier, a report of its accuracy and its confusion matrix into a folder.
+
+    The files are `listener.jeit`, `report.json` and `learning.png`.
 
     **Arguments:**
 
@@ -40,12 +42,12 @@ def write_listener(listener: Listener, folder: str | Path) -> None:
 
 
 def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -> None:
-    """Write `events.csv`, `report.json` and the picture `timeline.png` of classified sounds into a folder.
+    """Write the classified sounds of a recording into a folder: `events.csv`, `report.json` and `timeline.png`.
 
-    The table has a line for each window, every 0.1 s: `time_s`, the middle of the window; `sound`, the most probable
-    name, empty if the window is quiet; `probability`, the probability of this name, and `p_…`, those of all names;
-    `microphone`, the number, from 0, of the loudest microphone; and, if positions were estimated, `x_m`, `y_m` (`z_m`)
-    and `std_x_m` …, empty for windows without a position.
+    The table `events.csv` has a line for each window, every 0.1 s: `time_s`, the middle of the window; `sound`, the
+    most probable class, empty if the window is quiet; `probability`, the probability of this class, and `p_…`, those of
+    all classes; `microphone`, the number, from 0, of the loudest microphone; and, if positions were estimated, `x_m`,
+    `y_m` (`z_m`) and `std_x_m` …, empty for windows without a position.
 
     **Arguments:**
 
@@ -70,7 +72,7 @@ def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -
 
 
 def report_listener(listener: Listener) -> dict[str, Any]:
-    """Report how well a listener has learnt, as plain numbers, strings, lists and dictionaries."""
+    """Report a sound classifier's accuracy on held-out clips as plain numbers, strings, lists and dictionaries."""
     standing, held_out = listener.standing, None
     if standing is not None:
         is_right = standing.held_out == standing.right
@@ -128,7 +130,7 @@ def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
 
 
 def summary(listener: Listener) -> str:
-    """Summarise in one line how well a listener has learnt."""
+    """Summarise in one line how accurate a sound classifier is on held-out clips."""
     standing = listener.standing
     if standing is None:
         return "not known: nothing could be held out"
@@ -138,7 +140,7 @@ def summary(listener: Listener) -> str:
 
 
 def draw_listener(listener: Listener):
-    """Draw the confusion matrix of held-out clips, as a matplotlib `Figure` that needs no display."""
+    """Draw a sound classifier's confusion matrix on held-out clips, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_confusion
@@ -160,7 +162,7 @@ def draw_listener(listener: Listener):
 
 
 def draw_sound_labels(labels: SoundLabels):
-    """Draw the timeline of a classified recording, as a matplotlib `Figure` that needs no display."""
+    """Draw the classified sounds of a recording over time, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_sound_labels
@@ -171,7 +173,7 @@ def draw_sound_labels(labels: SoundLabels):
 
 
 def _table_columns(labels: SoundLabels) -> dict[str, list]:
-    """Return the columns of `events.csv`, by name."""
+    """Return the columns of the table `events.csv`, by name."""
     columns: dict[str, list] = {
         "time_s": [f"{time:.4f}" for time in labels.times],
         "sound": labels.named.tolist(),

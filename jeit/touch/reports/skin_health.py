@@ -1,4 +1,4 @@
-"""Write the events of a monitored skin to a folder: a table, a report, and a picture over time and on the skin."""
+"""Write the damage and repairs of a monitored skin to a folder: a table, a report and a picture."""
 
 from __future__ import annotations
 
@@ -30,11 +30,12 @@ def write_health(
     timed: bool = True,
     notes: Sequence[str] = (),
 ) -> None:
-    """Write `events.csv`, `report.json` and the picture `health.png` of the events that `watch` detected.
+    """Write the damage and repairs that `watch` detected to `events.csv`, `report.json` and the picture `health.png`.
 
-    `frames` (F, M) were recorded at `times` (F,); `timed`: True if times are in seconds, False if they are numbers of
-    frames; `notes`: reasons to doubt the result. In the table, a path is a list of points x y in metres, separated by
-    semicolons; electrodes are numbered from 1. Raises `ValueError` if `folder` cannot be a folder.
+    `frames` (F, M): the monitored frames, recorded at `times` (F,); `name`: name of the recording; `timed`: True if
+    times are in seconds, False if they are numbers of frames; `notes`: reasons to doubt the result. In the table
+    `events.csv`, the path of a cut is a list of points x y in metres, separated by semicolons; electrodes are numbered
+    from 1. Raises `ValueError` if `folder` cannot be a folder.
     """
     with results(folder, HEALTH_FILES) as result_folder:
         write_rows(result_folder / "events.csv", _EVENT_COLUMNS, (_event_row(event) for event in health.events))
@@ -43,7 +44,7 @@ def write_health(
 
 
 def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:
-    """Report the detected events as plain numbers, strings, lists and dictionaries; unknown values are None."""
+    """Report detected damage and repairs as plain numbers, strings, lists and dictionaries; unknown values are None."""
     held_event = health.held
     return as_plain_values(
         {
@@ -82,7 +83,7 @@ def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:
 
 
 def draw_health(health: SkinHealth, times: Float[np.ndarray, " F"], frames: Float[np.ndarray, "F M"], timed: bool):
-    """Draw the events over time, and on the skin if there is a model, as a `Figure` that needs no display."""
+    """Draw damage and repairs over time, and on the skin if it has a model, as a `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_health, plot_health_course
@@ -101,7 +102,7 @@ def draw_health(health: SkinHealth, times: Float[np.ndarray, " F"], frames: Floa
 
 
 def _event_row(event: HealthEvent) -> list[object]:
-    """Create the row of `events.csv` for an event."""
+    """Create the row of the table `events.csv` for an event: damage or repair."""
     path = "" if event.path is None else "; ".join(f"{x:.5f} {y:.5f}" for x, y in event.path)
     return [
         event.number,

@@ -1,5 +1,4 @@
-"""Write a trained gesture classifier, the touches classified in a stream, and the contacts of a recording, to
-folders."""
+"""Write a trained gesture classifier, the classified touches of a stream, or the contacts of a recording to folders."""
 
 from __future__ import annotations
 
@@ -22,9 +21,10 @@ _LEARNING_PACKAGES = ("jeit", "numpy", "scikit-learn", "skops")
 
 
 def write_gestures(learnt: LearntGestures, folder: str | Path, *, name: str = "recordings") -> None:
-    """Write `gestures.skops`, `report.json` and the picture `gestures.png` into `folder`, which is created if needed.
+    """Write a trained gesture classifier, its accuracy and its confusion matrix into `folder`, created if needed.
 
-    `name`: name of the recordings. Raises `ValueError` if `folder` cannot be a folder.
+    The files are `gestures.skops`, `report.json` and `gestures.png`. `name`: name of the recordings. Raises
+    `ValueError` if `folder` cannot be a folder.
     """
     with results(folder, GESTURE_FILES) as result_folder:
         learnt.model.write(result_folder / GESTURE_FILE)
@@ -33,7 +33,7 @@ def write_gestures(learnt: LearntGestures, folder: str | Path, *, name: str = "r
 
 
 def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:
-    """Report how well gestures were learnt, as plain numbers, strings, lists and dictionaries."""
+    """Report how accurate a gesture classifier is, as plain numbers, strings, lists and dictionaries."""
     model, standing = learnt.model, learnt.model.standing
     report: dict[str, Any] = {
         "recordings": name,
@@ -57,7 +57,7 @@ def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:
 
 
 def draw_gestures(learnt: LearntGestures):
-    """Draw the confusion matrix and the accuracy of each classifier, as a matplotlib `Figure` that needs no display."""
+    """Draw a gesture classifier's confusion matrix, and the accuracy of all classifiers tried, as a `Figure`."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_confusion, plot_tried
@@ -84,11 +84,12 @@ _PATH_COLUMNS = ("touch", "time_s", "x_m", "y_m", "peak_S")
 
 @dataclass(frozen=True)
 class WrittenWatch:
-    """Summary of what `write_watch` has written.
+    """Summary of the touches that `write_watch` has written.
 
-    **Fields**: `touches`: detected touches; `seconds`, `peaks` (F,): time and maximum change of every frame; `latency`
-    (K,): seconds from a frame to its result, for frames at which a touch was classified; `counts`: number of frames by
-    status; `first_reason`: why the first refused frame was refused, empty if none was; `notes`: notes of the frames.
+    **Fields**: `touches`: detected touches; `seconds`, `peaks` (F,): time, seconds, and maximum change, S, of each of F
+    frames; `latency` (K,): seconds from a frame to its result, for the K frames at which a touch was classified;
+    `counts`: number of frames by status; `first_reason`: why the first refused frame was refused, empty if none was;
+    `notes`: remarks on the frames.
     """
 
     touches: tuple[NamedTouch, ...]
@@ -108,15 +109,16 @@ def write_watch(
     name: str = "stream",
     progress: Callable[[WatchedFrame], None] | None = None,
 ) -> WrittenWatch:
-    """Write the detected touches to `events.csv` and `paths.csv`, then `report.json` and `timeline.png`, into `folder`.
+    """Write the classified touches of a stream into `folder`, as they end, and finally a report and a picture.
 
-    `events.csv` has a line for every touch, written as it ends; `paths.csv` has its position in each of its frames. A
-    touch unlike all touches of the training set has no gesture.
+    `events.csv` gets a line for every touch as the touch ends; `paths.csv` gets the position of the touch in each of
+    its frames. `report.json` and `timeline.png` follow at the end. A touch unlike all touches of the training set has
+    no gesture.
 
     `watched`: the results that `watch.follow(frames)` yields. Positions are in metres, changes in S; `named_s` is the
-    time in the stream at which a touch was classified, `latency_ms` the delay after that frame. `progress` is called
-    with every result. Raises `ValueError`, with the `name` of the stream, if there was no frame, and if `folder` cannot
-    be a folder.
+    time in the stream at which a touch was classified, `latency_ms` the delay of the prediction after the last frame.
+    `progress` is called with every result. Raises `ValueError`, with the `name` of the stream, if there was no frame,
+    and if `folder` cannot be a folder.
     """
     folder = results_folder(folder, WATCH_FILES)
     for file_name in WATCH_FILES[2:]:
@@ -160,7 +162,7 @@ def write_watch(
 
 
 def report_watch(written: WrittenWatch, watch: TouchWatch, name: str) -> dict[str, Any]:
-    """Report the detected touches as plain numbers, strings, lists and dictionaries; unknown values are None."""
+    """Report classified touches as plain numbers, strings, lists and dictionaries; unknown values are None."""
     names, counts = np.unique([touch.gesture for touch in written.touches if not touch.unlike], return_counts=True)
     latencies = written.latency
     return as_plain_values(
@@ -192,7 +194,7 @@ def report_watch(written: WrittenWatch, watch: TouchWatch, name: str) -> dict[st
 
 
 def draw_watch(written: WrittenWatch, watch: TouchWatch):
-    """Draw the timeline and the paths of touches, as a matplotlib `Figure` that needs no display."""
+    """Draw the classified touches of a stream over time, and their paths, as a `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_changes, plot_timeline, plot_touch_paths
@@ -222,12 +224,12 @@ def draw_watch(written: WrittenWatch, watch: TouchWatch):
 
 
 def _first_and_last(seconds: np.ndarray) -> tuple[float, float]:
-    """Return the times of the first and the last frame, seconds."""
+    """Return the times of the first and the last frame, seconds, at least 1 ms apart."""
     return float(seconds[0]), max(float(seconds[-1]), float(seconds[0]) + 1e-3)
 
 
 def _event_row(touch: NamedTouch) -> list[object]:
-    """Create the row of `events.csv` for a touch."""
+    """Create the row of the table `events.csv` for a touch."""
     course = touch.touch.course
     peak_frame = int(course.peak.argmax())
     centroids = course.centroid[np.isfinite(course.centroid).all(axis=1)]
@@ -255,7 +257,7 @@ def _event_row(touch: NamedTouch) -> list[object]:
 
 
 def _path_rows(touch: NamedTouch) -> list[list[object]]:
-    """Create the rows of `paths.csv` for a touch, one for each of its frames."""
+    """Create the rows of the table `paths.csv` for a touch, one for each frame of the touch."""
     course = touch.touch.course
     return [
         [
@@ -275,9 +277,10 @@ _MAX_NUMBERED = 20
 
 
 def write_contacts(found: RecordedContacts, images: TouchImages, folder: str | Path, *, name: str) -> None:
-    """Write `contacts.csv`, `report.json` and the picture `contacts.png` into `folder`, which is created if needed.
+    """Write the contacts of a recording into `folder`, which is created if needed: a table, a report and a picture.
 
-    `name`: name of the recording. Raises `ValueError` if `folder` cannot be a folder.
+    The files are `contacts.csv`, `report.json` and `contacts.png`. `name`: name of the recording. Raises `ValueError`
+    if `folder` cannot be a folder.
     """
     rows = (
         [frame, f"{found.seconds[frame]:.6g}", found.number_of(frame, contact)]
@@ -320,7 +323,7 @@ def _report_contacts(found: RecordedContacts, images: TouchImages, name: str) ->
 
 
 def _draw_contacts(found: RecordedContacts, images: TouchImages):
-    """Draw the image with the strongest contacts, and the paths of all touches, as a matplotlib `Figure`."""
+    """Draw the image of the frame with the strongest contacts, and the paths of all touches, as a `Figure`."""
     from matplotlib.figure import Figure
 
     from jeit.plot.axes import draw_scale_bar, extent_of, hide_axes

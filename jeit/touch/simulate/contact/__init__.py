@@ -1,7 +1,8 @@
 """Contact mechanics of pressed skins: from load to pressure, to the change of conductivity over time, to voltages.
 
-An indenter defines the height of its surface above its lowest point; a support defines the pressure beneath it. Arrays
-are NumPy arrays, since contact is not a smooth function of its parameters.
+An indenter defines the height of its surface above its lowest point; a support, the elastic body under the skin,
+defines the pressure beneath the indenter. Arrays are NumPy arrays, since contact is not a smooth function of its
+parameters.
 """
 
 from __future__ import annotations

@@ -16,22 +16,23 @@ from jeit.touch.simulate.contact.indenters import DiscIndenter
 from jeit.touch.simulate.contact.press import AbstractSupport, Press
 from jeit.touch.simulate.contact.samples import Samples
 
-# Lattice for contacts on few samples; number of samples below which it is used; width that it resolves, as a share of
-# the radius of a cell.
+# Fineness of the lattice of samples in each cell for contacts on few samples; number of samples below which it is used;
+# width that it resolves, as a share of the radius of a cell.
 _FINE_LATTICE, _MIN_NUM_SAMPLES, _RESOLVED_FRACTION = 11, 6, 1 / 6
 # Number of presses computed at once, so that the arrays fit in the cache.
 _PRESSES_AT_ONCE = 16
-# Factor of the reach of a contact with about half its area on the skin; 2^(1/4) for a ball on a Winkler foundation.
+# Factor by which the reach of a contact grows if about half its area is off the skin; 2^(1/4) for a ball on a Winkler
+# foundation.
 _REACH_MARGIN = 1.25
 # Minimum fraction of skin in the area within reach of a press; below it, the pressure may extend farther.
 _MIN_SKIN_FRACTION = 0.6
 
 
 class PressedCells(NamedTuple):
-    """Cells under touches, and the pressure on them.
+    """Mesh cells under each of n touches, and the pressure on these cells.
 
-    **Fields**: `cells`: (n, c), numbers of the cells under n touches; `pressure`: (n, c, s), pressure at the samples
-    of each cell, pascals. Rows of touches with fewer cells are padded with zeros."""
+    **Fields**: `cells`: (n, c), numbers of the c cells under each touch; `pressure`: (n, c, s), pressure at the s
+    sample points of each cell, pascals. Rows of touches with fewer cells than c are padded with zeros."""
 
     cells: Int[np.ndarray, "n c"]
     pressure: Float[np.ndarray, "n c s"]
@@ -43,10 +44,10 @@ def pressed_cells(
     touches: Sequence[tuple[Press, ...]],
     progress: Callable[[str], None] | None = None,
 ) -> PressedCells:
-    """Compute the cells under touches and their pressure; the pressures of all presses of a touch are added.
+    """Compute the cells under touches and the pressure on them; the pressures of all presses of a touch are added.
 
-    Parts of an indenter beyond the edge of the skin carry no load. `progress` is called with the number of presses
-    done. Raises `ValueError` for presses off the skin, and as the support.
+    Parts of an indenter beyond the edge of the skin carry no load. `progress` is called with the number of presses that
+    are computed. Raises `ValueError` for presses off the skin, and as `pressure` of the support does.
     """
     presses = [press for touch in touches for press in touch]
     if not presses:
@@ -113,7 +114,7 @@ def _pressed_cells(
 
 
 def _indenter_numbers(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
-    """Numbers of the indenters of presses; equal indenters have the same number."""
+    """Number of the indenter of each press (n,); equal indenters have the same number."""
     numbers: dict = {}
     numbers_by_id: dict[int, int] = {}
     for press in presses:
@@ -127,8 +128,8 @@ def _indenter_numbers(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
 def _reach_bounds(support: AbstractSupport, presses: Sequence[Press], indenter_numbers) -> Float[np.ndarray, " n"]:
     """Upper bound of the distance from the origin at which each press exerts pressure, metres.
 
-    The bound is the reach for the load rounded up to a power of two, times `_REACH_MARGIN` for presses at the edge of
-    the skin.
+    The bound is the reach of the pressure under the load rounded up to a power of two newtons, times `_REACH_MARGIN`,
+    which allows for presses at the edge of the skin.
     """
     known_reaches: dict[tuple[int, int], float] = {}
     log2_loads = np.ceil(np.log2([press.load for press in presses]))
@@ -148,7 +149,7 @@ def _reach_bounds(support: AbstractSupport, presses: Sequence[Press], indenter_n
 
 
 def _pressures_of_equal_indenters(samples: Samples, support: AbstractSupport, presses: Sequence[Press], cells, is_cell):
-    """Pressures (b, c, s) of presses with the same indenter at the samples of `cells` (b, c)."""
+    """Compute pressures (b, c, s) of b presses with the same indenter at the s samples of the `cells` (b, c)."""
     points = samples.points[cells]
     sample_shape = points.shape[:-1]
     local_points, fall, area_ratios = samples.to_indenter_frames(
@@ -170,7 +171,7 @@ def _pressures_of_equal_indenters(samples: Samples, support: AbstractSupport, pr
 
 
 def _pressures_on_finer_lattice(samples: Samples, support: AbstractSupport, press: Press, cells, is_cell):
-    """Pressures (c, s) of a press on few samples: the mean over a finer lattice in each of the `cells` (c,).
+    """Compute pressures (c, s) of a press that covers few samples: means over a finer lattice in each of `cells` (c,).
 
     If the press touches no point of the finer lattice either, the nearest sample carries the load. Raises `ValueError`
     for a press that touches no skin.
@@ -212,7 +213,7 @@ def _pressures_on_finer_lattice(samples: Samples, support: AbstractSupport, pres
 
 
 def _height_below_plane(samples: Samples, fall):
-    """Distance of the surface below the plane of the press, for curved skins; None for flat skins."""
+    """Return `fall`, the distance of a curved skin's surface below the plane of the press; None for flat skins."""
     return None if samples.curved is None else fall
 
 

@@ -1,10 +1,10 @@
 """Elastic half-space: support of a skin that is thick compared with the contact.
 
-The surface also sinks around the load: w = K p, where K is the convolution with Boussinesq's (1 − ν²) / (π E r). The
-pressure p ≥ 0 of a rigid indenter under a load W satisfies w + gap = approach where p > 0, w + gap ≥ approach
-elsewhere, and ∫ p = W. It is found by conjugate gradients over the pixels in contact; pixels leave the contact where
-the pressure would be negative, and enter it where the bodies overlap (Polonsky and Keer, Wear 231, 1999, 206-219). K is
-evaluated by FFT on a raster padded to twice its size, which avoids periodic images.
+The surface also sinks around the load: its displacement is w = K p, where K is the convolution with Boussinesq's (1 −
+ν²) / (π E r). The pressure p ≥ 0 of a rigid indenter under a load W satisfies w + gap = approach where p > 0, w + gap ≥
+approach elsewhere, and ∫ p = W. The pressure is found by conjugate gradients over the pixels in contact; pixels leave
+the contact where the pressure would be negative, and enter it where the bodies overlap (Polonsky and Keer, Wear 231,
+1999, 206-219). K is evaluated by FFT on a raster padded to twice its size, which avoids periodic images.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from jeit.touch.simulate.contact.press import (
 # Number of pixels along a side of the raster on which the contact area is located.
 _NUM_COARSE_PIXELS = 24
 # Minimum fraction of the load of a contact that must lie on the skin, since the pressure is not determined otherwise;
-# and fraction of the load carried by the points, above which this check is skipped.
+# fraction of the load carried by sample points above which this check is skipped.
 _MIN_LOAD_FRACTION, _CHECKED_LOAD_FRACTION = 0.2, 0.5
-# Share of the load moved in a step, below which the iteration stops; and maximum number of steps.
+# Share of the load that a step moves between pixels, below which the iteration stops; maximum number of steps.
 _TOLERANCE, _MAX_STEPS = 1e-8, 2000
 
 
 class HalfSpace(AbstractSupport):
-    """An elastic half-space.
+    """An elastic half-space as the support of a skin that is thick compared with the contact.
 
     **Fields**: `modulus`: Young's modulus E in pascals; `poisson`: Poisson's ratio; `pixels`: number of pixels along a
     side of the raster on which the pressure is computed, a rectangle slightly larger than the contact.
@@ -67,7 +67,7 @@ class HalfSpace(AbstractSupport):
         return self.modulus / (1 - self.poisson**2)
 
     def pressure(self, indenter: AbstractIndenter, load: float) -> PressureRaster:
-        """Pressure beneath `indenter` under a `load` in newtons.
+        """Compute the pressure beneath `indenter` under a `load` in newtons.
 
         Raises `ValueError` for a load that is not positive and for indenters thinner than a pixel, and `RuntimeError`
         if the iteration does not converge.
@@ -85,9 +85,10 @@ class HalfSpace(AbstractSupport):
         return PressureRaster(float(load), approach, reach, values, pixel)
 
     def spread(self, indenter: AbstractIndenter, loads, points, areas, fall=None):
-        """Pressures (n, q) at the points of n loads, scaled to carry the load: at an edge, the points on the skin also
-        carry the part of the load beyond it. Raises `ValueError` as `pressure`, for a curved skin, and if less than a
-        fifth of the load lies on the skin.
+        """Compute pressures (n, q) at the q points of each of n loads, scaled so that the points carry the load.
+
+        At an edge of the skin, the points on the skin also carry the part of the load beyond the edge. Raises
+        `ValueError` as `pressure`, for a curved skin, and if less than a fifth of the load lies on the skin.
         """
         if fall is not None:
             raise ValueError("support: a HalfSpace is flat, and the skin is curved; take a Foundation.")
@@ -117,8 +118,7 @@ class HalfSpace(AbstractSupport):
 
 
 def _check_on_skin(pressure: PressureRaster, points, areas) -> None:
-    """Check how much of a pressure lies on the skin, given by points and their areas. Raises `ValueError` if it is less
-    than a fifth."""
+    """Raise `ValueError` if less than a fifth of a load lies on the skin, which is given by points and their areas."""
     is_on_skin = areas > 0
     pixel_centres, pixel = raster(pressure.pixel * len(pressure.values) / 2, len(pressure.values))
     distances, nearest = KDTree(points[is_on_skin]).query(pixel_centres[pressure.values > 0])
@@ -160,8 +160,8 @@ def displacement_function(num_pixels: int, pixel, plane_modulus: float):
 
 
 def rigid_contact(gap: np.ndarray, displacements, total_pressure: float) -> tuple[np.ndarray, float]:
-    """Find the pressures ≥ 0 with sum `total_pressure` whose displacements close the `gap`, metres; return them and the
-    approach, metres.
+    """Find the pressures ≥ 0 with sum `total_pressure` whose displacements close the `gap`, metres; return the
+    pressures and the approach of the bodies, metres.
 
     `displacements`: function that computes displacements from pressures. The gap is infinite at pixels that cannot be
     in contact. Raises `RuntimeError` if the iteration does not converge.

@@ -1,4 +1,4 @@
-"""Sets of random indents with the voltages of a skin and depth maps, simulated in chunks like sets of presses."""
+"""Sets of random indents, with simulated voltages of a skin and depth maps, computed in chunks like sets of presses."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _UNITS_AND_MEANINGS = {
 
 
 class IndentSet:
-    """A set of `number` random touches drawn from `draws`, with the exact voltages of `skin`, determined by `seed`.
+    """A set of `number` random touches drawn from `draws`, with the noise-free voltages of a `skin`.
 
-    `shape`: (rows, columns) of the depth maps over the skin. `chunk`: number of touches that are simulated and written
-    at once; it also affects the random numbers.
+    `seed`: random seed, which determines the touches. `shape`: (rows, columns) of the maps of indentation depth over
+    the skin. `chunk`: number of touches that are simulated and written at once; it also affects the random numbers.
     """
 
     def __init__(
@@ -43,8 +43,8 @@ class IndentSet:
         shape: tuple[int, int] = (48, 48),
         chunk: int = 1000,
     ):
-        """Create a set. Raises `ValueError` for invalid arguments, and for depths that reach the thickness of the
-        skin."""
+        """Create a set of touches. Raises `ValueError` for invalid arguments, and for depths that reach the skin's
+        thickness."""
         check_kind("skin", skin, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
         check_kind("draws", draws, IndentDraws, "IndentDraws([ball_indenter(0.015)], skin.flat_outline, (1e-3, 8e-3))")
         for name, value in (("number", number), ("chunk", chunk)):
@@ -69,15 +69,15 @@ class IndentSet:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 hash of everything that determines the results."""
+        """SHA-256 hash of everything that determines the simulated data: skin, draws, seed, sizes, version."""
         model = self.skin.model
         arrays = model.mesh, model.electrodes, model.protocol, self.skin.conductivity, self.skin.thickness, self.draws
         settings = _VERSION, self.number, self.seed, self.chunk, self.shape
         return _digest(arrays, str(settings))
 
     def solve(self, chunk: int) -> dict[str, np.ndarray]:
-        """Simulate one chunk of k touches: relative changes of voltages (k, M) and depth maps (k, rows, columns), by
-        name as in the store."""
+        """Simulate a chunk of k touches: relative changes of voltages (k, M) and depth maps (k, rows, columns), by the
+        names of their arrays in the store."""
         key = jax.random.fold_in(jax.random.key(self.seed), chunk)
         touches = self.draws.draw(key, len(self.chunks[chunk]))
         depths = depth_maps(touches, self.places) / float(self.skin.thickness)
@@ -86,7 +86,7 @@ class IndentSet:
         return {"change": relative_changes(self.skin, touches, resting), "depth": depths.astype(np.float32)}
 
     def contents(self) -> Contents:
-        """Description of the arrays in the store of the set."""
+        """Describe the arrays in the Zarr store of the set."""
 
         def create_arrays(zarr_group: Any) -> None:
             channels = self.skin.model.protocol.num_measurements
@@ -114,7 +114,7 @@ class IndentSet:
 
 
 class _SkinAndDepth:
-    """A skin and its maximum depth of indentation, metres, as a hashable key: equal for equal skins and depths."""
+    """Hashable key of a skin and its maximum depth of indentation, metres; equal for equal skins and depths."""
 
     def __init__(self, skin: Skin, depth: float):
         self.skin, self.depth = skin, depth
@@ -130,7 +130,7 @@ class _SkinAndDepth:
 
 @lru_cache(maxsize=1)
 def _shared_resting_skin(skin_and_depth: _SkinAndDepth) -> RestingSkin | None:
-    """Data of the skin at rest shared by all chunks and sets of a skin; about a gigabyte for a layer."""
+    """Return the data of a skin at rest that all its chunks and sets share; about a gigabyte for a 3-D layer."""
     return resting_skin(skin_and_depth.skin, skin_and_depth.depth)
 
 

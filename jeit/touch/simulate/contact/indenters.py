@@ -17,16 +17,16 @@ from jeit_solvers.module import Module
 
 
 class AbstractIndenter(Module):
-    """Base class of rigid bodies that are pressed straight down, described in their own frame."""
+    """Base class of rigid bodies that are pressed straight down, described in the body's own frame of coordinates."""
 
     @abc.abstractmethod
     def gap(self, points: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "..."]:
-        """Height of the surface above its lowest point at `points` (…, 2), metres; infinite beside the indenter."""
+        """Return the height of the surface above its lowest point at `points` (…, 2), metres; infinite beside it."""
 
     @property
     @abc.abstractmethod
     def reach(self) -> float:
-        """Distance in metres from the frame's origin beyond which the body does not extend."""
+        """Distance in metres from the origin of the body's frame beyond which the body does not extend."""
 
 
 class DiscIndenter(AbstractIndenter):
@@ -50,7 +50,7 @@ class DiscIndenter(AbstractIndenter):
         self.diameter = float(diameter)
 
     def gap(self, points):
-        """Zero beneath the disc, infinite elsewhere."""
+        """Return zero at points beneath the disc, infinity elsewhere."""
         return _flat_gap(_distance_from_origin(points) <= self.diameter / 2)
 
     @property
@@ -77,7 +77,7 @@ class RingIndenter(AbstractIndenter):
 
     def __init__(self, outer_diameter: float, inner_diameter: float):
         """Create a ring. Raises `ValueError` for diameters that are not positive, and for an inner diameter that is not
-        smaller than the outer one."""
+        smaller than the outer diameter."""
         _check_size("outer_diameter", outer_diameter)
         _check_size("inner_diameter", inner_diameter, outer_diameter, "the outer diameter")
         if inner_diameter == outer_diameter:
@@ -87,13 +87,13 @@ class RingIndenter(AbstractIndenter):
         self.outer_diameter, self.inner_diameter = float(outer_diameter), float(inner_diameter)
 
     def gap(self, points):
-        """Zero beneath the wall of the tube, infinite elsewhere."""
+        """Return zero at points beneath the wall of the tube, infinity elsewhere."""
         distances = _distance_from_origin(points)
         return _flat_gap((distances <= self.outer_diameter / 2) & (distances >= self.inner_diameter / 2))
 
     @property
     def reach(self) -> float:
-        """Outer radius, metres."""
+        """Outer radius of the ring, metres."""
         return self.outer_diameter / 2
 
 
@@ -120,12 +120,12 @@ class BarIndenter(AbstractIndenter):
         self.length, self.width = float(length), float(width)
 
     def gap(self, points):
-        """Zero beneath the bar, infinite elsewhere."""
+        """Return zero at points beneath the bar, infinity elsewhere."""
         return _flat_gap(_is_within_rectangle(points, self.length, self.width))
 
     @property
     def reach(self) -> float:
-        """Half the diagonal, metres."""
+        """Half the diagonal of the bar, metres."""
         return float(np.hypot(self.length, self.width) / 2)
 
 
@@ -155,20 +155,20 @@ class PrismIndenter(AbstractIndenter):
         self.length, self.width, self.height = float(length), float(width), float(height)
 
     def gap(self, points):
-        """Height 2 height |y| / width beneath the prism, infinite elsewhere."""
+        """Return 2 `height` |y| / `width` at points beneath the prism, infinity elsewhere."""
         edge_heights = 2 * self.height * np.abs(np.asarray(points)[..., 1]) / self.width
         return np.where(_is_within_rectangle(points, self.length, self.width), edge_heights, np.inf)
 
     @property
     def reach(self) -> float:
-        """Half the diagonal of the base, metres."""
+        """Half the diagonal of the prism's upper face, metres."""
         return float(np.hypot(self.length, self.width) / 2)
 
 
 class RevolvedIndenter(AbstractIndenter):
-    """A rigid body of revolution; its depth in the skin follows from the load.
+    """A rigid body of revolution about the vertical; its depth in the skin follows from the load.
 
-    **Fields**: `indentation`: its profile, an indentation of `jeit.design`, such as `Bell()`.
+    **Fields**: `indentation`: profile of the body, an indentation of `jeit.design`, such as `Bell()`.
 
     **Example:**
 
@@ -186,7 +186,7 @@ class RevolvedIndenter(AbstractIndenter):
         self.indentation = indentation
 
     def gap(self, points):
-        """Depth of the profile in its middle minus that at the points; infinite beyond its reach."""
+        """Return the depth of the profile in its middle minus its depth at the points; infinity beyond its reach."""
         distances = _distance_from_origin(points)
         max_depth = float(self.indentation.depth_at(host.zeros(())))
         gaps = max_depth - np.asarray(self.indentation.depth_at(distances))
@@ -199,7 +199,7 @@ class RevolvedIndenter(AbstractIndenter):
 
 
 def ball_indenter(diameter: float) -> RevolvedIndenter:
-    """The lower half of a ball.
+    """Return an indenter with the shape of the lower half of a ball.
 
     **Arguments:**
 
@@ -219,7 +219,7 @@ def ball_indenter(diameter: float) -> RevolvedIndenter:
 
 
 class DepthMapIndenter(AbstractIndenter):
-    """An indenter given by an image of its surface, centred at the origin and interpolated linearly between pixels.
+    """An indenter given by an image of its surface heights, centred at the origin and interpolated linearly.
 
     **Fields**: `height`: (rows, columns), height of the surface towards the skin in metres, NaN where there is no
     surface; row 0 is at the minimum y; `pixel`: side of a pixel in metres.
@@ -248,7 +248,7 @@ class DepthMapIndenter(AbstractIndenter):
         self.height, self.pixel = height, float(pixel)
 
     def gap(self, points):
-        """Maximum height of the surface minus the height at the points; infinite where there is no surface."""
+        """Return the maximum height of the surface minus its height at the points; infinity where it is missing."""
         centre_pixel = (np.array(self.height.shape) - 1) / 2
         pixel_coordinates = np.moveaxis(np.asarray(points)[..., ::-1] / self.pixel + centre_pixel, -1, 0)
         flat_heights = map_coordinates(self.height, pixel_coordinates.reshape(2, -1), order=1, cval=np.nan)
@@ -267,8 +267,7 @@ def check_indenter(name: str, value) -> None:
 
 
 def _check_size(name: str, value, maximum: float = np.inf, limit: str = "") -> None:
-    """Check a length as `check_metres`, and warn if it looks like millimetres. Raises `ValueError` as
-    `check_metres`."""
+    """Check that a length is positive metres, not above `maximum`, and warn if it looks like millimetres."""
     check_metres(name, value, maximum, limit)
     check_length(name, value)
 

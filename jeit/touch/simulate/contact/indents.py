@@ -1,4 +1,4 @@
-"""Indents, which are presses of bodies into a layer to a given depth, and random presses and indents."""
+"""Indents, which are presses of bodies into a skin to a given depth; distributions of random presses and indents."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ from jeit.touch.simulate.contact.samples import lattice
 from jeit_solvers.engines import as_array
 from jeit_solvers.module import Module
 
-# Number of random places drawn at once for each place needed, of which those on the skin are used.
+# Number of random places drawn at once for each place needed; places off the skin are left out.
 _TRIES_PER_PLACE = 20
 
 
 class PressDraws(Module):
-    """Distribution of random touches. All draws are independent and uniform, except for the load, whose logarithm is
-    uniform; the angle of the indenter is uniform, too.
+    """Distribution of random touches, each of one or several presses with random indenters, loads, places and angles.
+
+    All draws are independent and uniform, except for the load, whose logarithm is uniform.
 
     **Arguments:**
 
-    - `indenters`: the indenters.
+    - `indenters`: indenters, one of which is drawn for each press.
     - `outline`: outline of the skin, within which places are drawn.
     - `load`: minimum and maximum load, newtons.
     - `margin`: minimum distance of places from the outline, metres.
@@ -64,7 +65,7 @@ class PressDraws(Module):
         at_once: int = 1,
     ):
         """Create the distribution. Raises `ValueError` without indenters, for invalid arguments, for loads that are not
-        positive and in order, and for a margin that leaves no place."""
+        positive and in order, and for a `margin` that leaves no place on the skin."""
         check_kind("indenters", indenters, (list, tuple), "a list of them, such as [ball_indenter(0.015)]")
         indenters = tuple(indenters)
         if not indenters:
@@ -110,8 +111,8 @@ class PressDraws(Module):
         return [tuple(presses[end - count : end]) for end, count in zip(ends, counts, strict=True)]
 
     def innermost(self) -> np.ndarray:
-        """Place (x, y), metres, approximately farthest from the edge of the skin: the best of a thousand random
-        places."""
+        """Return the place (x, y), metres, approximately farthest from the edge of the skin: the farthest of a thousand
+        random places."""
         places = self._random_places(np.random.default_rng(0), 1000)
         return places[np.asarray(self.outline.signed_distance(places)).argmax()]
 
@@ -126,15 +127,15 @@ class PressDraws(Module):
 # Fineness of the lattice of samples in each cell, see `lattice`; minimum fraction of the conductivity of a sheet that
 # remains where it is indented through its whole thickness.
 _LATTICE_FINENESS, _MIN_CONDUCTIVITY_RATIO = 2, 1e-3
-# Minimum divisor of relative changes, as a fraction of the maximum voltage.
+# Minimum divisor of relative changes of voltages, as a fraction of the maximum voltage.
 _MIN_RELATIVE_DIVISOR = 1e-3
 
 
 class Indent(Module):
-    """An indenter pressed to a given depth.
+    """An indenter pressed into a skin to a given depth.
 
-    **Fields**: `indenter`: the indenter; `depth`: depth of its lowest point, metres; `position`: position (x, y) of its
-    origin, metres; `angle`: angle by which it is rotated, radians.
+    **Fields**: `indenter`: the indenter; `depth`: depth of its lowest point below the skin's surface, metres;
+    `position`: position (x, y) of its origin, metres; `angle`: counter-clockwise angle of the indenter, radians.
 
     **Example:**
 
@@ -157,19 +158,20 @@ class Indent(Module):
         self.position, self.angle = check_position(position), check_angle(angle)
 
     def depth_at(self, points: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "..."]:
-        """Depth of the indentation at `points` (…, 2), metres."""
+        """Compute the depth of the indentation at `points` (…, 2), metres; 0 where the skin is not indented."""
         cos, sin = np.cos(self.angle), np.sin(self.angle)
         local_points = (np.asarray(points) - self.position) @ np.array([[cos, -sin], [sin, cos]])
         return np.maximum(self.depth - self.indenter.gap(local_points), 0.0)
 
 
 class IndentDraws(Module):
-    """Distribution of random touches of one or several indents, as `PressDraws`, but with a depth instead of a load;
-    the logarithm of the depth is uniform.
+    """Distribution of random touches, each of one or several indents with random indenters, depths, places and angles.
+
+    All draws are independent and uniform, except for the depth, whose logarithm is uniform.
 
     **Arguments:**
 
-    - `indenters`: the indenters.
+    - `indenters`: indenters, one of which is drawn for each indent.
     - `outline`: outline of the skin, within which places are drawn.
     - `depth`: minimum and maximum depth, metres.
     - `margin`: minimum distance of places from the outline, metres.
@@ -217,12 +219,12 @@ class IndentDraws(Module):
 def depth_maps(
     touches: Sequence[Sequence[Indent]], places: Float[np.ndarray, "*shape 2"]
 ) -> Float[np.ndarray, "n *shape"]:
-    """Depth (n, …) of the indentation by each of n touches, metres: the maximum over the indents of the touch.
+    """Compute the depth (n, …) to which each of n touches indents a skin, metres: the maximum over a touch's indents.
 
     **Arguments:**
 
     - `touches`: the touches, each a sequence of indents.
-    - `places`: positions (…, 2), metres.
+    - `places`: positions (…, 2) at which depths are computed, metres.
 
     **Example:**
 
@@ -239,11 +241,11 @@ def depth_maps(
 
 
 def indented_cells(skin: Skin, touches: Sequence[Sequence[Indent]]) -> TouchedCells:
-    """Relative changes of the conductivity of a skin's cells due to n touches; the indented volume does not conduct
-    (Park et al. 2022, text S4).
+    """Compute relative changes of the conductivity of a skin's cells due to n touches: the indented volume does not
+    conduct (Park et al. 2022, text S4).
 
-    The conductivity of a cell decreases by the indented share of its volume in a layer, and by the indented share of
-    its thickness in a sheet. Raises `ValueError` for indents as deep as the skin.
+    The conductivity of a cell decreases by the indented share of its volume in a 3-D layer, and by the indented share
+    of its thickness in a 2-D sheet. Raises `ValueError` for indents as deep as the skin.
     """
     check_kind("skin", skin, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
     mesh, thickness = skin.model.mesh, float(skin.thickness)
@@ -279,7 +281,7 @@ def indented_cells(skin: Skin, touches: Sequence[Sequence[Indent]]) -> TouchedCe
 def relative_changes(
     skin: Skin, touches: Sequence[Sequence[Indent]], resting: RestingSkin | None = None
 ) -> Float[np.ndarray, "n M"]:
-    """Exact changes (n, M) of a skin's voltages due to n touches, relative to the voltages at rest (see `relative_to`).
+    """Compute noise-free changes (n, M) of a skin's voltages due to n touches, relative to the voltages at rest.
 
     **Arguments:**
 
@@ -287,7 +289,7 @@ def relative_changes(
     - `touches`: the touches, each a sequence of indents.
     - `resting`: data of the same skin at rest, from `resting_skin`, which several calls can share.
 
-    Raises `ValueError` as `indented_cells`.
+    The changes are divided by the voltages at rest, as in `relative_to`. Raises `ValueError` as `indented_cells`.
 
     **Example:**
 
@@ -318,7 +320,7 @@ def resting_skin(skin: Skin, depth: float) -> RestingSkin | None:
 
 
 def relative_to(reference: Float[np.ndarray, " M"], voltages: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n M"]:
-    """Changes (n, M) of voltages relative to a reference, channel by channel, without unit.
+    """Compute changes (n, M) of voltages relative to reference voltages (M,), channel by channel, without unit.
 
     The divisor is at least a thousandth of the maximum reference voltage.
     """

@@ -6,12 +6,12 @@ conductivity:
     ∇·(σ₁∇u) = g (u − w),    ∇·(σ₂∇w) = g (w − u),
 
 where u is the potential of the lower sheet, which has the electrodes, w that of the upper sheet, whose edge is
-insulated, and g(x, y) the conductance between them per area. If g = 0, the upper sheet carries no current; if √(σ/g) is
-small compared with the contact, both sheets carry current. Sheets in contact everywhere conduct like σ₁ + σ₂ at most,
-and so does a contact if the upper sheet is only as large as the contact. For a contact on a larger upper sheet, which
-also leads current around the contact, the limit is σ₁ + 2σ₂: if u = w on a disc in an unbounded sheet, the dipole is
-σ₂/(σ₁ + σ₂), that of a disc of this conductivity. A `Material` with `saturation` σ₂/σ₁, or twice that, approximates
-this model.
+insulated, and g(x, y) the conductance between the sheets per area. If g = 0, the upper sheet carries no current; if
+√(σ/g) is small compared with the contact, both sheets carry current. Sheets in contact everywhere conduct like σ₁ + σ₂
+at most, and so does a contact if the upper sheet is only as large as the contact. For a contact on a larger upper
+sheet, which also leads current around the contact, the limit is σ₁ + 2σ₂: if u = w on a disc in an unbounded sheet, the
+dipole is σ₂/(σ₁ + σ₂), that of a disc of this conductivity. A `Material` with `saturation` σ₂/σ₁, or 2σ₂/σ₁ for a
+larger upper sheet, approximates this model.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ _MIN_RELATIVE_CONDUCTANCE = 1e-9
 
 
 class TwoSheets(Module):
-    """Model of two sheets on the same mesh. The system of 2n unknowns, for n nodes, is factorised at every call.
+    """Forward model of two conducting sheets, one on the other, that touch where they are pressed.
+
+    Both sheets have the same mesh. The system of 2n unknowns, for n nodes, is factorised at every call.
 
     **Fields**: `model`: forward model of the lower sheet; `pattern`, `plan`: sparsity pattern and factorisation plan of
     the system.
@@ -72,11 +74,11 @@ class TwoSheets(Module):
     def voltages(
         self, conductivity: ArrayLike, upper_conductivity: ArrayLike, conductance: ArrayLike
     ) -> Float[np.ndarray, " M"]:
-        """Voltages (M,) of the channels of the lower sheet.
+        """Compute the voltages (M,) of the channels of the lower sheet.
 
         `conductivity` and `upper_conductivity`: conductivities of the lower and of the upper sheet, S, one value or one
-        per cell; `conductance`: conductance between the sheets per area, S/m², one value or one per cell (m,). Raises
-        `ValueError` for other shapes, conductivities that are not positive, and negative conductances.
+        per cell (m,); `conductance`: conductance between the sheets per area, S/m², one value or one per cell (m,).
+        Raises `ValueError` for other shapes, conductivities that are not positive, and negative conductances.
         """
         mesh, electrodes = on_host((self.model.mesh, self.model.electrodes))
         conductivities = [
@@ -105,7 +107,7 @@ class TwoSheets(Module):
 
 
 def _symmetric_matrices(packed: Float[np.ndarray, "6 m"]) -> Float[np.ndarray, "m 3 3"]:
-    """Symmetric matrices (m, 3, 3) from the six entries of their lower triangles."""
+    """Build m symmetric matrices (m, 3, 3) from the six entries (6, m) of their lower triangles."""
     rows, columns = np.tril_indices(3)
     matrices = np.zeros((packed.shape[1], 3, 3))
     matrices[:, rows, columns] = matrices[:, columns, rows] = packed.T
@@ -123,9 +125,10 @@ def _check_conductance(conductance, num_cells: int) -> Float[np.ndarray, " m"]:
 
 
 class PlacedIndenter(AbstractIndenter):
-    """An indenter that is rotated counter-clockwise, then moved, as a part of `JoinedIndenters`.
+    """An indenter that is rotated counter-clockwise, then moved, to be a part of `JoinedIndenters`.
 
-    **Fields**: `indenter`: the indenter; `position`: position (x, y) of its origin, metres; `angle`: angle, radians.
+    **Fields**: `indenter`: the indenter; `position`: position (x, y) of its origin, metres; `angle`: angle by which it
+    is rotated, radians.
 
     **Example:**
 
@@ -145,7 +148,7 @@ class PlacedIndenter(AbstractIndenter):
         self.indenter, self.position, self.angle = indenter, check_position(position), check_angle(angle)
 
     def gap(self, points):
-        """Gap of the indenter at the points, transformed to its own frame."""
+        """Return the height of the moved indenter's surface above its lowest point at `points` (…, 2), metres."""
         cos, sin = np.cos(self.angle), np.sin(self.angle)
         return self.indenter.gap((np.asarray(points) - self.position) @ np.array([[cos, -sin], [sin, cos]]))
 
@@ -156,12 +159,11 @@ class PlacedIndenter(AbstractIndenter):
 
 
 class JoinedIndenters(AbstractIndenter):
-    """One rigid body of several parts under one load, with their lowest points at the same height. Parts beside each
-    other are `PlacedIndenter`.
+    """One rigid body of several indenters under one load; their lowest points are at the same height.
 
     **Arguments:**
 
-    - `parts`: the indenters.
+    - `parts`: the indenters; those beside the origin are given as `PlacedIndenter`.
 
     **Example:**
 
@@ -185,18 +187,18 @@ class JoinedIndenters(AbstractIndenter):
         self.parts = parts
 
     def gap(self, points):
-        """Minimum gap of the parts."""
+        """Return the minimum over the parts of the height of the surface at `points` (…, 2), metres."""
         return np.min([part.gap(points) for part in self.parts], axis=0)
 
     @property
     def reach(self) -> float:
-        """Maximum reach of the parts, metres."""
+        """Maximum reach of the parts from the origin, metres."""
         return max(part.reach for part in self.parts)
 
 
 def check_position(position, *, in_space: bool = False) -> Float[np.ndarray, " d"]:
-    """Convert a place (x, y) in metres to an array; if `in_space`, (x, y, z) is allowed, too. Raises `ValueError` for
-    anything else."""
+    """Convert a place (x, y) in metres, or (x, y, z) if `in_space`, to an array. Raises `ValueError` for another shape,
+    and values that are not finite."""
     coordinates = real_array("position", position, "(x, y) in metres")
     if coordinates.shape not in ((2,), (3,))[: 1 + in_space] or not np.isfinite(coordinates).all():
         raise ValueError(f"position: give (x, y) in metres, not {position!r}.")

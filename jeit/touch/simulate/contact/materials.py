@@ -20,20 +20,20 @@ from jeit.touch.simulate.contact.press import (
 )
 from jeit_solvers.module import Module
 
-# Number of pixels along a side of the raster on which the contact is located, and of the raster on which the load is
-# balanced.
+# Number of pixels along a side: of the raster on which the contact is located; of the raster on which the approach is
+# found that balances the load.
 _NUM_COARSE_PIXELS, _NUM_FINE_PIXELS = 24, 96
 
 
 class FoundationPressure(AbstractPressure):
-    """Pressure max(k (approach − gap), 0) of a foundation with `stiffness` k in Pa/m, evaluated at any point without a
-    raster."""
+    """Pressure max(k (approach − gap), 0) on a Winkler foundation with `stiffness` k in Pa/m, evaluated without a
+    raster at any point, at which the indenter's surface is `gap` above its lowest point."""
 
     indenter: AbstractIndenter
     stiffness: float
 
     def at(self, points):
-        """Pressure at points, pascals, from the gap of the indenter."""
+        """Compute the pressure at `points` (…, 2), metres, in pascals, from the heights of the indenter there."""
         return self.stiffness * np.maximum(self.approach - self.indenter.gap(points), 0.0)
 
 
@@ -41,8 +41,8 @@ class Foundation(AbstractSupport):
     """Winkler foundation: pressure p = E δ / thickness at indentation δ (Johnson, Contact Mechanics, 1985, section
     4.3).
 
-    It applies to layers that are thin compared with the width of the contact. **Fields**: `modulus`: modulus E in
-    pascals of the layer under compression without lateral expansion; `thickness`: in metres.
+    The model applies to layers that are thin compared with the width of the contact. **Fields**: `modulus`: modulus E
+    in pascals of the layer under compression without lateral expansion; `thickness`: thickness of the layer, metres.
 
     **Example:**
 
@@ -63,11 +63,11 @@ class Foundation(AbstractSupport):
 
     @property
     def stiffness(self) -> float:
-        """Pressure divided by indentation, Pa/m."""
+        """Pressure on the layer divided by its indentation, Pa/m."""
         return self.modulus / self.thickness
 
     def pressure(self, indenter: AbstractIndenter, load: float) -> FoundationPressure:
-        """Pressure beneath `indenter` under a `load` in newtons.
+        """Compute the pressure beneath `indenter` under a `load` in newtons.
 
         Raises `ValueError` for a load that is not positive or that presses through the layer, and for indenters thinner
         than a pixel.
@@ -93,8 +93,11 @@ class Foundation(AbstractSupport):
         return FoundationPressure(float(load), approach, reach, indenter, self.stiffness)
 
     def spread(self, indenter: AbstractIndenter, loads, points, areas, fall=None):
-        """Pressures (n, q) with the approach that balances each load on the given points. On a curved skin, `fall` is
-        added to the gaps. Raises `ValueError` for a load that presses through the layer."""
+        """Compute pressures (n, q), pascals, at q points under each of n loads, which the points carry.
+
+        On a curved skin, `fall` is added to the height of the indenter above the skin. Raises `ValueError` for a load
+        that presses through the layer.
+        """
         gaps = indenter.gap(points) if fall is None else indenter.gap(points) + fall
         approaches = water_level(gaps, areas, loads / self.stiffness)
         deepest_press = approaches.argmax()
@@ -112,11 +115,10 @@ class Foundation(AbstractSupport):
 def water_level(
     gap: Float[np.ndarray, "*n q"], area: Float[np.ndarray, "*n q"], volume: Float[np.ndarray, "*n"] | float
 ) -> Float[np.ndarray, "*n"]:
-    """Level δ at which Σ area · max(δ − gap, 0) equals `volume`, like the level of water over uneven ground; 0 if every
-    gap is infinite.
+    """Compute the level δ at which Σ area · max(δ − gap, 0) equals `volume`: that of water over ground of height `gap`.
 
-    If the m lowest points are under water, δ = (volume + Σ area · gap) / Σ area over these points. This is exact for
-    the smallest m for which the next point is not under water.
+    The level is 0 if every gap is infinite. If the m lowest points are under water, δ = (volume + Σ area · gap) / Σ
+    area over these points. This is exact for the smallest m for which the next point is not under water.
     """
     order = np.argsort(gap, axis=-1)
     heights = np.take_along_axis(gap, order, axis=-1)
@@ -132,25 +134,28 @@ def water_level(
 
 
 def check_modulus(modulus) -> None:
-    """Check a modulus in pascals. Raises `ValueError` unless it is positive."""
+    """Raise `ValueError` unless an elastic modulus, pascals, is positive."""
     if not (is_number(modulus) and modulus > 0):
         raise ValueError(f"modulus must be positive, in pascals (1e6 for a soft rubber); it is {describe(modulus)}.")
 
 
 class Material(Module):
-    """Material of a skin, in SI units. To change values: `dataclasses.replace(material("velostat"), noise=0.0)`.
+    """Material of a skin: its mechanical and electrical properties, in SI units.
+
+    To change values: `dataclasses.replace(material("velostat"), noise=0.0)`.
 
     **Fields**
 
-    - `conductivity`: S/m, and `thickness`: metres, of the conductor at rest.
+    - `conductivity`, `thickness`: conductivity, S/m, and thickness, metres, of the conductor at rest.
     - `support`: mechanical support that carries the load.
     - `saturation`, `half_pressure`: c and p½ (pascals) of the conductivity σ = σ₀ (1 + c q / (q + p½)) under an
       effective pressure q: c is the limit of the relative change, and p½ the pressure at which half of it is reached.
     - `hysteresis`: maximum difference of q between unloading and loading, divided by the maximum pressure.
-    - `creep`: (share, time constant in seconds) of each delayed branch of q.
+    - `creep`: pairs of the share of q that responds with delay, and the time constant of this response, seconds.
     - `conductivity_trend`, `contact_trend`: relative drift of the conductivity and of the contact impedance of each
       electrode, per second.
-    - `conductivity_walk`, `contact_walk`: standard deviation of their random walk, relative, per √s.
+    - `conductivity_walk`, `contact_walk`: standard deviation of the random walk of the conductivity and of the contact
+      impedances, relative, per √s.
     - `noise`: standard deviation of the noise of each voltage, relative to the root mean square of all voltages.
     - `gain_spread`: standard deviation of the logarithm of the gain of each channel.
 
@@ -195,7 +200,7 @@ class Material(Module):
             )
 
     def change(self, pressure: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """Relative change of conductivity at effective pressures (…), pascals: c q / (q + p½)."""
+        """Compute the relative change of conductivity, c q / (q + p½), at effective pressures q (…), pascals."""
         pressure = np.asarray(pressure)
         return self.saturation * pressure / (pressure + self.half_pressure)
 
@@ -218,7 +223,8 @@ def _are_branches(creep) -> bool:
     return sum(fraction for fraction, _ in creep) < 1
 
 
-# Values from papers are cited; all others are assumptions, chosen so that skins differ as described by their authors.
+# Values from papers are cited; all other values are assumptions, chosen so that materials differ as their authors
+# describe.
 MATERIALS = {
     # From Chen et al. 2022 and Pugach et al. 2015: carbon-filled polyolefin, 500 Ω cm, 0.1 mm thick. Two equal sheets
     # have at most twice the conductivity of one; Chen's double layer approaches a limit at 39 N. Pugach describes the
@@ -241,9 +247,9 @@ MATERIALS = {
     ),
     # From Silvera Tawil et al. 2011: sheet conductance 12.5 mS, 0.6 mm thick, under 5 mm of foam, with squares of 660
     # mS that would allow 54 times the conductivity if they formed one sheet in perfect contact. From Russo et al. 2017:
-    # response from 10 kPa on, elastic return, and hysteresis. Assumed: at most five times the conductivity, half of
-    # that change at 20 kPa; foam with a modulus of 300 kPa; less hysteresis and creep than the film; drift; noise of
-    # -70 dB, due to the many contacts in a fabric; gains.
+    # response from 10 kPa on, elastic return, and hysteresis. Assumed: at most five times the conductivity, half of the
+    # change at 20 kPa; foam with a modulus of 300 kPa; less hysteresis and creep than Velostat; drift; noise of -70 dB,
+    # due to the many contacts in a fabric; gains.
     "conductive fabric": Material(
         conductivity=12.5e-3 / 0.6e-3,
         thickness=0.6e-3,
@@ -260,8 +266,8 @@ MATERIALS = {
         gain_spread=0.01,
     ),
     # From Park et al. 2022: 10 mm thick, pressing raises the impedance, hysteresis below 3 %. From jeit.design: 1 S/m.
-    # Assumed: conductivity falls to a tenth at high pressure, half of that change at 50 kPa; modulus of 100 kPa; little
-    # creep; drift, since gels dry; noise of -66 dB (Park gives 0.45 Ω for a specimen of unknown resistance).
+    # Assumed: conductivity falls to a tenth at high pressure, by half of this change at 50 kPa; modulus of 100 kPa;
+    # little creep; drift, since gels dry; noise of -66 dB (Park gives 0.45 Ω for a specimen of unknown resistance).
     "hydrogel": Material(
         conductivity=1.0,
         thickness=10e-3,

@@ -16,10 +16,10 @@ from jeit_solvers.module import Module
 
 
 class AbstractPressure(Module):
-    """Pressure in the frame of the indenter that causes it.
+    """Pressure on a skin, as a function of the place in the frame of the indenter that causes it.
 
-    **Fields**: `load`: newtons; `approach`: distance that the indenter has moved since its first contact, metres;
-    `reach`: distance from the origin beyond which there is no pressure, metres.
+    **Fields**: `load`: load of the indenter, newtons; `approach`: distance that the indenter has moved since its first
+    contact, metres; `reach`: distance from the frame's origin beyond which there is no pressure, metres.
     """
 
     load: float
@@ -28,7 +28,7 @@ class AbstractPressure(Module):
 
     @abc.abstractmethod
     def at(self, points: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "..."]:
-        """Pressure in pascals at `points` (…, 2), metres."""
+        """Compute the pressure in pascals at `points` (…, 2), metres."""
 
 
 class AbstractSupport(Module):
@@ -36,8 +36,8 @@ class AbstractSupport(Module):
 
     @abc.abstractmethod
     def pressure(self, indenter: AbstractIndenter, load: float) -> AbstractPressure:
-        """Pressure beneath `indenter` under a `load` in newtons. Raises `ValueError` for a load that the support cannot
-        carry."""
+        """Compute the pressure beneath `indenter` under a `load` in newtons. Raises `ValueError` for a load that the
+        support cannot carry."""
 
     @abc.abstractmethod
     def spread(
@@ -48,13 +48,15 @@ class AbstractSupport(Module):
         areas: Float[np.ndarray, "n q"],
         fall: Float[np.ndarray, "n q"] | None = None,
     ) -> Float[np.ndarray, "n q"]:
-        """Pressures (n, q), pascals, under n loads at given points. The points carry the whole load, or none if the
-        indenter touches none of them.
+        """Compute pressures (n, q), pascals, at q points under each of n loads of the same indenter.
+
+        The points carry the whole load, or none if the indenter touches none of them.
 
         - `loads`: (n,), newtons.
-        - `points`: (n, q, 2), in the frame of the indenter, metres.
+        - `points`: (n, q, 2), points in the frame of the indenter, metres.
         - `areas`: (n, q), area of the skin around each point, m².
-        - `fall`: (n, q), for curved skins, distance of the skin below the plane of the frame at the points, metres.
+        - `fall`: (n, q), for curved skins: distance of the skin below the plane z = 0 of the frame at the points,
+          metres.
 
         Raises `ValueError` as `pressure`, and for a curved skin if the support requires a flat one.
         """
@@ -63,15 +65,15 @@ class AbstractSupport(Module):
 class PressureRaster(AbstractPressure):
     """Pressure on a raster centred at the origin, interpolated linearly between the centres of pixels.
 
-    **Fields**: `values`: (N, N), pascals, row 0 at the minimum y; `pixel`: sides of a pixel along x and y, metres; the
-    others as in `AbstractPressure`.
+    **Fields**: `values`: (N, N), pressures of the pixels, pascals, row 0 at the minimum y; `pixel`: sides of a pixel
+    along x and y, metres; `load`, `approach`, `reach`: as in `AbstractPressure`.
     """
 
     values: Float[np.ndarray, "N N"]
     pixel: Float[np.ndarray, "2"]
 
     def at(self, points):
-        """Pressure at points, pascals, interpolated linearly between pixels; zero outside the raster."""
+        """Interpolate the pressure, pascals, linearly at `points` (…, 2), metres; zero outside the raster."""
         pixel_coordinates = np.moveaxis(
             (np.asarray(points) / self.pixel)[..., ::-1] + (len(self.values) - 1) / 2, -1, 0
         )
@@ -80,20 +82,22 @@ class PressureRaster(AbstractPressure):
 
 
 def raster(half_widths, num_pixels: int) -> tuple[Float[np.ndarray, "N N 2"], Float[np.ndarray, "2"]]:
-    """Centres (N, N, 2) of the N × N pixels of a rectangle around the origin, and the sides of a pixel (2,), metres.
-    `half_widths`: half the sides of the rectangle; `num_pixels`: N."""
+    """Divide a rectangle around the origin into N × N pixels: return their centres (N, N, 2) and sides (2,), metres.
+
+    `half_widths`: half the sides of the rectangle, metres; `num_pixels`: N.
+    """
     pixel = 2 * np.asarray(half_widths, float) / num_pixels
     pixel_indices = np.arange(num_pixels) - (num_pixels - 1) / 2
     return np.stack(np.meshgrid(pixel[0] * pixel_indices, pixel[1] * pixel_indices), axis=-1), pixel
 
 
 def contact_window(is_pressed, reach: float, num_pixels: int) -> Float[np.ndarray, "2"]:
-    """Half the sides, in metres, of a rectangle around the origin that encloses the contact closely.
+    """Return half the sides, in metres, of a rectangle around the origin that encloses the contact closely.
 
     `is_pressed(half_widths, num_pixels)`: function that returns an array (N, N): whether each pixel of a raster over a
     rectangle is in contact. Starting from `reach`, the rectangle shrinks until the contact fills more than half of both
-    its sides, since a light load on a ball touches only a small part of it. If the contact lies between the pixels, the
-    last rectangle is returned.
+    its sides, since a light load on a ball touches only a small part of it. If the contact covers the centre of no
+    pixel, the last rectangle is returned.
     """
     half_widths = np.full(2, reach)
     while True:
@@ -108,14 +112,14 @@ def contact_window(is_pressed, reach: float, num_pixels: int) -> Float[np.ndarra
 
 
 def check_load(load) -> None:
-    """Check a load in newtons. Raises `ValueError` unless it is positive."""
+    """Raise `ValueError` unless a load, newtons, is positive."""
     if not (is_number(load) and load > 0):
         raise ValueError(f"load must be positive, in newtons (100 g weigh 0.98 N); it is {describe(load)}.")
 
 
 def check_resolved(contact: Bool[np.ndarray, "N N"], pixel) -> None:
-    """Check that a contact covers at least one pixel of a raster; `pixel`: sides of a pixel, metres. Raises
-    `ValueError` otherwise."""
+    """Raise `ValueError` unless a contact, (N, N) pixels of a raster, covers at least one; `pixel`: sides of a pixel,
+    metres."""
     if not contact.any():
         raise ValueError(
             f"indenter: its contact is thinner than a pixel, {1e3 * np.max(pixel):.2g} mm, of the raster that "
@@ -124,19 +128,19 @@ def check_resolved(contact: Bool[np.ndarray, "N N"], pixel) -> None:
 
 
 def check_support(name: str, value) -> None:
-    """Check that the argument `name` is a support. Raises `ValueError` otherwise."""
+    """Raise `ValueError` unless the argument `name` is a support, such as `Foundation(1e6, 3e-3)`."""
     check_kind(name, value, AbstractSupport, "a support, such as Foundation(1e6, 3e-3) or HalfSpace(1e6)")
 
 
 class Press(Module):
-    """An indenter under a load.
+    """An indenter that presses on a skin with a load.
 
     On a curved skin, the position is (x, y, z) on the touched face, and the indenter moves along the inward normal.
-    With angle 0, seen from outside, its x axis points to the right and its y axis up: along the projection of the z
-    axis onto the surface, or of the y axis where the surface is nearly horizontal.
+    With angle 0, seen from outside, the indenter's x axis points to the right and its y axis up: along the projection
+    of the z axis onto the surface, or of the y axis where the surface is nearly horizontal.
 
-    **Fields**: `indenter`: the indenter; `load`: load, newtons; `position`: position (x, y) of its origin, metres;
-    `angle`: angle by which it is rotated, radians.
+    **Fields**: `indenter`: the indenter; `load`: load, newtons; `position`: position (x, y) of the indenter's origin,
+    metres; `angle`: angle by which the indenter is rotated, radians.
 
     **Example:**
 
@@ -160,10 +164,13 @@ class Press(Module):
 
 
 class MovingPress(Module):
-    """A press over time, with one value for each of T frames; constant values may be given once.
+    """An indenter that moves over a skin: its load, position and angle in each of T frames.
+
+    Constant values may be given once.
 
     **Fields**: `indenter`: the indenter; `load` (T,): load, newtons, 0 while lifted; `position` (T, 2), or (T, 3) on a
-    curved skin: position of its origin, metres; `angle` (T,): angle by which it is rotated, radians.
+    curved skin: position of the indenter's origin, metres; `angle` (T,): angle by which the indenter is rotated,
+    radians.
 
     **Example:**
 
@@ -205,15 +212,15 @@ class MovingPress(Module):
         self.indenter, self.load, self.position, self.angle = indenter, load, position, angle
 
     def at(self, frame: int) -> Press | None:
-        """Press in one frame; None while lifted."""
+        """Return the press in the frame with index `frame`; None while the indenter is lifted."""
         if not self.load[frame]:
             return None
         return Press(self.indenter, self.load[frame], self.position[frame], self.angle[frame])
 
 
 def touches_of(presses) -> list[tuple[Press, ...]]:
-    """List the simultaneous presses of each touch, as tuples. Raises `ValueError` for an empty list, and for elements
-    that are not presses."""
+    """Convert a list of presses, or of tuples of presses, to a list of tuples: the simultaneous presses of each touch.
+    Raises `ValueError` for an empty list, and for elements that are not presses."""
     check_kind("presses", presses, (list, tuple), "a list of them, one for each frame, such as [press]")
     if not presses:
         raise ValueError("presses: give one at least.")
@@ -228,9 +235,10 @@ def touches_of(presses) -> list[tuple[Press, ...]]:
 
 
 def motions_of(motions, num_frames: int) -> list[MovingPress]:
-    """List the motions of a recording, given as one motion or as a list, which is empty for an untouched skin.
+    """Return the moving presses of a recording as a list; `motions` is one or a list, empty for an untouched skin.
 
-    Raises `ValueError` for anything else, for another number of frames, and for motions without any load.
+    Raises `ValueError` for anything but moving presses, for a number of frames other than `num_frames`, and for motions
+    without any load.
     """
     motions = [motions] if isinstance(motions, MovingPress) else motions
     check_kind(

@@ -1,7 +1,7 @@
-"""Sets of random touches and their frames, larger than memory: simulated in chunks and written to a Zarr store, on this
-machine or on a cluster.
+"""Sets of random touches and their frames, larger than memory: simulated in chunks and written to a Zarr store.
 
-The store and its chunks are as in the studies of `jeit.design`. Needs the extra `cluster`.
+The simulation runs on this machine or on a cluster. The store and its chunks are as in the studies of `jeit.design`.
+Needs the extra `cluster`.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ _UNITS_AND_MEANINGS = {
 
 
 class PressSet:
-    """A set of random touches with the frames of a skin, for `simulate_presses`; determined by its seed.
+    """A set of random touches and the frames of a pressed skin, which `simulate_presses` computes.
 
     **Arguments:**
 
     - `skin`: the skin.
-    - `draws`: the distribution of the touches.
+    - `draws`: distribution from which the touches are drawn.
     - `number`: number of touches.
-    - `seed`: random seed.
-    - `held`, `elapsed`: times as in `PressedSkin.frames`, seconds.
+    - `seed`: random seed, which determines the touches and the frames.
+    - `held`, `elapsed`: duration of the load, and time during which the skin has drifted, seconds.
     - `chunk`: number of touches that are simulated and written at once; it also affects the random numbers.
 
     **Example:**
@@ -67,8 +67,8 @@ class PressSet:
         elapsed: float = 0.0,
         chunk: int = 1000,
     ):
-        """Create a set. Raises `ValueError` for invalid arguments, and if the skin cannot carry the maximum load of
-        each indenter in its middle; at the edge, indenters go deeper, which is not checked."""
+        """Create a set of touches. Raises `ValueError` for invalid arguments, and if the middle of the skin cannot
+        carry the maximum load of each indenter; at the edge, indenters go deeper, which is not checked."""
         check_kind("skin", skin, PressedSkin, "a PressedSkin")
         check_kind(
             "draws",
@@ -95,7 +95,7 @@ class PressSet:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 hash of everything that determines the results."""
+        """SHA-256 hash of everything that determines the simulated data: skin, draws, seed, times, version."""
         model, settings = self.skin.model, (_VERSION, self.number, self.seed, self.held, self.elapsed, self.chunk)
         arrays = model.mesh, model.electrodes, model.protocol, self.skin.material, self.skin.conductivity
         leaves, structure = jax.tree.flatten((arrays, self.skin.gain, self.draws))
@@ -105,8 +105,8 @@ class PressSet:
         return hasher.hexdigest()
 
     def solve(self, chunk: int) -> dict[str, np.ndarray]:
-        """Simulate one chunk of k touches: arrays (k, …) by name as in the store, NaN where a touch has fewer presses
-        than `at_once`."""
+        """Simulate a chunk of k touches: arrays (k, …), by their names in the store, of voltages and of the presses;
+        NaN where a touch has fewer presses than `draws.at_once`."""
         draw_key, frame_key = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), chunk))
         touches = self.draws.draw(draw_key, len(self.chunks[chunk]))
         results = {name: np.full((len(touches), *shape), np.nan) for name, (shape, _) in self._shapes().items()}
@@ -127,7 +127,7 @@ class PressSet:
         return results
 
     def contents(self) -> Contents:
-        """Description of the arrays in the store of the set."""
+        """Describe the arrays in the Zarr store of the set."""
 
         def create_arrays(zarr_group: Any) -> None:
             for name, (shape, dimensions) in self._shapes().items():
@@ -149,7 +149,7 @@ class PressSet:
         )
 
     def _shapes(self) -> dict[str, tuple[tuple[int, ...], tuple[str, ...]]]:
-        """Shape and dimensions of each array for one touch, by name."""
+        """Return, by name, the shape of each array for one touch, and the names of its dimensions."""
         per_press = (self.draws.at_once,), ("press",)
         return {
             "voltages": ((self.skin.model.protocol.num_measurements,), ("channel",)),
@@ -173,11 +173,12 @@ def simulate_presses(
 
     **Arguments:**
 
-    - `presses`: the set.
+    - `presses`: the set of presses or indents.
     - `path`: path of the Zarr store, which is created if it does not exist.
-    - `client`, `progress`: as in `jeit.design.run_study`.
+    - `client`, `progress`: client of a Dask cluster, and function that is called with the progress, as in
+      `jeit.design.run_study`.
 
-    Raises `ValueError` for the store of another set, for a store in use by another process, and as
+    Raises `ValueError` for a path to the store of another set, for a store in use by another process, and as
     `PressedSkin.frames`; `ImportError` without the extra `cluster`; `OSError` if the store cannot be written.
 
     **Example:**
@@ -200,15 +201,15 @@ def simulate_presses(
 
 
 def open_presses(presses: PressSet | IndentSet, path: str | Path):
-    """Open the set in a store as an `xarray.Dataset` with dimensions touch, channel and press, or, for indents, row and
-    column instead of press.
+    """Open the simulated data of a set of presses or indents as an `xarray.Dataset`.
 
-    Data are read on access; `finished` (touch,) marks the touches that have been simulated.
+    The dimensions are touch, channel and press or, for indents, row and column instead of press. Data are read on
+    access; `finished` (touch,) marks the touches that have been simulated.
 
     **Arguments:**
 
     - `presses`: the set.
-    - `path`: path of the Zarr store.
+    - `path`: path of the Zarr store in which `simulate_presses` wrote the data.
 
     Raises as `jeit.design.study.store.Store`.
 
@@ -229,7 +230,7 @@ def open_presses(presses: PressSet | IndentSet, path: str | Path):
 
 
 def solve_presses(presses: PressSet | IndentSet, chunk: int) -> dict[str, np.ndarray]:
-    """Simulate one chunk of a set as `PressSet.solve`, but as a function, which can be sent to workers of a cluster."""
+    """Simulate one chunk of a set by its method `solve`; a function can be sent to workers of a cluster."""
     return presses.solve(chunk)
 
 

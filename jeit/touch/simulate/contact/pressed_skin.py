@@ -1,10 +1,11 @@
-"""Pressed skins: from loads to conductivity to voltages, with drift and the response of the material.
+"""Pressed skins: compute conductivity from loads, and voltages from conductivity, with hysteresis, creep and drift.
 
 The effective pressure q of a material follows from the pressure p over time by hysteresis, then creep.
 
 **Hysteresis** is a generalised play operator (Visintin, Differential Models of Hysteresis, 1994, section III.2) between
 the curve w = p, on which the load rises, and the curve w = p / (1 − H), on which it falls; between the curves, w is
-constant. It does not depend on the rate. Both curves end at zero, and their maximum difference after a load p is H p.
+constant. Hysteresis does not depend on the rate of loading. Both curves end at zero, and their maximum difference after
+a load p is H p.
 
 **Creep** is that of a standard linear solid with several branches, in which a share a_k of w is delayed:
 
@@ -45,7 +46,7 @@ from jeit_solvers.module import Module
 
 def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     """Draw standard normal numbers with `jax.random.normal`. The number of draws is rounded up to a power of two, so
-    that fewer programs are compiled for records of different lengths."""
+    that JAX compiles fewer programs for recordings of different lengths."""
     num_draws = math.prod(shape)
     return np.asarray(jax.random.normal(key, (1 << max(num_draws - 1, 0).bit_length(),)))[:num_draws].reshape(shape)
 
@@ -53,8 +54,8 @@ def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..
 def random_walk(
     key: Array, seconds: Float[np.ndarray, " T"], trend: float, deviation: float, count: int
 ) -> Float[np.ndarray, "T k"]:
-    """Logarithms (T, k) of `count` = k drifting quantities, 0 at time 0: a common `trend` per second, and an
-    independent random walk with standard `deviation` per √s for each. `seconds`: (T,), in ascending order."""
+    """Draw logarithms (T, k) of k = `count` drifting quantities, 0 at time 0: a common `trend` per second, and for each
+    an independent random walk of standard `deviation` per √s. `seconds`: times (T,), in ascending order."""
     time_steps = np.diff(seconds, prepend=0.0)
     normal_draws = standard_normal(key, (len(time_steps), count))
     return trend * np.asarray(seconds)[:, None] + deviation * np.cumsum(
@@ -63,7 +64,7 @@ def random_walk(
 
 
 def draw_gains(key: Array, spread: float, num_channels: int) -> Float[np.ndarray, " M"]:
-    """Draw gains of `num_channels` channels, log-normal about 1; `spread`: standard deviation of the logarithm."""
+    """Draw log-normal gains of channels (M,), with median 1; `spread`: standard deviation of the logarithm."""
     return np.exp(spread * standard_normal(key, (num_channels,)))
 
 
@@ -73,23 +74,23 @@ def white_noise(key: Array, deviation: float, shape: tuple[int, ...]) -> Float[n
 
 
 class MaterialState(NamedTuple):
-    """State of a material at m points, in pascals. **Fields**: `hysteresis_output`: (m,), output w of the hysteresis;
-    `branch_states`: (k, m), states y of the delayed branches."""
+    """State of a material at m points, pascals. **Fields**: `hysteresis_output`: (m,), pressure w after hysteresis;
+    `branch_states`: (k, m), states y of the k delayed branches of creep."""
 
     hysteresis_output: Float[np.ndarray, " m"]
     branch_states: Float[np.ndarray, "k m"]
 
 
 def unloaded_state(material: Material, num_points: int) -> MaterialState:
-    """State of a material at `num_points` points without earlier load."""
+    """Return the state of a material at `num_points` points without earlier load."""
     return MaterialState(np.zeros(num_points), np.zeros((len(material.creep), num_points)))
 
 
 def advance_state(
     material: Material, state: MaterialState, pressure: Float[np.ndarray, " m"], seconds: float
 ) -> tuple[MaterialState, Float[np.ndarray, " m"]]:
-    """Advance the state `state` by a time step in `seconds` to `pressure` (m,); return the new state and the effective
-    pressure (m,), pascals."""
+    """Advance a material's `state` by a time step of `seconds`, at whose end it bears `pressure` (m,); return the new
+    state and the effective pressure (m,), pascals."""
     output = np.maximum(pressure, np.minimum(state.hysteresis_output, pressure / (1 - material.hysteresis)))
     shares, times = _branches(material)
     branch_states = state.branch_states
@@ -103,38 +104,37 @@ def advance_state(
 
 
 def held_pressure(material: Material, pressure: Float[np.ndarray, "..."], seconds: float) -> Float[np.ndarray, "..."]:
-    """Effective pressure (…), pascals, under a first load that was applied suddenly and held for `seconds`."""
+    """Compute the effective pressure (…), pascals, under a first `pressure` applied suddenly and held for `seconds`."""
     shares, times = _branches(material)
     return np.asarray(pressure) * (1 - np.sum(shares * np.exp(-seconds / times)))
 
 
 def _branches(material: Material) -> tuple[np.ndarray, np.ndarray]:
-    """Shares (k, 1) and time constants (k, 1), in seconds, of the creep branches."""
+    """Return the shares (k, 1) and time constants (k, 1), seconds, of a material's k branches of creep."""
     pairs = np.array(material.creep, float).reshape(-1, 2)
     return pairs[:, :1], pairs[:, 1:]
 
 
-# Number of touches processed at once; numbers of cells that separate groups of touches; and ratio of the extent of a
-# touch to the square root of its area, above which it is assumed to consist of separate contacts.
+# Number of touches processed at once; limits between groups of touches, numbers of cells; ratio of the extent of a
+# touch to the square root of its area above which the touch is assumed to consist of separate contacts.
 _TOUCHES_AT_ONCE, _GROUP_NUM_CELLS, _MIN_SEPARATION = 1024, (128, 512, 2048), 3.0
 # Changes below this share of the maximum change of a touch are neglected.
 _MIN_RELATIVE_CHANGE = 1e-6
 
 
 class PressedSkin(Module):
-    """A sheet or layer of a material that is pressed. Voltages are exact; they are computed by low-rank updates of one
-    factorisation.
+    """Simulated skin, a sheet or a layer of a material, whose voltages under presses are computed.
 
-    The sheet may be a surface in space, and the layer a shell. Presses are then at (x, y, z), and the support of the
-    material must be a `Foundation`.
+    Voltages are computed exactly, by low-rank updates of one factorisation. The sheet may be a surface in space, and
+    the layer a shell. Presses are then at (x, y, z), and the support of the material must be a `Foundation`.
 
     **Arguments:**
 
     - `key`: random key from which the gains of the channels are drawn.
     - `model`: forward model of a sheet, or of a layer with its top at the maximum z.
     - `material`: the material.
-    - `conductivity`: conductivity at rest, S/m (2-D: S); may be tensors, which are scaled by presses. By default that
-      of the material.
+    - `conductivity`: conductivity at rest, S/m (2-D: S), by default that of the material; may be tensors, which presses
+      scale.
     - `face`: pressed face of a curved layer, "outer" or "inner".
 
     **Fields**: the arguments except `key`, and `gain` (M,): gain of each channel.
@@ -162,9 +162,9 @@ class PressedSkin(Module):
         conductivity: ArrayLike | None = None,
         face: str = "outer",
     ):
-        """Create a skin with random gains drawn with `key`.
+        """Create a skin with random gains of the channels drawn with `key`.
 
-        `conductivity`: at rest, S/m (2-D: S); default: that of the material. `face`: as in
+        `conductivity`: conductivity at rest, S/m (2-D: S); default: that of the material. `face`: as in
         `jeit.design.Skin.touched_face`. Raises `ValueError` for invalid arguments.
         """
         check_key(key)
@@ -194,8 +194,8 @@ class PressedSkin(Module):
 
         `presses`: for each touch, a press or a tuple of simultaneous presses. `held`: duration of the load, seconds.
         `elapsed`: time during which the skin has drifted, seconds, the same for all frames. `progress` is called with a
-        description of the progress. Raises `ValueError` for presses off the skin or through it, and for invalid
-        arguments.
+        description of the progress. Raises `ValueError` for presses off the skin, loads that press through the skin,
+        and invalid arguments.
         """
         check_key(key)
         check_seconds("held", held)
@@ -210,8 +210,8 @@ class PressedSkin(Module):
         held: float = 1.0,
         progress: Callable[[str], None] | None = None,
     ) -> TouchedCells:
-        """Cells whose conductivity is changed by n touches, and their relative changes. Arguments as in `frames`.
-        Raises `ValueError` as `frames`."""
+        """Compute which cells change their conductivity under n touches, and by which share. Arguments and errors: see
+        `frames`."""
         touches = touches_of(presses)
         pressed = pressed_cells(Samples.from_mesh(self.model.mesh, self.face), self.material.support, touches, progress)
         changes = self.material.change(held_pressure(self.material, pressed.pressure, held)).mean(axis=-1)
@@ -228,9 +228,10 @@ class PressedSkin(Module):
     ) -> Float[np.ndarray, "T M"]:
         """Simulate voltages (T, M) at times `seconds` (T,) of a skin under moving presses.
 
-        `motions`: a `MovingPress`, a list of simultaneous ones, or `[]` for an untouched skin. The skin has had no load
-        before the first frame, and drifts from time 0. `progress` is called with a description of the progress. Raises
-        `ValueError` for times that are negative or decrease, for motions of other lengths, and as `frames`.
+        `motions`: a `MovingPress`, a list of simultaneous moving presses, or `[]` for an untouched skin. The skin has
+        had no load before the first frame, and drifts from time 0. `progress` is called with a description of the
+        progress. Raises `ValueError` for times that are negative or decrease, for motions with more or fewer frames
+        than times, and as `frames`.
         """
         check_key(key)
         seconds = _check_times(seconds)
@@ -283,8 +284,8 @@ class PressedSkin(Module):
         *,
         progress: Callable[[str], None] | None = None,
     ) -> TouchedCells:
-        """Cells whose conductivity is changed in each of T frames, also by earlier loads, and their relative changes.
-        Arguments as in `record`. Raises `ValueError` as `record`."""
+        """Compute which cells change their conductivity in each of T frames, also due to earlier loads, and by which
+        share. Arguments and errors: see `record`."""
         seconds = _check_times(seconds)
         motions = motions_of(motions, len(seconds))
         presses_of_frames = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
@@ -307,9 +308,9 @@ class PressedSkin(Module):
     def voltages_under(
         self, touched: TouchedCells, *, progress: Callable[[str], None] | None = None
     ) -> Float[np.ndarray, "n M"]:
-        """Voltages (n, M) of the model under n touches, without gains, drift and noise.
+        """Compute the voltages (n, M) of the model under n touches, without gains, drift and noise.
 
-        `progress` is called with the number of touches done. Raises as `touch_changes`.
+        `progress` is called with the number of touches that are computed. Raises as `touch_changes`.
         """
         num_done = 0
         voltages = np.tile(self._rest_voltages, (len(touched.places), 1))
@@ -335,8 +336,9 @@ class PressedSkin(Module):
     ) -> Float[np.ndarray, "n M"]:
         """Add drift, gains and noise to exact voltages (n, M) at times `seconds`, (n,) or (1,) for all; return volts.
 
-        Voltages for conductivity e^d σ and contact impedances e^c z are those for σ and e^(c + d) z, divided by e^d.
-        The effect of contacts is linearised about the skin at rest. Raises `ValueError` for an invalid key.
+        Drift makes the conductivity e^d σ and the contact impedances e^c z. The voltages are those for σ and e^(c + d)
+        z, divided by e^d. The effect of contact impedances is linearised about the skin at rest. Raises `ValueError`
+        for an invalid key.
         """
         check_key(key)
         conductivity_key, contact_key, noise_key = jax.random.split(key, 3)
@@ -357,7 +359,7 @@ class PressedSkin(Module):
 
     @property
     def _dimension(self) -> int:
-        """Number of coordinates of the positions of presses."""
+        """Number of coordinates of the position of a press."""
         return 3 if is_curved(self.model.mesh) else 2
 
     @cached_property
@@ -367,8 +369,8 @@ class PressedSkin(Module):
 
     @cached_property
     def _contact_derivative(self) -> Float[np.ndarray, "L M"]:
-        """Derivative ∂v/∂log z (L, M) of the voltages at rest by the logarithms of the contact impedances, volts; zero
-        for point electrodes."""
+        """Derivative ∂v/∂log z (L, M), volts, of the M voltages at rest by the logarithms of the contact impedances of
+        the L electrodes; zero for point electrodes."""
         electrodes, protocol = self.model.electrodes, self.model.protocol
         if electrodes.is_point:
             return np.zeros((electrodes.num_electrodes, protocol.num_measurements))
@@ -378,7 +380,7 @@ class PressedSkin(Module):
 
 
 def _collect_changes(places, cells, changes, num_cells: int) -> TouchedCells:
-    """Collect the changes that are not negligible as `TouchedCells`, padded with zeros at the end of each row."""
+    """Collect the changes of cells that are not negligible as `TouchedCells`, whose rows are padded with zeros."""
     is_significant = np.abs(changes) > _MIN_RELATIVE_CHANGE * np.abs(changes).max(axis=1, keepdims=True)
     rows, is_entry = pad_rows([row[is_kept] for row, is_kept in zip(cells, is_significant, strict=True)])
     num_padding = _round_up(rows.shape[1]) - rows.shape[1]
@@ -405,9 +407,9 @@ def _concatenate(touched_of_recordings: Sequence[TouchedCells]) -> TouchedCells:
 def _groups_of_similar_cost(
     mesh: Mesh, cells: Int[np.ndarray, "n c"], change: Float[np.ndarray, "n c"]
 ) -> list[np.ndarray]:
-    """Group touches by similar cost, and return the numbers of the touches in each group.
+    """Group touches whose voltages cost similar computing time; return the numbers of the touches in each group.
 
-    Groups differ in the number of touched cells, and in whether these are close together or form separate contacts.
+    Groups differ in the number of touched cells, and in whether the cells are close together or form separate contacts.
     Touches without changes are left out.
     """
     is_changed = change != 0
@@ -426,12 +428,12 @@ def _groups_of_similar_cost(
 
 
 def _round_up(count: int) -> int:
-    """Round up to a power of two, at least 16, since JAX compiles a program for every number of touches and cells."""
+    """Round `count` up to a power of two, 16 or more: JAX compiles a program for every number of touches and cells."""
     return 2 ** max(4, (count - 1).bit_length())
 
 
 def check_seconds(name: str, value) -> None:
-    """Check that the argument `name` is a time in seconds, zero or more. Raises `ValueError` otherwise."""
+    """Raise `ValueError` unless the argument `name` is a time in seconds, zero or more."""
     if not (is_number(value) and value >= 0):
         raise ValueError(f"{name} must be seconds, zero or more; it is {describe(value)}.")
 

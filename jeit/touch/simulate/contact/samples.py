@@ -1,5 +1,5 @@
-"""Sample points on the cells of a skin at which pressure is computed, and their coordinates in the frames of
-presses."""
+"""Sample points on the cells of a skin, at which pressure is computed, and their coordinates in the frames of
+indenters."""
 
 from __future__ import annotations
 
@@ -18,19 +18,20 @@ from jeit.touch.simulate.contact.press import Press
 # Fineness n of the lattice of samples in a cell: barycentric coordinates are (i + 1/k) / (n + 1) with integers i of sum
 # n, for a cell with k corners.
 _LATTICE_FINENESS = 2
-# Minimum cosine of the angle between the normal of a curved skin and that at the press, for the skin to be beneath the
-# indenter. On a ball, the distance of a point from the place pressed is then at most 1 / cos(60° / 2) times its
-# distance from the axis of the press.
+# Minimum cosine of the angle between the normals of a curved skin at a cell and at the place pressed, for the cell to
+# be beneath the indenter. On a ball, the distance of a point from the place pressed is then at most 1 / cos(60° / 2)
+# times its distance from the axis of the press.
 _MIN_NORMAL_COSINE, _MAX_CHORD_RATIO = 0.5, 1.2
 # Minimum z component of a normal, above which "up" in the tangent plane of a curved skin is along y.
 _MIN_VERTICAL_COMPONENT = 0.866
-# Maximum distance of a press from the surface, relative to the root of the area of its largest triangle.
+# Maximum distance of a press from the surface of a skin, relative to the square root of the area of the surface's
+# largest triangle.
 _MAX_RELATIVE_DISTANCE = 0.5
 
 
 class CurvedGeometry(NamedTuple):
-    """Geometry of a curved skin. **Fields**: `surface`: the touched surface; `corners`: (m, k, 3), its unit normals at
-    the corners of cells; `cells`: (m, 3), its unit normals at the cells."""
+    """Geometry of a curved skin. **Fields**: `surface`: the touched surface; `corners`: (m, k, 3), unit normals of the
+    surface at the k corners of each of m cells; `cells`: (m, 3), unit normals of the surface at the cells."""
 
     surface: Triangles
     corners: Float[np.ndarray, "m k 3"]
@@ -40,10 +41,10 @@ class CurvedGeometry(NamedTuple):
 class Samples(NamedTuple):
     """Sample points on m cells of a skin, in the plane or on the touched surface.
 
-    - `points`: (m, s, d), sample points, metres.
+    - `points`: (m, s, d), s sample points in each cell, metres, with d = 2 coordinates, or 3 on a curved skin.
     - `area`: (m,), area per sample of each cell, m².
     - `radius`: radius of the largest cell, metres.
-    - `corners`: (m, k, d), corners of the cells, projected onto the plane or the touched surface, metres.
+    - `corners`: (m, k, d), k corners of each cell, projected onto the plane or the touched surface, metres.
     - `curved`: geometry of a curved skin; None for flat skins.
     """
 
@@ -55,8 +56,8 @@ class Samples(NamedTuple):
 
     @classmethod
     def from_mesh(cls, mesh: Mesh, face: str = "outer") -> "Samples":
-        """Create the samples of a sheet or a layer. The cells of a layer are pressed like the surface above them, in a
-        curved layer like its `face`."""
+        """Create the samples of a sheet or a layer. Each cell of a layer bears the pressure on the surface above it; in
+        a curved layer, this surface is its outer or inner `face`."""
         if is_curved(mesh):
             return cls._from_curved_mesh(mesh, face)
         check_flat(mesh, "these presses")
@@ -74,7 +75,8 @@ class Samples(NamedTuple):
         corners, normals = nearest_points.points[cells], surface.normals_at(nearest_points)[cells]
         triangle_indices = surface.nearest(corners.mean(axis=1)).triangle
         points = _curved_lattice(corners, normals, _LATTICE_FINENESS)
-        # In a layer, the area of a triangle of the surface is divided among the cells beneath it by their volumes.
+        # In a layer, the area of a triangle of the surface is divided among the cells beneath the triangle in
+        # proportion to their volumes.
         area_shares = cell_measures / np.bincount(triangle_indices, cell_measures, len(surface.cells))[triangle_indices]
         sample_areas = area_shares * surface.areas[triangle_indices] / points.shape[1]
         return cls(
@@ -86,14 +88,14 @@ class Samples(NamedTuple):
         )
 
     def lattice_points(self, cells: Int[np.ndarray, " c"], fineness: int) -> Float[np.ndarray, "c s d"]:
-        """Sample points (c, s, d) in the given cells, on a lattice whose fineness increases with `fineness`."""
+        """Return sample points (c, s, d) in the given cells, on a lattice whose points increase with `fineness`."""
         if self.curved is None:
             return lattice(self.corners[cells], fineness)
         return _curved_lattice(self.corners[cells], self.curved.corners[cells], fineness)
 
     def check(self, presses: Sequence[Press]) -> None:
-        """Check the positions of presses. Raises `ValueError` for positions with another number of coordinates, and for
-        positions off a curved skin."""
+        """Raise `ValueError` for presses whose positions have another number of coordinates than the sample points, and
+        for positions off a curved skin."""
         dimension, skin_kind = self.points.shape[-1], "flat" if self.curved is None else "curved"
         for press in presses:
             if len(press.position) != dimension:
@@ -115,8 +117,8 @@ class Samples(NamedTuple):
             )
 
     def facing_cells(self, presses: Sequence[Press], cells: Sequence) -> list[Int[np.ndarray, " c"]]:
-        """Select the cells of each press whose normals point towards the indenter. Cells on the opposite side of a tube
-        are left out."""
+        """Select, from the `cells` near each press, those whose normals point towards the indenter, so that cells on
+        the opposite side of a tube are left out."""
         arrays = [np.asarray(indices, int) for indices in cells]
         if self.curved is None:
             return arrays
@@ -135,11 +137,11 @@ class Samples(NamedTuple):
     def to_indenter_frames(
         self, presses: Sequence[Press], cells: Int[np.ndarray, "b c"], points: Float[np.ndarray, "b q d"]
     ):
-        """Transform points to the frames of indenters, which move along the inward normal at the place pressed.
+        """Transform points (b, q, d) to the frames of b indenters.
 
-        Returns the coordinates of the points in the frames (b, q, 2); their distance (b, q) below the tangent plane at
-        the place pressed, 0 on a flat skin; and the ratio (b, c) of the area of each cell as projected along the normal
-        to its area.
+        An indenter moves along the inward normal at the place pressed. Returns the coordinates of the points in the
+        frames (b, q, 2); the distance (b, q) of the points below the tangent plane at the place pressed, 0 on a flat
+        skin; and the ratio (b, c) of each cell's area projected along this normal to its area.
         """
         cos, sin = (function([press.angle for press in presses])[:, None] for function in (np.cos, np.sin))
         if self.curved is None:
@@ -153,7 +155,7 @@ class Samples(NamedTuple):
 
 
 def lattice(corners: Float[np.ndarray, "m k d"], fineness: int) -> Float[np.ndarray, "m s d"]:
-    """Evenly spaced points (m, s, d) in cells with the given corners; their number s increases with `fineness`."""
+    """Return evenly spaced points (m, s, d) in cells with `corners` (m, k, d); s increases with `fineness`."""
     return np.einsum("sk,mkd->msd", _barycentric_weights(corners.shape[1], fineness), corners)
 
 
@@ -165,7 +167,7 @@ def _barycentric_weights(num_corners: int, fineness: int) -> Float[np.ndarray, "
 
 
 def _curved_lattice(corners, normals, fineness: int) -> Float[np.ndarray, "m s 3"]:
-    """Points of the `lattice`, moved from flat triangles onto the curved surface that they approximate."""
+    """Return the points of `lattice`, moved from flat triangles onto the curved surface that these approximate."""
     weights = _barycentric_weights(corners.shape[1], fineness)
     return project_to_curved_surface(
         np.einsum("sk,mkd->msd", weights, corners), weights, corners[:, None], normals[:, None]
@@ -176,16 +178,17 @@ def project_to_curved_surface(points, weights, corners, normals) -> Float[np.nda
     """Move points (…, 3) of flat triangles onto the curved surface with unit `normals` (…, k, 3) at the `corners`
     (…, k, 3); `weights`: (…, k), barycentric coordinates of the points.
 
-    Points are moved half of the way to the interpolated projections onto the tangent planes at the corners, which is
-    exact to second order (Boubekeur and Alexa, Phong tessellation, ACM Transactions on Graphics 27(5), 2008, at 1/2).
+    Each point is projected onto the tangent planes at the corners. It is moved half of the way to the interpolated
+    projections, which is exact to second order (Boubekeur and Alexa, Phong tessellation, ACM Transactions on Graphics
+    27(5), 2008, at 1/2).
     """
     plane_distances = np.sum((corners - points[..., None, :]) * normals, axis=-1)
     return points + np.einsum("...k,...k,...kd->...d", weights / 2, plane_distances, normals)
 
 
 def _indenter_axes(surface: Triangles, presses: Sequence[Press]):
-    """Points pressed (b, 3) and axes of the frames there (b, 3, 3): right, up and outwards, as seen from outside with z
-    upwards."""
+    """Return the points (b, 3) of a surface where b indenters press, and the axes (b, 3, 3) of the indenters' frames:
+    right, up and outwards, as seen from outside with z upwards."""
     nearest_points = surface.nearest(np.array([press.position for press in presses]))
     corners = surface.cells[nearest_points.triangle]
     origins = project_to_curved_surface(

@@ -1,7 +1,7 @@
 """Simulation of damaged skins: cuts, faulty electrodes, and repair.
 
-Voltages are computed for the conductivity of the damaged skin, on a mesh that is fine along the cut. Readings include
-the drift, gains and noise of the material, which continue when damage occurs.
+Voltages are computed for the conductivity of the damaged skin, on a mesh that is fine along the cut. Simulated readings
+include the drift, gains and noise of the material, which continue when damage occurs.
 """
 
 from __future__ import annotations

@@ -16,15 +16,16 @@ from jeit.mesh import Domain, Mesh, Refine, centroids, check_flat, measures
 from jeit.touch.simulate.contact import Material
 from jeit_solvers.module import Module
 
-# Maximum number of random cuts that are tried; minimum and maximum angle of a bend, in radians.
+# Maximum number of random cuts that are tried; minimum and maximum angle of the bend in a cut, in radians.
 _MAX_TRIES, _MIN_BEND, _MAX_BEND = 400, 0.35, 1.2
 
 
 class Cut(Module):
-    """A cut in a skin.
+    """A cut in a skin along a polyline.
 
-    **Fields**: `path`: (k, 2) vertices in metres; `depth`: depth of the cut as a share of the thickness, 1 for a cut
-    through the skin; `residual`: factor by which the conductivity of the cut cells is multiplied.
+    **Fields**: `path`: (k, 2) vertices of the cut in metres; `depth`: depth of the cut as a share of the skin's
+    thickness, 1 for a cut through the skin; `residual`: factor by which the conductivity of the cut cells is
+    multiplied.
 
     **Example:**
 
@@ -54,20 +55,20 @@ class Cut(Module):
 
     @property
     def length(self) -> float:
-        """Length of the path, metres."""
+        """Length of the cut, metres."""
         return float(np.linalg.norm(np.diff(self.path, axis=0), axis=1).sum())
 
     def refine(self, cell_size: float = 1e-3) -> Refine:
-        """Refinement of a mesh along the cut: `Rectangle(…).mesh(num_points=n, refine=cut.refine())`.
+        """Return the refinement of a mesh along the cut: `Rectangle(…).mesh(num_points=n, refine=cut.refine())`.
 
-        `cell_size` in metres. Raises `ValueError` for a size that is not positive.
+        `cell_size`: size of the cells along the cut, metres. Raises `ValueError` for a size that is not positive.
         """
         check_metres("cell_size", cell_size)
         return Refine(self.along(cell_size), cell_size=cell_size)
 
     def along(self, step: float) -> Float[np.ndarray, "n 2"]:
-        """Points (n, 2) on the path, at most `step` metres apart. Raises `ValueError` for a step that is not
-        positive."""
+        """Return points (n, 2) on the cut, metres, at most `step` metres apart. Raises `ValueError` for a step that is
+        not positive."""
         check_metres("step", step)
         segments_points = [
             np.linspace(start, end, max(2, int(np.ceil(np.linalg.norm(end - start) / step)) + 1))
@@ -76,9 +77,10 @@ class Cut(Module):
         return np.concatenate([segment_points[:-1] for segment_points in segments_points] + [self.path[-1:]])
 
     def cells(self, mesh: Mesh) -> Int[np.ndarray, " c"]:
-        """Numbers of the cells that the cut crosses, seen from above; in a layer, down to the depth of the cut.
+        """Return the numbers of the cells of a mesh that the cut crosses; in a layer, down to the depth of the cut.
 
-        Raises `ValueError` for an argument that is not a flat mesh, and for a cut that crosses no cell.
+        Cells are those crossed as seen from above. Raises `ValueError` for an argument that is not a flat mesh, and for
+        a cut that crosses no cell.
         """
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the skin")
         check_flat(mesh, "cuts")
@@ -99,12 +101,12 @@ class Cut(Module):
     def conductivity(
         self, mesh: Mesh, conductivity: ArrayLike, thickness: float | None = None
     ) -> Float[np.ndarray, " m"]:
-        """Conductivity (m,) of the skin with the cut, S/m (2-D: S), computed from that without the cut.
+        """Compute the conductivity (m,) of the cut skin, S/m (2-D: S), from the `conductivity` of the whole skin.
 
-        The cells of the cut are multiplied by `residual`. In a sheet of `thickness` h metres that is cut in part, with
-        a remaining thickness r, the resistance across the cut is that of a sheet longer by (4h/π) ln csc(πr/2h), as for
-        a diaphragm in a channel (Lamb, Hydrodynamics, 6th edition, §306). Raises `ValueError` for an invalid
-        conductivity, and for a partial cut of a sheet without its thickness.
+        The conductivities of the cells that the cut crosses are multiplied by `residual`. In a sheet of `thickness` h
+        metres that is cut in part, with a remaining thickness r, the resistance across the cut is that of a sheet
+        longer by (4h/π) ln csc(πr/2h), as for a diaphragm in a channel (Lamb, Hydrodynamics, 6th edition, §306). Raises
+        `ValueError` for an invalid conductivity, and for a partial cut of a sheet without its thickness.
         """
         values = np.asarray(check_conductivity(mesh, conductivity))
         if values.ndim > 1 or np.iscomplexobj(values) or values.size not in (1, mesh.num_cells):
@@ -140,9 +142,9 @@ def draw_cut(
     - `key`: random key.
     - `outline`: outline of the skin.
     - `length`: minimum and maximum length, metres, between which the length is uniform.
-    - `depth`: depth as a share of the thickness, 1 for a cut through the skin.
+    - `depth`: depth of the cut as a share of the skin's thickness, 1 for a cut through the skin.
     - `bent`: probability that the cut has one bend of 20 to 70 degrees.
-    - `margin`: minimum distance from the edge, metres.
+    - `margin`: minimum distance of the cut from the edge of the skin, metres.
 
     Raises `ValueError` for invalid arguments, and if the skin is too small for the cut.
 
@@ -200,17 +202,17 @@ def _orientation(first, second) -> np.ndarray:
     return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
 
 
-# Factor of the hysteresis after a repair. Park et al. (2022), figure S13, show an increase without a number; 1.5 is an
-# assumption.
+# Factor by which a repair multiplies the hysteresis of a material. Park et al. (2022), figure S13, show an increase
+# without a number; 1.5 is an assumption.
 _HYSTERESIS_FACTOR = 1.5
 
 
 def mend_cut(
     mesh: Mesh, conductivity: ArrayLike, cut: Cut, material: Material, share: float = 1.0
 ) -> tuple[Float[np.ndarray, " m"], Material]:
-    """Conductivity (m,) of a skin whose cut was repaired, S/m (2-D: S), and its material.
+    """Compute the conductivity (m,), S/m (2-D: S), and the material of a skin whose cut was repaired.
 
-    The hysteresis of the material is multiplied by 1.5, up to 0.9.
+    The hysteresis of the material is multiplied by 1.5, up to at most 0.9.
 
     **Arguments:**
 
@@ -218,7 +220,7 @@ def mend_cut(
     - `conductivity`: conductivity of the skin before the cut, S/m (2-D: S).
     - `cut`: the cut.
     - `material`: material of the skin.
-    - `share`: factor of the conductivity of the repaired cells, about 0.9 to 1.1.
+    - `share`: factor by which the conductivity of the repaired cells is multiplied, about 0.9 to 1.1.
 
     Raises `ValueError` for invalid arguments, and as `Cut.cells`.
 

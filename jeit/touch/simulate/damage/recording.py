@@ -1,4 +1,4 @@
-"""Simulated recordings of damaged skins and of skins with faulty electrodes."""
+"""Simulation of recordings of damaged skins and of skins with faulty electrodes."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from jeit_solvers.module import Module
 
 FaultKind = Literal["dead", "loose", "torn"]
 FAULTS: tuple[FaultKind, ...] = ("dead", "loose", "torn")
-# Factor of the contact impedance of a dead electrode; and limit of the source's voltage, relative to its maximum for
-# the skin at rest.
+# Factor by which the contact impedance of a dead electrode is multiplied; limit of the current source's voltage,
+# relative to its maximum for the skin at rest.
 _DEAD_CONTACT_FACTOR, _MAX_VOLTAGE_RATIO = 1e7, 5.0
-# Minimum and maximum factor of the impedance of a loose contact; time constant of the fluctuations of its logarithm, in
-# seconds; number of levels for which voltages are solved.
+# Minimum and maximum factor by which the impedance of a loose contact is multiplied; time constant of the fluctuations
+# of this factor's logarithm, in seconds; number of levels of the factor for which voltages are solved.
 _LOOSE_CONTACT_FACTORS, _FLUCTUATION_TIME, _NUM_LEVELS = (10.0, 1000.0), 0.5, 7
 # Voltage picked up by a disconnected wire, relative to the root mean square of all voltages.
 _STRAY_FRACTION = 0.02
 
 
 class ElectrodeFault(Module):
-    """A fault of an electrode.
+    """A fault of an electrode: dead, loose or torn.
 
     **Fields**
 
-    - `electrode`: its number, from 0.
+    - `electrode`: number of the electrode, from 0.
     - `kind`: "dead": the contact impedance is multiplied by 10⁷, the source is limited to five times its maximum
       voltage at rest, and measurements on the electrode read only noise. "loose": the factor of the contact impedance
-      fluctuates between 10 and 1,000, with a time constant of half a second. "torn": the electrode is disconnected; its
-      channels read noise, or the constant `rail`.
+      fluctuates between 10 and 1,000, with a time constant of half a second. "torn": the electrode is disconnected;
+      channels with this electrode read noise, or the constant `rail`.
     - `rail`: constant reading of the channels of a torn electrode, volts, or None.
 
     **Example:**
@@ -64,10 +64,10 @@ class ElectrodeFault(Module):
     def changes(
         self, key: Array, model: ForwardModel, conductivity: ArrayLike, seconds: Float[np.ndarray, " T"]
     ) -> Float[np.ndarray, "T M"]:
-        """Change of the voltages (T, M) of a skin at rest due to the fault, at times `seconds` (T,), volts.
+        """Compute the changes (T, M), volts, of the voltages of a skin at rest due to the fault.
 
-        `conductivity` of the skin, S/m (2-D: S). Raises `ValueError` for invalid arguments, and for an electrode that
-        the model does not have.
+        `seconds`: times (T,) of the frames; `conductivity`: conductivity of the skin, S/m (2-D: S). Raises `ValueError`
+        for invalid arguments, and for an electrode that the model does not have.
         """
         check_key(key)
         check_model(model)
@@ -106,7 +106,7 @@ class ElectrodeFault(Module):
         return model.with_electrodes(faulty_electrodes)
 
     def _dead_electrode_voltages(self, model: ForwardModel, conductivity) -> Float[np.ndarray, " M"]:
-        """Voltages (M,) with a dead electrode and a source of limited voltage."""
+        """Compute voltages (M,) of a skin with a dead electrode and a current source of limited voltage."""
         initial_impedance, faulty_impedance = (
             np.asarray(state.transfer_impedance(conductivity))
             for state in (model, self._with_contact_factor(model, _DEAD_CONTACT_FACTOR))
@@ -121,8 +121,8 @@ class ElectrodeFault(Module):
         return voltages * relative_currents[np.asarray(model.protocol.drive_index)]
 
     def _loose_contact_voltages(self, key: Array, model: ForwardModel, conductivity, seconds: np.ndarray) -> np.ndarray:
-        """Voltages (T, M) for a fluctuating contact impedance, interpolated between solutions at a few levels of its
-        logarithm."""
+        """Compute voltages (T, M) for a fluctuating contact impedance, interpolated between those at a few levels of
+        the impedance's logarithm."""
         log_min, log_max = np.log(_LOOSE_CONTACT_FACTORS)
         levels = np.linspace(log_min, log_max, _NUM_LEVELS)
         level_voltages = [
@@ -136,7 +136,8 @@ class ElectrodeFault(Module):
             decay = np.exp(-time_step / _FLUCTUATION_TIME) if frame else 0.0
             fluctuation_value = decay * fluctuation_value + np.sqrt(1 - decay**2) * log_factor
             fluctuation[frame] = fluctuation_value
-        # The distribution function of the normal variable makes the logarithm uniformly distributed.
+        # The normal distribution function, applied to the fluctuation, makes the factor's logarithm uniformly
+        # distributed.
         level_positions = np.asarray(jax.scipy.stats.norm.cdf(fluctuation)) * (_NUM_LEVELS - 1)
         lower_levels = np.minimum(level_positions.astype(int), _NUM_LEVELS - 2)
         upper_weights = (level_positions - lower_levels)[:, None]
@@ -150,10 +151,10 @@ def check_fault(name: str, value) -> None:
 
 
 class DamageEvent(Module):
-    """A change of a skin during a recording.
+    """Damage or repair of a skin, or faults of its electrodes, at a time of a recording.
 
-    **Fields**: `time`: when it happens, seconds; `skin`: the skin from then on, with the same channels and gains, or
-    None for no change of the skin; `faults`: faults of electrodes from then on.
+    **Fields**: `time`: time of the event, seconds; `skin`: the changed skin from this time on, with the same channels
+    and gains, or None for no change of the skin; `faults`: faults of electrodes from this time on.
 
     **Example:**
 
@@ -185,20 +186,21 @@ def record_damage(
     seconds: Float[np.ndarray, " T"],
     events: Sequence[DamageEvent],
 ) -> Float[np.ndarray, "T M"]:
-    """Simulate voltages (T, M) of a skin under moving presses with events.
+    """Simulate voltages (T, M) of a skin under moving presses that is damaged or repaired during the recording.
 
-    Each event sets the skin and the faults until the next one. Drift, gains and noise continue through all of them.
-    Every frame is solved with its own conductivity.
+    Each event sets the skin and the faults of electrodes until the next event. Drift, gains and noise continue through
+    all events. The forward problem is solved for the conductivity of each frame.
 
     **Arguments:**
 
     - `key`: random key.
-    - `skin`: the skin.
-    - `motions`: the presses; `[]` for none.
-    - `seconds`: times (T,), seconds.
+    - `skin`: the skin before the first event.
+    - `motions`: a moving press, or a list of simultaneous ones; `[]` for none.
+    - `seconds`: times (T,) of the frames, seconds.
     - `events`: the events, in order of time.
 
-    Raises `ValueError` for invalid events, for a skin with other channels, and as `PressedSkin.touched_in_time`.
+    Raises `ValueError` for invalid events, for an event whose skin has other channels, and as
+    `PressedSkin.touched_in_time`.
 
     **Example:**
 
@@ -244,8 +246,8 @@ def exact_record(
     seconds: Float[np.ndarray, " T"],
     selected_frames: np.ndarray,
 ) -> Float[np.ndarray, "T M"]:
-    """Voltages (T, M) of the model without drift and noise in the `selected_frames` (T,) frames, and voltages at rest
-    in the others. Raises `ValueError` as `PressedSkin.touched_in_time`."""
+    """Compute voltages (T, M) of a skin without drift and noise in the frames that the mask `selected_frames` (T,)
+    selects; other frames have the voltages at rest. Raises `ValueError` as `PressedSkin.touched_in_time`."""
     voltages = np.tile(np.asarray(skin.model.voltages(skin.conductivity)), (len(seconds), 1))
     if not np.any([np.any(motion.load) for motion in ([motions] if isinstance(motions, MovingPress) else motions)]):
         return voltages

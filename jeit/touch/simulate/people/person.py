@@ -2,10 +2,10 @@
 
 Table I of Silvera Tawil et al. (2011) describes how six gestures are usually made, in words for area, intensity,
 displacement and duration. The numbers for these words are assumptions from everyday touch, and the same for all
-gestures: the contact of a fingertip has a radius of 7 mm, that of a flat hand through foam about 20 mm; typing takes
-1 N, resting fingers 2 N, a firm push 10 N; a knock lasts 0.15 s, a caress about 1 s. Words for a range, such as small
-to large, have a larger spread among people. For displacement in the plane, the table only says yes: here fingers stroke
-at about 0.1 m/s over the length of a hand, and scratch back and forth, faster and over a shorter path.
+gestures: the contact of a fingertip has a radius of 7 mm, that of a flat hand through foam about 20 mm; typing takes 1
+N, resting fingers 2 N, a firm push 10 N; a knock lasts 0.15 s, a caress about 1 s. Words for a range, such as small to
+large, have a larger spread among people. Of displacement in the plane, the table only says whether there is any: here
+fingers stroke at about 0.1 m/s over the length of a hand, and scratch back and forth, faster and over a shorter path.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ TRAITS = ("force", "radius", "duration", "speed", "path")
 """Parameters of a touch: force, N; radius of a disc with the area of the contact, m; duration, s; and, for moving
 touches, speed, m/s, and length of the path of a sweep, m."""
 
-# Median, and standard deviation of the logarithm among people, for each word. Units: m, N and s.
+# Median of a parameter, and standard deviation of its logarithm among people, for each word of Table I. Units: m, N and
+# s.
 _AREA = {"small": (7e-3, 0.2), "sm-large": (12e-3, 0.45), "med-large": (20e-3, 0.3)}
 _INTENSITY = {"low": (1.0, 0.3), "low-med": (2.0, 0.4), "med-high": (5.0, 0.4), "high": (10.0, 0.3)}
 _DURATION = {"short": (0.15, 0.3), "med-long": (1.2, 0.4)}
@@ -39,10 +40,10 @@ _TOUCH_SPREAD = 0.25
 
 @dataclass(frozen=True)
 class Manner:
-    """Description of a gesture by the words of Table I.
+    """Description of how a gesture is made, in the words of Table I of Silvera Tawil et al. (2011).
 
-    **Fields**: `area`, `intensity` and `duration`: words; `speed`: m/s, and `path`: length of a sweep, m, both 0 for
-    gestures that do not move.
+    **Fields**: `area`, `intensity`, `duration`: words for the area of the contact, its force and duration; `speed`:
+    speed of the contact, m/s, and `path`: length of a sweep, m, both 0 for gestures that do not move.
     """
 
     area: str
@@ -53,17 +54,17 @@ class Manner:
 
     @property
     def medians(self) -> Float[np.ndarray, " 5"]:
-        """Medians of `TRAITS` among people, in SI units; speed and path are 0 for gestures that do not move."""
+        """Medians (5,) of the parameters `TRAITS` among people, in SI units; speed and path may be 0."""
         return np.array([*(parameters[0] for parameters in self._word_parameters), self.speed, self.path])
 
     @property
     def spread(self) -> Float[np.ndarray, " 5"]:
-        """Standard deviations of the logarithms of `TRAITS` among people."""
+        """Standard deviations (5,) of the logarithms of the parameters `TRAITS` among people."""
         return np.array([*(parameters[1] for parameters in self._word_parameters), _PATH_SPREAD, _PATH_SPREAD])
 
     @property
     def touch_spread(self) -> float:
-        """Standard deviation of the logarithms of `TRAITS` among touches of one person."""
+        """Standard deviation of the logarithm of each of the parameters `TRAITS` among touches of one person."""
         return _TOUCH_SPREAD
 
     @property
@@ -93,14 +94,15 @@ GESTURES = tuple(MANNERS)
 # Time recorded before a touch and minimum time after it, in seconds; the number of frames is a multiple of
 # `_FRAME_MULTIPLE`.
 _TIME_BEFORE, _TIME_AFTER, _FRAME_MULTIPLE = 0.1, 0.5, 16
-# Maximum mean pressure of a hand, Pa; minimum distance of its path from the edge of the skin, m; maximum path of a hand
-# that does not move along the skin but rolls, m; share of a long touch in which the load rises, and in which it falls;
-# relative amplitude of fluctuations of the load.
+# Maximum mean pressure of a hand, Pa; minimum distance of the hand's path from the edge of the skin, m; maximum path of
+# a hand that does not move along the skin but rolls, m; share of a long touch in which the load rises, and in which it
+# falls; relative amplitude of fluctuations of the load.
 _MAX_PRESSURE, _EDGE_MARGIN, _MAX_ROLL, _RAMP_FRACTION, _FLUCTUATION_AMPLITUDE = 120e3, 15e-3, 2e-3, 0.15, 0.08
-# Number of fingertips of a scratch, their distance divided by their radius, and relative reduction of the load at the
-# turning points.
+# Number of fingertips that scratch; distance between them, divided by their radius; relative reduction of the load at
+# the turning points of a scratch.
 _NUM_FINGERTIPS, _FINGERTIP_SPACING, _LOAD_REDUCTION = 3, 2.6, 0.4
-# Number of random places tried for a path on the skin, and factor by which the path is then shortened.
+# Number of random places tried for a path on the skin; factor by which the path is shortened if it fits at none of
+# them.
 _MAX_TRIES, _SHORTENING_FACTOR = 20, 0.8
 
 
@@ -109,8 +111,8 @@ def gesture_motion(
 ) -> tuple[MovingPress, Float[np.ndarray, " T"]]:
     """Simulate a gesture with the given `traits` (see `TRAITS`, SI units) at a random place on the skin.
 
-    Returns the press and the times (T,) of its frames, seconds, at `rate` frames/s, from 0.1 s before to 0.5 s after
-    the gesture, since the skin recovers slowly.
+    Returns the moving press and the times (T,) of its frames, seconds, at `rate` frames/s. The frames begin 0.1 s
+    before the gesture, and end 0.5 s or more after it, since the skin recovers slowly.
     """
     force, radius, duration, speed, path = traits
     manner = MANNERS[gesture]
@@ -139,7 +141,7 @@ def gesture_motion(
 
 
 def _relative_loads(rng: np.random.Generator, progress: np.ndarray, gesture: str, num_sweeps: int) -> np.ndarray:
-    """Loads (T,) relative to the nominal value, at times `progress` (T,) as fractions of the duration."""
+    """Compute loads (T,), as fractions of the touch's force, at times `progress` (T,), fractions of its duration."""
     if MANNERS[gesture].duration == "short":
         return np.sin(np.pi * progress)
     ramp_factors = np.clip(np.minimum(progress, 1 - progress) / _RAMP_FRACTION, 0, 1)
@@ -152,7 +154,7 @@ def _relative_loads(rng: np.random.Generator, progress: np.ndarray, gesture: str
 
 
 def _random_path(rng: np.random.Generator, outline: Domain, length: float) -> tuple[np.ndarray, float, float]:
-    """Draw the centre, angle and length of a straight path on the skin; the length is reduced if no place is found."""
+    """Draw the centre, angle and length of a straight path on the skin, shorter than `length` if no place is found."""
     low_x, high_x, low_y, high_y = map(float, outline.extent)
     while True:
         for _ in range(_MAX_TRIES):
@@ -170,10 +172,10 @@ _MIN_SKIN_SIDE = 0.06
 
 
 class Person(Module):
-    """A simulated person, who touches skins in a manner of their own.
+    """A simulated person, who makes gestures with a force, contact size, duration and speed of their own.
 
-    **Fields**: `medians` (6, 5): median of each of the five traits (columns) in touches of this person, for each of the
-    six gestures (rows), in SI units.
+    **Fields**: `medians` (6, 5): median, over the touches of this person, of force, radius of the contact, duration,
+    speed and path (columns) for each of the six gestures (rows), in SI units.
 
     **Example:**
 
@@ -195,8 +197,8 @@ class Person(Module):
 
     @classmethod
     def draw(cls, key: Array) -> "Person":
-        """Draw a random person, whose medians are log-normally distributed about those of each gesture. Raises
-        `ValueError` for an invalid key."""
+        """Draw a random person, whose medians are log-normally distributed about the medians among people of each
+        gesture. Raises `ValueError` for an invalid key."""
         check_key(key)
         normal_draws = np.asarray(jax.random.normal(key, (len(GESTURES), len(TRAITS))))
         manners = MANNERS.values()
@@ -208,9 +210,9 @@ class Person(Module):
     ) -> tuple[MovingPress, Float[np.ndarray, " T"]]:
         """Simulate a gesture of this person at a random place on a skin with this `outline`.
 
-        Returns the press and the times (T,) of its frames, seconds, at `rate` frames/s, which begin before and end
-        after the touch. Traits are log-normally distributed about the medians of the person. Raises `ValueError` for
-        invalid arguments, and for a skin too small for a hand.
+        Returns the moving press and the times (T,) of its frames, seconds, at `rate` frames/s, which begin before and
+        end after the touch. Force, radius, duration, speed and path are log-normally distributed about the medians of
+        the person. Raises `ValueError` for invalid arguments, and for a skin too small for a hand.
         """
         check_key(key)
         check_name("gesture", gesture, GESTURES)

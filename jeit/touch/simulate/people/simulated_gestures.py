@@ -16,8 +16,9 @@ from jeit.touch.simulate.contact.press import MovingPress
 from jeit.touch.simulate.contact.pressed_skin import PressedSkin
 from jeit.touch.simulate.people.person import GESTURES, Person
 
-# Maximum time since the reference, during which the skin drifts, in seconds; number of frames of the reference; number
-# of recordings of the untouched skin, each with its own drift; and number of frames of each.
+# Maximum time since the reference frame, during which the skin drifts, in seconds; number of frames of which the
+# reference is the mean; number of recordings of the untouched skin, each with its own drift; number of frames of each
+# of them.
 _MAX_DRIFT_TIME, _NUM_REFERENCE_FRAMES, _NUM_UNTOUCHED_RECORDINGS, _NUM_UNTOUCHED_FRAMES = 60.0, 60, 40, 16
 # Number of recordings simulated at once.
 _RECORDINGS_AT_ONCE = 120
@@ -36,18 +37,18 @@ def simulate_gestures(
 ) -> GestureSet:
     """Simulate recordings of the gestures of people on a skin.
 
-    Before each recording, the skin has drifted for up to a minute since its reference, without load.
+    Before each recording, the skin has drifted for up to a minute since its reference frame, without load.
 
     **Arguments:**
 
     - `key`: random key.
     - `skin`: the skin.
     - `outline`: outline of the skin.
-    - `people`: the people.
+    - `people`: the people who touch the skin.
     - `each`: number of recordings of each gesture by each person.
     - `gestures`: names of the gestures.
-    - `rate`: frames/s.
-    - `progress`: called with a description of the progress.
+    - `rate`: frame rate, frames/s.
+    - `progress`: function that is called with a description of the progress.
 
     Raises `ValueError` for invalid arguments, and as `Person.touch` and `PressedSkin.record`.
 
@@ -108,18 +109,18 @@ def simulate_gestures(
     )
 
 
-# Time before the first gesture, in seconds.
+# Time before the first gesture of a stream, in seconds.
 _TIME_BEFORE_FIRST = 2.0
 
 
 @dataclass(frozen=True)
 class GestureStream:
-    """A stream of F frames of M channels with n touches.
+    """A simulated stream of F frames of M channels with n touches.
 
     - `seconds`: (F,), times of the frames.
     - `voltages`: (F, M), volts.
     - `gesture`: (n,), name of the gesture of each touch.
-    - `person`: (n,), number of the person who made it.
+    - `person`: (n,), number of the person who made the touch.
     - `onset`, `offset`: (n,), first and last time with load of each touch, seconds.
     """
 
@@ -143,17 +144,17 @@ def simulate_gesture_stream(
 ) -> GestureStream:
     """Simulate a stream of random gestures of random people on a skin.
 
-    The skin is not touched for the first two seconds. It creeps and drifts throughout.
+    The skin is not touched for the first two seconds. Creep and drift of the skin continue through the whole stream.
 
     **Arguments:**
 
     - `key`: random key.
     - `skin`: the skin.
     - `outline`: outline of the skin.
-    - `people`: the people.
+    - `people`: the people who touch the skin.
     - `number`: number of gestures.
     - `pause`: minimum time between gestures, seconds.
-    - `rate`: frames/s.
+    - `rate`: frame rate, frames/s.
 
     Raises `ValueError` for invalid arguments, and as `Person.touch` and `PressedSkin.record`.
 
