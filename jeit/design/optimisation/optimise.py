@@ -1,9 +1,9 @@
 """Layout optimisation: a layout score is maximised over electrode positions by gradients through the forward model.
 
-Bounded L-BFGS minimises -score + w Σ (violation / pitch)² over positions in the bounding box of the outline. The
-violations are those of the constraints, pitch is the mean spacing of the electrodes, and the weight w grows from stage
-to stage (the quadratic penalty method: Nocedal and Wright, Numerical Optimization, 2006, chapter 17). Remaining
-violations are then removed by minimising the penalty alone, without the score.
+Bounded L-BFGS minimises -score + w Σ (violation / pitch)² over positions in the bounding box of the outline. The pitch
+is the mean spacing of the electrodes; the weight w grows from stage to stage (the quadratic penalty method: Nocedal and
+Wright, Numerical Optimization, 2006, chapter 17). Remaining violations are then removed by minimising the penalty
+alone, without the score.
 """
 
 from __future__ import annotations
@@ -29,8 +29,7 @@ from jeit_solvers.module import Module
 
 # Stages of the optimisation: weight w of the penalty, and fraction of all steps after which the stage ends.
 _PENALTY_STAGES = ((1e2, 0.5), (1e3, 0.8), (1e4, 1.0))
-# Safety margin of the constraints, metres, so that a layout rounded to whole nanometres still satisfies the
-# constraints.
+# Safety margin of the constraints, metres, which a layout keeps when it is rounded to whole nanometres.
 _CONSTRAINT_MARGIN = 2e-7
 # Maximum distance by which the outline may extend beyond the mesh, relative to the size of the skin.
 _MAX_OVERHANG = 0.01
@@ -46,8 +45,8 @@ class Optimisation(Module):
     **Fields**
 
     - `layout`: the best layout that satisfies all constraints, or the given layout if no such layout is better.
-    - `scores`: all scores of `layout`; `value`: value of the objective for `layout`; `start_value`: value of the
-      objective for the given layout.
+    - `scores`: all scores of `layout`; `value`, `start_value`: values of the objective for `layout` and for the given
+      layout.
     - `centres` (S, L, 2) and `radii` (S, L), metres, `contact_impedance` (S, L), ohm·m², `thickness` (S,) of the sheet,
       metres: final parameters of the L electrodes from each start; `values` (S,): final value of the objective from
       each start.
@@ -89,15 +88,15 @@ def optimise_layout(
 ) -> Optimisation:
     """Maximise the `objective` of a sheet over the positions of its electrodes.
 
-    Use a measurement protocol that does not depend on the order of the electrodes, such as all two-terminal pairs, and
-    confirm the result on a finer mesh. The result is deterministic.
+    Use a protocol that does not depend on the order of the electrodes, such as all two-terminal pairs, and confirm the
+    result on a finer mesh. The result is deterministic.
 
     **Arguments:**
 
     - `skin`: a sheet with the initial layout; `objective`: the maximised function of the scores, for touches of this
       sheet.
     - `space`: the allowed layouts; by default all layouts on the skin.
-    - `steps`: maximum number of L-BFGS steps; the layouts of all starts are optimised together.
+    - `steps`: maximum number of L-BFGS steps; all starts are optimised together.
     - `starts`: number of initial layouts: the given layout, and random layouts drawn with `key` and moved apart.
     - `callback`: function called with the number of each step, 0 for the initial layouts, and the scores (S,) of all
       starts.
@@ -170,8 +169,8 @@ class _LayoutSearch(Module):
     def run(
         self, initial_variables: Float[Array, "S v"], steps: int, callback
     ) -> tuple[Float[Array, "S v"], Record, str]:
-        """Run all stages of the optimisation. Returns the final variables (S, v), the history of variables and scores,
-        and the status of the last stage."""
+        """Run all stages. Returns the final variables (S, v), the history of the starts, and the status of the last
+        stage."""
         record = Record(callback)
         variables, status, num_steps_done = initial_variables, "step limit", 0
         record.add(variables, self.cost(variables, _PENALTY_STAGES[0][0])[1])
@@ -185,8 +184,8 @@ class _LayoutSearch(Module):
     def choose_best(
         self, parameters: Varied, values, violations, start_value: float, status: str
     ) -> tuple[int | None, str, str]:
-        """Choose the start with the best final layout. Returns the index of this start, the status, and the reason in
-        words. The index is None if no start satisfies the constraints, or none improves on the given layout."""
+        """Choose the start with the best final layout. Returns its index, the status, and the reason in words. The
+        index is None if no start satisfies the constraints or improves on the given layout."""
         layout = self.skin.layout
         is_valid = (violations <= 0) & np.isfinite(values)
         is_initial_valid = self.variables.represents(varied_of(self.skin))
@@ -259,8 +258,8 @@ def _largest_violation(constraints: Constraints, centres, radii) -> float:
 
 
 def _make_feasible(variables: Variables, constraints: Constraints, start_variables):
-    """Move the layouts, given by design variables (S, v), until they satisfy the constraints, as far as minimisation of
-    the penalty succeeds."""
+    """Move the layouts of all starts (S, v) until they satisfy the constraints, as far as minimisation of the penalty
+    succeeds."""
 
     def cost(start_variables):
         penalties, gradients = _penalty_and_gradient(start_variables, variables, constraints)
@@ -271,9 +270,8 @@ def _make_feasible(variables: Variables, constraints: Constraints, start_variabl
 
 @eqx.filter_jit
 def _penalty_and_gradient(all_variables, variables: Variables, constraints: Constraints):
-    """Penalty (S,) for violated constraints of the layouts of S starts, and the gradient (S, v) of the penalty by the v
-    design variables. Both are scaled by a large factor, so that the minimisation stops only where the penalty is
-    zero."""
+    """Penalty (S,) for violated constraints of the layouts of S starts, and its gradient (S, v) by the v variables.
+    Both are scaled by a large factor, so that the minimisation stops only where the penalty is zero."""
     return jax.vmap(
         jax.value_and_grad(
             lambda start_variables: 1e6 * _penalty(variables, constraints, start_variables, _CONSTRAINT_MARGIN)
@@ -325,6 +323,6 @@ def _check_outline(outline: Domain, skin: Skin) -> None:
     low_x, high_x, low_y, high_y = outline.extent
     points = np.asarray(skin.model.mesh.points)
     overhang = max(*(points.min(axis=0) - (low_x, low_y)), *((high_x, high_y) - points.max(axis=0)))
-    # The mesh of a disk is a polygon inside the disk, so a small overhang of the outline is allowed.
+    # The mesh of a disk is a polygon inside the disk, so a small overhang is allowed.
     if overhang > _MAX_OVERHANG * max(high_x - low_x, high_y - low_y):
         raise ValueError(f"outline: it reaches {1e3 * overhang:.3g} mm beyond the model's mesh; give the skin's own.")

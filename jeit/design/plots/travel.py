@@ -34,7 +34,7 @@ def plot_travel(
     **Arguments:**
 
     - `optimisation`: result of `optimise_layout`.
-    - `start`: index of the start, from 0, if the optimisation had several starts.
+    - `start`: index of the start, from 0.
     - `keep_out`: regions without electrodes, to be hatched.
     - `title`: title of the plot; by default the mean distance between the electrodes' initial and final positions in
       millimetres.
@@ -78,7 +78,7 @@ def plot_travel(
 
 
 def _draw_legend(ax: Axes, *, has_keep_out: bool) -> None:
-    """Draw the legend of initial and final positions below the plot, beside the scale bar."""
+    """Draw the legend of the positions below the plot, beside the scale bar."""
     disc = {"marker": "o", "markersize": 8, "linestyle": "none"}
     handles: list[Artist] = [
         Line2D([], [], markerfacecolor="none", markeredgecolor=SOFT, label="where it began", **disc),
