@@ -51,8 +51,8 @@ def skin_response(
     - `skin`: the skin; `grid`: the touched positions.
     - `key`: random key for the k-means clustering of the taxels, from `jax.random.key`.
     - `touched`: conductivity changes due to the touches, by default `skin.touched_cells(grid.places)`.
-    - `num_taxels`: number of taxels, by default 90, or the number of positions if fewer than 90. - `threshold`: cosine
-      similarity threshold, as in `find_taxels`.
+    - `num_taxels`: number of taxels, by default 90, or the number of positions if fewer than 90.
+    - `threshold`: cosine similarity threshold, as in `find_taxels`.
     - `linear`: whether to compute linearised instead of exact voltage changes.
 
     Raises `ValueError` for more taxels than positions, if `touched` and `grid` have different numbers of positions, and

@@ -48,8 +48,8 @@ def plot_taxels(
     - `colour`: quantity shown by colours: "area", the area of the taxel whose cluster contains the position;
       "coverage", the number of taxels that cover the position; "label", a colour for each cluster.
     - `outlines`: whether to draw the outline of each taxel, along which the similarity equals the threshold.
-    - `electrodes`: positions (L, 2) or (L, 3) of the electrodes to be marked, metres. - `limit`: value at the upper end
-      of the colour bar, in m² for "area".
+    - `electrodes`: positions (L, 2) or (L, 3) of the electrodes to be marked, metres.
+    - `limit`: value at the upper end of the colour bar, in m² for "area".
     - `title`: title of the plot.
     - `ax`: axes to draw into; by default new ones.
 

@@ -266,7 +266,8 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
 
     **Arguments:**
 
-    - `study`: the study. - `store`: path of the Zarr store with its results.
+    - `study`: the study.
+    - `store`: path of the Zarr store with its results.
     - `path`: path of the HTML file.
 
     Raises `ValueError` if no chunk of the study is finished, `OSError` if the page cannot be written, and in the cases
