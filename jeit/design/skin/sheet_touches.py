@@ -18,8 +18,8 @@ from jeit_solvers.module import Module
 
 
 class SheetTouches(Module):
-    """Touches of a sheet at n positions, with derivatives of the conductivity changes with respect to the positions.
-    They are created with `sheet_touches`.
+    """Touches of a sheet at n positions, from `sheet_touches`, with derivatives of the conductivity changes with
+    respect to the positions.
 
     **Fields**
 
