@@ -33,7 +33,7 @@ _SOLVER = Descent(rtol=1e-10, atol=1e-20, damping=1e-2, history=1)
 class DecayProblem(NamedTuple):
     """Least-squares problem of the calibration of M microphones from T taps.
 
-    **Fields**: `level`: levels y (M, T), logarithms of intensities; `offset`: vectors (M, T, d) from the taps to the
+    **Fields**: `level`: levels y (M, T), logarithms of received power; `offset`: vectors (M, T, d) from the taps to the
     given positions of the microphones in metres; `weight`: weights (M, T) of the levels, 0 for unused ones; `floor`:
     noise floors N (M,); `decay`: class of the decay model; `spread`: standard deviation (P,) of each value over the
     microphones in the penalty, infinite for no penalty; `place_error`: unit of the displacements in metres.

@@ -1,2 +1,1 @@
-"""Localisation of sound sources from intensities: objectives, their minimisation, maps of the objectives, and the
-Cramér-Rao bound."""
+"""Localisation of sound sources from intensities: objectives, their minimisation, maps, and the Cramér-Rao bound."""

@@ -1,5 +1,4 @@
-"""Likelihood of source positions given the levels (logarithms of intensities) of the microphones, and the Cramér-Rao
-bound.
+"""Likelihood of source positions given the levels (logarithms of power) of the microphones, and the Cramér-Rao bound.
 
 Microphones are the first axis of all arrays, and frames the last. The unknowns of a frame are, for each source, its
 chart coordinates u and the logarithm s of its strength. The powers of several sources add. With the levels y_i, the
