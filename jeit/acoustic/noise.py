@@ -8,8 +8,8 @@ the variance
 Here τ is the relative error of the decay model and of the coupling between skin and microphone, s² is the variance of
 the power of noise alone, and κ S is due to the product of signal and noise. For a noise power N and ν degrees of
 freedom of a window, s² = 2 N² / ν and κ = 4 N / ν (noncentral chi-square distribution). Models are fitted to the levels
-y = log(power + N). For S ≫ N, the level is the logarithm of intensity, with the errors of gains; for S ≪ N, it is only
-an upper bound of the intensity. The level is nearly normally distributed in both cases.
+y = log(power + N). For S ≫ N, the level is the logarithm of intensity, with the errors of gains; for S ≪ N, the level
+is only an upper bound of the intensity. The level is nearly normally distributed in both cases.
 """
 
 from __future__ import annotations
@@ -81,7 +81,8 @@ class IntensityNoise(Module):
 
 
 def column(values: Float[Array, " M"], broadcast_to: Array) -> Array:
-    """Reshape values (M,), one per microphone, so that they broadcast along the first axis of `broadcast_to`."""
+    """Reshape `values` (M,), one per microphone, so that the values broadcast along the first axis of
+    `broadcast_to`."""
     return values.reshape((-1,) + (1,) * (broadcast_to.ndim - 1))
 
 

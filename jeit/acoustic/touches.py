@@ -62,7 +62,7 @@ def locate_touches(
     - `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022, minimised on a map of 200
       × 200 pixels and then refined.
     - `gap`: time without a position after which a touch has ended, seconds.
-    - `intensity`: frequency band and windows, for recordings of samples; by default those of the calibration.
+    - `intensity`: frequency band and windows, for recordings of samples; by default as in the calibration.
     - `silence`: recording of the untouched array, from which the noise floor is estimated if touches never pause.
     - `gain_drift`: standard deviation of the changes of the microphones' gains since the calibration, as a fraction of
       the intensities; see `locate`.

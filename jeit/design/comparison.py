@@ -80,8 +80,8 @@ def skin_response(
 
 
 def number_of_taxels(grid: TouchGrid, num_taxels: int | None) -> int:
-    """Number of taxels: `num_taxels`, or 90 (at most one per position) if it is None. Raises `ValueError` unless
-    `num_taxels` is from 1 to the number of positions."""
+    """Number of taxels: `num_taxels`, or 90 (at most one per position) if `num_taxels` is None. Raises `ValueError`
+    unless `num_taxels` is from 1 to the number of positions."""
     if num_taxels is None:
         return min(NUM_TAXELS, len(grid.places))
     if not 1 <= num_taxels <= len(grid.places):
@@ -136,8 +136,8 @@ def compare_layouts(
     - `margin`: minimum distance of touches from the edge of the skin, metres; a touch closer to the edge would lie
       partly outside.
     - `places`: number of touched positions along each side of the skin.
-    - `contrast`: conductivity of the touched part divided by that of the rest: 0 for an insulator, above 1 for a
-      conductor.
+    - `contrast`: conductivity of the touched part divided by that of the rest of the skin: 0 for an insulator, above 1
+      for a conductor.
     - `num_taxels`: number of virtual taxels, by default 90, or the number of positions if fewer than 90.
     - `seed`: random seed for the k-means clustering of the taxels.
     - `progress`: function called with the name of each step of the computation as the step begins.

@@ -47,8 +47,8 @@ class Candidates(Module):
           weights, the criterion is an integral over the body.
 
         The result is exact for any prior. The computation takes O(M³) operations, and so suits up to a few thousand
-        candidates. It works under `jit` and `vmap`. Raises `ValueError` for incompatible shapes, values that are not
-        finite, noise that is not positive, and negative weights.
+        candidates. The function works under `jit` and `vmap`. Raises `ValueError` for incompatible shapes, values that
+        are not finite, noise that is not positive, and negative weights.
         """
         jacobian, product, noise, weights = _check_candidates(
             jacobian, product, noise, weights, ("cells", "measurements")
@@ -82,8 +82,8 @@ class Candidates(Module):
 def _check_candidates(
     jacobian, prior, noise, weights, axis_names: tuple[str, str]
 ) -> tuple[Array, Array, Array, Array]:
-    """Check the arguments of `Candidates` and return them as arrays of matching shapes. `axis_names`: names of the axes
-    of `prior`, for error messages."""
+    """Check the arguments of `Candidates` and convert them to arrays of matching shapes. `axis_names`: names of the
+    axes of `prior`, for error messages."""
     jacobian, prior = jnp.asarray(jacobian, float), jnp.asarray(prior, float)
     noise = jnp.asarray(noise, float)
     if jacobian.ndim != 2 or prior.ndim != 2 or jacobian.shape[1] != prior.shape[0]:
@@ -114,7 +114,7 @@ def _candidates_from_product(jacobian, product, noise, weights) -> Candidates:
     """Compute the candidates from ΓJᵀ, with the factor S = ΓJᵀ N^-½ U Λ^-½ of the prior, where N^-½ JΓJᵀ N^-½ = UΛUᵀ
     and N is the covariance of the noise.
 
-    SSᵀ is the part of the prior covariance Γ that the measurements depend on; they do not depend on the remaining part.
+    SSᵀ is the part of the prior covariance Γ that the measurements depend on; the remaining part does not affect them.
     """
     kernel = jacobian @ product / (noise[:, None] * noise)
     eigenvalues, eigenvectors = jnp.linalg.eigh((kernel + kernel.T) / 2)
@@ -153,7 +153,7 @@ class Selection(Module):
 
     @property
     def share(self) -> Float[Array, ""]:
-        """Information of the chosen measurements divided by that of all candidates."""
+        """Information of the chosen measurements divided by the information of all candidates."""
         return self.information / self.total
 
 

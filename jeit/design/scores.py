@@ -42,8 +42,8 @@ _NUM_SQUARINGS = 10
 class TouchPrior(Module):
     """Gaussian prior of the amplitudes of touches, with covariance SSᵀ.
 
-    **Fields**: `factor`: S (n, r) for touches at n positions. An amplitude of 1 is that of the touches for which
-    voltage changes are computed.
+    **Fields**: `factor`: S (n, r) for touches at n positions. The touches for which voltage changes are computed have
+    the amplitude 1.
 
     **Example:**
 
@@ -223,8 +223,8 @@ def _compute_scores(jacobian, conductivity, touches: SheetTouches, prior: TouchP
 
 
 def _largest_eigenvalue(matrix: Float[Array, "r r"]) -> Float[Array, ""]:
-    """Largest eigenvalue of a positive semidefinite `matrix`. It is computed by repeated squaring, which needs only
-    matrix products and can be batched.
+    """Largest eigenvalue of a positive semidefinite `matrix`. The eigenvalue is computed by repeated squaring, which
+    needs only matrix products and can be batched.
 
     The derivative of a simple eigenvalue is the derivative of vᵀ(matrix)v with the eigenvector v held fixed.
     """

@@ -104,7 +104,7 @@ def sensitivity_map(
     - `grid`: the touched positions.
     - `indentation`: shape of the touch, by default the unit deformation `Bell()` of Park et al. 2022.
     - `thickness`: thickness of the layer that a sheet represents, metres; None for a layer.
-    - `contrast`: conductivity of the touched part divided by that of the rest.
+    - `contrast`: conductivity of the touched part divided by that of the rest of the skin.
     - `linear`: whether to compute linearised instead of exact voltage changes.
 
     Raises `ValueError` if the model, the grid and the thickness do not fit together, and for invalid values.

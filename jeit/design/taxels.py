@@ -19,7 +19,7 @@ from jeit_solvers.module import Module
 
 
 class Taxels(Module):
-    """The k virtual taxels of a layout, from touches at n positions; create them with `find_taxels`.
+    """The k virtual taxels of an electrode layout, from touches at n positions; `find_taxels` creates taxels.
 
     **Fields**
 

@@ -127,7 +127,7 @@ def calibrate_microphones(
     - `place_error`: standard deviation of each coordinate of the given positions of the microphones, metres; the
       displacements from these positions are estimated too. 0 if the positions are exact.
     - `intensity`: band and windows, for taps given as samples.
-    - `progress`: called with the name of each step when it begins.
+    - `progress`: function called with the name of each step when the step begins.
 
     Raises `ValueError` if fewer than three microphones can be calibrated, if most microphones disagree with the given
     positions, for an unknown `decay`, a `place_error` that is negative or not finite, for `intensity` given with taps
@@ -171,8 +171,8 @@ def fit_each_decay(
     """Fit each of the given decay models, by default all. Returns a dictionary of the fits by the model's name, and a
     dictionary of the reasons why other models could not be fitted.
 
-    `progress` is called with the name of each step when it begins. Raises `ValueError` as `calibrate_microphones` does,
-    but not if no decay model can be fitted.
+    `progress` is called with the name of each step when the step begins. Raises `ValueError` as `calibrate_microphones`
+    does, but not if no decay model can be fitted.
     """
     check_kind("taps", taps, Taps, "Taps, as of read_taps(path)")
     check_settings("intensity", intensity)

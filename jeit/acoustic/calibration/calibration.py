@@ -55,7 +55,7 @@ class Calibration(Module):
 
     The taps determine the gains of the decay models and the strengths of the taps only up to a common factor. The
     factor is chosen so that the geometric mean of the responses f_i(0) at distance 0 over the usable microphones is 1.
-    The strength of a source is therefore the intensity at a typical microphone directly below it.
+    The strength of a source is therefore the intensity at a typical microphone directly below the source.
 
     **Example:**
 

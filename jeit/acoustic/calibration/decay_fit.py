@@ -34,7 +34,7 @@ class DecayProblem(NamedTuple):
     """Least-squares problem of the calibration of M microphones from T taps.
 
     **Fields**: `level`: levels y (M, T), logarithms of received power; `offset`: vectors (M, T, d) from the taps to the
-    given positions of the microphones in metres; `weight`: weights (M, T) of the levels, 0 for unused ones; `floor`:
+    given positions of the microphones in metres; `weight`: weights (M, T) of the levels, 0 for unused levels; `floor`:
     noise floors N (M,); `decay`: class of the decay model; `spread`: standard deviation (P,) of each value over the
     microphones in the penalty, infinite for no penalty; `place_error`: unit of the displacements in metres.
 

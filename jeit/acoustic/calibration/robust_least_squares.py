@@ -133,7 +133,8 @@ class TapFit(Module):
 
     - `kind`: class of the decay model.
     - `offset`: (M, T, d) vectors from the taps to the given positions of the microphones in metres.
-    - `place_error`: standard deviation of each coordinate of the given positions in metres; 0 if they are exact.
+    - `place_error`: standard deviation of each coordinate of the given positions in metres; 0 if the positions are
+      exact.
     - `power`: (M, T) intensities of the taps minus the noise floor; NaN where not usable.
     - `noise`: noise of the microphones. `known_noise`: whether the noise floor was measured.
     - `values`: (P, M) logarithms of the K parameters of the decay models and, if `place_error` is not 0, the d
@@ -191,8 +192,8 @@ class TapFit(Module):
 
     @property
     def free(self) -> Bool[np.ndarray, "P M"]:
-        """Mask of the parameters that are fitted to data: those of microphones with usable readings that are not fixed
-        at a bound."""
+        """Mask of the parameters that are fitted to data: parameters of microphones with usable readings that are not
+        fixed at a bound."""
         return ~self.at_bound & self.usable.any(axis=1)
 
     @property

@@ -79,7 +79,8 @@ def calibrate_microphones(
     hop: Hop = None,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate an array of microphones from taps at known places; writes the calibration and a picture of it."""
+    """Calibrate an array of microphones from taps at known places; writes the calibration and a picture of the
+    calibration."""
     from jeit.acoustic import calibrate_microphones as calibrate
     from jeit.acoustic import read_taps
     from jeit.acoustic.calibration.calibrate import AUTO

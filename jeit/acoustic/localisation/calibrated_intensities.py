@@ -25,7 +25,7 @@ def calibrated_intensities(
 ) -> Intensities:
     """Compute the intensities of a recording. A recording of intensities is returned unchanged.
 
-    `intensity`: frequency band and windows; by default those of the calibration. `silence`: recording of the untouched
+    `intensity`: frequency band and windows, by default as in the calibration. `silence`: recording of the untouched
     array at the same gain, from which the noise floor is estimated. A silence is required if touches never pause; by
     default the floor is estimated from the quietest windows of the recording. Raises `ValueError` for another number of
     microphones than in the calibration, for a `silence` that is louder than the quietest windows of the recording, and

@@ -7,8 +7,8 @@ Park 2022, text S2, is
     L(u) = Σ_{i≠k} (I_k g_k(u) − I_i g_i(u))²,
 
 where k is the microphone with the highest intensity. The loss does not take noise into account: since g_i increases
-with distance, it amplifies the noise of distant microphones. Microphones are the first axis of all arrays, and frames
-the last. Intensities are divided by the highest intensity of the frame.
+with distance, the loss amplifies the noise of distant microphones. Microphones are the first axis of all arrays, and
+frames the last. Intensities are divided by the highest intensity of the frame.
 
 The functions for minimisation find the minimum of an objective from given starting positions, and the derivatives of
 the minimum. An objective, `Likelihood` or `Consistency`, has the attributes `microphone_array`, `frames` (the arrays

@@ -73,7 +73,7 @@ def locate(
     - `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022.
     - `map_shape`: (rows, columns) of the raster that is searched, (200, 200) in Park 2022; by default a coarse grid.
       The best position is refined with and without a raster.
-    - `intensity`: frequency band and windows, for recordings of samples; by default those of the calibration.
+    - `intensity`: frequency band and windows, for recordings of samples; by default as in the calibration.
     - `silence`: recording of the untouched array, from which the noise floor is estimated if touches never pause.
     - `gain_drift`: standard deviation of the changes of the microphones' gains since the calibration, as a fraction of
       the intensities. The changes are estimated from all touches of the recording, and the covariances of positions

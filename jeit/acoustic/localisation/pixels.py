@@ -88,9 +88,9 @@ def map_brightness(
     """Convert maps of the objective to brightness (F, rows, columns): 1 at the best pixel of each map, decreasing to 0
     as the objective increases, and 0 outside the outline.
 
-    For the method "likelihood", brightness is the likelihood divided by that of the best pixel, exp(−(map − minimum)).
-    For "consistency", it is exp(−(map − minimum) / scale), with the scale that makes the brightness 1/e where the loss
-    equals the quantile `share` of the loss over the pixels.
+    For the method "likelihood", brightness is the likelihood divided by the likelihood of the best pixel, exp(−(map −
+    minimum)). For "consistency", brightness is exp(−(map − minimum) / scale), with the scale that makes the brightness
+    1/e where the loss equals the quantile `share` of the loss over the pixels.
 
     **Arguments:**
 

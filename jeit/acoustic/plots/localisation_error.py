@@ -42,7 +42,7 @@ def plot_position_errors(
     - `microphones`: positions (M, d), metres.
     - `surface`: an outline, a surface, a `MicrophoneArray` or a `Calibration`.
     - `title`: title of the plot; by default the mean ± standard deviation of the localisation error.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for shapes that disagree.
 
@@ -116,7 +116,7 @@ def plot_error_curve(
     - `statistic`: statistic of the errors over positions, "median", "mean" or "rms".
     - `logarithmic`: whether the axis of `values` is logarithmic, for example for numbers of microphones.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for shapes that disagree, for an empty `errors`, and for more than six methods.
 

@@ -89,7 +89,7 @@ def plot_loss_map(
     - `method`: "likelihood" or "consistency", the method of the localiser.
     - `title`: title of the plot.
     - `colour_bar`: whether to draw a colour bar.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for another `method`, shapes that disagree, and `marks` that are not `MapMarks`.
 
@@ -203,7 +203,7 @@ def plot_receptive_fields(
     - `fit`: result of `calibrate_microphones`.
     - `microphones`: indices of the microphones to draw, from 0 as in the messages of the calibration; by default all.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for microphones that do not exist, and if `fit` is not a `CalibrationFit`.
 

@@ -28,7 +28,7 @@ AnySurface = Calibration | MicrophoneArray | AbstractSurface | Domain | ArrayLik
 
 
 class View(NamedTuple):
-    """A surface seen along the normal of its chart, the plane onto which it is unrolled or projected.
+    """A surface seen along the normal of its chart, the plane onto which the surface is unrolled or projected.
 
     **Fields**: `surface`: the surface, with NumPy arrays; `microphones`: chart coordinates (M, 2) of the microphones in
     metres; `usable`: mask (M,) of the usable microphones.

@@ -61,7 +61,7 @@ def plot_track(
     - `truth`: true path (N, d) of the touch, metres, if known.
     - `title`: title of the plot.
     - `colour_bar`: whether to draw a colour bar.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for shapes that disagree, and for arguments of the wrong type.
 

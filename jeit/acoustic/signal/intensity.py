@@ -272,13 +272,13 @@ def intensities(
 def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> TapIntensities:
     """Compute the intensity of each tap at each microphone, for calibration.
 
-    The power of a tap is the mean over the windows in which it is audible, the same windows for all microphones. The
-    loudness of a window is the sum over microphones of (power − floor) / floor; the tap is audible where the loudness
-    is at least half its maximum. A microphone with a fault in one of the audible windows is not usable for the tap,
-    since other windows have another loudness. The noise floor is estimated from the quietest windows of all taps, so
-    the recordings should include some silence before or after the taps. The field `freedom` of the result accounts for
-    the overlap of windows, exactly for white noise, but not for the selection of windows: if a tap is not audible at
-    all, the loudest windows of noise are selected, and the power of the tap is somewhat too high.
+    The power of a tap is the mean over the windows in which the tap is audible, the same windows for all microphones.
+    The loudness of a window is the sum over microphones of (power − floor) / floor; the tap is audible where the
+    loudness is at least half its maximum. A microphone with a fault in one of the audible windows is not usable for the
+    tap, since other windows have another loudness. The noise floor is estimated from the quietest windows of all taps,
+    so the recordings should include some silence before or after the taps. The field `freedom` of the result accounts
+    for the overlap of windows, exactly for white noise, but not for the selection of windows: if a tap is not audible
+    at all, the loudest windows of noise are selected, and the power of the tap is somewhat too high.
 
     **Arguments:**
 

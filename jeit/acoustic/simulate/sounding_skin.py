@@ -1,6 +1,6 @@
 """Simulated acoustic skin: an elastic layer with microphones.
 
-Simulated recordings replace measured ones, since no openly licensed recording of a skin with microphones exists. Sound
+Simulated recordings replace measurements, since no openly licensed recording of a skin with microphones exists. Sound
 is propagated in the frequency domain with spreading, viscoelastic loss, delays and edge echoes. The simulation thus
 differs from the decay model a/(r² + b) that the calibration fits, and is a meaningful test of this model. The setup is
 that of Park et al., Science Robotics 7, eabm7187 (2022). See `jeit.acoustic.simulate.propagation` for the physics, and

@@ -136,7 +136,8 @@ class Burst(Module):
 
 
 def check_burst(burst: Burst, duration: float) -> None:
-    """Raises `ValueError` if `burst` is not a `Burst`, or if a recording of `duration` seconds is too short for it."""
+    """Raises `ValueError` if `burst` is not a `Burst`, or if a recording of `duration` seconds is too short for one
+    burst."""
     check_kind("burst", burst, Burst, "a Burst, such as Burst(strength=2.0)")
     burst.check_fits(duration)
 

@@ -44,8 +44,8 @@ def simulate_wind(
     """Simulate a recording of a steady jet of air on the skin, such as from an air brush.
 
     Eddies act as independent sources at 64 random positions. Since eddies are much smaller than the spacing of the
-    microphones, the microphones receive independent noise, each microphone with the total power that it receives from
-    these positions.
+    microphones, the microphones receive independent noise, with the total power that each receives from the 64
+    positions.
 
     **Arguments:**
 

@@ -41,7 +41,7 @@ def plot_sensitivity_map(
     - `electrodes`: positions (L, 2) of the electrodes to be marked, metres.
     - `limit`: upper end of the colour bar, volts, by default the maximum of Θ.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` if `theta` is not a `SensitivityMap`.
 
@@ -91,7 +91,7 @@ def plot_sensitivity_histograms(
     - `maps`: sensitivity maps by name, for the legend.
     - `bins`: number of bins of equal width in the histogram.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` if `maps` is not a mapping to sensitivity maps.
 

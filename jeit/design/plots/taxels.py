@@ -51,7 +51,7 @@ def plot_taxels(
     - `electrodes`: positions (L, 2) or (L, 3) of the electrodes to be marked, metres.
     - `limit`: value at the upper end of the colour bar, in m² for "area".
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for an unknown `colour`, and for taxels of a batch of layouts.
 
@@ -92,7 +92,7 @@ def plot_taxel_areas(
     - `taxels`: taxels of one layout, or of one to six layouts by name.
     - `bins`: number of bins of equal width from 0 to the largest area, the same for all layouts.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for taxels of a batch of layouts, and unless there are one to six layouts.
 

@@ -38,7 +38,7 @@ def plot_travel(
     - `keep_out`: regions without electrodes, to be hatched.
     - `title`: title of the plot; by default the mean distance between the electrodes' initial and final positions in
       millimetres.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for a start that does not exist, and if `optimisation` is not an `Optimisation`.
 

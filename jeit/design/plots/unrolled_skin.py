@@ -57,7 +57,7 @@ def plot_unrolled(
     - `marks`: dictionary from names in the legend to positions (p, 3) on the surface that are marked, metres.
     - `scale`: mapping from values to colours; the default suits changes of sheet conductivity in siemens.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for values that do not match triangles or nodes, are complex or not finite, and for arguments of
     the wrong type.

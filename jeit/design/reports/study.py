@@ -242,8 +242,8 @@ def _parameter_text(name: str, value) -> str:
 
 
 def _escape_for_matplotlib(text: str) -> str:
-    """Escape a text so that matplotlib shows it unchanged: dollar signs start no formula, and a leading underscore does
-    not hide a label."""
+    """Escape a text so that matplotlib shows the text unchanged: dollar signs start no formula, and a leading
+    underscore does not hide a label."""
     return " " * text.startswith("_") + text.replace("$", r"\$")
 
 

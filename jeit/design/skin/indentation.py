@@ -30,7 +30,7 @@ class Bell(AbstractIndentation):
     """Gaussian indentation depth · exp(−r² / (2 deviation²)) at distance r; with the default values, the unit
     deformation of Park et al. 2022, text S4.
 
-    The indentation is set to 0 beyond r = 3 deviation, where it has dropped to about a hundredth of `depth`.
+    The indentation is set to 0 beyond r = 3 deviation, where the depth has dropped to about a hundredth of `depth`.
 
     **Fields**: `depth`: largest depth, metres; `deviation`: standard deviation of the Gaussian, metres.
 

@@ -342,7 +342,7 @@ def skin_electrodes(
     layout: Layout | SurfaceLayout, num_layers: int, contact_impedance=None
 ) -> SheetDiscs | SurfaceDiscs | FaceDiscs:
     """Create the disc electrodes of a `layout` in a sheet (`num_layers` = 0), or on the bottom of a layer.
-    `contact_impedance`: in ohm·m², by default that of the layout, or 1e-4 if the layout has none."""
+    `contact_impedance`: contact impedance in ohm·m², by default that of the layout, or 1e-4 if the layout has none."""
     if contact_impedance is None and layout.contact_impedance is None:
         contact_impedance = CONTACT_IMPEDANCE
     if isinstance(layout, SurfaceLayout):

@@ -1,4 +1,4 @@
-"""TOML files that describe a skin: the tables and keys of such a file, and its reading."""
+"""TOML files that describe a skin: the tables and keys of a skin file, and reading of the file."""
 
 from __future__ import annotations
 

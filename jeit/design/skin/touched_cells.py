@@ -50,8 +50,8 @@ def touched_cells(
     """Compute the mesh cells changed by single indentations of a sheet or of the top of a layer at `places` (n, 2), on
     a curved skin (n, 3), metres.
 
-    `contrast`: conductivity of the touched part divided by that of the rest: 0, the default, for an insulating indenter
-    (Park et al. 2022, text S4), above 1 for a conductor.
+    `contrast`: conductivity of the touched part divided by that of the rest of the skin: 0, the default, for an
+    insulating indenter (Park et al. 2022, text S4), above 1 for a conductor.
 
     **Layer** (3-D mesh, top at its maximum z): the conductivity of cells whose centroids lie in the indented part is
     multiplied by `contrast`. With an `edge` in metres, the change rises smoothly over a depth of twice `edge`, and is

@@ -265,7 +265,7 @@ def _optimality_scores(
     shared: _SharedData, point_data: _PointData, touches: SheetTouches, prior: TouchPrior, scores: tuple[str, ...]
 ) -> dict[str, Array]:
     """Compute the optimality scores from linearised voltage changes. In a batch, the Jacobian has been computed
-    already, and XLA reuses it."""
+    already, and XLA reuses the Jacobian."""
     model, _ = _model_and_touched_cells(shared, point_data)
     touches = touches.at_thickness(point_data.thickness)
     layout_score_values = layout_scores(model, point_data.conductivity, touches, prior=prior, noise=point_data.noise)

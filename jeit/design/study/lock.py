@@ -109,7 +109,7 @@ def _write_owner(descriptor: int) -> None:
 
 
 def _read_owner(descriptor: int) -> dict:
-    """Read the process that owns the lock from the lock file; empty if the owner ended before it was written."""
+    """Read from the lock file which process owns the lock; empty if the owner ended before the file was written."""
     try:
         owner = json.loads(os.pread(descriptor, _MAX_BYTES, 0))
     except (ValueError, RecursionError):

@@ -106,7 +106,7 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """A sweep over every combination of the lists in a study file; create it with `read_study`.
+    """A sweep over every combination of the lists in a study file; create a study with `read_study`.
 
     **Fields**
 

@@ -6,8 +6,8 @@ chunk that is not in the list counts as unfinished.
 
 The metadata of a store are checked as plain JSON before Zarr opens the store. Zarr looks up codecs by the names in a
 file, and the codec pickle executes code from the file. A store is therefore opened only if it has the form that jeit
-writes: format 3, the expected arrays and no others, only numbers and text, codecs that only pack bytes, and no links to
-other paths.
+writes: Zarr format 3, the expected arrays and no others, only numbers and text, codecs that only pack bytes, and no
+links to other paths.
 """
 
 from __future__ import annotations
@@ -209,8 +209,8 @@ class Store:
 
     def __init__(self, work: Study | Contents, path: str | Path, *, create: bool = True):
         """Raises `FileNotFoundError` if there is no store and `create` is False. Raises `ValueError` if the path is not
-        a store or is the store of another study, if the store is damaged, or if it might run code when opened. Raises
-        `ImportError` without the extra `cluster`, and `OSError` if the store cannot be written."""
+        a store or is the store of another study, if the store is damaged, or if opening the store might run code.
+        Raises `ImportError` without the extra `cluster`, and `OSError` if the store cannot be written."""
         zarr = optional("zarr", _TASK)
         self.contents = work if isinstance(work, Contents) else study_contents(work)
         check_kind("path", path, (str, os.PathLike), _PATH_DESCRIPTION)
