@@ -35,7 +35,7 @@ class Constraints(Module):
 
     def check_room(self, radii) -> None:
         """Raise `ValueError` if L discs of `radii` (L,), metres, are more than the densest packing of circles in the
-        outline allows."""
+        outline's bounding box allows."""
         x_min, x_max, y_min, y_max = self.outline.extent
         min_radius = float(np.min(radii))
         min_distance = max(self.minimum_spacing, 2 * min_radius)
