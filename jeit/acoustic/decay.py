@@ -1,7 +1,7 @@
 """Decay models: the intensity received by each microphone as a function of its distance from the source.
 
 Microphone i receives a source of strength I₀ at distance r with the intensity I₀ f_i(r). The models compute the
-response f_i and its logarithm. Fits use the logarithms of the parameters, which keeps the parameters positive.
+response f_i and its logarithm. Fits use the logarithms of the models' parameters, which keeps the parameters positive.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _DISTANCE_SMOOTHING = 1e-16
 
 
 class AbstractDecay(Module):
-    """Base class of decay models, which give the responses f_i of M microphones. A new model is a subclass."""
+    """Base class of decay models, which give the responses f_i of M microphones. A new decay model is a subclass."""
 
     name: ClassVar[str]
     parameters: ClassVar[tuple[str, ...]]
@@ -42,23 +42,24 @@ class AbstractDecay(Module):
 
     @abc.abstractmethod
     def logarithms(self) -> Float[Array, "K M"]:
-        """Logarithms (K, M) of the parameters in SI units, in the order of `parameters`. The first parameter is a
-        factor of the response."""
+        """Logarithms (K, M) of the parameters in SI units, in the order of `parameters`. The response is proportional
+        to the first parameter."""
 
     @classmethod
     @abc.abstractmethod
     def from_logarithms(cls, values: Float[Array, "K M"]) -> Self:
-        """Create the model from the logarithms of its parameters in SI units."""
+        """Create the decay model from the logarithms (K, M) of its K parameters in SI units."""
 
     @classmethod
     @abc.abstractmethod
     def start(cls, spacing: float, num_microphones: int) -> Self:
-        """Create the initial model of a fit, with gain 1 and a decay over about `spacing` metres."""
+        """Create the initial decay model of a fit, with gain 1 and a decay over about `spacing` metres."""
 
     @classmethod
     @abc.abstractmethod
     def bounds(cls, extent: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Lower and upper bounds of the logarithms of the parameters, for an array of size `extent` in metres."""
+        """Lower and upper bounds of the logarithms of the parameters, for a microphone array of size `extent` in
+        metres."""
 
 
 class InverseSquare(AbstractDecay):
@@ -196,13 +197,14 @@ class AttenuatedInverseSquare(AbstractDecay):
 
     @classmethod
     def bounds(cls, extent):
-        """Bounds of the logarithms of a, b and l: for a and b those of `InverseSquare`, for l that of `Exponential`."""
+        """Bounds of the logarithms of a, b and l: for a and b those of `InverseSquare`, for l the bounds of
+        `Exponential`."""
         low, high = InverseSquare.bounds(extent), Exponential.bounds(extent)
         return (*low[0], high[0][1]), (*low[1], high[1][1])
 
 
 def _stack_logarithms(*parameters: Float[Array, " M"]) -> Float[Array, "K M"]:
-    """Natural logarithms of the parameters, one row for each."""
+    """Natural logarithms (K, M) of K parameters of M microphones, one row for each parameter."""
     xp = namespace(parameters)
     return xp.log(xp.stack(parameters))
 
@@ -213,8 +215,8 @@ DECAYS: dict[str, type[AbstractDecay]] = {
 
 
 def find_decay(name: str | type[AbstractDecay]) -> type[AbstractDecay]:
-    """Return the class of the decay model with this `name` ("inverse-square", "exponential" or "attenuated"); a class
-    is returned unchanged. Raises `ValueError` for an unknown name."""
+    """Return the class of the decay model called `name` ("inverse-square", "exponential" or "attenuated"); a class
+    given as `name` is returned unchanged. Raises `ValueError` for an unknown name."""
     if isinstance(name, type) and issubclass(name, AbstractDecay):
         return name
     check_name("decay", name, DECAYS, ", a class like theirs, or 'auto'")

@@ -1,4 +1,5 @@
-"""`MicrophoneArray`: an array of microphones, with the expected intensities of a source and their variances."""
+"""`MicrophoneArray`: a model of an array of microphones, which gives the expected levels of a source and their
+variances."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from jeit_solvers.module import Module
 
 
 class MicrophoneArray(Module):
-    """Model of an array of microphones, from which the intensities of a source are computed.
+    """Model of an array of M microphones, from which the intensities of a source are computed.
 
     **Fields**: `microphones`: positions (M, d) in metres; `surface`: surface on which sources lie; `decay`: decay model
     of each microphone; `noise`: noise of the intensities.
@@ -35,15 +36,15 @@ class MicrophoneArray(Module):
     noise: IntensityNoise
 
     def response(self, chart: Float[Array, "2 ..."]) -> Float[Array, "M ..."]:
-        """Responses f_i of the microphones to sources at chart coordinates (2, …)."""
+        """Responses f_i (M, …) of the microphones to sources at chart coordinates (2, …), metres."""
         position = self.surface.place(chart)
         microphones = self.microphones.reshape(self.microphones.shape + (1,) * (position.ndim - 1))
         squares = [(position[k] - microphones[:, k]) ** 2 for k in range(position.shape[0])]
         return self.decay.response(sum(squares[1:], squares[0]))
 
     def expected(self, unknowns: Float[Array, "n F"]) -> tuple[Float[Array, "M F"], Float[Array, "M F"]]:
-        """Expected levels m (M, F) and their variances v (M, F). `unknowns` (n, F): chart coordinates and logarithm of
-        the strength of one or more sources."""
+        """Expected levels m (M, F) of M microphones in F frames, and their variances v (M, F). `unknowns` (n, F): chart
+        coordinates and logarithm of the strength of one or more sources."""
         sources = [unknowns[k : k + 3] for k in range(0, len(unknowns), 3)]
         xp = namespace(self, unknowns)
         powers = [xp.exp(source[2]) * self.response(source[:2]) for source in sources]

@@ -1,4 +1,4 @@
-"""Error model of intensities, and of levels: the logarithms of the received power, to which models are fitted.
+"""Error model of intensities, and of levels: the logarithms of the received power, to which decay models are fitted.
 
 If a microphone receives the expected power S from a source, the measured power minus the noise floor has the mean S and
 the variance
@@ -8,8 +8,8 @@ the variance
 Here τ is the relative error of the decay model and of the coupling between skin and microphone, s² is the variance of
 the power of noise alone, and κ S is due to the product of signal and noise. For a noise power N and ν degrees of
 freedom of a window, s² = 2 N² / ν and κ = 4 N / ν (noncentral chi-square distribution). Models are fitted to the levels
-y = log(power + N). For S ≫ N, the level is the logarithm of intensity, with the errors of gains; for S ≪ N, it is only
-an upper bound of the intensity. The level is nearly normally distributed in both cases.
+y = log(power + N). For S ≫ N, the level is the logarithm of intensity, with the errors of gains; for S ≪ N, the level
+is only an upper bound of the intensity. The level is nearly normally distributed in both cases.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from jeit_solvers.module import Module
 
 # Minimum relative error of a decay model.
 MIN_RELATIVE_ERROR = 1e-3
-# Minimum floor in standard deviations of the noise, which keeps the argument of the logarithm positive if no floor is
-# known.
+# Minimum noise floor in standard deviations of the noise, which keeps the argument of the logarithm positive if no
+# floor is known.
 _FLOOR_DEVIATIONS = 4.0
 
 
@@ -32,7 +32,7 @@ class IntensityNoise(Module):
     """Noise parameters of the intensities of M microphones; see `jeit.acoustic.noise` for the error model.
 
     **Fields**, each (M,): `floor`: noise floor N; `deviation`: standard deviation s of the power of noise; `cross`:
-    coefficient κ; these three are in the unit of intensity. `relative`: relative error τ of the decay model.
+    coefficient κ. These three fields are in the unit of intensity. `relative`: relative error τ of the decay model.
     """
 
     floor: Float[Array, " M"]
@@ -50,9 +50,9 @@ class IntensityNoise(Module):
         deviation: ArrayLike | None = None,
         relative: ArrayLike = MIN_RELATIVE_ERROR,
     ) -> "IntensityNoise":
-        """Create the noise parameters from the subtracted `floor` and the degrees of freedom ν of a window (`freedom`),
-        or from the standard deviation s of the intensity without a source (`deviation`). `relative`: relative error τ.
-        All are numbers or (M,)."""
+        """Create the noise parameters from the subtracted noise `floor` and the degrees of freedom ν of a window
+        (`freedom`), or from the standard deviation s of the intensity without a source (`deviation`). `relative`:
+        relative error τ. All parameters are numbers or (M,)."""
         arrays = [np.broadcast_to(np.asarray(value, float), (num_microphones,)) for value in (floor, freedom, relative)]
         floors, degrees, errors = arrays
         deviations = floors * np.sqrt(2 / degrees)
@@ -65,22 +65,24 @@ class IntensityNoise(Module):
         return cls(*(as_array(values) for values in (floor, deviations, 4 * floors / degrees, bounded_errors)))
 
     def variance(self, received: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
-        """Variance of the power minus the floor, for the expected power `received` (M, …)."""
+        """Variance (M, …) of the power minus the noise floor, for the expected power `received` (M, …)."""
         relative, cross, deviation = (column(x, received) for x in (self.relative, self.cross, self.deviation))
         return (relative**2 * received + cross) * received + deviation**2
 
     def level(self, power: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
-        """Level y = log(power + floor). The sum is bounded below by 0.05 floor."""
+        """Level y = log(power + floor) for the `power` (M, …) minus the noise floor. The sum is bounded below by 0.05
+        floor."""
         floor, xp = column(self.floor, power), namespace(self, power)
         return xp.log(xp.maximum(power + floor, 0.05 * floor))
 
     def level_variance(self, received: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
-        """Variance of the level y, for the expected power `received` (M, …)."""
+        """Variance (M, …) of the level y, for the expected power `received` (M, …)."""
         return self.variance(received) / (received + column(self.floor, received)) ** 2
 
 
 def column(values: Float[Array, " M"], broadcast_to: Array) -> Array:
-    """Reshape values (M,), one per microphone, so that they broadcast along the first axis of `broadcast_to`."""
+    """Reshape `values` (M,), one per microphone, so that the values broadcast along the first axis of
+    `broadcast_to`."""
     return values.reshape((-1,) + (1,) * (broadcast_to.ndim - 1))
 
 

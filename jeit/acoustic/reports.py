@@ -1,4 +1,4 @@
-"""Output files of acoustic localisation: reports, tables and plots."""
+"""Output files of acoustic localisation: reports, tables and plots of calibrations and tracks."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from jeit.report.folder import as_plain_values, results, version_of, write_json,
 
 
 def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
-    """Write a calibration to a JSON file for `Calibration.load`, and a plot of it beside it.
+    """Write a calibration to a JSON file for `Calibration.load`, and a plot of the calibration beside this file.
 
     **Arguments:**
 
     - `fit`: result of `calibrate_microphones`.
-    - `path`: path of the JSON file, whose folder is created if needed; the plot has the suffix `.png` instead.
+    - `path`: path of the JSON file, whose folder is created if needed; the plot has the same name with the suffix
+      `.png`.
 
     Raises `ValueError` if `path` is a folder, has the suffix `.png`, or is in a folder that cannot be created.
 
@@ -64,7 +65,7 @@ def draw_calibration(fit: CalibrationFit):
 
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
-# Number of pixels along each side of a map, and number of frames whose maps are computed at once.
+# Number of pixels along each side of a map of the skin, and number of frames whose maps are computed at once.
 _NUM_PIXELS, _NUM_CHUNK_FRAMES = 100, 256
 
 
@@ -99,8 +100,7 @@ def write_track(found: LocatedTouches, folder: str | Path) -> None:
 
 
 def report_track(located_touches: LocatedTouches) -> dict[str, Any]:
-    """Summarise the result of `locate_touches` in a dictionary of numbers, strings, lists and dictionaries, with None
-    for unknown values."""
+    """Summarise the result of `locate_touches` in a dictionary for a JSON report, with None for unknown values."""
     locations, track, calibration = located_touches.locations, located_touches.track, located_touches.calibration
     touches = []
     for number, touch in enumerate(track.touches, 1):
@@ -156,7 +156,7 @@ def report_track(located_touches: LocatedTouches) -> dict[str, Any]:
 
 
 def draw_track(located_touches: LocatedTouches):
-    """Plot the track of a recording. Returns a matplotlib `Figure`; no display is needed."""
+    """Plot the paths of the touches in a recording. Returns a matplotlib `Figure`; no display is needed."""
     from matplotlib.figure import Figure
 
     from jeit.acoustic.plots import plot_track
@@ -175,8 +175,8 @@ def draw_track(located_touches: LocatedTouches):
 
 
 def _overlay_maps(touches: LocatedTouches) -> np.ndarray | None:
-    """Overlay (rows, columns) of the maps of all located frames, in which older frames are fainter; None if no frame is
-    located."""
+    """Overlay (rows, columns) of the brightness maps of all located frames, in which older frames are fainter; None if
+    no frame is located."""
     locations, intensities = touches.locations, touches.intensities
     located_frames = np.flatnonzero(locations.has_position & (locations.status != LocationStatus.TWO_TOUCHES))
     if not located_frames.size:

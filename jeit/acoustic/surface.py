@@ -1,8 +1,9 @@
-"""Surfaces on which sources lie, described by a chart with two coordinates u in metres and an outline in the chart.
+"""Surfaces on which sound sources lie, described by a chart with two coordinates u in metres and an outline in the
+chart.
 
 The chart of a plane surface is the plane itself. A curved surface is described by its height above the best-fitting
-plane, which a thin-plate spline interpolates between known points. The height must be a unique function of the chart
-coordinates.
+plane, which a thin-plate spline interpolates between known points. The height must be a single-valued function of the
+chart coordinates.
 """
 
 import abc
@@ -22,7 +23,8 @@ _MAX_KNOTS = 300
 
 
 class AbstractSurface(Module):
-    """Base class of surfaces. `outline` is the outline of the surface in chart coordinates, in metres."""
+    """Base class of surfaces on which sources lie. `outline` is the outline of the surface in chart coordinates, in
+    metres."""
 
     outline: eqx.AbstractVar[Polygon]
 
@@ -37,7 +39,7 @@ class AbstractSurface(Module):
     @property
     @abc.abstractmethod
     def dimension(self) -> int:
-        """Dimension d of the space: 2 or 3."""
+        """Dimension d of the space in which the surface lies: 2 or 3."""
 
 
 class Plane(AbstractSurface):
@@ -46,23 +48,23 @@ class Plane(AbstractSurface):
     outline: Polygon
 
     def place(self, chart):
-        """Return the chart coordinates, which are the positions."""
+        """Return the chart coordinates `chart`, which are the positions in metres."""
         return chart
 
     def project(self, points):
-        """Return the positions, which are the chart coordinates."""
+        """Return the positions `points`, which are the chart coordinates in metres."""
         return points
 
     @property
     def dimension(self):
-        """Dimension of the space, 2."""
+        """Dimension of the space in which the plane lies, 2."""
         return 2
 
 
 class CurvedSurface(AbstractSurface):
-    """A curved surface x(u) = origin + axes u + normal h(u). The height h = Σ w_k ρ_k² log ρ_k + affine is a thin-plate
-    spline, where ρ_k is the distance of u from knot k, w_k are the `weights`, and `affine` are the coefficients of 1,
-    u₁ and u₂."""
+    """A curved surface x(u) = origin + axes u + normal h(u) with chart coordinates u. The height h = Σ w_k ρ_k² log ρ_k
+    + affine is a thin-plate spline, where ρ_k is the distance of u from knot k, w_k are the `weights`, and `affine` are
+    the coefficients of 1, u₁ and u₂."""
 
     outline: Polygon
     origin: Float[Array, " 3"]
@@ -81,18 +83,18 @@ class CurvedSurface(AbstractSurface):
         return points.reshape(3, *chart.shape[1:])
 
     def project(self, points):
-        """Chart coordinates (2, …) of points (3, …), projected along the normal."""
+        """Chart coordinates (2, …) of points (3, …) in metres, projected along the normal of the chart's plane."""
         flat = points.reshape(3, -1) - self.origin[:, None]
         return (self.axes.T @ flat).reshape(2, *points.shape[1:])
 
     @property
     def dimension(self):
-        """Dimension of the space, 3."""
+        """Dimension of the space in which the surface lies, 3."""
         return 3
 
 
 def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -> AbstractSurface:
-    """Create the surface with the given `outline`.
+    """Create the surface of a skin with the given `outline`.
 
     A plane surface is given by vertices (K, 2) in metres or an outline such as `Disk`; a curved surface by vertices (K,
     3) in metres and optionally `points` (T, 3), such as the positions of taps. The curved surface passes through the
@@ -118,7 +120,7 @@ def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -
 
 
 def bounding_box(surface: AbstractSurface) -> tuple[Float[Array, " 2"], Float[Array, " 2"]]:
-    """Lower left and upper right corner (2,) of the bounding box of the outline in the chart, in metres."""
+    """Lower left and upper right corner (2,) of the bounding box of a surface's outline in the chart, in metres."""
     vertices = surface.outline.vertices
     return vertices.min(axis=0), vertices.max(axis=0)
 
@@ -135,7 +137,7 @@ def to_space(
 
 
 def longer_side(surface: AbstractSurface) -> Float[Array, ""]:
-    """Length in metres of the longer side of the outline's bounding box."""
+    """Length in metres of the longer side of the bounding box of a surface's outline."""
     low, high = bounding_box(surface)
     return (high - low).max()
 
@@ -152,7 +154,7 @@ def chart_grid(surface: AbstractSurface, columns: int, rows: int) -> tuple[np.nd
 
 
 def outline_sides(surface: AbstractSurface) -> tuple[Float[Array, "2 K"], Float[Array, "2 K"]]:
-    """Start and end points (2, K) of all sides of the outline and its holes, in chart coordinates."""
+    """Start and end points (2, K) of all K sides of a surface's outline and its holes, in chart coordinates."""
     loops = surface.outline.loops()
     xp = namespace(loops)
     start, end = (xp.concatenate([xp.roll(loop, -shift, axis=0) for loop in loops]) for shift in (0, 1))
@@ -173,7 +175,8 @@ def _curved_surface(vertices: np.ndarray, points_on_surface: np.ndarray) -> Curv
     if singular_values[1] <= 1e-6 * singular_values[0]:
         raise ValueError("outline: its vertices lie on one line; give the outline of a surface, in metres.")
     normal = directions[2] * (1.0 if directions[2][np.argmax(np.abs(directions[2]))] > 0 else -1.0)
-    # The first axis of the chart is the projection of the coordinate axis that is most nearly parallel to the plane.
+    # The first axis of the chart is the projection of the coordinate axis that is most nearly parallel to the
+    # best-fitting plane.
     leading_axis = np.eye(3)[np.argmin(np.abs(normal) + np.array([0.0, 1e-3, 2e-3]))]
     first_axis = leading_axis - normal * (normal @ leading_axis)
     first_axis /= np.linalg.norm(first_axis)
@@ -192,7 +195,8 @@ def _curved_surface(vertices: np.ndarray, points_on_surface: np.ndarray) -> Curv
     squared = np.sum((chart[:, None] - chart) ** 2, axis=-1)
     kernel = _thin_plate(squared)
     polynomial = np.column_stack([np.ones(len(chart)), chart])
-    # Slight smoothing, so that small errors of the points, a fraction of a per cent, do not make the surface wavy.
+    # The spline is slightly smoothed, so that small errors of the points, a fraction of a per cent, do not make the
+    # surface wavy.
     system = np.block([[kernel + 1e-9 * scale**2 * np.eye(len(chart)), polynomial], [polynomial.T, np.zeros((3, 3))]])
     solution = np.linalg.lstsq(system, np.concatenate([height, np.zeros(3)]), rcond=None)[0]
     arrays = (origin, axes, normal, chart, solution[:-3], solution[-3:])
@@ -200,7 +204,7 @@ def _curved_surface(vertices: np.ndarray, points_on_surface: np.ndarray) -> Curv
 
 
 def _farthest_points(points: np.ndarray, max_points: int) -> np.ndarray:
-    """Indices of at most `max_points` points that are far from each other (farthest-point sampling)."""
+    """Indices of at most `max_points` of the `points` that are far from each other (farthest-point sampling)."""
     if len(points) <= max_points:
         return np.arange(len(points))
     indices, distance = [0], np.full(len(points), np.inf)

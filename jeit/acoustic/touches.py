@@ -1,4 +1,5 @@
-"""Localisation of touches in one call: intensities, the position in each frame, and the track of each touch."""
+"""Localisation of the touches in a recording in one call: intensities, the position in each frame, and the track of
+each touch."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ class LocatedTouches(Module):
     """Touches located in a recording.
 
     **Fields**: `intensities`: intensities of the recording; `locations`: position and status of each frame; `track`:
-    smoothed positions and touches; `calibration`, `method`: the calibration and method used.
+    smoothed positions of the touches; `calibration`, `method`: the calibration and method used.
 
     **Example:**
 
@@ -52,7 +53,7 @@ def locate_touches(
     gain_drift: float = GAIN_DRIFT,
     progress: Callable[[str], None] | None = None,
 ) -> LocatedTouches:
-    """Locate every touch in a recording, like the command `jeit locate`.
+    """Locate every touch in a recording of microphones, like the command `jeit locate`.
 
     **Arguments:**
 
@@ -61,14 +62,15 @@ def locate_touches(
     - `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022, minimised on a map of 200
       × 200 pixels and then refined.
     - `gap`: time without a position after which a touch has ended, seconds.
-    - `intensity`: band and windows, for recordings of samples; by default those of the calibration.
+    - `intensity`: frequency band and windows, for recordings of samples; by default as in the calibration.
     - `silence`: recording of the untouched array, from which the noise floor is estimated if touches never pause.
-    - `gain_drift`: standard deviation of the changes of the gains since the calibration, as a fraction of the
-      intensities; see `locate`.
-    - `progress`: called with the name of each step when it begins.
+    - `gain_drift`: standard deviation of the changes of the microphones' gains since the calibration, as a fraction of
+      the intensities; see `locate`.
+    - `progress`: function called with the name of each step of the computation when the step begins.
 
-    Raises `ValueError` for a recording with another number of microphones, fewer than three usable microphones, frames
-    farther apart than `gap`, `intensity` or `silence` given for a recording of intensities, and values out of range.
+    Raises `ValueError` for a recording with another number of microphones than the calibration, fewer than three usable
+    microphones, frames farther apart than `gap`, `intensity` or `silence` given for a recording of intensities, and
+    values out of range.
 
     **Example:**
 

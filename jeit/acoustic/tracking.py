@@ -1,9 +1,9 @@
-"""Tracks: positions of consecutive frames smoothed in time, and onset and offset of each touch.
+"""Tracks of touches: positions of consecutive frames smoothed in time, and onset and offset of each touch.
 
 The motion of a touch is modelled by a random acceleration: white noise of spectral density q in m²/s³. A Kalman filter
 runs forwards over the positions, and a Rauch-Tung-Striebel smoother runs backwards. Frames without a position are
-skipped, and positions too far from the prediction are rejected. The value of q with the highest likelihood is selected
-from a range.
+skipped, and positions too far from the filter's prediction are rejected. The value of q with the highest likelihood is
+selected from a range.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from jeit_solvers.module import Module
 
 # Candidate spectral densities of acceleration in m²/s³, from a finger at rest to one that moves violently.
 _DENSITIES = np.geomspace(1e-5, 10.0, 13)
-# Probability that a correct position is rejected as too far from its prediction.
+# Probability that a correct position is rejected as too far from the filter's prediction.
 _FALSE_REJECTION = 1e-4
 # Standard deviation of each component of the initial velocity of a touch, in m/s.
 _INITIAL_SPEED = 0.5
 
 
 class Touch(Module):
-    """A touch in a track.
+    """One touch in a track: its times, frames and length.
 
-    **Fields**: `onset`, `offset`: times in seconds of the middles of its first and last frame; `first`, `last`: indices
-    of these frames, both part of the touch; `length`: length of its path in metres.
+    **Fields**: `onset`, `offset`: times in seconds of the middles of the touch's first and last frame; `first`, `last`:
+    indices of these frames, both part of the touch; `length`: length of the touch's path in metres.
     """
 
     onset: float
@@ -41,11 +41,12 @@ class Touch(Module):
 
 
 class Track(Module):
-    """Smoothed positions of a recording with F frames.
+    """Smoothed positions of the touches in a recording with F frames.
 
-    **Fields**: `times`: (F,) in seconds; `position`: (F, d) in metres; `covariance`: (F, d, d) in m²; `velocity`:
-    (F, d) in m/s; `touches`: the touches in order of time; `rejected`: mask (F,) of frames whose position is too far
-    from the track of its touch. Position, covariance and velocity are NaN outside touches.
+    **Fields**: `times`: (F,) times of the frames in seconds; `position`: (F, d) smoothed positions in metres;
+    `covariance`: (F, d, d) covariances of the positions in m²; `velocity`: (F, d) velocities in m/s; `touches`: the
+    touches in order of time; `rejected`: mask (F,) of frames whose position is too far from the track of its touch.
+    Position, covariance and velocity are NaN outside touches.
     """
 
     times: Float[np.ndarray, " F"]
@@ -59,7 +60,8 @@ class Track(Module):
 def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None = None) -> Track:
     """Smooth the positions of each touch in a recording.
 
-    Covariances are multiplied by `locations.overlap`, since the errors of overlapping windows are correlated.
+    Covariances of measured positions are multiplied by `locations.overlap`, since the errors of overlapping windows are
+    correlated.
 
     **Arguments:**
 
@@ -67,7 +69,7 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
     - `gap`: time without a position after which a touch has ended, seconds.
     - `acceleration`: spectral density q of the random acceleration, m²/s³; by default the most likely value in a range.
 
-    Raises `ValueError` for values that are not positive, and if `locations` is not a `Locations`.
+    Raises `ValueError` if `gap` or `acceleration` is not positive, and if `locations` is not a `Locations`.
 
     **Example:**
 
@@ -95,8 +97,8 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
             np.where(has_position[touch_frames, None, None], locations.covariance[touch_frames], np.eye(dimension))
             * locations.overlap
         )
-        # A minimum standard deviation of a tenth of a micrometre is added, since covariances on a curved surface are
-        # singular.
+        # A minimum variance, that of a standard deviation of a tenth of a micrometre, is added, since covariances on a
+        # curved surface are singular.
         measured_covariance = measured_covariance + 1e-14 * np.eye(dimension)
         time_steps = np.diff(times[touch_frames], prepend=times[first])
         states, errors, is_accepted = _smooth_touch(
@@ -111,7 +113,8 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
 
 
 def _touch_intervals(times, has_position, gap: float) -> list[tuple[int, int]]:
-    """Indices of the first and last located frame of each touch."""
+    """Indices of the first and last frame with a position of each touch; touches are separated by more than `gap`
+    seconds."""
     located_indices = np.flatnonzero(has_position)
     if not located_indices.size:
         return []
@@ -123,9 +126,8 @@ def _touch_intervals(times, has_position, gap: float) -> list[tuple[int, int]]:
 
 
 def _smooth_touch(time_steps, measured, covariances, has_position, densities) -> tuple[np.ndarray, ...]:
-    """Call `_smooth_positions`: with NumPy for a touch with few frames; otherwise compiled, with frames padded to a
-    power of
-    two."""
+    """Call `_smooth_positions` with NumPy for a touch with few frames, and otherwise compiled, with the number of
+    frames padded to a power of two."""
     num_frames, dimension = measured.shape
     if num_frames <= MAX_NUMPY_FRAMES:
         return at_once(_smooth_positions, time_steps, measured, covariances, has_position, densities)
@@ -140,10 +142,10 @@ def _smooth_touch(time_steps, measured, covariances, has_position, densities) ->
 
 
 def _smooth_positions(time_steps, measured, measured_covariance, has_position, densities):
-    """Smooth the positions of one touch with n frames, for the most likely of the densities.
+    """Smooth the positions of one touch with n frames, for the most likely of the spectral `densities` of acceleration.
 
-    Returns the states (n, 2 d), position and velocity; their covariances (n, 2 d, 2 d); and the mask (n,) of accepted
-    positions.
+    Returns the states (n, 2 d), position and velocity; the covariances of the states (n, 2 d, 2 d); and the mask (n,)
+    of accepted positions.
     """
     xp, dimension = namespace(measured), measured.shape[1]
     score, filtered = _kalman_filter(time_steps, measured, measured_covariance, has_position, densities)
@@ -159,8 +161,8 @@ def _smooth_positions(time_steps, measured, measured_covariance, has_position, d
         covariance = covariance + gain @ (smoothed_covariance - next_covariance) @ gain.T
         return (mean, covariance), (mean, covariance)
 
-    # The recursion starts behind the last frame with a state equal to its prediction, so that the last frame is
-    # unchanged.
+    # The smoother's recursion starts behind the last frame with a state equal to its prediction, so that the last frame
+    # is unchanged.
     last_prediction = predicted_mean[-1], predicted_covariance[-1]
     next_arrays = (
         xp.concatenate([array[1:], array[-1:]]) for array in (predicted_mean, predicted_covariance, time_steps)
@@ -170,10 +172,10 @@ def _smooth_positions(time_steps, measured, measured_covariance, has_position, d
 
 
 def _kalman_filter(step, measured, measured_covariance, has_position, densities):
-    """Run the Kalman filter for Q spectral densities at once.
+    """Run the Kalman filter over the positions of one touch for Q spectral densities of acceleration at once.
 
     Returns the log-likelihood (Q,) of each density; and for every frame and density the filtered mean and covariance of
-    the state, the predicted mean and covariance, and whether the position was accepted.
+    the state (position and velocity), the predicted mean and covariance, and whether the position was accepted.
     """
     xp, dimension = namespace(measured), measured.shape[1]
     max_distance = float(chdtri(dimension, _FALSE_REJECTION))
@@ -199,8 +201,8 @@ def _kalman_filter(step, measured, measured_covariance, has_position, densities)
         # A rejected position lowers the likelihood of a density as much as a position at the limit of acceptance.
         score = xp.where(is_measured, -0.5 * (xp.minimum(squared_distance, max_distance) + log_determinant), 0.0)
         new_mean = xp.where(is_accepted[:, None], mean + xp.einsum("qij,qj->qi", gain, innovation), mean)
-        # The Joseph form of the update is accurate also for nearly exact positions, where the difference in the usual
-        # form is lost to rounding.
+        # The Joseph form of the covariance update is accurate also for nearly exact positions, for which the difference
+        # in the usual form is lost to rounding.
         update_matrix = xp.eye(2 * dimension) - xp.concatenate([gain, xp.zeros_like(gain)], axis=2)
         updated_covariance = update_matrix @ covariance @ xp.swapaxes(
             update_matrix, 1, 2
@@ -224,13 +226,13 @@ def _kalman_filter(step, measured, measured_covariance, has_position, densities)
 
 
 def _transition_matrix(step, dimension: int) -> Float[Array, "s s"]:
-    """Transition matrix (2 d, 2 d) of position and velocity for a time step in seconds."""
+    """Transition matrix (2 d, 2 d) of position and velocity for a time step of `step` seconds."""
     xp = namespace(step)
     return xp.kron(xp.eye(2) + step * xp.eye(2, k=1), xp.eye(dimension))
 
 
 def _process_noise(step, dimension: int) -> Float[Array, "s s"]:
-    """Covariance (2 d, 2 d) of position and velocity after a time step with white acceleration of spectral density
-    1."""
+    """Covariance (2 d, 2 d) of position and velocity after a time step of `step` seconds with white acceleration of
+    spectral density 1."""
     xp = namespace(step)
     return xp.kron(xp.stack([step**3 / 3, step**2 / 2, step**2 / 2, step]).reshape(2, 2), xp.eye(dimension))

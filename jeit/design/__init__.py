@@ -3,7 +3,7 @@
 For a given layout (the electrodes' positions), sensitivity maps, virtual taxels and scores are computed. Layouts are
 optimised by gradients, within an outline and with minimum spacing, and the most informative measurements are selected.
 Studies of many layouts can be resumed after a crash. Results are drawn by `plot_…` and written to files by `write_…`.
-This package exports what users call; the classes of the results are in its modules.
+This package exports the functions and classes that users call; the classes of the results are in the package's modules.
 
 Names are imported when first used, so that the command line shows the defaults (`jeit.design.defaults`) without delay.
 """

@@ -1,4 +1,5 @@
-"""Comparison of layouts: the response of each layout to touches, and the scores of two layouts side by side."""
+"""Comparison of electrode layouts: the response of each layout to touches, and the scores of two layouts side by
+side."""
 
 from __future__ import annotations
 
@@ -24,8 +25,8 @@ from jeit_solvers.module import Module
 class SkinResponse(Module):
     """Response of a skin to touches.
 
-    **Fields**: `layout`: the layout of its electrodes; `sensitivity`: its sensitivity map; `taxels`: its virtual
-    taxels.
+    **Fields**: `layout`: layout of the skin's electrodes; `sensitivity`: the skin's sensitivity map; `taxels`: the
+    skin's virtual taxels.
     """
 
     layout: Layout | SurfaceLayout
@@ -50,12 +51,12 @@ def skin_response(
     - `skin`: the skin; `grid`: the touched positions.
     - `key`: random key for the k-means clustering of the taxels, from `jax.random.key`.
     - `touched`: conductivity changes due to the touches, by default `skin.touched_cells(grid.places)`.
-    - `num_taxels`: number of taxels, by default 90 or the number of positions if that is smaller.
+    - `num_taxels`: number of taxels, by default 90, or the number of positions if fewer than 90.
     - `threshold`: cosine similarity threshold, as in `find_taxels`.
     - `linear`: whether to compute linearised instead of exact voltage changes.
 
     Raises `ValueError` for more taxels than positions, if `touched` and `grid` have different numbers of positions, and
-    as `Skin.touched_cells` and `Skin.voltage_changes` do.
+    in the cases of `Skin.touched_cells` and `Skin.voltage_changes`.
 
     **Example:**
 
@@ -79,7 +80,8 @@ def skin_response(
 
 
 def number_of_taxels(grid: TouchGrid, num_taxels: int | None) -> int:
-    """Number of taxels, as in `skin_response`. Raises `ValueError` unless it is from 1 to the number of positions."""
+    """Number of taxels: `num_taxels`, or 90 (at most one per position) if `num_taxels` is None. Raises `ValueError`
+    unless `num_taxels` is from 1 to the number of positions."""
     if num_taxels is None:
         return min(NUM_TAXELS, len(grid.places))
     if not 1 <= num_taxels <= len(grid.places):
@@ -89,16 +91,16 @@ def number_of_taxels(grid: TouchGrid, num_taxels: int | None) -> int:
     return num_taxels
 
 
-# A position is a blind spot if its sensitivity is below the minimum of the other layout by more than this relative
-# margin, so that rounding errors of coordinates do not produce blind spots.
+# A position is a blind spot if its sensitivity is below the lowest sensitivity of the other layout by more than this
+# relative margin. Rounding errors of coordinates thus do not produce blind spots.
 _BLIND_SPOT_MARGIN = 1e-6
 
 
 class LayoutComparison(Module):
     """Sensitivity and virtual taxels of two skins, from `compare_layouts`.
 
-    **Fields**: `skins`: the two skins; `responses`: the response of each; `margin` (metres), `places`, `contrast` and
-    `seed`: the arguments of `compare_layouts`.
+    **Fields**: `skins`: the two skins; `responses`: the response of each skin to touches; `margin` (metres), `places`,
+    `contrast` and `seed`: the arguments of `compare_layouts`.
     """
 
     skins: tuple[Skin, Skin]
@@ -110,7 +112,7 @@ class LayoutComparison(Module):
 
     @property
     def figures(self) -> list[dict]:
-        """Scores of each layout, as returned by `comparison_figures`."""
+        """Scores of the two layouts, one dictionary each, as returned by `comparison_figures`."""
         return comparison_figures(*self.responses)
 
 
@@ -131,16 +133,17 @@ def compare_layouts(
     **Arguments:**
 
     - `first`, `second`: skins with the same outline, created with `Skin.create`.
-    - `margin`: minimum distance of touches from the edge, metres; a touch closer to the edge would lie partly outside.
-    - `places`: number of touched positions along a side.
-    - `contrast`: conductivity of the touched part divided by that of the rest: 0 for an insulator, above 1 for a
-      conductor.
-    - `num_taxels`: number of virtual taxels, by default 90 or the number of positions if that is smaller.
+    - `margin`: minimum distance of touches from the edge of the skin, metres; a touch closer to the edge would lie
+      partly outside.
+    - `places`: number of touched positions along each side of the skin.
+    - `contrast`: conductivity of the touched part divided by that of the rest of the skin: 0 for an insulator, above 1
+      for a conductor.
+    - `num_taxels`: number of virtual taxels, by default 90, or the number of positions if fewer than 90.
     - `seed`: random seed for the k-means clustering of the taxels.
-    - `progress`: called with the name of each step as it begins.
+    - `progress`: function called with the name of each step of the computation as the step begins.
 
-    Raises `ValueError` for skins with different outlines and for a margin that leaves no position, before any response
-    is computed, and as `skin_response` does.
+    Raises `ValueError` for skins with different outlines, for a margin that leaves no position, and in the cases of
+    `skin_response`.
 
     **Example:**
 
@@ -154,7 +157,7 @@ def compare_layouts(
     check_same_outline(first.layout, second.layout)
     report = progress or (lambda step: None)
     prepared_skins = []
-    # Both skins are checked before any response is computed, so that errors are raised at once.
+    # Both skins are checked before any response is computed, so that errors are raised early.
     for skin in (first, second):
         grid = touches_away_from_the_edge(skin.outline, margin, places, places)
         checked_num_taxels = number_of_taxels(grid, num_taxels)
@@ -202,13 +205,14 @@ def _layout_area(layout: Layout | SurfaceLayout) -> float:
 
 
 def comparison_figures(first: SkinResponse, second: SkinResponse) -> list[dict]:
-    """Scores of each of two layouts, as plain numbers.
+    """Scores of each of two layouts, as dictionaries of plain numbers.
 
-    - `sensitivity_…_V`: minimum and mean sensitivity, volts; `sensitivity_uniformity`: mean divided by root mean
-      square.
-    - `blind_spot_fraction`: fraction of the area that is less sensitive than the other layout's least sensitive
+    - `sensitivity_…_V`: minimum and mean sensitivity, volts; `sensitivity_uniformity`: mean sensitivity divided by its
+      root mean square.
+    - `blind_spot_fraction`: fraction of the skin's area that is less sensitive than the other layout's least sensitive
       position.
-    - `taxel_count`: number of taxels with an area above zero; `taxel_area_cm2`: mean, standard deviation and maximum.
+    - `taxel_count`: number of taxels with an area above zero; `taxel_area_cm2`: mean, standard deviation and maximum of
+      the taxels' areas, cm².
     - `taxel_overlap`: mean number of taxels that cover a position; `two_point_mm`: mean diameter of the taxels.
     """
     return [_score_figures(*pair) for pair in ((first, second), (second, first))]

@@ -1,5 +1,5 @@
-"""Improvement of a layout on a sheet: optimisation on a coarse mesh, then comparison with the given layout on a finer
-mesh."""
+"""Improvement of an electrode layout on a sheet: optimisation on a coarse mesh, then comparison with the given layout
+on a finer mesh."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ class ImprovedLayout(Module):
 
     **Fields**
 
-    - `start`: the given layout; `skin`: its skin on the coarse mesh; `optimisation`: the result of the optimisation.
-    - `before`, `after`: scores of the given and of the optimised layout on a finer mesh, at more positions.
+    - `start`: the given layout; `skin`: the skin with this layout and the coarse mesh; `optimisation`: result of
+      `optimise_layout`.
+    - `before`, `after`: scores of the given and of the optimised layout on a finer mesh, for touches at more positions.
     - `space`, `noise` (volts), `seed`, `num_points`: the arguments of `improve_layout`.
     """
 
@@ -49,7 +50,7 @@ class ImprovedLayout(Module):
 
     @property
     def layout(self) -> Layout:
-        """The optimised layout, or the given one if none is better."""
+        """The optimised layout, or the given layout if no better layout was found."""
         return flat_layout(self.optimisation.layout)
 
 
@@ -66,20 +67,21 @@ def improve_layout(
     callback: Callable[[int, np.ndarray], None] | None = None,
     **material: Any,
 ) -> ImprovedLayout:
-    """Optimise the electrode positions of `layout` for worst sensitivity and mean variance, like the command `jeit
-    layout optimise`.
+    """Optimise the electrode positions of `layout` for the lowest sensitivity and the mean variance, like the command
+    `jeit layout optimise`.
 
     All two-terminal pairs of a sheet are measured, so the order of the electrodes does not matter.
 
     **Arguments:**
 
-    - `layout`: the initial layout, with its outline.
-    - `space`: the allowed layouts; by default all layouts on the skin whose centres are at least 8 mm apart.
-    - `noise`: standard deviation of a voltage at 1 mA, volts.
+    - `layout`: the initial layout, with the outline of its skin.
+    - `space`: the allowed layouts; by default all layouts on the skin whose electrodes' centres are at least 8 mm
+      apart.
+    - `noise`: standard deviation of the noise of a voltage at 1 mA, volts.
     - `steps`, `starts`, `callback`: as in `optimise_layout`; `seed`: random seed of the starts.
     - `num_points`: approximate number of nodes of the mesh used in the optimisation; the final scores are computed on a
       mesh with four times as many nodes.
-    - `progress`: called with the name of each step as it begins.
+    - `progress`: function called with the name of each step ("mesh", "optimise", "confirm") as the step begins.
     - `material`: thickness, conductivity and contact impedance, as in `Skin.create`.
 
     Raises `ValueError` if no layout satisfies the constraints, and as `Skin.create` and `optimise_layout` do.

@@ -1,4 +1,4 @@
-"""Measurement selection: choice of the most informative among candidate measurements."""
+"""Measurement selection: choice of the most informative measurements among many candidates."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Candidates(Module):
     """Sensitivities of M candidate measurements, whitened by the noise and by the prior.
 
     **Fields**: `rows` (M, r): the whitened sensitivity f_i of each candidate; `weight` (r, r): the matrix V such that
-    tr VC is the weighted sum of posterior variances for a covariance C of the r whitened coefficients.
+    tr VC is the weighted sum of the cells' variances for a posterior covariance C of the r whitened coefficients.
 
     **Example:**
 
@@ -40,15 +40,15 @@ class Candidates(Module):
     ) -> "Candidates":
         """Create the candidates from the Jacobian and a prior with covariance Γ of the conductivities.
 
-        - `jacobian`: J (M, m) of all candidate measurements, as from `ForwardModel.jacobian`.
+        - `jacobian`: Jacobian J (M, m) of M candidates with respect to m cells, as from `ForwardModel.jacobian`.
         - `product`: ΓJᵀ (m, M), the `covariance_product` of a prior times the variance of the conductivity.
-        - `noise`: standard deviation of each measurement (M,), or one value for all, volts.
+        - `noise`: standard deviation of the noise of each measurement (M,), or one value for all, volts.
         - `weights`: weights (m,) of the cells in criterion "A", all 1 by default; with the areas of the cells as
           weights, the criterion is an integral over the body.
 
-        Exact for any prior. Takes O(M³) operations, and so suits up to a few thousand candidates. Works under `jit` and
-        `vmap`. Raises `ValueError` for incompatible shapes, values that are not finite, noise that is not positive, and
-        negative weights.
+        The result is exact for any prior. The computation takes O(M³) operations, and so suits up to a few thousand
+        candidates. The function works under `jit` and `vmap`. Raises `ValueError` for incompatible shapes, values that
+        are not finite, noise that is not positive, and negative weights.
         """
         jacobian, product, noise, weights = _check_candidates(
             jacobian, product, noise, weights, ("cells", "measurements")
@@ -64,9 +64,9 @@ class Candidates(Module):
         """Create the candidates from the Jacobian and a prior with covariance SSᵀ, where `factor` is S (m, r). Other
         arguments as in `create`.
 
-        Suits any number of candidates, such as all drives with all measurements. If S omits small parts of the variance
-        (as the `basis` of a prior does), the information of precise measurements on these parts is omitted too, and the
-        `share` of a few measurements is overestimated. Raises `ValueError` as `create` does.
+        This function suits any number of candidates, such as all drives with all measurements. If S omits small parts
+        of the variance (as the `basis` of a prior does), the information of precise measurements on these parts is
+        omitted too, and the `share` of a few measurements is overestimated. Raises `ValueError` as `create` does.
         """
         jacobian, factor, noise, weights = _check_candidates(
             jacobian, factor, noise, weights, ("cells", "coefficients")
@@ -82,8 +82,8 @@ class Candidates(Module):
 def _check_candidates(
     jacobian, prior, noise, weights, axis_names: tuple[str, str]
 ) -> tuple[Array, Array, Array, Array]:
-    """Check the arguments of `Candidates` and return them as arrays of matching shapes. `axis_names`: names of the axes
-    of `prior`, for error messages."""
+    """Check the arguments of `Candidates` and convert them to arrays of matching shapes. `axis_names`: names of the
+    axes of `prior`, for error messages."""
     jacobian, prior = jnp.asarray(jacobian, float), jnp.asarray(prior, float)
     noise = jnp.asarray(noise, float)
     if jacobian.ndim != 2 or prior.ndim != 2 or jacobian.shape[1] != prior.shape[0]:
@@ -114,7 +114,7 @@ def _candidates_from_product(jacobian, product, noise, weights) -> Candidates:
     """Compute the candidates from ΓJᵀ, with the factor S = ΓJᵀ N^-½ U Λ^-½ of the prior, where N^-½ JΓJᵀ N^-½ = UΛUᵀ
     and N is the covariance of the noise.
 
-    SSᵀ is the part of Γ that the measurements depend on; they do not depend on the remaining part.
+    SSᵀ is the part of the prior covariance Γ that the measurements depend on; the remaining part does not affect them.
     """
     kernel = jacobian @ product / (noise[:, None] * noise)
     eigenvalues, eigenvectors = jnp.linalg.eigh((kernel + kernel.T) / 2)
@@ -127,19 +127,19 @@ def _candidates_from_product(jacobian, product, noise, weights) -> Candidates:
 
 
 Criterion = Literal["D", "A"]
-# Minimum relative gain of information by a swap; below it rounding errors could cause endless swaps.
+# Minimum relative gain of information by a swap, since rounding errors of smaller gains could cause endless swaps.
 _MIN_GAIN = 1e-9
 
 
 class Selection(Module):
-    """The chosen measurements, with their information and that of all candidates.
+    """The chosen measurements, with their information and the information of all candidates.
 
     **Fields**
 
     - `chosen`: (N,) indices of the candidates, in the order of the greedy choice; `protocol.subset(chosen)` is the
       protocol that measures them.
-    - `gains`: (N,) information added by each greedy choice, before any exchange; non-increasing for "D".
-    - `information`: information of the chosen measurements ("D": in nats, "A": reduction of the variance); `total`:
+    - `gains`: (N,) information added by each greedy choice, before any exchange; non-increasing for criterion "D".
+    - `information`: information of the chosen measurements ("D": in nats, "A": decrease of the variance); `total`:
       information of all candidates.
     - `swaps`: number of swaps by the exchange; `settled`: whether no further swap increases the information.
     """
@@ -153,7 +153,7 @@ class Selection(Module):
 
     @property
     def share(self) -> Float[Array, ""]:
-        """Information of the chosen measurements divided by that of all candidates."""
+        """Information of the chosen measurements divided by the information of all candidates."""
         return self.information / self.total
 
 
@@ -165,19 +165,19 @@ def select_measurements(
     exchange: bool = True,
     max_swaps: int | None = None,
 ) -> Selection:
-    """Select measurements of the candidates so that their information is as large as possible.
+    """Select `number` of the candidate measurements so that their information is as large as possible.
 
-    The selection is greedy: each step adds the candidate with the largest gain. The result is deterministic. For "D",
-    which is submodular, the greedy set has at least 1 - 1/e of the maximum information; `information_bound` gives an
-    upper bound for any set. A greedy choice takes O(M r) operations, a swap O(N M r). Works under `jit` and `vmap`, for
-    many layouts in one call.
+    The selection is greedy: each step adds the candidate with the largest gain of information. The result is
+    deterministic. Criterion "D" is submodular, so the greedy set has at least 1 - 1/e of the maximum information;
+    `information_bound` gives an upper bound for any set. A greedy choice takes O(M r) operations, a swap O(N M r), for
+    M candidates of r coefficients. The function works under `jit` and `vmap`, for many layouts in one call.
 
     **Arguments:**
 
     - `candidates`: the M candidate measurements.
     - `number`: number N of measurements to select.
     - `criterion`: "D", the information in nats, or "A", the decrease of the weighted posterior variance.
-    - `exchange`: whether the best swap of a chosen candidate for another one is then repeated until no swap increases
+    - `exchange`: whether chosen candidates are then swapped for others, the best swap first, until no swap increases
       the information (Fedorov's exchange).
     - `max_swaps`: maximum number of swaps, by default `number`.
 
@@ -198,7 +198,7 @@ def select_measurements(
 
 
 def information(candidates: Candidates, chosen, *, criterion: Criterion = "D") -> Float[Array, "..."]:
-    """Information (...,) of sets of candidates, given by their indices `chosen` (..., N): N different ones per set.
+    """Information (...,) of sets of candidate measurements, given by N different indices per set, `chosen` (..., N).
 
     Raises `ValueError` for invalid indices, and for an unknown criterion.
     """
@@ -216,11 +216,11 @@ def information_bound(
 ) -> Float[Array, ""]:
     """Compute an upper bound of the information of any set of `number` candidates.
 
-    If fractions of candidates may be measured, 0 ≤ w_i ≤ 1 with Σw_i = N, the information is a concave function of w,
-    and each of its tangents is an upper bound. The Frank-Wolfe method maximises the information, and the lowest bound
-    of its iterations is returned. The bound is tight if many candidates carry similar information. It is loose if the
-    noise is so low that every candidate adds information: fractions of all candidates then carry more information than
-    any small set.
+    If fractions w_i of the candidates may be measured, 0 ≤ w_i ≤ 1 with Σw_i = N, the information is a concave function
+    of w, and each tangent of this function is an upper bound. The Frank-Wolfe method maximises the information, and the
+    lowest bound of its iterations is returned. The bound is tight if many candidates carry similar information, and
+    loose if the noise is so low that every candidate adds information: fractions of all candidates then carry more
+    information than any small set.
 
     Boyd and Vandenberghe, Convex Optimization (2004), section 7.5.
 
@@ -229,7 +229,7 @@ def information_bound(
     - `candidates`: the candidate measurements.
     - `number`: number N of measurements in a set.
     - `criterion`: "D" or "A", as in `select_measurements`.
-    - `iterations`: number of iterations; more of them tighten the bound.
+    - `iterations`: number of Frank-Wolfe iterations; more iterations give a tighter bound.
 
     Raises `ValueError` if `number` is not from 1 to the number of candidates, and for an unknown criterion.
 
@@ -245,7 +245,7 @@ def information_bound(
 
 
 def random_selections(key: Array, num_candidates: int, number: int, count: int) -> Int[Array, "count N"]:
-    """Draw `count` sets of `number` different candidates each, all sets equally likely: indices (count, number).
+    """Draw `count` sets of `number` different candidates each, all sets equally likely, as indices (count, number).
 
     Raises `ValueError` if `number` is not from 1 to `num_candidates`.
     """
@@ -262,10 +262,10 @@ def nearest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N"
     """Find the `number` pairs of electrodes with the shortest distance, as indices of channels of `two_terminal(L)`,
     the protocol that measures all pairs of L electrodes.
 
-    `centres`: (L, d) metres. `lengths`: distances (L, L) between the electrodes, metres, such as those along a surface
-    from `SurfaceLayout.lengths`; by default the straight distances. Every position is then measured by electrodes close
-    to it. Among pairs of equal length the first ones are taken. Raises `ValueError` if `number` is not from 1 to
-    L(L - 1)/2.
+    `centres`: positions (L, d) of the electrodes, metres. `lengths`: distances (L, L) between the electrodes, metres,
+    such as those along a surface from `SurfaceLayout.lengths`; by default the straight distances. With the nearest
+    pairs, every position of the skin is measured by electrodes close to it. Pairs of equal distance are taken in the
+    order of the channels. Raises `ValueError` if `number` is not from 1 to L(L - 1)/2.
     """
     return _pairs_by_length(centres, number, 1, lengths)
 
@@ -285,7 +285,7 @@ def _pairs_by_length(centres, number: int, length_sign: int, lengths) -> np.ndar
         raise ValueError(
             f"number must be from 1 to the {len(first)} pairs of {len(centres)} electrodes; it is {number}."
         )
-    # Lengths are rounded to a nanometre, so that pairs of equal length are taken in their order.
+    # Distances are rounded to a nanometre, so that pairs of equal distance are taken in the order of the channels.
     if lengths is None:
         lengths = np.linalg.norm(centres[:, None] - centres, axis=-1)
     elif np.shape(lengths) != (len(centres), len(centres)):
@@ -329,8 +329,8 @@ def _select_with_swaps(candidates: Candidates, number: int, criterion: Criterion
 
 
 def _greedy_selection(candidates: Candidates, number: int, criterion: Criterion):
-    """Indices (N,) of the greedy choice and the gain of each. The choice is a Cholesky factorisation of I + FFᵀ, where
-    F are the rows f_i, with the best candidate as the next pivot.
+    """Indices (N,) of the greedily chosen candidates, and the gain of information of each. The choice is a pivoted
+    Cholesky factorisation of I + FFᵀ, where F has the rows f_i, with the best candidate as the next pivot.
 
     Choosing candidate p changes the posterior covariance from C to C - uuᵀ with u = C f_p / √(1 + f_pᵀC f_p). The rows
     of `directions` are the vectors u found so far.
@@ -347,7 +347,7 @@ def _greedy_selection(candidates: Candidates, number: int, criterion: Criterion)
         direction = covariance(directions, rows[best_candidate]) / jnp.sqrt(1 + variances[best_candidate])
         projections = rows @ direction
         if criterion == "A":
-            # Update f_jᵀCVC f_j to the new C, which changes C f_j by a multiple of `projections`.
+            # Update f_jᵀCVC f_j to the new covariance C, which changes C f_j by a multiple of `projections`.
             weighted_direction = weight @ direction
             weighted_projections = rows @ covariance(directions, weighted_direction)
             reductions = jnp.maximum(
@@ -370,17 +370,17 @@ def _greedy_selection(candidates: Candidates, number: int, criterion: Criterion)
 
 
 def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[Array, "N M"]:
-    """Gain (N, M) of information by swapping the i-th member of the set for candidate j; -inf where j is in the set.
+    """Gain (N, M) of information by swapping the i-th chosen candidate for candidate j; -inf where j is already chosen.
 
-    With c_ij = f_iᵀC f_j and b_ij = f_iᵀCVC f_j, where C is the posterior covariance for the present set, a swap
+    With c_ij = f_iᵀC f_j and b_ij = f_iᵀCVC f_j, where C is the posterior covariance for the chosen set, a swap
     multiplies det C⁻¹ by q = (1 + c_jj)(1 - c_ii) + c_ij² and lowers tr VC by
     ((1 - c_ii) b_jj + 2 c_ij b_ij - (1 + c_jj) b_ii) / q.
     """
     rows, weight = candidates.rows, candidates.weight
     selected_rows = rows[chosen]
     products = selected_rows @ rows.T
-    # F_T: the rows of the set. C F_Tᵀ = F_Tᵀ (I + F_T F_Tᵀ)⁻¹ gives c_ij and 1 - c_ii without differences of large
-    # numbers.
+    # F_T are the rows of the chosen set. C F_Tᵀ = F_Tᵀ (I + F_T F_Tᵀ)⁻¹ gives c_ij and 1 - c_ii without differences of
+    # large numbers.
     inverse_root = _inverse_root(products[:, chosen])
     half_products = inverse_root @ products
     c_j = jnp.maximum(jnp.sum(rows**2, axis=1) - jnp.sum(half_products**2, axis=0), 0)
@@ -399,8 +399,8 @@ def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[A
 
 
 def _information_of_set(candidates: Candidates, weighted_rows: Float[Array, "M r"], chosen, criterion: Criterion):
-    """Information of one set, from the N × N matrix I + F_T F_Tᵀ, where F_T are the rows of the set; `weighted_rows`:
-    the rows of all candidates times V."""
+    """Information of one set of N candidates, from the N × N matrix I + F_T F_Tᵀ, where F_T are the rows of the set.
+    `weighted_rows`: the rows of all candidates times V."""
     selected_rows = candidates.rows[chosen]
     inverse_root = _inverse_root(selected_rows @ selected_rows.T)
     if criterion == "D":
@@ -417,8 +417,8 @@ def _information_of_sets(candidates: Candidates, index_sets, criterion: Criterio
 
 
 def _information_and_slope(candidates: Candidates, fractions: Float[Array, " M"], criterion: Criterion):
-    """Information if candidate i is measured with the weight `fractions[i]`, and its derivative (M,) with respect to
-    the weights, from the r × r matrix C⁻¹."""
+    """Information if candidate i is measured with the weight `fractions[i]`, and the derivative (M,) of the information
+    with respect to the weights, from the inverse posterior covariance C⁻¹ (r, r)."""
     rows, weight = candidates.rows, candidates.weight
     inverse_root = _inverse_root(rows.T @ (fractions[:, None] * rows))
     half_products = inverse_root @ rows.T
@@ -430,8 +430,8 @@ def _information_and_slope(candidates: Candidates, fractions: Float[Array, " M"]
 
 
 def _inverse_root(matrix: Float[Array, "s s"]) -> Float[Array, "s s"]:
-    """Inverse L⁻¹ of the Cholesky factor of I + `matrix`, by matrix products only, since these can always be batched,
-    whereas LAPACK's solvers may not be."""
+    """Inverse L⁻¹ of the Cholesky factor of I + `matrix`. Only matrix products are used, since they can always be
+    batched, whereas LAPACK's solvers may not be."""
     return inverse_cholesky(jnp.eye(len(matrix)) + matrix[None])[0]
 
 
@@ -446,6 +446,6 @@ def _relaxed_bound(candidates: Candidates, number: int, criterion: Criterion, it
         return fractions + 2 / (step_index + 2) * (vertex - fractions), bound
 
     initial_fractions = jnp.full(candidates.num_candidates, number / candidates.num_candidates)
-    # The step size is 2 / (k + 2) at step k. The loop starts at k = 2, with a step size of 1/2, since the full step at
-    # k = 0 would discard the initial fractions.
+    # The Frank-Wolfe step size is 2 / (k + 2) at step k. The loop starts at k = 2, with a step size of 1/2, since the
+    # full step at k = 0 would discard the initial fractions.
     return jax.lax.fori_loop(2, iterations + 2, step, (initial_fractions, jnp.array(jnp.inf)))[1]

@@ -1,15 +1,15 @@
 """Layout scores: differentiable measures of how precisely a sheet with a given layout detects and locates touches.
 
-A touch of amplitude a_k at position k changes the M voltages by a_k Δv_k, in the linear approximation; their noise has
-standard deviation σ. The prior of the amplitudes at all positions is a = S c, where the entries of c are independent
-with unit variance. The voltages are y = Aᵀa + noise, where the rows of A are the Δv_k. Then the posterior covariance
-of the amplitudes is
+A touch of amplitude a_k at position k changes the M voltages by a_k Δv_k, in the linear approximation. The noise of the
+voltages has standard deviation σ. The prior of the amplitudes at all positions is a = S c, where the entries of c are
+independent with unit variance. The voltage changes are y = Aᵀa + noise, where the rows of A are the Δv_k. Then the
+posterior covariance of the amplitudes is
 
     C = S (1 + Sᵀ A σ⁻² Aᵀ S)⁻¹ Sᵀ.
 
 The Cramér-Rao bound is the minimum variance of an unbiased estimate of the position of a touch of unknown amplitude.
-The parameters (x, y, a) have the Fisher information J_ij = ∂_i(a Δv)ᵀ σ⁻² ∂_j(a Δv), and the variance of the position
-is the trace of the (x, y) block of J⁻¹.
+The parameters (x, y, a) have the Fisher information J_ij = ∂_i(a Δv)ᵀ σ⁻² ∂_j(a Δv), and the bound of the position's
+variance is the trace of the (x, y) block of J⁻¹.
 
 Atkinson, Donev and Tobias, Optimum Experimental Designs (Oxford, 2007), chapter 10; Kay, Fundamentals of Statistical
 Signal Processing: Estimation Theory (1993), chapter 3.
@@ -34,15 +34,16 @@ from jeit_solvers.dense import inverse_cholesky
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, undifferentiated
 from jeit_solvers.module import Module
 
-# Number k of matrix squarings: the largest eigenvalue of an r × r matrix has a relative error of at most ln(r) / 2^k,
-# however close the second largest is.
+# Number k of matrix squarings. The largest eigenvalue of an r × r matrix then has a relative error of at most ln(r) /
+# 2^k, however close the second largest eigenvalue is.
 _NUM_SQUARINGS = 10
 
 
 class TouchPrior(Module):
     """Gaussian prior of the amplitudes of touches, with covariance SSᵀ.
 
-    **Fields**: `factor`: S (n, r). Amplitudes are relative to the touches for which the voltages are computed.
+    **Fields**: `factor`: S (n, r) for touches at n positions. The touches for which voltage changes are computed have
+    the amplitude 1.
 
     **Example:**
 
@@ -58,13 +59,13 @@ class TouchPrior(Module):
     def create(
         cls, places: ArrayLike, *, correlation: float, deviation: float = 1.0, lengths: ArrayLike | None = None
     ) -> "TouchPrior":
-        """Create the prior with covariance deviation² exp(-d² / 2 correlation²) between positions at a distance of d
-        metres.
+        """Create the prior in which the amplitudes of touches at a distance of d metres have the covariance deviation²
+        exp(-d² / 2 correlation²).
 
-        `places`: positions (n, 2), or (n, 3) on a curved skin, metres. `lengths`: distances (n, n) between them,
-        metres, such as those along a curved surface from `Geodesics.between`; by default the straight distances.
-        Components with less than a millionth of the largest variance are omitted. Raises `ValueError` for a correlation
-        or deviation that is not positive, and for invalid positions.
+        `places`: touched positions (n, 2), or (n, 3) on a curved skin, metres. `lengths`: distances (n, n) between the
+        positions, metres, such as those along a curved surface from `Geodesics.between`; by default the straight
+        distances. Principal components with less than a millionth of the largest variance are omitted. Raises
+        `ValueError` if `correlation` or `deviation` is not positive, and for invalid positions.
         """
         if not (0 < correlation < np.inf and 0 < deviation < np.inf):
             raise ValueError(
@@ -83,16 +84,20 @@ class TouchPrior(Module):
 
 
 class Scores(Module):
-    """Scores of a layout. After `jax.vmap`, every array has a leading axis for the layouts.
+    """Scores of an electrode layout for touches at n positions. After `jax.vmap`, every array has a leading axis for
+    the layouts.
 
     **Fields**
 
-    - `sensitivity` (n,): Θ = ‖Δv‖₂ of a touch at each position, volts.
-    - `soft_worst`: smooth minimum (mean Θ^(-1/T))^(-T) of Θ, volts; it tends to the minimum as the temperature T → 0.
-    - `variance` (n,): posterior variance of the relative amplitude at each position, the diagonal of C.
-    - `log_information`: D-optimality, log-determinant of the information divided by that of the prior, nats.
-    - `largest_variance`: E-optimality, the largest eigenvalue of C: the variance of the least certain pattern of
-      touches.
+    - `sensitivity` (n,): Θ = ‖Δv‖₂, norm of the voltage changes due to a touch at each position, volts.
+    - `soft_worst`: smooth minimum (mean Θ^(-1/T))^(-T) of Θ, volts, which tends to the minimum as the temperature T →
+      0.
+    - `variance` (n,): posterior variance of the relative amplitude of a touch at each position, the diagonal of the
+      covariance C.
+    - `log_information`: D-optimality, log-determinant of the posterior information matrix minus that of the prior,
+      nats.
+    - `largest_variance`: E-optimality, the largest eigenvalue of C, which is the variance of the least certain pattern
+      of touches.
     - `localisation_error` (n,): Cramér-Rao bound of the root-mean-square error of an unbiased estimate of the position
       of a single touch of amplitude 1, metres.
     """
@@ -106,22 +111,22 @@ class Scores(Module):
 
     @property
     def worst(self) -> Float[Array, "*layouts"]:
-        """Minimum of Θ, volts."""
+        """Minimum of the sensitivity Θ over the touched positions, volts."""
         return self.sensitivity.min(axis=-1)
 
     @property
     def mean(self) -> Float[Array, "*layouts"]:
-        """Mean of Θ, volts."""
+        """Mean of the sensitivity Θ over the touched positions, volts."""
         return self.sensitivity.mean(axis=-1)
 
     @property
     def uniformity(self) -> Float[Array, "*layouts"]:
-        """Mean of Θ divided by its root mean square, as in `SensitivityMap`."""
+        """Mean of the sensitivity Θ divided by its root mean square, as in `SensitivityMap`."""
         return uniformity(self.sensitivity)
 
     @property
     def mean_variance(self) -> Float[Array, "*layouts"]:
-        """A-optimality: tr C / n, the mean of `variance`."""
+        """A-optimality: tr C / n, the mean of the posterior variances at the n positions."""
         return self.variance.mean(axis=-1)
 
 
@@ -137,16 +142,16 @@ def layout_scores(
     noise: ArrayLike,
     temperature: float = TEMPERATURE,
 ) -> Scores:
-    """Compute all scores of the layout of a sheet's model, from one factorisation and the Jacobian.
+    """Compute all scores of the electrode layout of a sheet, from its forward model.
 
-    Differentiable with respect to the positions, radii and contact impedances of the electrodes. For a batch of layouts
-    with the same number of electrodes, protocol and touches::
+    The scores are differentiable with respect to the positions, radii and contact impedances of the electrodes. For a
+    batch of layouts with the same number of electrodes, protocol and touches::
 
         jax.vmap(lambda electrodes: layout_scores(model.with_electrodes(electrodes), …))(stacked_electrodes)
 
-    A protocol of all two-terminal pairs does not depend on the order of the electrodes and determines every other
-    measurement. A protocol of adjacent electrodes depends on their numbering, which becomes meaningless once the
-    electrodes move.
+    A protocol of all two-terminal pairs does not depend on the order of the electrodes, and its voltages determine
+    every other measurement. A protocol of adjacent electrodes depends on their numbering, which becomes meaningless
+    once the electrodes move.
 
     **Arguments:**
 
@@ -154,7 +159,7 @@ def layout_scores(
     - `conductivity`: sheet conductivity, siemens.
     - `touches`: touches of the sheet, as from `Skin.sheet_touches`.
     - `prior`: prior of the amplitudes of the touches.
-    - `noise`: standard deviation of the channels (M,), or one value for all, volts.
+    - `noise`: standard deviation of the noise of each of M channels (M,), or one value for all, volts.
     - `temperature`: temperature T of the smooth minimum of the sensitivity.
 
     Raises `ValueError` if the model is not of a sheet, and for incompatible shapes and invalid values.
@@ -194,7 +199,8 @@ def _check_arguments(model: ForwardModel, touches: SheetTouches, prior: TouchPri
 
 @either_engine
 def _compute_scores(jacobian, conductivity, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> Scores:
-    """Compute the scores from the Jacobian (M, m) of the voltages."""
+    """Compute the scores of a layout from the Jacobian (M, m) of the M voltages with respect to the conductivities of m
+    cells."""
     xp = namespace(jacobian)
     weights, weight_slopes = touches.weights(conductivity)
     changes = weights @ jacobian.T  # (n, M)
@@ -205,7 +211,7 @@ def _compute_scores(jacobian, conductivity, touches: SheetTouches, prior: TouchP
     whitened_changes = changes / noise
     information_rows = prior.factor.T @ whitened_changes  # (r, M)
     inverse_root = inverse_cholesky((xp.eye(len(information_rows)) + information_rows @ information_rows.T)[None])[0]
-    covariance_factor = prior.factor @ inverse_root.T  # a factor B of C = BBᵀ
+    covariance_factor = prior.factor @ inverse_root.T  # factor B of the posterior covariance C = BBᵀ
     return Scores(
         sensitivity,
         xp.exp(-temperature * log_mean),
@@ -217,10 +223,10 @@ def _compute_scores(jacobian, conductivity, touches: SheetTouches, prior: TouchP
 
 
 def _largest_eigenvalue(matrix: Float[Array, "r r"]) -> Float[Array, ""]:
-    """Largest eigenvalue of a positive semidefinite matrix, by repeated squaring, which needs only matrix products and
-    can be batched.
+    """Largest eigenvalue of a positive semidefinite `matrix`. The eigenvalue is computed by repeated squaring, which
+    needs only matrix products and can be batched.
 
-    The derivative of a simple eigenvalue is that of vᵀ(matrix)v at a fixed eigenvector v.
+    The derivative of a simple eigenvalue is the derivative of vᵀ(matrix)v with the eigenvector v held fixed.
     """
     power = undifferentiated(matrix)
     for _ in range(_NUM_SQUARINGS):
@@ -233,11 +239,13 @@ def _largest_eigenvalue(matrix: Float[Array, "r r"]) -> Float[Array, ""]:
 def _localisation_error(
     amplitude_slope: Float[Array, "n M"], position_slopes: Float[Array, "2 n M"]
 ) -> Float[Array, " n"]:
-    """Cramér-Rao bound of the position: square root of the trace of the (x, y) block of the inverse information, from
-    its Schur complement; infinite if it is singular. `amplitude_slope`, `position_slopes`: derivatives of the whitened
-    voltages with respect to the amplitude, and to x and y."""
+    """Cramér-Rao bound (n,) of the position of a touch, metres: square root of the trace of the (x, y) block of the
+    inverse Fisher information, by a Schur complement. The bound is infinite if the information is singular.
+    `amplitude_slope`, `position_slopes`: derivatives of the whitened voltages with respect to the amplitude, and to x
+    and y."""
     xp, size = namespace(amplitude_slope), (amplitude_slope**2).sum(axis=1)
-    # Part of the derivatives orthogonal to that of the amplitude, computed before squaring since it may be small.
+    # Part of the position derivatives that is orthogonal to the amplitude derivative. It may be small, so it is
+    # computed before squaring.
     x_slope, y_slope = (
         position_slopes - ((position_slopes * amplitude_slope).sum(axis=2) / size)[..., None] * amplitude_slope
     )

@@ -1,4 +1,4 @@
-"""Sensitivity maps: the norm of the voltage changes due to a touch at each position of a skin."""
+"""Sensitivity maps: the norm of the voltage changes due to a touch at each of many positions of a skin."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from jeit_solvers.module import Module
 
 @either_engine
 def uniformity(sensitivities: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
-    """Mean of Θ over n positions divided by its root mean square: 1 if all values are equal, and smaller the more they
-    differ."""
+    """Mean of the sensitivity Θ over n positions divided by its root mean square: 1 if all values are equal, and
+    smaller the more the values differ."""
     return sensitivities.mean(axis=-1) / namespace(sensitivities).sqrt((sensitivities**2).mean(axis=-1))
 
 
@@ -42,43 +42,46 @@ class SensitivityMap(Module):
     @property
     @either_engine
     def values(self) -> Float[Array, " n"]:
-        """Θ (n,), volts."""
+        """Sensitivity Θ (n,) at each touched position, volts."""
         return namespace(self.changes).linalg.norm(self.changes, axis=-1)
 
     @property
     @either_engine
     def minimum(self) -> Float[Array, ""]:
-        """Minimum of Θ, at the least sensitive position, volts."""
+        """Minimum of the sensitivity Θ over the touched positions, volts."""
         return self.values.min(axis=-1)
 
     @property
     @either_engine
     def mean(self) -> Float[Array, ""]:
-        """Mean of Θ, volts."""
+        """Mean of the sensitivity Θ over the touched positions, volts."""
         return self.values.mean(axis=-1)
 
     @property
     @either_engine
     def uniformity(self) -> Float[Array, ""]:
-        """Mean of Θ divided by its root mean square: 1 if all positions are equal, and smaller the more they differ."""
+        """Mean of the sensitivity Θ divided by its root mean square: 1 if all positions have the same Θ, and smaller
+        the more Θ varies."""
         return uniformity(self.values)
 
     def blind_spot(self, level) -> Float[Array, ""]:
-        """Fraction of the area that is less sensitive than `level` (volts), such as the minimum of another layout.
+        """Fraction of the skin's area that is less sensitive than `level` (volts), such as the lowest sensitivity of
+        another layout.
 
-        Raises `ValueError` for a level that is negative or not a number.
+        Raises `ValueError` if `level` is negative or not a number.
         """
         if has_values(level) and not np.all(np.asarray(level) >= 0):
             raise ValueError(f"level must be a sensitivity in volts, not negative; it is {level!r}.")
         return _fraction_below(level, self.values)
 
     def histogram(self, bins: int | np.ndarray = 40) -> tuple[np.ndarray, np.ndarray]:
-        """Fraction of the area in each bin of Θ, and the edges of the bins in volts; `bins` as in `numpy.histogram`."""
+        """Fraction of the skin's area in each bin of the sensitivity Θ, and the edges of the bins in volts; `bins` as
+        in `numpy.histogram`."""
         counts, edges = np.histogram(np.asarray(self.values), bins=bins)
         return counts / self.values.size, edges
 
     def image(self) -> Float[np.ndarray, "rows columns"]:
-        """Θ as an image (rows, columns), volts, with row 0 at the smallest y, and NaN outside the skin."""
+        """Sensitivity Θ as an image (rows, columns), volts, with row 0 at the smallest y, and NaN outside the skin."""
         return self.grid.raster(self.values)
 
 
@@ -100,11 +103,11 @@ def sensitivity_map(
     - `conductivity`: conductivity of the model, S/m (2-D: S).
     - `grid`: the touched positions.
     - `indentation`: shape of the touch, by default the unit deformation `Bell()` of Park et al. 2022.
-    - `thickness`: thickness of the layer that a sheet represents, metres.
-    - `contrast`: conductivity of the touched part divided by that of the rest.
+    - `thickness`: thickness of the layer that a sheet represents, metres; None for a layer.
+    - `contrast`: conductivity of the touched part divided by that of the rest of the skin.
     - `linear`: whether to compute linearised instead of exact voltage changes.
 
-    Raises `ValueError` for a model, a grid and a thickness that do not fit together, and for invalid values.
+    Raises `ValueError` if the model, the grid and the thickness do not fit together, and for invalid values.
 
     **Example:**
 

@@ -1,4 +1,5 @@
-"""Virtual taxels: regions of a skin whose touches cause similar voltage changes (Park et al. 2022, text S4)."""
+"""Virtual taxels (tactile pixels): regions of a skin in which touches cause similar voltage changes (Park et al. 2022,
+text S4)."""
 
 from __future__ import annotations
 
@@ -18,13 +19,13 @@ from jeit_solvers.module import Module
 
 
 class Taxels(Module):
-    """The k virtual taxels of a layout, from touches at n positions; create them with `find_taxels`.
+    """The k virtual taxels of an electrode layout, from touches at n positions; `find_taxels` creates taxels.
 
     **Fields**
 
     - `places`: touched positions (n, 2), on a curved skin (n, 3), metres.
     - `cell_area` (n,): area of the part of the skin that each position represents, m².
-    - `clusters`: k-means clusters of the voltage changes, with their means.
+    - `clusters`: k-means clusters of the voltage changes, with the mean change of each cluster.
     - `similarity` (k, n): cosine of the angle between the mean voltage change of each cluster and the change at each
       position.
     - `threshold`: minimum similarity for a position to belong to a taxel.
@@ -40,20 +41,22 @@ class Taxels(Module):
 
     @property
     def labels(self) -> Int[Array, "*layouts n"]:
-        """Index of the cluster that each position belongs to; every position belongs to exactly one cluster."""
+        """Index of the cluster of voltage changes that each touched position belongs to; every position belongs to
+        exactly one cluster."""
         return self.clusters.labels
 
     @property
     @either_engine
     def members(self) -> Bool[Array, "*layouts k n"]:
-        """Mask of the positions that each taxel, a tactile pixel, covers. Taxels may overlap, and a position may be
-        covered by none."""
+        """Mask (k, n) of the touched positions that each taxel covers. Taxels may overlap, and a position may be
+        covered by no taxel."""
         return self.similarity >= self.threshold
 
     @property
     @either_engine
     def positions(self) -> Float[Array, "*layouts k d"]:
-        """Centroid of the positions in each cluster, metres; on a curved skin, it lies slightly below the surface."""
+        """Centroid of the touched positions in each cluster, metres; on a curved skin, the centroid lies slightly below
+        the surface."""
         num_taxels = self.similarity.shape[-2]
         weights = (self.labels[..., None, :] == np.arange(num_taxels)[:, None]) * self.cell_area[..., None, :]
         return weights @ self.places / weights.sum(axis=-1, keepdims=True)
@@ -61,7 +64,8 @@ class Taxels(Module):
     @property
     @either_engine
     def areas(self) -> Float[Array, "*layouts k"]:
-        """Area that each taxel covers, m²; 0 if no position has a change similar to the mean change of the cluster."""
+        """Area that each taxel covers, m²; 0 if no position has a voltage change similar to the mean change of the
+        taxel's cluster."""
         return (self.members * self.cell_area[..., None, :]).sum(axis=-1)
 
     @property
@@ -85,7 +89,7 @@ class Taxels(Module):
     @property
     @either_engine
     def coverage(self) -> Int[Array, "*layouts n"]:
-        """Number of taxels that cover each position."""
+        """Number of taxels that cover each touched position."""
         return self.members.sum(axis=-2)
 
     @property
@@ -107,8 +111,8 @@ class Taxels(Module):
         """Estimate of the minimum distance at which two touches are distinguishable, metres: the mean of the
         `diameters`.
 
-        This is the estimate of the paper, "average diameter of the virtual taxels". Two touches at a smaller distance
-        are on average within one taxel: their voltage changes differ in magnitude rather than in pattern.
+        Park et al. estimate this distance by the "average diameter of the virtual taxels". Two touches at a smaller
+        distance are on average within the same taxel: their voltage changes differ in magnitude rather than in pattern.
         """
         return self.diameters.mean(axis=-1)
 
@@ -142,15 +146,15 @@ def find_taxels(
     - `places`: the positions (n, 2), on a curved skin (n, 3), metres.
     - `cell_area`: area of the part of the skin that each position represents, m²; one value for all, or (n,).
     - `num_taxels`: number k of clusters.
-    - `threshold`: minimum cosine, between 0 and 1.
+    - `threshold`: minimum cosine, between 0 and 1, for a position to belong to a taxel.
     - `key`: random key for k-means, from `jax.random.key`.
-    - `directions`: whether to scale the changes to length 1 before clustering. Without scaling, as in the paper,
-      positions of low sensitivity fall into one cluster, since all their changes are small. With scaling, the changes
-      in a cluster have a similar pattern.
-    - `restarts`: number of restarts of k-means, of which the best result is kept.
+    - `directions`: whether to scale the voltage changes to length 1 before clustering. Without scaling, as in Park et
+      al., positions of low sensitivity fall into one cluster, since all their voltage changes are small. With scaling,
+      the changes in a cluster have a similar pattern.
+    - `restarts`: number of runs of k-means from random starts, of which the best result is kept.
 
-    Raises `ValueError` for shapes that disagree, changes that are not finite or all zero, and lengths and areas whose
-    units do not fit together.
+    Raises `ValueError` for shapes that disagree, voltage changes that are not finite or are all zero, and lengths and
+    areas whose units do not fit together.
 
     **Example:**
 
@@ -177,7 +181,7 @@ def _cosine_similarities(vectors: Float[Array, "k m"], unit_changes: Float[Array
 
 @either_engine
 def _normalise(vectors: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """Scale vectors to length 1; zero vectors remain zero and have a derivative of zero."""
+    """Scale n vectors (n, m) to length 1; zero vectors remain zero and have a derivative of zero."""
     xp, squared_norms = namespace(vectors), (vectors**2).sum(axis=1, keepdims=True)
     return xp.where(squared_norms > 0, vectors / xp.sqrt(xp.where(squared_norms > 0, squared_norms, 1)), 0)
 
@@ -214,7 +218,8 @@ def _check_lengths(places: np.ndarray, cell_area: np.ndarray) -> None:
     if not (np.isfinite(cell_area) & (cell_area > 0)).all():
         raise ValueError("cell_area must be positive and finite, in m².")
     box_area = float(np.prod(np.sort(np.ptp(places, axis=0))[-2:]))
-    # The cells approximately fill the bounding box of the positions; a factor of 100 indicates wrong units.
+    # The cells around the positions approximately fill the bounding box of the positions. If the areas differ by a
+    # factor of 100, the units are wrong.
     if box_area > 0 and not 0.01 < cell_area.sum() / box_area < 100:
         raise ValueError(
             f"cell_area: the cells are {cell_area.sum():.3g} m² together, but the box round the places is "

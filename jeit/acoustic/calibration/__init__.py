@@ -1,1 +1,1 @@
-"""Calibration: estimation of the decay model and noise of each microphone from taps at known positions."""
+"""Calibration: estimation of the decay model and the noise of each microphone from taps at known positions."""

@@ -1,7 +1,7 @@
 """Calibration: fit the decay model and noise of each microphone to taps at known positions with unknown strengths.
 
-The models are fitted by robust least squares. The decay model that best locates taps left out of the fit is selected.
-Outlying taps are excluded from the fit and reported.
+The models are fitted by robust least squares. The kind of decay model that best locates taps left out of the fit is
+selected. Outlying taps are excluded from the fit and reported.
 """
 
 from __future__ import annotations
@@ -28,36 +28,37 @@ from jeit_solvers.module import Module
 
 # Value of `decay` that selects the decay model by cross-validation.
 AUTO = "auto"
-# Minimum relative improvement of the localisation error of left-out taps for which a model with more parameters is
-# preferred.
+# Minimum relative improvement of the localisation error of left-out taps for which a decay model with more parameters
+# is preferred.
 _MIN_IMPROVEMENT = 0.05
-# Relative error of the intensities above which a note is given. On simulated skins with uneven coupling and exact
-# positions, the relative error is 18 to 21 %.
+# Relative error of the predicted intensities above which the calibration gives a note. On simulated skins with uneven
+# coupling and exact positions, the relative error is 18 to 21 %.
 _LARGE_ERROR = 0.23
-# Minimum fraction of the microphones with enough taps that must agree with the model, unless left-out taps are located
-# well. Otherwise the given positions are rejected.
+# Minimum fraction of the microphones with enough taps that must agree with the decay model, unless left-out taps are
+# located well. Otherwise the given positions of the microphones are rejected.
 _MIN_USABLE_SHARE = 0.5
 # Default standard deviation of each coordinate of the microphones' given positions, in metres.
 PLACE_ERROR = 2e-3
 
 
 class CalibrationFit(Module):
-    """A calibration, with the T taps to which it was fitted.
+    """A calibration of M microphones, with the T taps to which it was fitted.
 
     - `calibration`: the fitted calibration.
     - `distance`: (T, M) distance of each tap from the estimated position of each microphone in metres.
-    - `power`: (T, M) intensities minus the noise floor.
+    - `power`: (T, M) intensities of the taps minus the noise floor.
     - `usable`: (T, M) mask of the intensities to which the models were fitted before unusable microphones were
       excluded.
     - `strength`: (T,) strengths of the taps; NaN if no microphone received the tap or the tap was excluded.
-    - `outlier`: (T,) mask of taps that were excluded because no single source at the given position explains them.
-    - `explained`: (M,) fraction of the variance of a microphone's levels that its model explains.
-    - `shared`: (M,) mask of microphones whose own taps do not determine the decay of the response with distance, which
-      is then taken from the other microphones.
+    - `outlier`: (T,) mask of taps that were excluded because no single source at the given position explains their
+      intensities.
+    - `explained`: (M,) fraction of the variance of a microphone's levels that its decay model explains.
+    - `shared`: (M,) mask of microphones whose own taps do not determine the decay of the response with distance. The
+      decay is then taken from the other microphones.
     - `displacement`: (M, d) estimated displacement of each microphone from its given position in metres. The
-      `calibration` has the estimated positions.
+      `calibration` has the positions after displacement.
     - `left_out`: name of each decay model with its median localisation error in metres for taps left out of the fit;
-      infinite if it located none. The selected model is first.
+      infinite if the model located no tap. The selected model is first.
     """
 
     calibration: Calibration
@@ -73,13 +74,14 @@ class CalibrationFit(Module):
 
     @property
     def error(self) -> float:
-        """Median over the usable microphones of the relative error of the predicted intensities."""
+        """Median over the usable microphones of the relative error of the intensities that the decay models predict."""
         calibration = self.calibration
         return float(np.median(np.asarray(calibration.microphone_array.noise.relative)[calibration.usable]))
 
     @property
     def evidence(self) -> str:
-        """Text that compares the localisation errors of the decay models for left-out taps; empty if unknown."""
+        """Text that compares the localisation errors of the decay models for taps left out of the fit; empty if the
+        errors are unknown."""
         if not self.left_out:
             return ""
         selected_error, *other_errors = (_distance_text(error) for _, error in self.left_out)
@@ -118,14 +120,14 @@ def calibrate_microphones(
 
     **Arguments:**
 
-    - `taps`: the taps, their positions and those of the microphones.
+    - `taps`: the taps, with the positions of taps and microphones.
     - `decay`: "inverse-square", a / (r² + b) as in Park 2022; "exponential", a exp(−r / l); "attenuated", a exp(−r / l)
-      / (r² + b); a subclass of `AbstractDecay`; or "auto", which selects among the three the model with the smallest
-      median localisation error of left-out taps (four-fold cross-validation over the positions).
-    - `place_error`: standard deviation of each coordinate of the given positions of the microphones, metres, whose
-      displacements are estimated too; 0 if the positions are exact.
+      / (r² + b); a subclass of `AbstractDecay`; or "auto", which selects from these three models the one with the
+      smallest median localisation error of left-out taps (four-fold cross-validation over the positions).
+    - `place_error`: standard deviation of each coordinate of the given positions of the microphones, metres; the
+      displacements from these positions are estimated too. 0 if the positions are exact.
     - `intensity`: band and windows, for taps given as samples.
-    - `progress`: called with the name of each step when it begins.
+    - `progress`: function called with the name of each step when the step begins.
 
     Raises `ValueError` if fewer than three microphones can be calibrated, if most microphones disagree with the given
     positions, for an unknown `decay`, a `place_error` that is negative or not finite, for `intensity` given with taps
@@ -147,16 +149,17 @@ def calibrate_microphones(
 
 
 def select_fit(fits: dict[str, CalibrationFit], rejection_reasons: dict[str, str]) -> CalibrationFit:
-    """Select the fit that locates left-out taps best. Among fits with nearly equal errors, the one with the fewest
-    parameters is selected. Raises `ValueError` with the first of the `rejection_reasons` if `fits` is empty."""
+    """Select the fit whose decay model locates left-out taps best. Among fits with nearly equal errors, the fit with
+    the fewest parameters is selected. Raises `ValueError` with the first of the `rejection_reasons` if `fits` is
+    empty."""
     if not fits:
         raise ValueError(next(iter(rejection_reasons.values())))
-    # The fits are in order of their number of parameters.
+    # The fits are in the order of the number of parameters of their decay models.
     smallest_error = min(fit.left_out[0][1] for fit in fits.values())
     return next(fit for fit in fits.values() if not fit.left_out[0][1] > (1 + _MIN_IMPROVEMENT) * smallest_error)
 
 
-@np.errstate(all="ignore")  # models that do not fit are reported with a reason
+@np.errstate(all="ignore")  # decay models that cannot be fitted are reported with a reason
 def fit_each_decay(
     taps: Taps,
     decays: Sequence[type[AbstractDecay]] = (),
@@ -165,11 +168,11 @@ def fit_each_decay(
     intensity: IntensitySettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, CalibrationFit], dict[str, str]]:
-    """Fit each of the given decay models; by default all. Returns a dictionary of the fits by name, and a dictionary of
-    the reasons for which the other models could not be fitted.
+    """Fit each of the given decay models, by default all. Returns a dictionary of the fits by the model's name, and a
+    dictionary of the reasons why other models could not be fitted.
 
-    `progress` is called with the name of each step when it begins. Raises `ValueError` as `calibrate_microphones` does,
-    but not if no model can be fitted.
+    `progress` is called with the name of each step when the step begins. Raises `ValueError` as `calibrate_microphones`
+    does, but not if no decay model can be fitted.
     """
     check_kind("taps", taps, Taps, "Taps, as of read_taps(path)")
     check_settings("intensity", intensity)
@@ -199,12 +202,12 @@ def fit_each_decay(
 
 
 class _FitInput(NamedTuple):
-    """Input of a fit: positions and intensities of the taps, and the noise of the microphones.
+    """Input of the fit of a decay model: positions and intensities of the taps, and the noise of the microphones.
 
-    **Fields**: `microphones`, `positions`: positions of microphones and taps in metres; `surface`: the surface;
-    `place_error`: standard deviation of the microphones' coordinates in metres; `power`: intensities minus the floor,
-    NaN where unusable; `noise`: noise of the microphones; `known_noise`: whether its floor was measured; `faults`:
-    fault of each microphone; `settings`: band and windows, for taps given as samples.
+    **Fields**: `microphones`, `positions`: positions of microphones and taps in metres; `surface`: the surface of the
+    skin; `place_error`: standard deviation of the microphones' coordinates in metres; `power`: intensities minus the
+    noise floor, NaN where unusable; `noise`: noise of the microphones; `known_noise`: whether the noise floor was
+    measured; `faults`: fault of each microphone; `settings`: band and windows, for taps given as samples.
     """
 
     microphones: Float[np.ndarray, "M d"]
@@ -221,9 +224,10 @@ class _FitInput(NamedTuple):
 class _FittedModel(NamedTuple):
     """Result of the fit of one decay model.
 
-    **Fields**: `fit`: the fit; `initial_use`: mask of the readings used in the first fit, of all microphones; `usable`:
-    mask of the usable microphones; `reasons`: reasons why microphones are unusable; `explained`: fraction of variance
-    that each model explains; `left_out_taps`: localisation errors of left-out taps.
+    **Fields**: `fit`: the fit; `initial_use`: mask of the intensities used in the first fit, with all microphones;
+    `usable`: mask of the usable microphones; `reasons`: reasons why microphones are unusable; `explained`: fraction of
+    the variance of each microphone's levels that its model explains; `left_out_taps`: localisation errors of left-out
+    taps.
     """
 
     fit: TapFit
@@ -280,9 +284,10 @@ def _fit_decay_model(decay_class: type[AbstractDecay], fit_input: _FitInput) -> 
 
 
 def _calibration_fit(taps: Taps, fit_input: _FitInput, fitted: _FittedModel, left_out) -> CalibrationFit:
-    """Create the `CalibrationFit` of a fitted model. `left_out`: name and localisation error of each model."""
+    """Create the `CalibrationFit` of a fitted decay model. `left_out`: name and localisation error of each decay
+    model."""
     fit, is_usable = fitted.fit, fitted.usable
-    # Logarithm of the common factor of gains and strengths, according to the convention of `Calibration`.
+    # Logarithm of the common factor of gains and strengths, which `Calibration` defines.
     log_gain = np.log(np.asarray(fit.kind.from_logarithms(host.asarray(fit.logarithms)).gain))[is_usable].mean()
     strength = np.where(fit.received, np.exp(fit.strength + log_gain), np.nan)
     shared, errors = fit.shared & is_usable, standard_errors(fit)[: len(fit.logarithms)]

@@ -31,7 +31,7 @@ _UNITS = {"length": "m", "intensity": "square of the samples' unit"}
 _SCALE_DESCRIPTION = (
     "strength 1 is the source whose intensity upon a microphone has geometric mean 1 over the usable ones"
 )
-# Fields of `CurvedSurface` that are stored in the file.
+# Fields of `CurvedSurface` that are stored in a calibration file.
 _CURVE_FIELDS = ("origin", "axes", "normal", "knots", "weights", "affine")
 # Maximum size of a calibration file in bytes. A microphone takes several hundred bytes.
 _MAX_FILE_SIZE = 2**24
@@ -45,17 +45,17 @@ class Calibration(Module):
     - `microphone_array`: positions of the M microphones, surface, decay models and noise.
     - `usable`: mask (M,) of the usable microphones.
     - `reasons`: M reasons why a microphone is not usable; "" for usable microphones.
-    - `standard_errors`: relative standard errors (K, M) of the K parameters of the decay model.
-    - `intensity`: band and windows with which the samples of the taps were analysed; None if the taps were given as
-      intensities.
-    - `name`: name of the taps.
-    - `strengths`: strengths of the weakest and the strongest tap; None if unknown.
-    - `widening`: factor by which `locate` multiplies covariances, chosen so that the error ellipses contain taps that
-      were left out of the fit.
+    - `standard_errors`: relative standard errors (K, M) of the K parameters of each microphone's decay model.
+    - `intensity`: frequency band and windows with which the samples of the taps were analysed; None if the taps were
+      given as intensities.
+    - `name`: name of the calibration taps.
+    - `strengths`: strengths of the weakest and the strongest calibration tap; None if unknown.
+    - `widening`: factor by which `locate` multiplies covariances of positions, chosen so that the error ellipses
+      contain taps that were left out of the fit.
 
     The taps determine the gains of the decay models and the strengths of the taps only up to a common factor. The
-    factor is chosen so that the geometric mean of f_i(0) over the usable microphones is 1. The strength of a source is
-    therefore the intensity at a typical microphone directly below it.
+    factor is chosen so that the geometric mean of the responses f_i(0) at distance 0 over the usable microphones is 1.
+    The strength of a source is therefore the intensity at a typical microphone directly below the source.
 
     **Example:**
 
@@ -80,16 +80,16 @@ class Calibration(Module):
         return len(self.microphone_array.microphones)
 
     def save(self, path: str | Path) -> None:
-        """Write the calibration to a JSON file, which includes the format version and the units."""
+        """Write the calibration to a JSON file, together with the format version and the units."""
         text = json.dumps(self._to_json(), indent=1, ensure_ascii=False, allow_nan=False)
         with written_whole(path) as file:
             file.write(f"{text}\n".encode())
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
-        """Read a calibration from a file written by `save`. Raises `ValueError` for another format, version or unit and
-        for invalid values, and `OSError` if the file cannot be opened."""
-        # Imported here, since the import of pydantic takes longer than most uses of a calibration.
+        """Read a calibration from a file written by `save`. Raises `ValueError` for a file of another format, version
+        or unit and for invalid values, and `OSError` if the file cannot be opened."""
+        # Imported here, since the import of pydantic takes longer than most operations with a calibration.
         from jeit.acoustic.calibration.calibration_tables import CalibrationTable
         from jeit.files.limits import faults_message
         from jeit.files.schema import validated

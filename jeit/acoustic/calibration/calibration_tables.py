@@ -20,7 +20,7 @@ Loop = Annotated[np.ndarray, Numbers(((3, _MAX_VERTICES), (2, 2)), -1e6, 1e6, "m
 
 
 class UnitsTable(Table):
-    """Units of the values in the file."""
+    """Units of the values in a calibration file."""
 
     subject = "units"
     length: Literal["m"]
@@ -49,7 +49,7 @@ class SurfaceTable(Table):
 
 
 class IntensityTable(Table):
-    """Band and windows with which samples are analysed; see `IntensitySettings`."""
+    """Frequency band and windows with which samples are analysed; see `IntensitySettings`."""
 
     subject = "intensity"
     low: Annotated[float, Number(0, 1e9, "Hz")] = 50.0
@@ -59,7 +59,7 @@ class IntensityTable(Table):
 
 
 class ErrorsTable(Table):
-    """Relative standard error of each parameter of the decay model; null where unknown."""
+    """Relative standard error of each parameter of a microphone's decay model; null where unknown."""
 
     subject = "relative standard errors"
     a: NotNegative | None = None

@@ -1,12 +1,12 @@
 """Weighted least-squares fit of decay models to taps of unknown strength.
 
-Microphones are the first axis of arrays, and taps the last. For M microphones with P values each, and T taps, there
-are P M + T unknowns. The strengths of the taps are eliminated by a Schur complement, which leaves a system with P M
-unknowns. Since the microphones of an array are usually of the same kind, a penalty acts on the deviation of each
-parameter except the first from its common value over the array, relative to a `spread`. The common value is eliminated
-too: it is the mean, which minimises the penalty. Microphones may be displaced from their given positions; the
-displacements are further unknowns, with a penalty on their deviation from 0. The code uses NumPy, since an array is
-calibrated only once.
+Microphones are the first axis of arrays, and taps the last. For M microphones with P values (parameters and
+displacements) each, and T taps of one strength each, there are P M + T unknowns. The strengths of the taps are
+eliminated by a Schur complement, which leaves a system with P M unknowns. Since the microphones of an array are usually
+of the same kind, a penalty acts on the deviation of each parameter except the first (the gain) from the parameter's
+common value over the array, relative to a `spread`. The common value is eliminated too: the mean over the array
+minimises the penalty. Microphones may be displaced from their given positions; the displacements are further unknowns,
+with a penalty on their deviation from 0. The code uses NumPy, since a microphone array is calibrated only once.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from jeit.acoustic.decay import AbstractDecay
 from jeit_solvers import Descent, minimise_small, solve_definite
 from jeit_solvers.engines import host, slopes
 
-# Maximum number of steps of a minimisation.
+# Maximum number of steps of a least-squares minimisation.
 _MAX_STEPS = 100
-# Maximum change of the logarithm of a strength in a step.
+# Maximum change of the logarithm of a tap's strength in a step.
 _MAX_LOG_STEP = 3.0
-# Maximum number of iterations in which parameters are fixed at their bounds or released.
+# Maximum number of iterations in which parameters are fixed at their bounds or released from a bound.
 _MAX_ACTIVE_SET_STEPS = 6
-# The tolerance `atol`, in the unit of the cost, ends the fit once the data are fitted to rounding error.
+# The tolerance `atol`, in the unit of the cost, ends the fit once the levels are fitted to rounding error.
 _SOLVER = Descent(rtol=1e-10, atol=1e-20, damping=1e-2, history=1)
 
 
 class DecayProblem(NamedTuple):
-    """Least-squares problem of a calibration.
+    """Least-squares problem of the calibration of M microphones from T taps.
 
-    **Fields**: `level`: levels y (M, T); `offset`: vectors (M, T, d) from the taps to the given positions of the
-    microphones in metres; `weight`: weights (M, T) of the levels, 0 for unused ones; `floor`: noise floors N (M,);
-    `decay`: class of the decay model; `spread`: standard deviation (P,) of each value over the microphones, infinite
-    for no penalty; `place_error`: unit of the displacements in metres.
+    **Fields**: `level`: levels y (M, T), logarithms of received power; `offset`: vectors (M, T, d) from the taps to the
+    given positions of the microphones in metres; `weight`: weights (M, T) of the levels, 0 for unused levels; `floor`:
+    noise floors N (M,); `decay`: class of the decay model; `spread`: standard deviation (P,) of each value over the
+    microphones in the penalty, infinite for no penalty; `place_error`: unit of the displacements in metres.
 
-    The values (P, M) of the microphones are the logarithms of the K parameters of their decay models and, for P = K +
-    d, the coordinates of their displacements divided by `place_error`.
+    The values (P, M) of the microphones are the logarithms of the K parameters of each decay model and, for P = K + d,
+    the d coordinates of each microphone's displacement divided by `place_error`.
     """
 
     level: Float[np.ndarray, "M T"]
@@ -56,7 +56,7 @@ class DecayProblem(NamedTuple):
         return self.place_error * scaled_displacement if scaled_displacement.size else np.zeros(self.offset.shape[::2])
 
     def log_response(self, values: Any) -> Float[np.ndarray, "M T"]:
-        """Logarithm of the responses f (M, T) of the models that have the given `values` (P, M)."""
+        """Logarithm of the responses f (M, T) to the taps for the decay models with the given `values` (P, M)."""
         squared = ((self.offset + self.displacement(values)[:, None]) ** 2).sum(axis=-1)
         decay = self.decay.from_logarithms(values[: len(self.decay.parameters)])
         return np.asarray(decay.log_response(host.asarray(squared)))
@@ -64,14 +64,16 @@ class DecayProblem(NamedTuple):
     def expected(
         self, values: Float[np.ndarray, "P M"], strength: Float[np.ndarray, " T"]
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"]]:
-        """Expected levels m = log(e^s f + N) (M, T), and their derivatives with respect to s, which equal those with
-        respect to log f. `strength` (T,): logarithms s of the strengths."""
+        """Expected levels m = log(e^s f + N) (M, T), where f is the response and N the noise floor, and the derivatives
+        of m with respect to s, which equal those with respect to log f. `strength` (T,): logarithms s of the taps'
+        strengths."""
         return self.levels(strength + self.log_response(values))
 
     def levels(
         self, log_received: Float[np.ndarray, "M T"]
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"]]:
-        """Levels log(S + N) from the logarithm of the received power S, and their derivatives with respect to log S."""
+        """Levels log(S + N) for the received power S and the noise floor N, and their derivatives with respect to log
+        S; `log_received` is log S."""
         received = np.exp(log_received)
         total = received + self.floor[:, None]
         return np.log(total), received / total
@@ -79,14 +81,14 @@ class DecayProblem(NamedTuple):
     def expand(
         self, values: Float[np.ndarray, "P M"], strength: Float[np.ndarray, " T"]
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"], Float[np.ndarray, "P M T"]]:
-        """Residuals y − m, the derivatives of m with respect to s, and those with respect to the values. Residuals with
-        weight 0 are 0."""
+        """Residuals y − m of the levels y, the derivatives of the expected levels m with respect to the logarithmic
+        strengths s, and the derivatives with respect to the values. Residuals with weight 0 are 0."""
         log_response, derivatives = slopes(self.log_response, values)
         mean, signal_share = self.levels(strength + log_response)
         return self.residual(mean), signal_share, signal_share * np.stack(derivatives)
 
     def residual(self, mean: Float[np.ndarray, "M T"]) -> Float[np.ndarray, "M T"]:
-        """Residuals y − m for the expected levels `mean`; 0 where the weight is 0."""
+        """Residuals y − m of the levels for the expected levels m = `mean`; 0 where the weight is 0."""
         return np.where(self.weight > 0, self.level - mean, 0.0)
 
 
@@ -122,8 +124,8 @@ def fit_together(
     strength: Float[np.ndarray, " T"],
     free: Bool[np.ndarray, "P M"],
 ) -> tuple[Float[np.ndarray, "P M"], Float[np.ndarray, " T"]]:
-    """Fit the values in the mask `free` and the strengths of all taps jointly. Returns the values and the logarithms of
-    the strengths."""
+    """Fit the microphones' values in the mask `free` and the strengths of all taps jointly. Returns the values and the
+    logarithms of the strengths."""
 
     def unpack_unknowns(unknowns):
         return unknowns[: start.size].reshape(start.shape), unknowns[start.size :]
@@ -155,10 +157,11 @@ def fit_within(
     received: Bool[np.ndarray, " M"],
     bounds: tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]],
 ) -> tuple[Float[np.ndarray, "P M"], Float[np.ndarray, " T"], Bool[np.ndarray, "P M"]]:
-    """Fit values and strengths as `fit_together` does, with `bounds` on the values.
+    """Fit the microphones' values and the taps' strengths as `fit_together` does, with `bounds` on the values.
 
     `received`: mask of the microphones with usable readings, whose parameters are fitted. Also returns the mask of the
-    parameters that are fixed at a bound. A fixed parameter is released if the cost decreases towards the interior.
+    parameters that are fixed at a bound. A fixed parameter is released if the cost decreases from the bound towards the
+    interior.
     """
     lower, upper = (bound[:, None] for bound in bounds)
     is_fixed = ((start <= lower) | (start >= upper)) & received
@@ -179,11 +182,11 @@ def fit_within(
 def log_covariance(
     problem: DecayProblem, values: Float[np.ndarray, "P M"], strength: Float[np.ndarray, " T"], free, scale
 ) -> np.ndarray:
-    """Covariance (P M, P M) of the values, ordered by parameter and then by microphone.
+    """Covariance (P M, P M) of the fitted values, ordered by parameter and then by microphone.
 
-    The weights of the problem must be inverse variances. The undetermined common factor of gains and strengths is fixed
-    by the condition `scale` · values = constant, with `scale` (P M,). Entries of values that are not `free` (P, M) are
-    NaN.
+    The weights of the `problem` must be inverse variances. The undetermined common factor of gains and strengths is
+    fixed by the condition `scale` · values = constant, with `scale` (P M,). Entries of values that are not `free` (P,
+    M) are NaN.
     """
     schur = _schur_complement(_normal_equations(problem, values, strength, free)[1], 0.0)
     num_parameters, num_microphones = values.shape
@@ -193,8 +196,8 @@ def log_covariance(
     ]
     constraint = np.asarray(scale)[is_free]
     result = np.full((num_parameters * num_microphones, num_parameters * num_microphones), np.nan)
-    # The data do not determine the direction in which all gains increase and all strengths decrease. It is projected
-    # out according to the condition.
+    # The data do not determine the direction in which all gains increase and all strengths decrease. This direction is
+    # projected out according to the condition on `scale`.
     inverse = np.linalg.pinv(schur[np.ix_(is_free, is_free)], rcond=1e-12, hermitian=True)
     projector = np.eye(len(null_direction)) - np.outer(null_direction, constraint) / (constraint @ null_direction)
     result[np.ix_(is_free, is_free)] = projector @ inverse @ projector.T
@@ -202,7 +205,8 @@ def log_covariance(
 
 
 class _NormalEquations(NamedTuple):
-    """Normal equations of the least-squares problem.
+    """Normal equations of the least-squares problem of a calibration, for microphones with values (P, M) and taps with
+    strengths (T,).
 
     **Fields**: `matrix`: block (M, P, P) of each microphone; `penalty`: matrices (P, M, M) of the penalty, which couple
     the microphones; `coupling`: block (P, M, T) between values and strengths; `tap_matrix`: diagonal (T,) of the
@@ -252,7 +256,7 @@ def _solve_step(system: _NormalEquations, damping):
     diagonal = _tap_diagonal(system, damping)
     schur = _schur_complement(system, damping)
     # The step has no component along the undetermined direction, in which all gains increase and all strengths
-    # decrease, nor along parameters that are not free.
+    # decrease, nor along fixed parameters.
     null_direction = np.concatenate(
         [np.where(system.free[0], 1.0, 0.0), np.zeros((num_parameters - 1) * num_microphones)]
     )

@@ -1,12 +1,12 @@
 """Robust fit of the decay models of all microphones, the strengths of all taps, and the noise of each microphone.
 
-Arrays are (M, T) for M microphones and T taps. The fitted data are levels, log(power + floor).
+Arrays are (M, T) for M microphones and T taps. The fitted data are levels, log(power + noise floor).
 
 The fit is an iteratively reweighted least-squares fit. First, all microphones share the shape of the response, that is,
-all parameters of the decay model except the gain; almost any set of taps determines it. Then each microphone has its
-own shape, with the variation of the shapes over the array as the prior, and its own displacement from its given
-position. Between fits, the noise and the weights are re-estimated from the residuals, until convergence. Each step
-takes a `TapFit` and returns a new one.
+all parameters of the decay model except the gain; almost any set of taps determines the shared shape. Then each
+microphone has its own shape, with the variation of the shapes over the array as the prior, and its own displacement
+from its given position. Between fits, the noise and the weights are re-estimated from the residuals, until convergence.
+Each step takes a `TapFit` and returns a new `TapFit`.
 
 The noise of a microphone consists of a relative error and an additive deviation; see `jeit.acoustic.noise`.
 """
@@ -26,7 +26,7 @@ from jeit.acoustic.noise import MIN_RELATIVE_ERROR, IntensityNoise, noise_from_n
 from jeit_solvers.engines import host, on_host, slopes
 from jeit_solvers.module import Module
 
-# Residuals larger than this number of standard deviations are excluded from the noise estimate.
+# Residuals of levels larger than this number of standard deviations are excluded from the noise estimate.
 _OUTLIER_DEVIATIONS = 4.0
 # Weight of the median over all microphones in the noise estimate of one microphone, as a number of taps.
 _MEDIAN_WEIGHT = 20.0
@@ -41,12 +41,12 @@ def relative_errors(
     use: Bool[np.ndarray, "M T"],
     inflation: float,
 ) -> Float[np.ndarray, " M"]:
-    """Estimate the relative error τ of each microphone from the mean square of its residuals in excess of the variance
-    of additive noise. Outliers are excluded.
+    """Estimate the relative error τ of each microphone from the mean square of its level residuals in excess of the
+    variance of additive noise. Outliers are excluded.
 
     `received`: expected power. `use`: mask of the residuals to use. `inflation`: factor on squared residuals that
     corrects for the number of fitted parameters. Each estimate is shrunk towards the median over all microphones, which
-    has the weight of 20 taps, since the excess may be zero or negative if there are few taps.
+    has the weight of 20 taps, since the excess variance may be zero or negative if there are few taps.
     """
     floor, deviation, cross = (np.asarray(x) for x in (noise.floor, noise.deviation, noise.cross))
     num_inliers, excess = np.zeros(len(received)), np.zeros(len(received))
@@ -77,12 +77,12 @@ def additive_deviations(
     power: Float[np.ndarray, "M T"], received: Float[np.ndarray, "M T"], use: Bool[np.ndarray, "M T"], inflation: float
 ) -> Float[np.ndarray, " M"]:
     """Estimate the additive deviation s of each microphone, the standard deviation of its intensity without a source,
-    if only intensities are known.
+    if the noise was not measured.
 
     The relative error and the additive deviation are estimated together by maximum likelihood, on a grid and then on a
-    finer grid near the maximum. The deviation is 0 unless the likelihood is clearly higher than without it. The
-    estimate is at least half the median over all microphones, since few taps determine the noise poorly, and
-    underestimated noise causes false detections.
+    finer grid near the maximum. The additive deviation is 0 unless the likelihood is clearly higher than without
+    additive noise. The estimate is at least half the median over all microphones, since few taps determine the noise
+    poorly, and underestimated noise causes false detections.
     """
     deviation = np.zeros(len(received))
     trial_shares = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 18)])
@@ -116,32 +116,35 @@ def additive_deviations(
 _MAX_SHARED_ITERATIONS, _MAX_INDIVIDUAL_ITERATIONS = 6, 12
 # Degrees of freedom of Student's t distribution, from which the weights of the residuals are derived.
 _T_FREEDOM = 5.0
-# Ratio of the mean square residual of a tap to the median over all taps above which the tap is excluded.
+# Ratio of the mean square residual of a tap to the median over all taps, above which the tap is excluded as an outlier.
 _OUTLIER_RATIO = 12.0
 # Standard deviation of the logarithms of the shape parameters over the array: in the fit with a shared shape; initially
-# in the fit with individual shapes; its minimum; its maximum.
+# in the fit with individual shapes; minimum; maximum.
 _SHARED_SPREAD, _INITIAL_SPREAD, _MIN_SPREAD, _MAX_SPREAD = 0.03, 0.5, 0.1, 1.0
 # Maximum displacement of a microphone along each coordinate, in units of `place_error`.
 _MAX_DISPLACEMENT = 4.0
-# Relative standard error of the shape at or above which a microphone's own taps are considered not to determine it.
+# Relative standard error of the shape at or above which a microphone's own taps are considered not to determine the
+# shape.
 _UNDETERMINED_ERROR = 0.5
 
 
 class TapFit(Module):
-    """State of the fit of M microphones to T taps.
+    """State of the robust fit of M microphones to T taps.
 
     - `kind`: class of the decay model.
     - `offset`: (M, T, d) vectors from the taps to the given positions of the microphones in metres.
-    - `place_error`: standard deviation of each coordinate of the given positions in metres; 0 if they are exact.
-    - `power`: (M, T) intensities minus the floor; NaN where not usable.
-    - `noise`: noise of the microphones. `known_noise`: whether its floor was measured.
-    - `values`: (P, M) logarithms of the K parameters of the decay models, and the coordinates of the displacements of
-      the microphones from their given positions, divided by `place_error`, if it is not 0: P is K + d or K.
+    - `place_error`: standard deviation of each coordinate of the given positions in metres; 0 if the positions are
+      exact.
+    - `power`: (M, T) intensities of the taps minus the noise floor; NaN where not usable.
+    - `noise`: noise of the microphones. `known_noise`: whether the noise floor was measured.
+    - `values`: (P, M) logarithms of the K parameters of the decay models and, if `place_error` is not 0, the d
+      coordinates of the microphones' displacements divided by `place_error`: P is K or K + d.
     - `at_bound`: (P, M) mask of the parameters that are fixed at a bound.
-    - `spread`: (P,) standard deviation of each logarithm over the array, and of the displacements, used as the prior.
+    - `spread`: (P,) standard deviation of each of the values over the array, used as the prior.
     - `strength`: (T,) logarithms of the strengths of the taps.
     - `weight`: (M, T) inverse variances of the levels, reduced for large residuals.
-    - `outlier`: (T,) mask of the excluded taps. `dropped`: (M,) mask of the excluded microphones.
+    - `outlier`: (T,) mask of the taps excluded from the fit. `dropped`: (M,) mask of the microphones excluded from the
+      fit.
     - `bounds`: lower and upper bounds (P,) of the values.
     """
 
@@ -162,7 +165,7 @@ class TapFit(Module):
 
     @property
     def logarithms(self) -> Float[np.ndarray, "K M"]:
-        """Logarithms of the parameters of the decay models."""
+        """Logarithms (K, M) of the K parameters of the decay models."""
         return self.values[: len(self.kind.parameters)]
 
     @property
@@ -172,7 +175,8 @@ class TapFit(Module):
 
     @property
     def usable(self) -> Bool[np.ndarray, "M T"]:
-        """Mask of the readings with a finite level, of microphones that are not excluded."""
+        """Mask of the readings (intensities of taps at microphones) with a finite level, of microphones that are not
+        excluded."""
         is_positive = np.nan_to_num(self.power, nan=-np.inf) + self.noise.floor[:, None] > 0
         return is_positive & ~self.dropped[:, None]
 
@@ -188,17 +192,17 @@ class TapFit(Module):
 
     @property
     def free(self) -> Bool[np.ndarray, "P M"]:
-        """Mask of the parameters that are fitted to data: those of microphones with usable readings that are not fixed
-        at a bound."""
+        """Mask of the parameters that are fitted to data: parameters of microphones with usable readings that are not
+        fixed at a bound."""
         return ~self.at_bound & self.usable.any(axis=1)
 
     @property
     def shared(self) -> Bool[np.ndarray, " M"]:
         """Mask of the microphones whose own taps do not determine the decay of the response with distance. The prior
-        from the other microphones then determines it.
+        from the other microphones then determines the decay.
 
-        If no tap was near a microphone, the data give only an upper bound of b. Without the prior, b could be very
-        small, and estimated positions would be drawn to that microphone.
+        If no tap was near a microphone, the data give only an upper bound of the parameter b of the decay model.
+        Without the prior, b could be very small, and estimated positions would be drawn to that microphone.
         """
         spread_without_prior = np.where(np.arange(len(self.spread)) == 1, np.inf, self.spread)
         own_errors = standard_errors(replace(self, spread=spread_without_prior))[1]
@@ -206,17 +210,18 @@ class TapFit(Module):
 
     @property
     def level(self) -> Float[np.ndarray, "M T"]:
-        """Levels y = log(power + floor), with an arbitrary value where not usable."""
+        """Levels y = log(power + floor) of the readings, with an arbitrary value where a reading is not usable."""
         return np.asarray(self.noise.level(host.where(self.usable, self.power, 1.0)))
 
     def problem(self, *, with_outliers: bool = False) -> DecayProblem:
-        """Create the least-squares problem with the current weights, optionally including the excluded taps."""
+        """Create the least-squares problem of the fit with the current weights, optionally including the excluded
+        taps."""
         weight = np.where(self.usable if with_outliers else self.use, self.weight, 0.0)
         floor = np.asarray(self.noise.floor)
         return DecayProblem(self.level, self.offset, weight, floor, self.kind, self.spread, self.place_error)
 
     def expected(self) -> Float[np.ndarray, "M T"]:
-        """Levels predicted by the fitted models."""
+        """Levels (M, T) predicted by the fitted decay models."""
         return self.problem().expected(self.values, self.strength)[0]
 
 
@@ -279,13 +284,13 @@ def fit_taps(
 
 
 def refit_without(fit: TapFit, excluded: Bool[np.ndarray, " M"]) -> TapFit:
-    """Repeat the fit without the microphones in the mask `excluded`."""
+    """Repeat the fit of the decay models without the microphones in the mask `excluded`."""
     return _alternate_fits(replace(fit, dropped=fit.dropped | excluded), _MAX_INDIVIDUAL_ITERATIONS, update_spread=True)
 
 
 def standard_errors(fit: TapFit) -> Float[np.ndarray, "P M"]:
-    """Standard deviations (P, M) of the values, for gains normalised as in a `Calibration`; NaN for values fixed at a
-    bound."""
+    """Standard deviations (P, M) of the fitted values, for gains normalised as in a `Calibration`; NaN for values fixed
+    at a bound."""
     free = fit.free
     if free[0].sum() < 2:
         return np.full(free.shape, np.nan)
@@ -316,24 +321,24 @@ def _alternate_fits(fit: TapFit, iterations: int, *, update_spread: bool = False
 
 
 def _prior_spread(shapes, displacements) -> Float[np.ndarray, " P"]:
-    """Spread (P,) of all values from that of the `shapes` and of the displacements (`displacements`); infinite for the
-    gain, which has no prior."""
+    """Combine the spread of the shape parameters (`shapes`) and of the displacements (`displacements`) to the spread
+    (P,) of all values, infinite for the gain, which has no prior."""
     return np.concatenate([[np.inf], shapes, displacements])
 
 
 def _update_spread(fit: TapFit) -> Float[np.ndarray, " P"]:
-    """Update the spread of the shape parameters over the array, and that of the displacements, by one step of
-    expectation maximisation, from the estimates and their standard errors."""
+    """Update the spread of the shape parameters and of the displacements over the array by one step of expectation
+    maximisation, from the estimates and their standard errors."""
     has_readings = fit.usable.any(axis=1)
     if has_readings.sum() < 2:
         return fit.spread
     num_parameters, errors = len(fit.kind.parameters), np.nan_to_num(standard_errors(fit)[:, has_readings])
     shapes, displacements = fit.logarithms[1:, has_readings], fit.values[num_parameters:, has_readings]
-    # Deviations are limited, so that an outlying microphone does not dominate.
+    # Deviations from the median are limited, so that an outlying microphone does not dominate.
     deviations = np.abs(shapes - np.median(shapes, axis=1, keepdims=True))
     limited_deviations = np.minimum(deviations, 3 * fit.spread[1:num_parameters, None])
     shape_variance = (limited_deviations**2 + errors[1:num_parameters] ** 2).sum(axis=1) / (has_readings.sum() - 1)
-    # The displacements have one spread, which is at most `place_error`.
+    # All coordinates of the displacements have one spread, which is at most `place_error`.
     displacement_variance = np.full(
         len(displacements), (displacements**2 + errors[num_parameters:] ** 2).mean() if displacements.size else 0.0
     )
@@ -343,10 +348,11 @@ def _update_spread(fit: TapFit) -> Float[np.ndarray, " P"]:
 
 
 def _update_noise_and_weights(fit: TapFit) -> TapFit:
-    """Re-estimate the noise, the outlying taps and the weights from the residuals."""
+    """Re-estimate the microphones' noise, the outlying taps and the weights from the residuals of the fit."""
     expected = fit.expected()
     received = np.maximum(np.exp(expected) - fit.noise.floor[:, None], 0.0)
-    # The residuals are smaller than the errors, since strengths and parameters were fitted; `inflation` corrects this.
+    # The residuals are smaller than the errors of the data, since strengths and parameters were fitted; `inflation`
+    # corrects this.
     num_readings = fit.use.sum()
     num_fitted = fit.received.sum() + fit.free.sum()
     inflation = num_readings / max(num_readings - num_fitted, 0.1 * num_readings)
@@ -375,7 +381,8 @@ def _update_noise_and_weights(fit: TapFit) -> TapFit:
 
 
 def _residual_for_equal_errors(fit: TapFit, received: np.ndarray) -> Float[np.ndarray, "M T"]:
-    """Residuals (M, T) of the levels if the strengths are estimated with the same relative error for all microphones.
+    """Residuals (M, T) of the levels if the taps' strengths are estimated with the same relative error for all
+    microphones.
 
     With individual relative errors, a single microphone could dominate the strengths: its residuals would become ever
     smaller, and its weight ever larger.

@@ -1,6 +1,6 @@
 """Selection of usable microphones, and cross-validation of decay models.
 
-Microphones that received too few taps, or whose levels disagree with their model, are left out of a calibration.
+Microphones that received too few taps, or whose levels disagree with their decay model, are left out of a calibration.
 
 Decay models are compared by their localisation errors for taps left out of the fit. The tapped positions are divided
 into four folds, and the taps of each fold are located with models fitted to the other folds. All taps at one position
@@ -29,19 +29,20 @@ from jeit.acoustic.surface import AbstractSurface, bounding_box, longer_side, to
 from jeit_solvers import inverse_small, minimise_small
 from jeit_solvers.engines import as_array, at_once, host, namespace, on_device
 
-# Minimum fraction of the variance of a microphone's levels that its model must explain.
+# Minimum fraction of the variance of a microphone's levels that its decay model must explain.
 _MIN_EXPLAINED = 0.3
-# Maximum ratio of a microphone's relative error to the median over all microphones, and lower bound of that median.
+# Maximum ratio of a microphone's relative error to the median error over all microphones, and lower bound of this
+# median.
 _MAX_ERROR_RATIO, _MIN_MEDIAN_ERROR = 2.5, 0.1
-# Minimum decrease of the logarithm of a response from the nearest to the farthest tap.
+# Minimum decrease of the logarithm of a microphone's response from the nearest to the farthest tap.
 _MIN_DECREASE = 0.1
 
 
 def check_received(
     decay_class: type[AbstractDecay], distance: Float[np.ndarray, "M T"], power: Float[np.ndarray, "M T"], faults
 ) -> tuple[Bool[np.ndarray, " M"], str]:
-    """Return the mask of the microphones that received taps from enough different distances, and the reason why no
-    model can be fitted if fewer than three did, otherwise ""."""
+    """Return the mask of the microphones that received taps from enough different distances, and a reason: "", or why
+    no decay model can be fitted if there are fewer than three such microphones."""
     min_distances = len(decay_class.parameters) + 2
     resolution = 1e-4 * distance.max()
     is_received = np.isfinite(power)
@@ -64,14 +65,15 @@ def check_received(
 def exclude_unusable(
     fit: TapFit, faults
 ) -> tuple[TapFit, Bool[np.ndarray, " M"], tuple[str, ...], Float[np.ndarray, " M"]]:
-    """Repeat the fit without the unusable microphones.
+    """Repeat the fit of the decay models without the unusable microphones.
 
     Returns the new fit, the mask of the usable microphones, the reasons why microphones are unusable ("" for usable
-    ones), and the fraction of variance that each model explains.
+    microphones), and the fraction of the variance of each microphone's levels that its model explains.
     """
     reasons, explained = _reasons_and_explained(fit, faults)
     is_unusable = np.array([bool(reason) for reason in reasons])
-    # The disagreement of some microphones may become apparent only after others are excluded.
+    # The disagreement of some microphones with their models may become apparent only after other microphones are
+    # excluded.
     while is_unusable.any() and (~fit.dropped & ~is_unusable).sum() >= 3:
         fit = refit_without(fit, is_unusable)
         new_reasons, explained = _reasons_and_explained(fit, ("",) * len(is_unusable), explained)
@@ -85,7 +87,7 @@ def exclude_unusable(
 
 def _reasons_and_explained(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[np.ndarray, " M"]]:
     """Return the reason why each microphone is unusable ("" if usable), and the fraction of the variance of its levels
-    that its model explains. For excluded microphones this fraction is taken from `explained`."""
+    that its decay model explains. For excluded microphones this fraction is taken from `explained`."""
     expected, level, use = fit.expected(), fit.level, fit.use
     decreases = _response_decrease(fit)
     min_readings = len(fit.kind.parameters) + 2
@@ -118,7 +120,7 @@ def _reasons_and_explained(fit: TapFit, faults, explained=None) -> tuple[tuple[s
 
 
 def _response_decrease(fit: TapFit) -> Float[np.ndarray, " M"]:
-    """Decrease of the logarithm of each microphone's response from the nearest tap to the farthest."""
+    """Decrease (M,) of the logarithm of each microphone's response from the nearest tap to the farthest."""
     response, use = fit.problem().log_response(fit.values), fit.use
     max_response, min_response = (
         reduction(response, axis=1, where=use, initial=initial_value)
@@ -129,21 +131,22 @@ def _response_decrease(fit: TapFit) -> Float[np.ndarray, " M"]:
 
 # Number of folds in the cross-validation.
 _NUM_FOLDS = 4
-# Minimum relative error assumed when a raster is screened; maximum number of steps of a minimisation.
+# Minimum relative error of decay models assumed when a raster of positions is screened; maximum number of steps of a
+# minimisation.
 _SCREENING_ERROR, _MAX_STEPS = 0.2, 30
 # Minimum number of located taps for an estimate of `widening`; fraction of the taps that the error ellipses must
-# contain; quantile of χ² with two degrees of freedom for that fraction.
+# contain; quantile of χ² with two degrees of freedom for this fraction.
 _MIN_LOCATED, _CONTAINED_SHARE = 10, 0.9
 _CHI_SQUARE = -2 * math.log(1 - _CONTAINED_SHARE)
 
 
 class LeftOutTaps(NamedTuple):
-    """Localisation errors of T left-out taps.
+    """Localisation errors of T taps that were left out of the fit.
 
-    **Fields**: `errors`: distance (T,) of each estimate from the given position in metres; `squared_mahalanobis`:
-    squared Mahalanobis distance (T,), the squared error in units of the covariance; `mean_guess_error`: median distance
-    in metres of the given positions from their mean. The first two are NaN for outliers and for taps that could not be
-    located.
+    **Fields**: `errors`: distance (T,) of each estimated position from the given position in metres;
+    `squared_mahalanobis`: squared Mahalanobis distance (T,), the squared error in units of the covariance;
+    `mean_guess_error`: median distance in metres of the given positions from their mean. `errors` and
+    `squared_mahalanobis` are NaN for outliers and for taps that could not be located.
     """
 
     errors: Float[np.ndarray, " T"]
@@ -152,14 +155,14 @@ class LeftOutTaps(NamedTuple):
 
     @property
     def median(self) -> float:
-        """Median localisation error in metres; infinite if no tap was located."""
+        """Median localisation error of the left-out taps in metres; infinite if no tap was located."""
         finite_errors = self.errors[np.isfinite(self.errors)]
         return float(np.median(finite_errors)) if finite_errors.size else np.inf
 
     @property
     def widening(self) -> float:
-        """Factor on covariances for which the 90 % error ellipses contain 90 % of the taps. It is at least 1, since the
-        errors of the models may be larger at other positions."""
+        """Factor on covariances for which the 90 % error ellipses contain 90 % of the left-out taps. The factor is at
+        least 1, since the errors of the decay models may be larger at other positions."""
         finite_distances = self.squared_mahalanobis[np.isfinite(self.squared_mahalanobis)]
         if finite_distances.size < _MIN_LOCATED:
             return 1.0
@@ -167,7 +170,7 @@ class LeftOutTaps(NamedTuple):
 
     @property
     def is_better_than_mean(self) -> bool:
-        """Whether the median error is less than half of the error of always guessing the mean position."""
+        """Whether the median localisation error is less than half of the error of always guessing the mean position."""
         return self.median < 0.5 * self.mean_guess_error
 
 
@@ -215,8 +218,9 @@ def _microphone_array(fit: TapFit, values, microphones, surface: AbstractSurface
 
 
 def _locate_most_likely(array: MicrophoneArray, raster: Pixels, power, use):
-    """Positions (F, d) and covariances (F, d, d) by Fisher scoring from the best two valleys of a raster, within the
-    bounding box of the outline. For a rectangular outline, the result is that of a `Localiser` up to rounding."""
+    """Locate the sources of F frames by Fisher scoring from the best two valleys of a raster, within the bounding box
+    of the outline. Returns positions (F, d) and covariances (F, d, d), for a rectangular outline those of a `Localiser`
+    up to rounding."""
     xp = namespace(array, power)
     screening_array = eqx.tree_at(
         lambda tree: tree.noise.relative, array, xp.maximum(array.noise.relative, _SCREENING_ERROR)
@@ -244,7 +248,8 @@ def _locate_most_likely(array: MicrophoneArray, raster: Pixels, power, use):
 
 
 def _assign_folds(tap_positions: Float[np.ndarray, "T d"]) -> Int[np.ndarray, " T"]:
-    """Index of the fold of each tap. Distinct positions are assigned to the folds in turn, in a fixed random order."""
+    """Index (T,) of the fold of each tap in the cross-validation. Distinct positions are assigned to the folds in turn,
+    in a fixed random order."""
     resolution = 1e-4 * max(float(np.ptp(tap_positions, axis=0).max()), 1e-300)
     _, position_indices = np.unique(np.round(tap_positions / resolution), axis=0, return_inverse=True)
     order = np.random.default_rng(0).permutation(position_indices.max() + 1)

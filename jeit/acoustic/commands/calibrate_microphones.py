@@ -31,7 +31,7 @@ Hop = Annotated[
 
 
 def intensity_settings(low: float | None, high: float | None, window: float | None, hop: float | None):
-    """Create `IntensitySettings` from the options that were given; None if all of them are None."""
+    """Create `IntensitySettings` from the command-line options that were given; None if all options are None."""
     options = {"low": low, "high": high, "window": window, "hop": hop}
     options = {name: value for name, value in options.items() if value is not None}
     if not options:
@@ -79,7 +79,8 @@ def calibrate_microphones(
     hop: Hop = None,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate an array of microphones from taps at known places; writes the calibration and a picture of it."""
+    """Calibrate an array of microphones from taps at known places; writes the calibration and a picture of the
+    calibration."""
     from jeit.acoustic import calibrate_microphones as calibrate
     from jeit.acoustic import read_taps
     from jeit.acoustic.calibration.calibrate import AUTO
@@ -143,8 +144,8 @@ def _print_summary(console, fit: "CalibrationFit", taps: "Taps") -> None:
 
 
 def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:
-    """Cramér-Rao bound for sources with the positions and strengths of the taps: median over the taps of the standard
-    deviation along the major axis of the error ellipse, metres."""
+    """Cramér-Rao bound of the localisation of sources with the positions and strengths of the taps: median over the
+    taps of the standard deviation along the major axis of the error ellipse, metres."""
     import numpy as np
 
     from jeit.acoustic import cramer_rao

@@ -137,7 +137,7 @@ def _print_summary(console, located: "LocatedTouches") -> None:
 
 
 def _table_rows(located: "LocatedTouches") -> Iterator[tuple[str, ...]]:
-    """Yield a row of the printed table for each touch, and for the second of two simultaneous touches."""
+    """Yield a row of the printed table for each touch, and another row for the second of two simultaneous touches."""
     import numpy as np
 
     from jeit.acoustic.localisation.locations import LocationStatus
@@ -157,7 +157,8 @@ def _table_rows(located: "LocatedTouches") -> Iterator[tuple[str, ...]]:
         yield str(number), *time_cells, *position_cells, f"{error:.1f}", f"{1e3 * touch.length:.0f}", counts
         two_touch_frames = touch.first + np.flatnonzero(locations.status[frames] == LocationStatus.TWO_TOUCHES)
         if two_touch_frames.size:
-            # The stronger touch may change from frame to frame. The other touch is the one farther from the track.
+            # Which of two touches is the stronger may change from frame to frame. The second touch is the touch farther
+            # from the track.
             pair_positions = np.stack([locations.position[two_touch_frames], locations.second[two_touch_frames]])
             distances = np.linalg.norm(pair_positions - track.position[two_touch_frames], axis=-1)
             other_position = 1e3 * pair_positions[distances.argmax(axis=0), np.arange(two_touch_frames.size), :2].mean(

@@ -1,1 +1,1 @@
-"""Localisation of sources from intensities: objectives, their minimisation, maps, and the Cramér-Rao bound."""
+"""Localisation of sound sources from intensities: objectives, their minimisation, maps, and the Cramér-Rao bound."""

@@ -1,4 +1,4 @@
-"""Intensities of a recording, computed with the band and windows of the calibration."""
+"""Intensities of a recording, computed with the frequency band and windows of the calibration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jeit.acoustic.signal.intensity import IntensitySettings, check_settings, in
 from jeit.acoustic.signal.recording import Intensities, Recording
 from jeit.arguments import check_kind
 
-# Ratio of two noise floors above which they are considered different.
+# Ratio of two noise floors above which the floors are considered different.
 _MAX_FLOOR_RATIO = 4.0
 
 
@@ -25,10 +25,11 @@ def calibrated_intensities(
 ) -> Intensities:
     """Compute the intensities of a recording. A recording of intensities is returned unchanged.
 
-    `intensity`: band and windows; by default those of the calibration. `silence`: recording of the untouched array at
-    the same gain, from which the noise floor is estimated. It is required if touches never pause; by default the floor
-    is estimated from the quietest windows of the recording. Raises `ValueError` for another number of microphones, for
-    a `silence` that is louder than the quietest windows of the recording, and for arguments of the wrong type.
+    `intensity`: frequency band and windows, by default as in the calibration. `silence`: recording of the untouched
+    array at the same gain, from which the noise floor is estimated. A silence is required if touches never pause; by
+    default the floor is estimated from the quietest windows of the recording. Raises `ValueError` for another number of
+    microphones than in the calibration, for a `silence` that is louder than the quietest windows of the recording, and
+    for arguments of the wrong type.
     """
     recordings = {"recording": recording} if silence is None else {"recording": recording, "silence": silence}
     for name, value in recordings.items():
@@ -53,7 +54,7 @@ def calibrated_intensities(
     recorded_intensities = intensities(recording, settings)
     if silence is not None:
         return _replace_floor(recorded_intensities, intensities(silence, settings))
-    # Noise floors can be compared only if band and windows are those of the calibration.
+    # Noise floors can be compared only if frequency band and windows are those of the calibration.
     if settings != calibration.intensity:
         if calibration.intensity is None:
             return recorded_intensities
@@ -75,8 +76,8 @@ def calibrated_intensities(
 
 
 def _replace_floor(recorded_intensities: Intensities, silence: Intensities) -> Intensities:
-    """Replace the noise floor of a recording by that of `silence`. Microphones that are unusable in the silence become
-    unusable."""
+    """Replace the noise floor of a recording by the noise floor of `silence`. Microphones that are unusable in the
+    silence become unusable in the recording."""
     is_usable = np.asarray(silence.usable.any(axis=0))
     has_floors = (silence.floor > 0) & (recorded_intensities.floor > 0)
     ratio = (

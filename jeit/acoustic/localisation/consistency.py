@@ -1,17 +1,19 @@
-"""Intensity-consistency loss, and minimisation of objectives on a skin.
+"""Intensity-consistency loss, and minimisation of localisation objectives on a skin.
 
-Each microphone gives an estimate of the strength of a source at u: its intensity I_i multiplied by g_i(u) = 1 / f_i(u).
-At the true position, the estimates of all microphones are equal. The loss of Park 2022, text S2, is
+Each microphone i gives an estimate of the strength of a source at position u: its intensity I_i multiplied by g_i(u) =
+1 / f_i(u), where f_i is its response. At the true position, the estimates of all microphones are equal. The loss of
+Park 2022, text S2, is
 
     L(u) = Σ_{i≠k} (I_k g_k(u) − I_i g_i(u))²,
 
 where k is the microphone with the highest intensity. The loss does not take noise into account: since g_i increases
-with distance, it amplifies the noise of distant microphones. Microphones are the first axis of all arrays, and frames
-the last. Intensities are divided by the highest intensity of the frame.
+with distance, the loss amplifies the noise of distant microphones. Microphones are the first axis of all arrays, and
+frames the last. Intensities are divided by the highest intensity of the frame.
 
 The functions for minimisation find the minimum of an objective from given starting positions, and the derivatives of
 the minimum. An objective, `Likelihood` or `Consistency`, has the attributes `microphone_array`, `frames` (the arrays
-that differ between frames), `cost`, `expand`, `start`, and, for candidate positions, `features` and `screen`.
+that differ between frames), `cost`, `expand` and `start`, and the attributes `features` and `screen` for candidate
+positions.
 """
 
 from __future__ import annotations
@@ -38,11 +40,11 @@ from jeit_solvers.module import Module
 
 
 class Consistency(Module):
-    """Consistency loss of F frames.
+    """Intensity-consistency loss L of F frames, for the positions of one source per frame.
 
     **Fields**: `power`: intensities (M, F) divided by the highest intensity of the frame; `loudest`: index (F,) of the
-    microphone with the highest intensity; `scale`: that intensity (F,); `use`: mask (M, F) of the intensities used;
-    `microphone_array`: model of the array.
+    microphone with the highest intensity; `scale`: highest intensity (F,); `use`: mask (M, F) of the intensities used;
+    `microphone_array`: model of the microphone array.
     """
 
     power: Float[Array, "M F"]
@@ -55,7 +57,7 @@ class Consistency(Module):
     def create(
         cls, power: Float[Array, "M F"], use: Bool[Array, "M F"], microphone_array: MicrophoneArray
     ) -> "Consistency":
-        """Create the loss from intensities `power`. Values outside the mask `use` are ignored and may be NaN."""
+        """Create the loss from intensities `power`. Intensities outside the mask `use` are ignored and may be NaN."""
         xp = namespace(power, use)
         used_power = xp.where(use, power, 0.0)
         scale = xp.max(used_power, axis=0)
@@ -64,22 +66,23 @@ class Consistency(Module):
 
     @property
     def frames(self) -> tuple[Array, ...]:
-        """Fields whose last axis is the frame."""
+        """Fields of the loss whose last axis is the frame."""
         return self.power, self.loudest, self.scale, self.use
 
     def differences(self, chart: Float[Array, "2 F"]) -> Float[Array, "M F"]:
-        """Differences I_k g_k − I_i g_i of the estimated strengths; 0 where not used."""
+        """Differences I_k g_k − I_i g_i between the strengths that the loudest microphone k and microphone i indicate;
+        0 where intensities are not used."""
         estimates = self.power / self.microphone_array.response(chart)
         xp = namespace(self, estimates)
         loudest_estimate = xp.take_along_axis(estimates, self.loudest[None], axis=0)
         return xp.where(self.use, loudest_estimate - estimates, 0.0)
 
     def cost(self, chart: Float[Array, "2 F"]) -> Float[Array, " F"]:
-        """Loss L divided by the square of the highest intensity."""
+        """Consistency loss L (F,) divided by the square of the highest intensity."""
         return (self.differences(chart) ** 2).sum(axis=0)
 
     def expand(self, chart: Float[Array, "2 F"]) -> tuple[Array, Array, Array]:
-        """Loss, its gradient (2, F), and its Gauss-Newton matrix (2, 2, F)."""
+        """Loss (F,), gradient of the loss (2, F) by the chart coordinates, and Gauss-Newton matrix (2, 2, F)."""
         differences, derivatives = kept(slopes(self.differences, chart))
         gradient = 2 * namespace(differences).stack(
             [(differences * derivative).sum(axis=0) for derivative in derivatives]
@@ -91,16 +94,16 @@ class Consistency(Module):
         return (differences**2).sum(axis=0), gradient, symmetric_small(rows)
 
     def start(self, chart: Float[Array, "2 F"]) -> Float[Array, "2 F"]:
-        """Initial unknowns of a minimisation: the chart coordinates."""
+        """Initial unknowns of a minimisation of the loss: the chart coordinates."""
         return chart
 
     @staticmethod
     def features(microphone_array: MicrophoneArray, chart: Float[Array, "2 P"]) -> Float[Array, "N P"]:
         """Features of candidate positions for `screen`.
 
-        For the inverse-square model, 1 / f = (|x − x_i|² + b) / a, they are the ten products of pairs of (|x|², x, y,
-        1), or the fifteen products of pairs of (|x|², x, y, z, 1) in space. For other models they are the responses f
-        (M, P).
+        For the inverse-square model, 1 / f = (|x − x_i|² + b) / a, the features are the ten products of pairs of (|x|²,
+        x, y, 1), or the fifteen products of pairs of (|x|², x, y, z, 1) in space. For other decay models, the features
+        are the responses f (M, P).
         """
         if not isinstance(microphone_array.decay, InverseSquare):
             return microphone_array.response(chart)
@@ -113,8 +116,8 @@ class Consistency(Module):
         """Loss (F, P) of all frames at candidate positions, computed by matrix products.
 
         With A = I_k g_k and n microphones in use, the loss is n A² − 2 A Σ I_i g_i + Σ I_i² g_i². For the
-        inverse-square model, g is quadratic in the position, so the loss is a polynomial of degree four; it is computed
-        as the product of its coefficients and the features.
+        inverse-square model, g is quadratic in the position, so the loss is a polynomial of degree four, which is
+        computed as the product of its coefficients and the features.
         """
         xp = namespace(self, features)
         num_used = xp.sum(self.use, axis=0)
@@ -143,10 +146,11 @@ class Consistency(Module):
         return xp.stack(coefficients, axis=1) @ features
 
     def covariance(self, chart: Float[Array, "2 F"], strength: Float[Array, " F"]) -> Float[Array, "2 2 F"]:
-        """Covariance of the minimum u, from the variances of the intensities: Σ_i (∂u/∂I_i)(∂u/∂I_i)ᵀ var I_i.
+        """Covariance (2, 2, F) of the position u of the minimum, from the variances of the intensities: Σ_i
+        (∂u/∂I_i)(∂u/∂I_i)ᵀ var I_i.
 
-        The implicit function theorem gives the derivative of the minimum, ∂u/∂I = −H⁻¹ ∂²L/∂u∂I. Second derivatives are
-        approximated for small differences I_k g_k − I_i g_i.
+        The implicit function theorem gives the derivative of u, ∂u/∂I = −H⁻¹ ∂²L/∂u∂I, where H is the Hessian of the
+        loss L. Second derivatives are approximated for small differences I_k g_k − I_i g_i.
         """
         estimates, derivatives = slopes(lambda u: 1 / self.microphone_array.response(u), chart)
         xp = namespace(self, estimates)
@@ -155,7 +159,7 @@ class Consistency(Module):
         difference_gradients = xp.where(self.use, loudest_gradient - gradients, 0.0)
         matrix = xp.einsum("kmf,lmf->klf", difference_gradients, difference_gradients)
         # Derivative of ½ ∂L/∂u with respect to I_i: −g_i times the gradient of the difference of microphone i. For the
-        # loudest microphone k it is g_k times the sum of these gradients over all microphones.
+        # loudest microphone k, the derivative is g_k times the sum of these gradients over all microphones.
         is_loudest = xp.arange(estimates.shape[0])[:, None] == self.loudest
         mixed_derivatives = xp.where(
             is_loudest,
@@ -171,24 +175,25 @@ class Consistency(Module):
         return xp.einsum("ijf,jkf,klf->ilf", inverse, gradient_covariance, inverse)
 
 
-# Number of candidate positions along the outline.
+# Number of candidate positions along the outline of the skin.
 _OUTLINE_CANDIDATES = 240
 # Distance, as a fraction of the skin's size, below which two minima are considered the same.
 _MIN_VALLEY_DISTANCE = 0.05
-# Number of steps in the second valley before its cost is compared with that of the first; maximum difference of cost
-# for which the minimisation continues; maximum number of steps of a minimisation.
+# Number of steps in the second valley before its cost is compared with that of the first valley; maximum difference of
+# cost for which the minimisation in the second valley continues; maximum number of steps of a minimisation.
 _TRIAL_STEPS, _MAX_EXCESS, _MAX_STEPS = 8, 8.0, 30
 # Tolerance of the minimisation: predicted decrease of the cost in the next step, relative to 1 + |cost|.
 _TOLERANCE = 1e-12
 
 
 def find_minima(objective, first, second, try_second):
-    """Minimise the objective from the starting positions `first` and `second` (2, F).
+    """Minimise the objective of each frame from two starting positions, `first` and `second` (2, F).
 
-    `try_second`: mask of the frames for which the second start is tried, or None for none; the second start is
+    `try_second`: mask of the frames for which the second start is tried, or None for no frame; a second start is
     abandoned if it is not promising. Returns the unknowns (n, F) at the minimum; the cost on the outline minus the cost
-    of the minimum beyond it; the difference of cost between the two minima; whether the minimisation converged; and the
-    start and end (2, 2, F) of the side of the outline to which the position was moved, NaN for positions inside.
+    of the minimum beyond the outline; the difference of cost between the two minima; whether the minimisation
+    converged; and the start and end (2, 2, F) of the side of the outline to which the position was moved, NaN for
+    positions inside.
     """
     surface = objective.microphone_array.surface
     first_minimum = _minimise_in_plane(objective, objective.start(first), None)
@@ -211,8 +216,8 @@ def find_minima(objective, first, second, try_second):
             is_distinct & try_second & is_inside & second_is_inside, xp.abs(second_value - value), xp.inf
         )
         lowest_value = xp.minimum(value, second_value)
-        # If one of the two minima is outside the outline, the other is selected. A position on the outline may still be
-        # better.
+        # If one of the two minima is outside the outline, the minimum inside is selected. A position on the outline may
+        # still have a lower cost.
         second_is_better = xp.where(
             second_is_inside == is_inside, second_value < value, second_is_inside & xp.isfinite(second_value)
         )
@@ -223,7 +228,7 @@ def find_minima(objective, first, second, try_second):
             xp.where(second_is_better, second_is_inside, is_inside),
         )
     # Minima outside the outline are replaced by the best position on the outline. A minimum inside is also compared
-    # with it, if the other minimum, outside, has a lower cost.
+    # with the best position on the outline, if the other minimum is outside and has a lower cost.
     try_outline = xp.isfinite(value) & (~is_inside | (lowest_value < value))
     no_side = xp.full((2, 2, value.size), xp.nan)
 
@@ -252,10 +257,10 @@ def find_minima(objective, first, second, try_second):
 
 def _minimise_in_plane(objective, start, skip, *, max_steps: int | None = None) -> Minimum:
     """Minimise the objective within the bounding box of the outline, extended by its longer side in all directions. A
-    step is at most a quarter of that side, and a factor of ten in strength.
+    step is at most a quarter of the longer side, and a factor of ten in strength.
 
     `max_steps`: maximum number of steps, all with the approximate Hessian. By default, the last steps use the exact
-    Hessian.
+    Hessian of the objective.
     """
     surface = objective.microphone_array.surface
     low, high = bounding_box(surface)
@@ -281,21 +286,23 @@ def _minimise_in_plane(objective, start, skip, *, max_steps: int | None = None) 
 
 
 def _expand_exactly(objective, x) -> tuple[Array, Array, Array]:
-    """Value, gradient and Hessian of the objective. The Hessian is exact where it is positive definite, so that few
-    steps are needed near a minimum even if its misfit is large; elsewhere it is approximate."""
+    """Value, gradient and Hessian of the objective at the unknowns `x`. The Hessian is exact where the exact Hessian is
+    positive definite, so that few steps are needed near a minimum even if the misfit is large; elsewhere the Hessian is
+    approximate."""
     value, gradient, model = objective.expand(x)
     hessian = hessian_small(objective.cost, x)
     return value, gradient, namespace(hessian).where(definite_small(hessian), hessian, model)
 
 
 def _minimise_on_outline(objective, skip) -> tuple[Minimum, Array]:
-    """Find the best position on the outline: the best of many candidates, refined along its side. Frames in the mask
-    `skip` (F,) are left out. Also returns the start and end of the side (2, 2, F).
+    """Find the best position on the outline: the best of many candidates, refined along its side of the outline. Frames
+    in the mask `skip` (F,) are left out. Also returns the start and end of the side (2, 2, F).
     """
     start, end = outline_sides(objective.microphone_array.surface)
     xp = namespace(objective, start)
     length = xp.linalg.norm(end - start, axis=0)
-    # Candidate positions are equally spaced along the outline, and given by a side and a fraction of its length.
+    # Candidate positions are equally spaced along the outline. Each is given by a side and a fraction of the side's
+    # length.
     arc_lengths = xp.concatenate([xp.zeros(1), xp.cumsum(length)])
     candidate_arc_lengths = arc_lengths[-1] * (xp.arange(_OUTLINE_CANDIDATES) + 0.5) / _OUTLINE_CANDIDATES
     side_indices = xp.clip(xp.searchsorted(arc_lengths, candidate_arc_lengths, side="right") - 1, 0, length.size - 1)
@@ -339,11 +346,11 @@ def _minimise_on_outline(objective, skip) -> tuple[Minimum, Array]:
 
 
 def differentiable_minima(objective, unknowns, side, skin_size):
-    """Return the minimum `unknowns` as a differentiable function of all arrays in `objective`.
+    """Return the unknowns at a minimum, `unknowns`, as a differentiable function of all arrays in `objective`.
 
-    The result is a Newton step x − H⁻¹ ∇cost from the minimum x, with x and H held constant. The step is zero, and its
-    derivative −H⁻¹ ∂∇cost is that of the minimum by the implicit function theorem. `side`: start and end of the side of
-    the outline on which the minimum lies, or NaN. `skin_size`: size of the skin in metres.
+    The result is a Newton step x − H⁻¹ ∇cost from the minimum x, with x and the Hessian H held constant. The step is
+    zero, and its derivative −H⁻¹ ∂∇cost is the derivative of the minimum by the implicit function theorem. `side`:
+    start and end of the side of the outline on which the minimum lies, or NaN. `skin_size`: size of the skin in metres.
     """
     minimum, xp = undifferentiated(unknowns), namespace(objective, unknowns)
 

@@ -2,15 +2,16 @@
 
 A change h_i of the logarithm of gain i adds s_i h_i to the level of microphone i in every frame, where s_i = S_i / (S_i
 + N_i) for the received power S_i and the noise floor N_i. The changes have a normal prior of mean 0 and are the same
-throughout a recording. They and the unknowns of all frames are estimated together, by maximum a posteriori. With
-residuals r, weights W = 1 / v, derivatives J of the levels with respect to the unknowns of a frame, and S = diag(s),
-the normal equations of the changes, from which the unknowns of the frames are eliminated, have the matrix
+throughout a recording. The changes and the unknowns of all frames f are estimated together, by maximum a posteriori.
+With residuals r of the levels, weights W = 1 / v for the variances v, derivatives J of the levels with respect to the
+unknowns of a frame, and S = diag(s), the normal equations of the changes, from which the unknowns of the frames are
+eliminated, have the matrix
 
     A + 1 / deviation²,    A = Σ_f S (W − W J (Jᵀ W J)⁻¹ Jᵀ W) S.
 
-Its inverse is the covariance of the changes given the recording. A single touch reduces it little; touches all over the
-skin determine the changes. The changes are applied only if they are significant: if, with the right-hand side b, the
-statistic bᵀ A⁺ b is larger than is due to the errors of the decay models.
+The inverse of this matrix is the covariance of the changes given the recording. A single touch reduces the covariance
+little; touches all over the skin determine the changes. The changes are applied only if they are significant: if, with
+the right-hand side b, the statistic bᵀ A⁺ b is larger than is due to the errors of the decay models.
 """
 
 from __future__ import annotations
@@ -30,18 +31,20 @@ from jeit.acoustic.surface import longer_side, to_space
 from jeit_solvers import inverse_small
 from jeit_solvers.engines import as_array, host, on_device, on_host, slopes
 
-# Factors on the standard deviation that are tried in turn. The first is accepted if one source explains half of the
-# frames, the others if it explains nearly all of them: one source explains some pairs of touches too if the gains may
-# have changed much.
+# Factors on the prior standard deviation of the changes, which are tried in turn. The first factor is accepted if one
+# source explains half of the frames, the other factors if one source explains nearly all frames: if the gains may have
+# changed much, one source explains some pairs of touches too.
 _DEVIATION_FACTORS, _MIN_EXPLAINED_FIRST, _MIN_EXPLAINED_LATER = (1.0, 2.0, 4.0), 0.5, 0.9
-# Maximum number of iterations; change of the logarithms below which the iteration ends.
+# Maximum number of iterations; change of the estimated logarithms below which the iteration ends.
 _MAX_ITERATIONS, _CONVERGED_CHANGE = 4, 0.05
-# Side of the square cells in which all frames together have the weight of one, as a fraction of the skin's size: the
-# errors of a decay model are alike at neighbouring positions.
+# Side of the square cells in which all frames together have the weight of one frame, as a fraction of the skin's size,
+# since the errors of a decay model are alike at neighbouring positions.
 _CELL_SIZE = 0.3
-# Probability that changes are significant if the gains have not changed; relative tolerance of the rank of A.
+# Probability that estimated changes are significant although the gains have not changed; relative tolerance of the rank
+# of A.
 _FALSE_CHANGE, _RANK_TOLERANCE = 0.01, 1e-8
-# Share of its trace that is added to the Fisher matrix of a frame, which is singular where few microphones respond.
+# Fraction of its trace that is added to the diagonal of the Fisher matrix of a frame, which is singular where few
+# microphones respond.
 _RIDGE = 1e-12
 
 
@@ -49,7 +52,7 @@ class GainChanges(NamedTuple):
     """Estimated changes of the gains of M microphones.
 
     **Fields**: `logarithm`: logarithm (M,) of the factor by which the intensities of each microphone have changed, with
-    the mean 0; `covariance`: its covariance (M, M).
+    the mean 0; `covariance`: covariance (M, M) of `logarithm`.
     """
 
     logarithm: Float[np.ndarray, " M"]
@@ -75,16 +78,15 @@ def estimate_gain_changes(
     deviation: float,
     locate_frames: Callable[[MicrophoneArray], tuple[SourceEstimate, np.ndarray]],
 ) -> tuple[GainChanges, ...]:
-    """Estimate the changes of the gains since the calibration from the frames that one source explains.
+    """Estimate the changes of the microphones' gains since the calibration from the frames that one source explains.
 
     `power` (F, M): intensities minus the floor of frames with a touch; `use` (F, M): mask of the usable intensities.
-    `deviation`: standard deviation of the logarithms of the changes before the recording is considered; it is doubled,
-    at most twice, if one source explains too few frames. `locate_frames`: function that locates the source of each
-    frame by maximum likelihood with a given array, and also returns the mask (F,) of the frames that one source
-    explains.
+    `deviation`: prior standard deviation of the logarithms of the changes, which is doubled, at most twice, if one
+    source explains too few frames. `locate_frames`: function that locates the source of each frame by maximum
+    likelihood with a given microphone array, and also returns the mask (F,) of the frames that one source explains.
 
-    Returns a tuple with the estimate. If one source explains too few frames for an estimate, the tuple has two
-    possibilities, to be tried in turn: no changes, and unknown changes with the given standard deviation.
+    Returns a tuple with the estimated changes. If one source explains too few frames for an estimate, the tuple has two
+    alternatives, to be tried in turn: no changes, and unknown changes with the standard deviation `deviation`.
     """
     used_mask = use.any(axis=0).astype(float)
     # A factor common to all gains cannot be distinguished from the strengths of the touches.
@@ -104,8 +106,8 @@ def estimate_gain_changes(
 def _estimate_for_deviation(
     microphone_array: MicrophoneArray, power, use, scale, locate_frames
 ) -> tuple[GainChanges, float]:
-    """Estimate the changes of the gains for one standard deviation, and the fraction of the frames that one source
-    explains. `scale` (M, M): projection onto changes with the mean 0, times the standard deviation."""
+    """Estimate the changes of the gains for one prior standard deviation, and the fraction of the frames that one
+    source explains. `scale` (M, M): projection onto changes with the mean 0, times the prior standard deviation."""
     deviation = np.linalg.norm(scale, 2)
     centring_matrix = scale / deviation
     changes, explained_share = GainChanges(np.zeros(len(scale)), deviation * scale), 0.0
@@ -132,14 +134,14 @@ def _estimate_for_deviation(
         if np.abs(changes.logarithm - previous_logarithm).max() < _CONVERGED_CHANGE:
             break
     if not is_significant:
-        # The covariance becomes the mean square of the changes about 0 instead of about their estimate.
+        # The covariance becomes the mean square of the changes about 0, instead of about their estimate.
         logarithm = changes.logarithm
         changes = GainChanges(np.zeros_like(logarithm), changes.covariance + np.outer(logarithm, logarithm))
     return changes, explained_share
 
 
 def _are_significant(matrix: np.ndarray, right_hand_side: np.ndarray) -> bool:
-    """Whether the changes are larger than is due to the noise and the errors of the decay models."""
+    """Whether the changes of the gains are larger than noise and errors of the decay models explain."""
     eigenvalues, eigenvectors = np.linalg.eigh(matrix)
     is_determined = eigenvalues > _RANK_TOLERANCE * eigenvalues[-1]
     squared_components = (eigenvectors[:, is_determined].T @ right_hand_side) ** 2 / eigenvalues[is_determined]
@@ -153,12 +155,12 @@ def covariance_with_gains(
     sources: SourceEstimate,
     changes: GainChanges,
 ) -> Float[np.ndarray, "F d d"]:
-    """Covariance (F, d, d) in m² of the positions of `sources`, including the errors of the gains; NaN for frames
-    without a position.
+    """Covariance (F, d, d) in m² of the positions of `sources`, including the effect of errors of the gains; NaN for
+    frames without a position.
 
     `microphone_array`: the array before `GainChanges.apply`. With the Fisher matrix F of a frame for known gains, the
-    derivative of its unknowns with respect to the changes is B = F⁻¹ Jᵀ W S, and their covariance in the joint estimate
-    is F⁻¹ + B C Bᵀ for the covariance C of the changes.
+    derivative of the frame's unknowns with respect to the gain changes is B = F⁻¹ Jᵀ W S, and the covariance of the
+    unknowns in the joint estimate is F⁻¹ + B C Bᵀ for the covariance C of the changes.
     """
     array, unknowns = (
         _with_known_gains(microphone_array, changes),
@@ -176,14 +178,15 @@ def covariance_with_gains(
 
 
 def _with_known_gains(microphone_array: MicrophoneArray, changes: GainChanges) -> MicrophoneArray:
-    """Return the array with the changed gains, in NumPy, without the variances of the changes in its noise."""
+    """Return the microphone array with the changed gains, in NumPy, without the variances of the changes in its
+    noise."""
     return on_host(changes._replace(covariance=np.zeros_like(changes.covariance)).apply(microphone_array))
 
 
 def _unknowns_of_sources(
     microphone_array: MicrophoneArray, sources: SourceEstimate, frames
 ) -> Float[np.ndarray, "3 F"]:
-    """Chart coordinates and logarithm of the strength of `sources` in the frames with the indices or mask `frames`."""
+    """Chart coordinates and logarithmic strengths of `sources` in the frames with the indices or mask `frames`."""
     chart = on_host(microphone_array.surface).project(np.asarray(sources.position)[frames].T)
     return np.concatenate([chart, np.log(np.asarray(sources.strength))[None, frames]])
 
@@ -191,7 +194,8 @@ def _unknowns_of_sources(
 def _linearise_levels(
     array: MicrophoneArray, power, use, unknowns
 ) -> tuple[Likelihood, np.ndarray, np.ndarray, np.ndarray]:
-    """Likelihood of the frames, derivatives J (3, M, F) of the levels, shares s (M, F), and weights W (M, F)."""
+    """Likelihood of the frames, derivatives J (3, M, F) of the levels by the unknowns, shares s = S / (S + N) of the
+    source (M, F), and weights W (M, F)."""
     use = use.T & (power.T + array.noise.floor[:, None] > 0)
     likelihood = Likelihood.create(power.T, use, array)
     (mean, variance), derivatives = slopes(array.expected, unknowns)
@@ -200,7 +204,7 @@ def _linearise_levels(
 
 
 def _normal_equations(array: MicrophoneArray, power, use, unknowns) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix (M, M) and right-hand side (M,) of the changes of the gains, without the prior."""
+    """Matrix A (M, M) and right-hand side b (M,) of the normal equations of the gain changes, without the prior."""
     likelihood, jacobian, signal_share, weight = _linearise_levels(array, power, use, unknowns)
     cell_size = _CELL_SIZE * float(longer_side(array.surface))
     _, cell_indices, frames_per_cell = np.unique(
@@ -220,6 +224,6 @@ def _normal_equations(array: MicrophoneArray, power, use, unknowns) -> tuple[np.
 
 
 def _inverse_fisher(fisher) -> np.ndarray:
-    """Inverses of Fisher matrices (3, 3, F), also of singular ones: their ridge makes them definite."""
+    """Inverses (3, 3, F) of the Fisher matrices of F frames. A ridge makes singular matrices definite."""
     regularised_fisher = fisher + _RIDGE * np.maximum(np.trace(fisher), 1.0) * np.eye(len(fisher))[:, :, None]
     return np.asarray(inverse_small(regularised_fisher))

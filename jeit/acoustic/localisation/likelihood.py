@@ -1,4 +1,4 @@
-"""Likelihood of source positions given the levels of the microphones, and the Cramér-Rao bound.
+"""Likelihood of source positions given the levels (logarithms of power) of the microphones, and the Cramér-Rao bound.
 
 Microphones are the first axis of all arrays, and frames the last. The unknowns of a frame are, for each source, its
 chart coordinates u and the logarithm s of its strength. The powers of several sources add. With the levels y_i, the
@@ -6,8 +6,8 @@ expected levels m_i = log(Σ e^s f_i(u) + N_i) and their variances v_i, the nega
 
     cost = Σ_i [½ (y_i − m_i)² / v_i + ½ log v_i]
 
-over the microphones in use. It is minimised by Fisher scoring. The Fisher matrix is Σ_i [∇m_i ∇m_iᵀ / v_i + ½ ∇log v_i
-∇log v_iᵀ]; its inverse is the Cramér-Rao bound.
+over the microphones in use. The cost is minimised by Fisher scoring. The Fisher matrix is Σ_i [∇m_i ∇m_iᵀ / v_i + ½
+∇log v_i ∇log v_iᵀ]; its inverse is the Cramér-Rao bound.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from jeit_solvers.module import Module
 
 
 class Likelihood(Module):
-    """Negative log-likelihood of F frames.
+    """Negative log-likelihood of source positions and strengths in F frames.
 
-    **Fields**: `power`: intensities (M, F) minus the floor; `level`: levels y (M, F); `use`: mask (M, F) of the
-    intensities used; `microphone_array`: model of the array.
+    **Fields**: `power`: intensities (M, F) minus the noise floor; `level`: levels y (M, F); `use`: mask (M, F) of the
+    intensities used; `microphone_array`: model of the microphone array.
     """
 
     power: Float[Array, "M F"]
@@ -39,38 +39,40 @@ class Likelihood(Module):
     def create(
         cls, power: Float[Array, "M F"], use: Bool[Array, "M F"], microphone_array: MicrophoneArray
     ) -> "Likelihood":
-        """Create the likelihood from intensities `power`. Values outside the mask `use` are ignored and may be NaN."""
+        """Create the likelihood from intensities `power`. Intensities outside the mask `use` are ignored and may be
+        NaN."""
         used_power = namespace(power, use).where(use, power, 1.0)
         return cls(used_power, microphone_array.noise.level(used_power), use, microphone_array)
 
     @property
     def frames(self) -> tuple[Array, ...]:
-        """Fields whose last axis is the frame."""
+        """Fields of the likelihood whose last axis is the frame."""
         return self.power, self.level, self.use
 
     def cost(self, unknowns: Float[Array, "n F"]) -> Float[Array, " F"]:
-        """Negative log-likelihood, up to a constant."""
+        """Negative log-likelihood (F,) of each frame, up to a constant."""
         mean, variance = self.microphone_array.expected(unknowns)
         xp = namespace(self, mean)
         terms = 0.5 * (self.level - mean) ** 2 / variance + 0.5 * xp.log(variance)
         return xp.sum(xp.where(self.use, terms, 0.0), axis=0)
 
     def misfit(self, unknowns: Float[Array, "n F"]) -> Float[Array, " F"]:
-        """Misfit Σ (y − m)² / v. If the model is correct, it has a chi-square distribution; the number of degrees of
-        freedom is the number of microphones in use minus the number of unknowns."""
+        """Misfit Σ (y − m)² / v (F,) between levels y and expected levels m of variance v. If the model is correct, the
+        misfit has a chi-square distribution; its degrees of freedom are the number of microphones in use minus the
+        number of unknowns."""
         return (self.residual(unknowns) ** 2).sum(axis=0)
 
     def residual(self, unknowns: Float[Array, "n F"]) -> Float[Array, "M F"]:
-        """Standardised residuals (y − m) / √v; 0 where not used."""
+        """Standardised residuals (y − m) / √v of the levels y for expected levels m of variance v; 0 where not used."""
         mean, variance = self.microphone_array.expected(unknowns)
         xp = namespace(self, mean)
         return xp.where(self.use, (self.level - mean) / xp.sqrt(variance), 0.0)
 
     def expand(self, unknowns: Float[Array, "n F"]) -> tuple[Array, Array, Array]:
-        """Cost, its gradient (n, F), and the Fisher matrix (n, n, F)."""
+        """Negative log-likelihood (F,), its gradient (n, F) by the n unknowns, and the Fisher matrix (n, n, F)."""
         (mean, variance), derivatives = slopes(self.microphone_array.expected, unknowns)
-        # `kept` makes the compiler compute these arrays once for all sums below. From here on, `dv` is the derivative
-        # of log v.
+        # `kept` makes the compiler compute these arrays once for all sums below. In the sums, `dv` is the derivative of
+        # log v.
         mean, variance, derivatives = kept((mean, variance, [(dm, dv / variance) for dm, dv in derivatives]))
         xp = namespace(self, mean)
         used = xp.where(self.use, 1.0, 0.0)
@@ -90,14 +92,15 @@ class Likelihood(Module):
         return cost, gradient, matrix
 
     def start(self, chart: Float[Array, "2 F"]) -> Float[Array, "3 F"]:
-        """Initial unknowns of a minimisation: the chart coordinates and the logarithm of the best-fitting strength."""
+        """Initial unknowns of a minimisation: chart coordinates, and logarithm of the best-fitting strength at these
+        coordinates."""
         response = self.microphone_array.response(chart)
         xp = namespace(response)
         return xp.concatenate([chart, xp.log(self.strength(response))[None]])
 
     def strength(self, response: Float[Array, "M F"]) -> Float[Array, " F"]:
-        """Strength of sources with given responses f, by least squares with weights from the observed power. The result
-        is positive."""
+        """Strength (F,) of sources with the responses f = `response`, by least squares with weights from the observed
+        power. The strength is positive."""
         weight, xp = self._power_weights(), namespace(self, response)
         fitted_strength = xp.sum(weight * self.power * response, axis=0) / xp.sum(weight * response**2, axis=0)
         loudest = xp.max(xp.where(self.use, self.power / response, 0.0), axis=0)
@@ -110,7 +113,7 @@ class Likelihood(Module):
 
     def screen(self, response: Float[Array, "M P"]) -> Float[Array, "F P"]:
         """Half the weighted residual sum of squares (F, P) at candidate positions with responses f and the best-fitting
-        strength: ½ (Σ w p² − (Σ w p f)² / Σ w f²), with observed powers p and weights w derived from them. It
+        strength: ½ (Σ w p² − (Σ w p f)² / Σ w f²), with observed powers p and weights w derived from p. This sum
         approximates the cost, and takes two matrix products for all frames and positions."""
         weight, xp = self._power_weights(), namespace(self, response)
         weighted_power = weight * self.power
@@ -131,14 +134,14 @@ def cramer_rao(
 ) -> Float[Array, "N d d"]:
     """Cramér-Rao bound (N, d, d) in m²: the minimum covariance of unbiased estimates of the positions of sources.
 
-    It is the position block of the inverse Fisher matrix of position and logarithm of strength, for the noise model of
-    the array; the strength is treated as unknown.
+    The bound is the position block of the inverse Fisher matrix of position and logarithm of strength, for the noise
+    model of the microphone array; the strength is treated as unknown.
 
     **Arguments:**
 
     - `microphone_array`: model of the array, such as that of a `Calibration`.
-    - `position`: true positions (N, d), metres.
-    - `strength`: true strengths, (N,) or a number, in the unit of intensity.
+    - `position`: true positions (N, d) of the sources, metres.
+    - `strength`: true strengths of the sources, (N,) or a number, in the unit of intensity.
     - `use`: mask (M,) of the microphones used; by default all.
 
     Raises `ValueError` if `microphone_array` is not a `MicrophoneArray`.
@@ -163,6 +166,6 @@ def _bound_covariance(microphone_array: MicrophoneArray, position, strength, use
     num_sources = chart.shape[1]
     unknowns = xp.concatenate([chart, xp.log(xp.broadcast_to(xp.asarray(strength, float), (num_sources,)))[None]])
     use = xp.broadcast_to(xp.asarray(used_microphones, bool)[:, None], (len(used_microphones), num_sources))
-    # The Fisher matrix does not depend on the measured values.
+    # The Fisher matrix does not depend on the measured intensities.
     _, _, matrix = Likelihood.create(xp.ones(use.shape), use, microphone_array).expand(unknowns)
     return to_space(microphone_array.surface, chart, inverse_small(matrix)[:2, :2])[1]

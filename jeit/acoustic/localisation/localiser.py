@@ -1,9 +1,9 @@
 """`Localiser`: source positions from the intensities of many frames, by maximum likelihood or intensity consistency.
 
-The objective of each frame is evaluated on a coarse grid, and minimised from the two deepest valleys of the grid. A
-minimum outside the outline is replaced by the best position on the outline. The computation can be compiled. It is
-differentiable with respect to the intensities, the positions of the microphones and the decay models, by the implicit
-function theorem.
+The objective (negative log-likelihood or consistency loss) of each frame is evaluated on a coarse grid of positions,
+and minimised from the two deepest valleys (local minima) of the grid. A minimum outside the outline is replaced by the
+best position on the outline. The computation can be compiled. The positions are differentiable with respect to the
+intensities, the positions of the microphones and the decay models, by the implicit function theorem.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ from jeit_solvers.module import Module
 METHODS = {"likelihood": Likelihood, "consistency": Consistency}
 # Approximate number of positions of the coarse grid over the bounding box of the outline.
 _NUM_COARSE_PIXELS = 400
-# Number of frames processed together, so that their arrays fit into the processor's cache: with the coarse grid, and
-# with a map.
+# Maximum number of frames processed together, so that their arrays fit into the processor's cache: with the coarse
+# grid, and with maps.
 _MAX_CHUNK_FRAMES, _MAX_MAP_FRAMES = 1024, 32
-# Minimum relative error of the decay models assumed when a grid is screened.
+# Minimum relative error of the decay models assumed when a grid of positions is screened.
 _SCREENING_ERROR = 0.2
 
 
 class SourceEstimate(Module):
-    """Estimated sources of F frames.
+    """Estimated sound sources of F frames, one per frame.
 
-    - `position`: (F, d) in metres, on the surface and within its outline.
+    - `position`: (F, d) position in metres, on the surface of the skin and within its outline.
     - `covariance`: (F, d, d) covariance of the position in m².
-    - `strength`: (F,) in the unit of intensity.
-    - `misfit`: (F,) chi-square of the residuals. `freedom`: (F,) its degrees of freedom.
+    - `strength`: (F,) strength in the unit of intensity.
+    - `misfit`: (F,) chi-square of the residuals of the levels. `freedom`: (F,) degrees of freedom of the misfit.
     - `excess`: (F,) decrease of twice the objective (for the likelihood, −2 log-likelihood) at the best position beyond
-      the outline; 0 if no position beyond it is better.
-    - `rival`: (F,) difference of twice the objective between the two deepest valleys; ∞ without a second one.
+      the outline; 0 if no position beyond the outline is better.
+    - `rival`: (F,) difference of twice the objective between the two deepest valleys; ∞ without a second valley.
     - `converged`: (F,) whether the minimisation converged.
     """
 
@@ -68,11 +68,12 @@ class SourceEstimate(Module):
 
 
 class Localiser(Module):
-    """Estimator of source positions from intensities. Create it with `Localiser.create`, and call it with intensities.
+    """Estimator of source positions from intensities. Create a localiser with `Localiser.create`, and call it with
+    intensities.
 
-    **Fields**: `microphone_array`: model of the array; `coarse`: coarse grid; `pixels`: raster of the maps, if any;
-    `features`: precomputed features of its pixels; `method`: "likelihood" or "consistency"; `compiled`: whether calls
-    are compiled.
+    **Fields**: `microphone_array`: model of the microphone array; `coarse`: coarse grid of positions; `pixels`: raster
+    of the maps, if any; `features`: precomputed features of the raster's or grid's pixels; `method`: "likelihood" or
+    "consistency"; `compiled`: whether calls are compiled.
 
     **Example:**
 
@@ -102,9 +103,9 @@ class Localiser(Module):
 
         `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022. `map_shape`: (rows,
         columns) of the raster on which the objective of each frame is evaluated, (200, 200) in Park 2022; required for
-        `maps`. By default a coarse grid of about 400 positions is used. The best position is refined in either case.
-        `compiled`: whether to compile calls; False is faster for a single call. Raises `ValueError` for an unknown
-        method or an invalid shape.
+        `maps`. By default a coarse grid of about 400 positions is used. The best position is refined with and without a
+        raster. `compiled`: whether to compile calls; False is faster for a single call. Raises `ValueError` for an
+        unknown `method` or an invalid `map_shape`.
         """
         check_array(microphone_array)
         check_name("method", method, METHODS)
@@ -122,16 +123,17 @@ class Localiser(Module):
         return cls(microphone_array, coarse_grid, pixels, features, method, compiled)
 
     def __call__(self, power: ArrayLike, use: ArrayLike | None = None) -> SourceEstimate:
-        """Locate the source of each frame. `power` (F, M): intensities minus the floor. `use` (F, M): mask of the
-        intensities to use; by default all finite ones. Frames with fewer than three usable microphones give NaN."""
+        """Locate the source of each frame. `power` (F, M): intensities minus the noise floor. `use` (F, M): mask of the
+        intensities to use; by default all finite intensities. Frames with fewer than three usable microphones give
+        NaN."""
         return self._call_validated(_locate_sources, power, use)
 
     def maps(self, power: ArrayLike, use: ArrayLike | None = None) -> Float[Array, "F rows columns"]:
         """Compute the map of each frame: the negative log-likelihood with the best strength at each pixel, up to a
         constant; or the consistency loss divided by the square of the highest intensity.
 
-        The bottom row is first; pixels outside the outline are NaN. `power`, `use`: as in a call. Raises `ValueError`
-        if the localiser was created without `map_shape`.
+        The bottom row is first; pixels outside the outline are NaN. `power`, `use`: as in a call of the localiser.
+        Raises `ValueError` if the localiser was created without `map_shape`.
         """
         if self.pixels is None:
             raise ValueError("this Localiser has no maps; create it with map_shape=(rows, columns).")
@@ -140,11 +142,12 @@ class Localiser(Module):
     def with_maps(
         self, power: ArrayLike, use: ArrayLike | None = None
     ) -> tuple[SourceEstimate, Float[Array, "F rows columns"]]:
-        """Compute both the estimate and the map of each frame. Raises `ValueError` as `maps` does."""
+        """Compute both the estimated source and the map of each frame. Raises `ValueError` as `maps` does."""
         return self(power, use), self.maps(power, use)
 
     def _call_validated(self, function, power, use):
-        """Validate the intensities and the mask, and call `function` with the localiser and both arrays."""
+        """Validate the intensities `power` and the mask `use`, and call `function` with the localiser and both
+        arrays."""
         use_numpy = not self.compiled and has_values(self, power, use)
         xp = np if use_numpy else jnp
         power = xp.asarray(power, float)
@@ -155,7 +158,7 @@ class Localiser(Module):
                 f"power has shape {power.shape} and use {use.shape}; give (frames, microphones) with "
                 f"{len(self.microphone_array.microphones)} microphones."
             )
-        if not len(power):  # without frames, the result of an unusable frame gives the structure of the output
+        if not len(power):  # without frames, an unusable frame gives the structure of the output
             padded_result = self._call_validated(function, np.full((1, power.shape[1]), np.nan), None)
             return jax.tree.map(lambda array: array[:0], padded_result)
         return (
@@ -191,7 +194,8 @@ def _compute_features(objective, microphone_array: MicrophoneArray, chart) -> Ar
 
 
 def _map_raster(localiser: Localiser, microphone_array: MicrophoneArray) -> tuple[Pixels, Array]:
-    """Return the raster of the maps, or the coarse grid if there are no maps, and the features of its pixels."""
+    """Return the raster of the maps, or the coarse grid if there are no maps, and the features of the raster's
+    pixels."""
     if localiser.pixels is not None and localiser.features is not None:
         return localiser.pixels, localiser.features
     return localiser.coarse, METHODS[localiser.method].features(microphone_array, localiser.coarse.chart)
@@ -206,11 +210,12 @@ def _compute_maps(localiser: Localiser, power, use) -> Array:
 
 
 def _starting_positions(localiser: Localiser, power, use):
-    """Starting positions of the minimisation: those of the first valley (F, 2) and the second valley (F, 2), and the
-    mask (F,) of the frames whose second valley is worth a minimisation."""
+    """Starting positions of the minimisation: positions of the first valley (F, 2) and the second valley (F, 2) of each
+    frame, and the mask (F,) of the frames whose second valley is worth a minimisation."""
     constant_array = undifferentiated(localiser.microphone_array)
     pixels, features = _map_raster(localiser, constant_array)
-    # The valleys of a very accurate model are narrower than the grid spacing, so a minimum relative error is assumed.
+    # The valleys of a very accurate decay model are narrower than the grid spacing, so a minimum relative error is
+    # assumed.
     constant_array = eqx.tree_at(
         lambda tree: tree.noise.relative,
         constant_array,
@@ -227,7 +232,8 @@ def _starting_positions(localiser: Localiser, power, use):
 
 
 def _usable_readings(localiser: Localiser, power, use):
-    """Mask of the usable readings: those in `use` with a positive sum of power and floor, whose logarithm exists."""
+    """Mask of the usable readings: intensities in `use` with a positive sum of power and noise floor, whose logarithm
+    exists."""
     return use & (power + localiser.microphone_array.noise.floor > 0)
 
 

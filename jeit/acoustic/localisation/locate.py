@@ -1,4 +1,4 @@
-"""Localisation of the touches in a recording: detection, position and status of each frame."""
+"""Localisation of the touches in a recording: detection of touches, and position and status of each frame."""
 
 from __future__ import annotations
 
@@ -28,24 +28,26 @@ from jeit_solvers.engines import as_array, on_host
 # Default standard deviation of the changes of the microphones' gains since the calibration, as a fraction of the
 # intensities.
 GAIN_DRIFT = 0.1
-# Probability that a silent frame is detected as a touch, and that a frame with one source is classified as a misfit.
+# Probability that a silent frame is detected as a touch, and probability that a frame with one source is classified as
+# a misfit.
 _FALSE_ALARM, _FALSE_MISFIT = 1e-6, 1e-4
-# Detection threshold in standard deviations of the noise, if the distribution of the noise is unknown.
+# Detection threshold of touches in standard deviations of the noise, if the distribution of the noise is unknown.
 _ALARM_DEVIATIONS = 6.0
 # Thresholds of differences of −2 log-likelihood: a frame is "outside" if a position beyond the outline is better by
-# more than this (three standard deviations); a frame is "ambiguous" if its second valley is worse by less than this
-# (two standard deviations).
+# more than 9 (three standard deviations); a frame is "ambiguous" if its second valley is worse by less than 4 (two
+# standard deviations).
 _MIN_OUTSIDE_EXCESS, _MAX_AMBIGUOUS_DIFFERENCE = 9.0, 4.0
-# Thresholds for accepting two sources whose misfit is statistically significant: maximum ratio of their misfit to that
-# of one source, and maximum misfit per degree of freedom. Minimum ratio of the strengths of two sources, since errors
-# of the model look like a weak second source.
+# Thresholds for accepting two sources whose misfit is statistically significant: maximum ratio of the misfit of two
+# sources to that of one source, and maximum misfit per degree of freedom. Minimum ratio of the strengths of two
+# sources, since errors of the decay models look like a weak second source.
 _MAX_MISFIT_RATIO, _MAX_MISFIT, _MIN_STRENGTH_RATIO = 0.2, 10.0, 0.05
-# Fraction of the touches that are not explained by one source on the skin, above which changes of the setup are
+# Fraction of the frames with a touch that one source on the skin does not explain, above which changes of the setup are
 # searched for.
 _MAX_UNEXPLAINED = 0.25
 # Minimum fraction of the frames that one or two sources must explain if the gains have not changed.
 _MIN_EXPLAINED = 0.9
-# Minimum ratio of the intensity of a touch to the highest intensity of the recording, if no floor is known (−60 dB).
+# Minimum ratio of the intensity of a touch to the highest intensity of the recording, if no noise floor is known (−60
+# dB).
 _DYNAMIC_RANGE = 1e-6
 # Maximum plausible ratio of the strength of touches to that of the calibration taps, or its inverse (40 dB).
 _MAX_STRENGTH_RATIO = 1e4
@@ -70,17 +72,17 @@ def locate(
     - `calibration`: the calibrated array.
     - `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022.
     - `map_shape`: (rows, columns) of the raster that is searched, (200, 200) in Park 2022; by default a coarse grid.
-      The best position is refined in either case.
-    - `intensity`: band and windows, for recordings of samples; by default those of the calibration.
+      The best position is refined with and without a raster.
+    - `intensity`: frequency band and windows, for recordings of samples; by default as in the calibration.
     - `silence`: recording of the untouched array, from which the noise floor is estimated if touches never pause.
     - `gain_drift`: standard deviation of the changes of the microphones' gains since the calibration, as a fraction of
-      the intensities. The changes are estimated from all touches of the recording, and the covariances include their
-      remaining errors; 0 if the gains have not changed.
-    - `compiled`: whether to compile the computation, which takes seconds but makes it several times faster; by default
-      True for more than 1,024 frames with a touch. Use True for many successive recordings.
+      the intensities. The changes are estimated from all touches of the recording, and the covariances of positions
+      include the remaining errors of the gains. 0 if the gains have not changed.
+    - `compiled`: whether to compile the computation, which takes seconds but then makes the computation several times
+      faster; by default True for more than 1,024 frames with a touch. Use True for many successive recordings.
 
-    Raises `ValueError` for a recording with another number of microphones, a `gain_drift` that is negative or not
-    finite, and if fewer than three microphones can be used.
+    Raises `ValueError` for a recording with another number of microphones than the calibration, a `gain_drift` that is
+    negative or not finite, and if fewer than three microphones can be used.
 
     **Example:**
 
@@ -132,7 +134,7 @@ def locate(
 
 
 class _Settings(NamedTuple):
-    """Arguments of `locate` that determine how frames are located."""
+    """Arguments of `locate` that determine how the sources of frames are located."""
 
     method: str
     map_shape: tuple[int, int] | None
@@ -143,8 +145,8 @@ class _Settings(NamedTuple):
 def _locate_frames(
     microphone_array: MicrophoneArray, power: np.ndarray, use: np.ndarray, settings: _Settings
 ) -> tuple[np.ndarray, dict[str, np.ndarray], GainChanges]:
-    """Locate the sources of frames with a touch. Returns the status (F,), a dictionary of the results by the names of
-    the fields of `Locations`, and the changes of the gains with which they were computed."""
+    """Locate the sources of F frames with a touch. Returns the status (F,), a dictionary of the results by the names of
+    the fields of `Locations`, and the gain changes with which the results were computed."""
     compiled, num_frames = settings.compiled, len(power)
     padded_frames = _pad_frames(power, use, compiled)
 
@@ -162,7 +164,8 @@ def _locate_frames(
 
     def locate_with(changes: GainChanges) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         array = changes.apply(microphone_array)
-        # The status of a frame is always determined from the likelihood, also if another method locates the touch.
+        # The status of a frame is always determined from the likelihood, also if the consistency loss locates the
+        # touch.
         likelihood_estimate, _ = locate_most_likely(array)
         is_default_method = settings.method == "likelihood" and settings.map_shape is None
         selected_estimate = (
@@ -194,15 +197,15 @@ def _initial_status(most_likely: SourceEstimate, estimate: SourceEstimate) -> np
     has_rival = np.asarray(most_likely.rival) < _MAX_AMBIGUOUS_DIFFERENCE
     status = np.where(has_rival, LocationStatus.AMBIGUOUS, LocationStatus.TOUCH).astype(object)
     status[_exceeds_noise(misfit, freedom)] = LocationStatus.MISFIT
-    # A frame is "outside" if a source beyond the outline explains it, and is clearly better than any source inside. Two
-    # sources are not explained by one source beyond the outline.
+    # A frame is "outside" if a source beyond the outline explains its intensities, and does so clearly better than any
+    # source inside. One source beyond the outline does not explain the intensities of two sources.
     status[(excess > _MIN_OUTSIDE_EXCESS) & ~_exceeds_noise(misfit - excess, freedom)] = LocationStatus.OUTSIDE
     status[~np.isfinite(np.asarray(estimate.position)).all(axis=1)] = LocationStatus.UNUSABLE
     return status
 
 
 def _exceeds_noise(misfit: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    """Mask of the frames whose misfit is too large to be due to noise."""
+    """Mask (F,) of the frames whose misfit is too large to be due to noise."""
     return (freedom > 0) & (chdtrc(np.maximum(freedom, 1), misfit) < _FALSE_MISFIT)
 
 
@@ -214,8 +217,8 @@ def _fit_two_sources(
     microphone_array: MicrophoneArray,
     compiled: bool,
 ) -> None:
-    """Fit two sources to the frames that one source does not explain, and enlarge the covariances of the frames that
-    two sources do not explain either. Modifies `status` and `result` in place."""
+    """Fit two sources to the frames that one source does not explain, and enlarge the position covariances of the
+    frames that two sources do not explain either. Modifies `status` and `result` in place."""
     tried_frames = np.flatnonzero((status == LocationStatus.MISFIT) & (use.sum(axis=1) > 6))
     if tried_frames.size:
         two_sources = locate_two(
@@ -251,8 +254,8 @@ def _fit_two_sources(
 
 
 def _limit_uncertainty(status: np.ndarray, result: dict[str, np.ndarray], skin_size: float) -> None:
-    """Mark touches as ambiguous if their standard deviation exceeds a fourth of the skin's size, and replace
-    covariances that extend beyond the skin. Modifies `status` and `result` in place."""
+    """Mark touches as ambiguous if the standard deviation of their position exceeds a fourth of the skin's size, and
+    replace covariances that extend beyond the skin. Modifies `status` and `result` in place."""
     has_position = np.isfinite(result["position"]).all(axis=1)
     is_finite = np.isfinite(result["covariance"]).all(axis=(1, 2))
     deviation = np.zeros(len(status))
@@ -264,7 +267,7 @@ def _limit_uncertainty(status: np.ndarray, result: dict[str, np.ndarray], skin_s
 
 
 def _gain_note(changes: GainChanges) -> list[str]:
-    """Note on the estimated changes of the gains, if they are applied."""
+    """Note on the estimated changes of the microphones' gains; an empty list if no changes are applied."""
     factor = np.exp(changes.logarithm)
     if (factor == 1).all():
         return []
@@ -278,8 +281,8 @@ def _gain_note(changes: GainChanges) -> list[str]:
 def _setup_notes(
     status: np.ndarray, intensities: Intensities, use: np.ndarray, microphone_array: MicrophoneArray
 ) -> list[str]:
-    """Notes on changes of the setup since the calibration, which are searched for if one source does not explain many
-    of the frames."""
+    """Notes on changes of the setup since the calibration. Such changes are searched for if one source does not explain
+    many of the frames."""
     notes = []
     has_touch = ~np.isin(status, [LocationStatus.NO_TOUCH, LocationStatus.UNUSABLE])
     is_unexplained = np.isin(status, [LocationStatus.MISFIT, LocationStatus.OUTSIDE, LocationStatus.TWO_TOUCHES])
@@ -305,8 +308,8 @@ def _setup_notes(
 
 
 def _unit_note(strength: np.ndarray, intensities: Intensities, use: np.ndarray, calibration: Calibration) -> list[str]:
-    """Return a note if the intensities differ by orders of magnitude from those of the calibration, which suggests
-    another gain or unit."""
+    """Return a note if the intensities differ by orders of magnitude from the intensities of the calibration, which
+    suggests another gain or unit."""
     question = "do the recording and the taps have the same gain and unit?"
     if np.isfinite(strength).any():
         median_strength = float(np.nanmedian(strength))
@@ -316,7 +319,7 @@ def _unit_note(strength: np.ndarray, intensities: Intensities, use: np.ndarray, 
         if max(ratio, 1 / ratio) > _MAX_STRENGTH_RATIO:
             return [f"touches are {ratio:.3g} times as strong as the calibration's taps: {question}"]
         return []
-    # Without a touch and without a known floor, the intensities are compared with the noise of the calibration.
+    # Without a touch and without a known noise floor, the intensities are compared with the noise of the calibration.
     deviation = np.asarray(calibration.microphone_array.noise.deviation)
     has_noise = use.any(axis=0) & (deviation > 0)
     if intensities.floor.any() or not has_noise.any():
@@ -331,8 +334,8 @@ def _unit_note(strength: np.ndarray, intensities: Intensities, use: np.ndarray, 
 def microphones_in_use(
     intensities: Intensities, calibration: Calibration
 ) -> tuple[MicrophoneArray, np.ndarray, tuple[str, ...]]:
-    """Return the calibrated array with the noise of these intensities, the mask (F, M) of the usable readings, and a
-    description of the fault of each microphone.
+    """Return the calibrated microphone array with the noise of the `intensities`, the mask (F, M) of the usable
+    intensities, and a description of the fault of each microphone.
 
     Raises `ValueError` if fewer than three microphones can be used.
     """
@@ -355,7 +358,7 @@ def microphones_in_use(
             relative=np.asarray(calibrated_noise.relative),
         )
     else:
-        # Negative intensities are due to noise, which may be larger than in the calibration.
+        # Negative intensities are due to noise, which may be larger in the recording than in the calibration.
         deviation = np.maximum(
             noise_from_negative_powers(intensities.power, use), np.asarray(calibrated_noise.deviation)
         )
@@ -377,7 +380,8 @@ def microphones_in_use(
 
 
 def _detected_frames(intensities: Intensities, noise: IntensityNoise, use: np.ndarray) -> np.ndarray:
-    """Mask of the frames in which the intensity of at least one microphone exceeds the detection threshold."""
+    """Mask (F,) of the frames in which the intensity of at least one microphone exceeds the detection threshold of
+    touches."""
     power = np.where(use, intensities.power, -np.inf)
     if np.any(intensities.floor > 0) and np.isfinite(intensities.freedom):
         threshold = intensities.floor * (
@@ -390,7 +394,8 @@ def _detected_frames(intensities: Intensities, noise: IntensityNoise, use: np.nd
 
 
 def _pad_frames(power: np.ndarray, use: np.ndarray, compiled: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Repeat the last frame up to a round number of frames if `compiled`, so that few sizes are compiled."""
+    """Repeat the last frame up to a round number of frames if `compiled`, so that the program is compiled for few
+    numbers of frames."""
     if not compiled:
         return power, use
     num_frames = len(power)

@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float, Int
 
 from jeit_solvers.module import Module
 
-# Number of frames up to which a computation with NumPy is faster than compiling it.
+# Number of frames up to which a computation with NumPy is faster than compilation by JAX.
 MAX_NUMPY_FRAMES = 1024
 
 
 class LocationStatus(StrEnum):
-    """Status of a frame; see `Locations` for the meaning of each."""
+    """Status of the location of a frame; see `Locations` for the meaning of each status."""
 
     TOUCH = "touch"
     NO_TOUCH = "no touch"
@@ -28,23 +28,23 @@ class LocationStatus(StrEnum):
 
 
 class Locations(Module):
-    """Positions and status of F frames, from M microphones.
+    """Positions of touches and status of F frames, from M microphones.
 
-    - `times`: (F,) middle of each frame in seconds.
-    - `position`: (F, d) in metres; `covariance`: (F, d, d) in m²; `strength`: (F,) in the unit of intensity. NaN where
-      no touch was located.
+    - `times`: (F,) time of the middle of each frame in seconds.
+    - `position`: (F, d) position of the touch in metres; `covariance`: (F, d, d) covariance of the position in m²;
+      `strength`: (F,) strength in the unit of intensity. NaN where no touch was located.
     - `status`: (F,) `LocationStatus` of each frame.
-    - `misfit`: (F,) chi-square of the residuals; `freedom`: (F,) its degrees of freedom.
-    - `used`: (F, M) mask of the microphones that were used.
+    - `misfit`: (F,) chi-square of the residuals of the levels; `freedom`: (F,) degrees of freedom of the misfit.
+    - `used`: (F, M) mask of the microphones used in each frame.
     - `second`: (F, d) position in metres, and `second_strength`: (F,) strength, of the weaker of two touches; NaN for
-      other frames.
-    - `overlap`: length of a window divided by the hop between windows; the errors of overlapping windows are
-      correlated.
-    - `faults`: M descriptions of the fault of each microphone; "" for none.
-    - `notes`: remarks on the whole recording.
+      frames without a second touch.
+    - `overlap`: length of a window divided by the hop between windows; the errors of positions from overlapping windows
+      are correlated.
+    - `faults`: description of the fault of each of the M microphones; "" for no fault.
+    - `notes`: remarks on the recording as a whole.
     - `name`: name of the recording.
 
-    Values of the status:
+    Status of a frame:
 
     - "touch": one source on the skin explains the intensities.
     - "no touch": no intensity exceeds the detection threshold.
@@ -72,16 +72,16 @@ class Locations(Module):
 
     @property
     def has_position(self) -> Bool[np.ndarray, " F"]:
-        """Mask (F,) of the frames that have a position."""
+        """Mask (F,) of the frames for which a position was found."""
         return np.asarray(np.isfinite(self.position).all(axis=1))
 
     @property
     def located(self) -> Bool[np.ndarray, " F"]:
-        """Former name of `has_position`, which goes with the next version."""
+        """Former name of `has_position`, which will be removed in the next version."""
         text = "Locations.located is now Locations.has_position; the old name goes with the next version."
         warnings.warn(text, DeprecationWarning, stacklevel=2)
         return self.has_position
 
     def counts(self) -> dict[str, int]:
-        """Number of frames with each status that occurs."""
+        """Number of frames with each status that occurs in the recording."""
         return {str(status): int((self.status == status).sum()) for status in LocationStatus if status in self.status}

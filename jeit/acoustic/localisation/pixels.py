@@ -1,4 +1,4 @@
-"""Rasters of pixels on which objectives are evaluated, and images of touches computed from the maps."""
+"""Rasters of pixels on which localisation objectives are evaluated, and images of touches computed from the maps."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from jeit.acoustic.surface import chart_grid
 from jeit_solvers.engines import as_array, namespace, set_at
 from jeit_solvers.module import Module
 
-# Condition for a minimisation from the second valley: its value is less than this factor times the value of the best
-# valley, plus this offset. On rasters with more than this number of pixels, only the best valley is used.
+# Condition for a minimisation from the second valley of a map: the value at the second valley is less than this factor
+# times the value at the best valley, plus this offset. On rasters with more than this number of pixels, only the best
+# valley is used.
 _SECOND_VALLEY_FACTOR, _SECOND_VALLEY_OFFSET, _MAX_VALLEY_PIXELS = 1.5, 8.0, 2000
 
 
@@ -41,10 +42,10 @@ class Pixels(Module):
 
 
 def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Array]:
-    """Find the two lowest local minima (valleys) of each map.
+    """Find the two lowest local minima (valleys) of each of F maps of P pixels.
 
     Returns the chart coordinates (2, F) of the lowest pixel and of the second lowest local minimum, and the mask (F,)
-    of the frames in which the second is low enough for a minimisation.
+    of the frames in which the second minimum is low enough for a minimisation.
     """
     rows, columns = pixels.shape
     inside, xp = pixels.inside.reshape(rows, columns), namespace(maps, pixels)
@@ -53,7 +54,7 @@ def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Ar
         is_valid = ~xp.isnan(values) if pixels.full else inside & ~xp.isnan(values)
         return xp.where(is_valid, values, xp.inf)
 
-    # The row of the minimum is found first, and then the pixel in the row, which is faster than a single search.
+    # The row of the minimum is found first, and then the pixel in this row, which is faster than a single search.
     rasters = maps.reshape(-1, rows, columns)
     best_rows = xp.argmin(xp.min(fill_outside(rasters, inside), axis=2), axis=1)
     row_values = fill_outside(xp.take_along_axis(rasters, best_rows[:, None, None], axis=1)[:, 0], inside[best_rows])
@@ -84,20 +85,20 @@ def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Ar
 def map_brightness(
     maps: ArrayLike, *, method: str = "likelihood", share: float = 0.02
 ) -> Float[np.ndarray, "F rows columns"]:
-    """Convert maps to brightness (F, rows, columns): 1 at the best pixel of each map, decreasing to 0 with the value of
-    the map, and 0 outside the outline.
+    """Convert maps of the objective to brightness (F, rows, columns): 1 at the best pixel of each map, decreasing to 0
+    as the objective increases, and 0 outside the outline.
 
-    For the method "likelihood", brightness is the likelihood divided by that of the best pixel, exp(−(map − minimum)).
-    For "consistency", it is exp(−(map − minimum) / scale), with the scale that makes it 1/e where the loss equals a
-    quantile over the pixels.
+    For the method "likelihood", brightness is the likelihood divided by the likelihood of the best pixel, exp(−(map −
+    minimum)). For "consistency", brightness is exp(−(map − minimum) / scale), with the scale that makes the brightness
+    1/e where the loss equals the quantile `share` of the loss over the pixels.
 
     **Arguments:**
 
-    - `maps`: maps (F, rows, columns), as from `Localiser.maps`.
+    - `maps`: maps of the objective (F, rows, columns), as from `Localiser.maps`.
     - `method`: "likelihood" or "consistency", the method of the localiser.
-    - `share`: the quantile, between 0 and 1, for "consistency".
+    - `share`: quantile of the loss, between 0 and 1, for "consistency".
 
-    Raises `ValueError` for other methods or shapes.
+    Raises `ValueError` for another `method`, and for maps of another shape.
 
     **Example:**
 
@@ -131,16 +132,16 @@ def map_brightness(
 def overlay_images(
     images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3
 ) -> Float[np.ndarray, "F rows columns"]:
-    """Overlay each frame with the frames before it, which fade as exp(−age / `time_constant`).
+    """Overlay each image with the images before it, which fade as exp(−age / `time_constant`).
 
-    Each pixel of the result (F, rows, columns) is the maximum over the faded frames, so that a source at rest does not
-    saturate it. The last image shows the whole recording.
+    Each pixel of the result (F, rows, columns) is the maximum over the faded images, so that a source at rest does not
+    saturate the pixel. The last image shows the whole recording.
 
     **Arguments:**
 
-    - `images`: brightness (F, rows, columns), zero where there is no touch; NaN counts as zero.
-    - `times`: increasing times (F,), seconds.
-    - `time_constant`: time in which a frame fades to 1/e, seconds.
+    - `images`: brightness (F, rows, columns) of each frame, zero where there is no touch; NaN counts as zero.
+    - `times`: increasing times (F,) of the frames, seconds.
+    - `time_constant`: time in which an image fades to 1/e, seconds.
 
     Raises `ValueError` for shapes that disagree, times that do not increase, and a time constant that is not positive.
 
@@ -173,7 +174,8 @@ def last_overlay_image(
 ) -> Float[np.ndarray, "rows columns"]:
     """Compute only the last image (rows, columns) of `overlay_images`, for the time `time` in seconds.
 
-    A long recording can be processed in parts: the image of the whole is the maximum of the images of its parts.
+    A long recording can be processed in parts: the image of the whole recording is the maximum of the images of its
+    parts.
     """
     age = np.maximum(time - np.asarray(times, float), 0.0)
     weight = np.exp(-age / time_constant)

@@ -1,5 +1,5 @@
-"""Detection of changes since the calibration from the misfit: exchanged microphones, or a microphone whose response has
-changed."""
+"""Detection of changes of the microphones since the calibration, from the misfit of located touches: exchanged
+microphones, or a microphone whose response has changed."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from jaxtyping import Bool, Float
 from jeit.acoustic.localisation.localiser import Localiser
 from jeit.acoustic.microphones import MicrophoneArray
 
-# Number of the loudest frames that are used; misfit per degree of freedom above which changes are searched for; value
-# at which the misfit per degree of freedom is clipped; maximum ratio of the misfits after and before an accepted
-# change.
+# Number of the loudest frames that are used; misfit per degree of freedom above which changes of the setup are searched
+# for; value at which the misfit per degree of freedom is clipped; maximum ratio of the misfits after and before an
+# accepted change.
 _NUM_FRAMES, _LARGE_MISFIT, _MAX_MISFIT, _MAX_MISFIT_RATIO = 24, 3.0, 100.0, 0.7
-# Maximum number of changes that are searched for.
+# Maximum number of changes of the setup that are searched for.
 _MAX_CHANGES = 4
-# A single microphone is left out for a test only if more than this number of microphones remain.
+# A single microphone is left out for a test only if more than this number of microphones are not yet changed.
 _MIN_REMAINING = 5
 
 
@@ -36,13 +36,14 @@ class SetupChanges(NamedTuple):
 def find_setup_changes(
     microphone_array: MicrophoneArray, power: Float[np.ndarray, "F M"], use: Bool[np.ndarray, "F M"]
 ) -> SetupChanges:
-    """Find changes of the setup that explain the misfit: with the microphones exchanged back, or left out, one source
-    explains the frames.
+    """Find changes of the setup that explain the misfit of touches: with the microphones exchanged back, or left out,
+    one source explains the frames.
 
-    `power` (F, M): intensities minus the floor of frames with a touch; `use` (F, M): mask of the usable intensities.
-    Only the loudest frames are used. The search is greedy: it repeatedly accepts the change that lowers the misfit
-    most, so it finds several changes only if each of them alone lowers the misfit. No changes are returned for fewer
-    than three frames, if one source explains the frames without a change, or if no change explains them.
+    `power` (F, M): intensities minus the noise floor of frames with a touch; `use` (F, M): mask of the usable
+    intensities. Only the loudest frames are used. The search is greedy: it repeatedly accepts the change that lowers
+    the misfit most, so it finds several changes only if each change alone lowers the misfit. No changes are returned
+    for fewer than three frames, if one source explains the frames without a change, or if no change explains the
+    misfit.
     """
     loudest_frames = np.argsort(-np.where(use, power, 0.0).sum(axis=1))[:_NUM_FRAMES]
     changes = SetupChanges([], [])
@@ -53,7 +54,8 @@ def find_setup_changes(
     localiser = Localiser.create(microphone_array)
 
     def mean_misfit(states: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Mean misfit per degree of freedom for each candidate, given by the order and the mask of the channels."""
+        """Mean misfit per degree of freedom for each candidate change, given by the order and the mask of the
+        channels."""
         estimates = localiser(
             np.concatenate([power[:, order] for order, _ in states]),
             np.concatenate([use[:, order] & mask for order, mask in states]),
@@ -69,8 +71,8 @@ def find_setup_changes(
         and len(changes.exchanged) + len(changes.altered) < _MAX_CHANGES
         and remaining.size
     ):
-        # Altered microphones come first among the candidates, since exchanging an altered microphone may lower the
-        # misfit too.
+        # Altered microphones come first among the candidate changes, since exchanging an altered microphone may lower
+        # the misfit too.
         singles = [(int(k),) for k in remaining if remaining.size > _MIN_REMAINING]
         candidates = singles + [(int(k), int(m)) for k, m in combinations(remaining, 2)]
         candidate_states = [_apply_change(state, channels) for channels in candidates]
@@ -89,7 +91,8 @@ def find_setup_changes(
 
 
 def _apply_change(state: tuple[np.ndarray, np.ndarray], channels: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the order and the mask of the channels after exchanging two channels, or leaving out one."""
+    """Return the order and the mask of the microphones' channels after exchanging two channels, or leaving out one
+    channel."""
     order, mask = (array.copy() for array in state)
     if len(channels) == 2:
         order[list(channels)] = order[list(channels[::-1])]

@@ -1,4 +1,4 @@
-"""Localisation of two simultaneous sources, for frames that a single source does not explain."""
+"""Localisation of two simultaneous sound sources, for frames that a single source does not explain."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from jeit_solvers import inverse_small, minimise_small
 from jeit_solvers.engines import at_once, has_values, namespace, on_device, on_host, scan
 from jeit_solvers.module import Module
 
-# Approximate number of grid positions, all pairs of which are screened; number of pairs that are refined.
+# Approximate number of grid positions, all pairs of which are screened; number of pairs of positions that are refined.
 _NUM_PIXELS, _NUM_STARTS = 150, 3
 
 
 class TwoSources(Module):
     """Estimated pairs of sources of F frames.
 
-    **Fields**: `position`: (F, 2, d) in metres, the stronger source first; `covariance`: (F, 2, d, d) in m²;
-    `strength`: (F, 2) in the unit of intensity; `misfit`: (F,) chi-square of the residuals; `freedom`: (F,) its degrees
-    of freedom; `converged`: (F,) whether the minimisation converged.
+    **Fields**: `position`: (F, 2, d) positions in metres, the stronger source first; `covariance`: (F, 2, d, d)
+    covariances of the positions in m²; `strength`: (F, 2) strengths in the unit of intensity; `misfit`: (F,) chi-square
+    of the residuals of the levels; `freedom`: (F,) degrees of freedom of the misfit; `converged`: (F,) whether the
+    minimisation converged.
     """
 
     position: Float[Array, "F 2 d"]
@@ -39,17 +40,17 @@ class TwoSources(Module):
 def locate_two(
     microphone_array: MicrophoneArray, power: ArrayLike, use: ArrayLike | None = None, *, compiled: bool = False
 ) -> TwoSources:
-    """Locate the most probable pair of sources of each frame. All pairs of positions on a coarse grid are screened, and
-    the best three pairs are refined.
+    """Locate the most probable pair of simultaneous sources of each frame. All pairs of positions on a coarse grid are
+    screened, and the best three pairs are refined.
 
-    Since there are six unknowns, frames with fewer than six usable microphones give NaN. Both sources are searched for
-    within the bounding box of the outline.
+    Since two sources have six unknowns, frames with fewer than six usable microphones give NaN. Both sources are
+    searched for within the bounding box of the skin's outline.
 
     **Arguments:**
 
     - `microphone_array`: model of the array, such as that of a `Calibration`.
-    - `power`: intensities (F, M) minus the floor.
-    - `use`: mask (F, M) of the intensities to use; by default all finite ones.
+    - `power`: intensities (F, M) minus the noise floor.
+    - `use`: mask (F, M) of the intensities to use; by default all finite intensities.
     - `compiled`: whether to compile the computation, for repeated calls; calls within a JAX transformation are always
       compiled.
 
@@ -125,11 +126,12 @@ def _locate_two(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -
 
 
 def _best_pairs(power, use, response, pixels: Pixels, microphone_array: MicrophoneArray) -> Float[Array, "starts 6"]:
-    """Find the pairs of grid positions with the lowest weighted residuals of a frame, each with its best-fitting
-    strengths. Pairs that are neighbours of a better pair are excluded. Returns the unknowns (starts, 6)."""
+    """Find the pairs of grid positions with the lowest weighted residuals of a frame, each pair with its best-fitting
+    strengths. Pairs that are neighbours of a better pair are excluded. Returns the unknowns (starts, 6) of the best
+    pairs."""
     xp = namespace(response, power)
     weight = xp.where(use, 1 / microphone_array.noise.variance(xp.maximum(power, 0.0)), 0.0)
-    # The unit of intensities is arbitrary, so they are divided by the highest intensity of the frame.
+    # The unit of intensities is arbitrary, so intensities are divided by the highest intensity of the frame.
     scale = xp.max(xp.where(use, power, 0.0))
     weight = weight * scale**2
     scaled_power = xp.where(use, power, 0.0) / scale

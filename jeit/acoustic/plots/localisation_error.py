@@ -1,4 +1,5 @@
-"""Plots of localisation errors: pairs of true and estimated positions on the skin, and error curves."""
+"""Plots of localisation errors: pairs of true and estimated positions on the skin, and curves of the error against a
+quantity."""
 
 from __future__ import annotations
 
@@ -30,18 +31,18 @@ def plot_position_errors(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot true positions and the corresponding estimates, on a drawing of the surface with its microphones.
+    """Plot true positions of sources and the corresponding estimates, on a drawing of the surface with its microphones.
 
     True positions of sources without an estimate (NaN) are drawn as hollow markers.
 
     **Arguments:**
 
-    - `true`: true positions (P, d), metres.
+    - `true`: true positions (P, d) of the sources, metres.
     - `found`: estimated positions (P, d), metres.
     - `microphones`: positions (M, d), metres.
     - `surface`: an outline, a surface, a `MicrophoneArray` or a `Calibration`.
-    - `title`: title of the plot; by default the mean ± standard deviation of the error.
-    - `ax`: axes to draw into; by default new ones.
+    - `title`: title of the plot; by default the mean ± standard deviation of the localisation error.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for shapes that disagree.
 
@@ -103,21 +104,21 @@ def plot_error_curve(
 ) -> Axes:
     """Plot localisation errors of one or several methods against another quantity, such as the noise.
 
-    For errors of several positions per value a line shows their `statistic`, and a band their interquartile range. NaN
-    is ignored. The axis of errors is logarithmic.
+    If each value has the errors of several positions, a line shows the `statistic` of the errors, and a band the
+    interquartile range. NaN is ignored. The axis of errors is logarithmic.
 
     **Arguments:**
 
-    - `values`: values (K,) of the quantity.
+    - `values`: values (K,) of the quantity on the abscissa.
     - `errors`: dictionary from the name of each method to its errors (K,) or (K, N), metres, for N positions per value.
-    - `bound`: the Cramér-Rao bound (K,) or (K, N), metres; for (K, N) its `statistic` is drawn.
+    - `bound`: the Cramér-Rao bound (K,) or (K, N), metres; for (K, N) the `statistic` of the bound is drawn.
     - `quantity`: label of the axis of `values`.
-    - `statistic`: "median", "mean" or "rms".
+    - `statistic`: statistic of the errors over positions, "median", "mean" or "rms".
     - `logarithmic`: whether the axis of `values` is logarithmic, for example for numbers of microphones.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
-    Raises `ValueError` for shapes that disagree, for no errors, and for more than six methods.
+    Raises `ValueError` for shapes that disagree, for an empty `errors`, and for more than six methods.
 
     **Example:**
 

@@ -1,4 +1,4 @@
-"""Plots over the skin: the map of the loss for one frame, and the receptive fields of microphones."""
+"""Plots over the skin: the map of the localisation objective for one frame, and the receptive fields of microphones."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, draw_colour_bar, 
 from jeit_solvers.engines import on_host
 
 # Dynamic range in decibels of the circles that show the received intensities: the circle of a microphone this far below
-# the loudest one has the minimum size.
+# the loudest microphone has the minimum size.
 _DYNAMIC_RANGE = 30.0
-# Maximum of the colour scale above the minimum of the map: standard deviations ("likelihood"), decibels
+# Upper end of the colour scale above the minimum of the map: in standard deviations ("likelihood"), or decibels
 # ("consistency").
 _MAX_COLOUR_VALUES = {"likelihood": 15.0, "consistency": 40.0}
 _MAP_LABELS = {
@@ -43,7 +43,7 @@ _MAP_LABELS = {
 
 
 class MapMarks(NamedTuple):
-    """Positions to mark on a map.
+    """True and estimated positions to mark on a map.
 
     **Fields**: `truth`: true position (d,) in metres; `estimate`: estimated position (d,) in metres; `covariance`:
     covariance of the estimate (d, d) in m², drawn as a 95 % ellipse.
@@ -73,24 +73,25 @@ def plot_loss_map(
     colour_bar: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot the map of one frame from `Localiser.with_maps`. The most probable positions have the brightest colours.
+    """Plot the map of the localisation objective for one frame, from `Localiser.with_maps`. The most probable positions
+    have the brightest colours.
 
     A likelihood map is drawn as √(2 (map − minimum)), the number of standard deviations by which a position is worse
-    than the best; a map of the consistency loss (Park 2022) is drawn in decibels above its minimum.
+    than the best position; a map of the consistency loss (Park 2022) is drawn in decibels above its minimum.
 
     **Arguments:**
 
     - `values`: map (rows, columns) over the bounding box of the outline, bottom row first, NaN outside the outline.
     - `surface`: a `Calibration`, a `MicrophoneArray`, a surface or an outline.
-    - `microphones`: positions (M, d), metres; by default those of the array.
+    - `microphones`: positions (M, d) of the microphones, metres; by default those of `surface`.
     - `received`: intensities (M,), shown by the size of the microphones' circles.
     - `marks`: true and estimated position to mark.
     - `method`: "likelihood" or "consistency", the method of the localiser.
     - `title`: title of the plot.
     - `colour_bar`: whether to draw a colour bar.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
-    Raises `ValueError` for other methods, shapes that disagree, and `marks` that are not `MapMarks`.
+    Raises `ValueError` for another `method`, shapes that disagree, and `marks` that are not `MapMarks`.
 
     **Example:**
 
@@ -132,8 +133,8 @@ def plot_loss_map(
 
 
 def _draw_marks(ax: Axes, view: View, marks: MapMarks) -> list[Line2D]:
-    """Draw the marked positions and return their legend entries. Raises `ValueError` for shapes that do not match the
-    surface, and for a covariance without an estimate."""
+    """Draw the true and estimated positions in `marks`, and return their legend entries. Raises `ValueError` for shapes
+    that do not match the surface, and for a covariance without an estimate."""
     if marks.covariance is not None and marks.estimate is None:
         raise ValueError("covariance: give estimate too, the position whose covariance it is.")
     handles = []
@@ -151,11 +152,12 @@ def _draw_marks(ax: Axes, view: View, marks: MapMarks) -> list[Line2D]:
 
 
 def _above_minimum(pixels: np.ndarray, method: str) -> np.ndarray:
-    """Convert a map to standard deviations ("likelihood") or decibels ("consistency") above its minimum."""
+    """Convert a map of the objective to standard deviations ("likelihood") or decibels ("consistency") above its
+    minimum."""
     minimum = np.nanmin(pixels)
     if method == "likelihood":
         return np.sqrt(2 * (pixels - minimum))
-    # Without noise the minimum of the loss may be zero: the loss is clipped at 120 dB below its maximum.
+    # Without noise the minimum of the loss may be zero, so the loss is clipped at 120 dB below its maximum.
     lower_limit = max(minimum, 1e-12 * np.nanmax(pixels), np.finfo(float).tiny)
     return 10 * np.log10(np.maximum(pixels, lower_limit) / lower_limit)
 
@@ -191,17 +193,17 @@ def plot_receptive_fields(
     """Plot the receptive field of each microphone: the intensity of each tap, divided by the strength of the tap,
     against distance, with the fitted decay model.
 
-    Red circles are taps excluded from the fit. The panel of an unusable microphone states the reason. The dashed line
-    is the standard deviation of the noise divided by the median strength of the taps. The number beside the index is
-    the distance at which the response is half that to a tap directly above the microphone. The panels are insets of the
-    returned axes.
+    Red circles are taps excluded from the fit. The panel of an unusable microphone states why it is unusable. The
+    dashed line is the standard deviation of the noise divided by the median strength of the taps. The number beside the
+    microphone's index is the distance at which the response is half the response to a tap directly above the
+    microphone. The panels are insets of the returned axes.
 
     **Arguments:**
 
     - `fit`: result of `calibrate_microphones`.
     - `microphones`: indices of the microphones to draw, from 0 as in the messages of the calibration; by default all.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for microphones that do not exist, and if `fit` is not a `CalibrationFit`.
 
@@ -225,7 +227,7 @@ def plot_receptive_fields(
     rows = -(-selected.size // columns)
     ax = axes_or_new(ax, (max(4.8, min(11.0, 2.2 * columns)), max(3.6, min(9.0, 1.75 * rows))))
     ax.set_axis_off()
-    # The position of the title is fixed, since matplotlib would derive it from all panels.
+    # The position of the title is fixed, since matplotlib would derive the position from all panels.
     ax.set_title(title or "", loc="left", y=1.0, pad=26)
     distance = np.linspace(0, float(fit.distance.max()), 200)
     decay = on_host(fit.calibration.microphone_array.decay)
@@ -276,8 +278,8 @@ def _label_panels(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
 
 
 def _tap_strengths(fit: CalibrationFit) -> Float[np.ndarray, " T"]:
-    """Strength of each tap. For taps excluded from the fit it is the median over the usable microphones of intensity
-    divided by response."""
+    """Strength (T,) of each tap. For taps excluded from the fit, the strength is the median over the usable microphones
+    of intensity divided by response."""
     response = np.asarray(on_host(fit.calibration.microphone_array.decay).response(fit.distance.T**2)).T
     strength = np.where((fit.power > 0) & fit.calibration.usable, fit.power / response, np.nan)
     is_received = np.isfinite(strength).any(axis=1)
@@ -287,8 +289,8 @@ def _tap_strengths(fit: CalibrationFit) -> Float[np.ndarray, " T"]:
 
 
 def _draw_receptive_field(panel: Axes, fit: CalibrationFit, index: int, relative, lines, columns: int) -> None:
-    """Draw the panel of one microphone: its taps, fitted curve and noise. `lines`: distances in metres, the response at
-    these distances, and the noise."""
+    """Draw the panel of one microphone: taps, fitted decay model and noise. `lines`: distances in metres, the response
+    at these distances, and the noise."""
     distance, curve, noise = lines
     reason = fit.calibration.reasons[index]
     is_positive = np.isfinite(relative) & (relative > 0)
@@ -303,7 +305,7 @@ def _draw_receptive_field(panel: Axes, fit: CalibrationFit, index: int, relative
         size = 9 if columns <= 2 else 5
         panel.scatter(1e3 * fit.distance[mask, index], relative[mask], s=size, rasterized=True, **style)
     style = {"color": SOFT, "linewidth": 1.2, "linestyle": (0, (1, 1))} if reason else {"color": INK, "linewidth": 1.6}
-    # No curve is drawn for a microphone without readings.
+    # No curve is drawn for a microphone without positive intensities.
     is_in_range = (distance <= fit.distance[:, index].max()) & is_positive.any()
     panel.plot(1e3 * distance[is_in_range], curve[is_in_range], zorder=3, **style)
     if noise > 0:

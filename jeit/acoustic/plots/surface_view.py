@@ -1,4 +1,4 @@
-"""Elements shared by all plots of touches: the surface seen from above, its microphones, and error ellipses."""
+"""Elements shared by all plots of touches: the skin's surface seen from above, its microphones, and error ellipses."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ AnySurface = Calibration | MicrophoneArray | AbstractSurface | Domain | ArrayLik
 
 
 class View(NamedTuple):
-    """A surface seen along the normal of its chart, the plane onto which it is unrolled or projected.
+    """A surface seen along the normal of its chart, the plane onto which the surface is unrolled or projected.
 
     **Fields**: `surface`: the surface, with NumPy arrays; `microphones`: chart coordinates (M, 2) of the microphones in
     metres; `usable`: mask (M,) of the usable microphones.
@@ -40,7 +40,7 @@ class View(NamedTuple):
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Bounding box (x_min, x_max, y_min, y_max) of the outline in metres."""
+        """Bounding box (x_min, x_max, y_min, y_max) of the surface's outline in metres."""
         (left, bottom), (right, top) = bounding_box(self.surface)
         return float(left), float(right), float(bottom), float(top)
 
@@ -73,10 +73,10 @@ class View(NamedTuple):
 
 
 def view_of(surface: AnySurface, microphones: ArrayLike | None = None, usable: ArrayLike | None = None) -> View:
-    """Create the view of a calibration, an array, a surface or an outline.
+    """Create the view of the surface of a calibration, a microphone array, a surface or an outline.
 
-    `microphones` (M, d): positions in metres, by default those of the calibration or array. `usable` (M,): mask of the
-    usable microphones. Raises `ValueError` for shapes that disagree.
+    `microphones` (M, d): positions of the microphones in metres, by default those of the calibration or array. `usable`
+    (M,): mask of the usable microphones. Raises `ValueError` for shapes that disagree.
     """
     if isinstance(surface, Calibration):
         usable = surface.usable if usable is None else usable
@@ -104,13 +104,14 @@ def chart_of(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarr
 
 
 def outline_of(view: View) -> Path:
-    """Path of the outline and its holes in chart coordinates."""
+    """Path of the surface's outline and its holes in chart coordinates."""
     loops = (Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in view.surface.outline.loops())
     return Path.make_compound_path(*loops)
 
 
 def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool = False) -> list[Line2D]:
-    """Draw the outline, a scale bar and the microphones, with crosses for unusable ones; return the legend entries."""
+    """Draw the surface's outline, a scale bar and the microphones, with crosses for unusable microphones. Returns the
+    legend entries."""
     ax.add_patch(
         PathPatch(outline_of(view), facecolor="none", edgecolor=INK, linewidth=0.9, joinstyle="round", zorder=2)
     )
@@ -159,10 +160,11 @@ def draw_ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray, *, colour
 
 
 def draw_legend(ax: Axes, handles: list) -> None:
-    """Draw a legend below the plot, with as many columns as fit. Without entries, no legend is drawn."""
+    """Draw a legend of the entries `handles` below the plot, with as many columns as fit. Without entries, no legend is
+    drawn."""
     if not handles:
         return
-    # 0.45 inches for a marker with its gaps, and 0.065 inches for each letter.
+    # A legend entry takes 0.45 inches for a marker with its gaps, and 0.065 inches for each letter.
     widths = [0.45 + 0.065 * len(str(handle.get_label())) for handle in handles]
     available_width = ax.bbox.width / ax.figure.dpi
     columns = len(handles) if sum(widths) <= available_width else max(1, int(available_width / max(widths)))

@@ -21,15 +21,15 @@ from jeit.plot.axes import INK, SOFT, axes_or_new, draw_colour_bar
 
 _OVERLAY_COLOURS = LinearSegmentedColormap.from_list("glow", ["#ffffff", "#bccddf", "#6a8aae"])
 _TIME_COLOURS = LinearSegmentedColormap.from_list("time", ["#0d0887", "#7e03a8", "#cc4778", "#f89540", "#fbd724"])
-# Markers of located frames whose status is not "touch".
+# Markers of frames with a position whose status is not "touch".
 _STATUS_MARKERS = {
     LocationStatus.TWO_TOUCHES: "D",
     LocationStatus.OUTSIDE: "^",
     LocationStatus.MISFIT: "X",
     LocationStatus.AMBIGUOUS: "P",
 }
-# Thresholds of motion below which a touch is drawn as a single position: the distance of its path from the mean of the
-# path, in standard deviations; and the diameter of the path, as a fraction of the size of the surface.
+# Thresholds of motion below which a touch is drawn as a single position: the distance of the touch's path from the mean
+# of the path, in standard deviations; and the diameter of the path, as a fraction of the size of the surface.
 _MIN_MOTION_DEVIATIONS, _MIN_MOTION_SHARE = 4.0, 0.05
 
 
@@ -44,11 +44,11 @@ def plot_track(
     colour_bar: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot the path of every touch, coloured by time, with its onset and offset. Dots are the positions of individual
-    frames.
+    """Plot the path of every touch in a recording, coloured by time, with its onset and offset. Dots are the positions
+    of individual frames.
 
     A touch at rest is drawn as a dot with its 95 % ellipse. Frames whose status is not "touch" have their own markers,
-    explained in the legend. A curved surface is drawn in the coordinates of its chart.
+    which the legend explains. A curved surface is drawn in the coordinates of its chart.
 
     **Arguments:**
 
@@ -58,10 +58,10 @@ def plot_track(
       `locations`, are drawn as crosses.
     - `overlay`: brightness (rows, columns) from 0 to 1 over the bounding box of the outline, bottom row first, as in
       the last image of `overlay_images`.
-    - `truth`: true path (N, d), metres, if known.
+    - `truth`: true path (N, d) of the touch, metres, if known.
     - `title`: title of the plot.
     - `colour_bar`: whether to draw a colour bar.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for shapes that disagree, and for arguments of the wrong type.
 
@@ -127,7 +127,7 @@ def _label_no_touch(ax: Axes, view: View, locations: Locations) -> None:
 def _draw_touch(
     ax: Axes, view: View, track: Track, touch: Touch, path, time_colours: ScalarMappable, existing_labels: set
 ) -> list:
-    """Draw a touch and return its legend entries whose labels are not in `existing_labels`."""
+    """Draw the path of a touch, and return those legend entries whose labels are not in `existing_labels`."""
     frames = slice(touch.first, touch.last + 1)
     positions, frame_times = path[frames], track.times[frames]
     best_frame = touch.first + int(np.argmin(np.trace(track.covariance[frames], axis1=1, axis2=2)))
@@ -160,8 +160,8 @@ def _draw_touch(
 
 
 def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, time_colours: ScalarMappable) -> list:
-    """Draw the position of each frame: a dot; a ring if the track rejects the position; a marker for each status other
-    than "touch". Return the legend entries."""
+    """Draw the position of each frame as a dot, with a ring if the track rejects the position, and with a marker if the
+    status is not "touch". Returns the legend entries."""
     positions = view.chart(locations.position, "locations")
     has_no_marker = locations.has_position & ~np.isin(locations.status, list(_STATUS_MARKERS))
     is_accepted, is_rejected = has_no_marker & ~track.rejected, locations.has_position & track.rejected
@@ -169,7 +169,7 @@ def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, time_
     dot_options = {"s": 7, "linewidths": 0, "alpha": 0.6, "zorder": 3.7}
     ax.scatter(*positions[is_accepted].T, color=time_colours.to_rgba(track.times[is_accepted]), **dot_options)
     if is_rejected.any():
-        # If the frame has a marker for its status, the ring is drawn larger, around that marker.
+        # If the frame has a marker for its status, the ring is drawn larger, around this marker.
         ring_options: dict[str, Any] = {
             "s": np.where(has_no_marker, 16, 60)[is_rejected],
             "linewidths": 0.8,
@@ -187,8 +187,8 @@ def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, time_
 def _draw_other_frames(
     ax: Axes, view: View, locations: Locations, positions: np.ndarray, time_colours: ScalarMappable
 ) -> list:
-    """Draw frames with the status "outside", "misfit", "ambiguous" or "two touches", the last with both touches; return
-    the legend entries."""
+    """Draw the positions of frames with the status "outside", "misfit", "ambiguous" or "two touches", the last with
+    both touches. Returns the legend entries."""
     handles = []
     second = view.chart(locations.second, "locations.second")
     for status, marker in _STATUS_MARKERS.items():

@@ -1,1 +1,2 @@
-"""Recordings and their files, detection of faulty microphones, and sound intensities computed from samples."""
+"""Recordings of microphones and their files, detection of faulty microphones, and sound intensities computed from
+samples."""

@@ -7,20 +7,20 @@ from scipy.spatial import KDTree
 
 from jeit.mesh.topology import distance, inside
 
-# Minimum sampling rate at which the vibrations of a touch can be recorded.
+# Minimum sampling rate with which the vibrations of a touch can be recorded.
 MIN_RATE = 100.0  # Hz
-# Maximum plausible length of a skin. Larger coordinates are probably in millimetres.
+# Maximum plausible length of a skin. Larger coordinates are probably in millimetres instead of metres.
 MAX_EXTENT = 5.0  # m
-# Maximum distance of a tap from the outline, as a fraction of the skin's length; distance in metres below which two
+# Maximum distance of a tap outside the outline, as a fraction of the skin's length; distance in metres below which two
 # microphones coincide.
 _MAX_OUTSIDE_SHARE, _MIN_SPACING = 0.05, 1e-6  # of the length; m
-# Maximum magnitude of a coordinate in metres; squares of larger lengths would lose precision.
+# Maximum magnitude of a coordinate in metres; squares of larger coordinates would lose precision.
 _MAX_COORDINATE = 1e9
 
 
 def choose_array(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
-    """Return which of the arrays named `first` and `second` the file contains. Raises `ValueError` if it contains both
-    or neither."""
+    """Return the name, `first` or `second`, of the one of two alternative arrays that a file contains. Raises
+    `ValueError` if the file contains both arrays or neither."""
     if first in arrays and second in arrays:
         raise ValueError(f"it holds both '{first}' and '{second}'; keep the one to use.")
     if second not in arrays and first not in arrays:
@@ -30,15 +30,15 @@ def choose_array(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
 
 
 def short_text(values: np.ndarray) -> str:
-    """Text of an array for a message: its values if it has at most four, otherwise its shape."""
+    """Text of an array for a message: its values if there are at most four, otherwise its shape."""
     return f"of shape {values.shape}" if values.size > 4 else str(values.tolist())
 
 
 def real_array_of(value, label: str, axes: str) -> np.ndarray:
     """Convert `value` to a real array with as many axes as `axes` names, separated by commas.
 
-    float32 is kept; other types become float64. Raises `ValueError` for values that are not real, another number of
-    axes, and empty arrays.
+    Arrays of float32 keep their type; other types become float64. Raises `ValueError` for values that are not real,
+    another number of axes, and empty arrays.
     """
     try:
         array = np.asarray(value)
@@ -54,7 +54,7 @@ def real_array_of(value, label: str, axes: str) -> np.ndarray:
 
 
 def real_number(value, label: str) -> float:
-    """Convert a number, or an array with one element, to a float. Raises `ValueError` for anything else."""
+    """Convert a number, or an array with one element, to a float. Raises `ValueError` for other values."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiu" or array.size != 1:
         raise ValueError(f"{label} must be one real number; it is {array.dtype} of shape {array.shape}.")
@@ -62,8 +62,8 @@ def real_number(value, label: str) -> float:
 
 
 def sampling_rate(value) -> float:
-    """Return the sampling rate in Hz as a float. Raises `ValueError` if it is not a finite number, or too low to record
-    touches."""
+    """Return the sampling rate in Hz as a float. Raises `ValueError` if the rate is not a finite number, or too low to
+    record touches."""
     rate = real_number(value, "rate")
     if not np.isfinite(rate) or rate < MIN_RATE:
         raise ValueError(
@@ -83,8 +83,8 @@ def check_full_scale(value) -> float | None:
 
 
 def check_coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarray:
-    """Return points as an array (n, d) in metres, with `dimension` = (d,) and d = 2 or 3. Raises `ValueError` for other
-    shapes, and for coordinates that are not finite."""
+    """Return n points as an array (n, d) in metres, where `dimension` is (d,), and d is 2 or 3. Raises `ValueError` for
+    other shapes, and for coordinates that are not finite."""
     points = real_array_of(value, label, "points, 2 or 3").astype(float)
     if points.shape[1] not in (2, 3) or points.shape[1:] != dimension:
         raise ValueError(
@@ -110,8 +110,8 @@ def check_extent(points: np.ndarray, label: str) -> None:
 
 
 def check_microphones(positions: np.ndarray, skin: np.ndarray) -> None:
-    """Raise `ValueError` if two microphones with `positions` (M, d) coincide, or if one is farther from the bounding
-    box of the points `skin` (n, d) than the length of the box. All are in metres."""
+    """Raise `ValueError` if two microphones with `positions` (M, d) coincide, or if a microphone is farther from the
+    bounding box of the points `skin` (n, d) than the length of this box. All coordinates are in metres."""
     low, high = skin.min(axis=0), skin.max(axis=0)
     extent = (high - low).max()
     distances = np.linalg.norm(positions - np.clip(positions, low, high), axis=1)
@@ -132,7 +132,8 @@ def check_microphones(positions: np.ndarray, skin: np.ndarray) -> None:
 
 
 def check_taps(positions: np.ndarray, outline: np.ndarray) -> None:
-    """Raise `ValueError` if a tap (T, 2) is outside the outline (K, 2) by more than 5 % of the skin's length."""
+    """Raise `ValueError` if one of the taps at `positions` (T, 2) is outside the `outline` (K, 2) by more than 5 % of
+    the skin's length."""
     extent = np.ptp(outline, axis=0).max()
     outside = np.flatnonzero(~inside(positions, [outline]))
     distances = distance(positions[outside], outline, np.roll(outline, -1, axis=0)).min(axis=1)

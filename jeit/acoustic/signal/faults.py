@@ -1,9 +1,9 @@
-"""Detection of faulty microphones and faulty stretches of sound, from the samples alone.
+"""Detection of faulty microphones and faulty stretches of sound, from the microphones' samples alone.
 
 Four faults are distinguished: the samples of a channel never change (dead), do not change for a while (stuck), are cut
-off at an end of the channel's range (clipping), or are not finite. Similar signals without a fault are accepted: a
-converter that holds each value for several samples, a quiet channel with an amplitude of a few converter steps, and a
-single loud peak.
+off at an end of the channel's range (clipping), or are not finite. Similar signals without a fault are accepted: those
+of a converter that holds each value for several samples, of a quiet channel with an amplitude of a few converter steps,
+and with a single loud peak.
 """
 
 from __future__ import annotations
@@ -13,30 +13,31 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
-# Fault codes of samples, as returned by `sample_faults`. Descriptions list the faults in this order.
+# Fault codes of samples, as returned by `sample_faults`. Descriptions of faults are in this order.
 SOUND, NOT_FINITE, STUCK, CLIPPING = range(4)
 _FAULT_WORDS = {NOT_FINITE: "NaN or infinite", STUCK: "stuck", CLIPPING: "clipping"}
 
-# Minimum duration of a stuck stretch: in seconds, and in samples.
+# Minimum duration of a stretch of constant samples that counts as stuck: in seconds, and in samples.
 _STUCK_TIME, _STUCK_SAMPLES = 0.02, 64
 # A constant stretch is silence, not a fault, if the signal elsewhere decays to a range of at most this many converter
 # steps, or at most this fraction of the channel's range.
 _REST_STEPS, _REST_RANGE = 3.0, 1e-4
-# Samples are at an end of the range if they are closer to it than this fraction of the channel's range, or, where the
-# full scale is known, closer to it than this fraction of the full scale.
+# Samples are at an end of the range if they are closer to this end than the first fraction of the channel's range, or,
+# where the full scale is known, closer to the full scale than the second fraction of it.
 _TOP_RANGE, _TOP_FULL_SCALE = 3e-4, 1e-3
-# Minimum number of converted values at the top of a clipped peak, and minimum ratio of the fall beside it to the fall
-# of a parabola.
+# Minimum number of converted values at the top of a clipped peak, and minimum ratio of the fall beside the peak to the
+# fall of a parabola.
 _MIN_FLAT_VALUES, _MIN_FALL_RATIO = 3, 3.0
 
 
 def sample_faults(
     samples: Float[np.ndarray, " S"], rate: float, full_scale: float | None = None
 ) -> tuple[UInt8[np.ndarray, " S"], str]:
-    """Return the fault code of each sample of one channel, and the reason why the channel is dead ("" if it is not).
+    """Return the fault code of each sample of one channel, and the reason why the channel is dead ("" if the channel is
+    not dead).
 
-    The code is 0 (`SOUND`) for a good sample, otherwise `NOT_FINITE`, `STUCK` or `CLIPPING`. `rate`: sampling rate in
-    Hz. `full_scale`: largest possible magnitude of a sample, or None if unknown.
+    The fault code is 0 (`SOUND`) for a good sample, otherwise `NOT_FINITE`, `STUCK` or `CLIPPING`. `rate`: sampling
+    rate in Hz. `full_scale`: largest possible magnitude of a sample, or None if unknown.
     """
     codes = np.zeros(samples.shape, np.uint8)
     is_finite = np.isfinite(samples)
@@ -50,7 +51,7 @@ def sample_faults(
     if lowest == highest:
         return codes, f"dead: every {'' if all_finite else 'finite '}sample is {lowest:g}"
     is_stuck = _stuck_samples(samples, rate, float(highest - lowest))
-    # A channel that stays at one end of its range is stuck, not clipping.
+    # A channel that stays at one end of its range is stuck, and does not clip.
     moving_samples = samples if is_stuck is None else np.where(is_stuck, np.nan, samples)
     is_clipped = _clipped_samples(moving_samples, full_scale)
     if is_clipped is not None:
@@ -87,8 +88,8 @@ def window_faults(
 
 
 def intensity_faults(power: Float[np.ndarray, "F M"]) -> tuple[Bool[np.ndarray, "F M"], tuple[str, ...]]:
-    """Return the mask of the usable intensities and a description of each channel's fault, for intensities given
-    without samples. Faults are NaN, infinity, and channels that contain only zeros."""
+    """Return the mask of the usable intensities and a description of each channel's fault, for intensities `power`
+    given without samples. Faults are NaN, infinity, and channels that contain only zeros."""
     finite = np.isfinite(power)
     dead_channels = ~(finite & (power != 0)).any(axis=0)
     reasons = []
@@ -126,7 +127,7 @@ def _format_share(mask: np.ndarray) -> str:
 
 
 def _true_runs(flags: Bool[np.ndarray, " S"]) -> Shaped[np.ndarray, "2 R"]:
-    """Start and end indices of the runs of True; the end is exclusive."""
+    """Start and end indices (2, R) of the R runs of True in `flags`; the end is exclusive."""
     change = np.flatnonzero(np.diff(flags, prepend=False, append=False))
     return np.stack([change[::2], change[1::2]])
 
@@ -139,16 +140,16 @@ def _converter_step(samples: np.ndarray) -> float:
 
 def _stuck_samples(samples: np.ndarray, rate: float, extent: float) -> Bool[np.ndarray, " S"] | None:
     """Mask of the samples in long constant stretches, unless the signal also comes to rest elsewhere; None if no sample
-    is stuck. `extent`: range of the samples."""
+    is stuck. `extent`: difference between the largest and smallest sample."""
     min_length = max(_STUCK_SAMPLES, round(_STUCK_TIME * rate))
-    # A stuck stretch covers at least two whole blocks. Runs are searched for only if a block is constant, which saves
-    # time.
+    # A stuck stretch covers at least two whole blocks. Stretches are searched for only if a block is constant, which
+    # saves time.
     block = min_length // 4
     blocks = samples[: samples.size // block * block].reshape(-1, block)
     block_ranges = blocks.max(axis=1) - blocks.min(axis=1)
     if not (block_ranges == 0).any():
         return None
-    # Each flag stands for a pair of equal neighbours, so a run of n flags is a stretch of n + 1 samples.
+    # Each flag stands for a pair of equal successive samples, so a run of n flags is a stretch of n + 1 samples.
     start, stop = _true_runs(samples[1:] == samples[:-1])
     is_long = stop - start + 1 >= min_length
     if not is_long.any():
@@ -157,14 +158,16 @@ def _stuck_samples(samples: np.ndarray, rate: float, extent: float) -> Bool[np.n
     for first_flag, last_flag in zip(start[is_long], stop[is_long], strict=True):
         is_stuck[first_flag : last_flag + 1] = True
     # Silence can be constant too: with a coarse converter, or in a simulation without noise. The sound then fades into
-    # silence, so that some other blocks are almost constant. In a stuck channel with noise no other block is.
+    # silence, so that some other blocks are almost constant. In a stuck channel with noise, no other block is almost
+    # constant.
     is_moving = ~is_stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(block_ranges)
     rest_range = max(_REST_STEPS * _converter_step(samples), _REST_RANGE * extent)
     return None if is_moving.any() and block_ranges[is_moving].min() <= rest_range else is_stuck
 
 
 def _clipped_samples(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray, " S"] | None:
-    """Mask of the samples at an end of the channel's range, if its peaks are cut off there; None if they are not."""
+    """Mask of the samples at an end of the channel's range, if the channel's peaks are cut off there; None if no peak
+    is cut off."""
     lowest, highest = np.fmin.reduce(samples), np.fmax.reduce(samples)
     is_clipped = None
     step = samples_per_value = 0.0
@@ -173,7 +176,7 @@ def _clipped_samples(samples: np.ndarray, full_scale: float | None) -> Bool[np.n
         if full_scale is not None and peak >= (1 - _TOP_FULL_SCALE) * full_scale:
             heights.append(peak - (1 - _TOP_FULL_SCALE) * full_scale)
         distance_below_top = peak - sign * samples
-        # Most channels need no further test: they have too few samples near the end of the range to be clipped.
+        # Most channels need no further test, since they have too few samples near the end of the range to be clipped.
         if np.count_nonzero(distance_below_top <= max(heights)) < _MIN_FLAT_VALUES:
             continue
         if not samples_per_value:
@@ -192,9 +195,9 @@ def _has_clipped_peak(
 
     `distance_below_top` (S,): distance of each sample below the top. `samples_per_value`: number of samples per
     converted value. An unclipped peak is nearly a parabola: if n successive converted values stay within `height` of
-    the top, then k values later it has fallen by at most `height` · ((n - 1 + 2k) / (n - 1))². A clipped peak falls by
-    much more, about the height that was cut off. Slow or loud peaks are thus accepted, however many samples they have
-    near the top, and so is a single value that the converter holds for several samples.
+    the top, then k values later the peak has fallen by at most `height` · ((n - 1 + 2k) / (n - 1))². A clipped peak
+    falls by much more, about the height that was cut off. Slow or loud peaks are thus accepted, however many samples
+    are near the top, and so is a single value that the converter holds for several samples.
     """
     start, stop = _true_runs(near_top)
     values_per_run = (stop - start) / samples_per_value

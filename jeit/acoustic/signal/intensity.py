@@ -5,13 +5,14 @@ power is
 
     P = 2 / (N Σ w²) · Σ_k W_k |X_k|².
 
-The weight W_k is the fraction of the frequency interval (k ± 1/2) r / N of bin k, clipped to 0 to r/2, that lies in the
-band. A sine of amplitude A well inside the band has P = A²/2 (Parseval). White noise of variance σ² has the mean power
-σ² · (high - low) / (r/2), also if the edges of the band fall between bins. The mean of each window is subtracted, which
-does not affect bins from k = 2 on; these relations are therefore exact for low ≥ 1.5 / window.
+The weight W_k is the fraction of the frequency interval (k ± 1/2) r / N of bin k, clipped to the range 0 to r/2, that
+lies in the band. A sine of amplitude A well inside the band has P = A²/2 (Parseval). White noise of variance σ² has the
+mean power σ² · (high - low) / (r/2), also if the edges of the band fall between bins. The mean of each window is
+subtracted, which does not affect bins from k = 2 on. The relations for sine and noise are therefore exact for low ≥ 1.5
+/ window.
 
-P is a quadratic form xᵀAx. For white noise its mean is σ² tr A and its variance 2 σ⁴ tr A². Its distribution is nearly
-that of mean · χ²_ν / ν, with ν = (tr A)² / tr A² degrees of freedom.
+The band power P is a quadratic form xᵀAx of the samples. For white noise, the mean of P is σ² tr A and the variance 2
+σ⁴ tr A². The distribution of P is nearly that of mean · χ²_ν / ν, with ν = (tr A)² / tr A² degrees of freedom.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ from jeit.acoustic.signal.recording import Intensities, Recording, Taps
 from jeit.arguments import check_kind
 from jeit_solvers.module import Module
 
-# Minimum number of frequency bins in the band.
+# Minimum number of frequency bins in the frequency band.
 _MIN_BINS = 4.0
-# Number of samples transformed at a time: 2 MiB, so that samples and transforms fit into the processor's cache.
+# Number of samples Fourier-transformed at a time: 2 MiB, so that samples and transforms fit into the processor's cache.
 _MAX_CHUNK_SAMPLES = 2**18
 
 
 class WindowGrid(NamedTuple):
-    """Windows and band of a recording, in samples and frequency bins.
+    """Windows and frequency band of a recording, in samples and frequency bins.
 
     **Fields**: `length`, `hop`: length of a window and distance between windows, in samples; `taper`: Hann window (N,);
     `first`: index of the first bin in the band; `weights`: 2 W_k / (N Σ w²) of the bins in the band (K,).
@@ -50,10 +51,10 @@ class WindowGrid(NamedTuple):
 
 
 def window_grid(settings, rate: float, num_samples: int | None, name: str) -> WindowGrid:
-    """Convert `IntensitySettings` to windows and bins at the sampling rate `rate` in Hz.
+    """Convert `IntensitySettings` to windows in samples and frequency bins, at the sampling rate `rate` in Hz.
 
-    `num_samples`: number of samples of the recording, if known; `name`: its name in messages. Raises `ValueError` if
-    band, window, rate and number of samples are not compatible.
+    `num_samples`: number of samples of the recording, if known; `name`: name of the recording in messages. Raises
+    `ValueError` if band, window, rate and number of samples are not compatible.
     """
     length, hop = round(settings.window * rate), max(1, round(settings.hop * rate))
     if settings.high > rate / 2:
@@ -73,7 +74,8 @@ def window_grid(settings, rate: float, num_samples: int | None, name: str) -> Wi
             f"{name}: {num_samples} samples at {rate:g} Hz last {num_samples / rate:.3g} s, less than one window of "
             f"{settings.window:g} s. Record longer, or shorten window=."
         )
-    # The periodic Hann window is used instead of the symmetric one: its transform is nonzero in three bins only.
+    # The periodic Hann window is used instead of the symmetric window, since its transform is nonzero in three bins
+    # only.
     taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
     edges = np.clip((np.arange(length // 2 + 2) - 0.5) * rate / length, 0, rate / 2)
     clipped_edges = np.clip(edges, settings.low, settings.high)
@@ -84,12 +86,13 @@ def window_grid(settings, rate: float, num_samples: int | None, name: str) -> Wi
 
 
 def band_power(samples: np.ndarray, grid: WindowGrid) -> np.ndarray:
-    """Band power (F, M) of samples (M, S) in F windows."""
+    """Band power (F, M) of the samples (M, S) of M microphones in F windows."""
     finite = np.isfinite(samples)
     if not finite.all():
-        # Windows that contain these samples are marked as not usable, so their values do not matter.
+        # Windows that contain samples that are not finite are marked as not usable, so the values set here do not
+        # matter.
         samples = np.where(finite, samples, 0)
-    # A large constant would cost precision. The remaining mean of each window is removed below.
+    # A large constant offset of the samples would cost precision. The remaining mean of each window is removed below.
     samples = samples - samples.mean(axis=1, keepdims=True, dtype=float)
     windows = sliding_window_view(samples, grid.length, axis=-1)[:, :: grid.hop]
     num_microphones, num_windows = windows.shape[:2]
@@ -103,19 +106,19 @@ def band_power(samples: np.ndarray, grid: WindowGrid) -> np.ndarray:
         tapered = np.multiply(chunk, grid.taper, out=buffer[: chunk.size].reshape(chunk.shape))
         spectrum = np.asarray(scipy.fft.rfft(tapered, workers=2))[..., grid.first : last]
         if grid.first < 2:
-            # In bins from 2 on, the transform of the Hann window is zero, and the mean has no effect.
+            # In bins from 2 on, the transform of the Hann window is zero, and the mean of the window has no effect.
             spectrum = spectrum - chunk.mean(axis=-1)[..., None] * taper_spectrum
         power[start : start + chunk_size] = ((np.real(spectrum) ** 2 + np.imag(spectrum) ** 2) @ grid.weights).T
     return power
 
 
 def _overlap_trace(grid: WindowGrid, lag: int) -> float:
-    """tr(A_0 A_lag) for two windows `lag` samples apart: half the covariance of their powers for white noise of
-    variance 1.
+    """tr(A_0 A_lag) for the band-power matrices A of two windows `lag` samples apart: half the covariance of the powers
+    in the two windows for white noise of variance 1.
 
-    With g(d) = Σ_k W_k cos(2πkd/N), which has the period N, A_nm = w_n w_m g(n - m). The trace is therefore
-    Σ_d g(d)² r(d), where r is the autocorrelation of u_n = w_n w_(n+lag) over the overlap of the windows. No N × N
-    matrix is needed.
+    With g(d) = Σ_k W_k cos(2πkd/N), which has the period N, A_nm = w_n w_m g(n - m). The trace is therefore Σ_d g(d)²
+    r(d), where r is the autocorrelation of u_n = w_n w_(n+lag) over the overlap of the windows. No N × N matrix has to
+    be formed.
     """
     weights = np.zeros(grid.length // 2 + 1)
     weights[grid.first : grid.first + len(grid.weights)] = grid.weights
@@ -129,14 +132,14 @@ def _overlap_trace(grid: WindowGrid, lag: int) -> float:
 
 
 def white_freedom(grid: WindowGrid) -> float:
-    """Degrees of freedom ν of the power of white noise in one window. The value is exact, except that the subtraction
-    of the mean in bins 0 and 1 is neglected."""
+    """Degrees of freedom ν of the band power of white noise in one window. The value is exact, except that the
+    subtraction of the window's mean in bins 0 and 1 is neglected."""
     # tr A = Σ w² Σ W, where the weights W include the factor 2 / (N Σ w²).
     return float(((grid.taper**2).sum() * grid.weights.sum()) ** 2 / _overlap_trace(grid, 0))
 
 
 def noise_correlation(grid: WindowGrid, num_windows: int) -> Float[np.ndarray, "F F"]:
-    """Correlation (F, F) between the powers of white noise in F = `num_windows` overlapping windows."""
+    """Correlation (F, F) between the band powers of white noise in F = `num_windows` overlapping windows."""
     overlapping_lags = range(min(num_windows, -(-grid.length // grid.hop)))
     lag_traces = np.zeros(num_windows)
     lag_traces[: len(overlapping_lags)] = [_overlap_trace(grid, j * grid.hop) for j in overlapping_lags]
@@ -144,7 +147,7 @@ def noise_correlation(grid: WindowGrid, num_windows: int) -> Float[np.ndarray, "
     return lag_traces[lags] / lag_traces[0]
 
 
-# A tap is audible in a window if its loudness there is at least this fraction of its maximum loudness.
+# A tap is audible in a window if the loudness of the window is at least this fraction of the tap's maximum loudness.
 _AUDIBLE_SHARE = 0.5
 
 
@@ -155,7 +158,8 @@ class IntensitySettings(Module):
     the starts of successive windows in seconds.
 
     The sound of touches on a soft skin is below 1 kHz. Below 50 Hz, motion of the skin and of the arm that wears it
-    dominates. Raises `ValueError` for an invalid band, and for times that are invalid or probably not in seconds.
+    dominates. Raises `ValueError` for an invalid frequency band, and for times that are invalid or probably not in
+    seconds.
 
     **Example:**
 
@@ -201,11 +205,13 @@ def check_settings(name: str, settings: IntensitySettings | None) -> None:
 class TapIntensities(NamedTuple):
     """Intensities of T taps at M microphones, as returned by `tap_intensities`.
 
-    - `power`: (T, M) mean band power while the tap is audible, minus the noise floor. Values may be negative.
+    - `power`: (T, M) mean band power in the windows in which the tap is audible, minus the noise floor. Values may be
+      negative.
     - `floor`: (M,) noise power that was subtracted.
-    - `freedom`: (T,) degrees of freedom ν of the mean: for noise alone, its variance is 2 floor² / ν.
-    - `usable`: (T, M) mask of the usable values.
-    - `faults`: M descriptions of the fault of each channel; "" for none.
+    - `freedom`: (T,) degrees of freedom ν of the mean band power: for noise alone, the variance of the mean is 2 floor²
+      / ν.
+    - `usable`: (T, M) mask of the usable values of `power`.
+    - `faults`: description of the fault of each of the M channels; "" for no fault.
     """
 
     power: Float[np.ndarray, "T M"]
@@ -218,13 +224,14 @@ class TapIntensities(NamedTuple):
 def intensities(
     recording: Recording, settings: IntensitySettings | None = None, floor: Float[np.ndarray, " M"] | None = None
 ) -> Intensities:
-    """Compute the intensities of a recording in sliding windows. Windows with faults are marked as not usable.
+    """Compute the intensities (band powers) of a recording in sliding windows. Windows with faulty samples are marked
+    as not usable.
 
     **Arguments:**
 
     - `recording`: samples of the microphones.
     - `settings`: band and windows, by default `IntensitySettings()`.
-    - `floor`: noise floor (M,) in the squared unit of the samples. By default it is estimated from the quietest
+    - `floor`: noise floor (M,) in the squared unit of the samples. By default the floor is estimated from the quietest
       windows, which requires that at least a fifth of all windows contain no touch. If touches never pause, give the
       floor measured in silence.
 
@@ -265,18 +272,18 @@ def intensities(
 def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> TapIntensities:
     """Compute the intensity of each tap at each microphone, for calibration.
 
-    The power of a tap is the mean over the windows in which it is audible, the same windows for all microphones. The
-    loudness of a window is the sum over microphones of (power − floor) / floor; the tap is audible where the loudness
-    is at least half its maximum. A microphone with a fault in one of these windows is not usable for the tap, since
-    other windows have another loudness. The noise floor is estimated from the quietest windows of all taps, so the
-    recordings should include some silence before or after the taps. `freedom` of the result accounts for the overlap of
-    windows, exactly for white noise, but not for the selection of windows: if a tap is not audible at all, the loudest
-    windows of noise are selected, and its power is somewhat too high.
+    The power of a tap is the mean over the windows in which the tap is audible, the same windows for all microphones.
+    The loudness of a window is the sum over microphones of (power − floor) / floor; the tap is audible where the
+    loudness is at least half its maximum. A microphone with a fault in one of the audible windows is not usable for the
+    tap, since other windows have another loudness. The noise floor is estimated from the quietest windows of all taps,
+    so the recordings should include some silence before or after the taps. The field `freedom` of the result accounts
+    for the overlap of windows, exactly for white noise, but not for the selection of windows: if a tap is not audible
+    at all, the loudest windows of noise are selected, and the power of the tap is somewhat too high.
 
     **Arguments:**
 
-    - `taps`: the taps. If they contain intensities instead of samples, these are returned unchanged, with a floor of
-      zero and infinite `freedom`.
+    - `taps`: the taps. If the taps contain intensities instead of samples, the intensities are returned unchanged, with
+      a floor of zero and infinite `freedom`.
     - `settings`: band and windows, by default `IntensitySettings()`.
 
     Raises `ValueError` if `taps` is not a `Taps`, and if band, window and samples are not compatible.
@@ -299,8 +306,8 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     grid = window_grid(settings or IntensitySettings(), rate, samples.shape[-1], taps.name)
     usable_masks, faults = [], []
     for m in range(samples.shape[1]):
-        # All taps of a microphone are tested together, since range, converter step and silence are properties of the
-        # channel.
+        # All taps of a microphone are tested for faults together, since range, converter step and silence are
+        # properties of the channel.
         codes, dead = sample_faults(samples[:, m].ravel(), rate, taps.full_scale)
         mask, reason = window_faults(codes.reshape(-1, samples.shape[-1]), dead, grid.length, grid.hop)
         usable_masks.append(mask)
@@ -310,12 +317,13 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     num_taps, num_windows, num_microphones = power.shape
     freedom = white_freedom(grid)
     floor = noise_floor(power.reshape(-1, num_microphones), usable.reshape(-1, num_microphones), freedom)
-    # The minimum floor prevents a simulated channel without noise from dominating. Dead channels are ignored.
+    # A minimum noise floor prevents a simulated channel without noise from dominating the loudness. Dead channels are
+    # ignored.
     is_alive = usable.any(axis=(0, 1))
     positive_floor = np.maximum(floor, max(1e-9 * power.max(), np.finfo(float).tiny))
     loudness = np.where(is_alive, power / positive_floor - floor / positive_floor, 0).sum(axis=-1)
     is_audible = loudness >= _AUDIBLE_SHARE * loudness.max(axis=1, keepdims=True)
-    # The loudest window is always included, also if no window is above the floor.
+    # The loudest window of a tap is always included, also if no window is above the noise floor.
     is_audible |= loudness == loudness.max(axis=1, keepdims=True)
     mean = np.einsum("tf,tfm->tm", is_audible, power) / is_audible.sum(axis=1)[:, None]
     correlation = noise_correlation(grid, num_windows)
@@ -331,16 +339,17 @@ def noise_floor(
 
     `share`: minimum fraction of the windows that are free of touches. `freedom`: degrees of freedom ν of the power of
     noise. The initial estimate is a low quantile of the powers divided by the same quantile of χ²_ν / ν, as in minimum
-    statistics (R. Martin, IEEE Trans. Speech Audio Process. 9, 504-512, 2001). It is up to a few tenths too high if
-    most windows are loud, since the actual fraction of quiet windows is unknown. It is refined iteratively: the new
-    floor is the mean of the powers below c times the floor, divided by the mean of χ²_ν / ν truncated at c. If ν is
-    infinite, the low quantile itself is returned. The floor of a channel without usable windows is 0.
+    statistics (R. Martin, IEEE Trans. Speech Audio Process. 9, 504-512, 2001). The initial estimate is up to a few
+    tenths too high if most windows are loud, since the actual fraction of quiet windows is unknown. The floor is
+    refined iteratively: the new floor is the mean of the powers below c times the floor, divided by the mean of χ²_ν /
+    ν truncated at c. If ν is infinite, the low quantile itself is returned. The floor of a channel without usable
+    windows is 0.
 
-    If the noise is not white, its power varies more than ν indicates, and the floor is underestimated: by 8 % for a
-    spectrum 1/f from 50 to 1000 Hz, and by a third for 1/f².
+    If the noise is not white, its power varies more than ν indicates, and the noise floor is underestimated: by 8 % for
+    a spectrum 1/f from 50 to 1000 Hz, and by a third for 1/f².
 
-    Raises `ValueError` for shapes that disagree, usable windows that are not finite, and a share or freedom out of
-    range.
+    Raises `ValueError` for shapes that disagree, usable windows whose power is not finite, and a `share` or `freedom`
+    out of range.
     """
     power, usable = np.asarray(power, float), np.asarray(usable)
     if power.ndim != 2 or usable.shape != power.shape or usable.dtype != bool:
@@ -356,15 +365,15 @@ def noise_floor(
         raise ValueError("power is NaN or infinite in windows that usable calls usable; mark those False.")
     num_usable = usable.sum(axis=0)
     sorted_power = np.sort(np.where(usable, power, np.inf), axis=0)
-    # The median of the quietest `share` of the windows.
+    # Rank of the median power of the quietest `share` of the windows.
     rank = np.clip(np.floor(0.5 * share * num_usable).astype(int), 0, max(len(power) - 1, 0))
     floor = np.take_along_axis(sorted_power, rank[None], axis=0)[0] if len(power) else np.zeros(power.shape[1])
     floor = np.where(num_usable > 0, floor, 0.0)
     if np.isinf(freedom):
         return floor
     half_freedom = freedom / 2
-    # Quantiles of χ²_ν / ν, and its mean below the cut-off c: ∫_0^c y p(y) dy is the distribution function of χ² with
-    # ν + 2 degrees of freedom, at ν c.
+    # Quantiles of χ²_ν / ν, and the mean of χ²_ν / ν below the cut-off c: ∫_0^c y p(y) dy is the distribution function
+    # of χ² with ν + 2 degrees of freedom, at ν c.
     floor = floor / (gammaincinv(half_freedom, 0.5 * share) / half_freedom)
     cutoff = gammaincinv(half_freedom, 0.9) / half_freedom
     mean_below_cutoff = gammainc(half_freedom + 1, half_freedom * cutoff) / 0.9
@@ -379,8 +388,8 @@ def noise_floor(
 
 
 def degrees_of_freedom(settings: IntensitySettings, rate: float) -> float:
-    """Degrees of freedom ν of the power of white noise in one window, sampled at `rate` Hz. The variance of the power
-    is 2 mean² / ν."""
+    """Degrees of freedom ν of the band power of white noise in one window, sampled at `rate` Hz. The variance of the
+    power is 2 mean² / ν."""
     return white_freedom(window_grid(settings, rate, None, "settings"))
 
 

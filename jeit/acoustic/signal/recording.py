@@ -1,7 +1,8 @@
-"""Recordings of microphones, and the files from which they are read.
+"""Recordings of microphones, and the files from which recordings are read.
 
-All input is validated here: types, shapes, metres and hertz. Later steps do not check it again. The signals of a broken
-microphone (NaN, zeros, clipped peaks) are accepted here; `jeit.acoustic.signal.faults` detects them.
+All input is validated here: types, shapes, and plausible values in metres and hertz. Later steps do not check the input
+again. The signals of a broken microphone (NaN, zeros, clipped peaks) are accepted here; `jeit.acoustic.signal.faults`
+detects such faults.
 """
 
 from __future__ import annotations
@@ -39,12 +40,12 @@ _MAX_SAMPLE = 1e15
 
 
 class Recording(Module):
-    """Simultaneous samples of M microphones.
+    """Simultaneous sound samples of M microphones.
 
     **Arguments:**
 
-    - `samples`: samples (M, S) in any unit (volts, counts, fractions of full scale). NaN and infinite samples are kept;
-      magnitudes above 1e15 are replaced by infinity.
+    - `samples`: S samples of each microphone (M, S) in any unit (volts, counts, fractions of full scale). NaN and
+      infinite samples are kept; magnitudes above 1e15 are replaced by infinity.
     - `rate`: sampling rate of each microphone, Hz.
     - `full_scale`: largest magnitude of a sample that the device can return, or None if unknown.
     - `name`: name of the recording, used in messages.
@@ -66,7 +67,7 @@ class Recording(Module):
         self, samples: ArrayLike, rate: ArrayLike, *, full_scale: ArrayLike | None = None, name: str = "recording"
     ):
         """Raises `ValueError` for samples that are not real, have another shape than (M, S) or look transposed, and for
-        an implausible rate."""
+        an implausible sampling rate."""
         array = real_array_of(samples, "samples", "microphones, samples")
         is_too_large = np.abs(array) > _MAX_SAMPLE if array.dtype.kind == "f" else np.zeros(0, bool)
         self.samples = np.where(is_too_large, np.inf, array) if is_too_large.any() else array
@@ -86,15 +87,15 @@ class Intensities(Module):
 
     - `times`: middle (F,) of each window, seconds.
     - `power`: band power (F, M) minus the noise floor, in the squared unit of the samples. Values may be negative, and
-      are NaN only where they are not usable.
-    - `floor`: noise power (M,) that was subtracted; zero if unknown.
-    - `freedom`: degrees of freedom ν of the power of white noise in a window: its variance is 2 floor² / ν. Infinite if
-      unknown.
+      are NaN only where a window is not usable.
+    - `floor`: noise power (M,) that was subtracted from the band power; zero if unknown.
+    - `freedom`: degrees of freedom ν of the power of white noise in a window, whose variance is 2 floor² / ν. Infinite
+      if unknown.
     - `overlap`: length of a window divided by the hop between windows; 1 if windows do not overlap.
     - `usable`: mask (F, M) of the windows without a fault; by default where `power` is finite.
-    - `faults`: M descriptions of the fault of each channel; "" for none.
+    - `faults`: description of the fault of each of the M channels; "" for no fault.
     - `name`: name of the recording, used in messages.
-    - `notes`: remarks on the measurement.
+    - `notes`: remarks on the measurement, as texts.
 
     **Example:**
 
@@ -127,7 +128,7 @@ class Intensities(Module):
         name: str = "intensities",
         notes: Sequence[str] | np.ndarray = (),
     ):
-        """By default, `usable` and `faults` are derived from NaN, infinite values and dead channels.
+        """By default, `usable` and `faults` are derived from NaN, infinite values and dead channels in `power`.
 
         Raises `ValueError` for values that are not real or out of range, for shapes that disagree, and for times that
         do not increase.
@@ -169,7 +170,8 @@ class Intensities(Module):
 
 
 class Taps(Module):
-    """T touches at known positions, for calibration; d = 2 or 3. Give either `power`, or `samples` and `rate`.
+    """T taps at known positions in d = 2 or 3 dimensions, for the calibration of M microphones, with either `power`, or
+    `samples` and `rate`.
 
     **Arguments:**
 
@@ -177,7 +179,7 @@ class Taps(Module):
     - `outline`: vertices (K, d) of the skin's outline in order, metres. A plane outline is ordered counter-clockwise.
     - `positions`: positions (T, d) of the taps, metres.
     - `power`: intensity (T, M) of each tap above the noise floor.
-    - `samples`: recording (T, M, S) of each tap.
+    - `samples`: S samples of each tap at each microphone (T, M, S).
     - `rate`: sampling rate of the samples, Hz.
     - `full_scale`, `name`: as in `Recording`.
 
@@ -213,8 +215,8 @@ class Taps(Module):
         """Either `power` or `samples` and `rate` must be given.
 
         Raises `ValueError` for invalid arrays, for microphones farther from the skin than its length, for two
-        microphones at the same position, and, on a plane skin, for taps farther outside the outline than 5 % of its
-        length.
+        microphones at the same position, and, on a plane skin, for taps farther outside the outline than 5 % of the
+        skin's length.
         """
         self.outline = check_coordinates(outline, "outline", np.shape(microphones)[-1:])
         self.microphones = check_coordinates(microphones, "microphones", self.outline.shape[1:])
@@ -266,7 +268,7 @@ def read_recording(path: str | Path) -> Recording | Intensities:
 
     - `path`: path of the file.
 
-    Raises `ValueError` for any other content, and `OSError` if the file cannot be opened.
+    Raises `ValueError` for a file with other content, and `OSError` if the file cannot be opened.
 
     **Example:**
 
@@ -308,7 +310,7 @@ def read_taps(path: str | Path) -> Taps:
 
     - `path`: path of the file.
 
-    Raises `ValueError` for other content, and `OSError` if the file cannot be opened.
+    Raises `ValueError` for a file with other content, and `OSError` if the file cannot be opened.
 
     **Example:**
 
@@ -357,7 +359,7 @@ def write_recording(path: str | Path, recording: Recording | Intensities) -> Non
 
 
 def write_taps(path: str | Path, taps: Taps) -> None:
-    """Write taps to an NPZ file for `read_taps`.
+    """Write calibration taps to an NPZ file for `read_taps`.
 
     **Arguments:**
 

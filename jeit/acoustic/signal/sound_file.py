@@ -1,4 +1,4 @@
-"""Sound files: WAV, and further formats if `soundfile` is installed."""
+"""Reading of sound files: WAV, and further formats if the package `soundfile` is installed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import scipy.io.wavfile
 from jeit.arguments.extras import optional
 from jeit.files import check_memory, read_as, reason
 
-# Bytes of memory needed per byte of a file with eight bits per sample.
+# Bytes of memory needed per byte of a sound file with eight bits per sample.
 _MEMORY_FACTOR = 16
 # First bytes of the formats read by `soundfile`: FLAC, Ogg, AIFF, CAF, AU, Wave64, VOC, MP3 with a tag.
 _SOUNDFILE_STARTS = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"riff", b"Creative", b"ID3")
@@ -24,9 +24,9 @@ def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
     """Read the samples (M, S), the sampling rate in Hz and the full scale of a sound file. Returns None if the format
     is unknown.
 
-    Integer samples are converted to fractions of full scale, from -1 to 1. Floats are unchanged; if any exceeds 1, the
-    full scale is None (unknown). Raises `ValueError` for broken files, for formats that cannot be read, and if
-    `soundfile` is needed but not installed.
+    Integer samples are converted to fractions of full scale, from -1 to 1. Float samples are unchanged; if the
+    magnitude of any float exceeds 1, the full scale is None (unknown). Raises `ValueError` for broken files, for
+    formats that cannot be read, and if `soundfile` is needed but not installed.
     """
     check_memory(path.name, _MEMORY_FACTOR * path.stat().st_size)
     with path.open("rb") as file:
@@ -44,7 +44,7 @@ def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
 
 
 def _is_mp3(start: bytes) -> bool:
-    """Whether the bytes are the start of an MPEG layer III frame: eleven set bits, any version, and the layer."""
+    """Whether the bytes `start` begin an MPEG layer III (MP3) frame: eleven set bits, any version, and the layer."""
     return len(start) > 1 and start[0] == 0xFF and start[1] & 0xE6 == 0xE2
 
 
@@ -54,9 +54,9 @@ def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
         warnings.simplefilter("always")
         try:
             rate, data = scipy.io.wavfile.read(path)
-        except Exception as error:  # damaged files raise exceptions of many types
+        except Exception as error:  # SciPy raises exceptions of many types for damaged files
             problem = error
-    # SciPy only warns of a truncated file, or fails later. Its other warnings concern chunks without sound.
+    # SciPy only warns of a truncated file, or fails later. Other warnings of SciPy concern chunks without sound.
     if any("prematurely" in str(warning.message) for warning in caught_warnings):
         raise ValueError("the WAV file is cut off: it holds fewer samples than its header says. Copy it again.")
     if "Unknown wave file format" in str(problem):  # A-law or ADPCM, for example
@@ -67,7 +67,8 @@ def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
     if data.dtype == np.uint8:
         return (samples - 128.0) / 128.0, rate, 1.0
     if data.dtype.kind == "i":
-        # SciPy returns 24-bit samples in the upper bits of 32-bit integers, so this scale is right for them too.
+        # SciPy returns 24-bit samples in the upper bits of 32-bit integers, so this scale is right for 24-bit samples
+        # too.
         return samples / -float(np.iinfo(data.dtype.name).min), rate, 1.0
     return samples, rate, _full_scale(samples)
 
@@ -76,7 +77,7 @@ def _read_with_soundfile(path: Path) -> tuple[np.ndarray, float, float | None]:
     try:
         soundfile: Any = optional("soundfile", "a format that is not plain WAV", "Or convert it to plain WAV.")
     except ImportError as error:
-        raise ValueError(str(error)) from None  # like other faults of this file: the caller may read further files
+        raise ValueError(str(error)) from None  # the caller may read further files
     error_message = "not a sound file that soundfile reads"
     with read_as(error_message):
         file = soundfile.SoundFile(path)
@@ -84,7 +85,7 @@ def _read_with_soundfile(path: Path) -> tuple[np.ndarray, float, float | None]:
         check_memory(path.name, 16.0 * file.frames * file.channels)
         with read_as(error_message):
             data, rate, subtype = file.read(file.frames, "float64", always_2d=True), file.samplerate, file.subtype
-    # Decoded samples of compressed formats may slightly exceed 1, although their full scale is 1.
+    # Decoded samples of compressed formats may slightly exceed 1, although the full scale is 1.
     return data.T, rate, _full_scale(data) if subtype in ("FLOAT", "DOUBLE") else 1.0
 
 

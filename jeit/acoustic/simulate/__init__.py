@@ -1,4 +1,4 @@
-"""Simulation of an acoustic skin with microphones, and of the sound of touches on it."""
+"""Simulation of an acoustic skin with microphones, and of the sound of touches on the skin."""
 
 from __future__ import annotations
 

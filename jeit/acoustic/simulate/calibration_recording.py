@@ -29,12 +29,12 @@ from jeit.acoustic.simulate.synthesis import (
 from jeit.arguments.checks import check_not_negative
 from jeit_solvers.module import Module
 
-# Number of samples computed at once: 32 MB.
+# Maximum number of samples computed at once: 32 MB.
 MAX_CHUNK_SAMPLES = 2**22
 
 
 class CalibrationTaps(Module):
-    """Recordings of taps at known positions.
+    """Simulated recordings of T taps at known positions, for calibration.
 
     **Fields**: `samples`: recorded samples (T, M, S); `rate`: sampling rate in Hz; `positions`: positions of the taps
     (T, 2) in metres; `strengths`: true strengths of the taps (T,).
@@ -58,9 +58,9 @@ def simulate_calibration_taps(
     noise: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> CalibrationTaps:
-    """Simulate repeated taps at each of P positions: T = P · repeats recordings, ordered by position.
+    """Simulate repeated calibration taps at each of P positions: T = P · repeats recordings, ordered by position.
 
-    The strengths are log-normal; they are unknown to a calibration.
+    The strengths of the taps are log-normal, and unknown to a calibration.
 
     **Arguments:**
 
@@ -68,11 +68,11 @@ def simulate_calibration_taps(
     - `key`: random key.
     - `positions`: tapped positions (P, 2), metres.
     - `repeats`: number of taps at each position.
-    - `burst`: envelope of a tap; its strength is the median of the strengths.
-    - `strength_spread`: standard deviation of the logarithm of the strength.
+    - `burst`: envelope of a tap; the strength of `burst` is the median of the strengths.
+    - `strength_spread`: standard deviation of the logarithm of the taps' strengths.
     - `duration`: duration of each recording, seconds.
     - `noise`: whether to add the microphones' noise.
-    - `progress`: called with a text after each part of the computation.
+    - `progress`: function called with a text after each part of the computation.
 
     Raises `ValueError` as `simulate_tap` does.
 
@@ -100,7 +100,7 @@ def simulate_calibration_taps(
     level = noise_power(skin) if noise else None
     keys = jax.random.split(tap_key, len(tap_positions))
     # The taps are computed in chunks, which limits memory. All chunks have the same size, so that one compiled program
-    # serves all.
+    # serves all chunks.
     num_chunks = min(len(tap_positions), -(-samples.size // MAX_CHUNK_SAMPLES))
     for chunk in np.array_split(np.arange(-(-len(tap_positions) // num_chunks) * num_chunks), num_chunks):
         chunk = np.minimum(chunk, len(tap_positions) - 1)

@@ -10,8 +10,8 @@ from jeit.arguments.checks import check_not_negative
 from jeit.layout.layout import LARGEST
 from jeit_solvers.module import Module
 
-# Time between two slots of a multiplexer in seconds, and number of slots. Eight 4:1 multiplexers switch simultaneously
-# every 25 µs, so each microphone is sampled every 100 µs (Park 2022, text S3).
+# Time between two slots of a multiplexer in seconds, and number of slots per multiplexer. Eight 4:1 multiplexers switch
+# simultaneously every 25 µs, so each microphone is sampled every 100 µs (Park 2022, text S3).
 SLOT_TIME = 25e-6
 NUM_SLOTS = 4
 
@@ -22,13 +22,14 @@ class MicrophoneModel(Module):
     **Fields**
 
     - `depth`: depth of the nominal microphone under the surface, in metres.
-    - `reach`, `snr_db`: signal-to-noise ratio in the band, in decibels, at which a nominal microphone receives a steady
-      source of strength 1 at the horizontal distance `reach` in metres, far from all edges. The microphones of Park
-      2022 sense touches up to "about 5.5 cm" (Fig. S15), interpreted here as the distance for 0 dB.
+    - `reach`, `snr_db`: signal-to-noise ratio in the frequency band, in decibels, at which a nominal microphone
+      receives a steady source of strength 1 at the horizontal distance `reach` in metres, far from all edges. The
+      microphones of Park 2022 sense touches up to "about 5.5 cm" (Fig. S15), interpreted here as the distance for 0 dB.
     - `gain_spread_db`, `noise_spread_db`: standard deviations of gain and noise power, in decibels of power.
-    - `depth_spread`: standard deviation of the logarithm of depth. All three spreads are choices of this library.
+    - `depth_spread`: standard deviation of the logarithm of the depth. The values of all three spreads are choices of
+      this library.
 
-    Raises `ValueError` for invalid properties.
+    Raises `ValueError` for invalid properties of the microphones.
     """
 
     depth: float = 0.01
@@ -48,7 +49,7 @@ class MicrophoneModel(Module):
 
 
 class Readout(Module):
-    """Readout of the microphones: analogue filters, multiplexers, and sampling.
+    """Readout of the microphones of a skin: analogue filters, multiplexers, and sampling.
 
     **Fields**
 
@@ -57,9 +58,9 @@ class Readout(Module):
       crosstalk.
     - `multiplexed`: if True, the sampling rate is 10 kHz and microphone i is sampled (i mod 4) · 25 µs after the first.
       If False, all microphones are sampled simultaneously at 40 kHz, without crosstalk. The device of Park 2022 has 8
-      multiplexers; here their number is not limited.
+      multiplexers; in the simulation, the number of multiplexers is not limited.
 
-    Raises `ValueError` for a band that is too high for the sampling rate, and for crosstalk of 0 dB or more.
+    Raises `ValueError` for a frequency band that is too high for the sampling rate, and for crosstalk of 0 dB or more.
     """
 
     band: tuple[float, float] = (60.0, 900.0)
@@ -83,7 +84,7 @@ class Readout(Module):
 
     @property
     def coupling(self):
-        """Amplitude of the crosstalk from the previously read microphone."""
+        """Amplitude of the crosstalk from the previously read microphone, relative to that microphone's amplitude."""
         return 10 ** (self.coupling_db / 20)
 
     def stagger(self, number: int) -> np.ndarray:
@@ -92,7 +93,8 @@ class Readout(Module):
 
 
 def microphone_grid(number: int, *, width: float = 0.2, height: float = 0.2) -> np.ndarray:
-    """Centres (number², 2) in metres of number × number equal cells of the skin, row by row from the lower left.
+    """Positions (number², 2) in metres of microphones at the centres of number × number equal cells of a skin, row by
+    row from the lower left.
 
     **Arguments:**
 

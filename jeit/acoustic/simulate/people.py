@@ -19,17 +19,17 @@ from jeit.arguments import check_key, check_kind, check_name, describe
 from jeit.arguments.checks import check_positive
 from jeit_solvers.module import Module
 
-# Standard deviation of the logarithm of a trait between the clips of one person; and standard deviation of `slope`,
-# which varies linearly, between people. Between the clips of one person, `slope` varies half as much.
+# Standard deviation of the logarithm of a trait between the clips of one person; and standard deviation of the trait
+# `slope` itself between people. Between the clips of one person, `slope` varies half as much.
 WITHIN_PERSON_SPREAD, SLOPE_SPREAD = 0.25, 0.3
 
 
 @dataclass(frozen=True)
 class Trait:
-    """Distribution of a trait among people.
+    """Distribution of a trait of touches among people.
 
-    **Fields**: `median`: median in SI units; `spread`: standard deviation of the logarithm, or of the trait itself for
-    `slope`.
+    **Fields**: `median`: median of the trait in SI units; `spread`: standard deviation of the trait's logarithm, or of
+    the trait itself for `slope`.
     """
 
     median: float
@@ -70,20 +70,20 @@ MODALITIES = tuple(SOUND_MANNERS)
 """Names of the touch modalities, in the order of Park 2022."""
 
 
-# Standard deviations between the taps of one clip: of the logarithm of strength, and of the logarithm of the interval;
-# and maximum distance in metres of a pat from its mean position.
+# Standard deviations between the taps of one clip: of the logarithm of the strength, and of the logarithm of the
+# interval between taps; and maximum distance in metres of a pat from the mean position of the pats.
 _STRENGTH_SPREAD, _RHYTHM_SPREAD, _PAT_RADIUS = 0.25, 0.12, 4e-3
-# Minimum distance of the centre of a touch from the edge, in metres; minimum speed of a hand at a turn, divided by its
-# mean speed.
+# Minimum distance of the centre of a touch from the edge of the skin, in metres; minimum speed of a stroking hand at a
+# turn, divided by the hand's mean speed.
 _EDGE_MARGIN, _MIN_SPEED_RATIO = 0.02, 0.1
-# Minimum length of a burst in seconds, which limits random values.
+# Minimum length of a burst of sound in seconds, which limits random lengths.
 _MIN_BURST_LENGTH = 0.01
 
 
 class SoundingPerson(Module):
-    """Traits of one person.
+    """A simulated person, with individual traits of touch.
 
-    **Fields**: `medians`: for each modality, dictionary of the person's traits by name, in SI units.
+    **Fields**: `medians`: for each modality of touch, a dictionary of the person's traits by name, in SI units.
 
     **Example:**
 
@@ -96,7 +96,8 @@ class SoundingPerson(Module):
     medians: Mapping[str, Mapping[str, float]] = eqx.field(static=True)
 
     def __check_init__(self):
-        """Raises `ValueError` if the traits are not those of `SOUND_MANNERS`, or are not positive numbers."""
+        """Raises `ValueError` if the names of the traits are not those in `SOUND_MANNERS`, or the traits are not
+        positive numbers."""
         check_kind("medians", self.medians, Mapping, "traits by modality, such as of SoundingPerson.draw(key)")
         for name, traits in SOUND_MANNERS.items():
             if set(self.medians.get(name, {})) != set(traits):
@@ -106,8 +107,8 @@ class SoundingPerson(Module):
 
     @classmethod
     def draw(cls, key: Array) -> "SoundingPerson":
-        """Draw a random person. Traits are log-normal about the medians of the population; `slope` is normal. Raises
-        `ValueError` if `key` is not a random key."""
+        """Draw a random person. Traits are log-normal about the medians of the population; the trait `slope` is normal.
+        Raises `ValueError` if `key` is not a random key."""
         check_key(key)
         rng = _numpy_generator(key)
         medians = {}
@@ -124,8 +125,9 @@ class SoundingPerson(Module):
     def touch(self, key: Array, modality: str, skin: SoundingSkin, *, duration: float = 2.9) -> SimulatedSound:
         """Simulate `duration` seconds of a touch of this person at a random position on the skin, without noise.
 
-        `modality`: one of `MODALITIES`. The traits of the touch are log-normal about those of the person, with a
-        standard deviation of the logarithm of 0.25; `slope` is normal. Raises `ValueError` for invalid arguments.
+        `modality`: one of `MODALITIES`. The traits of the touch are log-normal about the person's traits, with a
+        standard deviation of the logarithm of 0.25; the trait `slope` is normal. Raises `ValueError` for invalid
+        arguments.
         """
         check_skin_and_key(skin, key)
         check_name("modality", modality, MODALITIES)
@@ -140,8 +142,8 @@ class SoundingPerson(Module):
                 traits[name] = max(median + SLOPE_SPREAD / 2 * rng.normal(), 0.1)
             else:
                 traits[name] = float(median * np.exp(WITHIN_PERSON_SPREAD * rng.normal()))
-        # The touch is simulated with its own spectral slope in place of the skin's. The microphones' noise depends on
-        # the skin's slope and is therefore not added here.
+        # The touch is simulated with its own spectral slope in place of the skin's slope. The microphones' noise
+        # depends on the skin's slope, and is therefore not added here.
         sloped_skin = eqx.tree_at(lambda tree: tree.spectral_slope, skin, traits.pop("slope"))
         return _SIMULATIONS[modality](rng, sloped_skin, sound_key, traits, duration)
 
@@ -149,7 +151,7 @@ class SoundingPerson(Module):
 def _simulate_taps(
     rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float
 ) -> SimulatedSound:
-    """Simulate a pat or tickle: taps of random strength and rhythm at random positions within a small disc."""
+    """Simulate a pat or a tickle: taps of random strength and rhythm at random positions within a small disc."""
     burst = Burst(traits["strength"], max(traits["length"], _MIN_BURST_LENGTH))
     interval, radius = traits["interval"], traits.get("radius", _PAT_RADIUS)
     num_taps = int(np.ceil(2 * duration / interval)) + 2
@@ -181,7 +183,7 @@ def _simulate_stroke(
         _random_position(rng, skin), -(max_coordinates - np.abs(half_path)), max_coordinates - np.abs(half_path)
     )
     times = sample_times(skin, duration)
-    # The mean speed of a sinusoidal motion of amplitude L/2 and angular frequency w is L w / π.
+    # The mean speed of a sinusoidal motion of peak-to-peak length L and angular frequency w is L w / π.
     angular_frequency = np.pi * traits["speed"] / length
     speed = np.maximum(
         length / 2 * angular_frequency * np.abs(np.cos(angular_frequency * times + phase)),
@@ -197,7 +199,7 @@ def _simulate_stroke(
 def _simulate_wind(
     rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float
 ) -> SimulatedSound:
-    """Simulate an air jet at a random position."""
+    """Simulate an air jet that blows on a random position of the skin."""
     return simulate_wind(
         skin, key, _random_position(rng, skin), slope=skin.spectral_slope, duration=duration, noise=False, **traits
     )
@@ -241,11 +243,11 @@ _ROOM_LEVEL, _ROOM_SPREAD = -6.0, 4.0
 
 @dataclass(frozen=True)
 class SoundClip:
-    """Recording of one touch.
+    """Simulated recording of one touch by one person.
 
     **Fields**: `touch`: sound of the touch without noise, with the true source; `noise`: noise (M, S) of the
-    microphones and the room; `modality`: name of the modality; `person`: index of the person. `samples` is the recorded
-    sound.
+    microphones and the room; `modality`: name of the kind of touch; `person`: index of the person. The property
+    `samples` is the recorded sound.
     """
 
     touch: SimulatedSound
@@ -255,11 +257,11 @@ class SoundClip:
 
     @property
     def samples(self) -> Float[np.ndarray, "M S"]:
-        """Recorded samples: the sum of touch and noise."""
+        """Recorded samples (M, S): the sum of the touch's sound and the noise."""
         return self.touch.samples + self.noise
 
     def with_louder_noise(self, decibels: float) -> Float[np.ndarray, "M S"]:
-        """Return the samples (M, S) with the level of the noise raised by a number of decibels."""
+        """Return the recorded samples (M, S) with the level of the noise raised by a number of decibels."""
         return self.touch.samples + 10 ** (decibels / 20) * self.noise
 
 
@@ -272,11 +274,11 @@ def simulate_sound_clips(
     modalities: Sequence[str] = MODALITIES,
     duration: float = 2.9,
 ) -> Iterator[SoundClip]:
-    """Yield recordings of touches by several people, ordered by person and modality. Clips are generated one at a time,
-    so that a large set need not fit into memory.
+    """Yield recordings of touches by several people, ordered by person and modality. Recordings (clips) are generated
+    one at a time, so that a large set need not fit into memory.
 
-    The noise consists of the microphones' noise and the room's sound, whose level in decibels relative to that noise is
-    normal with a mean of -6 dB. Every clip has its own random key.
+    The noise consists of the microphones' noise and the room's sound, whose level in decibels relative to the
+    microphones' noise is normal with a mean of -6 dB. Every clip has its own random key.
 
     **Arguments:**
 

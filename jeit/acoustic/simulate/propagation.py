@@ -1,6 +1,6 @@
 """Propagation of sound from a touch to the microphones: spreading, loss, dispersion, edge echoes, and the multiplexer.
 
-Sound is propagated in the frequency domain. Expected powers are integrals over frequency and involve no random numbers.
+Sound is propagated in the frequency domain. Expected powers are integrals over frequency, and need no random numbers.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from jeit.acoustic.simulate.sounding_skin import SoundingSkin
 
 
 def band_filter(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float[Array, " F"]:
-    """Power response (F,) of the analogue filters: 1 in the band, 1/2 at its limits, and 0 more than half an octave
-    outside."""
+    """Power response (F,) of the analogue filters at `frequencies` (F,) in Hz: 1 in the band, 1/2 at the limits of the
+    band, and 0 more than half an octave outside."""
     octaves = jnp.log2(jnp.maximum(frequencies, 1e-9))
     low, high = jnp.log2(skin.readout.band[0]), jnp.log2(skin.readout.band[1])
     rising, falling = jnp.clip(octaves - low + 0.5, 0, 1), jnp.clip(high - octaves + 0.5, 0, 1)
@@ -24,28 +24,30 @@ def band_filter(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float[Ar
 
 
 def source_density(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float[Array, " F"]:
-    """Power spectral density (F,) of a source of strength 1, in 1/Hz. Its integral over positive frequencies is 1."""
+    """Power spectral density (F,) of a source of strength 1 at `frequencies` (F,) in Hz, in 1/Hz. The integral of the
+    density over positive frequencies is 1."""
 
     lowest, highest = skin.readout.band
 
     def unnormalised_density(f):
         return band_filter(skin, f) * (jnp.maximum(f, 1e-9) / lowest) ** -skin.spectral_slope
 
-    # The integral uses a uniform grid of log-frequency, in which both edges of the filter have the same width:
-    # ∫ S df = ∫ S f d(ln f).
+    # The integral uses a uniform grid of log-frequency, in which both edges of the band filter have the same width: ∫ S
+    # df = ∫ S f d(ln f).
     grid = lowest * jnp.exp(jnp.linspace(-0.35, jnp.log(highest / lowest) + 0.35, 2001))
     return unnormalised_density(frequencies) / jnp.trapezoid(unnormalised_density(grid) * grid, jnp.log(grid))
 
 
 @jax.jit
 def transfer(skin: SoundingSkin, frequencies: Float[Array, " F"], position: Float[Array, "2"]) -> Complex[Array, "M F"]:
-    """Transfer functions (M, F) from a source at `position` (2,) in metres to each channel.
+    """Transfer functions (M, F) of the sound amplitude from a source at `position` (2,) in metres to each of M
+    channels.
 
     A path of length ρ contributes spreading(ρ) · exp(-(loss(f) + i wavenumber(f)) ρ), with ρ² = (horizontal distance)²
     + (depth of the microphone)². The paths are the direct path, the echoes from the four edges, which are image sources
-    multiplied by `reflection`, and the echoes from the four corners, multiplied by its square. Echoes from the top and
-    bottom faces are part of the spreading. The transfer functions include the gain of each microphone and, for a
-    multiplexed readout, crosstalk and the delays of the sampling times.
+    multiplied by `reflection`, and the echoes from the four corners, multiplied by the square of `reflection`. Echoes
+    from the top and bottom faces are part of the spreading. The transfer functions include the gain of each microphone
+    and, for a multiplexed readout, crosstalk and the delays of the sampling times.
     """
     layer = skin.layer
     x, y = position
@@ -64,7 +66,8 @@ def transfer(skin: SoundingSkin, frequencies: Float[Array, " F"], position: Floa
     received = jnp.sum(amplitude[..., None] * jnp.exp(-path_lengths[..., None] * decay), axis=1)
     if not skin.readout.multiplexed:
         return received
-    # Microphone i is connected to slot i mod 4 of multiplexer i div 4. The slot read 25 µs earlier may be open.
+    # Microphone i is connected to slot i mod 4 of multiplexer i div 4. The slot read 25 µs earlier may have no
+    # microphone.
     index = np.arange(skin.num_microphones)
     previous_index = index - index % NUM_SLOTS + (index - 1) % NUM_SLOTS
     has_previous = previous_index < skin.num_microphones
@@ -74,15 +77,15 @@ def transfer(skin: SoundingSkin, frequencies: Float[Array, " F"], position: Floa
 
 
 def expected_power(skin: SoundingSkin, positions) -> Float[np.ndarray, "P M"]:
-    """Mean square (P, M) of each channel without noise, for a steady source of strength 1 at each of `positions` (P, 2)
-    in metres.
+    """Mean square (P, M) of the samples of each of M channels without noise, for a steady source of strength 1 at each
+    of `positions` (P, 2) in metres.
 
-    It is the integral over frequency of the source's spectral density times |transfer|². For a source of strength s it
-    is multiplied by s². Raises `ValueError` for positions outside the skin.
+    The mean square is the integral over frequency of the source's spectral density times |transfer|², and is
+    proportional to the square of the source's strength. Raises `ValueError` for positions outside the skin.
     """
     points = skin.layer.check_inside("positions", positions)
     # Interference of two echoes makes |transfer|² oscillate with a period of at least 1 / (longest delay) in frequency.
-    # Four points per period make the sum nearly exact.
+    # Four frequencies per period make the sum nearly exact.
     step = min(1 / (4 * skin.layer.longest_delay), skin.readout.band[0] / 10)
     frequencies = np.arange(1, np.ceil(np.sqrt(2) * skin.readout.band[1] / step)) * step
     return np.asarray(_expected_power(skin, jnp.asarray(points), jnp.asarray(frequencies), step))
@@ -95,8 +98,8 @@ def _expected_power(skin, points, frequencies, step):
 
 
 def nominal_power(skin: SoundingSkin, distances) -> Float[np.ndarray, " K"]:
-    """Mean square (K,) received by a nominal microphone from a source of strength 1 at horizontal `distances` (K,) in
-    metres, far from all edges."""
+    """Mean square (K,) of the signal received by a nominal microphone from a source of strength 1 at horizontal
+    `distances` (K,) in metres, far from all edges."""
     return np.asarray(_nominal_power(skin, jnp.hypot(jnp.asarray(distances, float), skin.microphone_model.depth)))
 
 
@@ -110,6 +113,6 @@ def _nominal_power(skin, length):
 
 
 def noise_power(skin: SoundingSkin) -> Float[np.ndarray, " M"]:
-    """Mean square (M,) of the noise of each microphone, which lies in the band; see `MicrophoneModel`."""
+    """Mean square (M,) of the noise of each microphone, which lies in the frequency band; see `MicrophoneModel`."""
     nominal = nominal_power(skin, skin.microphone_model.reach) * 10 ** (-skin.microphone_model.snr_db / 10)
     return nominal * np.asarray(skin.noise_factor)

@@ -1,6 +1,7 @@
-"""Simulation of recordings: the samples of all channels for a source, with its true position and amplitude.
+"""Simulation of recordings: the samples of all channels for a sound source, with the source's true position and
+amplitude.
 
-A touch with envelope e(t) at a fixed position is received with a mean energy (over random keys) of Σ e² times
+A touch with envelope e(t) at a fixed position is received with an energy whose mean over random keys is Σ e² times
 `expected_power`, except for sound beyond the ends of the recording.
 """
 
@@ -35,12 +36,12 @@ HOP = 0.01
 
 
 class SimulatedSound(Module):
-    """Samples of all channels during a touch, and the true source.
+    """Simulated samples of M channels during a touch, and the true source.
 
     **Fields**: `samples`: (M, S), in the unit of source strength; `rate`: sampling rate in Hz; `position`: positions
     (N, 2) of the source in metres at `position_times` (N,) in seconds, where N = 0 for `simulate_silence`, and a silent
-    source has the position of its last or first sound; `active`: root mean square (S,) of the source at `times`,
-    without the delay of propagation; `noisy`: whether the samples include noise.
+    source has the position of its last or first sound; `active`: root mean square (S,) of the source's sound at
+    `times`, without the delay of propagation; `noisy`: whether the samples include noise.
     """
 
     samples: Float[np.ndarray, "M S"]
@@ -52,12 +53,12 @@ class SimulatedSound(Module):
 
     @property
     def times(self) -> np.ndarray:
-        """Sampling times (S,) of the first channel in seconds. Other channels are delayed by `skin.stagger`."""
+        """Sampling times (S,) of the first channel in seconds. The other channels are delayed by `skin.stagger`."""
         return np.arange(self.samples.shape[1]) / self.rate
 
 
 def simulate_silence(skin: SoundingSkin, key: Array, *, duration: float = 1.0) -> SimulatedSound:
-    """Simulate the noise of the microphones without a source.
+    """Simulate a recording of the microphones' noise without a sound source.
 
     **Arguments:**
 
@@ -82,10 +83,10 @@ def simulate_silence(skin: SoundingSkin, key: Array, *, duration: float = 1.0) -
 
 
 def superpose(skin: SoundingSkin, key: Array | None, *recordings: SimulatedSound) -> Float[np.ndarray, "M S"]:
-    """Return the samples (M, S) of several simultaneous touches, with microphone noise added unless `key` is None.
+    """Return the samples (M, S) of several simultaneous touches, with microphones' noise added unless `key` is None.
 
-    Raises `ValueError` if there are no recordings, if they differ in duration or do not match the skin, or if they
-    include noise; simulate them with `noise=False`.
+    Raises `ValueError` if there are no `recordings`, or if the recordings differ in duration, do not match the skin, or
+    include noise; simulate the recordings with `noise=False`.
     """
     check_skin_and_key(skin, jax.random.key(0) if key is None else key)
     if not recordings:
@@ -104,8 +105,8 @@ def superpose(skin: SoundingSkin, key: Array | None, *recordings: SimulatedSound
 def simulate_recording(
     skin: SoundingSkin, key: Array, positions: np.ndarray, envelope: np.ndarray, noise: bool
 ) -> SimulatedSound:
-    """Simulate the recording of a source with the root mean square `envelope` (S,) at `positions` in metres: (B, 2),
-    one per block, or (1, 2) for a source at rest."""
+    """Simulate the recording of a source whose sound has the root mean square `envelope` (S,). `positions` of the
+    source in metres: (B, 2), one for each block of time, or (1, 2) for a source at rest."""
     source_key, noise_key = jax.random.split(key)
     num_samples, block_centres = len(envelope), block_times(skin, len(envelope))
     positions = np.broadcast_to(positions, (len(block_centres), 2))
@@ -136,7 +137,7 @@ def simulate_recording(
 
 
 def block_times(skin: SoundingSkin, count: int) -> np.ndarray:
-    """Middles of the blocks that cover `count` samples, in seconds: 0, one hop, two hops, …"""
+    """Middles of the blocks of time that cover `count` samples, in seconds: 0, one hop, two hops, …"""
     return HOP * np.arange(int(np.ceil(count / round(HOP * skin.rate))) + 1)
 
 

@@ -1,9 +1,9 @@
-"""Simulated skin: an elastic layer with microphones.
+"""Simulated acoustic skin: an elastic layer with microphones.
 
-Simulated recordings replace measured ones, since no openly licensed recording of a skin with microphones exists. Sound
+Simulated recordings replace measurements, since no openly licensed recording of a skin with microphones exists. Sound
 is propagated in the frequency domain with spreading, viscoelastic loss, delays and edge echoes. The simulation thus
-differs from the decay model a/(r² + b) that localisation fits, and is a meaningful test of it. The setup is that of
-Park et al., Science Robotics 7, eabm7187 (2022). See `jeit.acoustic.simulate.propagation` for the physics, and
+differs from the decay model a/(r² + b) that the calibration fits, and is a meaningful test of this model. The setup is
+that of Park et al., Science Robotics 7, eabm7187 (2022). See `jeit.acoustic.simulate.propagation` for the physics, and
 `jeit.acoustic.simulate.touches` for touches.
 """
 
@@ -26,12 +26,13 @@ class Elastomer(Module):
     """A soft rubber, in which a touch radiates mainly shear waves of speed √(shear modulus / density).
 
     **Fields**: `shear_modulus`: shear modulus in Pa; `density`: density in kg/m³; `attenuation`: attenuation in nepers
-    per metre at `attenuation_frequency`, in Hz; `attenuation_exponent`: the attenuation is proportional to frequency to
-    this power.
+    per metre at `attenuation_frequency`, in Hz; `attenuation_exponent`: exponent n of the attenuation, which is
+    proportional to frequency to the power n.
 
-    The default shear modulus, of a soft silicone, gives a speed of 10 m/s at `attenuation_frequency`. For a loss
-    tangent d the attenuation is π f d / speed; the default of 4 /m at 100 Hz corresponds to d = 0.13, typical of soft
-    rubber (chosen by this library, not given in Park 2022). Raises `ValueError` for values that no rubber has.
+    The default shear modulus, of a soft silicone, gives a wave speed of 10 m/s at `attenuation_frequency`. For a loss
+    tangent d the attenuation at frequency f is π f d / speed; the default of 4 /m at 100 Hz corresponds to d = 0.13,
+    typical of soft rubber (chosen by this library, not given in Park 2022). Raises `ValueError` for values that no
+    rubber has.
     """
 
     shear_modulus: float = 1e5
@@ -51,22 +52,23 @@ class Elastomer(Module):
 
     @property
     def wave_speed(self):
-        """Speed of shear waves in metres per second."""
+        """Speed of shear waves in the elastomer in metres per second."""
         return (self.shear_modulus / self.density) ** 0.5
 
     def loss(self, frequencies: Float[Array, " F"]) -> Float[Array, " F"]:
-        """Attenuation (F,) in nepers per metre at `frequencies` (F,) in Hz."""
+        """Attenuation (F,) of shear waves in nepers per metre at `frequencies` (F,) in Hz."""
         return self.attenuation * (frequencies / self.attenuation_frequency) ** self.attenuation_exponent
 
     def wavenumber(self, frequencies: Float[Array, " F"]) -> Float[Array, " F"]:
-        """Wavenumber (F,) in radians per metre at `frequencies` (F,) in Hz: 2πf / speed plus the dispersion that
-        causality requires for an attenuation proportional to f^n.
+        """Wavenumber (F,) of shear waves in radians per metre at `frequencies` f (F,) in Hz: 2πf / speed plus the
+        dispersion that causality requires for an attenuation proportional to f^n.
 
-        The Kramers-Kronig relation for a power law gives the dispersion loss(f0) tan(πn/2) (x^n - x) with x = f / f0
-        (Szabo, J. Acoust. Soc. Am. 96 (1994) 491). With the default attenuation, the speed increases by an eighth over
-        the band.
+        The Kramers-Kronig relation for a power law gives the dispersion loss(f0) tan(πn/2) (x^n - x) with x = f / f0,
+        where f0 is `attenuation_frequency` (Szabo, J. Acoust. Soc. Am. 96 (1994) 491). With the default attenuation,
+        the wave speed increases by an eighth over the band.
         """
-        # The limit for n → 1 is a logarithm, which this value of n approximates closely enough.
+        # The limit of the dispersion for n → 1 is a logarithm, which the formula with this value of n approximates
+        # closely enough.
         exponent = jnp.where(jnp.abs(self.attenuation_exponent - 1) < 1e-6, 1 + 1e-6, self.attenuation_exponent)
         relative = frequencies / self.attenuation_frequency
         dispersion = self.attenuation * jnp.tan(jnp.pi / 2 * exponent) * (relative**exponent - relative)
@@ -99,21 +101,22 @@ class ElastomerLayer(Module):
 
     @property
     def longest_delay(self) -> float:
-        """Travel time of sound along the longest simulated path, in seconds."""
+        """Travel time of sound along the longest simulated path in the layer, in seconds."""
         return 2 * float(np.hypot(self.width, self.height)) / self.material.wave_speed
 
     def spreading(self, length: Array, depth) -> Array:
-        """Amplitude after a path of `length` metres, relative to the amplitude at a nominal microphone `depth` metres
-        directly below the source.
+        """Amplitude of the sound after a path of `length` metres, relative to the amplitude at a nominal microphone
+        `depth` metres directly below the source.
 
-        Near the source, the wave spreads in three dimensions, with amplitude 1/ρ. Beyond about one thickness, the layer
-        guides it in two dimensions, with amplitude 1/√ρ. The formula √(1 + ρ/thickness) / ρ has both limits.
+        Near the source, the wave spreads in three dimensions, with amplitude 1/ρ after a path of length ρ. Beyond about
+        one thickness, the layer guides the wave in two dimensions, with amplitude 1/√ρ. The formula √(1 + ρ/thickness)
+        / ρ has both limits.
         """
         return jnp.sqrt((1 + length / self.thickness) / (1 + depth / self.thickness)) * depth / length
 
     def check_inside(self, name: str, points) -> Float[np.ndarray, "P 2"]:
-        """Return `points` (P, 2) in metres as floats. Raises `ValueError` unless all are finite and on the layer;
-        `name` is the argument's name in the message."""
+        """Return `points` (P, 2) in metres as floats. Raises `ValueError` unless all points are finite and on the
+        layer; `name` is the argument's name in the message."""
         try:
             positions = np.asarray(points, float)
         except (TypeError, ValueError) as error:
@@ -141,21 +144,21 @@ class ElastomerLayer(Module):
 class SoundingSkin(Module):
     """An elastomer layer with microphones under its surface, for simulations.
 
-    The unit of samples is arbitrary: a source of strength 1 has a mean square of 1 at a nominal microphone directly
-    below it, without loss and echoes.
+    The unit of samples is arbitrary: a source of strength 1 gives samples with a mean square of 1 at a nominal
+    microphone directly below the source, without loss and echoes.
 
     **Arguments:**
 
     - `key`: random key from which depths, gains and noise of the microphones are drawn.
-    - `microphones`: positions (M, 2), metres; by default those of `microphone_grid(5)`.
+    - `microphones`: positions (M, 2) of the microphones, metres; by default those of `microphone_grid(5)`.
     - `layer`: shape and material of the layer.
     - `microphone_model`: properties of the nominal microphone.
-    - `readout`: filters and sampling.
+    - `readout`: analogue filters and sampling of the microphones.
     - `spectral_slope`: the power spectral density of a touch is proportional to frequency to the power
       −`spectral_slope` (1 is 3 dB per octave).
 
     **Fields**: the arguments except `key`, and of each microphone the depth under the surface `microphone_depth` (M,)
-    in metres, the amplitude `gain` (M,), and `noise_factor` (M,), its noise power divided by that of the nominal
+    in metres, the amplitude `gain` (M,), and `noise_factor` (M,), the noise power divided by that of the nominal
     microphone.
 
     **Example:**
@@ -188,8 +191,9 @@ class SoundingSkin(Module):
         """Create a skin with randomly varying microphones.
 
         `key`: random key for the deviations of the microphones from `microphone_model`. `microphones`: positions (M, 2)
-        in metres; by default a grid of 5 × 5. The defaults of `layer`, `microphone_model` and `readout` describe the
-        device of Park 2022. Raises `ValueError` for microphones outside the layer, and for arguments of the wrong type.
+        in metres; by default a grid of 5 × 5 microphones. The defaults of `layer`, `microphone_model` and `readout`
+        describe the device of Park 2022. Raises `ValueError` for microphones outside the layer, and for arguments of
+        the wrong type.
         """
         check_key(key)
         self.layer = ElastomerLayer() if layer is None else layer

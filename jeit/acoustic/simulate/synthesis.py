@@ -1,7 +1,7 @@
 """Synthesis of noise with a given spectrum, and of bursts of noise.
 
 The sound of a touch on soft rubber is modelled as band-limited random noise, steady or in bursts: white noise is
-multiplied by an envelope and then filtered. All functions take an explicit random key; the same key gives the same
+multiplied by an envelope and then filtered. All functions take an explicit random key, and the same key gives the same
 samples.
 """
 
@@ -21,31 +21,31 @@ from jeit.arguments import check_kind
 from jeit.arguments.checks import check_positive
 from jeit_solvers.module import Module
 
-# Duration in seconds for which the source's filter rings before and after a burst, since it has zero phase: about the
-# inverse of its lowest frequency.
+# Duration in seconds for which the zero-phase filter of the source rings before and after a burst: about the inverse of
+# the filter's lowest frequency.
 RINGING_TIME = 0.05
 
 
 def bin_frequencies(skin: SoundingSkin, num_samples: int, bins: int) -> Array:
-    """Frequencies (bins,) in Hz of the lowest `bins` bins of a transform of `num_samples` samples."""
+    """Frequencies (bins,) in Hz of the lowest `bins` bins of a Fourier transform of `num_samples` samples."""
     return jnp.arange(bins) * (skin.rate / num_samples)
 
 
 def num_filled_bins(skin: SoundingSkin, num_samples: int, *, blur: float = 0.0) -> int:
-    """Number of bins of a real transform of `num_samples` samples up to half an octave above the band plus `blur` in
-    Hz. The remaining bins are zero."""
+    """Number of bins of a real Fourier transform of `num_samples` samples up to half an octave above the band plus
+    `blur` in Hz. The sound has zero amplitude in the remaining bins."""
     return min(int((np.sqrt(2) * skin.readout.band[1] + blur) * num_samples / skin.rate) + 1, num_samples // 2)
 
 
 def transform_size(count: int, padding: float, rate: float) -> int:
-    """Length in samples of a fast transform of `count` samples with at least `padding` seconds of zeros."""
+    """Length in samples of a fast Fourier transform of `count` samples with at least `padding` seconds of zeros."""
     min_size = count + int(np.ceil(padding * rate))
     return 2 * int(np.asarray(next_fast_len((min_size + 1) // 2)))
 
 
 def source_spectrum(skin: SoundingSkin, key: Array, envelope: Array, num_samples: int, bins: int) -> Array:
-    """Fourier transform (bins,) of white noise multiplied by `envelope` and filtered to the spectral density of a
-    source.
+    """Fourier transform (bins,) of the sound of a source: white noise multiplied by `envelope`, and filtered to the
+    spectral density of a source.
 
     Real white noise of variance 1 has the density 2 / rate at positive frequencies.
     """
@@ -54,9 +54,11 @@ def source_spectrum(skin: SoundingSkin, key: Array, envelope: Array, num_samples
 
 
 def noise_spectrum(skin: SoundingSkin, key: Array, level: Array, num_samples: int, bins: int) -> Array:
-    """Fourier transform (M, bins) of noise with mean square `level` (M,) and a flat spectrum in the band.
+    """Fourier transform (M, bins) of the noise of M microphones with mean square `level` (M,) and a flat spectrum in
+    the band.
 
-    In a real signal of `num_samples` samples, bin k > 0 with variance v_k contributes 2 v_k / size² to the mean square.
+    In a real signal of `num_samples` samples, bin k > 0 with variance v_k contributes 2 v_k / size² to the mean square,
+    where size is `num_samples`.
     """
     shape = band_filter(skin, bin_frequencies(skin, num_samples, bins))
     variance = level[:, None] * shape / jnp.sum(shape) * num_samples**2 / 2
@@ -70,7 +72,7 @@ def _noise_samples(skin, key, level, count, size, bins):
 
 
 def microphone_noise(skin: SoundingSkin, key: Array, count: int) -> Float[np.ndarray, "M S"]:
-    """Simulate `count` samples (M, S) of microphone noise."""
+    """Simulate `count` samples of noise of each microphone, (M, S) with S = `count`."""
     # Noise synthesised from a spectrum is periodic with period `size`. More samples than needed are generated, so that
     # the last samples are independent of the first.
     size = transform_size(count, RINGING_TIME, skin.rate)
@@ -82,15 +84,15 @@ def sample_times(skin: SoundingSkin, duration: float) -> Float[np.ndarray, " S"]
     return np.arange(max(2, round(duration * skin.rate))) / skin.rate
 
 
-# Time in seconds at which the first burst begins, which leaves room for the ringing of the filter.
+# Time in seconds at which the first burst of a recording begins, which leaves room for the ringing of the filter.
 FIRST_ONSET = 0.02
 
 
 class Burst(Module):
-    """Envelope of a tap, which rises fast and then decays.
+    """Envelope of the sound of a tap, which rises fast and then decays.
 
-    **Fields**: `strength`: root mean square over `length`; `length`: duration in seconds. Raises `ValueError` for
-    values that are not positive.
+    **Fields**: `strength`: root mean square of the sound over `length`; `length`: duration in seconds. Raises
+    `ValueError` for values that are not positive.
 
     **Example:**
 
@@ -119,22 +121,23 @@ class Burst(Module):
     def envelope(
         self, times: Float[np.ndarray, " S"], onsets: Float[np.ndarray, " N"], strengths: Float[np.ndarray, " N"]
     ) -> Float[np.ndarray, " S"]:
-        """Root mean square (S,) at `times` in seconds of N bursts of this length, with the given `onsets` in seconds
-        and `strengths`.
+        """Root mean square (S,) of the sound at `times` in seconds of N bursts of this length, with the given `onsets`
+        (N,) in seconds and `strengths` (N,).
 
-        The shape of a burst is t e^(-t / a) with a = length / 6. It reaches its maximum after a sixth of `length`, and
-        is 4 % of it at the end. The integral of its square is a³ / 4; divided by `length`, this is the mean square by
-        which the shape is normalised.
+        The shape of a burst is t e^(-t / a) with a = length / 6. The shape reaches its maximum after a sixth of
+        `length`, and is 4 % of the maximum at the end. The integral of its square is a³ / 4; divided by `length`, this
+        integral is the mean square by which the shape is normalised.
         """
         rise_time = self.length / 6
         elapsed = np.maximum(times - onsets[:, None], 0)
         shape = elapsed * np.exp(-elapsed / rise_time) / np.sqrt(rise_time**3 / 4 / self.length)
-        # Overlapping bursts are treated as independent noises, so their powers add.
+        # Overlapping bursts are treated as independent noises, so the powers of the bursts add.
         return np.sqrt(((strengths[:, None] * shape) ** 2).sum(axis=0))
 
 
 def check_burst(burst: Burst, duration: float) -> None:
-    """Raises `ValueError` if `burst` is not a `Burst`, or if a recording of `duration` seconds is too short for it."""
+    """Raises `ValueError` if `burst` is not a `Burst`, or if a recording of `duration` seconds is too short for one
+    burst."""
     check_kind("burst", burst, Burst, "a Burst, such as Burst(strength=2.0)")
     burst.check_fits(duration)
 

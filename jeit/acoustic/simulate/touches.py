@@ -1,6 +1,7 @@
-"""Simulation of touches on an acoustic skin: taps, pats, tickles and strokes. Results include the true source.
+"""Simulation of the sound of touches on an acoustic skin: taps, pats, tickles and strokes. Results include the true
+source.
 
-All functions take an explicit random key; the same key gives the same samples.
+All functions take an explicit random key, and the same key gives the same samples.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from jeit.acoustic.simulate.synthesis import (
 from jeit.arguments.checks import check_positive
 
 # Speed in m/s at which a stroke has its nominal strength. The power dissipated by friction is force times speed, so the
-# sound's power is taken as proportional to speed, and its amplitude to the square root of speed.
+# power of the sound is taken as proportional to speed, and the amplitude to the square root of speed.
 NOMINAL_SPEED = 0.1
 
 
@@ -41,7 +42,7 @@ def simulate_tap(
     duration: float = 0.15,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate taps at one position, as by a vibrator with a rubber tip.
+    """Simulate a recording of taps at one position, as by a vibrator with a rubber tip.
 
     **Arguments:**
 
@@ -86,7 +87,7 @@ def simulate_pat(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate firm taps of a hand at one position, at regular intervals.
+    """Simulate a recording of a pat: firm taps of a hand at one position, at regular intervals.
 
     **Arguments:**
 
@@ -124,18 +125,18 @@ def simulate_tickle(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate many light taps of random strength and rhythm near a position.
+    """Simulate a recording of a tickle: many light taps of random strength and rhythm near a position.
 
-    Each tap is half way between the previous tap and a random position near the given one; positions outside the skin
-    are moved to its edge. The strengths are log-normal with the standard deviation 0.3 of the logarithm. Each tap is
-    delayed by a random part of up to a quarter of the interval.
+    Each tap is half way between the previous tap and a random position near `position`; taps outside the skin are moved
+    to the edge of the skin. The strengths are log-normal, with the standard deviation 0.3 of the logarithm. Each tap is
+    delayed by a random time of up to a quarter of the interval between taps.
 
     **Arguments:**
 
     - `skin`: the simulated skin.
     - `key`: random key.
-    - `position`: mean position (2,), metres.
-    - `burst`: envelope of a tap; its strength is the median of the strengths.
+    - `position`: mean position (2,) of the taps, metres.
+    - `burst`: envelope of a tap; the strength of `burst` is the median of the strengths.
     - `radius`: largest distance of the random positions from `position`, metres.
     - `taps_per_second`: mean number of taps per second.
     - `duration`: duration of the recording, seconds.
@@ -164,7 +165,7 @@ def simulate_tickle(
     )
     strengths = burst.strength * np.exp(0.3 * np.asarray(jax.random.normal(strength_key, (num_taps,))))
     distance, angle = np.asarray(jax.random.uniform(position_key, (2, num_taps)))
-    # The square root makes the positions uniform over the disc.
+    # The square root of a uniform number makes the positions uniform over the disc.
     offsets = (radius * np.sqrt(distance) * [np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)]).T
     for index in range(1, num_taps):
         offsets[index] = (offsets[index - 1] + offsets[index]) / 2
@@ -184,7 +185,7 @@ def simulate_stroke(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate a finger that rubs along a path.
+    """Simulate a recording of a stroke: a finger that rubs along a path.
 
     **Arguments:**
 
@@ -192,7 +193,7 @@ def simulate_stroke(
     - `key`: random key.
     - `path`: vertices (K, 2) of a polyline, metres, traversed at constant speed; or a function that returns positions
       (N, 2) in metres at times (N,) in seconds.
-    - `strength`: root mean square of the source at 0.1 m/s; it is proportional to the square root of speed.
+    - `strength`: root mean square of the sound at 0.1 m/s, which is proportional to the square root of speed.
     - `duration`: duration of the stroke, seconds.
     - `noise`: whether to add the microphones' noise.
 

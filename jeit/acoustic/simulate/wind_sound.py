@@ -1,4 +1,4 @@
-"""Simulation of airborne noise: an air jet that blows on a skin, and the sound of the surrounding room."""
+"""Simulation of airborne sound: an air jet that blows on a skin, and the sound of the surrounding room."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from jeit.acoustic.simulate.synthesis import (
 )
 from jeit.arguments.checks import check_not_negative, check_positive
 
-# Number of source positions in a jet, and number of frequencies at which their total power is computed. The power is
-# interpolated between these frequencies, where it is smooth.
+# Number of source positions in an air jet, and number of frequencies at which the total power of the sources is
+# computed. The power, which is smooth, is interpolated between these frequencies.
 _NUM_EDDIES, _NUM_FREQUENCIES = 64, 160
 # Exponent of Kolmogorov's law of turbulence: the energy density is proportional to frequency to minus this power.
 TURBULENCE = 5 / 3
@@ -41,10 +41,10 @@ def simulate_wind(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate a steady jet of air on the skin, such as from an air brush.
+    """Simulate a recording of a steady jet of air on the skin, such as from an air brush.
 
     Eddies act as independent sources at 64 random positions. Since eddies are much smaller than the spacing of the
-    microphones, the microphones receive independent noise, each with the total power that it receives from these
+    microphones, the microphones receive independent noise, with the total power that each receives from the 64
     positions.
 
     **Arguments:**
@@ -52,9 +52,9 @@ def simulate_wind(
     - `skin`: the simulated skin.
     - `key`: random key.
     - `position`: mean position (2,) of the eddies, metres.
-    - `strength`: root mean square of the sum of all sources.
+    - `strength`: root mean square of the sound of all sources together.
     - `radius`: standard deviation of the normally distributed positions of the eddies, metres.
-    - `gusts`: standard deviation of the logarithm of the amplitude, which varies with time.
+    - `gusts`: standard deviation over time of the logarithm of the amplitude.
     - `gust_time`: correlation time of the amplitude, seconds.
     - `slope`: the power spectral density is proportional to frequency to the power −`slope`.
     - `duration`: duration of the recording, seconds.
@@ -96,13 +96,13 @@ def simulate_wind(
 def simulate_room_sound(
     skin: SoundingSkin, key: Array, *, level_db: float = 0.0, slope: float = 1.0, duration: float = 1.0
 ) -> SimulatedSound:
-    """Simulate the sound of a room: the same signal for all microphones, multiplied by their gains.
+    """Simulate a recording of the sound of a room: the same signal for all microphones, multiplied by their gains.
 
     **Arguments:**
 
     - `skin`: the simulated skin.
     - `key`: random key.
-    - `level_db`: power of the sound relative to the noise of the nominal microphone, decibels.
+    - `level_db`: power of the room's sound relative to the noise power of the nominal microphone, decibels.
     - `slope`: the power spectral density is proportional to frequency to the power −`slope`.
     - `duration`: duration of the recording, seconds.
 
@@ -130,15 +130,15 @@ def simulate_room_sound(
 
 
 def _frequency_grid(skin: SoundingSkin) -> Float[np.ndarray, " G"]:
-    """Frequencies (G,) in Hz from half an octave below the band to half an octave above it, with equal ratios."""
+    """Frequencies (G,) in Hz with equal ratios, from half an octave below the band to half an octave above the band."""
     low, high = skin.readout.band
     return np.geomspace(low / np.sqrt(2), high * np.sqrt(2), _NUM_FREQUENCIES)
 
 
 @jax.jit
 def _received_power(skin: SoundingSkin, positions: Array, frequencies: Array) -> Array:
-    """Power (M, G) received by each microphone from equal sources at all positions (P, 2), divided by the total power
-    of the sources."""
+    """Power (M, G) received by each microphone at G `frequencies` from equal sources at all `positions` (P, 2), divided
+    by the total power of the sources."""
     total = jnp.zeros((skin.microphones.shape[0], len(frequencies)))
 
     def add_source(index, total):
@@ -149,14 +149,15 @@ def _received_power(skin: SoundingSkin, positions: Array, frequencies: Array) ->
 
 def _spectral_density(skin: SoundingSkin, slope: float, received: ArrayLike) -> Float[np.ndarray, "M G"]:
     """Power spectral densities (M, G) at the microphones, in 1/Hz, for sources of total mean square 1. `received` (M,
-    G): received power divided by source power."""
+    G): received power divided by the power of the sources."""
     grid = _frequency_grid(skin)
     shape = np.asarray(band_filter(skin, jnp.asarray(grid))) * (grid / grid[0]) ** -slope
     return np.asarray(received) * shape / np.trapezoid(shape, grid)
 
 
 def _coloured_noise(skin: SoundingSkin, key: Array, density: Float[np.ndarray, "M G"], count: int) -> np.ndarray:
-    """Simulate `count` samples (M, S) of independent noises with the power spectral densities `density`."""
+    """Simulate `count` samples (M, S) of independent noises at M microphones, with the power spectral densities
+    `density`."""
     size = transform_size(count, RINGING_TIME, skin.rate)
     bins = num_filled_bins(skin, size)
     frequencies = np.asarray(bin_frequencies(skin, size, bins))
@@ -169,10 +170,11 @@ def _coloured_noise(skin: SoundingSkin, key: Array, density: Float[np.ndarray, "
 
 
 def _slow_noise(key: Array, count: int, correlation_length: float) -> Float[np.ndarray, " S"]:
-    """Slowly varying normal noise (S,) of variance 1, with a correlation length of `correlation_length` samples."""
+    """Simulate slowly varying normal noise (S,) of variance 1, with a correlation length of `correlation_length`
+    samples."""
     num_knots = int(np.ceil(count / correlation_length)) + 3
     values = np.asarray(jax.random.normal(key, (num_knots,)))
-    # The interpolation weights are the cosine and sine of the same angle, so the variance is 1 everywhere.
+    # The interpolation weights are the cosine and sine of the same angle, so the variance of the noise is 1 everywhere.
     knot_coordinates = np.arange(count) / correlation_length
     knot_index = knot_coordinates.astype(int)
     angle = np.pi / 2 * (knot_coordinates - knot_index)

@@ -21,7 +21,7 @@ layout = typer.Typer(name="layout", help="Compare and optimise layouts of electr
 layout.command()(optimise)
 
 _FILES = ("report.json", "comparison.png")
-# Maximum number of touched positions along a side: 65,536 touches in total.
+# Maximum number of touched positions along a side of the skin: 65,536 touches in total.
 _MAX_POSITIONS = 256
 # Option name for each argument name that error messages of the called functions mention.
 _OPTION_NAMES = {
@@ -127,7 +127,7 @@ def compare(
 
 
 def _model_text(skin: "Skin") -> str:
-    """The kind of model that a skin has, in words."""
+    """Describe a skin in words: layer or sheet, and its thickness."""
     thickness = f"{1e3 * float(skin.thickness):g} mm thick"
     return f"a layer {thickness}" if skin.model.mesh.dimension == 3 else f"a sheet, {thickness}"
 

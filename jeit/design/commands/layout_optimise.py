@@ -65,10 +65,10 @@ def optimise(
     height: skins.Height = 1e3 * defaults.SIDE,
     quiet: Quiet = False,
 ) -> None:
-    """Move the electrodes of LAYOUT until its worst sensitivity and mean variance are as good as they get.
+    """Move the electrodes of LAYOUT to increase the skin's lowest sensitivity and to decrease the mean variance.
 
-    All two-terminal pairs are measured, so the order of electrodes does not matter. Figures of both layouts are on a
-    finer mesh than the one optimised on.
+    All two-terminal pairs are measured, so the order of electrodes does not matter. The scores of both layouts are
+    computed on a finer mesh than that of the optimisation.
     """
     from jeit.cli.console import Steps, plain_console, say_written
     from jeit.design import DesignSpace, improve_layout
@@ -127,7 +127,8 @@ def _print_improvement(console, result: "ImprovedLayout") -> None:
 
 
 def _parse_region(text: str, outline: "Domain") -> "Disk | Rectangle":
-    """A disc "x,y,radius" or rectangle "x1,y1,x2,y2" in mm. Raises `ValueError` if it is none or off the skin."""
+    """Parse a keep-out region: a disc "x,y,radius" or a rectangle "x1,y1,x2,y2", mm. Raises `ValueError` for other
+    text, and for a region off the skin."""
     from jeit.mesh import Disk, Rectangle
 
     try:

@@ -1,4 +1,4 @@
-"""Command-line options that describe a flat skin, and reading of a layout together with the outline of its skin."""
+"""Command-line options that describe a flat skin, and reading of an electrode layout with the outline of its skin."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _MIN_CONDUCTIVITY, _MAX_CONDUCTIVITY = 1e-9, 1e9
 
 
 def read_with_outline(name: str, width: float, height: float) -> "Layout":
-    """Read a layout with the outline of its skin, by name or from a file. If neither gives an outline, it is a
-    rectangle of `width` × `height` (mm).
+    """Read an electrode layout with the outline of its skin; `name`: name of a built-in layout, or path of a file. If
+    the layout has no outline, the outline is a rectangle of `width` × `height` (mm).
 
-    Raises `ValueError` for fewer than three electrodes.
+    Raises `ValueError` for a layout with fewer than three electrodes.
     """
     from jeit.layout import named_layout, read_layout
     from jeit.layout.layout import LARGEST, SMALLEST
@@ -56,8 +56,8 @@ def read_with_outline(name: str, width: float, height: float) -> "Layout":
 
 
 def check_layer(thickness: float, conductivity: float) -> None:
-    """Raise `ValueError` unless --thickness-mm is more than the depth of a touch, and --conductivity is within the
-    range of conductivities of skins."""
+    """Raise `ValueError` unless --thickness-mm is more than the depth of a touch, and --conductivity is from 1e-9 to
+    1e9 S/m."""
     from jeit.design.defaults import DEPTH
 
     if not 1e3 * DEPTH < thickness < float("inf"):

@@ -1,4 +1,5 @@
-"""`jeit study`: run a sweep over layouts from a TOML file; the run can be stopped at any moment and resumed."""
+"""`jeit study`: compute the scores of many electrode layouts, which a TOML file lists; the run can be stopped at any
+moment and resumed."""
 
 from __future__ import annotations
 
@@ -35,14 +36,14 @@ def _top(context: typer.Context) -> None:
 def run(
     file: File, output: Output = None, page: Page = None, scheduler: Scheduler = None, quiet: Quiet = False
 ) -> None:
-    """Run a study from its beginning, and report."""
+    """Run a study from its beginning, and write its report."""
     from jeit.design.study.lock import locked
 
     sweep, store = _read_study_and_path(file, output)
     if store.exists() and not (store / "zarr.json").is_file():
         raise ValueError(f"--output {store}: there is something else already; choose another name.")
     if store.exists():
-        with locked(store, "study"):  # reports a process that is still writing, before the user deletes the store
+        with locked(store, "study"):  # refuses while another process is writing, before the store is deleted
             pass
         raise ValueError(f"{store} is there already: 'jeit study resume {file}' goes on with it; or delete it.")
     _run_with_progress(sweep, file, store, page, scheduler, quiet)
@@ -52,19 +53,19 @@ def run(
 def resume(
     file: File, output: Output = None, page: Page = None, scheduler: Scheduler = None, quiet: Quiet = False
 ) -> None:
-    """Go on with a study that was stopped; finished chunks are not computed again."""
+    """Continue a study that was stopped; its finished chunks are not computed again."""
     from jeit.design.study.store import Store
 
     sweep, store = _read_study_and_path(file, output)
     if not store.exists():
         raise ValueError(f"there is no {store} to go on with: begin with 'jeit study run {file}'.")
-    Store(sweep, store, create=False)  # checks that the path is a store of this study
+    Store(sweep, store, create=False)  # checks that the path is the store of this study
     _run_with_progress(sweep, file, store, page, scheduler, quiet)
 
 
 @study.command()
 def status(file: File, output: Output = None) -> None:
-    """Say how far a study is."""
+    """Print how many points of a study are finished."""
     from jeit.arguments import counted
     from jeit.design.study import study_progress
 
@@ -81,7 +82,7 @@ def status(file: File, output: Output = None) -> None:
 
 @study.command()
 def report(file: File, output: Output = None, page: Page = None) -> None:
-    """Write one HTML page of what is finished."""
+    """Write an HTML page with the finished results of a study."""
     from jeit.design.reports import write_study_report
 
     sweep, store = _read_study_and_path(file, output)
@@ -99,8 +100,8 @@ def _read_study_and_path(file: Path, output: Path | None) -> "tuple[Study, Path]
 
 
 def _report_path(file: Path, store: Path, page: Path | None) -> Path:
-    """Path of the report. Raises `ValueError` if its folder does not exist, and if it is the path of the study file or
-    of its store."""
+    """Path of the HTML report. Raises `ValueError` if the folder of the report does not exist, and if the path is that
+    of the study file or of the store of results."""
     report_path = page or file.with_suffix(".html")
     if not report_path.parent.is_dir():
         raise ValueError(f"--page {report_path}: there is no folder {report_path.parent}; make it first.")
@@ -151,7 +152,8 @@ def _run_with_progress(
 
 
 def connected(scheduler: str):
-    """Connect to the dask scheduler at the address `scheduler`. Raises `ValueError` if there is no answer."""
+    """Connect to the dask scheduler at the address `scheduler`. Raises `ValueError` if the scheduler does not
+    answer."""
     from jeit.arguments.extras import optional
 
     try:

@@ -1,1 +1,1 @@
-"""Layout optimisation: electrodes are moved along gradients of a score, within constraints."""
+"""Layout optimisation: electrodes are moved along gradients of a layout score, within constraints."""

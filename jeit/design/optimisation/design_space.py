@@ -1,4 +1,4 @@
-"""The design space of a layout optimisation, its constraints, and bounded minimisation from several starts."""
+"""The design space and the constraints of a layout optimisation, and bounded minimisation from several starts."""
 
 from __future__ import annotations
 
@@ -34,12 +34,13 @@ class Constraints(Module):
             raise ValueError(f"minimum_spacing must be in metres, not negative; it is {self.minimum_spacing!r}.")
 
     def check_room(self, radii) -> None:
-        """Raise `ValueError` if discs of `radii` (L,), metres, are more than the densest packing of circles allows."""
+        """Raise `ValueError` if L discs of `radii` (L,), metres, are more than the densest packing of circles in the
+        outline's bounding box allows."""
         x_min, x_max, y_min, y_max = self.outline.extent
         min_radius = float(np.min(radii))
         min_distance = max(self.minimum_spacing, 2 * min_radius)
-        # Circles around the centres with half of `min_distance` as the radius do not overlap, and extend beyond the
-        # region of the centres by that radius.
+        # Circles of radius `min_distance` / 2 around the discs' centres do not overlap. They extend by this radius
+        # beyond the region in which the centres may lie.
         available_area = (x_max - x_min - 2 * min_radius + min_distance) * (
             y_max - y_min - 2 * min_radius + min_distance
         )
@@ -50,12 +51,13 @@ class Constraints(Module):
             )
 
     def shortfall(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> Float[Array, " q"]:
-        """Violation of each constraint, metres: positive if it is violated, otherwise zero or negative. Differentiable
-        almost everywhere."""
+        """Violation (q,) of each of q constraints, metres: positive if the constraint is violated, otherwise zero or
+        negative. The violation is differentiable almost everywhere."""
         return jnp.concatenate(list(self.shortfalls(centres, radii).values()))
 
     def shortfalls(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> dict[str, Float[Array, " q"]]:
-        """Violations, metres, by the name of the constraint: "minimum_spacing", "outline" and "keep_out"."""
+        """Violations of the constraints on L discs, metres, by the name of the constraint: "minimum_spacing", "outline"
+        and "keep_out"."""
         first, second = np.triu_indices(len(radii), 1)
         distances = jnp.sqrt(jnp.sum((centres[first] - centres[second]) ** 2, axis=1) + 1e-24)
         keep_out_violations = [radii + domain.signed_distance(centres) for domain in self.keep_out]
@@ -67,20 +69,24 @@ class Constraints(Module):
 
 
 class DesignSpace(Module):
-    """The layouts allowed in an optimisation, and the quantities that are varied.
+    """The layouts allowed in a layout optimisation, and the quantities that are varied.
 
     **Fields**
 
     - `outline`: domain that contains all electrodes, by default the outline of the skin.
-    - `minimum_spacing`: minimum distance between centres, metres; electrodes never overlap, even if it is 0.
-    - `keep_out`: domains that no electrode may overlap.
+    - `minimum_spacing`: minimum distance between the electrodes' centres, metres; electrodes never overlap, even if
+      this distance is 0.
+    - `keep_out`: domains of the skin that no electrode may overlap.
     - `symmetry`: symmetry of the layout about the middle of the outline's bounding box. Every half (x or y below or
-      above the middle) or quarter must contain the same number of electrodes. Those of the first part are kept, and the
-      others are replaced by their images. Use several starts, since a symmetric layout has fewer ways to improve.
-    - `sizes`: whether the diameters are varied too: True for half to twice the given ones, or two limits, metres.
-    - `contact_impedance`: two limits, ohm·m², between which the contact impedances are varied; None to keep them.
-    - `thickness`: two limits, metres, between which the thickness of the sheet is varied, starting from that of the
-      skin; its sheet conductivity is proportional to it. None to keep it.
+      above the middle) or quarter must contain the same number of electrodes. The electrodes of the first part are
+      kept, and the other electrodes are replaced by images of the first. Use several starts, since a symmetric layout
+      has fewer ways to improve.
+    - `sizes`: whether the electrodes' diameters are varied too: True for half to twice the given diameters, or two
+      limits, metres.
+    - `contact_impedance`: two limits, ohm·m², between which the contact impedances are varied; None to keep the
+      impedances.
+    - `thickness`: two limits, metres, between which the thickness of the sheet is varied, starting from the thickness
+      of the skin; the sheet conductivity is proportional to the thickness. None to keep the thickness.
 
     **Example:**
 
@@ -124,8 +130,8 @@ class DesignSpace(Module):
         self.contact_impedance, self.thickness = contact_impedance, thickness
 
     def constraints(self, skin: Skin) -> Constraints:
-        """Constraints on the layouts of a `skin`. Raises `ValueError` if neither the design space nor the skin has an
-        outline, for a curved skin, and for an invalid spacing."""
+        """Constraints on the electrode layouts of a `skin`. Raises `ValueError` if neither the design space nor the
+        skin has an outline, for a curved skin, and for an invalid spacing."""
         if isinstance(skin.layout, SurfaceLayout):
             raise ValueError("skin is curved; move its electrodes with jeit.design.optimise_surface_layout.")
         outline = skin.layout.outline if self.outline is None else self.outline
@@ -137,7 +143,7 @@ class DesignSpace(Module):
 
     def variables(self, skin: Skin, constraints: Constraints, depth: float) -> Variables:
         """Design variables of the layouts, starting from the layout of a `skin` whose touches are `depth` metres deep.
-        Raises `ValueError` for settings that no layout can satisfy."""
+        Raises `ValueError` for settings of the design space that no layout can satisfy."""
         options = {"sizes": self.sizes, "contacts": self.contact_impedance, "thickness": self.thickness}
         outline = constraints.outline
         variables = Variables.create(outline, varied_of(skin), symmetry=self.symmetry, **options)
@@ -148,7 +154,7 @@ class DesignSpace(Module):
 
 
 def varied_of(skin: Skin) -> Varied:
-    """The parameters of a sheet that an optimisation may vary, with their current values."""
+    """Current values of the parameters of a sheet that a layout optimisation may vary."""
     discs = skin.model.electrodes
     contact_impedance = discs.contact_impedance  # pyright: ignore[reportAttributeAccessIssue]
     return Varied(skin.layout.centres, skin.layout.diameters / 2, contact_impedance, jnp.asarray(skin.thickness, float))
@@ -160,13 +166,13 @@ def _check_thickness(thickness: tuple[float, float], depth: float, outline: Doma
     check_metres("thickness", np.max(thickness), longer_side(outline), "the skin is wide")
 
 
-# The minimisation has converged if the relative decrease of the cost in a step is below this.
+# The minimisation has converged if the relative decrease of the cost in a step is below this value.
 _TOLERANCE = 1e-5
 
 
 class Record:
-    """History of an optimisation from S starts: variables (S, v) and scores (S,) after every step. `callback` is called
-    after each step with its number and the scores."""
+    """History of an optimisation of v variables from S starts: the variables (S, v) and scores (S,) initially and after
+    every step. `callback` is called with each step's number, 0 for the initial layouts, and the scores."""
 
     def __init__(self, callback: Callable[[int, Float[np.ndarray, " S"]], None] | None = None):
         self.variables: list[np.ndarray] = []
@@ -174,7 +180,7 @@ class Record:
         self._callback = callback
 
     def add(self, variables, scores) -> None:
-        """Add the variables and the scores after a step."""
+        """Append the variables (S, v) and the scores (S,) of all starts after a step."""
         self.variables.append(np.array(variables))
         self.scores.append(np.array(scores))
         if self._callback is not None:
@@ -184,8 +190,8 @@ class Record:
 def descend(
     cost, variables: Float[Array, "S v"], steps: int, record: Record, *, tolerance: float = _TOLERANCE
 ) -> tuple[Float[Array, "S v"], Status]:
-    """Minimise the sum of the costs of S starts over variables between 0 and 1 by L-BFGS. Returns the final variables
-    and the status: converged, step limit, or stalled if no step along the gradient lowers the cost.
+    """Minimise the sum of the costs of S starts over v variables between 0 and 1 by L-BFGS. Returns the final variables
+    (S, v) and the status: converged, step limit, or stalled if no step along the gradient lowers the cost.
 
     `cost`: function of the variables (S, v) that returns the costs (S,), the scores (S,) for the `record`, and the
     gradient (S, v) of the costs.

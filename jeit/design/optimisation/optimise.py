@@ -1,8 +1,9 @@
-"""Layout optimisation: a score is maximised over electrode positions by gradients through the forward model.
+"""Layout optimisation: a layout score is maximised over electrode positions by gradients through the forward model.
 
-Bounded L-BFGS minimises -score + w Σ (violation / pitch)² over positions in the bounding box of the outline, where the
-weight w grows from stage to stage (the quadratic penalty method: Nocedal and Wright, Numerical Optimization, 2006,
-chapter 17). Remaining violations of the constraints are then removed by minimising the penalty alone.
+Bounded L-BFGS minimises -score + w Σ (violation / pitch)² over positions in the bounding box of the outline. The pitch
+is the mean spacing of the electrodes; the weight w grows from stage to stage (the quadratic penalty method: Nocedal and
+Wright, Numerical Optimization, 2006, chapter 17). Remaining violations are then removed by minimising the penalty
+alone, without the score.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh import Domain
 from jeit_solvers.module import Module
 
-# Stages of the optimisation: weight of the penalty, and fraction of all steps after which the stage ends.
+# Stages of the optimisation: weight w of the penalty, and fraction of all steps after which the stage ends.
 _PENALTY_STAGES = ((1e2, 0.5), (1e3, 0.8), (1e4, 1.0))
-# Safety margin of the constraints, metres, so that a layout rounded to whole nanometres still satisfies them.
+# Safety margin of the constraints, metres, which a layout keeps when it is rounded to whole nanometres.
 _CONSTRAINT_MARGIN = 2e-7
 # Maximum distance by which the outline may extend beyond the mesh, relative to the size of the skin.
 _MAX_OVERHANG = 0.01
-# Minimum relative improvement of the score for a layout to count as better.
+# Minimum relative improvement of the score for a layout to count as better than the given layout.
 _MIN_IMPROVEMENT = 1e-9
-# Number of random positions drawn for a start; the first ones inside the allowed region are used.
+# Number of random positions drawn for a random layout; the first positions inside the allowed region are used.
 _NUM_DRAWN_POSITIONS = 20_000
 
 
@@ -43,16 +44,19 @@ class Optimisation(Module):
 
     **Fields**
 
-    - `layout`: the best layout that satisfies all constraints, or the given layout if none is better.
-    - `scores`: all scores of `layout`; `value`: its score; `start_value`: score of the given layout.
+    - `layout`: the best layout that satisfies all constraints, or the given layout if no such layout is better.
+    - `scores`: all scores of `layout`; `value`, `start_value`: values of the objective for `layout` and for the given
+      layout.
     - `centres` (S, L, 2) and `radii` (S, L), metres, `contact_impedance` (S, L), ohm·m², `thickness` (S,) of the sheet,
-      metres: final values of each start; `values` (S,): their scores.
-    - `shortfall` (S,): largest violation of a constraint at the end of each start, metres; 0 if all are satisfied.
-    - `history` (S, T): score of each start after each step, without penalties.
-    - `snapshots` (S, T, L, 2): centres after each step, metres; the first are those of the start.
-    - `best`: index of the start that `layout` results from; None if `layout` is the given one.
+      metres: final parameters of the L electrodes from each start; `values` (S,): final value of the objective from
+      each start.
+    - `shortfall` (S,): largest final violation of a constraint from each start, metres; 0 if all constraints are
+      satisfied.
+    - `history` (S, T): value of the objective from each start, initially and after each step, without penalties.
+    - `snapshots` (S, T, L, 2): centres of the electrodes initially and after each step, metres.
+    - `best`: index of the start that `layout` results from; None if `layout` is the given layout.
     - `status`: "converged", "step limit", "stalled" (no shorter step improved the cost) or "infeasible"; `reason`: an
-      explanation in words.
+      explanation of the result in words.
     """
 
     layout: Layout | SurfaceLayout
@@ -89,14 +93,16 @@ def optimise_layout(
 
     **Arguments:**
 
-    - `skin`: a sheet with the initial layout; `objective`: an objective for touches of this sheet.
+    - `skin`: a sheet with the initial layout; `objective`: the maximised function of the scores, for touches of this
+      sheet.
     - `space`: the allowed layouts; by default all layouts on the skin.
     - `steps`: maximum number of L-BFGS steps; all starts are optimised together.
-    - `starts`: number of starts: the given layout, and random layouts drawn with `key` and moved apart.
-    - `callback`: called after each step with its number and the scores (S,).
+    - `starts`: number of initial layouts: the given layout, and random layouts drawn with `key` and moved apart.
+    - `callback`: function called with the number of each step, 0 for the initial layouts, and the scores (S,) of all
+      starts.
 
-    Raises `ValueError` for a layer, for arguments that `layout_scores` rejects, if the touches are for another
-    thickness, and for constraints that cannot be satisfied.
+    Raises `ValueError` for a layer instead of a sheet, for arguments that `layout_scores` rejects, if the touches are
+    for a sheet of another thickness, and for constraints that cannot be satisfied.
 
     **Example:**
 
@@ -148,7 +154,7 @@ def optimise_layout(
 
 
 class _LayoutSearch(Module):
-    """The optimisation from S starts, and its result."""
+    """Optimisation of a layout from S starts by the penalty method, and choice of the best result."""
 
     skin: Skin
     objective: Objective
@@ -156,13 +162,14 @@ class _LayoutSearch(Module):
     variables: Variables
 
     def cost(self, variables, penalty_weight):
-        """Penalised cost of each start (S,), its score (S,) and the gradient of the cost (S, v)."""
+        """Penalised cost (S,) and score (S,) of the layout of each start, and the gradient (S, v) of the cost by the v
+        variables."""
         return _penalised_cost(variables, jnp.asarray(penalty_weight), self)
 
     def run(
         self, initial_variables: Float[Array, "S v"], steps: int, callback
     ) -> tuple[Float[Array, "S v"], Record, str]:
-        """Run the optimisation. Returns the final variables of the starts, their history, and the status of the last
+        """Run all stages. Returns the final variables (S, v), the history of the starts, and the status of the last
         stage."""
         record = Record(callback)
         variables, status, num_steps_done = initial_variables, "step limit", 0
@@ -177,8 +184,8 @@ class _LayoutSearch(Module):
     def choose_best(
         self, parameters: Varied, values, violations, start_value: float, status: str
     ) -> tuple[int | None, str, str]:
-        """Choose the best start. Returns its index, or None if none is better than the given layout, the status, and
-        the reason."""
+        """Choose the start with the best final layout. Returns its index, the status, and the reason in words. The
+        index is None if no start satisfies the constraints or improves on the given layout."""
         layout = self.skin.layout
         is_valid = (violations <= 0) & np.isfinite(values)
         is_initial_valid = self.variables.represents(varied_of(self.skin))
@@ -209,8 +216,8 @@ class _LayoutSearch(Module):
         return best, status, reason
 
     def create_layout(self, parameters: Varied, varies_contacts: bool) -> Layout:
-        """Create the layout with the final `parameters`. If `varies_contacts`, the contact impedances were varied, and
-        are those of `parameters` too."""
+        """Create the layout with the final `parameters`. The contact impedances are those of `parameters` if
+        `varies_contacts`, and otherwise those of the given layout."""
         layout = self.skin.layout
         return Layout(
             parameters.centres,
@@ -223,7 +230,7 @@ class _LayoutSearch(Module):
 
 
 def _random_starts(variables: Variables, constraints: Constraints, num_layouts: int, key) -> list[np.ndarray]:
-    """Draw the variables of `num_layouts` random layouts, with positions uniform in the outline and outside the
+    """Draw the design variables of `num_layouts` random layouts, with positions uniform in the outline and outside the
     keep-out domains."""
     layouts_variables, num_generators = [], variables.num_generators
     for layout_key in jax.random.split(key, num_layouts) if num_layouts else ():
@@ -251,7 +258,8 @@ def _largest_violation(constraints: Constraints, centres, radii) -> float:
 
 
 def _make_feasible(variables: Variables, constraints: Constraints, start_variables):
-    """Move the starts (S, v) until they satisfy the constraints, as far as minimisation of the penalty succeeds."""
+    """Move the layouts of all starts (S, v) until they satisfy the constraints, as far as minimisation of the penalty
+    succeeds."""
 
     def cost(start_variables):
         penalties, gradients = _penalty_and_gradient(start_variables, variables, constraints)
@@ -262,8 +270,8 @@ def _make_feasible(variables: Variables, constraints: Constraints, start_variabl
 
 @eqx.filter_jit
 def _penalty_and_gradient(all_variables, variables: Variables, constraints: Constraints):
-    """Penalty for violated constraints of each of S starts (S,), and its gradient by the v variables (S, v). Both are
-    scaled by a large factor, so that the minimisation stops only where the penalty is zero."""
+    """Penalty (S,) for violated constraints of the layouts of S starts, and its gradient (S, v) by the v variables.
+    Both are scaled by a large factor, so that the minimisation stops only where the penalty is zero."""
     return jax.vmap(
         jax.value_and_grad(
             lambda start_variables: 1e6 * _penalty(variables, constraints, start_variables, _CONSTRAINT_MARGIN)
@@ -277,12 +285,13 @@ def _penalised_cost(all_variables, penalty_weight, search: _LayoutSearch):
 
     def cost_and_score(start_variables):
         parameters = variables.varied(start_variables)
-        # The score is undefined for an electrode outside the skin, so it is evaluated at the nearest point of the skin.
+        # The score is undefined for an electrode outside the skin, so the electrode is moved to the nearest point of
+        # the skin.
         clipped_parameters = parameters._replace(centres=constraints.outline.nearest(parameters.centres))
         score = objective.score(objective.scores_of_varied(search.skin, clipped_parameters))
         return penalty_weight * _penalty(variables, constraints, start_variables) - score, score
 
-    # Starts are evaluated one after the other, since the Jacobian of a single start fills the cache.
+    # Starts are evaluated one after the other, since the Jacobian of a single layout fills the processor's cache.
     (cost, score), gradient = jax.lax.map(jax.value_and_grad(cost_and_score, has_aux=True), all_variables)
     return cost, score, gradient
 
@@ -314,6 +323,6 @@ def _check_outline(outline: Domain, skin: Skin) -> None:
     low_x, high_x, low_y, high_y = outline.extent
     points = np.asarray(skin.model.mesh.points)
     overhang = max(*(points.min(axis=0) - (low_x, low_y)), *((high_x, high_y) - points.max(axis=0)))
-    # The mesh of a disk is a polygon inside it.
+    # The mesh of a disk is a polygon inside the disk, so a small overhang is allowed.
     if overhang > _MAX_OVERHANG * max(high_x - low_x, high_y - low_y):
         raise ValueError(f"outline: it reaches {1e3 * overhang:.3g} mm beyond the model's mesh; give the skin's own.")

@@ -1,8 +1,8 @@
 """Layout optimisation of curved sheets: electrodes are moved along the surface by gradients through the forward model.
 
-Gradient ascent with a line search: electrodes move in their tangent planes and are then projected to the nearest point
-of the surface, which agrees with a step along the surface to second order. A step that does not raise the score, or
-that brings electrodes too close to each other or to the edge, is halved.
+The score is raised by gradient ascent with a line search. Electrodes move in their tangent planes and are then
+projected to the nearest point of the surface, which agrees with a step along the surface to second order. A step that
+does not raise the score, or that brings electrodes too close to each other or to the edge, is halved.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ _MAX_STEP_FRACTION, _MIN_STEP_FRACTION = 0.3, 1e-3
 class SurfaceOptimisation(Module):
     """Result of `optimise_surface_layout`.
 
-    **Fields**: `layout`: the best layout; `value`: its score; `start_value`: score of the given layout; `history` (T,):
-    score after every step, non-decreasing; `snapshots` (T, L, 3): centres after every step, metres.
+    **Fields**: `layout`: the best layout; `value`: score of the best layout; `start_value`: score of the given layout;
+    `history` (T,): score initially and after every step, non-decreasing; `snapshots` (T, L, 3): centres of the L
+    electrodes initially and after every step, metres.
     """
 
     layout: SurfaceLayout
@@ -56,11 +57,13 @@ def optimise_surface_layout(
 
     **Arguments:**
 
-    - `skin`: a curved sheet with the initial layout; `objective`: as for `optimise_layout`.
-    - `steps`: maximum number of steps.
-    - `minimum_spacing`: minimum distance between centres, metres; electrodes never overlap, even if it is 0.
-    - `margin`: minimum distance of an electrode's rim from the edge, metres.
-    - `callback`: called after each step with its number and the score.
+    - `skin`: a curved sheet with the initial layout; `objective`: the maximised function of the scores, as for
+      `optimise_layout`.
+    - `steps`: maximum number of steps of the gradient ascent.
+    - `minimum_spacing`: minimum distance between the electrodes' centres, metres; electrodes never overlap, even if
+      this distance is 0.
+    - `margin`: minimum distance of an electrode's rim from the edge of the surface, metres.
+    - `callback`: function called after each step with the step's index, from 0, and the score.
 
     Raises `ValueError` for flat skins and layers, if `steps` is not a positive whole number, and for negative lengths.
 
@@ -116,8 +119,8 @@ def optimise_surface_layout(
 
 
 def surface_scores(skin: Skin, objective: Objective, positions: Float[Array, "L 3"]) -> Scores:
-    """Compute all scores of a curved sheet with its electrodes moved to `positions` (L, 3), metres; differentiable with
-    respect to the positions."""
+    """Compute all scores of a curved sheet with its electrodes moved to `positions` (L, 3), metres. The scores are
+    differentiable with respect to the positions."""
     discs = skin.model.electrodes
     assert isinstance(discs, SurfaceDiscs)
     model = skin.model.with_electrodes(SurfaceDiscs(positions, discs.radius, discs.contact_impedance))
@@ -125,7 +128,8 @@ def surface_scores(skin: Skin, objective: Objective, positions: Float[Array, "L 
 
 
 def _score_function(skin: Skin, objective: Objective):
-    """Return a compiled function of the positions (L, 3) that computes the score and its gradient (L, 3)."""
+    """Return a compiled function that computes the score of electrode positions (L, 3), metres, and the gradient (L, 3)
+    of the score."""
     compiled_score = jax.jit(
         jax.value_and_grad(lambda score_positions: objective.score(surface_scores(skin, objective, score_positions)))
     )

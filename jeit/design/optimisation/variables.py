@@ -42,42 +42,45 @@ class Varied(NamedTuple):
 
 
 class Range(Module):
-    """Logarithmic scale for k positive values between `lower` (k,) and `lower` · exp(`span`)."""
+    """Logarithmic mapping from k variables between 0 and 1 to positive values between `lower` (k,) and `lower` ·
+    exp(`span`)."""
 
     lower: Float[np.ndarray, " k"]
     span: Float[np.ndarray, " k"]
 
     @classmethod
     def create(cls, name: str, limits, initial_values, unit: str) -> "Range":
-        """Create the range from its two `limits`, the same for all k values of `initial_values` (k,).
-        Raises `ValueError` for invalid limits."""
+        """Create the range of k values between two `limits`, the same for all; `initial_values` (k,) gives the number
+        k. Raises `ValueError` for invalid limits."""
         lower, upper = limits if np.shape(limits) == (2,) else (0.0, 0.0)
         if not 0 < lower < upper < np.inf:
             raise ValueError(f"{name} must be two values in {unit}, the smaller one first; it is {limits!r}.")
         return cls(np.full(np.shape(initial_values), lower), np.full(np.shape(initial_values), np.log(upper / lower)))
 
     def variables(self, values) -> Float[np.ndarray, " k"]:
-        """Variables between 0 and 1 that correspond to `values`; values outside the range are clipped to it."""
+        """Variables (k,) between 0 and 1 that correspond to `values` (k,); values outside the range are clipped to the
+        range."""
         return np.minimum(np.maximum(np.log(np.asarray(values) / self.lower) / self.span, 0), 1)
 
     def values(self, variables) -> Float[Array, " k"]:
-        """Values that correspond to variables between 0 and 1."""
+        """Values (k,) that correspond to `variables` (k,) between 0 and 1."""
         return jnp.asarray(self.lower) * jnp.exp(self.span * variables)
 
 
 class Variables(Module):
-    """Mapping from variables between 0 and 1 to the parameters `Varied`. The variables describe G generators; the other
-    electrodes are their images under the symmetry.
+    """Mapping from design variables between 0 and 1 to the parameters `Varied` of a layout. The variables describe G
+    electrodes, the generators; the other electrodes are images of the generators under the symmetry.
 
     **Fields**
 
-    - `low`, `size` (2,): lower left corner and side lengths of the bounding box of the centres, metres.
-    - `images` (k, 2, 2): matrices of the symmetry; `order` (L,): index of each electrode among the images of the
-      generators.
-    - `initial`: the initial parameters; `start`: the variables that correspond to them.
-    - `sizes` (G), `contacts` (G), `thickness` (1): ranges of the radii, contact impedances and thickness; None if these
-      are not varied.
-    - `pitch`: mean spacing of the electrodes, metres: the side of a square with the area available to each.
+    - `low`, `size` (2,): lower left corner and side lengths of the box in which the electrodes' centres may lie,
+      metres.
+    - `images` (k, 2, 2): matrices of the k operations of the symmetry; `order` (L,): index of each electrode among the
+      images of the generators.
+    - `initial`: the initial parameters of the layout; `start`: the design variables that correspond to `initial`.
+    - `sizes` (G), `contacts` (G), `thickness` (1): ranges of the radii, contact impedances and thickness; None for
+      parameters that are not varied.
+    - `pitch`: mean spacing of the electrodes, metres: the side of a square with the area available to each electrode.
     """
 
     low: np.ndarray
@@ -95,7 +98,8 @@ class Variables(Module):
     def create(
         cls, outline: Domain, initial: Varied, *, symmetry=None, sizes=False, contacts=None, thickness=None
     ) -> "Variables":
-        """Create the variables from the `initial` parameters. Raises `ValueError` for settings that contradict them."""
+        """Create the mapping from the `initial` parameters of a layout. Raises `ValueError` for settings that
+        contradict the parameters."""
         if symmetry is not None:
             check_name("symmetry", symmetry, filter(None, _IMAGES), ", or None")
         centres, radii = np.asarray(initial.centres), np.asarray(initial.radii)
@@ -123,7 +127,8 @@ class Variables(Module):
         image_positions = (np.einsum("kij,gj->kgi", images, centres[is_generator] - box_centre) + box_centre).reshape(
             -1, 2
         )
-        # Images are assigned to electrodes such that the sum of their distances is minimal.
+        # Images of generators are assigned to electrodes such that the sum of the distances between image and electrode
+        # is minimal.
         order = scipy.optimize.linear_sum_assignment(np.linalg.norm(centres[:, None] - image_positions, axis=-1))[1]
         start = [np.clip((centres[is_generator] - low) / size, 0, 1).ravel()]
         if size_range is not None:
@@ -142,7 +147,8 @@ class Variables(Module):
         return cls(low, size, images, order, symmetric_parameters, *ranges, np.concatenate(start), pitch)
 
     def represents(self, varied: Varied) -> bool:
-        """Whether the start represents `varied` exactly: True if `varied` has the symmetry and lies in the ranges."""
+        """Whether the variables `start` give the parameters `varied` exactly: True if `varied` has the symmetry and
+        lies in the ranges."""
         represented = self.varied(jnp.asarray(self.start))
         are_equal = (
             np.allclose(represented_values, given_values, rtol=1e-6, atol=0)
@@ -152,7 +158,7 @@ class Variables(Module):
 
     @property
     def num_generators(self) -> int:
-        """Number of generators, G."""
+        """Number of generators, G: electrodes that the variables describe directly."""
         return len(self.order) // len(self.images)
 
     @property
@@ -163,7 +169,7 @@ class Variables(Module):
         return np.tile(self.sizes.lower, len(self.images))[self.order]
 
     def varied(self, variables: Float[Array, " v"]) -> Varied:
-        """Parameters that correspond to the variables."""
+        """Parameters of the layout that correspond to the design variables (v,) between 0 and 1."""
         num_generators = self.num_generators
         offsets, remaining_variables = (
             variables[: 2 * num_generators].reshape(num_generators, 2) * self.size - self.size / 2,
@@ -186,7 +192,7 @@ class Variables(Module):
         return Varied(centres[self.order], radii, contact_impedance, thickness)
 
     def _values_of_images(self, values: Float[Array, " G"]) -> Float[Array, " L"]:
-        """Repeat the values (G,) of the generators for all electrodes (L,)."""
+        """Repeat the values (G,) of the generators for their images: values (L,) of all electrodes."""
         return jnp.tile(values, len(self.images))[self.order]
 
 
@@ -217,17 +223,16 @@ def _check_symmetric_counts(num_first: int, num_sectors: int, num_electrodes: in
 
 def balanced_score(scores: Scores) -> Float[Array, ""]:
     """Default score of an `Objective`: log of the smooth minimum of the sensitivity minus log of the mean variance, so
-    that a change of either by one per cent counts the same."""
+    that a change of either quantity by one per cent counts the same."""
     return jnp.log(scores.soft_worst) - jnp.log(scores.mean_variance)
 
 
 class Objective(Module):
-    """Objective of a layout optimisation: a function of the `Scores` of a layout, which is maximised.
+    """Objective of a layout optimisation: the function of a layout's `Scores` that is maximised.
 
     **Fields**: `touches`: touches of the skin, as from `Skin.sheet_touches`; `prior`, `noise` (volts) and
-    `temperature`: as in `layout_scores`; `score`: function of `Scores` whose values differ by the order of 1 between
-    layouts, such as a logarithm. Raises `ValueError` if `score` is not a function, and for touches or a prior of
-    another type.
+    `temperature`: as in `layout_scores`; `score`: function of `Scores` whose values differ by about 1 between layouts,
+    such as a logarithm. Raises `ValueError` if `score` is not a function, and for touches or a prior of the wrong type.
 
     **Example:**
 
@@ -275,8 +280,8 @@ class Objective(Module):
         return layout_scores(skin.model, skin.model_conductivity, self.touches, **options)
 
     def scores_of_varied(self, skin: Skin, varied: Varied) -> Scores:
-        """Compute the scores of a skin with its electrodes and thickness replaced by those of `varied`; differentiable
-        with respect to these."""
+        """Compute the scores of a skin with its electrodes and thickness replaced by those of `varied`. The scores are
+        differentiable with respect to `varied`."""
         model = skin.model.with_electrodes(SheetDiscs(varied.centres, varied.radii, varied.contact_impedance))
         conductance = skin.model_conductivity * (varied.thickness / skin.thickness)
         touches = self.touches.at_thickness(varied.thickness)

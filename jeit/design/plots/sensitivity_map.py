@@ -33,15 +33,15 @@ def plot_sensitivity_map(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot the sensitivity Θ over the skin, in millivolts.
+    """Plot the sensitivity Θ to touches over the skin, in millivolts.
 
     **Arguments:**
 
     - `theta`: the sensitivity map.
-    - `electrodes`: positions (L, 2) to be marked, metres.
+    - `electrodes`: positions (L, 2) of the electrodes to be marked, metres.
     - `limit`: upper end of the colour bar, volts, by default the maximum of Θ.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` if `theta` is not a `SensitivityMap`.
 
@@ -83,15 +83,15 @@ def plot_sensitivity_map(
 def plot_sensitivity_histograms(
     maps: Mapping[str, SensitivityMap], *, bins: int = 40, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Plot histograms of the sensitivity, as shares of the area, of several maps. A dashed line marks the minimum of
-    the first map.
+    """Plot histograms of several sensitivity maps, as shares of the skin's area. A dashed line marks the minimum of the
+    first map.
 
     **Arguments:**
 
     - `maps`: sensitivity maps by name, for the legend.
-    - `bins`: number of bins of equal width.
+    - `bins`: number of bins of equal width in the histogram.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` if `maps` is not a mapping to sensitivity maps.
 

@@ -1,4 +1,4 @@
-"""Plots of virtual taxels: map, histogram of areas, and similarity of each position to a taxel."""
+"""Plots of virtual taxels: map of taxels, histogram of their areas, and similarity of each position to a taxel."""
 
 from __future__ import annotations
 
@@ -40,20 +40,20 @@ def plot_taxels(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot the map of the taxels of one layout.
+    """Plot a map of the virtual taxels of one electrode layout.
 
     **Arguments:**
 
     - `taxels`: the taxels, as from `find_taxels`.
     - `colour`: quantity shown by colours: "area", the area of the taxel whose cluster contains the position;
       "coverage", the number of taxels that cover the position; "label", a colour for each cluster.
-    - `outlines`: whether to draw the outline of each taxel, where the similarity falls below the threshold.
-    - `electrodes`: positions (L, 2) or (L, 3) to be marked, metres.
+    - `outlines`: whether to draw the outline of each taxel, along which the similarity equals the threshold.
+    - `electrodes`: positions (L, 2) or (L, 3) of the electrodes to be marked, metres.
     - `limit`: value at the upper end of the colour bar, in m² for "area".
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
-    Raises `ValueError` for other values of `colour`, and for batches of layouts.
+    Raises `ValueError` for an unknown `colour`, and for taxels of a batch of layouts.
 
     **Example:**
 
@@ -85,16 +85,16 @@ def plot_taxel_areas(
     taxels: Taxels | Mapping[str, Taxels], *, bins: int = 20, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
     """Plot the histogram of the taxel areas of one or several layouts. The legend gives the mean ± standard deviation
-    of each layout.
+    of each layout's areas.
 
     **Arguments:**
 
     - `taxels`: taxels of one layout, or of one to six layouts by name.
     - `bins`: number of bins of equal width from 0 to the largest area, the same for all layouts.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
-    Raises `ValueError` for batches, and unless there are one to six layouts.
+    Raises `ValueError` for taxels of a batch of layouts, and unless there are one to six layouts.
 
     **Example:**
 
@@ -133,11 +133,11 @@ def plot_similarity(
     colour_bar: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot the similarity of each position's voltage change to the mean change of taxel `index`, and the taxel's
-    outline.
+    """Plot the cosine similarity of each position's voltage change to the mean voltage change of taxel `index`, and the
+    taxel's outline.
 
-    `electrodes`: positions (L, 2) or (L, 3) to be marked, metres. Raises `ValueError` for an index of no taxel, and for
-    batches of layouts.
+    `electrodes`: positions (L, 2) or (L, 3) of the electrodes to be marked, metres. Raises `ValueError` for an `index`
+    of no taxel, and for taxels of a batch of layouts.
     """
     _check_single(taxels)
     num_taxels = len(taxels.similarity)
@@ -166,8 +166,8 @@ def _check_single(taxels: Taxels) -> None:
 
 
 def _cell_sides(taxels: Taxels) -> tuple[np.ndarray, np.ndarray]:
-    """Width and height (n,) of the drawn cells, metres: the spacings of the grid, or squares of the given area if the
-    positions form no grid."""
+    """Widths and heights (n,) of the drawn cells, metres: the spacings of the grid, or the sides of squares of the
+    given area if the positions form no grid."""
     spacings_by_axis = [np.diff(np.unique(axis.round(9))) for axis in np.asarray(taxels.places).T]
     square_sides = np.sqrt(np.asarray(taxels.cell_area))
     if all(len(spacings) and np.allclose(spacings, spacings[0], rtol=1e-3) for spacings in spacings_by_axis):
@@ -178,14 +178,14 @@ def _cell_sides(taxels: Taxels) -> tuple[np.ndarray, np.ndarray]:
 def _draw_cells(ax: Axes, taxels: Taxels, values: np.ndarray, *, colour_map: str) -> PolyCollection:
     half_sizes = np.stack(_cell_sides(taxels), axis=1)[:, None] / 2
     corners = np.asarray(taxels.places)[:, None] + half_sizes * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    # Edges in the colour of the cell hide the gaps between cells.
+    # Cell edges are drawn in the colour of the cell, which hides gaps between cells.
     cells = PolyCollection(list(corners), array=values, cmap=colormaps[colour_map], edgecolors="face", linewidth=0.4)
     ax.add_collection(cells)
     return cells
 
 
 def _map_colours(taxels: Taxels) -> np.ndarray:
-    """Indices (k,) of the colours of the clusters: for each one the first colour of the palette that none of its
+    """Indices (k,) of the colours of the k clusters: each cluster gets the first colour of the palette that none of its
     neighbours has."""
     labels, num_taxels = np.asarray(taxels.labels), len(taxels.similarity)
     first_labels, second_labels = labels[_triangulate(taxels).edges].T

@@ -28,16 +28,17 @@ def plot_travel(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot the path of every electrode for one start of an optimisation. Hollow discs mark the initial positions,
-    filled discs the final ones.
+    """Plot the path of every electrode for one start of a layout optimisation. Hollow discs mark the initial positions,
+    filled discs the final positions.
 
     **Arguments:**
 
     - `optimisation`: result of `optimise_layout`.
     - `start`: index of the start, from 0.
-    - `keep_out`: regions to be hatched.
-    - `title`: title of the plot; by default the mean distance between initial and final positions in millimetres.
-    - `ax`: axes to draw into; by default new ones.
+    - `keep_out`: regions without electrodes, to be hatched.
+    - `title`: title of the plot; by default the mean distance between the electrodes' initial and final positions in
+      millimetres.
+    - `ax`: axes to draw into; by default new axes.
 
     Raises `ValueError` for a start that does not exist, and if `optimisation` is not an `Optimisation`.
 
@@ -77,7 +78,7 @@ def plot_travel(
 
 
 def _draw_legend(ax: Axes, *, has_keep_out: bool) -> None:
-    """Draw a legend below the plot, beside the scale bar."""
+    """Draw the legend of the positions below the plot, beside the scale bar."""
     disc = {"marker": "o", "markersize": 8, "linestyle": "none"}
     handles: list[Artist] = [
         Line2D([], [], markerfacecolor="none", markeredgecolor=SOFT, label="where it began", **disc),
@@ -91,6 +92,6 @@ def _draw_legend(ax: Axes, *, has_keep_out: bool) -> None:
 
 
 def outline_path(domain: Domain) -> Path:
-    """Boundary of a domain and of its holes as closed loops of a matplotlib path, in metres."""
+    """Convert the boundary of a domain, including its holes, to closed loops of a matplotlib path, in metres."""
     loops = [np.asarray(loop) for loop in domain.loops()]
     return Path.make_compound_path(*(Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in loops))

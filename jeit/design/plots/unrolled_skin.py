@@ -43,21 +43,24 @@ def plot_unrolled(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot an unrolled surface, with dashed lines along the cut.
+    """Plot a curved surface unrolled to a plane, with dashed lines along the cut.
 
-    If unrolling changes lengths by more than half a per cent on average, the plot states the distortion.
+    If unrolling changes lengths on the surface by more than half a per cent on average, the plot states this
+    distortion.
 
     **Arguments:**
 
     - `unrolled`: the surface, as from `jeit.mesh.unroll`.
-    - `values`: one value for each triangle of the surface, drawn in uniform colours, or for each node, interpolated.
+    - `values`: one value for each triangle of the surface, drawn in a uniform colour, or one for each node,
+      interpolated.
     - `electrodes`: disc electrodes, drawn as circles with their numbers or labels.
-    - `marks`: positions (p, 3) on the surface to be marked, metres, by their names in the legend.
-    - `scale`: mapping from values to colours; by default for changes of sheet conductivity in S.
+    - `marks`: dictionary from names in the legend to positions (p, 3) on the surface that are marked, metres.
+    - `scale`: mapping from values to colours; the default suits changes of sheet conductivity in siemens.
     - `title`: title of the plot.
-    - `ax`: axes to draw into; by default new ones.
+    - `ax`: axes to draw into; by default new axes.
 
-    Raises `ValueError` for values of another shape, complex or not finite, and for arguments of the wrong type.
+    Raises `ValueError` for values that do not match triangles or nodes, are complex or not finite, and for arguments of
+    the wrong type.
 
     **Example:**
 

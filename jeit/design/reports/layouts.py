@@ -1,4 +1,4 @@
-"""Reports on the comparison of two layouts and on the optimisation of a layout."""
+"""Reports on the comparison of two electrode layouts and on the optimisation of a layout."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MAX_NAME_LENGTH = 32
 
 
 def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> None:
-    """Write `comparison.png` and `report.json` into a folder.
+    """Write the comparison of two layouts to `comparison.png` and `report.json` in a folder.
 
     **Arguments:**
 
@@ -39,8 +39,8 @@ def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> Non
 
 
 def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:
-    """Scores of both layouts ("layouts") and parameters of the skins and touches ("options"), as plain numbers and
-    strings."""
+    """Scores of the two compared layouts ("layouts"), and parameters of the skins and touches ("options"), as plain
+    numbers and strings."""
     skin, response = result.skins[0], result.responses[0]
     options = {
         "thickness_mm": 1e3 * skin.thickness,
@@ -57,8 +57,8 @@ def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:
 
 
 def draw_layout_comparison(result: LayoutComparison):
-    """Plot the sensitivity and taxel maps of both layouts with the same colour scales, and their histograms, as a
-    matplotlib `Figure`."""
+    """Plot the sensitivity and taxel maps of two layouts with the same colour scales, and histograms of sensitivity and
+    taxel area, as a matplotlib `Figure`."""
     from matplotlib.artist import Artist
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
@@ -86,8 +86,8 @@ def draw_layout_comparison(result: LayoutComparison):
             ax=row_axes[0],
         )
         plot_taxels(response.taxels, electrodes=centres, limit=max_area, title=f"{name}: taxels", ax=row_axes[1])
-        # The taxel map places its scale bar for the touched part only; replace it by one for the whole skin, which both
-        # maps show.
+        # The scale bar of the taxel map is placed for the touched part of the skin only. It is replaced by a scale bar
+        # for the whole skin, which both maps show.
         for scale_bar_part in (row_axes[1].lines[-1], row_axes[1].texts[-1]):
             scale_bar_part.remove()
         draw_scale_bar(row_axes[1], outline.extent)
@@ -108,7 +108,7 @@ def draw_layout_comparison(result: LayoutComparison):
 
 
 def distinct_names(names: list[str]) -> list[str]:
-    """Two names, with numbers appended if they are equal."""
+    """Return the two layout names, with numbers appended if the names are equal."""
     return names if names[0] != names[1] else [f"{name} ({k})" for k, name in enumerate(names, 1)]
 
 
@@ -118,7 +118,7 @@ def _shorten_name(name: str) -> str:
 
 
 def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:
-    """Write `layout.csv`, `layout.svg`, `travel.png` and `report.json` into a folder.
+    """Write an optimised layout to `layout.csv`, `layout.svg`, `travel.png` and `report.json` in a folder.
 
     **Arguments:**
 
@@ -154,8 +154,8 @@ def draw_improved_layout(result: ImprovedLayout):
 
 
 def report_improved_layout(result: ImprovedLayout) -> dict[str, Any]:
-    """Result of the optimisation, scores of the given ("start") and the optimised layout ("optimised") on the finer
-    mesh, and the options, as plain numbers and strings; None for values that are not finite."""
+    """Result of the layout optimisation, scores of the given ("start") and the optimised layout ("optimised") on the
+    finer mesh, and the options, as plain numbers and strings. Values that are not finite are None."""
     optimisation, skin, space = result.optimisation, result.skin, result.space
     content = {
         "layout": result.start.name,
@@ -193,8 +193,8 @@ def _score_figures(scores: Scores) -> dict[str, Any]:
 
 
 def _format_region(domain: Domain) -> str | dict[str, Any]:
-    """Region in the format of the option --keep-out, a disc "x,y,radius" or a rectangle "x1,y1,x2,y2" in millimetres; a
-    description for other regions."""
+    """Keep-out region in the format of the option --keep-out, a disc "x,y,radius" or a rectangle "x1,y1,x2,y2" in
+    millimetres. A region of another shape gives a description."""
     if isinstance(domain, Disk):
         numbers = (*domain.centre, domain.radius)
     elif isinstance(domain, Rectangle):

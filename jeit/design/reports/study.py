@@ -1,4 +1,4 @@
-"""HTML report of a study: table of its points, and plots of their scores and sensitivity maps."""
+"""HTML report of a study: table of its points (skins), and plots of their scores and sensitivity maps."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from jeit.design.study.store import Store, open_results
 from jeit.mesh import Rectangle
 from jeit.mesh.geodesic import Geodesics, Triangles, unroll
 
-# Maximum number of maps in a report, and of plots side by side.
+# Maximum number of sensitivity maps in a report, and of maps side by side.
 _MAX_MAPS, _NUM_COLUMNS = 24, 4
-# The mesh of an unrolled map is refined until it has this many nodes, so that they cannot be distinguished.
+# The mesh of an unrolled map is refined until it has this many nodes, so that single nodes cannot be distinguished.
 _MIN_MAP_NODES = 3000
-# Text that gives the value of a swept parameter above a map; the layout is given by its name.
+# Format of the value of each swept parameter in the title of a map; the layout is given by its name.
 _LABELS = {
     "diameter_mm": "⌀ {:g} mm",
     "contact_impedance_ohm_m2": "{:g} Ω m²",
@@ -37,14 +37,14 @@ _LABELS = {
     "noise_V": "noise {:g} V",
     "cell_mm": "cells {:g} mm",
 }
-# Titles of scores that differ from the names in the store.
+# Titles of scores whose titles differ from their names in the store of results.
 _TITLES = {"mean": "mean sensitivity", "minimum": "least sensitivity"}
-# Ticks of a logarithmic scale, as multiples of powers of ten, and the format of their labels.
+# Ticks of a logarithmic scale, as multiples of powers of ten, and the format of the tick labels.
 _TICKS, _PLAIN_NUMBER = (1.0, 2.0, 5.0), "{x:g}"
 
 
 def draw_scatter(data):
-    """Plot the mean against the minimum sensitivity of every point, with a colour for each layout."""
+    """Plot the mean against the minimum sensitivity of every point of a study, with a colour for each layout."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -71,19 +71,19 @@ def draw_scatter(data):
 
 
 def stored_score_names(data) -> list[str]:
-    """Names of the scores, that is of the arrays with one value for each point."""
+    """Names of the scores in the results of a study, that is of the arrays with one value for each point."""
     return [name for name in data.data_vars if data[name].dims == ("point",)]
 
 
 def values_and_unit(data, name: str) -> tuple[np.ndarray, str]:
-    """Values of a score at every point, and their unit. Volts are converted to millivolts."""
+    """Values of the score `name` for every point of a study, and their unit. Volts are converted to millivolts."""
     values, unit = data[name].values, data[name].attrs.get("units", "1")
     return (1e3 * values, "mV") if unit == "V" else (values, unit)
 
 
 def draw_scores(data):
-    """Plot every score against the number of the point, with a colour for each layout. Infinite values are drawn as
-    triangles at the top."""
+    """Plot every score of a study against the number of the point, with a colour for each layout. Infinite scores are
+    drawn as triangles at the top."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
@@ -128,15 +128,16 @@ def draw_scores(data):
 
 
 def map_points(data) -> np.ndarray:
-    """Indices of the finished points whose maps are drawn in the report: all of them, or an evenly spaced selection if
-    there are more than the report shows."""
+    """Indices of the finished points whose sensitivity maps are drawn in the report: all finished points, or 24 evenly
+    spaced points if there are more."""
     finished = np.flatnonzero(data.finished.values)
     selected_positions = np.linspace(0, len(finished) - 1, min(len(finished), _MAX_MAPS)).round().astype(int)
     return finished[selected_positions]
 
 
 def draw_maps(study: Study, data):
-    """Plot the sensitivity maps of the points chosen by `map_points`, with the same colour scale and the electrodes."""
+    """Plot the sensitivity maps of the points chosen by `map_points`, all with the same colour scale, and their
+    electrodes."""
     from matplotlib.collections import EllipseCollection
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
@@ -189,7 +190,7 @@ def draw_maps(study: Study, data):
 
 
 class _FlatMaps:
-    """Drawing of maps of flat skins, in millimetres."""
+    """Drawing of sensitivity maps of flat skins, in millimetres."""
 
     def __init__(self, outline: Rectangle, grid: TouchGrid):
         self.extent, self.grid = tuple(1e3 * length for length in outline.extent), grid
@@ -202,8 +203,8 @@ class _FlatMaps:
 
 
 class _UnrolledMaps:
-    """Drawing of maps of curved skins, unrolled, in millimetres. Every node has the value of the touched position that
-    is nearest along the surface."""
+    """Drawing of sensitivity maps of curved skins, unrolled, in millimetres. Every node has the value of the touched
+    position that is nearest along the surface."""
 
     def __init__(self, outline: Triangles, grid: TouchGrid):
         fine_surface = outline
@@ -224,8 +225,8 @@ class _UnrolledMaps:
 
 
 def point_titles(study: Study) -> list[str]:
-    """Title of every point: its number and layout, followed by the other parameters that differ between points, two per
-    line."""
+    """Title of every point of a study: its number and layout, followed by the other parameters that differ between
+    points, two per line."""
     coordinates = [point.coordinates for point in study.points]
     varying = [name for name in _LABELS if len({values[name] for values in coordinates}) > 1]
     titles = []
@@ -241,8 +242,8 @@ def _parameter_text(name: str, value) -> str:
 
 
 def _escape_for_matplotlib(text: str) -> str:
-    """Escape a text so that matplotlib shows it unchanged: dollar signs start no formula, and a leading underscore does
-    not hide a label."""
+    """Escape a text so that matplotlib shows the text unchanged: dollar signs start no formula, and a leading
+    underscore does not hide a label."""
     return " " * text.startswith("_") + text.replace("$", r"\$")
 
 
@@ -259,8 +260,9 @@ img { max-width: 100% } pre { background: #f4f4f4; padding: 1em; overflow-x: aut
 def write_study_report(study: Study, store: str | Path, path: str | Path) -> None:
     """Write the finished results of a study as one HTML file. An existing file is replaced as a whole.
 
-    The page shows the maps of up to 24 finished points with the same colour scale, mean against minimum sensitivity,
-    parameters and scores of every point, and the study file, its fingerprint and the versions of packages.
+    The page shows the sensitivity maps of up to 24 finished points with the same colour scale, a plot of mean against
+    minimum sensitivity, parameters and scores of every point, the study file with its fingerprint, and the versions of
+    packages.
 
     **Arguments:**
 
@@ -268,7 +270,8 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
     - `store`: path of the Zarr store with its results.
     - `path`: path of the HTML file.
 
-    Raises `ValueError` if no chunk is finished, `OSError` if the page cannot be written, and as `open_results` does.
+    Raises `ValueError` if no chunk of the study is finished, `OSError` if the page cannot be written, and in the cases
+    of `open_results`.
 
     **Example:**
 
@@ -341,7 +344,7 @@ def _figure_html(figure: Any, caption: str) -> str:
 
 
 def _points_table(study: Study, data) -> str:
-    """HTML table with a row for every point: the swept parameters, then the scores."""
+    """HTML table with a row for every point of a study: the swept parameters, then the scores."""
     swept_names = list(study.points[0].coordinates)
     values_and_units = {name: values_and_unit(data, name) for name in stored_score_names(data)}
     column_titles = [

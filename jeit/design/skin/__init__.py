@@ -1,1 +1,1 @@
-"""Skins and touches: indentations, the cells that they change, and the resulting voltage changes."""
+"""Skins and touches: indentations, the mesh cells that indentations change, and the resulting voltage changes."""

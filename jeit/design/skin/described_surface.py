@@ -1,4 +1,4 @@
-"""Creation of the surface of a curved skin from its table in a TOML file: generated, or read from a file."""
+"""Creation of the surface of a curved skin from its table in a TOML file: a generated shape, or a file of triangles."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from jeit.design.skin.surface_tables import SurfaceTable
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
-# Typical extent of a skin, metres, from which the likely unit of a file is determined.
+# Typical extent of a skin, metres, from which the likely unit of length of a file is determined.
 _TYPICAL_EXTENT = 0.15
-# Side of an equilateral triangle divided by the square root of its area.
+# Side of an equilateral triangle divided by the square root of the triangle's area.
 _SIDE_TO_ROOT_AREA = 2 / 3**0.25
 
 
 def described_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
-    """Create the surface that `table` describes, with cells of `cell_size` metres, or read its file of triangles; paths
-    are relative to `folder`.
+    """Create the surface that `table` describes, with triangles of `cell_size` metres, or read the surface from the
+    file that `table` names. Paths are relative to `folder`.
 
-    Raises `ValueError` for a surface that cannot be created or read, or is invalid; `ImportError` for a CAD file if
-    Gmsh is not installed.
+    Raises `ValueError` for a surface that cannot be created or read, or is invalid. Raises `ImportError` for a CAD file
+    if Gmsh is not installed.
     """
     try:
-        with size_checked():  # no warning about the size, since a surface that is too large is rejected
+        with size_checked():  # no warning about the size, since `_check_unit` rejects a surface that is too large
             surface = _create_surface(table, folder, cell_size)
     except (ValueError, OSError) as error:
         raise ValueError(f"surface: {error}") from None
@@ -41,7 +41,8 @@ def described_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Me
 
 
 def _check_unit(table: SurfaceTable, surface: Mesh) -> None:
-    """Raise `ValueError` for a file whose surface is implausibly large or small; the message gives the likely unit."""
+    """Raise `ValueError` if the surface of a file is implausibly large or small for a skin; the message gives the
+    likely unit of length."""
     from jeit.design.skin.surface_tables import ScanTable
 
     extent = float(np.ptp(np.asarray(surface.points), axis=0).max())
@@ -62,7 +63,7 @@ def _length_text(metres: float) -> str:
 
 
 def surface_identity(table: SurfaceTable, folder: Path) -> str:
-    """Text that identifies a surface: its table, with a file replaced by the hash of its content."""
+    """Text that identifies the surface of a skin: its table, with a file replaced by the hash of its content."""
     values = table.model_dump()
     if "file" in values:
         values["file"] = hashlib.sha256((folder / values["file"]).read_bytes()).hexdigest()
@@ -70,7 +71,8 @@ def surface_identity(table: SurfaceTable, folder: Path) -> str:
 
 
 def typical_cell(surface: Mesh) -> float:
-    """Typical cell size of a surface, metres: side of an equilateral triangle with the mean area of its triangles."""
+    """Typical cell size of a surface, metres: side of an equilateral triangle with the mean area of the surface's
+    triangles."""
     return _SIDE_TO_ROOT_AREA * float(np.sqrt(np.mean(np.asarray(measures(surface)))))
 
 

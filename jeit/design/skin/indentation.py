@@ -14,7 +14,7 @@ from jeit_solvers.module import Module
 
 
 class AbstractIndentation(Module):
-    """Base class of indentations: to define a new indentation, subclass it."""
+    """Base class of indentations of a skin; a new indentation is a subclass."""
 
     @abc.abstractmethod
     def depth_at(self, distance: Float[Array | np.ndarray, "..."]) -> Float[Array | np.ndarray, "..."]:
@@ -23,16 +23,16 @@ class AbstractIndentation(Module):
     @property
     @abc.abstractmethod
     def reach(self) -> float:
-        """Distance in metres beyond which the depth is 0."""
+        """Distance in metres from the centre beyond which the depth is 0."""
 
 
 class Bell(AbstractIndentation):
     """Gaussian indentation depth · exp(−r² / (2 deviation²)) at distance r; with the default values, the unit
     deformation of Park et al. 2022, text S4.
 
-    It is set to 0 beyond r = 3 deviation, where it has dropped to about a hundredth of `depth`.
+    The indentation is set to 0 beyond r = 3 deviation, where the depth has dropped to about a hundredth of `depth`.
 
-    **Fields**: `depth`: largest depth, metres; `deviation`: deviation of the Gaussian, metres.
+    **Fields**: `depth`: largest depth, metres; `deviation`: standard deviation of the Gaussian, metres.
 
     **Example:**
 
@@ -59,15 +59,15 @@ class Bell(AbstractIndentation):
 
     @property
     def reach(self) -> float:
-        """Distance beyond which the depth is 0: three times the deviation, metres."""
+        """Distance from the centre beyond which the depth is 0: three times the standard deviation, metres."""
         return 3 * self.deviation
 
 
 class Hemisphere(AbstractIndentation):
-    """Indentation by a rigid ball of radius R: depth − (R − √(R² − r²)) at distance r where this is positive, otherwise
-    0.
+    """Indentation by a rigid ball of radius R: depth − (R − √(R² − r²)) at distance r where this difference is
+    positive, otherwise 0.
 
-    The default diameter is that of the experiments of Park et al. 2022.
+    The default diameter is that of the ball in the experiments of Park et al. 2022.
 
     **Fields**: `depth`: depth of the lowest point, metres; `diameter`: diameter 2R of the ball, metres.
 
@@ -102,5 +102,5 @@ class Hemisphere(AbstractIndentation):
 
     @property
     def reach(self) -> float:
-        """Distance beyond which the depth is 0: the radius of the contact area, metres."""
+        """Distance from the centre beyond which the depth is 0: the radius of the contact area, metres."""
         return float((self.depth * (self.diameter - self.depth)) ** 0.5)

@@ -1,4 +1,4 @@
-"""Measurement protocols of skins."""
+"""Measurement protocols of skins with electrodes."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def skin_protocol(
     - `name`: name of the protocol; `current`: injected current, amperes.
     - `num_pairs`: for "two-terminal" only: number of pairs of nearest electrodes that are measured, 0 for all pairs. On
       a curved skin, distances are along the surface. The default is 94 pairs, as in Park et al. 2022, or all pairs if
-      there are fewer.
+      fewer.
 
-    Raises `ValueError` for an unknown name, for more pairs than exist, for `num_pairs` with another protocol, and as
-    the functions of the protocols do.
+    Raises `ValueError` for an unknown name, for more pairs than exist, for `num_pairs` with another protocol than
+    "two-terminal", and as `two_terminal`, `adjacent` and `opposite` do.
     """
     check_layout("layout", layout)
     check_name("protocol", name, PROTOCOLS)
@@ -48,7 +48,7 @@ def skin_protocol(
 
 
 def number_of_pairs(layout: Layout | SurfaceLayout, num_pairs: int | None) -> int:
-    """Number of measured pairs, as in `skin_protocol`. Raises `ValueError` for more pairs than exist."""
+    """Number of measured pairs of electrodes, as in `skin_protocol`. Raises `ValueError` for more pairs than exist."""
     num_all_pairs = layout.num_electrodes * (layout.num_electrodes - 1) // 2
     if num_pairs is None:
         return min(NUM_PAIRS, num_all_pairs)

@@ -1,4 +1,5 @@
-"""Search for the cells of a skin within reach of a touch, by distance along the surface and depth below it (NumPy)."""
+"""Search for the cells of a skin within reach of a touch, by distance along the surface and depth below the surface
+(NumPy)."""
 
 from __future__ import annotations
 
@@ -11,17 +12,17 @@ from scipy.spatial import KDTree
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geodesic import Geodesics, Triangles
 
-# Maximum distance of positions from the surface of a curved skin, relative to its thickness, or to the size of the
-# cells of a sheet.
+# Maximum distance of touched positions from the surface of a curved skin, relative to the skin's thickness, or for a
+# sheet to the size of its cells.
 _MAX_RELATIVE_DISTANCE = 0.5
 
 
 class ReachedCells(NamedTuple):
-    """Cells within reach of n touches.
+    """Mesh cells of a skin within reach of n touches.
 
-    **Fields**: `cells`: indices of the cells of each touch; `distances`: distances of their centroids from the position
-    of the touch along the surface, metres; `centroid_depths` (m,): depth of the centroid of every cell of the mesh
-    below the surface, metres; `thickness`: thickness of a layer, metres, None for a sheet.
+    **Fields**: `cells`: indices of the cells within reach of each touch; `distances`: distances of these cells'
+    centroids from the position of the touch along the surface, metres; `centroid_depths` (m,): depth below the surface
+    of the centroid of every cell of the mesh, metres; `thickness`: thickness of a layer, metres, None for a sheet.
     """
 
     cells: list[Int[np.ndarray, " c"]]
@@ -31,23 +32,24 @@ class ReachedCells(NamedTuple):
 
 
 def is_curved(mesh: Mesh) -> bool:
-    """Whether a mesh is a surface in space, or a shell on such a surface."""
+    """Whether a mesh is that of a curved skin: a surface in space, or a shell on such a surface."""
     return mesh.is_surface or {"inner", "outer"} <= set(mesh.tags)
 
 
 def touched_surface(mesh: Mesh, face: str = "outer") -> Triangles:
-    """The touched surface of a curved skin: the sheet itself, or the `face` of a shell."""
+    """The touched surface of a curved skin: the sheet itself, or the face ("outer" or "inner") of a shell that `face`
+    names."""
     return Triangles.of(mesh, None if mesh.is_surface else face)
 
 
 def reached_cells(
     mesh: Mesh, places: Float[np.ndarray, "n d"], radius: float, max_depth: float, face: str = "outer"
 ) -> ReachedCells:
-    """Find the cells whose centroids lie within `radius` metres of `places` along the surface, and less than
-    `max_depth` metres below it.
+    """Find the cells whose centroids lie within `radius` metres of `places` along the surface of a skin, and less than
+    `max_depth` metres below the surface.
 
     In a flat layer, depth is measured from its top, at the maximum z; in a shell, from its `face` along the inward
-    normal. Raises `ValueError` for positions that are not on a curved surface.
+    normal. Raises `ValueError` for positions that are not on the surface of a curved skin.
     """
     cell_centroids = np.asarray(centroids(mesh))
     if is_curved(mesh):
@@ -106,5 +108,5 @@ def shell_thickness(mesh: Mesh) -> float:
 
 
 def millimetre_text(place) -> str:
-    """Text of a position in millimetres: "(12, 3.5)"."""
+    """Format a position in metres as a text in millimetres, such as "(12, 3.5)"."""
     return "(" + ", ".join(f"{1e3 * value:.4g}" for value in place) + ")"

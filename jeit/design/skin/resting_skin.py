@@ -17,21 +17,21 @@ from jeit_solvers import NearInverse, Strips, over_cores
 from jeit_solvers.engines import on_device
 from jeit_solvers.module import Module
 
-# Number of touches per call of a compiled program, and ratios of successive sizes to which the numbers of nodes and of
-# cells are padded. One program is compiled for each size, and the cost of a touch grows with the square of its number
-# of nodes.
+# Number of touches per call of a compiled program, and ratios of successive sizes to which a touch's numbers of nodes
+# and of cells are padded. One program is compiled for each size, and the cost of a touch grows with the square of its
+# number of nodes.
 _TOUCHES_PER_CALL, _NODE_SIZE_RATIO, _CELL_SIZE_RATIO = 2 * EXACT_AT_ONCE, 2**0.5, 2.0
 
 
 class RestingSkin(Module):
-    """An untouched skin, with the entries of its inverse system matrix for all pairs of nodes that may be touched.
+    """An untouched skin, with the entries of the inverse system matrix for all pairs of nodes that may be touched.
 
     **Fields**
 
-    - `model`: its forward model; `voltages` (M,): its voltages, volts.
-    - `element` (m, q, q): contribution of each cell to the system matrix.
+    - `model`: forward model of the skin; `voltages` (M,): voltages of the M channels without a touch, volts.
+    - `element` (m, q, q): contribution of each of m cells with q nodes to the system matrix.
     - `strips`: the nodes that may be touched, ordered in strips across the skin.
-    - `fields` (p, L): potentials at these nodes for unit currents into the electrodes; `inverse`: entries of the
+    - `fields` (p, L): potentials at these p nodes for unit currents into the L electrodes; `inverse`: entries of the
       inverse system matrix for pairs of these nodes.
     """
 
@@ -46,11 +46,11 @@ class RestingSkin(Module):
     def create(
         cls, model: ForwardModel, conductivity, touchable: Bool[np.ndarray, " n"], *, max_bytes: float = 2**31
     ) -> "RestingSkin | None":
-        """Precompute the quantities of a model with a `conductivity`, S/m (2-D: S).
+        """Precompute the quantities of an untouched skin from its forward model and its `conductivity`, S/m (2-D: S).
 
         `touchable`: mask (n,) of the nodes that touches may reach. Returns None if the inverse would take more than
-        `max_bytes` bytes; it takes slightly more than 8 bytes for each pair of these nodes. Raises `ValueError` if
-        `model` is not a forward model, and for an invalid conductivity.
+        `max_bytes` bytes. The inverse takes slightly more than 8 bytes for each pair of touchable nodes. Raises
+        `ValueError` if `model` is not a forward model, and for an invalid conductivity.
         """
         check_model(model)
         conductivity = cell_conductivity(model.mesh, check_conductivity(model.mesh, conductivity))
@@ -63,8 +63,8 @@ class RestingSkin(Module):
         return cls(model, voltages, cell_stiffness(model, conductivity), strips, *skin_fields_and_inverse)
 
     def changes(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
-        """Compute the exact voltage changes (n, M) due to n single touches, volts, as `touch_changes` does. Raises
-        `RuntimeError` as `touch_changes` does."""
+        """Compute the exact voltage changes (n, M) of M channels due to n single touches, volts, as `touch_changes`
+        does. Raises `RuntimeError` in the cases of `touch_changes`."""
         touched_at = touched_nodes(self.model, touched, self.strips)
         cells, relative_changes = np.asarray(touched.cells), np.asarray(touched.change)
         num_changed_cells = np.count_nonzero(relative_changes, axis=1)
@@ -94,12 +94,13 @@ class RestingSkin(Module):
 
 
 def _padded_size(count, ratio: float):
-    """Round a count up to the next of a series of multiples of 16, each about `ratio` times the previous one."""
+    """Round `count` up to the next number in a series of multiples of 16, in which each is about `ratio` times the
+    previous multiple."""
     exponent = np.ceil(np.log(np.maximum(count, 16) / 16) / np.log(ratio) - 1e-9)
     return (np.ceil(ratio**exponent - 1e-9) * 16).astype(int)
 
 
 def _pad_rows(rows: np.ndarray, length: int, mode) -> np.ndarray:
-    """Truncate or pad rows (n, k, …) to `length` entries."""
+    """Truncate or pad the n rows of `rows` (n, k, …) from k to `length` entries."""
     num_missing = max(length - rows.shape[1], 0)
     return np.pad(rows[:, :length], [(0, 0), (0, num_missing), *[(0, 0)] * (rows.ndim - 2)], mode)

@@ -18,14 +18,14 @@ from jeit_solvers.module import Module
 
 
 class SheetTouches(Module):
-    """Touches of a sheet at n positions, with derivatives with respect to the positions; create them with
-    `sheet_touches`.
+    """Touches of a sheet at n positions, from `sheet_touches`, with derivatives of the conductivity changes with
+    respect to the positions.
 
     **Fields**
 
-    - `touched`: the touched cells and their conductivity changes.
-    - `slope` (n, c, 2): derivative of `touched.change` with respect to the position, per metre; on a curved sheet in
-      two orthogonal tangential directions.
+    - `touched`: the cells that each touch changes, and their conductivity changes.
+    - `slope` (n, c, 2): derivative of the relative conductivity change `touched.change` with respect to the position,
+      per metre; on a curved sheet in two orthogonal tangential directions.
     - `thickness`: thickness of the layer that the sheet represents, metres; `depth`: maximum depth of the touches,
       metres.
     """
@@ -36,8 +36,8 @@ class SheetTouches(Module):
     depth: float
 
     def at_thickness(self, thickness) -> "SheetTouches":
-        """The same touches on a layer of another `thickness`, metres; the conductivity changes are proportional to
-        depth / thickness."""
+        """The same touches of a sheet for a layer of another `thickness`, metres. Conductivity changes are proportional
+        to depth / thickness."""
         depth_ratio = self.thickness / thickness
         touched = eqx.tree_at(
             lambda cells_to_change: cells_to_change.change, self.touched, self.touched.change * depth_ratio
@@ -45,8 +45,8 @@ class SheetTouches(Module):
         return SheetTouches(touched, self.slope * depth_ratio, jnp.asarray(thickness), self.depth)
 
     def weights(self, conductivity: Float[Array, " m"]) -> tuple[Float[Array, "n m"], Float[Array, "2 n m"]]:
-        """Change of the conductivity of every cell by every touch (n, m), siemens, and its derivatives with respect to
-        the two coordinates of the position (2, n, m), siemens per metre."""
+        """Change of the conductivity of every cell by every touch (n, m), siemens, and derivatives of the change with
+        respect to the two coordinates of the position (2, n, m), siemens per metre."""
         cells = self.touched.cells
         indices = np.arange(len(cells))[:, None], cells
 
@@ -62,7 +62,7 @@ def sheet_touches(
 ) -> SheetTouches:
     """Compute touches at `places` (n, 2), metres, of a sheet (2-D mesh) that represents a layer of `thickness` metres.
 
-    Other arguments as in `touched_cells`. The derivatives are those of the indentation's depth at the centroids of the
+    Other arguments as in `touched_cells`. Derivatives are those of the indentation's depth at the centroids of the
     cells. Raises `ValueError` as `touched_cells` does, and for a mesh that is not a sheet.
     """
     if mesh.dimension != 2:
@@ -84,7 +84,7 @@ def sheet_touches(
 
 def _flatten_centroids(mesh: Mesh, touched: TouchedCells, reach: float) -> Float[np.ndarray, "n c 2"]:
     """Map the centroids of touched cells to the tangent plane at the position of their touch, keeping the distance
-    along the surface: coordinates (n, c, 2) relative to that position, metres."""
+    along the surface. Returns coordinates (n, c, 2) relative to the position, metres."""
     surface, places, cells = Triangles.of(mesh), np.asarray(touched.places), np.asarray(touched.cells)
     cell_centroids = np.asarray(centroids(mesh))
     normals = surface.normals_at(surface.nearest(places))

@@ -31,14 +31,14 @@ from jeit.protocol import Protocol
 from jeit_solvers.engines import host
 from jeit_solvers.module import Module
 
-# Number of nodes of a plane mesh, multiplied by (cell size)² / area: 1.155 for equilateral cells, and slightly more due
-# to the nodes on the edge.
+# Number of nodes of a plane mesh times (cell size)² / area: 1.155 for equilateral cells, and slightly more due to the
+# nodes on the edge.
 _NODES_PER_CELL_AREA = 1.2
-# Maximum cell size, relative to the smallest diameter of the electrodes.
+# Maximum cell size, relative to the smallest electrode diameter.
 _MAX_CELL_RATIO = 1.5
 
-# Maximum thickness of a layer of cells, relative to the depth of a touch: the uppermost centroids are at a quarter of
-# the thickness of their layer.
+# Maximum thickness of a layer of cells, relative to the depth of a touch: the uppermost centroids are a quarter of the
+# layer's thickness below the surface.
 _MAX_LAYER_RATIO = 3.0
 
 
@@ -49,14 +49,14 @@ class Skin(Module):
 
     **Fields**
 
-    - `layout`: layout of the electrodes, with the outline of the skin, or its surface.
-    - `model`: forward model, with mesh, electrodes and protocol.
-    - `thickness`: thickness, metres; for a sheet, thickness of the layer that it represents.
+    - `layout`: layout of the electrodes, with the outline of a flat skin, or the surface of a curved skin.
+    - `model`: forward model of the skin, with mesh, electrodes and protocol.
+    - `thickness`: thickness of the skin, metres; for a sheet, thickness of the layer that the sheet represents.
     - `conductivity`: conductivity of the material, S/m, one value or one for each cell.
-    - `num_layers`: number of layers of cells; 0 for a sheet.
-    - `cell_size`: cell size of the plane mesh, metres; None if it was not given.
+    - `num_layers`: number of layers of mesh cells; 0 for a sheet.
+    - `cell_size`: cell size of the plane mesh, metres; None if no size was given.
 
-    Create it with `Skin.create`, which checks the arguments and makes the mesh, or from a custom `model` with
+    Create a skin with `Skin.create`, which checks the arguments and makes the mesh, or from a custom `model` with
     electrodes of class `SheetDiscs` (`SurfaceDiscs` on a curved sheet) or `FaceDiscs`.
 
     **Example:**
@@ -84,8 +84,8 @@ class Skin(Module):
         num_layers: int = 0,
         cell_size: float | None = None,
     ):
-        """Raises `ValueError` for a model with electrodes of another class or number, and for an invalid thickness or
-        conductivity."""
+        """Raises `ValueError` for a model whose electrodes have the wrong class or number, and for an invalid thickness
+        or conductivity."""
         sheet_class = SurfaceDiscs if isinstance(layout, SurfaceLayout) else SheetDiscs
         electrode_class = FaceDiscs if num_layers else sheet_class
         if not isinstance(model.electrodes, electrode_class):
@@ -131,17 +131,17 @@ class Skin(Module):
     ) -> "Skin":
         """Create a skin with electrodes of `layout`: check the arguments and make the mesh.
 
-        - `thickness`: metres; `conductivity`: S/m.
+        - `thickness`: thickness of the skin, metres; `conductivity`: conductivity of the material, S/m.
         - `contact_impedance`: contact impedance of the electrodes, ohm·m²; by default that of the layout, or 1e-4 if
           the layout has none.
         - `num_layers`: number of layers of cells, 0 for a sheet.
-        - `cell_size`: cell size of the plane mesh, metres (default 4.5e-3), or `num_points`: approximate number of its
-          nodes. Not for a `SurfaceLayout`, whose surface is a mesh already.
+        - `cell_size`: cell size of the plane mesh, metres (default 4.5e-3), or `num_points`: approximate number of
+          nodes of the mesh. Neither is given for a `SurfaceLayout`, whose surface is a mesh already.
         - `protocol`: measurement protocol, by default `skin_protocol(layout)`.
 
         Raises `ValueError` for a layout without an outline, a skin that is thicker than wide, cells so small that the
-        mesh would have too many nodes, electrodes too small for the cells, and as `jeit.mesh.shell` does if the
-        thickness exceeds the radius of curvature.
+        mesh would have too many nodes, electrodes too small for the cells, and a curved skin that is thicker than its
+        radius of curvature.
         """
         check_layout("layout", layout)
         if isinstance(layout, SurfaceLayout):
@@ -180,20 +180,22 @@ class Skin(Module):
 
     @property
     def touched_face(self) -> str:
-        """The touched face of a curved layer: "outer", or "inner" if its electrodes are on the outer face."""
+        """The touched face of a curved layer: "outer", or "inner" if the electrodes are on the outer face."""
         inward = isinstance(self.layout, SurfaceLayout) and not self.layout.outward
         return "inner" if inward else "outer"
 
     @property
     def model_conductivity(self) -> Float[Array, "..."]:
-        """Conductivity for the forward model: that of the material in S/m for a layer, the sheet conductivity in
+        """Conductivity for the forward model: conductivity of the material in S/m for a layer, sheet conductivity in
         siemens for a sheet."""
         return model_conductivity(self.conductivity, self.thickness, self.num_layers)
 
     def with_layout(self, layout: Layout | SurfaceLayout, contact_impedance: ArrayLike | None = None) -> "Skin":
-        """The same skin with the electrodes of another layout, which must be as many; mesh and protocol are unchanged.
+        """The same skin with the electrodes of another `layout` with the same number of electrodes; mesh and protocol
+        are unchanged.
 
-        `contact_impedance` as in `create`. Raises `ValueError` for electrodes outside the mesh or too small for it.
+        `contact_impedance` as in `create`. Raises `ValueError` for electrodes outside the mesh or too small for its
+        cells.
         """
         electrodes, mesh = skin_electrodes(layout, self.num_layers, contact_impedance), self.model.mesh
         if self.cell_size is None or isinstance(layout, SurfaceLayout):
@@ -215,7 +217,7 @@ class Skin(Module):
 
         `indentation`: shape of the touches, by default `Bell()`; `contrast`: as in the function `touched_cells`. Raises
         `ValueError` for touches as deep as the skin, for a touch that changes no cell, for instance because there are
-        too few layers of cells, and for a contrast of 1, which changes nothing.
+        too few layers of cells, and for a contrast of 1, which changes no conductivity.
         """
         indentation = Bell() if indentation is None else indentation
         if not self.num_layers:
@@ -241,21 +243,21 @@ class Skin(Module):
     def sheet_touches(
         self, places: ArrayLike, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
     ) -> SheetTouches:
-        """Compute touches of a sheet, with derivatives with respect to the positions; arguments as in `touched_cells`.
-        Raises `ValueError` as the function `sheet_touches` does."""
+        """Compute touches of a sheet, with derivatives with respect to the touched positions; arguments as in
+        `touched_cells`. Raises `ValueError` as the function `sheet_touches` does."""
         indentation = Bell() if indentation is None else indentation
         return sheet_touches(self.model.mesh, indentation, places, thickness=float(self.thickness), contrast=contrast)
 
     def voltage_changes(self, touched: TouchedCells, *, linear: bool = False) -> Float[Array, "n M"]:
-        """Compute the voltage changes (n, M) due to touches, volts: exact, or linearised if `linear`. Errors and limits
-        as in `touch_changes`."""
+        """Compute the voltage changes (n, M) of M channels due to n touches, volts: exact, or linearised if `linear`.
+        Errors and limits are those of `touch_changes`."""
         return touch_changes(self.model, self.model_conductivity, touched, linear=linear)
 
 
 def skins_of(layouts: Sequence[Layout | SurfaceLayout], protocols: Sequence[Protocol], **options) -> list[Skin]:
-    """Create skins from layouts and their protocols, with `options` of `Skin.create`, and raise errors as it does.
-    Consecutive layouts with the same outline and number of electrodes share one mesh and the symbolic factorisation of
-    its system matrix."""
+    """Create one skin for each layout and its protocol, with `options` of `Skin.create`, and raise the errors of
+    `Skin.create`. Consecutive layouts with the same outline and number of electrodes share one mesh and the symbolic
+    factorisation of its system matrix."""
     skins: list[Skin] = []
     for layout, protocol in zip(layouts, protocols, strict=True):
         if skins and _can_share_mesh(skins[-1], layout):
@@ -273,7 +275,7 @@ def skins_of(layouts: Sequence[Layout | SurfaceLayout], protocols: Sequence[Prot
 
 
 def _can_share_mesh(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
-    """Whether the mesh of a skin can be used for another layout."""
+    """Whether the mesh of a skin can be used for another `layout` too."""
     if isinstance(layout, SurfaceLayout):
         skin_layout = skin.layout
         if (
@@ -307,14 +309,14 @@ def longer_side(outline: Domain | Triangles) -> float:
 
 
 def model_conductivity(conductivity, thickness, num_layers: int):
-    """Conductivity for a forward model: the `conductivity` of the material, S/m, for a layer; for a sheet, multiplied
-    by the thickness, in siemens."""
+    """Conductivity for a forward model: for a layer the `conductivity` of the material, S/m; for a sheet this
+    conductivity times the thickness, in siemens."""
     return conductivity if num_layers else conductivity * thickness
 
 
 def plain_outline(outline: Domain) -> Domain:
-    """Replace an outline that is an axis-parallel rectangle by a `Rectangle`, so that it is meshed as one; return other
-    outlines unchanged."""
+    """Convert an outline that is an axis-parallel rectangle to a `Rectangle`, so that it is meshed as a rectangle;
+    return other outlines unchanged."""
     if [len(loop) for loop in outline.loops()] != [4]:
         return outline
     low_x, high_x, low_y, high_y = outline.extent
@@ -339,8 +341,8 @@ def curved_model(
 def skin_electrodes(
     layout: Layout | SurfaceLayout, num_layers: int, contact_impedance=None
 ) -> SheetDiscs | SurfaceDiscs | FaceDiscs:
-    """Create disc electrodes in a sheet (`num_layers` = 0), or on the bottom of a layer. `contact_impedance`: in
-    ohm·m², by default that of the layout, or 1e-4 if the layout has none."""
+    """Create the disc electrodes of a `layout` in a sheet (`num_layers` = 0), or on the bottom of a layer.
+    `contact_impedance`: contact impedance in ohm·m², by default that of the layout, or 1e-4 if the layout has none."""
     if contact_impedance is None and layout.contact_impedance is None:
         contact_impedance = CONTACT_IMPEDANCE
     if isinstance(layout, SurfaceLayout):
@@ -373,7 +375,7 @@ def check_cell_size(
     """Raise `ValueError` if cells of size `cell_size` (metres) are too large for the electrodes of `layout`, or if
     there would be too many cells.
 
-    `name`: name of the size in the error message; `area`: area of the skin, m²; `num_layers`: number of layers of
+    `name`: name of the cell size in the error message; `area`: area of the skin, m²; `num_layers`: number of layers of
     cells, 0 for a sheet.
     """
     check_metres(name, cell_size)
@@ -396,5 +398,5 @@ def check_cell_size(
 
 
 def smallest_diameter(layout: Layout | SurfaceLayout) -> float:
-    """Smallest diameter of the electrodes, metres."""
+    """Smallest electrode diameter of a layout, metres."""
     return float(np.asarray(layout.diameters).min())

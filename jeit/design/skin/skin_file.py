@@ -1,4 +1,4 @@
-"""TOML files that describe a skin: tables of their keys, and reading."""
+"""TOML files that describe a skin: the tables and keys of a skin file, and reading of the file."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ class MaterialTable(Table):
 
 
 class LayoutTable(Table):
-    """Table "electrodes": layout, diameter and contact impedance. NaN stands for the value of the layout."""
+    """Table "electrodes": layout, diameter and contact impedance. A diameter or impedance of NaN stands for the value
+    in the layout."""
 
     subject = "a skin"
     layout: Word
@@ -59,7 +60,7 @@ class MeasurementTable(Table):
 
 
 class CellsTable(Table):
-    """Table "mesh": cell size and number of layers."""
+    """Table "mesh": cell size, and number of layers of cells."""
 
     subject = "a skin"
     cell_mm: Annotated[float, CELL] = 1e3 * defaults.CELL_SIZE
@@ -83,7 +84,7 @@ class SkinTable(Table):
 
 
 def describes_skin(path: str | Path) -> bool:
-    """Whether a file is a TOML file with a table "skin", even if it is invalid otherwise.
+    """Whether a file is a TOML file with a table "skin", even if the rest of the file is invalid.
 
     **Arguments:**
 
@@ -106,15 +107,15 @@ def read_described_skin(path: str | Path) -> Skin:
     """Read the skin that a TOML file describes.
 
     The file has the tables skin, electrodes, measurement and mesh of a study file, and for a curved skin the table
-    surface. Every key has a single value. Only `layout` in the table electrodes is required, a name or a file in the
-    same folder; all other keys have defaults.
+    surface. Every key has a single value. Only the key `layout` in the table electrodes is required, the name of a
+    layout or a file in the same folder; all other keys have defaults.
 
     **Arguments:**
 
     - `path`: path of the file.
 
-    Raises `FileNotFoundError` if there is no such file, and `ValueError` for files that are not TOML, for unknown keys
-    and invalid values, and as `Skin.create` does.
+    Raises `FileNotFoundError` if the file does not exist. Raises `ValueError` for a file that is not TOML, for unknown
+    keys and invalid values, and in the cases of `Skin.create`.
 
     **Example:**
 
@@ -126,7 +127,7 @@ def read_described_skin(path: str | Path) -> Skin:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"'{path}': there is no such file.")
-    # Imported late, since the import of pydantic takes longer than most operations on a skin file.
+    # Imported here, since the import of pydantic takes longer than most operations on a skin file.
     from jeit.files.limits import faults_message
     from jeit.files.schema import validated
 

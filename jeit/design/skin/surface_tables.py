@@ -13,7 +13,7 @@ _SECTION = Numbers(((2, 2),), 2, 5000, "mm", single=True)
 
 
 class TubeTable(Table):
-    """The lateral surface of a cylinder."""
+    """Surface of a skin: the lateral surface of a cylinder."""
 
     subject = "a tube"
     kind: Literal["tube"]
@@ -43,7 +43,7 @@ class SphereTable(Table):
 
 
 class CapTable(Table):
-    """The cap of a sphere about its pole."""
+    """Surface of a skin: the cap of a sphere about its pole."""
 
     subject = "a cap"
     kind: Literal["cap"]
@@ -53,7 +53,7 @@ class CapTable(Table):
 
 
 class BentSheetTable(Table):
-    """A flat sheet bent around a cylinder along `axis`."""
+    """Surface of a skin: a flat sheet bent around a cylinder along `axis`."""
 
     subject = "a bent sheet"
     kind: Literal["bent sheet"]
@@ -65,7 +65,7 @@ class BentSheetTable(Table):
 
 
 class ScanTable(Table):
-    """A surface from a file of triangles or a CAD file, with the unit of length."""
+    """Surface of a skin: a file of triangles or a CAD file, with the file's unit of length."""
 
     subject = "a surface's file"
     file: Word
@@ -92,7 +92,7 @@ SURFACE = OneOf(
 
 
 def check_keys_of_surface(surface: SurfaceTable | None, skin: Table, mesh: Table) -> None:
-    """Raise an error for keys of the tables `skin` and `mesh` that have no effect on a skin with this surface."""
+    """Raise an error for keys of the tables `skin` and `mesh` that have no effect on a skin with this `surface`."""
     if surface is None:
         return
     if size_keys := {"width_mm", "height_mm"} & skin.model_fields_set:

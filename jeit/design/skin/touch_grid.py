@@ -19,9 +19,9 @@ class TouchGrid(Module):
 
     **Fields**
 
-    - `places`: positions (n, 2), on a curved skin (n, 3), metres.
+    - `places`: touched positions (n, 2), on a curved skin (n, 3), metres.
     - `rows`, `columns` (n,): row and column of each position in the raster; row 0 has the smallest y.
-    - `shape`: numbers of rows and columns of the raster; `pitch`: width and height of a rectangle, metres.
+    - `shape`: numbers of rows and columns of the raster; `pitch`: width and height of a rectangle of the grid, metres.
     """
 
     places: Float[np.ndarray, "n d"]
@@ -32,18 +32,18 @@ class TouchGrid(Module):
 
     @property
     def cell_area(self) -> float:
-        """Area of a rectangle, m²."""
+        """Area of the rectangle around a touched position, m²."""
         return self.pitch[0] * self.pitch[1]
 
     def raster(self, values) -> Float[np.ndarray, "rows columns"]:
-        """Arrange values (n,) as an image (rows, columns), with NaN outside the skin."""
+        """Arrange `values` (n,) at the touched positions as an image (rows, columns), with NaN outside the skin."""
         image = np.full(self.shape, np.nan)
         image[self.rows, self.columns] = np.asarray(values)
         return image
 
 
 class SurfaceGrid(TouchGrid):
-    """Touched positions of a curved skin, spread evenly over it by distances along its surface.
+    """Touched positions of a curved skin, spread evenly over its surface by distances along the surface.
 
     The raster has a single row. **Fields**: those of `TouchGrid`, and `areas` (n,): area that each position represents,
     m².
@@ -53,8 +53,8 @@ class SurfaceGrid(TouchGrid):
 
     @classmethod
     def spread(cls, surface: Triangles, number: int, margin: float = 0.0) -> "SurfaceGrid":
-        """Spread `number` positions evenly over a surface, at least `margin` metres from its edge. Raises `ValueError`
-        if the margin leaves no room."""
+        """Spread `number` touched positions evenly over a surface, at least `margin` metres from its edge. Raises
+        `ValueError` if the margin leaves no room."""
         places = spread(surface, number, margin=margin)
         allowed_areas = surface.node_areas * (surface.distance_to_border(surface.points) >= margin)
         area_per_place = float(allowed_areas.sum()) / number
@@ -68,9 +68,9 @@ class SurfaceGrid(TouchGrid):
         )
 
     def on(self, surface: Triangles, face: Triangles) -> "SurfaceGrid":
-        """Map the positions from `surface` to another surface `face` with the same triangulation: the nearest point of
-        `surface` is mapped to the point with the same coordinates within the same triangle. Areas are scaled
-        accordingly."""
+        """Map the touched positions from `surface` to another surface `face` with the same triangulation. The nearest
+        point of `surface` is mapped to the point of `face` with the same coordinates within the same triangle. Areas
+        are scaled accordingly."""
         nearest_points = surface.nearest(self.places)
         areas = self.areas * nearest_points.of_nodes(surface, face.node_areas / surface.node_areas)
         mean_area = float(areas.mean())
@@ -91,11 +91,11 @@ class SurfaceGrid(TouchGrid):
 
 
 def touch_grid(outline: Domain | Triangles, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
-    """Create a grid of touched positions: divide the bounding box of an outline into equal rectangles, and take the
-    centres that lie inside.
+    """Create a grid of touched positions: the bounding box of a skin's outline is divided into equal rectangles, whose
+    centres inside the outline are taken.
 
-    The default is 48 × 48, as in Park et al. 2022. On a curved skin, whose outline is its surface, rows × columns
-    positions are spread evenly over the surface.
+    The default is 48 × 48 rectangles, as in Park et al. 2022. On a curved skin, whose outline is its surface, rows ×
+    columns positions are spread evenly over the surface.
 
     **Arguments:**
 
@@ -130,8 +130,8 @@ def touch_grid(outline: Domain | Triangles, columns: int = PLACES, rows: int = P
 def touches_away_from_the_edge(
     outline: Domain | Triangles, margin: float, columns: int = PLACES, rows: int = PLACES
 ) -> TouchGrid:
-    """The positions of `touch_grid` that are farther than a margin from the outline, so that touches do not reach
-    beyond the edge.
+    """The touched positions of `touch_grid` that are farther than a `margin` from the outline, so that touches do not
+    reach beyond the edge.
 
     **Arguments:**
 
@@ -139,7 +139,7 @@ def touches_away_from_the_edge(
     - `margin`: minimum distance from the edge, metres.
     - `columns`, `rows`: numbers of columns and rows of the grid.
 
-    Raises `ValueError` if no position is that far from the edge.
+    Raises `ValueError` if no position is farther from the edge than `margin`.
 
     **Example:**
 
@@ -161,13 +161,13 @@ def touches_away_from_the_edge(
 
 
 def check_grid(grid: TouchGrid) -> None:
-    """Raise `ValueError` unless `grid` is a `TouchGrid`; its positions alone are not enough."""
+    """Raise `ValueError` unless `grid` is a `TouchGrid`, not only an array of positions."""
     check_kind("grid", grid, TouchGrid, "a TouchGrid, as of touch_grid(skin.outline)")
 
 
 def check_places(places, dimension: int = 2) -> Float[np.ndarray, "n d"]:
-    """Convert positions (n, `dimension`), metres, to an array. Raises `ValueError` for anything else, such as a whole
-    `TouchGrid`, and for values that are not finite."""
+    """Convert touched positions (n, `dimension`), metres, to an array. Raises `ValueError` for arguments that are not
+    positions, such as a whole `TouchGrid`, and for values that are not finite."""
     requirement = f"places must be (n, {dimension}), one or more, in metres, such as touch_grid(skin.outline).places"
     try:
         positions = np.asarray(places, float)

@@ -1,4 +1,4 @@
-"""Cells and nodes of a mesh that a touch changes, and the relative change of each cell's conductivity."""
+"""Cells and nodes of a skin's mesh that a touch changes, and the relative change of each cell's conductivity."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from jeit_solvers.module import Module
 
 
 class TouchedCells(Module):
-    """Changed cells of n touches: each touch changes the conductivity of up to c cells from σ to σ (1 + change).
+    """Mesh cells changed by n touches: each touch changes the conductivity of up to c cells from σ to σ (1 + change).
 
     **Fields**
 
     - `places`: centres of the touches (n, 2), on a curved skin (n, 3), metres.
-    - `cells` (n, c): indices of the changed cells; `change` (n, c): relative change of their conductivity, −1 for a
-      cell that becomes an insulator. Touches with fewer than c cells are padded with changes of 0.
+    - `cells` (n, c): indices of the changed cells; `change` (n, c): relative change of each cell's conductivity, −1 for
+      a cell that becomes an insulator. Touches with fewer than c cells are padded with changes of 0.
     - `num_cells`: number of cells of the mesh.
     """
 
@@ -47,21 +47,21 @@ def touched_cells(
     edge: float = 0.0,
     face: str = "outer",
 ) -> TouchedCells:
-    """Compute the cells changed by single indentations of the top of a layer, or of a sheet, at `places` (n, 2), on a
-    curved skin (n, 3), metres.
+    """Compute the mesh cells changed by single indentations of a sheet or of the top of a layer at `places` (n, 2), on
+    a curved skin (n, 3), metres.
 
-    `contrast`: conductivity of the touched part divided by that of the rest: 0, the default, for an insulating indenter
-    (Park et al. 2022, text S4), above 1 for a conductor.
+    `contrast`: conductivity of the touched part divided by that of the rest of the skin: 0, the default, for an
+    insulating indenter (Park et al. 2022, text S4), above 1 for a conductor.
 
     **Layer** (3-D mesh, top at its maximum z): the conductivity of cells whose centroids lie in the indented part is
-    multiplied by `contrast`. With an `edge` in metres, the change rises smoothly over twice that depth and is
+    multiplied by `contrast`. With an `edge` in metres, the change rises smoothly over a depth of twice `edge`, and is
     differentiable with respect to depth and position.
 
     **Sheet** (2-D mesh) that represents a layer of `thickness` metres: a fraction depth / thickness of the
     cross-section has its conductivity multiplied by `contrast`.
 
-    **Curved skin** (a surface in space, or a shell on such a surface): as above, with distances along the touched
-    surface, which is the `face` of a shell, and depths along its inward normal.
+    **Curved skin** (a surface in space, or a shell on such a surface): as for a sheet or a layer, but distances are
+    along the touched surface, which is the `face` of a shell, and depths along the inward normal.
 
     Raises `ValueError` for positions where no cell is touched, for an indentation as deep as the skin, and if
     `thickness` is missing for a sheet or given for a layer.
@@ -111,8 +111,8 @@ def touched_cells(
 
 
 def pad_rows(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Join rows of integers of different lengths to one array, padded with zeros. Returns the array and a mask of the
-    entries that are not padding."""
+    """Join `rows` of integers of different lengths to one array, padded with zeros. Returns this array and a mask of
+    the entries that are not padding."""
     lengths = np.array([len(row) for row in rows])
     is_entry = np.arange(max(lengths.max(), 1)) < lengths[:, None]
     padded = np.zeros(is_entry.shape, np.int32)
@@ -130,20 +130,20 @@ def _check_values(contrast: float, edge: float) -> None:
         raise ValueError(f"edge must be a depth in metres, not negative; it is {edge!r}.")
 
 
-# Number of touches processed at once, and multiple to which the number of nodes is padded, since a program is compiled
-# for each number.
+# Number of touches processed at once, and multiple to which a touch's number of nodes is padded, since a program is
+# compiled for each number of nodes.
 _TOUCHES_AT_ONCE, _PADDING_MULTIPLE = 64, 16
 
 
 class TouchedNodes(Module):
-    """Nodes of the cells that n touches change.
+    """Mesh nodes of the cells that n touches change.
 
     **Fields**
 
     - `strips`: the nodes of all touches, ordered in strips across the skin.
     - `nodes` (n, k): nodes of each touch, as indices into the order of `strips`; touches with fewer than k nodes repeat
-      the last one.
-    - `corners` (n, c, d + 1): nodes of the changed cells of each touch, as indices into its row of `nodes`.
+      their last node.
+    - `corners` (n, c, d + 1): nodes of the changed cells of each touch, as indices into the touch's row of `nodes`.
     """
 
     strips: Strips
@@ -152,8 +152,8 @@ class TouchedNodes(Module):
 
 
 def touched_nodes(model: ForwardModel, touches: TouchedCells, strips: Strips | None = None) -> TouchedNodes:
-    """Find the nodes of the cells that touches change. `strips`: order of a set of nodes that contains these; by
-    default it is created for these nodes only."""
+    """Find the mesh nodes of the cells that touches change. `strips`: order of a set of nodes that contains these
+    nodes; by default an order of these nodes only."""
     mesh, cells, is_changed = model.mesh, np.asarray(touches.cells), np.asarray(touches.change) != 0
     is_touched = np.zeros(mesh.num_points, bool)
     is_touched[np.asarray(mesh.cells)[cells[is_changed]]] = True
@@ -176,8 +176,8 @@ def touched_nodes(model: ForwardModel, touches: TouchedCells, strips: Strips | N
 
 
 def _number_nodes(nodes: Int[np.ndarray, "b c q"], no_node: int):
-    """Number the distinct nodes of each of b touches from 0, except for the index `no_node`, which marks padding.
-    Returns the number of every entry of `nodes` (b, c, q), and the touch, number and index of every distinct node."""
+    """Number the distinct mesh nodes of each of b touches from 0, except for the index `no_node`, which marks padding.
+    Returns the number of every entry of `nodes` (b, c, q), and for every distinct node its touch, number and index."""
     first_keys = (no_node + 1) * np.arange(len(nodes), dtype=np.int32)
     keys = nodes + first_keys[:, None, None]
     is_used = np.zeros(len(nodes) * (no_node + 1), bool)

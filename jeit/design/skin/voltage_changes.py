@@ -1,16 +1,16 @@
-"""Voltage changes due to single touches: exact, by low-rank updates of one factorisation, or linearised.
+"""Voltage changes due to single touches of a skin: exact, by low-rank updates of one factorisation, or linearised.
 
 A touch adds a matrix D to the system matrix K of the electrode model; D is nonzero only between the k nodes of the
-touch. Let F be the fields for unit currents into the electrodes and G = K⁻¹, both restricted to these nodes. By the
-Sherman-Morrison-Woodbury formula, the transfer impedance changes by
+touch. Let F be the potentials for unit currents into the electrodes and G = K⁻¹, both restricted to these k nodes. By
+the Sherman-Morrison-Woodbury formula, the transfer impedance changes by
 
-    ΔZ = −Fᵀ D F + (D F)ᵀ Y,    (G⁻¹ + D) Y = D F,
+    ΔZ = −Fᵀ D F + (D F)ᵀ Y,    (G⁻¹ + D) Y = D F.
 
 The system for Y is solved by conjugate gradients with G as the preconditioner, which requires products with G and D
-only, not G⁻¹. Few steps are needed, since a touch changes the energy of any field by a bounded factor. Nodes that a
-touch disconnects make the matrix singular, but no current flows there. If Y has the residual R, then (D F)ᵀ Y + Yᵀ R
-differs from the exact value by Rᵀ (G⁻¹ + D)⁻¹ R, of which Rᵀ G R is the main part, and this is added. G is needed only
-between nodes of the same touch, which are close to each other.
+only, not with G⁻¹. Few steps are needed, since a touch changes the energy of any field by a bounded factor. Nodes that
+a touch disconnects make G⁻¹ + D singular, but no current flows at these nodes. If Y has the residual R, then (D F)ᵀ Y +
+Yᵀ R differs from the exact value by Rᵀ (G⁻¹ + D)⁻¹ R, of which the main part Rᵀ G R is added. G is needed only between
+nodes of the same touch, which are close to each other.
 """
 
 from __future__ import annotations
@@ -33,17 +33,18 @@ from jeit.protocol import Protocol
 from jeit_solvers import over_cores
 from jeit_solvers.engines import has_values, on_device
 
-# Tolerance of the error bound, relative to the voltages, and maximum number of conjugate-gradient steps.
+# Tolerance of the error bound, relative to the voltage changes, and maximum number of conjugate-gradient steps.
 _TOLERANCE, _MAX_STEPS = 1e-8, 200
-# Factor by which an insulating touch is assumed to lower the energy of a field, which depends on the shape of the
-# touched part, and maximum of this factor for touched parts with a very low remaining conductivity.
+# Factor by which an insulating touch is assumed to lower the energy of a field (the true factor depends on the shape of
+# the touched part), and maximum of this factor for touched parts with a very low remaining conductivity.
 _INSULATING_FACTOR, _MAX_FACTOR = 10.0, 1e6
-# Voltages below this, relative to the energy of the load D F, are rounding errors.
+# Voltage changes below this value, relative to the energy of the load D F, are rounding errors.
 _MIN_RELATIVE_VOLTAGE = 1e-12
 # Number of touches processed at once for exact and linearised changes, so that their blocks of the inverse or of the
 # Jacobian fit into the cache.
 EXACT_AT_ONCE, _LINEAR_AT_ONCE = 2, 8
-# Multiple to which the number of strips that a touch spans is padded, since a program is compiled for each number.
+# Multiple to which the number of strips of nodes that a touch spans is padded, since a program is compiled for each
+# number.
 _STRIP_MULTIPLE = 3
 
 
@@ -52,10 +53,11 @@ def touch_changes(
 ) -> Float[Array, "n M"]:
     """Compute the changes (n, M) of the M voltages of the protocol due to n single touches, in volts.
 
-    - `conductivity`: as in `ForwardModel.voltages`, real, S/m (2-D: S). Exact changes allow tensors, which a touch
-      scales.
+    - `conductivity`: real conductivity as in `ForwardModel.voltages`, S/m (2-D: S). Exact changes allow conductivity
+      tensors, which a touch scales.
     - `linear`: if True, the linearised changes J δσ from the Jacobian J, which are differentiable and can be batched
-      with `vmap`. Otherwise the exact changes, equal to a separate solve for every touch up to 1e-8 of the largest.
+      with `vmap`. Otherwise the exact changes, which equal those of a separate solve for every touch up to 1e-8 of the
+      largest change.
 
     Raises `ValueError` for touches of another mesh and for exact changes under `jit`, `grad` or `vmap`. Raises
     `RuntimeError` if the exact changes are not found: for conductors with a contrast above about 1e6, where the
@@ -107,7 +109,7 @@ def _exact_changes(model: ForwardModel, conductivity, touched: TouchedCells):
 
 
 def check_finite_changes(changes, places: Float[np.ndarray, "n d"]) -> None:
-    """Raise `RuntimeError` if the changes due to any of the touches at `places`, metres, are not finite."""
+    """Raise `RuntimeError` if the voltage changes due to any of the touches at `places`, metres, are not finite."""
     failed_touches = np.flatnonzero(~np.isfinite(np.asarray(changes)).all(axis=1))
     if failed_touches.size:
         raise RuntimeError(
@@ -119,13 +121,14 @@ def check_finite_changes(changes, places: Float[np.ndarray, "n d"]) -> None:
 
 @jax.jit
 def cell_stiffness(model: ForwardModel, conductivity) -> Float[Array, "m q q"]:
-    """Contribution of each cell to the system matrix (m, q, q), siemens; `conductivity` of the cells, S/m (2-D: S)."""
+    """Contribution (m, q, q) of each of m cells with q nodes to the system matrix, siemens. `conductivity`:
+    conductivity of the cells, S/m (2-D: S)."""
     return _unpack_symmetric(stiffness(model.mesh, conductivity), model.mesh.dimension + 1)
 
 
 @jax.jit
 def changes_between(protocol: Protocol, element_matrices, fields_and_inverse, touches, index):
-    """Compute the voltage changes due to the touches with indices `index` (c, s), s touches at a time.
+    """Compute the exact voltage changes due to the touches with indices `index` (c, s), s touches at a time.
 
     `element_matrices`: from `cell_stiffness`; `fields_and_inverse`: from `fields_and_inverse`; `touches`: cells and
     changes of all touches, from `TouchedCells`, and their nodes and corners, from `touched_nodes`."""
@@ -149,7 +152,7 @@ def _join_chunks(chunks: Float[Array, "c s *m"]) -> Float[Array, "cs *m"]:
 
 
 def _weakening_factor(change: Float[Array, "b c"]) -> Float[Array, " b"]:
-    """Largest factor (b,) by which each touch lowers the energy of a field."""
+    """Largest factor (b,) by which each of b touches lowers the energy of an electric field."""
     remaining_conductivity = 1 + change
     return jnp.clip(
         jnp.where(
@@ -163,7 +166,7 @@ def _weakening_factor(change: Float[Array, "b c"]) -> Float[Array, " b"]:
 
 
 def _impedance_changes(blocks, corners, inverse, fields, weakening_factor):
-    """Change ΔZ (b, L, L) of the transfer impedance due to b touches.
+    """Change ΔZ (b, L, L) of the transfer impedance between L electrodes due to each of b touches.
 
     ΔZ = −Fᵀ D F + (D F)ᵀ Y, where Y solves (G⁻¹ + D) Y = D F. D, the change of the system matrix by a touch, is
     assembled from `blocks` (b, c, q, q), siemens, for its c cells with nodes `corners` (b, c, q), indices among the k
@@ -181,11 +184,13 @@ def _impedance_changes(blocks, corners, inverse, fields, weakening_factor):
     def step(state):
         solution, residual, scaled_residual, direction, scaled_direction, energy, ratio, num_steps = state
         direction = scaled_residual + ratio * direction
-        # G⁻¹ times the direction, without a solve: the same combination of the residuals.
+        # `scaled_direction` is G⁻¹ times the search direction, computed without a solve as the same combination of
+        # residuals.
         scaled_direction = residual + ratio * scaled_direction
         system_product = scaled_direction + touch_matrix @ direction
         curvature = jnp.sum(direction * system_product, axis=1, keepdims=True)
-        # Converged touches are not changed any more, since their residual and curvature are rounding errors.
+        # The solutions of converged touches are not changed any more, since their residual and curvature are rounding
+        # errors.
         is_active = (energy > max_energy) & (curvature > 0)
         step_length = jnp.where(is_active, energy / jnp.where(is_active, curvature, 1.0), 0.0)
         solution, residual = solution + step_length * direction, residual - step_length * system_product
@@ -200,8 +205,8 @@ def _impedance_changes(blocks, corners, inverse, fields, weakening_factor):
 
     scaled_load, zeros = inverse @ right_hand_side, jnp.zeros_like(right_hand_side)
     initial_energy = jnp.sum(right_hand_side * scaled_load, axis=1, keepdims=True)
-    # The remaining error is at most the energy Rᵀ G R times `weakening_factor`. The voltages change by at least
-    # Fᵀ D F due to insulators, and by at least the square of this divided by the energy of the load due to conductors.
+    # The remaining error is at most the energy Rᵀ G R times `weakening_factor`. The voltages change by at least Fᵀ D F
+    # due to insulators, and by at least (Fᵀ D F)² divided by the energy of the load due to conductors.
     linear = jnp.abs(jnp.sum(fields * right_hand_side, axis=1, keepdims=True))
     voltages = jnp.minimum(linear, linear**2 / jnp.where(initial_energy > 0, initial_energy, 1.0))
     max_energy = (
@@ -220,7 +225,7 @@ def _impedance_changes(blocks, corners, inverse, fields, weakening_factor):
     solution, residual, scaled_residual, *_, energy, _, _ = jax.lax.while_loop(is_unfinished, step, initial_state)
     change = _transpose(solution) @ (right_hand_side + residual) + _transpose(residual) @ scaled_residual
     change -= _transpose(fields) @ right_hand_side
-    # Voltages that are so small compared with the load consist of its rounding errors.
+    # Voltage changes that are so small compared with the load D F consist of the load's rounding errors.
     is_rounding = jnp.sum(voltages, axis=(1, 2)) < _MIN_RELATIVE_VOLTAGE * jnp.sum(initial_energy, axis=(1, 2))
     converged = jnp.all(energy <= max_energy, axis=(1, 2)) & ~is_rounding
     return jnp.where(converged[:, None, None], (change + _transpose(change)) / 2, jnp.nan)

@@ -1,4 +1,5 @@
-"""Computation of the sensitivity maps and scores of the points of a chunk, in one compiled batch or one by one."""
+"""Computation of the sensitivity maps and scores of the points (skins) of a chunk of a study, in one compiled batch or
+one by one."""
 
 from __future__ import annotations
 
@@ -34,11 +35,11 @@ from jeit_solvers.module import Module
 
 
 class _SharedData(Module):
-    """Data shared by all points of one shape.
+    """Data shared by all points of a study that have the same shape.
 
     **Fields**: `model`: the forward model; `touched`: the touched cells on a skin of `thickness` metres; `touches`: the
-    same touches with derivatives with respect to the position, and `prior`: the prior of their amplitudes, both None
-    unless a score needs them; `grid`: the touched positions; `key`: random key for k-means.
+    same touches with derivatives with respect to the position, and `prior`: the prior of the touches' amplitudes, both
+    None unless a score needs them; `grid`: the touched positions; `key`: random key for k-means.
     """
 
     model: ForwardModel
@@ -51,8 +52,8 @@ class _SharedData(Module):
 
 
 class _PointData(Module):
-    """Data that differ between points of one shape. `conductivity` is that of the forward model, S/m (2-D: S), and
-    `noise` is in volts. In a batch of k points, every array has a leading axis of length k."""
+    """Data that differ between points of the same shape. `conductivity` is the conductivity of the forward model, S/m
+    (2-D: S), and `noise` is in volts. In a batch of k points, every array has a leading axis of length k."""
 
     electrodes: SheetDiscs | SurfaceDiscs | FaceDiscs
     protocol: Protocol
@@ -65,7 +66,7 @@ def check_points(study: Study) -> None:
     """Check all points of a study by creating their skins, touches and electrodes. Raises `ValueError` for a mesh that
     is too coarse."""
     checked_keys = set()
-    for index in itertools.chain.from_iterable(study.chunks):  # grouped by shape
+    for index in itertools.chain.from_iterable(study.chunks):  # points grouped by shape
         point = study.points[index]
         key = (id(point.layout), point.shape)
         if key in checked_keys:
@@ -93,11 +94,12 @@ def check_points(study: Study) -> None:
 
 
 def solve_chunk(study: Study, number: int, solved: Callable[[int], None] | None = None) -> dict[str, np.ndarray]:
-    """Compute the results of chunk `number` for its k points: "sensitivity" (k, n) in volts, and the scores (k,).
+    """Compute the results of chunk `number` of a study for its k points: "sensitivity" (k, n) at n positions in volts,
+    and the scores (k,).
 
-    Linearised maps are computed in one compiled batch, which has the same size for every chunk of a shape and is
-    divided among the devices of JAX. Exact maps are computed one after the other; after each but the last, `solved` is
-    called with the number of finished maps.
+    Linearised sensitivity maps are computed in one compiled batch, which has the same size for every chunk of a shape
+    and is divided among the devices of JAX. Exact maps are computed one after the other; after each map but the last,
+    `solved` is called with the number of finished maps.
     """
     points = [study.points[index] for index in study.chunks[number]]
     shared = _shared_data(study, points[0].shape)
@@ -122,13 +124,13 @@ def solve_chunk(study: Study, number: int, solved: Callable[[int], None] | None 
 
 def study_grid(study: Study) -> TouchGrid:
     """Grid of touched positions of a study. On curved layers, the positions are on the surface with the electrodes, and
-    the opposite face is touched above or below them."""
+    the opposite face is touched above or below these positions."""
     return touch_grid(study.outline, study.columns, study.rows)
 
 
 @lru_cache(maxsize=4)
 def _first_skin(study: Study, shape: Shape) -> Skin:
-    """Skin of the first point of a shape; all points of a shape have the same mesh."""
+    """Skin of the first point of a study that has the given `shape`; all points of a shape have the same mesh."""
     point = next(point for point in study.points if point.shape == shape)
     return Skin.create(
         point.layout,
@@ -201,7 +203,8 @@ def _solve_batch(
 def _solve_exactly(
     shared: _SharedData, all_point_data: list[_PointData], options: dict, solved: Callable[[int], None] | None
 ) -> Iterator[dict[str, Array]]:
-    """Yield the results of each skin, with exact maps; the callback `solved` is called as in `solve_chunk`."""
+    """Yield the results of each skin, with exact sensitivity maps. The callback `solved` is called as in
+    `solve_chunk`."""
     for num_solved, point_data in enumerate(all_point_data, 1):
         model, touched = _model_and_touched_cells(shared, point_data)
         yield _compute_results(shared, point_data, touch_changes(model, point_data.conductivity, touched), **options)
@@ -210,10 +213,11 @@ def _solve_exactly(
 
 
 def _model_and_touched_cells(shared: _SharedData, point_data: _PointData) -> tuple[ForwardModel, TouchedCells]:
-    """The forward model of a skin, and its touched cells."""
+    """The forward model of a point's skin, and the cells that the touches change."""
     model = shared.model.with_electrodes(point_data.electrodes).with_protocol(point_data.protocol)
     touched = eqx.tree_at(
-        # The change of a sheet is proportional to depth / thickness; layers of one shape have the same thickness.
+        # The relative change of a sheet's conductivity is proportional to depth / thickness; layers of one shape have
+        # the same thickness.
         lambda cells_to_change: cells_to_change.change,
         shared.touched,
         replace_fn=lambda change: change * (shared.thickness / point_data.thickness),
@@ -260,8 +264,8 @@ def _compute_results(
 def _optimality_scores(
     shared: _SharedData, point_data: _PointData, touches: SheetTouches, prior: TouchPrior, scores: tuple[str, ...]
 ) -> dict[str, Array]:
-    """Compute the optimality scores from linearised changes. In a batch, the Jacobian has been computed already, and
-    XLA reuses it."""
+    """Compute the optimality scores from linearised voltage changes. In a batch, the Jacobian has been computed
+    already, and XLA reuses the Jacobian."""
     model, _ = _model_and_touched_cells(shared, point_data)
     touches = touches.at_thickness(point_data.thickness)
     layout_score_values = layout_scores(model, point_data.conductivity, touches, prior=prior, noise=point_data.noise)
@@ -272,8 +276,8 @@ def _optimality_scores(
         if name in scores:
             results[name] = getattr(layout_score_values, name)
     if "localisation_error" in scores:
-        # Mean and maximum are infinite if any position cannot be determined; `localisation_lost` is the fraction of the
-        # area where this is the case.
+        # Mean and maximum are infinite if the position of any touch cannot be determined; `localisation_lost` is the
+        # fraction of the area where touches cannot be located.
         results["localisation_error_mean"] = 1e3 * jnp.mean(layout_score_values.localisation_error)
         results["localisation_error_max"] = 1e3 * jnp.max(layout_score_values.localisation_error)
         results["localisation_lost"] = jnp.mean(jnp.isinf(layout_score_values.localisation_error))

@@ -1,4 +1,4 @@
-"""Contents of the store of a study: names, units and descriptions of its arrays."""
+"""Contents of the store of a study's results: names, units and descriptions of the arrays."""
 
 from __future__ import annotations
 
@@ -36,14 +36,15 @@ _SCORE_ARRAYS = {
 
 
 class Contents(NamedTuple):
-    """Description of the contents of a store, whose results are computed in chunks.
+    """Description of the contents of a store of results that are computed in chunks.
 
     **Fields**
 
-    - `kind`: one word for the contents, such as "study"; `made_by`: the command that creates them; both for messages.
+    - `kind`: one word for the contents, such as "study"; `made_by`: the command that creates the contents; both for
+      messages.
     - `fingerprint`: hash of everything that determines the results.
     - `chunks`: for each chunk, the rows of every array that it contains.
-    - `arrays`: names of the results; `attributes`: plain values stored with them.
+    - `arrays`: names of the arrays of results; `attributes`: plain values stored with the arrays.
     - `fill`: function that creates all arrays in an empty Zarr group.
     """
 
@@ -57,7 +58,8 @@ class Contents(NamedTuple):
 
 
 def study_contents(study: Study) -> Contents:
-    """Contents of the store of a study. Each row of an array belongs to one point and is stored in a separate file."""
+    """Contents of the store of a study's results. Each row of an array belongs to one point and is stored in a separate
+    file."""
     coordinates = [point.coordinates for point in study.points]
     parameter_values = {name: [values[name] for values in coordinates] for name in coordinates[0]}
     arrays = _result_arrays(study)

@@ -1,4 +1,4 @@
-"""Creation of the layouts of a study by name, on flat skins and curved surfaces."""
+"""Creation of the electrode layouts of a study by name, on flat skins and curved surfaces."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def curved_layout(
     """Create or read the layout `name` of a curved skin: "inner-N" for N electrodes spread evenly over `surface`, or a
     `.csv` file with positions in space. Other arguments as in `study_layout`.
 
-    Gaps are measured along the surface. Raises `ValueError` for an unknown name, electrodes that overlap or are not on
-    the surface, and gaps below `minimum_gap`.
+    Gaps between electrodes are measured along the surface. Raises `ValueError` for an unknown name, electrodes that
+    overlap or are not on the surface, and gaps below `minimum_gap`.
     """
     try:
         layout = _create_curved(name, folder, surface, outward, diameter)
@@ -71,12 +71,12 @@ _SUFFIXES = (".csv", ".dxf", ".svg")
 def study_layout(
     name: str, folder: Path, outline: Rectangle, diameter: float, contact_impedance: float, minimum_gap: float
 ) -> Layout:
-    """Create or read the layout `name` of a skin with this `outline`. Files are relative to `folder`; units are metres
-    and ohm·m².
+    """Create or read the layout `name` of a skin with this `outline`. Paths of files are relative to `folder`; units
+    are metres and ohm·m².
 
-    If `diameter` or `contact_impedance` is NaN, the value in the file is used, or 6 mm and 1e-4 ohm·m² if there is
-    none. Raises `ValueError` for an unknown name, electrodes that overlap or extend beyond the skin, and gaps below
-    `minimum_gap`.
+    If `diameter` or `contact_impedance` is NaN, the value in the layout's file is used, or 6 mm and 1e-4 ohm·m² if the
+    file has none. Raises `ValueError` for an unknown name, electrodes that overlap or extend beyond the skin, and gaps
+    below `minimum_gap`.
     """
     try:
         layout = _create_flat(name, folder, outline, diameter)
@@ -92,7 +92,7 @@ def study_layout(
 
 
 def is_layout_file(name: str) -> bool:
-    """Whether the name of a layout is that of a file."""
+    """Whether the `name` of a layout is the name of a file."""
     return Path(name).suffix.lower() in _SUFFIXES
 
 
@@ -114,13 +114,13 @@ def _create_flat(name: str, folder: Path, outline: Rectangle, diameter: float) -
 
 
 def check_num_electrodes(number: int) -> None:
-    """Raise `ValueError` unless the number of electrodes is allowed in a study."""
+    """Raise `ValueError` unless the `number` of electrodes is allowed in a study."""
     if not 4 <= number <= 1024:
         raise ValueError(f"it has {number} electrodes; give 4 to 1024.")
 
 
 def check_spacing(layout: Layout | SurfaceLayout, lengths: Float[np.ndarray, "L L"], minimum_gap: float) -> None:
-    """Raise `ValueError` for gaps below `minimum_gap` between electrodes; `lengths`: distances of their centres,
+    """Raise `ValueError` for gaps between electrodes below `minimum_gap`; `lengths`: distances (L, L) of their centres,
     metres."""
     radii = np.asarray(layout.diameters) / 2
     gaps = lengths - radii[:, None] - radii

@@ -1,5 +1,5 @@
-"""Lock that allows one process at a time to write a store: a file beside the store names the process, and is ignored
-once that process has ended."""
+"""Lock that allows one process at a time to write a store of results: a file beside the store names the process, and is
+ignored once this process has ended."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ _MAX_BYTES = 4096
 
 @contextlib.contextmanager
 def locked(path: Path, contents: str) -> Iterator[None]:
-    """Context in which no other process writes the store at `path`. `contents`: one word for the contents of the store,
-    for messages.
+    """Context in which no other process writes the store of results at `path`. `contents`: one word for the contents of
+    the store, for messages.
 
     The lock is the file `.NAME.lock` beside the store, held by `flock`, which the system releases when the process ends
-    for any reason. Its content names the owner. If the owner is on another machine, whose processes cannot be checked,
-    the store counts as locked as long as the file exists. Raises `ValueError` if another process, or another thread of
-    this process, writes the store, and `OSError` if no file can be written beside it.
+    for any reason. The content of the file names the owner, the process that writes the store. If the owner is on
+    another machine, whose processes cannot be checked, the store counts as locked as long as the file exists. Raises
+    `ValueError` if another process, or another thread of this process, writes the store, and `OSError` if no file can
+    be written beside the store.
     """
     path = path.resolve()  # the same lock, whichever link leads to the store
     lock_path = path.with_name(f".{path.name}.lock")
@@ -50,14 +51,14 @@ def locked(path: Path, contents: str) -> Iterator[None]:
 
 
 def _acquire(lock_path: Path, store_path: Path, contents: str) -> int:
-    """Open the file of the lock and acquire the lock; returns the file descriptor."""
+    """Open the lock file and acquire the lock. Returns the file descriptor."""
     while True:
         descriptor = os.open(lock_path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
         try:
             is_locked = _try_to_lock(descriptor)
             if is_locked and not _is_file_at(
                 descriptor, lock_path
-            ):  # the previous owner has just ended and removed the file
+            ):  # the previous owner has just ended and removed the lock file
                 os.close(descriptor)
                 continue
             owner = _read_owner(descriptor)
@@ -76,8 +77,8 @@ def _acquire(lock_path: Path, store_path: Path, contents: str) -> int:
 
 
 def _try_to_lock(descriptor: int) -> bool | None:
-    """Try to lock the file. Returns whether this process holds the lock now; None if the system or the file system does
-    not support locks."""
+    """Try to lock the lock file. Returns whether this process holds the lock now; None if the system or the file system
+    does not support locks."""
     if fcntl is None:
         return None
     try:
@@ -90,7 +91,7 @@ def _try_to_lock(descriptor: int) -> bool | None:
 
 
 def _is_file_at(descriptor: int, lock_path: Path) -> bool:
-    """Whether the open file is still the one at the path of the lock."""
+    """Whether the open file `descriptor` is still the file at the path of the lock."""
     try:
         return os.path.samestat(os.fstat(descriptor), lock_path.stat())
     except FileNotFoundError:
@@ -98,7 +99,8 @@ def _is_file_at(descriptor: int, lock_path: Path) -> bool:
 
 
 def _write_owner(descriptor: int) -> None:
-    """Write the process, the machine and the time into the lock file as JSON, so that others can name its owner."""
+    """Write this process, its machine and the time into the lock file as JSON, so that other processes can name the
+    owner."""
     owner = {"pid": os.getpid(), "host": platform.node(), "boot": boot_identifier()}
     owner["since"] = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
     os.ftruncate(descriptor, 0)
@@ -107,7 +109,7 @@ def _write_owner(descriptor: int) -> None:
 
 
 def _read_owner(descriptor: int) -> dict:
-    """Read the owner from the file; empty if the owner ended before the file was written."""
+    """Read from the lock file which process owns the lock; empty if the owner ended before the file was written."""
     try:
         owner = json.loads(os.pread(descriptor, _MAX_BYTES, 0))
     except (ValueError, RecursionError):
@@ -116,13 +118,14 @@ def _read_owner(descriptor: int) -> dict:
 
 
 def _has_ended(owner: dict, *, certain: bool) -> bool:
-    """Whether the owner has ended. `certain`: it is known not to hold the lock of the file any more, which is
-    conclusive for an owner on this machine only."""
+    """Whether the process that owns the lock file has ended. `certain`: whether the owner is known not to hold the
+    file's lock any more, which is conclusive only for an owner on this machine."""
     return _is_on_this_machine(owner) and (certain or not is_alive(owner.get("pid")))
 
 
 def _is_on_this_machine(owner: dict) -> bool:
-    """Whether the owner runs, or ran, on this machine, by its name or its boot identifier."""
+    """Whether the process that owns the lock runs, or ran, on this machine, by the machine's name or boot
+    identifier."""
     return owner.get("host") == platform.node() or (bool(boot_identifier()) and owner.get("boot") == boot_identifier())
 
 

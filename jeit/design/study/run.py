@@ -1,4 +1,4 @@
-"""Running of a study, on this machine or on a cluster, with reports of the progress."""
+"""Running of a study of electrode layouts, on this machine or on a cluster, with reports of the progress."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from jeit.design.study.store import Store, open_results, writing
 
 
 class Progress(NamedTuple):
-    """Progress of a study.
+    """Progress of the computation of a study.
 
-    **Fields**: `points`, `all_points`: finished and total number of points; `chunks`, `all_chunks`: the same for
-    chunks; `seconds_left`: estimated remaining time, None until this run has finished its first point.
+    **Fields**: `points`, `all_points`: finished and total number of points; `chunks`, `all_chunks`: finished and total
+    number of chunks; `seconds_left`: estimated remaining time, None until this run has finished its first point.
 
-    With exact maps, `points` includes points of the current chunk, which would be solved again after an interruption.
+    With exact sensitivity maps, `points` includes points of the current chunk, which would be solved again after an
+    interruption.
     """
 
     points: int
@@ -34,7 +35,7 @@ class Progress(NamedTuple):
 
 class ProgressReporter:
     """Reports the progress of work in `chunks` by calling `progress`, and estimates the remaining time from the points
-    finished since its creation. `finished_chunks`: numbers of the chunks that were finished before."""
+    finished since the reporter's creation. `finished_chunks`: numbers of the chunks that were finished before."""
 
     def __init__(
         self, chunks: Sequence[Sequence[int]], finished_chunks: set[int], progress: Callable[[Progress], None] | None
@@ -45,7 +46,7 @@ class ProgressReporter:
         self._report(self._initial_points, None)
 
     def finished(self, number: int) -> None:
-        """Report a finished chunk."""
+        """Report that the chunk `number` is finished."""
         self._finished_chunks.add(number)
         self._estimate_and_report(self._num_finished_points())
 
@@ -74,10 +75,11 @@ def over_cluster(
     client: Any, solve: Callable[[Any, int], _Result], work: Any, numbers: Iterable[int]
 ) -> Iterator[tuple[int, _Result]]:
     """Yield the number of each chunk with its results `solve(work, number)`, in the order in which the workers of a
-    `dask.distributed.Client` complete them. Chunks of a lost worker are solved again."""
+    `dask.distributed.Client` complete the chunks. Chunks of a lost worker are solved again."""
     distributed = optional("distributed", "a cluster")
-    # The work is sent once, as a task, so that it is sent again if the only worker that has it is lost. Scattered data
-    # would be lost in this case, and sending it with every chunk would transfer a layer of 70 MB a thousand times.
+    # The data `work` is sent once, as a task, so that it is sent again if the only worker that has it is lost.
+    # Scattered data would then be lost, and sending `work` with every chunk would transfer a layer of 70 MB a thousand
+    # times.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sending large graph")
         work_future = client.submit(_return_unchanged, work, pure=False)
@@ -97,24 +99,24 @@ def _return_unchanged(work: Any) -> Any:
 def run_study(
     study: Study, path: str | Path, *, client: Any = None, progress: Callable[[Progress], None] | None = None
 ):
-    """Run the unfinished chunks of a study, and return the results as `open_results` does.
+    """Compute the unfinished chunks of a study, and return the results as `open_results` does.
 
-    If a run is killed at any moment, the next run continues after the last finished chunk and gives the same store bit
-    for bit.
+    If a run is killed at any moment, the next run continues after the last finished chunk and gives the same store of
+    results bit for bit.
 
     **Arguments:**
 
     - `study`: the study.
     - `path`: path of the Zarr store, which is created if it does not exist.
     - `client`: a `dask.distributed.Client` whose workers have jeit installed. Chunks of a lost worker are solved again,
-      and only this process writes. By default, the chunks are computed in this process.
-    - `progress`: called with a `Progress` at the start and after each chunk; without a `client`, also after each exact
-      map.
+      and only this process writes the store. By default, the chunks are computed in this process.
+    - `progress`: function called with a `Progress` at the start and after each chunk; without a `client`, also after
+      each exact map.
 
-    Only one process at a time may run a study; locks of processes that have ended are ignored. Raises, before anything
-    runs, `ValueError` for meshes too coarse for their electrodes or touches, for the store of another study, and for a
-    store that another process writes. Raises `ImportError` without the extra `cluster`, and `OSError` if the store
-    cannot be written, such as on a full disk; finished chunks are kept.
+    Only one process at a time may run a study; locks of processes that have ended are ignored. Raises `ValueError`,
+    before any chunk is computed, for meshes too coarse for their electrodes or touches, for the store of another study,
+    and for a store that another process writes. Raises `ImportError` without the extra `cluster`, and `OSError` if the
+    store cannot be written, such as on a full disk; finished chunks are kept.
 
     **Example:**
 
@@ -136,15 +138,15 @@ def run_study(
 
 
 def study_progress(study: Study, path: str | Path) -> Progress:
-    """Progress of the study in a store: the numbers of finished points and chunks. Chunks that do not match their
-    checksums count as unfinished.
+    """Progress of a study in a store of results: the numbers of finished points and chunks. Chunks that do not match
+    their checksums count as unfinished.
 
     **Arguments:**
 
     - `study`: the study.
     - `path`: path of the Zarr store.
 
-    Raises errors as `Store` does.
+    Raises the errors of `Store`.
 
     **Example:**
 
@@ -161,8 +163,8 @@ def study_progress(study: Study, path: str | Path) -> Progress:
 def _solve_chunks(
     study: Study, numbers: list[int], client: Any, solved: Callable[[int], None]
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """Yield the number of each chunk with its results, in the order in which they are solved; `solved` as in
-    `solve_chunk`."""
+    """Yield the number of each chunk of a study with its results, in the order in which the chunks are solved; `solved`
+    as in `solve_chunk`."""
     if client is None:
         for number in numbers:
             yield number, solve_chunk(study, number, solved)

@@ -1,4 +1,4 @@
-"""`Study`: a sweep over layouts and skin parameters, read from a TOML file and checked before anything runs."""
+"""`Study`: a sweep over electrode layouts and skin parameters, read from a TOML file and checked first."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ if TYPE_CHECKING:
 LayoutFactory = Callable[[str, float, float, float], Layout | SurfaceLayout]
 """Function that creates a layout from name, diameter, contact impedance and minimum gap, as `study_layout` does."""
 
-# Version of the results: increase it if the same study would give different results.
+# Version of the results of studies: to be increased if the same study would give different results.
 _VERSION = 2
-# Minimum number of electrodes of each protocol.
+# Minimum number of electrodes for each measurement protocol.
 _MIN_ELECTRODES = {"adjacent": 4, "opposite": 4, "two-terminal": 2}
-# Maximum size of a study file, and of its store of results, bytes.
+# Maximum size of a study file, and of the study's store of results, bytes.
 _MAX_FILE_BYTES, _MAX_STORE_BYTES = 2**22, 20e9
 
 
 class Shape(NamedTuple):
     """Parameters that points must have in common to share a mesh and a batch; fields as in `Point`. `thickness` is 0
-    for sheets, whose mesh does not depend on it."""
+    for sheets, whose mesh does not depend on the thickness."""
 
     electrodes: int
     protocol: str
@@ -73,22 +73,23 @@ class Point:
 
     @property
     def shape(self) -> Shape:
-        """Parameters that determine which points can share a batch: those with the same shape."""
+        """Parameters that determine which points can share a batch: points with the same shape."""
         thickness = self.thickness if self.layers else 0.0
         return Shape(self.layout.num_electrodes, self.protocol, self.pairs, self.cell_size, self.layers, thickness)
 
     @property
     def electrodes(self) -> SheetDiscs | SurfaceDiscs | FaceDiscs:
-        """Electrodes of the forward model, in the sheet or on the bottom of the layer."""
+        """Electrodes of the point's forward model, in the sheet or on the bottom of the layer."""
         return skin_electrodes(self.layout, self.layers)
 
     def measured(self, current: float) -> Protocol:
-        """Measurement protocol at a `current` in amperes."""
+        """Measurement protocol of the point, with an injected `current` in amperes."""
         return skin_protocol(self.layout, self.protocol, num_pairs=self.pairs, current=current)
 
     @property
     def coordinates(self) -> dict[str, str | int | float]:
-        """The swept parameters, by their names in the study file; mean values if the electrodes differ."""
+        """The point's values of the swept parameters, by their names in the study file; mean values if the electrodes
+        differ."""
         return {
             "layout": self.layout.name,
             "electrodes": self.layout.num_electrodes,
@@ -105,12 +106,13 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """A sweep over every combination of the lists in a study file; create it with `read_study`.
+    """A sweep over every combination of the lists in a study file; create a study with `read_study`.
 
     **Fields**
 
-    - `name`: name of the study; `points`: the skins, in the order of the lists, where the last list varies fastest.
-    - `outline`: outline of the skins; for curved skins, the surface for the first cell size.
+    - `name`: name of the study; `points`: the skins, in the order of the file's lists, where the last list varies
+      fastest.
+    - `outline`: outline of the skins; for curved skins, the surface with the first cell size.
     - `indentation`, `contrast`: the touch, as in `touched_cells`; `exact`: whether voltage changes are exact instead of
       linearised; `columns`, `rows`: size of the grid of touched positions.
     - `current`: injected current, amperes; `scores`: names of the scores that are computed.
@@ -118,7 +120,7 @@ class Study:
     - `chunk_points`: maximum number of points in a chunk; `text`: content of the study file; `surface`: text that
       identifies the surface of curved skins, empty for flat skins.
 
-    Studies compare equal if they have the same results.
+    Two studies compare equal if they have the same results.
     """
 
     name: str
@@ -154,7 +156,7 @@ class Study:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 hash of everything that determines the results; comments and the name of the study do not."""
+        """SHA-256 hash of everything that determines the results, without comments and the study's name."""
         outline_values = [self.surface] if isinstance(self.outline, Triangles) else [*map(float, self.outline.extent)]
         content = [_VERSION, *outline_values, type(self.indentation).__name__]
         content += [*map(float, vars(self.indentation).values()), self.columns, self.rows, self.current]
@@ -162,7 +164,7 @@ class Study:
         content += [self.seed, self.chunk_points]
         for point in self.points:
             content += [point.coordinates, point.layers]
-            # Positions of built-in layouts are left out, since their last digits depend on the compilation.
+            # The hash omits positions of built-in layouts, since their last digits depend on the compilation.
             if is_layout_file(point.layout.name):
                 arrays = (point.layout.centres, point.layout.diameters, point.layout.contact_impedance)
                 content += [(np.round(array, 12) + 0.0).tolist() for array in map(np.asarray, arrays)]
@@ -177,7 +179,7 @@ class Study:
 
 def read_study(path: str | Path) -> Study:
     """Read the study that a TOML file describes. Lengths are in millimetres. Keys with lists are swept: every
-    combination of their values is a point::
+    combination of their values is a point, that is a skin::
 
         name = "32 electrodes: inside or around"
         [skin]
@@ -210,15 +212,15 @@ def read_study(path: str | Path) -> Study:
         wanted = ["minimum", "mean", "uniformity", "blind_spot", "taxels"]    # num_taxels, threshold, seed
         # for sheets also "information", "mean_variance", "largest_variance", "localisation_error"; correlation_mm
 
-    Only `electrodes.layouts` is required; the defaults of other keys are those of `jeit.design.defaults`. Paths of
-    files are relative to the study file.
+    Only the key `electrodes.layouts` is required; the defaults of other keys are those of `jeit.design.defaults`. Paths
+    of files are relative to the study file.
 
     **Arguments:**
 
     - `path`: path of the file.
 
-    Raises `FileNotFoundError` if there is no such file. Raises `ValueError`, naming the keys and a remedy, for keys
-    that are unknown or have no effect in combination with the others, values of the wrong type or out of range (such as
+    Raises `FileNotFoundError` if the file does not exist. Raises `ValueError`, naming the keys and a remedy, for keys
+    that are unknown or have no effect in combination with other keys, values of the wrong type or out of range (such as
     metres for millimetres), electrodes that overlap, impossible spacings, layouts without the electrodes that a
     protocol needs, and studies that would take too much memory or disk space.
 
@@ -232,7 +234,7 @@ def read_study(path: str | Path) -> Study:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
-    # Imported late, since the import of pydantic takes longer than most operations on a study file.
+    # Imported here, since the import of pydantic takes longer than most operations on a study file.
     from jeit.design.study.study_tables import StudyTable
     from jeit.files.limits import faults_message
     from jeit.files.schema import validated
@@ -253,7 +255,7 @@ def _study_from_table(text: str, table: StudyTable, folder: Path) -> Study:
     electrodes = table.electrodes
     minimum_gap = 1e-3 * electrodes.minimum_gap_mm
     cell_sizes, outline, layout_factories = _surface_meshes(table, folder)
-    # Every layout is created once for each mesh; on flat skins, a single one serves all meshes.
+    # Every layout is created once for each mesh; on flat skins, a single layout serves all meshes.
     layouts = [
         [create_layout(name, diameter, impedance, minimum_gap) for create_layout in layout_factories]
         for name, diameter, impedance in itertools.product(
@@ -326,7 +328,8 @@ def _create_indentation(table: StudyTable) -> AbstractIndentation:
 
 
 def _check_touches(table: StudyTable) -> None:
-    """Check that there are enough touches for the scores, and that results and computations fit disk and memory."""
+    """Check that there are enough touches for the scores, that the results fit the disk, and the computation the
+    memory."""
     scores, num_touches = table.scores, table.touch.columns * table.touch.rows
     sheet_scores = [score for score in OPTIMALITY if score in scores.wanted]
     num_bytes = 8.0 * table.num_points * num_touches
@@ -357,7 +360,7 @@ def _check_touches(table: StudyTable) -> None:
 def _check_layout(
     layout: Layout | SurfaceLayout, outline: Rectangle | Triangles, layers: int, table: StudyTable
 ) -> None:
-    """Check that a layout can be measured and meshed for all values of the swept parameters."""
+    """Check that an electrode layout can be measured and meshed for all values of the swept parameters."""
     width_mm, max_thickness_mm = 1e3 * longer_side(outline), max(table.skin.thickness_mm)
     if max_thickness_mm > width_mm:
         raise ValueError(f"skin.thickness_mm is {max_thickness_mm:g}, more than the skin is wide: {width_mm:g} mm.")
@@ -381,7 +384,7 @@ def _check_layout(
 
 
 def _num_pairs(layout: Layout | SurfaceLayout, protocol: str, pairs: int | None) -> int:
-    """Number of pairs for `Point`, 0 for all pairs: the given number, or by default 94, or all if there are fewer."""
+    """Number of measured pairs, 0 for all pairs: the number `pairs`, by default 94, or all pairs if fewer."""
     if pairs is not None:
         return pairs
     return defaults.NUM_PAIRS if protocol == "two-terminal" and _num_all_pairs(layout) > defaults.NUM_PAIRS else 0
@@ -421,15 +424,15 @@ def _to_metres(lengths: list[float]) -> list[float]:
 
 
 def _without_rounding(value) -> float:
-    """Round to 12 digits, which removes rounding errors of unit conversion."""
+    """Round `value` to 12 digits, which removes rounding errors of unit conversion."""
     return float(f"{float(value):.12g}")
 
 
 def _surface_meshes(
     table: StudyTable, folder: Path
 ) -> tuple[list[float], Rectangle | Triangles, Sequence[LayoutFactory]]:
-    """Returns the cell sizes, metres; the outline, or for curved skins the surface for the first cell size; and the
-    functions that create layouts: a single one for flat skins, and one for each cell size for curved skins."""
+    """Returns the cell sizes, metres; the outline, or for curved skins the surface with the first cell size; and the
+    functions that create layouts: a single function for flat skins, one for each cell size for curved skins."""
     from jeit.design.skin.surface_tables import ScanTable  # imported already when the table was read
 
     cell_sizes = [1e-3 * size for size in table.mesh.cell_mm]

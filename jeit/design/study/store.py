@@ -1,13 +1,13 @@
-"""The store of a study: points and results in Zarr.
+"""The store of a study: its points and their results in the Zarr format.
 
-`Store` holds the results of a study, or of other work in chunks, on disk. Chunks have separate files. A single file
+`Store` holds the results of a study, or of other work in chunks, on disk. Each chunk has separate files. A single file
 lists the finished chunks with their checksums, and is replaced as a whole after the files of a chunk are written; a
 chunk that is not in the list counts as unfinished.
 
-The metadata of a store are checked as plain JSON before Zarr opens them. Zarr looks up codecs by the names in a file,
-and one of them, pickle, executes code from the file. A store is therefore opened only if it has the form that jeit
-writes: format 3, the expected arrays and no others, only numbers and text, codecs that only pack bytes, and no links to
-other paths.
+The metadata of a store are checked as plain JSON before Zarr opens the store. Zarr looks up codecs by the names in a
+file, and the codec pickle executes code from the file. A store is therefore opened only if it has the form that jeit
+writes: Zarr format 3, the expected arrays and no others, only numbers and text, codecs that only pack bytes, and no
+links to other paths.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from jeit.design.study.contents import Contents, study_contents
 from jeit.design.study.lock import locked
 from jeit.design.study.spec import Study
 
-# Allowed codecs: they only pack bytes. Sharding is excluded, since it contains further codecs.
+# Codecs allowed in a store, which only pack bytes. Sharding is excluded, since it contains further codecs.
 CODECS = frozenset({"blosc", "bytes", "crc32c", "transpose", "vlen-utf8", "zstd"})
 # Maximum unpacked size of a chunk of text, and maximum overhead of a chunk of numbers, bytes.
 _MAX_TEXT_CHUNK, _MAX_CHUNK_OVERHEAD = 2**24, 2**12
@@ -47,7 +47,7 @@ _UNREADABLE_METADATA = f"has a {_METADATA_FILE} that is no JSON object, or neste
 
 
 class ArrayShape(NamedTuple):
-    """Size of an array of a store: number of values along each axis, the same for a chunk, and Zarr's name of the data
+    """Size of an array of a store: number of values along each axis, in all and per chunk, and Zarr's name of the data
     type."""
 
     shape: tuple[int, ...]
@@ -56,7 +56,7 @@ class ArrayShape(NamedTuple):
 
 
 def find_danger(path: Path) -> str | None:
-    """Reason why a store must not be opened; None if nothing in it can run code or link to other paths. Raises
+    """Reason why a store must not be opened; None if nothing in the store can run code or link to other paths. Raises
     `OSError` for files that cannot be read."""
     for folder, folders, files in os.walk(path):
         for name in [*folders, *files]:
@@ -75,8 +75,8 @@ def find_danger(path: Path) -> str | None:
 
 
 def find_damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
-    """Description of the first difference from a store with the arrays `expected`, by name; None if there is none.
-    Raises `OSError` for files that cannot be read."""
+    """Description of the first difference of a store from one with the arrays `expected`, by name; None without a
+    difference. Raises `OSError` for files that cannot be read."""
     content = _read_bytes(path / _METADATA_FILE)
     if content is None:
         return _UNREADABLE_METADATA
@@ -105,8 +105,8 @@ def find_damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
 
 
 def _chunk_damage(folder: Path, array: ArrayShape) -> str | None:
-    """Description of the first chunk whose unpacked size is unknown or larger than a chunk of the array can be; None if
-    there is none."""
+    """Description of the first chunk whose unpacked size is unknown or larger than a chunk of the array can be; None
+    without such a chunk."""
     max_bytes = _MAX_TEXT_CHUNK if array.data_type == "string" else 8 * math.prod(array.chunks) + _MAX_CHUNK_OVERHEAD
     for file in folder.rglob("*"):
         if file.is_file() and file.name != _METADATA_FILE:
@@ -119,7 +119,7 @@ def _chunk_damage(folder: Path, array: ArrayShape) -> str | None:
 
 def _unpacked_size(beginning: bytes, size: int) -> int | None:
     """Unpacked size in bytes of a chunk, from its `beginning` and its `size` on disk: as stated in a zstd frame (RFC
-    8878) or a blosc header, otherwise `size` itself. None if a frame does not state it."""
+    8878) or a blosc header, otherwise `size` itself. None if a frame does not state its size."""
     if beginning.startswith(b"\x28\xb5\x2f\xfd") and len(beginning) > 5:
         descriptor = beginning[4]
         is_single_segment = descriptor >> 5 & 1
@@ -174,7 +174,7 @@ def _find_node_damage(node: Any, expected: ArrayShape) -> str | None:
 
 
 def _read_bytes(file: Path) -> dict[str, Any] | None:
-    """Read the JSON object in a file; None if the file contains anything else. Raises `OSError`."""
+    """Read the JSON object in a file; None without a JSON object. Raises `OSError` if the file cannot be read."""
     try:
         content = json.loads(file.read_bytes())
     except (ValueError, RecursionError):
@@ -197,20 +197,20 @@ _PATH_DESCRIPTION = "that of the store, such as 'results.zarr'"
 
 
 class OtherContents(ValueError):
-    """Raised where a store has other contents than requested."""
+    """Raised if a store has other contents than the requested study or work."""
 
 
 class Store:
-    """The store of a study, or of other `Contents`, at `path`.
+    """The store of results of a study, or of other `Contents`, at `path`.
 
-    With `create`, it is opened for writing and created empty if it does not exist; otherwise it is opened for reading
-    only. Use `writing` to write a store.
+    With `create`, the store is opened for writing and created empty if it does not exist; otherwise it is opened for
+    reading only. Use `writing` to write a store.
     """
 
     def __init__(self, work: Study | Contents, path: str | Path, *, create: bool = True):
         """Raises `FileNotFoundError` if there is no store and `create` is False. Raises `ValueError` if the path is not
-        a store or that of another study, if the store is damaged, or if it might run code when it is opened. Raises
-        `ImportError` without the extra `cluster`, and `OSError` if the store cannot be written."""
+        a store or is the store of another study, if the store is damaged, or if opening the store might run code.
+        Raises `ImportError` without the extra `cluster`, and `OSError` if the store cannot be written."""
         zarr = optional("zarr", _TASK)
         self.contents = work if isinstance(work, Contents) else study_contents(work)
         check_kind("path", path, (str, os.PathLike), _PATH_DESCRIPTION)
@@ -243,11 +243,11 @@ class Store:
 
     @property
     def versions(self) -> dict[str, str]:
-        """Versions of the packages that created the store, by their names."""
+        """Versions of the packages that created the store, by the packages' names."""
         return self._attributes()["versions"]
 
     def finished(self) -> dict[int, str]:
-        """Checksum of every finished chunk, by its number."""
+        """Checksum of every finished chunk, by the chunk's number."""
         return {int(number): checksum for number, checksum in self._attributes()["finished"].items()}
 
     def sound(self) -> list[int]:
@@ -255,8 +255,8 @@ class Store:
         return [number for number, checksum in self.finished().items() if self._checksum(number) == checksum]
 
     def write(self, number: int, results: Mapping[str, np.ndarray]) -> None:
-        """Write the results of chunk `number`, then mark it as finished. Raises `OSError` if it cannot be written; the
-        chunk then counts as unfinished."""
+        """Write the results of chunk `number`, then mark the chunk as finished. Raises `OSError` if the results cannot
+        be written; the chunk then counts as unfinished."""
         try:
             for name, values in results.items():
                 self.write_array(name, self.contents.chunks[number], values)
@@ -271,7 +271,7 @@ class Store:
             ) from error
 
     def write_array(self, name: str, points: Sequence[int], values: np.ndarray) -> None:
-        """Write `values` (k, …) of the array `name` for k points."""
+        """Write `values` (k, …) of the array `name` for the k `points`."""
         array, first_row = self._group[name], 0
         for rows in _consecutive_runs(points):
             last_row = first_row + rows.stop - rows.start
@@ -282,7 +282,7 @@ class Store:
         content = _read_json(self.path)
         finished = content["attributes"]["finished"] | {str(number): checksum}
         content["attributes"]["finished"] = dict(sorted(finished.items(), key=lambda item: int(item[0])))
-        # The temporary file is beside the store: inside, Zarr would not recognise it if it were left behind.
+        # The temporary file is beside the store, since Zarr would not recognise a file left behind inside the store.
         temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.tmp")
         try:
             with open(temporary, "w", encoding="utf-8") as file:
@@ -300,14 +300,14 @@ class Store:
                 {name: np.concatenate([self._group[name][rows] for rows in runs]) for name in self.contents.arrays}
             )  # pyright: ignore
         except (OSError, ValueError, RuntimeError):
-            return None  # a file that cannot be decoded
+            return None  # a file of the chunk cannot be decoded
 
     def open_dataset(self):
-        """Open the whole store as an `xarray.Dataset`, whose values are read when they are needed."""
+        """Open the whole store as an `xarray.Dataset`, whose values are read from disk when they are needed."""
         return optional("xarray", _TASK).open_zarr(str(self.path), chunks=None, zarr_format=3)
 
     def _check(self, expected: Mapping[str, ArrayShape]) -> None:
-        """Check the metadata of the store before Zarr opens it. Raises `ValueError` if it is dangerous or damaged."""
+        """Check the metadata before Zarr opens the store. Raises `ValueError` if the store is dangerous or damaged."""
         try:
             danger = find_danger(self.path)
             damage = None if danger else find_damage(self.path, expected)
@@ -323,8 +323,8 @@ class Store:
             raise self._damage_error(damage)
 
     def _attributes(self) -> dict:
-        """Read the attributes of the store; empty if the path is not a store. Raises `ValueError` if they cannot be
-        read.
+        """Read the attributes of the store; empty if the path is not a store. Raises `ValueError` if the attributes
+        cannot be read.
         """
         try:
             content = _read_json(self.path)
@@ -349,11 +349,11 @@ class Store:
 
 @contextlib.contextmanager
 def writing(work: Study | Contents, path: str | Path) -> Iterator[Store]:
-    """Context with the store of `work` at `path`, which no other process can write; it is created empty if it does not
-    exist.
+    """Context with the store of `work` at `path`, which no other process can write. The store is created empty if it
+    does not exist.
 
-    Temporary files of killed runs are removed. Raises errors as `Store` does, and `ValueError` if another process
-    writes the store.
+    Temporary files of killed runs are removed. Raises the errors of `Store`, and `ValueError` if another process writes
+    the store.
     """
     check_kind("path", path, (str, os.PathLike), _PATH_DESCRIPTION)
     contents = work if isinstance(work, Contents) else study_contents(work)
@@ -378,7 +378,7 @@ def open_results(study: Study, path: str | Path):
     - `study`: the study.
     - `path`: path of the Zarr store.
 
-    Raises errors as `Store` does.
+    Raises the errors of `Store`.
 
     **Example:**
 
@@ -403,7 +403,7 @@ def open_results(study: Study, path: str | Path):
 
 
 def _store_shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]:
-    """Sizes of the arrays of `contents`, by name, from a store in memory that has no values."""
+    """Sizes of the arrays of `contents`, by name, determined from a store in memory that has no values."""
     group = zarr.open_group(zarr.storage.MemoryStore(), mode="w", zarr_format=3)
     contents.fill(group)
     return {
@@ -413,14 +413,14 @@ def _store_shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]
 
 
 def _consecutive_runs(points: Sequence[int]) -> list[slice]:
-    """Group consecutive numbers of points to slices."""
+    """Group numbers of points into slices of consecutive numbers."""
     point_numbers = np.asarray(points)
     ends = np.flatnonzero(np.diff(point_numbers) != 1) + 1
     return [slice(int(run[0]), int(run[-1]) + 1) for run in np.split(point_numbers, ends)]
 
 
 def _create_store(zarr: ModuleType, contents: Contents, path: Path) -> None:
-    """Create the store atomically: under a temporary name, which is then changed."""
+    """Create the store atomically: it is written under a temporary name, and then renamed."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.new")
     shutil.rmtree(temporary, ignore_errors=True)
     attributes = {

@@ -1,4 +1,5 @@
-"""Tables of a study file: type, range and unit of every key. Keys with lists are swept."""
+"""Tables of a study file: type, range and unit of every key. Every combination of the values in lists is a point of the
+study."""
 
 from __future__ import annotations
 
@@ -24,8 +25,8 @@ from jeit.design.skin.skin_file import (
 from jeit.design.skin.surface_tables import SURFACE, SurfaceTable, check_keys_of_surface
 from jeit.files.schema import Number, Several, Table, Word, fault
 
-# Maximum numbers of layouts and of points: they are created before anything runs and take milliseconds and kilobytes
-# each.
+# Maximum numbers of layouts and of points of a study, which are created before any computation and take milliseconds
+# and kilobytes each.
 _MAX_LAYOUTS, _MAX_POINTS = 2000, 100_000
 
 
@@ -41,7 +42,8 @@ class MaterialSweep(Table):
 
 
 class LayoutSweep(Table):
-    """Table "electrodes": layouts, diameters and contact impedances. NaN stands for the values of the layout."""
+    """Table "electrodes": layouts, diameters and contact impedances. A diameter or impedance of NaN stands for the
+    values of the layout."""
 
     subject = "a study"
     layouts: Several[Word]
@@ -75,7 +77,7 @@ class TouchTable(Table):
 
 
 class CellsSweep(Table):
-    """Table "mesh": cell sizes and number of layers."""
+    """Table "mesh": cell sizes, and number of layers of cells."""
 
     subject = "a study"
     cell_mm: Annotated[list[float], CELL] = Field(default=[1e3 * defaults.CELL_SIZE])
@@ -115,13 +117,13 @@ class StudyTable(Table):
 
     @property
     def num_points(self) -> int:
-        """Number of points, that is of all combinations of swept values."""
+        """Number of points of the study, that is of all combinations of swept values."""
         skin, measurement = self.skin, self.measurement
         other_lists = (measurement.protocol, measurement.pairs or [0], measurement.noise_V, self.mesh.cell_mm)
         return self.num_layouts * math.prod(map(len, (skin.thickness_mm, skin.conductivity_S_per_m, *other_lists)))
 
     def value_of(self, key: str) -> Any:
-        """Value of a key, given by its dotted name such as "mesh.layers"."""
+        """Value of the key with the dotted name `key`, such as "mesh.layers"."""
         section, name = key.split(".")
         return getattr(getattr(self, section), name)
 
@@ -165,7 +167,7 @@ class StudyTable(Table):
         return self
 
 
-# Keys that have an effect only if another key has one of the given values.
+# Keys of a study file that have an effect only if another key has one of the given values.
 _REQUIRED_VALUES: dict[str, tuple[str, tuple[str, ...]]] = {
     "mesh.layers": ("skin.model", ("layer",)),
     "touch.deviation_mm": ("touch.indentation", ("bell",)),
