@@ -48,11 +48,11 @@ class Solid(Body):
         return self.outline.extent
 
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
-        """Empty, because a solid has no edge along which electrodes follow each other."""
+        """Empty, because a solid, unlike a plane body, has no boundary loops."""
         return ()
 
     def describe(self) -> dict[str, Any]:
-        """Description of the outline, and the thickness."""
+        """Shape and sizes of the outline, and the thickness, in metres."""
         return {**self.outline.describe(), "thickness": float(self.thickness)}
 
     @size_checked()
@@ -110,7 +110,7 @@ class OwnMesh(Body):
         return tuple(as_array(points[loop[:, 0]]) for loop in np.split(facets, loop_starts))
 
     def describe(self) -> dict[str, Any]:
-        """Dimensions, and numbers of nodes and cells."""
+        """Dimensions of the mesh, and numbers of its nodes and cells."""
         return {
             "shape": "mesh",
             "dimension": self.given.dimension,
@@ -125,7 +125,8 @@ class OwnMesh(Body):
 
 
 def as_body(given: Body | Mesh) -> Body:
-    """Convert a mesh to a body; a body is returned unchanged. Raises `ValueError` for anything else."""
+    """Convert a mesh to a body; a body is returned unchanged. Raises `ValueError` for an argument that is neither a
+    body nor a mesh."""
     if isinstance(given, Mesh):
         return OwnMesh(given)
     check_kind("domain", given, Body, "an outline such as Disk(0.05), a Solid, or a Mesh")

@@ -44,7 +44,7 @@ class Polygon(Domain):
 
         Either orientation is accepted; the outline is stored counter-clockwise, holes clockwise. Raises `ValueError`
         for fewer than three vertices, repeated vertices, an outline that crosses or touches itself, and holes that are
-        not inside.
+        not inside the outline.
         """
         if not has_values(vertices, holes):
             self.vertices = jnp.asarray(vertices)
@@ -60,7 +60,7 @@ class Polygon(Domain):
 
     @property
     def area(self) -> Float[Array, ""]:
-        """Area inside the outline minus that of the holes, in m² (shoelace formula)."""
+        """Area inside the outline minus the area of the holes, in m² (shoelace formula)."""
         return polyline.area(self.loops())
 
     @property
