@@ -51,7 +51,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
 
     @property
     def contact_impedance(self) -> Float[Array, " L"]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Contact impedances (L,) of all parts, ohm·m² (ohm·m for arcs)."""
+        """Contact impedances (L,) of all parts, ohm·m² (ohm·m for arcs on the edge of a sheet)."""
         return namespace(self).concatenate([part.contact_impedance for part in self.parts])
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
@@ -63,7 +63,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         )
 
     def geometry(self) -> dict[str, Any]:
-        """Descriptions of all parts."""
+        """Descriptions of the electrodes of all parts."""
         return {"parts": [part.describe() for part in self.parts]}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
@@ -72,7 +72,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
             part.draw(mesh, pen)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """Refinements of all parts."""
+        """Refinements of a plane mesh that the electrodes of all parts request."""
         return tuple(refine for part in self.parts for refine in part.refinement(body))
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
@@ -96,7 +96,8 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
 
 
 _CIRCLE_CORNERS, _SIDE_CORNERS = 32, 8
-# Number of triangles near a point, by nearest centroids, that are searched when it is projected onto the surface.
+# Number of triangles near a point, by nearest centroids, that are searched when the point is projected onto the
+# surface.
 _NUM_CANDIDATES = 24
 
 
@@ -104,9 +105,9 @@ _NUM_CANDIDATES = 24
 class ElectrodeShapes:
     """Polygons for drawing electrodes, one or more per electrode.
 
-    **Fields**: `corners` (q, d): corners of all polygons in turn, metres, in space counter-clockwise as seen from
-    outside; a dot has a single corner; `sizes` (p,): number of corners of each polygon; `electrode` (p,): index of the
-    electrode that each polygon belongs to.
+    **Fields**: `corners` (q, d): corners of all polygons, one polygon after the other, metres, in space
+    counter-clockwise as seen from outside; a dot has a single corner; `sizes` (p,): number of corners of each polygon;
+    `electrode` (p,): index of the electrode that each polygon belongs to.
 
     **Example:**
 
@@ -162,7 +163,7 @@ def shapes_of(mesh: Mesh, electrodes: AbstractElectrodes) -> ElectrodeShapes:
 
 
 def _all_polygons(mesh: Mesh, electrodes: AbstractElectrodes) -> list[list[np.ndarray]]:
-    """Polygons of each electrode."""
+    """Polygons that draw each electrode."""
     points = np.asarray(mesh.points)
     if points.shape[1] == 2:
         pen = _PlanePen()

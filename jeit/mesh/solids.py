@@ -145,8 +145,10 @@ def polygon(
 
 def stacked_cells(cells: np.ndarray, num_nodes: int, num_layers: int) -> np.ndarray:
     """Tetrahedra (3 m num_layers, 4) of the prisms above triangles (m, 3); node k · `num_nodes` + i is node i of the
-    plane mesh after k layers. Every side face of a prism is divided along the diagonal that rises from its
-    lower-numbered to its higher-numbered node, so that the tetrahedra of neighbouring prisms match.
+    plane mesh after k layers.
+
+    Every side face of a prism is divided along the diagonal that rises from its lower-numbered to its higher-numbered
+    node, so that the tetrahedra of neighbouring prisms match.
     """
     a, b, c = np.sort(cells.astype(np.int64), axis=1).T
     num_nodes_up = num_nodes
