@@ -24,7 +24,7 @@ _STRONG_CHANGE, _STRONG_NOISY_CHANGE, _NOISY_SHARE = 0.3, 0.1, 0.3
 _MAX_MISFIT_RATIO, _LARGE_MISFIT = 1.1, 0.1
 # Lower bound of the conductivity of a linear image, as a share of the background conductivity.
 _MIN_CONDUCTIVITY = 0.01
-# Maximum change of conductivity in an image, relative to the background, above which bodies are fitted in a solid.
+# Bodies are fitted in a solid if the largest change of conductivity in an image exceeds this share of the background.
 _MIN_BODY_CHANGE = 0.05
 # Step along the linear image for the finite difference that approximates the derivative of the voltages.
 _DERIVATIVE_STEP = 1e-4

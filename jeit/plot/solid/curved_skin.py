@@ -109,7 +109,8 @@ def plot_curved_skin(
 
 
 def _visible_points(mesh, points, camera: Camera):
-    """Select the points that the surface does not hide: no part of it is nearer to the viewer on the same ray."""
+    """Select the points that the surface does not hide: no part of the surface is nearer to the viewer on the same
+    ray."""
     corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
     page_corners, depths = camera.on_page(corners), camera.nearness(corners)
     visible = []
