@@ -53,8 +53,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, width: ArrayLike, contact_impedance: ArrayLike):
-        """`width` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
-        values."""
+        """`width` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for values
+        that are not positive and for positions that are not finite."""
         self.position = as_positions(position, (2,))
         self.width = as_electrode_values("width", width, len(self.position), unit="metres")
         self.contact_impedance = as_electrode_values(
@@ -123,7 +123,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for electrodes that lie off the boundary, are wider than it, or overlap."""
+        """Raise `ValueError` for electrodes that lie off the boundary, are wider than the boundary is long, or
+        overlap."""
         check_dimension("BoundaryElectrodes", mesh, 2)
         if not has_values(self.position, self.width, mesh):
             return

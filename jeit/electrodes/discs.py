@@ -131,8 +131,8 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
-        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
-        values."""
+        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for values
+        that are not positive and for positions that are not finite."""
         self.position, self.radius, self.contact_impedance = as_discs(position, 2, radius, contact_impedance)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
@@ -189,8 +189,8 @@ class FaceDiscs(AbstractDiscs, AbstractMovableElectrodes):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
-        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
-        values."""
+        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for values
+        that are not positive and for positions that are not finite."""
         self.position, self.radius, self.contact_impedance = as_discs(position, 3, radius, contact_impedance)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
@@ -288,7 +288,7 @@ def same_face(mesh: Mesh, position: Float[Array, "L 3"], radius: Float[Array, " 
 def nearest_facets(
     mesh: Mesh, position: Float[Array, "L 3"], added_distance: Float[Array, "L b"] | float = 0.0
 ) -> Int[Array, " L"]:
-    """Boundary triangle with the nearest centroid to each position; among equally near triangles, the first.
+    """Index of the boundary triangle whose centroid is nearest to each position; the first of equally near triangles.
 
     `added_distance` (L, b): m², added to the squared distances to disfavour some triangles.
     """
@@ -373,8 +373,8 @@ class SurfaceDiscs(AbstractDiscs):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
-        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
-        values."""
+        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for values
+        that are not positive and for positions that are not finite."""
         self.position, self.radius, self.contact_impedance = as_discs(position, 3, radius, contact_impedance)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:

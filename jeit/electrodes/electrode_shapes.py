@@ -55,7 +55,8 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         return namespace(self).concatenate([part.contact_impedance for part in self.parts])
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """Copy with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for invalid values."""
+        """Copy of the electrodes with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for values
+        that are not positive."""
         values = as_electrode_values("contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²")
         pieces = jnp.split(values, np.cumsum([part.num_electrodes for part in self.parts])[:-1])
         return CombinedElectrodes(
@@ -90,7 +91,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         )
 
     def check(self, mesh: Mesh) -> None:
-        """Check every part on its own. Raises `ValueError` as the parts do."""
+        """Check the electrodes of every part separately. Raises `ValueError` as `check` of the parts does."""
         for part in self.parts:
             part.check(mesh)
 
@@ -146,7 +147,7 @@ def shapes_of(mesh: Mesh, electrodes: AbstractElectrodes) -> ElectrodeShapes:
     **Arguments:**
 
     - `mesh`: a solid, a surface in space or a plane mesh.
-    - `electrodes`: the electrodes on it.
+    - `electrodes`: the electrodes on the mesh.
 
     **Example:**
 

@@ -48,7 +48,7 @@ class ElectrodePen(Protocol):
         """Draw a rectangle with sides along x and y."""
 
     def dot(self, middle: np.ndarray) -> None:
-        """Draw an electrode without a size, or one whose shape is not visible from above."""
+        """Draw an electrode that has no size, or whose shape is not visible from above."""
 
 
 class AbstractElectrodes(Module):
@@ -83,7 +83,7 @@ class AbstractElectrodes(Module):
 
     @abc.abstractmethod
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> "AbstractElectrodes":
-        """Copy with other contact impedances, one number or (L,), ohm·m² (ohm·m for arcs).
+        """Copy of the electrodes with other contact impedances, one number or (L,), ohm·m² (ohm·m for arcs).
 
         Raises `ValueError` for point electrodes, which have no contact impedance.
         """
@@ -125,7 +125,8 @@ class AbstractPlacedElectrodes(AbstractCompleteElectrodes):
     position: eqx.AbstractVar[Float[Array, "L d"]]
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """Copy with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for invalid values."""
+        """Copy of the electrodes with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for values
+        that are not positive."""
         return replace_contact_impedance(self, contact_impedance)
 
 
@@ -162,7 +163,8 @@ class AbstractPointElectrodes(AbstractElectrodes):
 def replace_contact_impedance(
     electrodes: AbstractCompleteElectrodes, contact_impedance: ArrayLike
 ) -> AbstractCompleteElectrodes:
-    """Copy electrodes with another `contact_impedance`, one number or (L,). Raises `ValueError` for invalid values."""
+    """Copy electrodes with another `contact_impedance`, one number or (L,). Raises `ValueError` for values that are not
+    positive."""
     values = as_electrode_values("contact_impedance", contact_impedance, electrodes.num_electrodes, unit="ohm·m²")
     return eqx.tree_at(lambda complete_electrodes: complete_electrodes.contact_impedance, electrodes, values)
 

@@ -229,7 +229,7 @@ class FacePatches(AbstractMovableElectrodes):
 
     def __init__(self, position: ArrayLike, width: ArrayLike, height: ArrayLike, contact_impedance: ArrayLike):
         """`width`, `height` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for
-        invalid values."""
+        values that are not positive and for positions that are not finite."""
         self.position = as_positions(position, (3,))
         self.width = as_electrode_values("width", width, len(self.position), unit="metres")
         self.height = as_electrode_values("height", height, len(self.position), unit="metres")

@@ -141,7 +141,8 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         )
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """Copy with other contact impedances, ohm·m² (ohm·m in 2-D). Raises `ValueError` for invalid values."""
+        """Copy of the electrodes with other contact impedances, ohm·m² (ohm·m in 2-D). Raises `ValueError` for values
+        that are not positive."""
         return replace_contact_impedance(self, contact_impedance)
 
     def geometry(self) -> dict[str, Array]:
@@ -217,7 +218,7 @@ def plates(mesh: Mesh, tags: Sequence[str], contact_impedance: ArrayLike) -> Fac
 
 
 def electrodes_from_nodes(mesh: Mesh, nodes: Sequence, contact_impedance: ArrayLike) -> FacetElectrodes:
-    """Complete electrodes given by nodes: each covers the boundary facets whose nodes all belong to it.
+    """Complete electrodes given by nodes: each electrode covers the boundary facets whose nodes all belong to it.
 
     For electrodes with one node each use `NodeElectrodes`.
 

@@ -73,7 +73,7 @@ class PointElectrodes(AbstractPointElectrodes):
         return _point_contact(self.contact_nodes(mesh), load)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for electrodes outside the mesh, or two at the same position."""
+        """Raise `ValueError` for electrodes outside the mesh, or two electrodes at the same position."""
         if self.position.shape[1] != mesh.space_dimension:
             raise ValueError(
                 f"position has {self.position.shape[1]} coordinates and the mesh is in {mesh.space_dimension}-D."

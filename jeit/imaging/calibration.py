@@ -134,8 +134,8 @@ def relative_misfit(predicted, measured, mask) -> float:
 
 
 def estimated_positions(model: ForwardModel, voltages, mask, deviation: float | None) -> Placement | None:
-    """Electrode positions estimated from a reference frame; None if they cannot be estimated. `deviation`: standard
-    deviation of the described positions, metres, or None for the default."""
+    """Electrode positions estimated from a reference frame; None if the positions cannot be estimated. `deviation`:
+    standard deviation of the described positions, metres, or None for the default."""
     if not isinstance(model.electrodes, AbstractMovableElectrodes) or np.iscomplexobj(voltages):
         return None
     if deviation is None:

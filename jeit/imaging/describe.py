@@ -366,7 +366,7 @@ def _describe_body(geometry: dict, electrodes: dict, protocol: dict, current: fl
 
 
 def _protocol(table: dict, path: Path) -> Protocol | None:
-    """The protocol of a description's table `[protocol]`; None if it has no channels."""
+    """The protocol of a description's table `[protocol]`; None if the protocol has no channels."""
     try:
         return parse_description({"protocol": table}, "the description").protocol(path)
     except ValueError:  # none of its channels is left, or there are too few electrodes
@@ -374,7 +374,7 @@ def _protocol(table: dict, path: Path) -> Protocol | None:
 
 
 def _measurement_of(numbers: _Numbers, description: Description, protocol: Protocol) -> Measurement | None:
-    """The numbers of a file as a measurement with `protocol`; None if they do not fit the protocol."""
+    """The numbers of a file as a measurement with `protocol`; None if the numbers do not fit it."""
     try:
         frames = numbers.frames([protocol.num_measurements])
         if frames.table.shape[1] != protocol.num_measurements:

@@ -68,8 +68,8 @@ class ImagedDifference:
       images, inclusions are found in the logarithm of conductivity, which weights both signs alike, and must exceed the
       noise; in complex images, in the real part.
     - `unlike_electrodes`: electrodes, numbered from 0, that the model fits far worse than the others, with the ratio of
-      the misfits. Channels that measure on them have less weight.
-    - `shapes`: fitted bodies with their outlines; None if none were fitted, or if they do not explain the voltages.
+      the misfits. Channels on these electrodes have less weight.
+    - `shapes`: fitted bodies with outlines; None if no bodies were fitted, or if they do not explain the voltages.
     - `labels`: label of every pixel of the raster, if requested: 0 background, 1 resistive, 2 conductive.
     - `timings`: duration of each step in seconds.
     - `frame`: number of the imaged frame in its file, from 0; `num_frames`: number of frames in the file.
@@ -436,7 +436,7 @@ def _region_labels(regions, grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
 
 def _labels(mesh: Mesh, bodies: Sequence[Star | Ellipsoid], grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
     """Label the pixels in resistive and conductive bodies, in a solid at half its height. Where bodies overlap, the
-    first in the list counts."""
+    first body of the list determines the label."""
     centres, inside = grid.pixel_centres(), np.asarray(grid.cell) >= 0
     if mesh.dimension == 3:
         z = np.asarray(mesh.points)[:, 2]

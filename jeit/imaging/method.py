@@ -111,7 +111,7 @@ def as_settings(requested: ImagingSettings | None) -> ImagingSettings:
 
 
 def check_prior(prior) -> None:
-    """Check that `prior` is a prior or the name of a prior. Raises `ValueError` otherwise."""
+    """Raise `ValueError` unless `prior` is a prior or the name of a prior."""
     if not isinstance(prior, AbstractPrior):
         check_name("prior", prior, PRIORS, "" if isinstance(prior, str) else ", or an object such as Noser()")
 
@@ -126,7 +126,8 @@ def check_body(contact: str | None, num_points: int | None) -> None:
 
 
 def check_hyperparameter(hyperparameter: float | str) -> None:
-    """Check λ or the name of its rule. Raises `ValueError` unless it is a positive number or the name of a rule."""
+    """Check λ or the name of its rule. Raises `ValueError` unless `hyperparameter` is a positive number or the name of
+    a rule."""
     if isinstance(hyperparameter, str):
         check_name("hyperparameter", hyperparameter, RULES, ", or a number")
     elif not (is_number(hyperparameter) and hyperparameter > 0):

@@ -117,7 +117,7 @@ class PreparedDifference:
     @property
     def relative_noise(self) -> Float[Array, " M"]:
         """Noise of the channels relative to each other, volts: `jeit.inverse.relative_noise` of the reference,
-        multiplied, for channels that measure on `unlike_electrodes`, by the relative misfit of these electrodes."""
+        multiplied by the relative misfit of the electrode for channels that measure on `unlike_electrodes`."""
         noise = relative_noise(np.asarray(self.reference.voltages)[0], self.mask)
         is_reading = np.asarray(self.model.protocol.channel_measurement) != 0
         return as_array(noise * np.max(np.where(is_reading, self._electrode_weights, 1), axis=1))
@@ -126,7 +126,7 @@ class PreparedDifference:
     def unlike_electrodes(self) -> dict[int, float]:
         """Electrodes, numbered from 0, whose channels in the reference are fitted far worse than those of the other
         electrodes, each with the ratio of the misfits. Such electrodes may be loose or displaced, or their gain may
-        differ. Channels that measure on them have less weight."""
+        differ. Channels that measure on these electrodes have less weight."""
         return {
             int(electrode): float(self._electrode_weights[electrode])
             for electrode in np.flatnonzero(self._electrode_weights > 1)
@@ -336,7 +336,7 @@ def select_frames(
 
 
 def check_measurement(name: str, given: Measurement) -> None:
-    """Check that the argument `name` is a `Measurement`. Raises `ValueError` otherwise, such as for a path."""
+    """Raise `ValueError` if the argument `name` is not a `Measurement` but, for example, a path."""
     check_kind(name, given, Measurement, "a Measurement, as of jeit.read(path)")
 
 
@@ -367,7 +367,7 @@ def imaging_mesh(
 
 
 def check_real(measurement: Measurement) -> None:
-    """Check that voltages are real, for functions other than `image_difference`. Raises `ValueError` otherwise."""
+    """Raise `ValueError` if voltages are complex, for functions other than `image_difference`."""
     if np.iscomplexobj(measurement.voltages):
         raise ValueError(
             f"'{measurement.name}' is complex; choose the part to image with [data] component in its description: "

@@ -230,7 +230,7 @@ def _explained(
 
 def _has_one_sign(model: ForwardModel, measurement: Measurement) -> bool | None:
     """True if all voltages have one sign; False if they have the signs (or all opposite signs) of a uniform body with
-    the described wiring, which magnitudes are given when their file is read; None otherwise."""
+    the described wiring, which magnitudes are given when their file is read; None for other signs."""
     used = np.asarray(measurement.mask)[0]
     signs = np.sign(np.real(np.asarray(measurement.filled())[0]))[used]
     expected = np.sign(select_channels(on_host(model.protocol), _impedances(model)[0]))[used]

@@ -145,8 +145,8 @@ class Layout(Module):
     def sheet_discs(self, contact_impedance: ArrayLike | None = None) -> SheetDiscs:
         """Create the electrodes for a forward model on a sheet.
 
-        `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if it is
-        neither given nor known from the layout.
+        `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if the
+        contact impedance is neither given nor known from the layout.
         """
         impedance = self.contact_impedance if contact_impedance is None else contact_impedance
         if impedance is None:

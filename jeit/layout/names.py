@@ -28,12 +28,12 @@ def ring(
 
     **Arguments:**
 
-    - `radius`: of the circle, metres.
+    - `radius`: radius of the circle, metres.
     - `num_electrodes`: number L of electrodes.
     - `start_angle`: angle of the first electrode, radians counter-clockwise from +x (default: 12 o'clock).
     - `clockwise`: whether the electrodes follow each other clockwise.
-    - `centre` (x, y): of the circle, metres.
-    - `height`: z of all electrodes, metres.
+    - `centre` (x, y): centre of the circle, metres.
+    - `height`: z coordinate of all electrodes, metres.
 
     Raises `ValueError` for a radius that is not positive or fewer than two electrodes.
 
@@ -105,7 +105,7 @@ def grid(
 
     - `width`, `height`: distances between the outermost electrodes, metres.
     - `columns`, `rows`: numbers of electrodes along x and along y.
-    - `centre` (x, y): of the grid, metres.
+    - `centre` (x, y): centre of the grid, metres.
 
     Raises `ValueError` for sides that are not positive, and for fewer than one row or column.
 
@@ -200,9 +200,9 @@ def named_layout(name: str, outline: Domain | None = None, *, diameter: float = 
 
     - "park-inner" and "park-boundary": the two designs compared in text S4 of Park et al., Science Robotics 7, eabm7187
       (2022), for the default outline only. The coordinates of "park-inner" are not published; the paper states "as
-      evenly as possible in a square area" and "about 40 mm" apart. Here they are a centroidal Voronoi tessellation with
-      nearest neighbours 31 to 38 mm apart. The centres of "park-boundary" are 5 mm from the edge and 23.75 mm apart,
-      none in a corner, counter-clockwise from the lower left.
+      evenly as possible in a square area" and "about 40 mm" apart. Here the electrodes of "park-inner" form a
+      centroidal Voronoi tessellation with nearest neighbours 31 to 38 mm apart. The centres of "park-boundary" are 5 mm
+      from the edge and 23.75 mm apart, none in a corner, counter-clockwise from the lower left.
     - "grid-CxR": C columns and R rows; each electrode is in the centre of one of C × R equal rectangles that fill the
       bounding box of the skin.
     - "perimeter-N": N electrodes along the edge of a rectangle or a disk, with 2 mm of skin between the electrodes and

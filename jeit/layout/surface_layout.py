@@ -52,7 +52,8 @@ def spread(
     - `margin`: minimum distance of positions from the edge of the surface, metres.
     - `iterations`: maximum number of iterations.
 
-    Raises `ValueError` for fewer than one position, a margin that leaves no room, and as `Triangles.of` does.
+    Raises `ValueError` for fewer than one position, a margin that leaves no room for electrodes, and in the same cases
+    as `Triangles.of`.
 
     **Example:**
 
@@ -232,8 +233,8 @@ class SurfaceLayout(Module):
     def discs(self, contact_impedance: ArrayLike | None = None, *, sheet: bool = True) -> SurfaceDiscs | FaceDiscs:
         """Create the electrodes for a forward model of the surface as a `sheet`, or else of a layer on the surface.
 
-        `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if it is
-        neither given nor known from the layout.
+        `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if the
+        contact impedance is neither given nor known from the layout.
         """
         impedance = self.contact_impedance if contact_impedance is None else contact_impedance
         if impedance is None:
@@ -242,8 +243,8 @@ class SurfaceLayout(Module):
 
 
 def _check_apart(centres: np.ndarray, diameters: np.ndarray, labels: Sequence[str]) -> None:
-    """Raise `ValueError` for discs that overlap. Distances are straight lines, since between discs that overlap they
-    hardly differ from those along the surface."""
+    """Raise `ValueError` for discs that overlap. Distances between discs are straight, since for discs that overlap
+    they hardly differ from distances along the surface."""
     gaps = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
     np.fill_diagonal(gaps, np.inf)
     if gaps.min() < -_ROUNDING:

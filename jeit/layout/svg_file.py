@@ -162,7 +162,7 @@ def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
 
 
 def _closed_loop(element: ElementTree.Element, loop: np.ndarray, closed: bool) -> np.ndarray:
-    """Vertices of a loop without a repetition of the first. Raises `ValueError` if the loop is not closed."""
+    """Vertices of a loop without a repetition of the first vertex. Raises `ValueError` if the loop is not closed."""
     is_repeated = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-6 * np.ptp(loop))
     if not (closed or is_repeated):
         raise ValueError(f"{describe_element(element)} is not closed; close the skin's outline.")

@@ -145,8 +145,8 @@ def check_connected(first: np.ndarray, second: np.ndarray, num_cells: int) -> No
 
 
 def locate_tags(tags: Mapping[str, ArrayLike], facets: np.ndarray) -> dict[str, np.ndarray]:
-    """Convert the facets of each tag to indices (t,) into `facets`. Raises `ValueError` for a tag with other facets
-    than those in `facets`."""
+    """Convert the facets of each tag to indices (t,) into `facets`. Raises `ValueError` for a tag with a facet that is
+    not in `facets`."""
     located = {}
     for name, value in tags.items():
         if not isinstance(name, str) or not name:
@@ -205,8 +205,8 @@ def size_checked() -> Iterator[None]:
 def warn_large(extent: float, name: str, size_factor: float = 1.0, *, of_file: bool = False) -> None:
     """Warn if a length of `extent` metres is probably in another unit, because the object is too large.
 
-    `size_factor`: size of the object divided by this length; `of_file`: whether the length may come from a file, for
-    which the message suggests a scale. Inside `size_checked` there is no warning.
+    `size_factor`: size of the object divided by `extent`; `of_file`: whether the length may come from a file, for which
+    the message suggests a scale. Inside `size_checked` there is no warning.
     """
     if not size_factor * extent > LARGE or _SIZE_CHECKED.get():
         return

@@ -357,7 +357,7 @@ def _call_meshio(path: Path, action: Any, *, writing: bool = False) -> Any:
 
 
 def _shorten_message(error: BaseException | str) -> str:
-    """Shorten a message to one line."""
+    """Shorten an error message of meshio to one line."""
     message = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return message if len(message) <= _MAX_MESSAGE else f"{message[: _MAX_MESSAGE - 1]}…"
 

@@ -1,5 +1,5 @@
-"""Measures, centroids, normals and P1 gradients of cells and facets. They are differentiable in the points, and
-computed immediately if the points have values."""
+"""Measures, centroids, normals and P1 gradients of cells and facets. These quantities are differentiable with respect
+to the points, and are computed by NumPy unless JAX traces the points."""
 
 from __future__ import annotations
 

@@ -273,7 +273,7 @@ def box(
 
     - `width`, `depth`, `height`: lengths along x, y and z, metres.
     - `num_points`: number of nodes, met within about 10 % (default 4,000); or `cell_size`: edge length in metres.
-    - `num_layers`: number of layers along z, by default derived from these.
+    - `num_layers`: number of layers along z, by default derived from `num_points` or `cell_size`.
     - `refine`: as in `disk`, as seen from above.
 
     Raises `ValueError` for invalid or contradictory arguments.
@@ -312,7 +312,7 @@ def cylinder(
 
     - `radius`, `height`: in metres.
     - `num_points`: number of nodes, met within about 10 % (default 4,000); or `cell_size`: edge length in metres.
-    - `num_layers`: number of layers along z, by default derived from these.
+    - `num_layers`: number of layers along z, by default derived from `num_points` or `cell_size`.
     - `refine`, `num_boundary`, `boundary_points` (angles): as in `disk`, as seen from above.
 
     Raises `ValueError` for invalid or contradictory arguments.

@@ -21,7 +21,7 @@ def cell_facets(cells: np.ndarray) -> np.ndarray:
 
 
 def facet_keys(facets: np.ndarray, num_points: int) -> np.ndarray:
-    """One integer per facet, independent of the order of its nodes."""
+    """One integer per facet that identifies it, independent of the order of its nodes."""
     key = np.zeros(len(facets), dtype=np.int64)
     for column in np.sort(facets.astype(np.int64), axis=1).T:
         key = key * num_points + column
@@ -119,7 +119,7 @@ _PAIRS_PER_BATCH = 250_000
 
 
 def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray:
-    """Check that vertices (k, 2) form a simple loop, and orient it as requested, keeping the first vertex. Raises
+    """Check that vertices (k, 2) form a simple loop, and orient the loop as requested, keeping the first vertex. Raises
     `ValueError` unless the vertices form a simple loop."""
     try:
         loop = np.asarray(vertices, dtype=float)
@@ -215,8 +215,8 @@ def _intersecting_sides(first: np.ndarray, second: np.ndarray, tolerance: float)
 
 
 def _intersects(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, tolerance: float) -> np.ndarray:
-    """Whether each segment from a to b crosses the segment from c to d or comes within `tolerance` of it; all (p,
-    2)."""
+    """Whether each segment from a to b crosses the segment from c to d or comes within `tolerance` of it; `a` to `d`:
+    end points (p, 2)."""
     is_crossing = (_signed_area_of_corner(a, b, c) * _signed_area_of_corner(a, b, d) < 0) & (
         _signed_area_of_corner(c, d, a) * _signed_area_of_corner(c, d, b) < 0
     )

@@ -139,8 +139,8 @@ class ColourScale(Module):
     - `difference`: whether values are changes, drawn with a diverging colour map centred at zero; otherwise, they are
       drawn with a perceptually uniform sequential colour map from the minimum to the maximum.
     - `quantity`: label of the colour bar; default: conductivity or its change.
-    - `unit`: unit of the values, "" for none; default: that of conductivity ("S" for a sheet, "S/m" for a body). The
-      colour bar adds an SI prefix.
+    - `unit`: unit of the values, "" for none; default: the unit of conductivity ("S" for a sheet, "S/m" for a body).
+      The colour bar adds an SI prefix.
     - `limit`: value at the end of the colour bar, in `unit`; default: the maximum magnitude.
     - `colour_map`: name of a matplotlib colour map to use instead of these colour maps.
     - `bar`: whether to draw the colour bar.
@@ -210,7 +210,7 @@ class FittedScale(Module):
 
 
 def check_scale(scale: ColourScale) -> None:
-    """Check that `scale` is a `ColourScale`. Raises `ValueError` otherwise."""
+    """Raise `ValueError` if `scale` is not a `ColourScale`."""
     check_kind("scale", scale, ColourScale, "a ColourScale, such as ColourScale(colour_map='viridis')")
 
 

@@ -91,7 +91,7 @@ def describe_electrodes(electrodes: AbstractElectrodes | None) -> dict[str, Any]
 
 
 def version_of(package: str) -> str | None:
-    """Version of an installed package; None if it is not installed."""
+    """Version of an installed package; None if the package is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

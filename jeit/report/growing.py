@@ -93,7 +93,7 @@ class GrowingRows:
                     np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
 
     def _blocks(self) -> Iterator[tuple[float, bytes]]:
-        """Blocks of the file, each with the share of the file that has been read with it."""
+        """Yield the file of rows in blocks, each with the share of the file that has been read up to its end."""
         size = self._file.seek(0, os.SEEK_END)
         self._file.seek(0)
         while block := self._file.read(_BLOCK_BYTES):

@@ -290,7 +290,8 @@ def _inclusion_report(result: ImagedDifference, inclusion: Inclusion) -> dict[st
 
 
 def _interval_report(inclusion: Inclusion) -> dict[str, Any]:
-    """68 % intervals of the estimated properties of a body, None at an open end; empty if none were estimated."""
+    """68 % intervals of the estimated properties of a body, None at an open end; empty if no intervals were
+    estimated."""
     if inclusion.contrast_interval is None:
         return {}
     return {
@@ -311,7 +312,8 @@ def _size_report(inclusion: Inclusion) -> dict[str, Any]:
 
 
 def _shapes_report(result: ImagedDifference) -> dict[str, Any] | None:
-    """Report of fitted bodies with their outlines, and of bodies left out as artefacts; None if none were fitted."""
+    """Report of fitted bodies with their outlines, and of bodies left out as artefacts; None if no bodies were
+    fitted."""
     if result.shapes is None:
         return None
     body_reports, left_out_reports = (

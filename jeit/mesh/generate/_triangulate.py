@@ -184,7 +184,7 @@ def improvable(front: Front, cells: np.ndarray) -> np.ndarray:
 
 
 def missing_segments(front: Front, cells: np.ndarray, num_points: int) -> np.ndarray:
-    """Indices of the outline segments that are not an edge of any cell."""
+    """Indices of the outline segments that are not edges of cells."""
     edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]]).astype(np.int64)
     segments = front.segments().astype(np.int64)
     is_present = np.isin(segments[:, 0] * num_points + segments[:, 1], edges[:, 0] * num_points + edges[:, 1])
@@ -390,7 +390,8 @@ def smooth(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
 def generate(
     curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size, front: Front | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mesh the region inside the first of `curves` and outside the others: points (n, 2) and cells (m, 3).
+    """Mesh the region inside the first of `curves` and outside the other curves, which are holes: points (n, 2) and
+    cells (m, 3).
 
     `stops` are arc lengths on each curve, and `fixed` points (f, 2) inside, at which nodes are placed; `size` returns
     the requested edge length at points (p, 2). If a `front` already filled for this size is given, the steps

@@ -91,7 +91,7 @@ def closed_line(vertices: np.ndarray) -> Curve:
 
 
 def is_within(curves: list[Curve], points: np.ndarray) -> np.ndarray:
-    """Whether points lie inside the first curve and outside the others, which are holes."""
+    """Whether points lie inside the first curve and outside all other curves, which are holes."""
     result = np.zeros(len(points), bool)
     for curve in curves:
         result ^= curve.inside(points)

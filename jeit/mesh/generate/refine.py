@@ -138,8 +138,8 @@ class SizeField:
     """Requested edge length at any point, for a given background cell size."""
 
     def __init__(self, curves: list[Curve], refine: Refinement, required_nodes: np.ndarray, spacing: np.ndarray):
-        """`required_nodes` (k, 2): positions where nodes must be; `spacing` (k,): distance of each of them to its
-        nearest neighbour or side.
+        """`required_nodes` (k, 2): positions where nodes must be; `spacing` (k,): distance of each of these nodes to
+        the nearest other node or side.
 
         Raises `ValueError` if `refine` contains anything but `Refine` objects.
         """

@@ -44,8 +44,8 @@ class Target:
 
     @staticmethod
     def create(num_points: int | None, cell_size: float | None) -> Target:
-        """Create a target from the two arguments of a mesh function. Raises `ValueError` if both are given or one is
-        out of range."""
+        """Create a target from the two arguments of a mesh function. Raises `ValueError` if both arguments are given or
+        one is out of range."""
         if num_points is not None and cell_size is not None:
             raise ValueError("num_points, cell_size: give one of the two, not both.")
         if cell_size is not None:
@@ -91,7 +91,7 @@ def mesh_within(
     boundary_points: ArrayLike | None = None,
     interior_points: ArrayLike | None = None,
 ) -> Mesh:
-    """Mesh the region inside the first of `curves` and outside the others; its area is `area` m².
+    """Mesh the region of `area` m² inside the first of `curves` and outside the other curves, which are holes.
 
     Nodes are placed at `boundary_points`, arc lengths (k,) in metres on the first curve, and at `interior_points` (k,
     2) in metres. Raises `ValueError` for invalid or contradictory arguments.
@@ -210,8 +210,8 @@ def _interior_samples(curves: list[Curve]) -> np.ndarray:
 
 
 def _estimate_num_nodes(curves: list[Curve], size: Size, area: float) -> float:
-    """Estimate the number of nodes of a mesh with this size function, from samples inside the domain and along its
-    outline."""
+    """Estimate the number of nodes of a mesh whose cell sizes are given by the function `size`, from samples inside the
+    domain and along its outline."""
     num_nodes = area * float(np.mean(1.0 / size(_interior_samples(curves)) ** 2))
     for curve in curves:
         num_nodes += curve.length * float(np.mean(1.0 / size(curve.at(np.linspace(0, curve.length, 400)))))

@@ -94,7 +94,7 @@ class Geodesics(Module):
         limit: float = np.inf,
     ) -> Float[np.ndarray, "s p"]:
         """Geodesic distances (s, p), metres, from `sources` (s, 3) to `targets` (p, 3), or (s, n) to all nodes if there
-        are no targets. Points off the surface are projected to the nearest point on it.
+        are no targets. Points off the surface are replaced by the nearest points on the surface.
 
         Distances beyond `limit`, metres, and between disconnected parts are infinite. Raises `ValueError` for points
         farther from the surface than a quarter of its extent.
@@ -145,7 +145,8 @@ class Geodesics(Module):
         return lengths
 
     def owners(self, sources: ArrayLike | SurfacePlaces) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """For each node, the index of the nearest of the `sources` (s, 3) and the geodesic distance to it, metres."""
+        """For each node, the index of the nearest of the `sources` (s, 3) and the geodesic distance to this source,
+        metres."""
         source_places = sources if isinstance(sources, SurfacePlaces) else self.surface.nearest(sources)
         nodes = self.surface.cells[source_places.triangle]
         length = np.linalg.norm(self.surface.points[nodes] - source_places.points[:, None], axis=-1)

@@ -177,7 +177,8 @@ def _transforms_across_sides(plane_corners, opposite):
 
 def _compose_transforms(previous, turn, shift):
     """Compose the rotations and translations along the path from each triangle to the root. `previous` (L, m): next
-    triangle on that path. Returns the rotation and translation for the whole path, and the triangle where it ends."""
+    triangle on the path from each triangle. Returns the rotation and translation for the whole path, and the triangle
+    where it ends."""
     xp = namespace(previous, turn)
     row = xp.arange(len(previous))[:, None]
     for _ in range(_MAX_DOUBLINGS):

@@ -294,8 +294,8 @@ def _path_along_edges(points, edges, ends, cut, border) -> list[int]:
 
 
 def _split_along_path(cells, path: list[int], num_nodes: int, *, is_closed: bool):
-    """Duplicate the nodes along a path for the triangles on one side of it. On a closed surface, the ends of the path
-    are not duplicated."""
+    """Duplicate the nodes along a path for the triangles on one side of the path. On a closed surface, the ends of the
+    path are not duplicated."""
     doubled_nodes = path[1:-1] if is_closed else path
     path_edges = set(itertools.pairwise(path))
     path_nodes = set(path)

@@ -19,7 +19,7 @@ from jeit_solvers.module import Module
 
 
 class Body(Module):
-    """Base of all bodies: plane outlines (`Domain`), solids above an outline (`Solid`), and given meshes
+    """Base class of all bodies: plane outlines (`Domain`), solids above an outline (`Solid`), and given meshes
     (`OwnMesh`).
 
     **Example:**
@@ -118,7 +118,7 @@ class Domain(Body):
     def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
         """Distance (p,) of `points` (p, 2) from the edge in metres, negative outside.
 
-        It is differentiable almost everywhere; within 1e-12 m of the edge it is smoothed.
+        The distance is differentiable almost everywhere; within 1e-12 m of the edge it is smoothed.
         """
 
     @abc.abstractmethod
@@ -151,8 +151,8 @@ def numerics(*values: Any) -> Any:
 
 def check_length(name: str, value: Any, size_factor: float = 1.0) -> Any:
     """Check a length in metres and convert it to a float; traced values are returned unchanged. Raises `ValueError`
-    unless the length is positive, and warns if the object is large: `size_factor` is the object's size divided by this
-    length."""
+    unless the length is positive, and warns if the object is large: `size_factor` is the object's size divided by
+    `value`."""
     if not has_values(value):
         return value
     try:

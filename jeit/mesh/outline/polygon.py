@@ -40,7 +40,8 @@ class Polygon(Domain):
     holes: tuple[Float[Array, "h 2"], ...]
 
     def __init__(self, vertices: ArrayLike, holes: Sequence[ArrayLike] = ()):
-        """`vertices` (k, 2) of the outline and of each of `holes`, in order, in metres, the first vertex not repeated.
+        """`vertices` (k, 2) of the outline and of each of `holes`, in order, in metres, without a repetition of the
+        first vertex.
 
         Either orientation is accepted; the outline is stored counter-clockwise, holes clockwise. Raises `ValueError`
         for fewer than three vertices, repeated vertices, an outline that crosses or touches itself, and holes that are

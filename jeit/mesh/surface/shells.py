@@ -199,7 +199,7 @@ def _fold_positions(positions: np.ndarray, corners: np.ndarray, bent_axis: int, 
 def _cut_cells(
     points: np.ndarray, cells: np.ndarray, edges: dict[str, np.ndarray], height: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Cut cells and named edges along a line; `height` (n,) are the signed distances of the nodes from it."""
+    """Cut cells and named edges along a line; `height` (n,): signed distances of the nodes from the line."""
     side = np.where(np.abs(height) <= _LINE_TOLERANCE * np.ptp(height), 0, np.sign(height)).astype(int)
     sides = side[cells]
     is_crossed = (sides.min(axis=1) < 0) & (sides.max(axis=1) > 0)
@@ -288,8 +288,7 @@ def shell(
     - `thickness`: in metres.
     - `num_layers`: number of layers of prisms.
     - `outward`: whether the skin extends outward from the surface, or else inward.
-    - `normals` (n, 3): unit vectors at the nodes, if more accurate ones than those of `jeit.mesh.node_normals` are
-      known.
+    - `normals` (n, 3): unit normals at the nodes; default: `jeit.mesh.node_normals`, which may be less accurate.
 
     Raises `ValueError` for a mesh that is not a surface in space, a thickness that is not positive, no layers, a shell
     that intersects itself, and a thickness at which prisms turn inside out, as they do beyond the radius of curvature;

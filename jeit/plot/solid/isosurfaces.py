@@ -86,7 +86,7 @@ def plot_isosurfaces(
     - `values`: per cell (m,) or per node (n,); changes of conductivity in S/m, or as described by `scale`.
     - `electrodes`: drawn on the body and numbered.
     - `levels`: shares between 0 and 1. The surface of the highest level is opaque, others are translucent. A sign whose
-      maximum is less than 0.3 of that of the other sign is left out. For absolute images (see
+      maximum change is less than 0.3 of that of the opposite sign is left out. For absolute images (see
       `ColourScale.difference`), levels are fractions of the range from minimum to maximum.
     - `inclusions`: drawn as their sign and the outline of their form, or of a ball of their volume.
     - `camera`: direction of view.
@@ -182,8 +182,8 @@ def level_surfaces(
 
 
 def check_levels(levels: Sequence[float]) -> list[float]:
-    """Check the levels of isosurfaces, and return them as a list. Raises `ValueError` unless they are between 0 and
-    1."""
+    """Check the levels of isosurfaces, and return them as a list. Raises `ValueError` for a level that is not between 0
+    and 1."""
     shares: Float[np.ndarray, " k"] | Sequence = np.atleast_1d(np.asarray(levels, dtype=object))
     if len(shares) == 0 or not all(is_number(level) and 0 < level < 1 for level in shares):
         level_texts = ", ".join(describe(level) for level in shares[:4]) or "none"

@@ -83,7 +83,7 @@ def plot_slices(
     **Arguments:**
 
     - `mesh`, `values`, `electrodes`, `inclusions`, `scale`: as for `plot_slice`.
-    - `axis`: "x", "y" or "z"; the slices are perpendicular to it.
+    - `axis`: "x", "y" or "z"; the slices are perpendicular to this axis.
     - `at`: number of slices, evenly spaced over the body, or their coordinates on the axis in metres.
     - `figure`: the figure to draw in; default: a new one.
 
