@@ -56,7 +56,7 @@ class PointElectrodes(AbstractPointElectrodes):
         return {"position": self.position}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Draw dots."""
+        """Draw each electrode as a dot."""
         for place in np.asarray(self.position):
             pen.dot(place)
 
@@ -66,7 +66,7 @@ class PointElectrodes(AbstractPointElectrodes):
 
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
-        """Values of the basis functions at the electrodes as `load` (n, L), with zero mass."""
+        """Values of the n basis functions at the L electrodes as `load` (n, L) of the contact, with zero mass."""
         cell, weights, _ = _locate(self.position, mesh)
         index = mesh.cells[cell], np.arange(self.num_electrodes)[:, None]
         load = sum_into((mesh.num_points, self.num_electrodes), index, weights)
@@ -135,7 +135,7 @@ class NodeElectrodes(AbstractPointElectrodes):
         return {}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Draw dots."""
+        """Draw each electrode as a dot."""
         for place in np.asarray(mesh.points)[np.asarray(self.nodes)]:
             pen.dot(place)
 

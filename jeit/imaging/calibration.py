@@ -55,7 +55,7 @@ def calibrated_model(
     - `base`: a frame of the undisturbed body.
     - `contact`: "each", "common" or "fixed"; default: `default_contact`, or "common" if the data do not determine the
       contact impedance of each electrode.
-    - `clock`: measures the duration of each step.
+    - `clock`: timer that measures the duration of each step.
 
     Raises `ValueError` if the calibration fails.
 

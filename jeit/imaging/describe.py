@@ -154,7 +154,7 @@ def find_description(
     - `keys`: names of the arrays of frames in the file and in the reference, for files with several arrays.
     - `known`: known entries of the table `[protocol]`, such as the kind or the number of electrodes.
     - `current`: amplitude of the driven current, amperes.
-    - `progress`: called with the name of each step when it begins.
+    - `progress`: function called with the name of each step when the step begins.
 
     Raises `ValueError` for files that cannot be read, for several arrays if none is named, and if no protocol fits.
 

@@ -314,7 +314,7 @@ def image_difference(
       named "reference".
     - `settings`: default: `ImagingSettings()`.
     - `frame`: number (from 0) or name of the frame to image; default: the first.
-    - `progress`: called with the name of each step when it begins.
+    - `progress`: function called with the name of each step when the step begins.
 
     Raises `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`) or lack the positions of the
     electrodes, and for arguments of another type, such as the path of a file.

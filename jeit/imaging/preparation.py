@@ -237,7 +237,7 @@ def prepare_difference(
     - `measurement`, `reference`, `frame`: as in `image_difference`.
     - `contact`, `num_points`: as in `ImagingSettings`.
     - `as_is`: image even if the wiring seems to differ from its description, and leave spikes in place.
-    - `clock`: measures the duration of each step.
+    - `clock`: timer that measures the duration of each step.
 
     Raises `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`) or lack the positions of the
     electrodes, if the calibration fails, and, unless `as_is`, if the wiring differs from its description or from that

@@ -88,7 +88,7 @@ def image_sequence(
     - `regions`: regions of interest by name, each a function of the mesh, such as `lambda mesh:
       jeit.image.ball_region(mesh, (0, 0), 0.01)`. These functions are called before imaging, so that their errors are
       raised early.
-    - `progress`: called with the name of each step when it begins.
+    - `progress`: function called with the name of each step when the step begins.
 
     Spikes in single channels are replaced by what other channels determine (`jeit.data.mask_spikes`).
     Channels missing in more than half of the frames are not used; frames that lack any other channel are refused. The

@@ -92,7 +92,7 @@ def prepare_imager(
     - `reference`: frames of the undisturbed sensor.
     - `settings`: default: `StreamSettings()`.
     - `measurement`: the frames to image, if they are available; their protocol must be that of the reference.
-    - `progress`: called with the name of each step when it begins.
+    - `progress`: function called with the name of each step when the step begins.
 
     Raises `ValueError` if the protocols differ, and in the same cases as `image_difference`.
 

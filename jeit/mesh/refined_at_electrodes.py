@@ -32,7 +32,7 @@ def graded_box(outline: Rectangle, height: float, planes: Sequence[Float[np.ndar
     """Mesh of a box above a rectangle, from z = 0 up, with about `num_points` nodes and with cell faces in the given
     `planes`: positions along x, y and z.
 
-    Tags are those of `jeit.mesh.box`.
+    The mesh has the tags of `jeit.mesh.box`.
     """
     x_min, x_max, y_min, y_max = outline.extent
     ends = [(x_min, x_max), (y_min, y_max), (0.0, height)]
@@ -56,8 +56,8 @@ def graded_layers(
     outline: Domain, height: float, planes: Float[np.ndarray, " k"], rims: Float[np.ndarray, "p 2"], num_points: int
 ) -> Mesh:
     """Mesh of a solid above any outline, with thin layers at the heights `planes` and small cells at `rims`, points (p,
-    2) on the rims of electrodes, seen from above. Those of `rims` that lie on the edge of a disk become nodes. Tags are
-    those of `jeit.mesh.layer`."""
+    2) on the rims of electrodes, seen from above. Points of `rims` on the edge of a disk become nodes. The mesh has the
+    tags of `jeit.mesh.layer`."""
     stops = _distinct_positions(planes, 0.0, height)
     area = float(outline.area)
 

@@ -35,9 +35,9 @@ def disk(
 
     **Arguments:**
 
-    - `radius`: in metres.
+    - `radius`: radius of the disk in metres.
     - `num_points`: number of nodes, met within about 5 % (default 1,200); or `cell_size`: edge length in metres.
-    - `centre` (x, y): in metres.
+    - `centre` (x, y): centre of the disk in metres.
     - `refine`: one or several `Refine`, or a function that takes points (p, 2) and returns the requested edge lengths
       there (p,) in metres, which are scaled by a common factor if `num_points` is given.
     - `num_boundary`: number of nodes on the circle; the cells grow from the circle inwards.
@@ -190,7 +190,7 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
     **Arguments:**
 
     - `mesh`: a plane mesh.
-    - `thickness`: in metres.
+    - `thickness`: thickness of the plate in metres.
     - `num_layers`: number of layers of prisms.
     - `heights` (num_layers + 1,): heights of the nodes in metres, from 0 to the thickness, instead of equal layers.
 
@@ -274,7 +274,7 @@ def box(
     - `width`, `depth`, `height`: lengths along x, y and z, metres.
     - `num_points`: number of nodes, met within about 10 % (default 4,000); or `cell_size`: edge length in metres.
     - `num_layers`: number of layers along z, by default derived from `num_points` or `cell_size`.
-    - `refine`: as in `disk`, as seen from above.
+    - `refine`: local refinement as in `disk`, at positions seen from above.
 
     Raises `ValueError` for invalid or contradictory arguments.
 
@@ -310,10 +310,10 @@ def cylinder(
 
     **Arguments:**
 
-    - `radius`, `height`: in metres.
+    - `radius`, `height`: radius and height of the cylinder in metres.
     - `num_points`: number of nodes, met within about 10 % (default 4,000); or `cell_size`: edge length in metres.
     - `num_layers`: number of layers along z, by default derived from `num_points` or `cell_size`.
-    - `refine`, `num_boundary`, `boundary_points` (angles): as in `disk`, as seen from above.
+    - `refine`, `num_boundary`, `boundary_points` (angles): as in `disk`, at positions seen from above.
 
     Raises `ValueError` for invalid or contradictory arguments.
 

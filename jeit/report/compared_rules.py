@@ -97,7 +97,7 @@ def write_choice(result: ComparedRules, folder: str | Path) -> None:
     **Arguments:**
 
     - `result`: the comparison.
-    - `folder`: created if needed.
+    - `folder`: folder of the files, created if needed.
 
     Raises `ValueError` for a path that cannot be a folder.
 

@@ -52,7 +52,7 @@ def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[fl
     **Arguments:**
 
     - `result`: the image.
-    - `folder`: created if needed.
+    - `folder`: folder of the files, created if needed.
     - `truth` (x, y): a known position in metres, marked in the picture of a sheet.
 
     **Example:**

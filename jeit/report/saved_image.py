@@ -280,7 +280,7 @@ def write_views(
     **Arguments:**
 
     - `image`: the image.
-    - `folder`: created if needed.
+    - `folder`: folder of the files, created if needed.
     - `camera`: direction of view.
     - `levels`: isosurfaces, as in `jeit.plot.plot_isosurfaces`.
     - `planes`: planes of sections.

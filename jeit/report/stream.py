@@ -63,13 +63,13 @@ def write_stream(
 
     - `images`: images of `jeit.inverse.stream`.
     - `calibration`: calibration of the imager of these images (see `jeit.imaging.prepare_imager`).
-    - `folder`: created if needed.
+    - `folder`: folder of the files, created if needed.
     - `name`: name of the stream, for error messages.
     - `film`: name of the film's file, ending in .gif or, if ffmpeg is installed, .mp4; None for no film.
     - `rate`: frames per second, for titles with times instead of frame numbers, and for the pace of the film.
-    - `progress`: called with every image.
-    - `drawing`: called at the end with the step, "images" or one of `PICTURES`, sometimes followed by a colon and the
-      progress. If `drawing` raises an error, the files written so far remain.
+    - `progress`: function called with every image.
+    - `drawing`: function called at the end with the step, "images" or one of `PICTURES`, sometimes followed by a colon
+      and the progress. If `drawing` raises an error, the files written so far remain.
 
     `frames.csv` has the place in metres and the value, S (3-D: S/m), of the maximum change of each image; both are
     empty for unchanged frames. `images.npz` has `conductivity` (frames, cells), NaN for refused frames, `background`,

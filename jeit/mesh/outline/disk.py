@@ -25,8 +25,8 @@ class Disk(Domain):
 
     **Arguments:**
 
-    - `radius`: in metres, positive.
-    - `centre` (x, y): in metres.
+    - `radius`: radius in metres, positive.
+    - `centre` (x, y): centre in metres.
 
     **Example:**
 

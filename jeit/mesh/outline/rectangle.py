@@ -26,7 +26,7 @@ class Rectangle(Domain):
     **Arguments:**
 
     - `width`, `height`: lengths along x and along y, metres, positive.
-    - `centre` (x, y): in metres.
+    - `centre` (x, y): centre in metres.
 
     **Example:**
 

@@ -285,7 +285,7 @@ def shell(
     **Arguments:**
 
     - `surface`: a surface in space.
-    - `thickness`: in metres.
+    - `thickness`: thickness of the skin in metres.
     - `num_layers`: number of layers of prisms.
     - `outward`: whether the skin extends outward from the surface, or else inward.
     - `normals` (n, 3): unit normals at the nodes; default: `jeit.mesh.node_normals`, which may be less accurate.

@@ -38,7 +38,7 @@ def tube(
 
     **Arguments:**
 
-    - `radius`, `height`: in metres.
+    - `radius`, `height`: radius and height of the tube in metres.
     - `num_points`: number of nodes, met within about 5 % (default 1,200); or `cell_size`: edge length in metres; or
       `num_around`: number of nodes around the tube.
 
@@ -71,7 +71,7 @@ def forearm(
 
     **Arguments:**
 
-    - `length`: in metres.
+    - `length`: length of the sleeve in metres.
     - `wrist`, `elbow`: radius of a circular section in metres, or semi-axes (along x, along y) of an elliptical one.
     - `num_points`, `cell_size`, `num_around`: as in `tube`.
 
@@ -179,7 +179,7 @@ def sphere(radius: float, *, num_points: int | None = None, cell_size: float | N
 
     **Arguments:**
 
-    - `radius`: in metres.
+    - `radius`: radius of the sphere in metres.
     - `num_points`: number of nodes (default 1,200); or `cell_size`: edge length in metres.
 
     Raises `ValueError` for invalid or contradictory arguments.

@@ -46,7 +46,7 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
 
     - `choices`: a `jeit.inverse.Choice`, or several by name, as from `jeit.inverse.compare_rules`.
     - `title`: title of the plot.
-    - `ax`: axes to draw in; default: new ones.
+    - `ax`: axes to draw in; default: new axes.
 
     Raises `ValueError` for hyperparameters that were given as numbers, which have no curve, and for objects that are
     not choices.

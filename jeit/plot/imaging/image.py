@@ -41,9 +41,9 @@ def plot_mesh(
     **Arguments:**
 
     - `mesh`: the mesh.
-    - `electrodes`: drawn to scale and numbered.
+    - `electrodes`: electrodes, which are drawn to scale and numbered.
     - `title`: title of the plot.
-    - `ax`: axes to draw in; default: new ones.
+    - `ax`: axes to draw in; default: new axes.
 
     Raises `ValueError` for arguments of another type, and for a surface in space.
 
@@ -121,14 +121,14 @@ def plot_image(
     **Arguments:**
 
     - `mesh`: a plane mesh, or a solid, of which a slice is drawn.
-    - `values`: per cell (m,) or, interpolated, per node (n,).
-    - `electrodes`: drawn to scale and numbered.
-    - `inclusions`: marked by their sign and a circle.
+    - `values`: values to draw, per cell (m,) or, interpolated, per node (n,).
+    - `electrodes`: electrodes, which are drawn to scale and numbered.
+    - `inclusions`: inclusions, which are marked by their sign and a circle.
     - `scale`: colour scale; default: for changes of conductivity in S (3-D: S/m). For conductivity itself, use
       `ColourScale(difference=False)`.
     - `height`: z in metres of the slice through a 3-D mesh; default: half the height.
     - `title`: title of the plot.
-    - `ax`: axes to draw in; default: new ones.
+    - `ax`: axes to draw in; default: new axes.
 
     Raises `ValueError` for values that have another shape, are complex or not finite, for a height outside the mesh,
     and for arguments of another type.

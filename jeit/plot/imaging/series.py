@@ -131,7 +131,7 @@ def plot_frames(
 
     - `mesh`, `electrodes`: as for `plot_image`.
     - `changes` (F, m): changes of conductivity, S (3-D: S/m, drawn at half the height); rows of NaN are refused frames.
-    - `titles`: one per frame; default: the numbers of the frames from 0.
+    - `titles`: one title per frame; default: the numbers of the frames from 0.
     - `scale`: colour scale; default: for changes of conductivity.
     - `most`: maximum number of frames on the sheet.
     - `count`: counts of all frames, if `changes` has only some of them.

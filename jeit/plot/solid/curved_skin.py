@@ -39,7 +39,7 @@ def plot_curved_skin(
     **Arguments:**
 
     - `layout`: the skin.
-    - `values`: one per triangle or per node of `layout.surface`; without values, the surface is grey.
+    - `values`: one value per triangle or per node of `layout.surface`; without values, the surface is grey.
     - `marks`: points (p, 3) in metres by name in the legend, drawn at the nearest points of the surface. Points hidden
       by the surface are left out.
     - `camera`: direction of view.

@@ -83,15 +83,15 @@ def plot_isosurfaces(
     **Arguments:**
 
     - `mesh`: a mesh of tetrahedra.
-    - `values`: per cell (m,) or per node (n,); changes of conductivity in S/m, or as described by `scale`.
-    - `electrodes`: drawn on the body and numbered.
+    - `values`: values per cell (m,) or per node (n,); changes of conductivity in S/m, or as described by `scale`.
+    - `electrodes`: electrodes, which are drawn on the body and numbered.
     - `levels`: shares between 0 and 1. The surface of the highest level is opaque, others are translucent. A sign whose
       maximum change is less than 0.3 of that of the opposite sign is left out. For absolute images (see
       `ColourScale.difference`), levels are fractions of the range from minimum to maximum.
-    - `inclusions`: drawn as their sign and the outline of their form, or of a ball of their volume.
+    - `inclusions`: inclusions, drawn as their sign and the outline of their form, or of a ball of their volume.
     - `camera`: direction of view.
     - `scale`: colour scale; default: for changes of conductivity in S/m.
-    - `ax`: axes to draw in; default: new ones.
+    - `ax`: axes to draw in; default: new axes.
 
     Raises `ValueError` for values of another shape, levels out of range, a mesh that is not a solid, and arguments of
     another type.

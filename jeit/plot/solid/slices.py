@@ -41,11 +41,11 @@ def plot_slice(
     **Arguments:**
 
     - `mesh`: a mesh of tetrahedra.
-    - `values`: per cell (m,), or per node (n,), which are averaged in each cell; changes of conductivity in S/m, or as
-      described by `scale`. The colour scale is fitted to the whole body.
+    - `values`: values per cell (m,), or values per node (n,), which are averaged in each cell; changes of conductivity
+      in S/m, or as described by `scale`. The colour scale is fitted to the whole body.
     - `plane`: the plane.
-    - `electrodes`: drawn where the plane intersects them.
-    - `inclusions`: drawn as the section of their form, or of a ball of their volume.
+    - `electrodes`: electrodes, which are drawn where the plane intersects them.
+    - `inclusions`: inclusions, drawn as the section of their form, or of a ball of their volume.
     - `scale`, `ax`: as for `plot_isosurfaces`.
 
     Raises `ValueError` for a plane that misses the body, values of another shape, and arguments of another type.
