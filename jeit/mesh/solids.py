@@ -76,8 +76,8 @@ def rectangle(
 ) -> Mesh:
     """Mesh a rectangle.
 
-    Without refinement the mesh consists of rows of nearly equilateral cells. Node 0 is the lower left corner. The sides
-    are tagged 'left', 'right', 'bottom', 'top'.
+    Without refinement or required nodes, the mesh consists of rows of nearly equilateral cells. Node 0 is the lower
+    left corner. The sides are tagged 'left', 'right', 'bottom', 'top'.
 
     **Arguments:**
 
