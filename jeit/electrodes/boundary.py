@@ -36,9 +36,9 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
     polygon. The integrals over partly covered edges are polynomials in the two end points of the electrode, so they are
     exact and differentiable in position and width.
 
-    **Fields**: `position` (L, 2): metres, projected to the nearest boundary edge; `width` (L,): metres;
-    `contact_impedance` (L,): ohm·m (for a sheet, the contact impedance in ohm·m² divided by the thickness of the
-    sheet).
+    **Fields**: `position` (L, 2): positions of the L electrodes, metres, projected to the nearest boundary edge;
+    `width` (L,): metres; `contact_impedance` (L,): ohm·m (for a sheet, the contact impedance in ohm·m² divided by the
+    thickness of the sheet).
 
     **Example:**
 
@@ -53,8 +53,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, width: ArrayLike, contact_impedance: ArrayLike):
-        """`width` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
-        values."""
+        """`width` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for values
+        that are not positive and for positions that are not finite."""
         self.position = as_positions(position, (2,))
         self.width = as_electrode_values("width", width, len(self.position), unit="metres")
         self.contact_impedance = as_electrode_values(
@@ -62,7 +62,7 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         )
 
     def geometry(self) -> dict[str, Array]:
-        """Positions and widths."""
+        """Positions and widths of the electrodes, metres."""
         return {"position": self.position, "width": self.width}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
@@ -76,7 +76,7 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
 
         Example: with 32 electrodes that cover a fraction of 0.73 of a disk's boundary, z·σ = 1e-4 radii and 2,000
         nodes, the error of adjacent voltages is 3 %; with cells of half the size at the middles of the electrodes
-        instead, it is 57 %.
+        instead, the error is 57 %.
         """
         edge = body.loops(720)[0]
         centres, half_width = along(np.asarray(self.position), np.asarray(edge)), np.asarray(self.width) / 2
@@ -92,7 +92,7 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         return (tangents / np.linalg.norm(tangents, axis=1, keepdims=True))[:, None]
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
-        """The boundary edges of `mesh`."""
+        """Nodes of the boundary edges of `mesh`."""
         return (mesh.facets,)
 
     @values_at_once
@@ -108,8 +108,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         phi_start = 1 - phi_end
         weights = (end - start) * np.array([1.0, 4.0, 1.0], start.dtype)[:, None, None, None] / 6
 
-        # The sum over the turns, (b, L), is explicit, because XLA converts a sum over such a short axis into a slow
-        # matrix product.
+        # The sum over the turns around the loop, (b, L), is explicit, because XLA converts a sum over such a short axis
+        # into a slow matrix product.
         def integral(values):
             values = weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2]
             return values[0] + values[1] + values[2]
@@ -123,7 +123,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for electrodes that lie off the boundary, are wider than it, or overlap."""
+        """Raise `ValueError` for electrodes that lie off the boundary, are wider than the boundary is long, or
+        overlap."""
         check_dimension("BoundaryElectrodes", mesh, 2)
         if not has_values(self.position, self.width, mesh):
             return
@@ -153,7 +154,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
 
 
 def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs of electrodes that cover a common part of an edge, given the covered intervals (3, b, L) of each edge."""
+    """Pairs of electrodes that cover a common part of an edge, given the `start` and `end` (3, b, L) of the intervals
+    of the b edges that they cover, see `_covered_intervals`."""
     start, end = start.transpose(2, 1, 0), end.transpose(2, 1, 0)
     pairs = []
     for first in range(start.shape[0]):
@@ -195,10 +197,10 @@ def _arc_points(mesh: Mesh, centre: np.ndarray, width: float) -> np.ndarray:
 def _project(position, mesh: Mesh):
     """Nearest boundary facet (L,) of each position, arc length (L,) of the foot point along it, and distance (L,).
 
-    The foot point p(t) on an edge is where the offset is perpendicular to the tangent τ(t) = (1-t)τ_0 + tτ_1,
-    interpolated between the corners of the edge; the tangent at a corner bisects those of the two edges that meet
-    there. For positions on the edge this is the ordinary projection, but its derivative is continuous where an
-    electrode slides across a corner.
+    The foot point p(t) on an edge is where the offset of the position from p(t) is perpendicular to the tangent τ(t) =
+    (1-t)τ_0 + tτ_1, interpolated between the corners of the edge; the tangent at a corner bisects those of the two
+    edges that meet there. For positions on the edge this is the ordinary projection, but its derivative is continuous
+    where an electrode slides across a corner.
     """
     xp = namespace(position, mesh)
     corners = mesh.points[mesh.facets]
@@ -239,10 +241,11 @@ def _normalised(vectors):
 
 @either_engine
 def _covered_intervals(position, width, mesh: Mesh):
-    """Interval of each edge that each electrode covers: start and end (3, b, L), with 0 ≤ start ≤ end ≤ length.
+    """Interval of each of b edges that each of L electrodes covers: start and end (3, b, L), with 0 ≤ start ≤ end ≤
+    length.
 
-    The first axis counts turns around the loop, because an electrode may extend across the point where arc length
-    starts.
+    The first axis counts turns around the boundary loop, because an electrode may extend across the point where arc
+    length starts.
     """
     xp = namespace(position, width, mesh)
     length = facet_measures(mesh)

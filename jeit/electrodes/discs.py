@@ -53,8 +53,8 @@ def nearest_electrodes(middles, position, radius) -> Int[Array, "q k"]:
     """Indices (q, k) of the electrodes that may reach each of the triangles with centroids `middles` (q, d); k is 8, or
     the number of electrodes if smaller.
 
-    At most 8 non-overlapping round electrodes, with `position` (L, d) and `radius` (L,), reach a triangle, unless it is
-    so much larger than they are that the mesh is rejected. Not differentiated.
+    At most 8 non-overlapping round electrodes, with `position` (L, d) and `radius` (L,), reach a triangle, unless the
+    triangle is so much larger than the electrodes that `check` rejects the mesh. The indices have no derivatives.
     """
     xp = namespace(middles, position, radius)
     distance = xp.sum((middles[:, None] - position) ** 2, axis=-1) - radius**2
@@ -75,7 +75,8 @@ def window_contact(
 ) -> Contact:
     """Contact integrals from window values at the p quadrature points of q triangles.
 
-    `measure`: areas of the triangles; `window`: covered fraction of each quadrature point, for each `electrode`.
+    `measure`: areas of the triangles; `window`: value of the window (0 to 1) of each electrode at each quadrature
+    point; `electrode`: indices of k electrodes for each triangle.
     """
     barycentric, weights = triangle_quadrature()
     current = measure[:, None, None] * weights * window / contact_impedance[electrode][..., None]
@@ -87,16 +88,16 @@ def window_contact(
 
 
 class AbstractDiscs(AbstractPlacedElectrodes):
-    """Base of round electrodes."""
+    """Base class of round electrodes."""
 
     radius: eqx.AbstractVar[Float[Array, " L"]]
 
     def geometry(self) -> dict[str, Array]:
-        """Positions and radii."""
+        """Positions and radii of the electrodes, metres."""
         return {"position": self.position, "radius": self.radius}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Draw discs, or dots for electrodes on walls."""
+        """Draw each electrode as a disc, or as a dot if it is on a wall."""
         flat_flags = seen_flat(mesh, self.position)
         for position, radius, is_flat in zip(
             np.asarray(self.position), np.asarray(self.radius), flat_flags, strict=True
@@ -111,9 +112,11 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
     """Complete electrodes that are discs inside a sheet (2-D mesh), independent of its nodes.
 
     The indicator function of the disc is replaced by a smooth window whose edge is half a cell wide, so that the
-    integrals are differentiable in position and radius and converge to those of the sharp disc as the mesh is refined.
+    contact integrals are differentiable in position and radius and converge to those of the sharp disc as the mesh is
+    refined.
 
-    **Fields**: `position` (L, 2): metres; `radius` (L,): metres; `contact_impedance` (L,): ohm·m².
+    **Fields**: `position` (L, 2): positions of the L discs, metres; `radius` (L,): metres; `contact_impedance` (L,):
+    ohm·m².
 
     **Example:**
 
@@ -128,8 +131,8 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
-        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
-        values."""
+        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for values
+        that are not positive and for positions that are not finite."""
         self.position, self.radius, self.contact_impedance = as_discs(position, 2, radius, contact_impedance)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
@@ -138,16 +141,16 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
         return (Refine(np.asarray(self.position), cell_size=0.7 * radius.min(), distance=float(radius.max())),)
 
     def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:
-        """Unit vectors along x and along y."""
+        """Unit vectors along x and along y, in which each disc can move."""
         return np.broadcast_to(np.eye(2), (self.num_electrodes, 2, 2))
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
-        """The cells of `mesh`."""
+        """Nodes of the cells of `mesh`."""
         return (mesh.cells,)
 
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
-        """Contact integrals over the cells, by quadrature of the windows."""
+        """Contact integrals over the cells, by quadrature of the discs' windows."""
         xp = namespace(self, mesh)
         area = measures(mesh)
         barycentric, _ = triangle_quadrature()
@@ -186,8 +189,8 @@ class FaceDiscs(AbstractDiscs, AbstractMovableElectrodes):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
-        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
-        values."""
+        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for values
+        that are not positive and for positions that are not finite."""
         self.position, self.radius, self.contact_impedance = as_discs(position, 3, radius, contact_impedance)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
@@ -199,12 +202,12 @@ class FaceDiscs(AbstractDiscs, AbstractMovableElectrodes):
         return np.stack(tangent_frames(on_host(mesh), np.asarray(self.position))[1:], axis=1)
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
-        """The boundary triangles of `mesh`."""
+        """Nodes of the boundary triangles of `mesh`."""
         return (mesh.facets,)
 
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
-        """Contact integrals over the boundary triangles, by quadrature of the windows."""
+        """Contact integrals over the boundary triangles, by quadrature of the discs' windows."""
         xp = namespace(self, mesh)
         area = facet_measures(mesh)
         barycentric, _ = triangle_quadrature()
@@ -231,8 +234,8 @@ def as_discs(position, dimension: int, radius, contact_impedance):
 
 
 def disc_window(points, position, radius, edge):
-    """Fraction (q, k, p) of quadrature points (q, p, d) covered by discs at `position` (q, k, d) with `radius` (q, k);
-    `edge` (q,) is the half-width of the smooth edge."""
+    """Windows (q, k, p), from 0 to 1, of discs at `position` (q, k, d) with `radius` (q, k) at quadrature points (q, p,
+    d); `edge` (q,) is the half-width of the smooth edge."""
     return window_within(squared_distances(points, position), radius, edge)
 
 
@@ -265,12 +268,12 @@ def seen_flat(mesh: Mesh, position: Float[Array, "L d"]) -> Bool[np.ndarray, " L
 
 
 def same_face(mesh: Mesh, position: Float[Array, "L 3"], radius: Float[Array, " L"]) -> Float[Array, "b L"]:
-    """Matrix (b, L): 1 for boundary triangles on the face of an electrode, also around an edge of the body, otherwise
-    0.
+    """Matrix (b, L): 1 if boundary triangle b may lie on the same flat or curved face as electrode L, also if that face
+    continues around an edge of the body, otherwise 0.
 
     This keeps an electrode on a thin layer from reaching through to the opposite face. On a face with radius of
     curvature R, the plane of a triangle at the rim of a disc of radius r passes r² / 2R from the disc's centre and is
-    rotated by 2 arcsin(r / 2R); for r = R these are r / 2 and 60°. Not differentiated.
+    rotated by 2 arcsin(r / 2R); for r = R the distance is r / 2 and the angle 60°. The matrix has no derivatives.
     """
     normal, corner = facet_normals(mesh), mesh.points[mesh.facets[:, 0]]
     height = abs(normal @ position.T - (normal * corner).sum(axis=1)[:, None])
@@ -285,7 +288,7 @@ def same_face(mesh: Mesh, position: Float[Array, "L 3"], radius: Float[Array, " 
 def nearest_facets(
     mesh: Mesh, position: Float[Array, "L 3"], added_distance: Float[Array, "L b"] | float = 0.0
 ) -> Int[Array, " L"]:
-    """Boundary triangle with the nearest centroid to each position; among equally near triangles, the first.
+    """Index of the boundary triangle whose centroid is nearest to each position; the first of equally near triangles.
 
     `added_distance` (L, b): m², added to the squared distances to disfavour some triangles.
     """
@@ -297,8 +300,8 @@ def nearest_facets(
 
 
 def tangent_frames(mesh: Mesh, position):
-    """Unit vectors (L, 3) at each electrode: normal of the nearest facet, horizontal and upward direction. Not
-    differentiated."""
+    """Unit vectors (L, 3) at each electrode: normal of the nearest facet, horizontal and upward direction. The vectors
+    have no derivatives."""
     xp = namespace(mesh, position)
     normal = facet_normals(mesh)[nearest_facets(mesh, position)]
     is_horizontal = abs(normal[:, 2:]) > 0.9
@@ -309,8 +312,8 @@ def tangent_frames(mesh: Mesh, position):
 
 
 def check_discs(electrodes: AbstractDiscs, mesh: Mesh, area) -> None:
-    """Raise `ValueError` unless every disc lies on the mesh, separate from the others, and is large enough for the
-    cells."""
+    """Raise `ValueError` unless every disc lies on the mesh, is separate from the other discs, and is large enough for
+    the cells."""
     if not has_values(electrodes, mesh):
         return
     electrodes, mesh = on_host((electrodes, mesh))
@@ -349,10 +352,10 @@ class SurfaceDiscs(AbstractDiscs):
 
     These are the `SheetDiscs` of curved sheets. Where the surface around the centre is developable, as in bent sheets
     and tubes, a disc consists exactly of the points within a geodesic distance of its radius, so bending does not
-    change the integrals. Elsewhere a disc consists of the points within a straight distance of its radius whose normals
-    point to the same side as at its centre; with radius of curvature R, its radius along the surface is larger by the
-    fraction radius² / 24 R². Differentiable in position along the surface; a displacement off it has no first-order
-    effect.
+    change the contact integrals. Elsewhere a disc consists of the points within a straight distance of its radius whose
+    normals point to the same side as at its centre; on a surface with radius of curvature R, its radius along the
+    surface is larger by the fraction radius² / 24 R². The integrals are differentiable in position along the surface; a
+    displacement off the surface has no first-order effect.
 
     **Fields**: `position` (L, 3): points on the surface, metres; `radius` (L,): metres; `contact_impedance` (L,):
     ohm·m².
@@ -370,8 +373,8 @@ class SurfaceDiscs(AbstractDiscs):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
-        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
-        values."""
+        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for values
+        that are not positive and for positions that are not finite."""
         self.position, self.radius, self.contact_impedance = as_discs(position, 3, radius, contact_impedance)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
@@ -379,12 +382,12 @@ class SurfaceDiscs(AbstractDiscs):
         return ()
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
-        """The triangles of `mesh`."""
+        """Nodes of the triangles of `mesh`."""
         return (mesh.cells,)
 
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
-        """Contact integrals over the triangles, by quadrature of the windows."""
+        """Contact integrals over the triangles, by quadrature of the discs' windows."""
         xp = namespace(self, mesh)
         area = measures(mesh)
         barycentric, _ = triangle_quadrature()

@@ -51,11 +51,12 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
 
     @property
     def contact_impedance(self) -> Float[Array, " L"]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Contact impedances (L,) of all parts, ohm·m² (ohm·m for arcs)."""
+        """Contact impedances (L,) of all parts, ohm·m² (ohm·m for arcs on the edge of a sheet)."""
         return namespace(self).concatenate([part.contact_impedance for part in self.parts])
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """Copy with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for invalid values."""
+        """Copy of the electrodes with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for values
+        that are not positive."""
         values = as_electrode_values("contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²")
         pieces = jnp.split(values, np.cumsum([part.num_electrodes for part in self.parts])[:-1])
         return CombinedElectrodes(
@@ -63,7 +64,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         )
 
     def geometry(self) -> dict[str, Any]:
-        """Descriptions of all parts."""
+        """Descriptions of the electrodes of all parts."""
         return {"parts": [part.describe() for part in self.parts]}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
@@ -72,7 +73,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
             part.draw(mesh, pen)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """Refinements of all parts."""
+        """Refinements of a plane mesh that the electrodes of all parts request."""
         return tuple(refine for part in self.parts for refine in part.refinement(body))
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
@@ -90,13 +91,14 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         )
 
     def check(self, mesh: Mesh) -> None:
-        """Check every part on its own. Raises `ValueError` as the parts do."""
+        """Check the electrodes of every part separately. Raises `ValueError` as `check` of the parts does."""
         for part in self.parts:
             part.check(mesh)
 
 
 _CIRCLE_CORNERS, _SIDE_CORNERS = 32, 8
-# Number of triangles near a point, by nearest centroids, that are searched when it is projected onto the surface.
+# Number of triangles near a point, by nearest centroids, that are searched when the point is projected onto the
+# surface.
 _NUM_CANDIDATES = 24
 
 
@@ -104,9 +106,9 @@ _NUM_CANDIDATES = 24
 class ElectrodeShapes:
     """Polygons for drawing electrodes, one or more per electrode.
 
-    **Fields**: `corners` (q, d): corners of all polygons in turn, metres, in space counter-clockwise as seen from
-    outside; a dot has a single corner; `sizes` (p,): number of corners of each polygon; `electrode` (p,): index of the
-    electrode that each polygon belongs to.
+    **Fields**: `corners` (q, d): corners of all polygons, one polygon after the other, metres, in space
+    counter-clockwise as seen from outside; a dot has a single corner; `sizes` (p,): number of corners of each polygon;
+    `electrode` (p,): index of the electrode that each polygon belongs to.
 
     **Example:**
 
@@ -145,7 +147,7 @@ def shapes_of(mesh: Mesh, electrodes: AbstractElectrodes) -> ElectrodeShapes:
     **Arguments:**
 
     - `mesh`: a solid, a surface in space or a plane mesh.
-    - `electrodes`: the electrodes on it.
+    - `electrodes`: the electrodes on the mesh.
 
     **Example:**
 
@@ -162,7 +164,7 @@ def shapes_of(mesh: Mesh, electrodes: AbstractElectrodes) -> ElectrodeShapes:
 
 
 def _all_polygons(mesh: Mesh, electrodes: AbstractElectrodes) -> list[list[np.ndarray]]:
-    """Polygons of each electrode."""
+    """Polygons that draw each electrode."""
     points = np.asarray(mesh.points)
     if points.shape[1] == 2:
         pen = _PlanePen()

@@ -19,11 +19,11 @@ class Contact(Module):
     """Contact integrals of a set of L electrodes on a mesh, divided by contact impedance.
 
     In the complete electrode model every electrode l adds the energy (1/z_l) ∫_l (u - U_l)². With P1 basis functions φ
-    it is determined by:
+    this energy is determined by:
 
     - `mass` (q, k, k), in siemens: Σ_l (1/z_l) ∫ φ_i φ_j over the q facets or cells, with k nodes each, that electrodes
       may touch, and `nodes` (q, k): their nodes; one pair of arrays for each kind of electrode;
-    - `load` (n, L), in siemens: (1/z_l) ∫ φ_i, with column sums |e_l| / z_l.
+    - `load` (n, L), in siemens: (1/z_l) ∫ φ_i, with column sums |e_l| / z_l, |e_l| being the size of the electrode.
 
     Point electrodes have no contact energy: `load` contains φ_i at the electrode, dimensionless; `mass` is zero, and
     `nodes` only contains the node that the forward model grounds.
@@ -35,8 +35,8 @@ class Contact(Module):
 
 
 class ElectrodePen(Protocol):
-    """Interface to draw electrodes as seen from above, with one stroke per electrode; `middle` (d,) is its centre. All
-    lengths are in metres."""
+    """Interface to draw electrodes as seen from above, with one stroke per electrode; `middle` (d,) is the electrode's
+    centre. All lengths are in metres."""
 
     def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
         """Draw an electrode on the edge of a sheet, which covers the polylines `pieces`, each (k, 2)."""
@@ -48,11 +48,11 @@ class ElectrodePen(Protocol):
         """Draw a rectangle with sides along x and y."""
 
     def dot(self, middle: np.ndarray) -> None:
-        """Draw an electrode without a size, or one whose shape is not visible from above."""
+        """Draw an electrode that has no size, or whose shape is not visible from above."""
 
 
 class AbstractElectrodes(Module):
-    """Base of all electrodes; they compute contact integrals on a mesh."""
+    """Base class of all electrodes, which compute contact integrals on a mesh."""
 
     contact_impedance: eqx.AbstractVar[Float[Array, " L"]]
     """Contact impedances (L,), ohm·m² (ohm·m for arcs on the edge of a sheet). Raises `AttributeError` for point
@@ -70,7 +70,7 @@ class AbstractElectrodes(Module):
 
     @abc.abstractmethod
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
-        """Nodes of the facets or cells that may have contact mass, as in `Contact.nodes`; they depend on the mesh
+        """Nodes of the facets or cells that electrodes may touch, as in `Contact.nodes`; the nodes depend on the mesh
         only."""
 
     @abc.abstractmethod
@@ -83,7 +83,7 @@ class AbstractElectrodes(Module):
 
     @abc.abstractmethod
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> "AbstractElectrodes":
-        """Copy with other contact impedances, one number or (L,), ohm·m² (ohm·m for arcs).
+        """Copy of the electrodes with other contact impedances, one number or (L,), ohm·m² (ohm·m for arcs).
 
         Raises `ValueError` for point electrodes, which have no contact impedance.
         """
@@ -98,15 +98,15 @@ class AbstractElectrodes(Module):
 
     @abc.abstractmethod
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """Refinement of a plane mesh for the electrodes; empty if unknown."""
+        """Refinements of a plane mesh at the electrodes; empty if the electrodes know none."""
 
     def describe(self) -> dict[str, Any]:
-        """Kind, number, positions and sizes; lengths in metres."""
+        """Kind, number, positions and sizes of the electrodes; lengths in metres."""
         return {"kind": type(self).__name__, "number": self.num_electrodes, **self.geometry(), "unit": "m"}
 
 
 class AbstractCompleteElectrodes(AbstractElectrodes):
-    """Base of complete electrodes, each of which has a size and a contact impedance."""
+    """Base class of complete electrodes, each of which has a size and a contact impedance."""
 
     @property
     def is_point(self) -> bool:
@@ -120,17 +120,18 @@ class AbstractCompleteElectrodes(AbstractElectrodes):
 
 
 class AbstractPlacedElectrodes(AbstractCompleteElectrodes):
-    """Base of complete electrodes whose positions are independent of the nodes of the mesh."""
+    """Base class of complete electrodes whose positions are independent of the nodes of the mesh."""
 
     position: eqx.AbstractVar[Float[Array, "L d"]]
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """Copy with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for invalid values."""
+        """Copy of the electrodes with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for values
+        that are not positive."""
         return replace_contact_impedance(self, contact_impedance)
 
 
 class AbstractMovableElectrodes(AbstractPlacedElectrodes):
-    """Base of complete electrodes that can slide on a mesh."""
+    """Base class of complete electrodes that can slide on a mesh."""
 
     @abc.abstractmethod
     def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a d"]:
@@ -138,7 +139,7 @@ class AbstractMovableElectrodes(AbstractPlacedElectrodes):
 
 
 class AbstractPointElectrodes(AbstractElectrodes):
-    """Base of point electrodes, which have no contact."""
+    """Base class of point electrodes, which have no contact impedance."""
 
     @property
     def is_point(self) -> bool:
@@ -162,13 +163,15 @@ class AbstractPointElectrodes(AbstractElectrodes):
 def replace_contact_impedance(
     electrodes: AbstractCompleteElectrodes, contact_impedance: ArrayLike
 ) -> AbstractCompleteElectrodes:
-    """Copy electrodes with another `contact_impedance`, one number or (L,). Raises `ValueError` for invalid values."""
+    """Copy electrodes with another `contact_impedance`, one number or (L,). Raises `ValueError` for values that are not
+    positive."""
     values = as_electrode_values("contact_impedance", contact_impedance, electrodes.num_electrodes, unit="ohm·m²")
     return eqx.tree_at(lambda complete_electrodes: complete_electrodes.contact_impedance, electrodes, values)
 
 
 def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) -> Float[Array, " L"]:
-    """Broadcast a positive number or array (L,) to floats (L,). Raises `ValueError` if that is impossible."""
+    """Broadcast a positive number or array (L,) to floats (L,). Raises `ValueError` for another shape, and for values
+    that are not positive."""
     if has_values(values):
         values = real_array(
             name, values, f"one number for all electrodes or one for each of the {num_electrodes}, in {unit}"
@@ -192,8 +195,8 @@ def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) ->
 
 
 def as_positions(position, dimensions: tuple[int, ...]) -> Float[Array, "L d"]:
-    """Check and convert electrode positions (L, d) in metres; `dimensions` contains the allowed d. Raises `ValueError`
-    for other shapes, NaN and infinity."""
+    """Check and convert electrode positions (L, d) in metres; `dimensions` contains the allowed numbers d of
+    coordinates. Raises `ValueError` for other shapes, NaN and infinity."""
     position = as_array(position, float)
     if position.ndim != 2 or position.shape[1] not in dimensions or position.shape[0] == 0:
         allowed_shapes = " or ".join(f"(L, {dimension})" for dimension in dimensions)

@@ -37,8 +37,8 @@ _NUM_RIM_POINTS = 16
 
 @size_checked()
 def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None = None) -> Mesh:
-    """Mesh a body with smaller cells at the electrodes: as their `refinement` says or, for rectangular electrodes on
-    solids, with layers and rows of cells that end at the electrodes.
+    """Mesh a body with smaller cells at the electrodes: with those that the electrodes' `refinement` requests or, for
+    rectangular electrodes on solids, with layers and rows of cells that end at the electrodes.
 
     The edges of rectangular electrodes on a box, and their upper and lower edges on the wall of another solid, coincide
     with cell faces. A body that is given as a mesh is not remeshed.
@@ -124,7 +124,7 @@ def _rim_points(outline, centre, half_size, is_horizontal: bool) -> Float[np.nda
     )
 
 
-# Distance between two electrodes, divided by the smaller size, below which they are at the same position.
+# Distance between two electrodes, divided by the smaller one's size, below which they are at the same position.
 _MIN_SEPARATION = 1e-3
 
 Distance = Callable[[Float[np.ndarray, "L 3"]], Float[np.ndarray, " L"]]
@@ -149,8 +149,8 @@ def check_on_surface(
 
 
 def _all_on_surface(position, allowed, distance_from_surface: Distance) -> bool:
-    """Whether all positions lie on the surface and are spread over it. Positions that nearly coincide do not count,
-    since they may lie on the surface by chance."""
+    """Whether all positions lie on the surface and are not all nearly the same. Positions that nearly coincide may lie
+    on the surface by chance."""
     return bool((np.ptp(position, axis=0).max() > allowed).all() and (distance_from_surface(position) <= allowed).all())
 
 
@@ -168,7 +168,7 @@ def check_apart(position: Float[np.ndarray, "L 3"], size: Float[np.ndarray, " L"
 
 def check_size(name: str, sizes: Float[np.ndarray, " L"], max_size: float, object_name: str) -> None:
     """Raise `ValueError` with the argument's `name` for the first electrode larger than `max_size` metres, the size of
-    the object that it lies on; `object_name` names that object."""
+    the object that the electrode lies on; `object_name` names this object."""
     for number in np.flatnonzero(sizes > (1 + _MIN_SEPARATION) * max_size)[:1]:
         size = float(sizes[number])
         hint = IN_MILLIMETRES if 10 * max_size < size <= 1000 * max_size else "give the size of what lies on it."
@@ -179,7 +179,8 @@ def check_size(name: str, sizes: Float[np.ndarray, " L"], max_size: float, objec
 
 
 def check_placed(electrodes: AbstractMovableElectrodes, mesh: Mesh) -> None:
-    """Raise `ValueError` for patches that lie off the surface of the mesh, or are larger than it."""
+    """Raise `ValueError` for rectangular electrodes that lie off the surface of the mesh, or are larger than the
+    surface."""
     sizes = {name: np.asarray(value) for name, value in electrodes.geometry().items() if name in ("width", "height")}
     points = np.asarray(mesh.points)
     from jeit.mesh.geodesic import Triangles
@@ -196,9 +197,9 @@ def _length_text(metres: float) -> str:
     return f"{1e3 * metres:.3g} mm" if metres < 1 else f"{metres:.3g} m"
 
 
-# Maximum number of non-overlapping patches that can reach a triangle no larger than they are.
+# Maximum number of non-overlapping patches that can reach a triangle no larger than the patches.
 _MAX_PATCHES_PER_TRIANGLE = 8
-# Triangle that replaces those that a patch does not reach.
+# Triangle that replaces the triangles that a patch does not reach.
 _UNIT_TRIANGLE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 
 
@@ -207,11 +208,11 @@ class FacePatches(AbstractMovableElectrodes):
 
     A patch lies in the tangent plane at its position: its width is horizontal (perpendicular to z), its height runs up
     the surface; on a horizontal face, width is along x and height along y. On a curved face the patch covers the
-    projection of that rectangle: on a cylinder of radius R, an electrode of arc length a has the width 2 R sin(a / 2
-    R).
+    projection of the rectangle onto the face: on a cylinder of radius R, an electrode of arc length a has the width 2 R
+    sin(a / 2 R).
 
-    **Fields**: `position` (L, 3): points on the surface, metres; `width`, `height` (L,): metres; `contact_impedance`
-    (L,): ohm·m².
+    **Fields**: `position` (L, 3): centres of the L electrodes on the surface, metres; `width`, `height` (L,): metres;
+    `contact_impedance` (L,): ohm·m².
 
     **Example:**
 
@@ -227,8 +228,8 @@ class FacePatches(AbstractMovableElectrodes):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, width: ArrayLike, height: ArrayLike, contact_impedance: ArrayLike):
-        """Sizes and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
-        values."""
+        """`width`, `height` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for
+        values that are not positive and for positions that are not finite."""
         self.position = as_positions(position, (3,))
         self.width = as_electrode_values("width", width, len(self.position), unit="metres")
         self.height = as_electrode_values("height", height, len(self.position), unit="metres")
@@ -237,11 +238,11 @@ class FacePatches(AbstractMovableElectrodes):
         )
 
     def geometry(self) -> dict[str, Array]:
-        """Positions, widths and heights."""
+        """Positions, widths and heights of the electrodes, metres."""
         return {"position": self.position, "width": self.width, "height": self.height}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Draw rectangles on horizontal faces, dots elsewhere."""
+        """Draw electrodes on horizontal faces as rectangles, all others as dots."""
         positions, is_flat = np.asarray(self.position), seen_flat(mesh, self.position)
         sizes = np.asarray(self.width), np.asarray(self.height)
         for position, width, height, is_undistorted in zip(positions, *sizes, is_flat, strict=True):
@@ -259,13 +260,13 @@ class FacePatches(AbstractMovableElectrodes):
         return np.stack(tangent_frames(on_host(mesh), np.asarray(self.position))[1:], axis=1)
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
-        """The boundary triangles of `mesh`."""
+        """Nodes of the boundary triangles of `mesh`."""
         return (mesh.facets,)
 
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
-        """Contact integrals over the parts of boundary triangles within the patches, as seen along the patches'
-        normals; exact."""
+        """Exact contact integrals over the parts of boundary triangles that lie within the patches as seen along their
+        normals."""
         xp = namespace(self, mesh)
         area, half_size = facet_measures(mesh), xp.stack([self.width, self.height], axis=-1) / 2
         normal, tangent, upward = tangent_frames(mesh, self.position)
@@ -318,10 +319,10 @@ class FacePatches(AbstractMovableElectrodes):
 
 
 def _reaching_patches(mesh: Mesh, position, half_size, frames):
-    """Patches (b, k) that may cover a part of each boundary triangle, nearest first, and whether they do.
+    """Patches (b, k) that may cover a part of each boundary triangle, nearest first, and whether each patch does.
 
-    Triangles must lie on the same side of the body as the patch: have a similar normal, and a smaller depth than the
-    size of the patch. Not differentiated.
+    A triangle must lie on the same side of the body as the patch: it must have a similar normal, and a smaller depth
+    than the size of the patch. The results have no derivatives.
     """
     xp = namespace(mesh, position)
     corners = mesh.points[mesh.facets]

@@ -29,8 +29,8 @@ from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, namespace, sum_into, undifferentiated, values_at_once
 
-# Covered fraction of a triangle below which it counts as zero: it has few correct digits, which would matter for small
-# contact impedances.
+# Covered fraction of a triangle below which the fraction counts as zero: such a fraction has few correct digits, which
+# would matter for small contact impedances.
 _MIN_COVERED_FRACTION = 1e-12
 
 
@@ -97,7 +97,7 @@ def _cross_product(first: Float[Array, "*q 2"], second: Float[Array, "*q 2"]) ->
 
 
 class FacetElectrodes(AbstractCompleteElectrodes):
-    """Complete electrodes that cover whole boundary facets of a mesh; exact.
+    """Complete electrodes that cover whole boundary facets of a mesh; their contact integrals are exact.
 
     **Arguments:** `mesh`: the mesh; `facets`: for each electrode, the indices of its boundary facets;
     `contact_impedance`: one number or (L,), ohm·m² (ohm·m in 2-D). **Fields**: `covers` (b, L): 1 where electrode l
@@ -141,7 +141,8 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         )
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """Copy with other contact impedances, ohm·m² (ohm·m in 2-D). Raises `ValueError` for invalid values."""
+        """Copy of the electrodes with other contact impedances, ohm·m² (ohm·m in 2-D). Raises `ValueError` for values
+        that are not positive."""
         return replace_contact_impedance(self, contact_impedance)
 
     def geometry(self) -> dict[str, Array]:
@@ -163,12 +164,13 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         return ()
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
-        """The boundary facets of `mesh`."""
+        """Nodes of the boundary facets of `mesh`."""
         return (mesh.facets,)
 
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
-        """Contact integrals over whole facets: ∫φ_i = |f| / d, ∫φ_iφ_j = |f| (1 + δ_ij) / (d (d + 1))."""
+        """Contact integrals over whole facets f with d nodes: ∫φ_i = |f| / d, ∫φ_iφ_j = |f| (1 + δ_ij) / (d (d +
+        1))."""
         xp = namespace(self, mesh)
         d = mesh.dimension
         measure = facet_measures(mesh)
@@ -181,7 +183,8 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` if the electrodes were made for a mesh with another number of boundary facets."""
+        """Raise `ValueError` if the electrodes were made for a mesh whose number of boundary facets is not that of
+        `mesh`."""
         if self.covers.shape[0] != mesh.facets.shape[0]:
             raise ValueError(
                 f"These electrodes were made for a mesh of {self.covers.shape[0]} boundary facets, and this one has "
@@ -215,7 +218,7 @@ def plates(mesh: Mesh, tags: Sequence[str], contact_impedance: ArrayLike) -> Fac
 
 
 def electrodes_from_nodes(mesh: Mesh, nodes: Sequence, contact_impedance: ArrayLike) -> FacetElectrodes:
-    """Complete electrodes given by nodes: each covers the boundary facets whose nodes all belong to it.
+    """Complete electrodes given by nodes: each electrode covers the boundary facets whose nodes all belong to it.
 
     For electrodes with one node each use `NodeElectrodes`.
 

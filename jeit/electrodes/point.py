@@ -30,7 +30,7 @@ class PointElectrodes(AbstractPointElectrodes):
     Current is injected, and voltage is measured, by P1 interpolation in the cell that contains the position. The
     potential of a point source is singular, so voltages at driven electrodes depend on the mesh.
 
-    **Fields**: `position` (L, d): metres.
+    **Fields**: `position` (L, d): positions of the L electrodes, metres.
 
     **Example:**
 
@@ -56,7 +56,7 @@ class PointElectrodes(AbstractPointElectrodes):
         return {"position": self.position}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Draw dots."""
+        """Draw each electrode as a dot."""
         for place in np.asarray(self.position):
             pen.dot(place)
 
@@ -66,14 +66,14 @@ class PointElectrodes(AbstractPointElectrodes):
 
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
-        """Values of the basis functions at the electrodes as `load` (n, L), with zero mass."""
+        """Values of the n basis functions at the L electrodes as `load` (n, L) of the contact, with zero mass."""
         cell, weights, _ = _locate(self.position, mesh)
         index = mesh.cells[cell], np.arange(self.num_electrodes)[:, None]
         load = sum_into((mesh.num_points, self.num_electrodes), index, weights)
         return _point_contact(self.contact_nodes(mesh), load)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for electrodes outside the mesh, or two at the same position."""
+        """Raise `ValueError` for electrodes outside the mesh, or two electrodes at the same position."""
         if self.position.shape[1] != mesh.space_dimension:
             raise ValueError(
                 f"position has {self.position.shape[1]} coordinates and the mesh is in {mesh.space_dimension}-D."
@@ -102,7 +102,7 @@ class PointElectrodes(AbstractPointElectrodes):
 
 
 class NodeElectrodes(AbstractPointElectrodes):
-    """Point electrodes at nodes of a mesh, as in imported models; exact.
+    """Point electrodes at nodes of a mesh, as in imported models, without interpolation.
 
     **Fields**: `nodes` (L,): indices into `mesh.points`.
 
@@ -135,7 +135,7 @@ class NodeElectrodes(AbstractPointElectrodes):
         return {}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Draw dots."""
+        """Draw each electrode as a dot."""
         for place in np.asarray(mesh.points)[np.asarray(self.nodes)]:
             pen.dot(place)
 
@@ -151,7 +151,7 @@ class NodeElectrodes(AbstractPointElectrodes):
         return _point_contact(self.contact_nodes(mesh), sum_into((mesh.num_points, self.num_electrodes), index, ones))
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for a node index out of range."""
+        """Raise `ValueError` for an electrode whose node index is not one of `mesh`."""
         if has_values(self.nodes) and int(self.nodes.max()) >= mesh.num_points:
             raise ValueError(
                 f"nodes: index {int(self.nodes.max())} is out of range for a mesh of {mesh.num_points} nodes; indices "
@@ -165,8 +165,8 @@ def _point_contact(nodes, load) -> Contact:
 
 @either_engine
 def _locate(position, mesh: Mesh):
-    """Cell that contains each position, barycentric coordinates in it, and the smallest of these, which is negative
-    outside."""
+    """Cell that contains each position, barycentric coordinates in the cell, and the smallest of the coordinates, which
+    is negative for a position outside the mesh."""
     xp = namespace(position, mesh)
     corners = mesh.points[mesh.cells]  # (m, d + 1, d)
     # Basis functions are linear, so their values at a position follow from their gradients.
@@ -184,8 +184,8 @@ def _locate(position, mesh: Mesh):
 class IntegratedElectrodes(AbstractElectrodes):
     """Precomputed contact integrals of other electrodes on a mesh; the electrodes cannot be changed afterwards.
 
-    **Fields**: `integrals`: contact integrals of the electrodes on that mesh; `point`: whether they are point
-    electrodes.
+    **Fields**: `integrals`: contact integrals of the electrodes on the mesh; `point`: whether the integrals are those
+    of point electrodes.
     """
 
     integrals: Contact
@@ -242,4 +242,4 @@ class IntegratedElectrodes(AbstractElectrodes):
         return self.integrals
 
     def check(self, mesh: Mesh) -> None:
-        """Does nothing; check the original electrodes instead."""
+        """Does nothing; the original electrodes must be checked instead."""

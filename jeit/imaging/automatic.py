@@ -15,23 +15,24 @@ from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.prior.matern import MEASURED
 from jeit.inverse.shapes import ShapeReconstruction
 
-# Changes relative to the background above which voltages are not linear in conductivity: in general, and for noisy
-# data, whose images are damped far below the true change. Share of noise in the difference above which data are noisy.
+# Changes of conductivity relative to the background above which voltages are not linear in conductivity: in general,
+# and for noisy data, whose images are damped far below the true change. Share of noise in the voltage difference above
+# which data count as noisy.
 _STRONG_CHANGE, _STRONG_NOISY_CHANGE, _NOISY_SHARE = 0.3, 0.1, 0.3
-# Tolerances for the share of the difference that the voltages of a linear image do not explain: relative to the share
-# not explained in the linear approximation, and absolute.
+# Maximum share of the voltage difference that the voltages of a linear image may leave unexplained: relative to the
+# share that the linear approximation of these voltages leaves unexplained, and absolute.
 _MAX_MISFIT_RATIO, _LARGE_MISFIT = 1.1, 0.1
-# Lower bound of the conductivity of a linear image, as a share of the background.
+# Lower bound of the conductivity of a linear image, as a share of the background conductivity.
 _MIN_CONDUCTIVITY = 0.01
-# Largest change of an image, relative to the background, above which bodies are fitted in a solid.
+# Bodies are fitted in a solid if the largest change of conductivity in an image exceeds this share of the background.
 _MIN_BODY_CHANGE = 0.05
 # Step along the linear image for the finite difference that approximates the derivative of the voltages.
 _DERIVATIVE_STEP = 1e-4
 
 
 class ChosenMethod(NamedTuple):
-    """Result of the automatic choice. **Fields**: `method`: name of the chosen method; `reason`: the reason, in a
-    sentence; `imaged`: its result; `shapes`: the fitted bodies, if they explain the voltages."""
+    """Automatically chosen imaging method and its image. **Fields**: `method`: name of the method; `reason`: why it was
+    chosen, in a sentence; `imaged`: its result; `shapes`: the fitted bodies, if they explain the voltages."""
 
     method: str
     reason: str
@@ -40,11 +41,11 @@ class ChosenMethod(NamedTuple):
 
 
 def image_automatically(prepared: PreparedDifference, options: MethodOptions, segmented: bool = False) -> ChosenMethod:
-    """Compute the one-step image if it is sound, otherwise the Gauss-Newton image with its bodies fitted as shapes. If
-    Gauss-Newton imaging fails, the one-step image is returned.
+    """Compute the one-step image if it is sound (see `linear_image_fault`), otherwise the Gauss-Newton image with the
+    bodies in it fitted as shapes. If Gauss-Newton imaging fails, the one-step image is returned.
 
     In a solid with the default prior, bodies are also fitted where the one-step image is sound. Each method uses its
-    default λ, not the requested one. If the image is to be `segmented` and no shapes were fitted, total variation is
+    default λ, not the requested λ. If the image is to be `segmented` and no shapes were fitted, total variation is
     used.
     """
     imaged = _image_by("one-step", prepared, options)
@@ -76,7 +77,7 @@ def image_automatically(prepared: PreparedDifference, options: MethodOptions, se
 
 
 def _image_by(name: str, prepared: PreparedDifference, options: MethodOptions) -> Imaged:
-    """Image by the method `name` with its default λ."""
+    """Image a difference by the method `name` with the method's default λ."""
     method = METHODS[name]
     return method.image(prepared, options._replace(hyperparameter=method.hyperparameter))
 
@@ -123,9 +124,9 @@ def _edges(prepared: PreparedDifference) -> str:
 def _shapes(
     prepared: PreparedDifference, smooth: Reconstruction, options: MethodOptions
 ) -> tuple[ShapeReconstruction | None, str]:
-    """Fit the bodies of a smooth image as shapes. Returns them with half a sentence for the message; None, with the
-    reason, if none are found, or if their misfit exceeds both that of the smooth image and one standard deviation of
-    `PreparedDifference.sharp_noise`."""
+    """Fit the bodies of a smooth image as shapes. Returns the shapes, with half a sentence for the message. Returns
+    None, with the reason, if no bodies are found, or if the misfit of the shapes exceeds both that of the smooth image
+    and one standard deviation of `PreparedDifference.sharp_noise`."""
     shapes, edges = shapes_in(prepared, smooth, options), _edges(prepared)
     if not shapes.bodies:
         return None, f"; no body's {edges[:-1]} explains the voltages better than errors of the model do"
@@ -138,8 +139,8 @@ def _shapes(
 
 
 def linear_image_fault(prepared: PreparedDifference, change: Float[Array, " m"]) -> str:
-    """Describe the fault of a linear image, the `change` of conductivity per cell in S/m (2-D: S); empty if it has
-    none."""
+    """Describe the fault of a linear image, the `change` of conductivity per cell in S/m (2-D: S); empty if the image
+    has no fault."""
     background, relative_change = float(prepared.calibration.conductivity), np.asarray(change)
     relative_change = relative_change / background
     lowest, highest = float(relative_change.min()), float(relative_change.max())
@@ -163,8 +164,8 @@ def linear_image_fault(prepared: PreparedDifference, change: Float[Array, " m"])
 
 
 def _unexplained_share(prepared: PreparedDifference, background: float, relative: np.ndarray, step: float) -> float:
-    """Share of the measured difference that is not explained by the change of voltages for a step along the image,
-    divided by the length of the step. The norm is weighted by the inverse of the noise."""
+    """Share of the measured voltage difference that is not explained by the modelled change of voltages for a step
+    along the image, this change divided by the length of the step. The norm is weighted by the inverse of the noise."""
     model, used = prepared.model, np.asarray(prepared.mask)
     conductivity = background * np.maximum(1 + step * relative, _MIN_CONDUCTIVITY)
     predicted = (np.asarray(model.voltages(conductivity)) - np.asarray(model.voltages(background))) / step

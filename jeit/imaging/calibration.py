@@ -20,9 +20,10 @@ from jeit.mesh import Mesh
 from jeit_solvers import one_thread_of_blas
 from jeit_solvers.engines import as_array
 
-# Misfit of the reference up to which described electrode positions are taken as they are; standard deviation of these
-# positions, relative to the width of the body: 2° of a disk; and the ratios of misfits below which estimated positions
-# are used, each channel relative to its noise, and all volts alike.
+# Misfit of the model to the reference up to which the described electrode positions are used; standard deviation of
+# these positions, relative to the width of the body: 2° of a disk; and ratios of the misfit with estimated positions to
+# the misfit with described positions below which the estimated positions are used: with each channel relative to its
+# noise, and with equal weights.
 _MAX_EXACT_MISFIT, _POSITION_DEVIATION, _MAX_RELATIVE_RATIO, _MAX_MISFIT_RATIO = 0.01, 0.0175, 0.7, 2.0
 
 
@@ -45,8 +46,8 @@ class Clock:
 def calibrated_model(
     model: ForwardModel, base: Measurement, *, contact: str | None = None, clock: Clock | None = None
 ) -> tuple[Calibration, str]:
-    """Calibrate the forward model on a frame of the undisturbed body; return the `Calibration`, and which calibration
-    of the contact impedance was used.
+    """Calibrate the forward model on a frame of the undisturbed body; return the `Calibration`, and the kind of
+    calibration of the contact impedance.
 
     **Arguments:**
 
@@ -54,7 +55,7 @@ def calibrated_model(
     - `base`: a frame of the undisturbed body.
     - `contact`: "each", "common" or "fixed"; default: `default_contact`, or "common" if the data do not determine the
       contact impedance of each electrode.
-    - `clock`: measures the duration of each step.
+    - `clock`: timer that measures the duration of each step.
 
     Raises `ValueError` if the calibration fails.
 
@@ -85,20 +86,21 @@ def calibrated_model(
 
 
 def threads_for(mesh: Mesh) -> AbstractContextManager:
-    """Context in which the BLAS has one thread for a sheet: its matrices are small, and on a busy machine threads that
-    wait for each other take ten times as long."""
+    """Context in which the BLAS has one thread for a sheet: the matrices of a sheet are small, and on a busy machine
+    threads that wait for each other take ten times as long."""
     return one_thread_of_blas() if mesh.dimension == 2 else nullcontext()
 
 
 def _with_estimated_positions(
     calibration: Calibration, model: ForwardModel, voltages, mask, deviation: float | None
 ) -> Calibration:
-    """The calibration with estimated electrode positions, if these explain the reference far better.
+    """The calibration with estimated electrode positions, if these positions explain the reference frame far better.
 
-    The described positions are kept if they explain the reference, and if the misfit has other causes: estimated
-    positions explain little of the misfit of a two-dimensional model of a deep tank. The background is estimated
-    together with the positions, from channels weighted by their relative noise. If it were fitted mainly to the largest
-    voltages, those at the drives, it would follow the errors of a two-dimensional model there.
+    The described positions are kept if they explain the reference, and if the misfit has other causes: for example,
+    estimated positions explain little of the misfit of a two-dimensional model of a deep tank. The background is
+    estimated together with the positions, from channels weighted by their relative noise. If the background were fitted
+    mainly to the largest voltages, those at the driven electrodes, it would follow the errors of a two-dimensional
+    model there.
     """
     described_misfit = relative_misfit(calibration.voltages, voltages, mask)
     if (
@@ -124,15 +126,16 @@ def _with_estimated_positions(
 
 
 def relative_misfit(predicted, measured, mask) -> float:
-    """Misfit of predicted voltages (M,), each channel relative to its expected noise, as a share of the voltages."""
+    """Norm of the errors of predicted voltages (M,), as a share of the norm of the measured voltages, with each channel
+    divided by its expected noise."""
     noise = np.asarray(relative_noise(measured, mask))[mask]
     errors = (np.asarray(predicted) - measured)[mask]
     return float(np.linalg.norm(errors / noise) / np.linalg.norm(measured[mask] / noise))
 
 
 def estimated_positions(model: ForwardModel, voltages, mask, deviation: float | None) -> Placement | None:
-    """Electrode positions estimated from a reference frame; None if they cannot be. `deviation` of their description,
-    metres, or None for the default."""
+    """Electrode positions estimated from a reference frame; None if the positions cannot be estimated. `deviation`:
+    standard deviation of the described positions, metres, or None for the default."""
     if not isinstance(model.electrodes, AbstractMovableElectrodes) or np.iscomplexobj(voltages):
         return None
     if deviation is None:

@@ -1,4 +1,5 @@
-"""Comparison of the rules for the hyperparameter on one measured difference: the λ chosen by each, and its image.
+"""Comparison of the rules for the hyperparameter λ on one measured difference: the λ that each rule chooses, and the
+image with this λ.
 
 The command `jeit choose` runs `compare_on_data`; for simulated data see `jeit.inverse.compare_rules`.
 """
@@ -26,12 +27,13 @@ from jeit.inverse.linearisation import Linearisation
 
 @dataclass(frozen=True)
 class RuleOutcome:
-    """Result of one rule for a difference.
+    """Value of λ that one rule chooses for a measured difference, and the image with this λ.
 
     **Fields**
 
     - `choice`: the chosen λ, and the curve from which it was chosen.
-    - `residual`: ‖w (v - Jx)‖ / ‖w v‖, the share of the difference v not explained by the image x.
+    - `residual`: ‖w (v - Jx)‖ / ‖w v‖, the share of the voltage difference v that the image x does not explain, with
+      the Jacobian J and the weights w of the channels.
     - `noise_figure`: signal-to-noise ratio of the data divided by that of the image (see `jeit.inverse.RULES`).
     - `change`: the image, change of conductivity per cell (m,), S/m (2-D: S).
     - `inclusions`: inclusions found in the image, strongest first.
@@ -53,7 +55,7 @@ class RuleOutcome:
 
 @dataclass(frozen=True)
 class ComparedRules:
-    """Result of `compare_on_data`.
+    """Images of one difference with the λ of each rule: the result of `compare_on_data`.
 
     **Fields**
 
@@ -85,7 +87,8 @@ def compare_on_data(
     frame: int | str | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ComparedRules:
-    """Image the change between a reference frame and a frame of `measurement` with the hyperparameter of each rule.
+    """Image the change between a reference frame and a frame of `measurement` with the hyperparameter that each rule
+    chooses.
 
     The images are computed by one-step imaging. A rule that cannot be applied to the data is listed in `refused`, or
     raises `ValueError` if it is the only one requested.

@@ -1,4 +1,4 @@
-"""Description of a file of voltages that nobody has described: what it may be, with the evidence.
+"""Search for the protocol of a file of voltages that has no description, with the evidence for each protocol.
 
 Protocols of common kinds whose number of channels fits the file are compared: by reciprocity, which needs no model, and
 by the misfit of a uniform body of the given shape (`jeit.imaging.wiring`), in a frame of the empty body.
@@ -31,32 +31,32 @@ from jeit.imaging.wiring import Wiring, find_wiring
 from jeit.mesh import Solid
 from jeit.protocol import Protocol
 
-# Fewest and most electrodes of the protocols that are tried; nodes of the mesh on which these are compared, of a sheet
-# and a solid.
+# Minimum and maximum number of electrodes of the protocols that are tried; number of nodes of the mesh on which the
+# protocols are compared, for a sheet and for a solid.
 _FEWEST, _MOST, _NODES = 4, 64, {2: 700, 3: 4000}
-# Unexplained share of the empty body above which an explanation is not good enough to go on; and that above which it is
-# not although the kind of protocol is known, or any other order of the channels leaves `_ORDERED` times as much.
+# Unexplained share of the empty body's voltages above which the best protocol is refused: in general; and if its kind
+# is known, or if the channels in another order would leave `_ORDERED` times that share unexplained.
 _HOPELESS, _HOPELESS_EVEN_SO, _ORDERED = 0.25, 0.5, 2.0
 # Maximum spread of the frames of an empty body; minimum number of channels for each electrode.
 _MAX_SPREAD, _MIN_CHANNELS = 0.2, 2
-# Maximum number of candidates whose misfit is computed; ratio to the best candidate, and difference from it, above
-# which an explanation is ruled out.
+# Maximum number of candidate protocols whose misfit is computed; ratio of a candidate's unexplained share to that of
+# the best candidate, and difference between them, above which the candidate is ruled out.
 _MAX_COMPARED, _RIVAL_RATIO, _RIVAL_MARGIN = 12, 1.3, 0.01
-# Reciprocity error from which gains are estimated, and ratio of the error that they may leave to it.
+# Reciprocity error from which gains are estimated; maximum ratio of the error after this correction to that before.
 _MIN_GAIN_ERROR, _MAX_GAIN_RATIO = 0.03, 0.4
-# Table layout of which nothing is stated.
+# Layout of a table of numbers about which nothing is known.
 _UNKNOWN_LAYOUT = TableLayout()
-# Contact impedance of a new description, times conductivity over the size of the body.
+# Contact impedance of a new description, times conductivity, divided by the size of the body.
 _RELATIVE_CONTACT = 0.01
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Possible interpretation of a file. **Fields**: `protocol`: the table `[protocol]` of a description, without the
-    current; `frames`: number of frames; `spread`: deviation of the frames of the empty body from their mean, relative;
-    `reciprocity`: error of the mean, None if no two channels are reciprocal; `measurement`: the mean frame,
-    read with this protocol; `wiring`: the wiring with which a uniform body explains it; `gains`: gains of the
-    measurement patterns, if they explain the reciprocity error."""
+    """Protocol that may be that of a file. **Fields**: `protocol`: table `[protocol]` of a description, without the
+    current; `frames`: number of frames; `spread`: relative deviation of the empty body's frames from their mean;
+    `reciprocity`: reciprocity error of the mean frame, None if no two channels are reciprocal; `measurement`: the mean
+    frame, read with this protocol; `wiring`: the wiring with which a uniform body explains this frame; `gains`: gains
+    of the measurement patterns, if they explain the reciprocity error."""
 
     protocol: dict[str, Any]
     frames: int
@@ -68,7 +68,7 @@ class Candidate:
 
     @property
     def misfit(self) -> float:
-        """Relative misfit of a uniform body to the mean; infinite if it was not computed."""
+        """Relative misfit of a uniform body to the mean frame; infinite if the misfit was not computed."""
         if self.wiring is None:
             return np.inf
         return self.wiring.misfit if self.reversed_signs else self.wiring.described
@@ -80,21 +80,21 @@ class Candidate:
 
     @property
     def unexplained(self) -> float:
-        """Relative error of the explanation of all frames: misfit, spread, and the reciprocity error, which has twice
-        the variance of its noise."""
+        """Relative error with which this protocol explains all frames: root of the sum of squares of misfit, spread,
+        and 1/√2 of the reciprocity error, which has twice the variance of the noise."""
         return float(np.sqrt(self.misfit**2 + self.spread**2 + (self.reciprocity or 0) ** 2 / 2))
 
     @property
     def ordered(self) -> bool:
-        """Whether the same voltages in another order of the channels would be explained far worse: a share of
-        √(1 - r²) would be left on the average, with r the square of their mean over the mean of their squares."""
+        """Whether a uniform body would explain the voltages far worse if the channels were in another order: a share
+        √(1 - r²) would be unexplained on average, with r the squared mean of the voltages over their mean square."""
         values = np.asarray(self.measurement.voltages)[np.asarray(self.measurement.mask)]
         mean_ratio = abs(values.mean()) ** 2 / np.mean(np.abs(values) ** 2)
         return bool(_ORDERED * self.unexplained < np.sqrt(1 - mean_ratio**2))
 
     @property
     def name(self) -> str:
-        """The protocol in words."""
+        """Kind, number of electrodes and options of the protocol, in words."""
         options = {key: value for key, value in self.protocol.items() if key not in ("kind", "number")}
         option_text = ", ".join(f"{key} {str(value).lower()}" for key, value in options.items())
         return f"{self.protocol['kind']}, {self.protocol['number']} electrodes{option_text and ', ' + option_text}"
@@ -102,8 +102,8 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Findings:
-    """Result of `find_description`. **Fields**: `candidates`: the best first; `undecided`: others that explain it as
-    well; `text`: a commented description, TOML, of the best; `known`: whether the kind of the protocol was known."""
+    """Result of `find_description`. **Fields**: `candidates`: protocols, the best first; `undecided`: others that fit
+    the file as well; `text`: commented description, TOML, with the best; `known`: whether its kind was known."""
 
     candidates: tuple[Candidate, ...]
     undecided: tuple[Candidate, ...]
@@ -112,7 +112,7 @@ class Findings:
 
     @property
     def fault(self) -> str:
-        """Reason why the best explanation is not good enough to be used; empty if it is."""
+        """Reason why the best protocol explains the file too poorly to be used; empty if it does not."""
         best = self.candidates[0]
         limit = _HOPELESS_EVEN_SO if self.known or best.ordered else _HOPELESS
         if best.unexplained < limit and best.spread < _MAX_SPREAD:
@@ -143,20 +143,20 @@ def find_description(
     current: float = 1e-3,
     progress: Callable[[str], None] = lambda step: None,
 ) -> Findings:
-    """Compare the protocols that fit a file of voltages, and write a description with the best.
+    """Compare the protocols that fit a file of voltages, and write a description with the best protocol.
 
     **Arguments:**
 
     - `path`: file of the voltages.
-    - `geometry`, `electrodes`: tables of a description, metres, the second without the number of electrodes and without
-      the contact impedance, ohm·m (on a solid ohm·m²), which is estimated roughly unless given.
-    - `reference`: file of the empty body; without it, the mean of all frames stands for it.
-    - `keys`: arrays of the file and of the reference, where files hold several.
-    - `known`: known entries of `[protocol]`, such as its kind or number.
-    - `current`: amplitude, amperes.
-    - `progress`: called with the name of each step when it begins.
+    - `geometry`, `electrodes`: tables of a description, metres; `electrodes` lacks the number of electrodes, and the
+      contact impedance, ohm·m (on a solid ohm·m²), is estimated roughly unless given.
+    - `reference`: file of frames of the empty body; by default, the mean of all frames replaces them.
+    - `keys`: names of the arrays of frames in the file and in the reference, for files with several arrays.
+    - `known`: known entries of the table `[protocol]`, such as the kind or the number of electrodes.
+    - `current`: amplitude of the driven current, amperes.
+    - `progress`: function called with the name of each step when the step begins.
 
-    Raises `ValueError` for files that cannot be read, several arrays and none named, and if no protocol fits.
+    Raises `ValueError` for files that cannot be read, for several arrays if none is named, and if no protocol fits.
 
     **Example:**
 
@@ -210,7 +210,7 @@ def _described_body(
     reference: Path,
     known: dict[str, Any],
 ) -> Findings:
-    """Findings of a file that states its protocol: a description of the body alone."""
+    """Findings for a file that contains its protocol: their description is of the body alone."""
     data, base = read(path, format), read(reference, format)
     number = data.protocol.num_electrodes
     if known.get("number", number) != number or "kind" in known or "order" in known:
@@ -239,9 +239,9 @@ def _described_body(
 
 @dataclass(frozen=True)
 class _Numbers:
-    """The numbers of a file. **Fields**: `frames`: function that arranges them in frames with one of several numbers of
-    channels; `shape`: their shape in words; `sizes`: possible numbers of values in a frame; `data`: entries of `[data]`
-    that describe their arrangement."""
+    """The numbers in a file. **Fields**: `frames`: function that arranges them in frames, given possible numbers of
+    channels; `shape`: their shape in words; `sizes`: possible numbers of values in a frame; `data`: entries of a
+    description's table `[data]` for this arrangement."""
 
     path: Path
     frames: Callable[[Sequence[int]], Frames]
@@ -251,7 +251,7 @@ class _Numbers:
 
     @classmethod
     def read(cls, path: Path, key: str | None, excluded: str | None = None) -> _Numbers:
-        """Read a file; `key`: name of its array; `excluded`: array that is not the one."""
+        """Read the numbers in a file; `key`: name of the array of frames; `excluded`: an array without frames."""
         if path.suffix.lower() in (".mat", ".npz", ".npy"):
             table, axis = _array(path, key, excluded)
             shape = " × ".join(map(str, table.shape))
@@ -271,21 +271,21 @@ class _Numbers:
         divisors = {total // k for k in range(1, 1 + total // max(length, 1)) if length < total // k}
         table = text.values.reshape(lines, length) if total == lines * length else np.zeros((0, 0))
         sizes = tuple({length, length - 1, lines, *divisors})
-        if lines == length == len(table) and _spread(table.T) < _spread(table):  # alike are the columns
+        if lines == length == len(table) and _spread(table.T) < _spread(table):  # columns resemble each other more
             data = {"frames_in": "columns"}
             return cls(path, lambda counts: frames_in_table(table.T, counts, _UNKNOWN_LAYOUT), shape, sizes, data)
         return cls(path, lambda counts: frames_in_text(text, counts, _UNKNOWN_LAYOUT, path.name), shape, sizes)
 
 
 def _spread(rows: np.ndarray) -> float:
-    """Deviation of rows from their mean, relative."""
+    """Norm of the deviations of rows from their mean, divided by the norm of the rows."""
     values = np.where(np.isfinite(rows), rows, 0)
     norm = float(np.linalg.norm(values))
     return float(np.linalg.norm(values - values.mean(axis=0))) / norm if norm else 0.0
 
 
 def _array(path: Path, key: str | None, excluded: str | None) -> tuple[np.ndarray, str]:
-    """The array of frames in a file, and where its frames usually are."""
+    """The array of frames in a file, and whether its frames are usually its "rows" or its "columns"."""
     if path.suffix.lower() == ".npy":
         return np.atleast_2d(npy_array(path)), "rows"
     if path.suffix.lower() == ".mat":
@@ -309,7 +309,7 @@ def _array(path: Path, key: str | None, excluded: str | None) -> tuple[np.ndarra
 
 
 def _protocols(number: int) -> Iterator[dict[str, Any]]:
-    """Tables of the protocols of common kinds of so many electrodes."""
+    """Yield the table `[protocol]` of every common protocol for `number` electrodes."""
     common_options = {"driven_electrodes": (False, True), "order": ("rotating", "fixed")}
     for kind, options in (
         ("adjacent", {**common_options, "reciprocal": ("all", "half")}),
@@ -326,7 +326,7 @@ def _protocols(number: int) -> Iterator[dict[str, Any]]:
 def _fitting(
     numbers: _Numbers, base_numbers: _Numbers, geometry: dict, electrodes: dict, known: dict, current: float
 ) -> Iterator[Candidate]:
-    """Candidates whose frames fit both files, without those that are the same in another order."""
+    """Yield candidates whose number of channels fits both files; of equal protocols, only the first."""
     counts, found_protocols = set(numbers.sizes), set()
     for number in [known["number"]] if "number" in known else range(_FEWEST, _MOST + 1):
         if not any(number * (number - 4) / 4 <= count <= number**2 for count in counts):
@@ -352,7 +352,7 @@ def _fitting(
 
 
 def _channel_counts(known: dict) -> list[int]:
-    """Numbers of channels of the protocols that agree with what is known, if the number of electrodes is."""
+    """Numbers of channels of protocols that have the `known` entries; empty without the number of electrodes."""
     tables = _protocols(known["number"]) if "number" in known else ()
     fitting = [table for table in tables if all(table.get(key, value) == value for key, value in known.items())]
     protocols = [_protocol({**table, "current": 1.0}, Path("a")) for table in fitting]
@@ -366,7 +366,7 @@ def _describe_body(geometry: dict, electrodes: dict, protocol: dict, current: fl
 
 
 def _protocol(table: dict, path: Path) -> Protocol | None:
-    """The protocol of a table; None if it has no channels."""
+    """The protocol of a description's table `[protocol]`; None if the protocol has no channels."""
     try:
         return parse_description({"protocol": table}, "the description").protocol(path)
     except ValueError:  # none of its channels is left, or there are too few electrodes
@@ -374,7 +374,7 @@ def _protocol(table: dict, path: Path) -> Protocol | None:
 
 
 def _measurement_of(numbers: _Numbers, description: Description, protocol: Protocol) -> Measurement | None:
-    """The measurement in which the numbers are read with this protocol; None if they do not fit it."""
+    """The numbers of a file as a measurement with `protocol`; None if the numbers do not fit it."""
     try:
         frames = numbers.frames([protocol.num_measurements])
         if frames.table.shape[1] != protocol.num_measurements:
@@ -385,8 +385,8 @@ def _measurement_of(numbers: _Numbers, description: Description, protocol: Proto
 
 
 def _with_misfit(candidate: Candidate, models: dict[int, ForwardModel]) -> Candidate:
-    """The candidate with the wiring that explains the empty body best, on a mesh that candidates of as many electrodes
-    share."""
+    """The candidate with the wiring that explains the empty body best. Candidates with equally many electrodes share a
+    mesh."""
     number, empty_frame = candidate.protocol["number"], candidate.measurement
     assert empty_frame.domain is not None
     assert empty_frame.electrodes is not None
@@ -398,7 +398,7 @@ def _with_misfit(candidate: Candidate, models: dict[int, ForwardModel]) -> Candi
 
 
 def _with_gains(candidate: Candidate, models: dict[int, ForwardModel]) -> Candidate:
-    """The candidate with gains of its measurements, if they explain most of the reciprocity error."""
+    """The candidate with gains of its measurement patterns, if they explain most of the reciprocity error."""
     if candidate.reciprocity is None or candidate.reciprocity < _MIN_GAIN_ERROR:
         return candidate
     gains, error = channel_gains(candidate.measurement)
@@ -434,8 +434,8 @@ def _text(
     rivals: Sequence[Candidate],
     tables: dict[str, dict[str, Any]],
 ) -> str:
-    """The description in TOML, with the evidence as comments. `shape`: shape of the numbers in words; `data`:
-    entries of `[data]` that describe their arrangement."""
+    """The file's description in TOML, with the evidence as comments. `shape`: shape of the numbers in words; `data`:
+    entries of the table `[data]`, which describe the arrangement of the numbers."""
     notes = [note for note in best.measurement.notes if not note.startswith("[protocol]")]
     reversed_signs = best.reversed_signs or any("polarity" in note for note in notes)
     remark = "no two channels are reciprocal" if best.reciprocity is None else f"broken by {percent(best.reciprocity)}"

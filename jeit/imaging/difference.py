@@ -36,27 +36,27 @@ from jeit_solvers.engines import as_array
 
 _MIDDLE = 0.5
 # Minimum width of electrodes relative to their distance that raises no doubt; misfit of the reference above which it
-# may have been exchanged with the frame, and ratio of the misfits below which that is likely.
+# may have been exchanged with the frame, and ratio of the frame's misfit to it below which this is likely.
 _MIN_RELATIVE_WIDTH, _MIN_SUSPICIOUS_MISFIT, _MAX_EXCHANGED_MISFIT = 0.005, 0.1, 0.5
 # Maximum misfit of an image's voltages, in standard deviations, that raises no doubt.
 _MISFIT = 3.0
 # Minimum share of usable voltages that raises no doubt, and ranges of plausible conductivities: of solids in S/m, from
 # tap water and fat to brine, with a margin on both sides; of sheets in S, from a megohm a square to metal.
 _MIN_USABLE_SHARE, _CONDUCTIVITIES = 0.5, {2: (1e-6, 1e5), 3: (1e-3, 30.0)}
-# Voltage that no amplifier of such an instrument reads; and units smaller than a volt, with their number in a volt.
+# Voltage above the range of an EIT instrument's amplifiers; and units smaller than a volt, with their number per volt.
 _MAX_VOLTS, _SMALLER_UNITS = 60.0, (("mV", 1e3), ("uV", 1e6))
 
 
 @dataclass(frozen=True)
 class ImagedDifference:
-    """Result of `image_difference`.
+    """Image of the change between two frames: the result of `image_difference`.
 
     **Fields**
 
     - `measurement`, `reference`: the two frames compared, one frame each.
     - `quality`: the quality of the data, assessed before imaging.
     - `settings`: the settings used, with automatic choices filled in.
-    - `why`: the reason for the method, if it was chosen automatically.
+    - `why`: the reason for the imaging method, if the method was chosen automatically.
     - `wiring`: the estimated connection of electrodes and channels.
     - `calibration`: the forward model fitted to the reference, with its mesh.
     - `reconstruction`: the reconstruction matrix, the result of the iteration, or the shapes; with the hyperparameter
@@ -64,12 +64,12 @@ class ImagedDifference:
     - `change`: change of conductivity in every cell (m,), S/m (2-D: S), relative to `calibration.conductivity`. For
       complex voltages, the complex change of admittivity σ + iωε.
     - `raster`: `change` on a grid, NaN outside the mesh; `extent`: (x_min, x_max, y_min, y_max) in metres.
-    - `inclusions`: regions of changed conductivity, strongest first; the `shapes` if there are any. In iterative images
-      they are found in the logarithm of conductivity, which weights both signs alike, and must exceed the noise; in
-      complex images, in the real part.
+    - `inclusions`: regions of changed conductivity, strongest first; the `shapes` if there are any. In iterative
+      images, inclusions are found in the logarithm of conductivity, which weights both signs alike, and must exceed the
+      noise; in complex images, in the real part.
     - `unlike_electrodes`: electrodes, numbered from 0, that the model fits far worse than the others, with the ratio of
-      the misfits. Channels that measure on them have less weight.
-    - `shapes`: fitted bodies with their outlines; None if none were fitted, or if they do not explain the voltages.
+      the misfits. Channels on these electrodes have less weight.
+    - `shapes`: fitted bodies with outlines; None if no bodies were fitted, or if they do not explain the voltages.
     - `labels`: label of every pixel of the raster, if requested: 0 background, 1 resistive, 2 conductive.
     - `timings`: duration of each step in seconds.
     - `frame`: number of the imaged frame in its file, from 0; `num_frames`: number of frames in the file.
@@ -120,13 +120,13 @@ class ImagedDifference:
 
     @property
     def lowest(self) -> float:
-        """Minimum change relative to the background; below -1, a linear image has negative conductivities."""
+        """Minimum change of conductivity, relative to the background; below -1, conductivity is negative."""
         return float(np.real(self.change).min()) / float(np.real(self.calibration.conductivity))
 
     @property
     def peak_ranges(self) -> tuple[tuple[float, float], ...]:
-        """68 % interval of the change in each inclusion, S/m (2-D: S). Empty without fitted bodies, and where the data
-        leave an end open."""
+        """68 % interval of the change in each inclusion, S/m (2-D: S). Empty without fitted bodies, and if the data
+        leave an end of an interval open."""
         background = float(np.real(self.calibration.conductivity))
         intervals = [inclusion.contrast_interval or (None, None) for inclusion in self.inclusions]
         ranges = [
@@ -208,7 +208,7 @@ class ImagedDifference:
 
 
 def _imaged_on(reconstruction, calibration: Calibration) -> ForwardModel:
-    """Forward model on the mesh of the result."""
+    """Forward model on the mesh of a reconstruction."""
     finer_image = reconstruction.finer if isinstance(reconstruction, ShapeReconstruction) else None
     return calibration.model if finer_image is None else finer_image.model
 
@@ -225,7 +225,7 @@ def _doubts_of_data(imaged: ImagedDifference) -> list[str]:
 
 
 def _doubt_of_lengths(imaged: ImagedDifference) -> str:
-    """Whether electrodes on the edge of a sheet are so narrow that lengths may be in another unit; empty if not."""
+    """Sentence if electrodes on the edge of a sheet are so narrow that lengths may not be in metres; else empty."""
     electrodes, domain = imaged.measurement.electrodes, imaged.measurement.domain
     if not isinstance(electrodes, BoundaryElectrodes) or not isinstance(domain, Domain):
         return ""
@@ -240,7 +240,7 @@ def _doubt_of_lengths(imaged: ImagedDifference) -> str:
 
 
 def _doubt_of_order(imaged: ImagedDifference) -> str:
-    """Whether the frame fits an undisturbed body much better than the reference does; empty if not."""
+    """Sentence if the frame fits an undisturbed body much better than the reference does; otherwise empty."""
     misfit = float(imaged.calibration.misfit)
     usable = np.asarray(imaged.measurement.mask)[0] & np.asarray(imaged.reference.mask)[0]
     if not (misfit > _MIN_SUSPICIOUS_MISFIT and usable.any()):
@@ -258,8 +258,8 @@ def _doubt_of_order(imaged: ImagedDifference) -> str:
 
 
 def _doubt_of_units(imaged: ImagedDifference) -> str:
-    """What is wrong with the level of the voltages, and the unit that is likely; empty if nothing is, or if the notes
-    say that the scale is not known."""
+    """Sentence if the level of the voltages is implausible, with the unit that is likely; otherwise empty, also if the
+    notes of the measurement say that the scale is not known."""
     lower, upper = _CONDUCTIVITIES[imaged.mesh.dimension]
     background = abs(complex(imaged.calibration.conductivity))
     frames = [
@@ -314,7 +314,7 @@ def image_difference(
       named "reference".
     - `settings`: default: `ImagingSettings()`.
     - `frame`: number (from 0) or name of the frame to image; default: the first.
-    - `progress`: called with the name of each step when it begins.
+    - `progress`: function called with the name of each step when the step begins.
 
     Raises `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`) or lack the positions of the
     electrodes, and for arguments of another type, such as the path of a file.
@@ -399,7 +399,7 @@ def _inclusions(
 
 
 def _body_inclusion(body: Star | Ellipsoid, background: float) -> Inclusion:
-    """The inclusion that a fitted body is, with its intervals if they were estimated."""
+    """A fitted body as an inclusion, with the intervals of its properties if they were estimated."""
     centroid = tuple(body.centroid.tolist())
     if (quantities := body.quantities) is not None:
         return Inclusion(
@@ -437,7 +437,7 @@ def _region_labels(regions, grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
 
 def _labels(mesh: Mesh, bodies: Sequence[Star | Ellipsoid], grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
     """Label the pixels in resistive and conductive bodies, in a solid at half its height. Where bodies overlap, the
-    first in the list counts."""
+    first body of the list determines the label."""
     centres, inside = grid.pixel_centres(), np.asarray(grid.cell) >= 0
     if mesh.dimension == 3:
         z = np.asarray(mesh.points)[:, 2]

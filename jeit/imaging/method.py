@@ -49,8 +49,8 @@ class ImagingSettings:
       used. Defaults: "noise-figure" for one-step imaging, 5 for Gauss-Newton and Levenberg-Marquardt, 300 for total
       variation, which gave good images of measured tanks.
     - `contact`: calibration of the contact impedance: "each" (one value per electrode), "common" (one value) or
-      "fixed". Default: "each" if voltages are measured on driven electrodes, otherwise "fixed", since the data do not
-      determine it.
+      "fixed". Default: "each" if voltages are measured on driven electrodes, otherwise "fixed", since the data then do
+      not determine the contact impedance.
     - `num_points`: approximate number of mesh nodes; default: 2,000 for a sheet, 10,000 for a solid.
     - `raster_shape`: (rows, columns) of the raster.
     - `level`, `least_peak`: see `jeit.image.find_inclusions`.
@@ -111,7 +111,7 @@ def as_settings(requested: ImagingSettings | None) -> ImagingSettings:
 
 
 def check_prior(prior) -> None:
-    """Check a prior or its name. Raises `ValueError` for anything else."""
+    """Raise `ValueError` unless `prior` is a prior or the name of a prior."""
     if not isinstance(prior, AbstractPrior):
         check_name("prior", prior, PRIORS, "" if isinstance(prior, str) else ", or an object such as Noser()")
 
@@ -126,7 +126,8 @@ def check_body(contact: str | None, num_points: int | None) -> None:
 
 
 def check_hyperparameter(hyperparameter: float | str) -> None:
-    """Check λ or the name of its rule. Raises `ValueError` for anything but a positive number or a rule."""
+    """Check λ or the name of its rule. Raises `ValueError` unless `hyperparameter` is a positive number or the name of
+    a rule."""
     if isinstance(hyperparameter, str):
         check_name("hyperparameter", hyperparameter, RULES, ", or a number")
     elif not (is_number(hyperparameter) and hyperparameter > 0):
@@ -159,7 +160,7 @@ _MIN_PEAK, _MIN_AREA, _MAX_STARTS = 0.15, 0.002, 8
 
 @dataclass(frozen=True)
 class Method:
-    """A method to image a difference.
+    """An imaging method for the difference of two frames.
 
     - `image`: the function that computes the image from a prepared difference and the requested settings.
     - `takes_prior`: whether the method uses the prior of the settings.
@@ -187,8 +188,8 @@ def prior_for(prior: NamedPrior, domain: Body) -> AbstractPrior:
 
 
 def rule_for(name: str, prepared: PreparedDifference) -> Rule:
-    """Rule `name` for the hyperparameter, with the noise of the data if the rule needs it. Raises `ValueError` if that
-    noise is not known."""
+    """Rule `name` for the hyperparameter, with the noise of the data if the rule needs it. Raises `ValueError` if the
+    rule needs noise that is not known."""
     if name != "discrepancy":
         return RULES[name]
     if prepared.noise is None:
@@ -264,8 +265,8 @@ def _iterative_image(
 def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, options: MethodOptions) -> ShapeReconstruction:
     """Fit bodies that explain a difference, starting from the inclusions of its smooth image.
 
-    A body is kept only if the objective without it is larger by the factor `least_rise` and the evidence favours it.
-    The factor allows for model errors, which the noise does not include.
+    A body is kept only if the objective of the fit without it is larger by the factor `least_rise` and the Bayesian
+    evidence favours the body. The factor allows for model errors, which the noise does not include.
     """
     model, background = prepared.model, prepared.calibration.conductivity
     is_solid = prepared.mesh.dimension == 3

@@ -38,8 +38,8 @@ def chosen_frame(measurement: Measurement, frame: int | str | None = None) -> in
 
 @contextmanager
 def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
-    """Context manager that adds the frame number to a `ValueError` that names the measurement, if it has several
-    frames."""
+    """Context manager that adds the frame number to a `ValueError` that names the measurement, if the measurement has
+    several frames."""
     try:
         yield
     except ValueError as error:
@@ -51,15 +51,15 @@ def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
 
 # Default number of mesh nodes for a solid and for a sheet.
 SOLID_POINTS, SHEET_POINTS = 10_000, 2000
-# Minimum share of a difference that is assumed to remain unexplained by any model.
+# Minimum share of a voltage difference that is assumed to remain unexplained by any model.
 _MIN_MISFIT = 0.03
-# Factor by which this share is larger for images with sharp outlines.
+# Factor by which the unexplained share is larger for images with sharp outlines.
 _SHARP_FACTOR = 3.0
-# Relative standard deviation of strengths due to the discretisation, of a sheet and a solid: the cells of a solid are
-# coarse beside its bodies. Estimated on 23 bodies in simulated boxes and cylinders.
+# Relative standard deviation, due to the discretisation, of the strengths of fitted bodies in a sheet and in a solid:
+# the cells of a solid are coarse relative to the bodies. Estimated on 23 bodies in simulated boxes and cylinders.
 _DISCRETISATION_DEVIATION = {2: 0.0, 3: 0.03}
-# Misfit of an electrode, relative to that of the others, above which it counts as unlike them. In sound tanks the ratio
-# was at most 2.6.
+# Misfit of an electrode, relative to that of the other electrodes, above which it counts as unlike them. In sound tanks
+# the ratio was at most 2.6.
 _MIN_UNLIKE_MISFIT = 3.0
 
 
@@ -117,16 +117,16 @@ class PreparedDifference:
     @property
     def relative_noise(self) -> Float[Array, " M"]:
         """Noise of the channels relative to each other, volts: `jeit.inverse.relative_noise` of the reference,
-        multiplied by the relative misfit of unlike electrodes for channels that measure on them."""
+        multiplied by the relative misfit of the electrode for channels that measure on `unlike_electrodes`."""
         noise = relative_noise(np.asarray(self.reference.voltages)[0], self.mask)
         is_reading = np.asarray(self.model.protocol.channel_measurement) != 0
         return as_array(noise * np.max(np.where(is_reading, self._electrode_weights, 1), axis=1))
 
     @property
     def unlike_electrodes(self) -> dict[int, float]:
-        """Electrodes, numbered from 0, whose channels in the reference are fitted far worse than those of the others,
-        each with the ratio of the misfits. They may be loose or displaced, or their gain may differ. Channels that
-        measure on them have less weight."""
+        """Electrodes, numbered from 0, whose channels in the reference are fitted far worse than those of the other
+        electrodes, each with the ratio of the misfits. Such electrodes may be loose or displaced, or their gain may
+        differ. Channels that measure on these electrodes have less weight."""
         return {
             int(electrode): float(self._electrode_weights[electrode])
             for electrode in np.flatnonzero(self._electrode_weights > 1)
@@ -134,7 +134,8 @@ class PreparedDifference:
 
     @functools.cached_property
     def _electrode_weights(self) -> Float[np.ndarray, " L"]:
-        """Relative misfit (L,) of unlike electrodes, by which their noise is multiplied; 1 for the others."""
+        """Relative misfit (L,) of unlike electrodes, by which the noise of their channels is multiplied; 1 for the
+        other electrodes."""
         base = np.asarray(self.reference.voltages)[0]
         residual = np.asarray(self.calibration.voltages) - base
         misfits = electrode_misfits(self.model.protocol, residual, relative_noise(base, self.mask), self.mask)
@@ -142,8 +143,8 @@ class PreparedDifference:
 
     @property
     def noise(self) -> float | None:
-        """Estimated standard deviation of the noise of the difference, that of rounding included, in units of
-        `relative_noise`; None if not known."""
+        """Estimated standard deviation of the noise of the voltage difference, including rounding, in units of
+        `relative_noise`; None if the noise is not known."""
         if self.quality.trusted_noise is None:
             return None
         relative_rounding = np.asarray(self._rounding)[self.mask] / np.asarray(self.relative_noise)[self.mask]
@@ -151,7 +152,7 @@ class PreparedDifference:
 
     @property
     def modelled_noise(self) -> Float[Array, " M"]:
-        """Expected deviation of the difference from the voltages of the model, volts: the root of the sum of squares of
+        """Expected deviation of the voltage difference from that of the model, volts: the root of the sum of squares of
         the noise of the difference, of rounding, and of the model error, which is the difference times the relative
         misfit of the reference (at least 3 %).
 
@@ -161,17 +162,17 @@ class PreparedDifference:
 
     @property
     def sharp_noise(self) -> Float[Array, " M"]:
-        """`modelled_noise` for bodies with sharp outlines, volts. Its model error is three times larger, since bodies
-        with sharp outlines, unlike smooth images, cannot adapt to model errors."""
+        """`modelled_noise` for bodies with sharp outlines, volts. The model error in it is three times larger, since
+        bodies with sharp outlines, unlike smooth images, cannot adapt to model errors."""
         return self._noise_with_error_share(_SHARP_FACTOR * max(self._misfit, _MIN_MISFIT))
 
     @property
     def accuracy(self) -> Accuracy:
-        """Errors of the difference, from which intervals are computed.
+        """Errors of the voltage difference, from which the intervals of fitted bodies are computed.
 
         The errors of the voltages are noise, the unknown part of electrode positions and contacts, and a share of the
-        difference that equals the misfit of the reference, at least 2 %. The errors of all strengths are the part of
-        that misfit that noise does not explain and, in a solid, the discretisation.
+        difference that equals the misfit of the reference, at least 2 %. The common errors of the strengths of all
+        bodies are the part of this misfit that noise does not explain and, in a solid, the discretisation error.
         """
         model_error = self.calibration.model_error
         if model_error is None:  # a reference that the described places explain still leaves them uncertain
@@ -200,8 +201,8 @@ class PreparedDifference:
 
     @functools.cached_property
     def _misfit(self) -> float:
-        """Relative misfit of the reference, with equal weights or, if that is less, with channels weighted by their
-        noise."""
+        """Relative misfit of the model to the reference, with equally weighted channels or with channels weighted by
+        their noise, whichever misfit is smaller."""
         reference = np.asarray(self.reference.voltages)[0], np.asarray(self.reference.mask)[0]
         return min(float(self.calibration.misfit), relative_misfit(self.calibration.voltages, *reference))
 
@@ -236,7 +237,7 @@ def prepare_difference(
     - `measurement`, `reference`, `frame`: as in `image_difference`.
     - `contact`, `num_points`: as in `ImagingSettings`.
     - `as_is`: image even if the wiring seems to differ from its description, and leave spikes in place.
-    - `clock`: measures the duration of each step.
+    - `clock`: timer that measures the duration of each step.
 
     Raises `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`) or lack the positions of the
     electrodes, if the calibration fails, and, unless `as_is`, if the wiring differs from its description or from that
@@ -291,7 +292,8 @@ def prepare_difference(
 
 
 def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
-    """Check the wiring found in `reference`. Raises `ValueError` if it differs from its description, unless `as_is`."""
+    """Check the wiring found in `reference`. Raises `ValueError` if this wiring differs from its description, unless
+    `as_is`."""
     if wiring.fault and not as_is:
         # Voltages of the opposite sign cannot be calibrated, even with `as_is`.
         advice = "" if wiring.reversed_signs else "; or go on as it is (as_is=True, --as-is)"
@@ -307,8 +309,8 @@ def select_frames(
     """Select the frame to image and its reference, one frame each.
 
     A frame named "reference" in `measurement` is imaged only if requested, and serves as reference if no `reference` is
-    given. A reference measured with other currents is converted to those of the measurement if it determines their
-    voltages (see `jeit.data.driven_by`), which is recorded in its notes.
+    given. A reference measured with other currents is converted to the currents of the measurement if it determines
+    their voltages (see `jeit.data.driven_by`); its notes record the conversion.
 
     **Arguments:**
 
@@ -334,7 +336,7 @@ def select_frames(
 
 
 def check_measurement(name: str, given: Measurement) -> None:
-    """Check that the argument `name` is a `Measurement`. Raises `ValueError` otherwise, such as for a path."""
+    """Raise `ValueError` if the argument `name` is not a `Measurement` but, for example, a path."""
     check_kind(name, given, Measurement, "a Measurement, as of jeit.read(path)")
 
 
@@ -351,7 +353,7 @@ def imaging_mesh(
       solid.
     - `usual`: default of `num_points`.
 
-    Raises `ValueError` if a number is given for a body that has its own mesh.
+    Raises `ValueError` if `num_points` is given for a body that has its own mesh.
 
     **Example:**
 
@@ -365,7 +367,7 @@ def imaging_mesh(
 
 
 def check_real(measurement: Measurement) -> None:
-    """Check that voltages are real, for functions other than `image_difference`. Raises `ValueError` otherwise."""
+    """Raise `ValueError` if voltages are complex, for functions other than `image_difference`."""
     if np.iscomplexobj(measurement.voltages):
         raise ValueError(
             f"'{measurement.name}' is complex; choose the part to image with [data] component in its description: "
@@ -374,8 +376,8 @@ def check_real(measurement: Measurement) -> None:
 
 
 def body_of(measurement: Measurement, reference: Measurement) -> tuple[Body, AbstractElectrodes]:
-    """Body and electrodes of a measurement, or else of its reference. Raises `ValueError` if neither has them, and if
-    electrode positions are as uncertain as the body is wide."""
+    """Body and electrodes of a measurement, or else of its reference. Raises `ValueError` if neither measurement has
+    them, and if electrode positions are as uncertain as the body is wide."""
     domain = measurement.domain if measurement.domain is not None else reference.domain
     electrodes = measurement.electrodes if measurement.electrodes is not None else reference.electrodes
     if domain is None or electrodes is None:

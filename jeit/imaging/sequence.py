@@ -2,9 +2,10 @@
 
 Frequency-difference imaging compares a body at two frequencies, without a frame of the empty body. Admittivity σ + iωε
 depends on frequency, in tissue and in phantoms of tissue more than in saline. The plain difference v₂ - v₁ contains the
-changes of the background and of the objects. The weighted difference v₂ - αv₁ with α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ removes all
-that is proportional to the voltages at the first frequency; it is zero for a homogeneous body. Seo, Lee, Kim, Zribi and
-Woo, Physiol. Meas. 29 (2008) 755-769; Jun, Kuen, Lee, Woo, Holder and Seo, Physiol. Meas. 30 (2009) 1087-1099.
+changes of the background and of the objects. The weighted difference v₂ - αv₁ with α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ removes the
+part of v₂ that is proportional to v₁, the voltages at the first frequency; the weighted difference is zero for a
+homogeneous body. Seo, Lee, Kim, Zribi and Woo, Physiol. Meas. 29 (2008) 755-769; Jun, Kuen, Lee, Woo, Holder and Seo,
+Physiol. Meas. 30 (2009) 1087-1099.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ _MIN_FRAME_SHARE = 0.5
 
 @dataclass(frozen=True)
 class ImagedSequence:
-    """Result of `image_sequence`.
+    """Images of the frames of a measurement: the result of `image_sequence`.
 
     **Fields**
 
@@ -74,7 +75,8 @@ def image_sequence(
     regions: Mapping[str, Callable[[Mesh], Bool[np.ndarray, " m"]]] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ImagedSequence:
-    """Image every frame of a measurement, with one linear method and one λ. Frames without times are numbered.
+    """Image every frame of a measurement, with one linear method and one λ. If frames have no times, their numbers
+    replace the times.
 
     **Arguments:**
 
@@ -84,14 +86,14 @@ def image_sequence(
     - `settings`: settings of a linear method; default: one-step imaging. λ is chosen for the frame that differs most
       from the reference.
     - `regions`: regions of interest by name, each a function of the mesh, such as `lambda mesh:
-      jeit.image.ball_region(mesh, (0, 0), 0.01)`. They are called before imaging, so that their errors are raised
-      early.
-    - `progress`: called with the name of each step when it begins.
+      jeit.image.ball_region(mesh, (0, 0), 0.01)`. These functions are called before imaging, so that their errors are
+      raised early.
+    - `progress`: function called with the name of each step when the step begins.
 
     Spikes in single channels are replaced by what other channels determine (`jeit.data.mask_spikes`).
     Channels missing in more than half of the frames are not used; frames that lack any other channel are refused. The
-    images need four bytes per cell and frame. Raises `ValueError` as `image_difference`, for a measurement with
-    one frame, for an iterative method, and for images that would not fit in memory.
+    images need four bytes per cell and frame. Raises `ValueError` in the same cases as `image_difference`, for a
+    measurement with one frame, for an iterative method, and for images that would not fit in memory.
 
     **Example:**
 
@@ -158,13 +160,13 @@ def image_sequence(
 
 @dataclass(frozen=True)
 class ImagedFrequencies:
-    """Result of `image_frequencies`.
+    """Image of the change of a body between two frequencies: the result of `image_frequencies`.
 
     **Fields**
 
     - `image`: the image of the weighted difference of the two frequencies.
-    - `weight`: factor α of the voltages at the first frequency, by which those of the body as a whole change; 1 for
-      plain differences.
+    - `weight`: factor α of the voltages at the first frequency, by which the voltages of the body as a whole change; 1
+      for plain differences.
 
     **Example:**
 
@@ -193,7 +195,8 @@ def image_frequencies(
     - `second`, `first`: voltages of the same body, electrodes and protocol at two frequencies; complex voltages give an
       image of admittivity.
     - `settings`: as for `image_difference`.
-    - `weighted`: whether to image v₂ - αv₁ (see `frequency_weight`) or v₂ - v₁. The background is fitted to αv₁, or v₁.
+    - `weighted`: whether to image v₂ - αv₁ (see `frequency_weight`) or v₂ - v₁. The background is fitted to the
+      subtracted voltages, αv₁ or v₁.
     - `frame`: number (from 0) or name of the frame of `second`; default: the first.
 
     Raises `ValueError` for data that cannot be imaged, and if the voltages at the two frequencies are not similar.

@@ -51,7 +51,7 @@ class StreamSettings:
     - `contact`, `num_points` (default: 1,200), `as_is`: as in `jeit.imaging.ImagingSettings`.
 
     Raises `ValueError` for a solver that cannot image frames, an unknown prior, a memory that is not a number of
-    frames, and as `jeit.imaging.ImagingSettings`.
+    frames, and in the same cases as `jeit.imaging.ImagingSettings`.
 
     **Example:**
 
@@ -92,9 +92,9 @@ def prepare_imager(
     - `reference`: frames of the undisturbed sensor.
     - `settings`: default: `StreamSettings()`.
     - `measurement`: the frames to image, if they are available; their protocol must be that of the reference.
-    - `progress`: called with the name of each step when it begins.
+    - `progress`: function called with the name of each step when the step begins.
 
-    Raises `ValueError` for another protocol, and in the same cases as `image_difference`.
+    Raises `ValueError` if the protocols differ, and in the same cases as `image_difference`.
 
     **Example:**
 
@@ -136,9 +136,10 @@ def prepare_imager(
 def described_reference(
     description: Description, frames: Float[np.ndarray, "N M"], *, name: str = "reference"
 ) -> Measurement:
-    """The mean of frames (N, M), volts, of an undisturbed sensor, as a measurement of the sensor that is described.
+    """Measurement of a described sensor that contains the mean of frames (N, M), volts, of the undisturbed sensor.
 
-    Raises `ValueError` for a description without geometry, electrodes or protocol, and as `jeit.data.screen`.
+    Raises `ValueError` for a description without geometry, electrodes or protocol, and in the same cases as
+    `jeit.data.screen`.
     """
     protocol = description.protocol(description.origin)
     if protocol is None or description.domain is None or description.electrodes is None:

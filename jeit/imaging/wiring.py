@@ -6,8 +6,8 @@ two rows. The exchanges that make the frame most similar to its reference are fo
 
 `find_wiring` finds the wiring that explains a frame of the empty body. A uniform body is known except for its
 conductivity and its contacts. Its transfer impedance Z (L, L) is computed for several contact impedances; if electrode
-k is at the place of electrode p(k), it is Z[p, p]. Wirings are compared by their misfit to the frame, with a free
-scale.
+k is at the place of electrode p(k), the transfer impedance is Z[p, p]. Wirings are compared by their misfit to the
+frame, up to a scale factor.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from jeit.forward.model import select_channels
 from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
 
-# Maximum ratio of the difference after an exchange to that before, for each exchange and for all reported exchanges
-# together; and maximum number of exchanges.
+# Maximum ratio of the difference between frame and reference after an exchange to the difference before, for each
+# exchange and for all reported exchanges together; and maximum number of exchanges.
 _MAX_EXCHANGE_RATIO, _MAX_TOTAL_RATIO, _MAX_EXCHANGES = 0.9, 0.5, 4
 
 
 def exchanges_message(frame: Measurement, reference: Measurement) -> str:
     """Sentence that names the drives, or the measurements of every drive, that seem exchanged in a frame, numbered from
-    1; empty if no exchanges halve its difference from the reference, or if not all drives have the same
+    1; empty if no exchanges halve the frame's difference from the reference, or if not all drives have the same
     measurements."""
     order = _order(frame)
     if order is None:
@@ -92,7 +92,8 @@ def _exchanges(
 
 MOST_MISFIT = 0.15
 """Relative misfit of the empty body above which a wiring error is suspected."""
-# Maximum ratio of the misfit with another wiring to that before: for each exchange, and for the wiring reported.
+# Maximum ratio of the misfit after a change of the wiring to the misfit before: for each exchange, and for the reported
+# wiring.
 _MAX_STEP_RATIO, _MAX_WIRING_RATIO = 0.85, 0.6
 _MAX_ELECTRODE_EXCHANGES = 4
 # Relative misfit of the empty body above which imaging is refused even if no other wiring explains the frame.
@@ -106,10 +107,11 @@ class Wiring:
     """Estimated connection of electrodes and channels.
 
     - `places`: electrode k is at the place of electrode `places[k]`, numbered from 0.
-    - `order`: order of the channels, a name in `channel_orders`; empty if as described.
+    - `order`: order of the channels, a name in `channel_orders`; empty for the described order.
     - `reversed_signs`: whether all voltages have the opposite sign.
-    - `magnitudes`: whether the voltages look to have lost their signs.
-    - `misfit`: relative misfit of a uniform body with this wiring to the frame; `described`: with the described wiring.
+    - `magnitudes`: whether the voltages seem to have lost their signs.
+    - `misfit`: relative misfit of a uniform body with this wiring to the frame; `described`: relative misfit with the
+      described wiring.
     """
 
     places: tuple[int, ...]
@@ -126,7 +128,7 @@ class Wiring:
 
     @property
     def fault(self) -> str:
-        """The fault of the wiring, in a sentence; empty if it has none that prevents imaging."""
+        """The fault of the wiring, in a sentence; empty if the wiring has no fault that prevents imaging."""
         if self.explanation or self.described < _HOPELESS:
             return self.explanation
         return (
@@ -136,7 +138,7 @@ class Wiring:
 
     @property
     def explanation(self) -> str:
-        """The wiring found, in a sentence, with electrodes numbered from 1; empty if it is the described one."""
+        """The estimated wiring, in a sentence, with electrodes numbered from 1; empty for the described wiring."""
         faults = [_exchange_text(self.places, self._cycles())]
         faults.append(self.order and f"the channels look ordered {self.order}")
         faults.append(
@@ -163,12 +165,13 @@ class Wiring:
 
 def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
     """Find the wiring that explains the first frame of `measurement`, of the empty body: the described wiring, unless
-    the misfit of another is far smaller.
+    the misfit of another wiring is far smaller.
 
     Candidates are other orders of the channels, voltages of opposite sign, other first electrodes, the reverse order of
     electrodes, and up to four successive exchanges of two electrodes. Voltages all of one sign, or with the signs that
-    the described wiring gives them, may be magnitudes: they are compared without signs if that explains more. Errors
-    that leave the voltages unchanged, such as a rotation of the electrodes of a symmetric body, cannot be found.
+    the described wiring gives them, may be magnitudes: they are compared without signs if a wiring then explains the
+    frame better. Errors that leave the voltages unchanged, such as a rotation of the electrodes of a symmetric body,
+    cannot be found.
     """
     num_electrodes, orders = model.protocol.num_electrodes, channel_orders(model.protocol)
     described_wiring = Wiring(tuple(range(num_electrodes)))
@@ -226,8 +229,8 @@ def _explained(
 
 
 def _has_one_sign(model: ForwardModel, measurement: Measurement) -> bool | None:
-    """True if all voltages have one sign; False if they have the signs of a uniform body with the described wiring,
-    which magnitudes are given when they are read; None otherwise."""
+    """True if all voltages have one sign; False if they have the signs (or all opposite signs) of a uniform body with
+    the described wiring, which magnitudes are given when their file is read; None for other signs."""
     used = np.asarray(measurement.mask)[0]
     signs = np.sign(np.real(np.asarray(measurement.filled())[0]))[used]
     expected = np.sign(select_channels(on_host(model.protocol), _impedances(model)[0]))[used]
@@ -238,7 +241,7 @@ def _has_one_sign(model: ForwardModel, measurement: Measurement) -> bool | None:
 
 def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
     """Possible orders of the channels in a file, by name: index in the file (M,) of each channel of the protocol. The
-    first has an empty name and is the order of the protocol."""
+    first order has an empty name and is that of the protocol."""
     drive, measurement = np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)
     channels = np.arange(len(drive))
     first = np.asarray(protocol.measurement).argmax(axis=1)[measurement]
@@ -267,8 +270,8 @@ def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
 def _comparison(
     model: ForwardModel, measurement: Measurement, orders, *, signs: bool = True
 ) -> Callable[[Wiring], Wiring]:
-    """Function that computes the misfit of a wiring and the sign of its voltages; of their magnitudes without
-    `signs`."""
+    """Function that computes the misfit of a wiring to the first frame of `measurement`, and the sign of the voltages;
+    without `signs`, the misfit of their magnitudes."""
     protocol = on_host(model.protocol)
     voltages, mask = np.real(np.asarray(measurement.filled())[0]), np.asarray(measurement.mask)[0]
     impedances, voltages = _impedances(model), voltages if signs else np.abs(voltages)

@@ -1,4 +1,4 @@
-"""Reading and writing of layouts in CSV files, in a plane and on surfaces."""
+"""Reading and writing of electrode layouts in CSV files, for flat and for curved skins."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from jeit.mesh import Domain, Mesh
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _PLANE_COLUMNS = ("x", "y", "diameter")
 _LENGTH_COLUMNS = ("x", "y", "z", "diameter")
-# Title of a column with its unit: "x_mm", "x [mm]", "x (mm)" or "xmm".
+# Title of a column of lengths with its unit: "x_mm", "x [mm]", "x (mm)" or "xmm".
 _LENGTH_TITLE = re.compile(rf"({'|'.join(_LENGTH_COLUMNS)})[ _]*[\[(]?({'|'.join(_UNITS)})[\])]?")
 _LABEL_COLUMN, _IMPEDANCE_COLUMN = "label", "contact_impedance_ohm_m2"
 MOST_BYTES = 2**24
@@ -30,11 +30,11 @@ MOST_BYTES = 2**24
 
 
 class LayoutTable(NamedTuple):
-    """A table of L electrodes.
+    """Table of L electrodes, read from a file.
 
     **Fields**: `lengths`: coordinates and diameters (L,) by name, metres; `contact_impedance`: (L,) ohm·m², or None;
-    `labels`: labels, or None; `lines`: number of the line of each electrode; `titles`: titles of the columns of
-    lengths.
+    `labels`: labels, or None; `lines`: number of the line of each electrode in the file; `titles`: titles of the
+    columns of lengths.
     """
 
     lengths: dict[str, Float[np.ndarray, " L"]]
@@ -51,7 +51,7 @@ def millimetres(metres: float) -> float:
 
 
 def write_csv(layout: Layout | SurfaceLayout, file: BinaryIO) -> None:
-    """Write the electrodes of a layout as a table, without the outline or the surface."""
+    """Write the electrodes of a layout as a CSV table, without the outline or the surface."""
     lengths = np.column_stack([layout.centres, layout.diameters])
     names = _PLANE_COLUMNS if lengths.shape[1] == 3 else _LENGTH_COLUMNS
     header = [*(f"{name}_mm" for name in names), _LABEL_COLUMN]
@@ -67,8 +67,8 @@ def write_csv(layout: Layout | SurfaceLayout, file: BinaryIO) -> None:
 
 
 def read_csv(path: Path, outline: Domain | None) -> Layout:
-    """Read a layout in a plane from a table, written by `write_csv` or by hand. Raises `ValueError`, naming the
-    line."""
+    """Read an electrode layout of a flat skin from a CSV table, written by `write_csv` or by hand. Raises `ValueError`
+    for an invalid table, naming the line."""
     table = read_table(path, _PLANE_COLUMNS)
     centres, diameters = np.column_stack([table.lengths["x"], table.lengths["y"]]), table.lengths["diameter"]
     _check_unit(centres, diameters, table.titles)
@@ -84,9 +84,9 @@ def read_csv(path: Path, outline: Domain | None) -> Layout:
 
 
 def read_table(path: Path, length_columns: Sequence[str]) -> LayoutTable:
-    """Read a table of electrodes. `length_columns`: the columns of lengths that it must have, from "x", "y", "z" and
-    "diameter"; the title of each states its unit. Raises `ValueError` for a table with other columns or invalid
-    values."""
+    """Read a table of electrodes. `length_columns`: the columns of lengths that the table must have, from "x", "y", "z"
+    and "diameter"; the title of each column states its unit. Raises `ValueError` for a table with other columns or
+    invalid values."""
     lines = _read_lines(path, length_columns)
     delimiter = next((mark for mark in ";\t" if mark in lines[0][1]), ",")
     (_, header), *rows = [(number, _split_cells(line, delimiter)) for number, line in lines]
@@ -154,8 +154,8 @@ def _split_cells(line: str, delimiter: str) -> list[str]:
 
 
 def _find_columns(header: list[str], length_columns: Sequence[str]) -> dict[str, tuple[int, float]]:
-    """Index and unit (in metres) of every column, by name. Raises `ValueError` for columns that are missing, unknown,
-    repeated, or do not state their unit."""
+    """Index and unit (in metres) of every column of a table, by name. Raises `ValueError` for columns that are missing,
+    unknown, repeated, or do not state their unit."""
     columns: dict[str, tuple[int, float]] = {}
     for index, title in enumerate(header):
         length = _LENGTH_TITLE.fullmatch(title.lower())
@@ -202,7 +202,7 @@ def read_surface_layout(path: str | Path, surface: Mesh, *, outward: bool = True
 
     The columns are `x_mm`, `y_mm`, `z_mm`, `diameter_mm` and optionally `label` and `contact_impedance_ohm_m2`, in the
     format of `read_layout`. Positions are moved to the surface. Raises `FileNotFoundError` if there is no such file,
-    and `ValueError` for an invalid table, naming the line, and as `SurfaceLayout` does.
+    and `ValueError` for an invalid table, naming the line, and in the same cases as `SurfaceLayout`.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""Reading and writing of layouts as DXF drawings, with the package ezdxf."""
+"""Reading and writing of electrode layouts as DXF drawings, with the package ezdxf."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jeit.layout.csv_file import MOST_BYTES
 from jeit.layout.layout import Layout
 from jeit.mesh import Disk, Domain, Polygon
 
-# Texts for the error message without the extra: the task that needs it, and the formats that do not.
+# Texts of the error message if the extra `cad` is missing: the task that needs it, and the formats that do not.
 _EXTRA_TEXTS = ("a DXF drawing", "CSV and SVG files need nothing more.")
 _OUTLINE_LAYER, _ELECTRODE_LAYER, _LABEL_LAYER = "OUTLINE", "ELECTRODES", "LABELS"
 # AutoCAD's colour numbers: laser cutters distinguish lines to cut from lines to engrave by their colour.
@@ -24,8 +24,8 @@ _LAYER_COLOURS = {_OUTLINE_LAYER: 1, _ELECTRODE_LAYER: 5, _LABEL_LAYER: 8}
 
 
 def write_dxf(layout: Layout, file: BinaryIO) -> None:
-    """Write a layout as a drawing in millimetres, in the format of AutoCAD 2007, the first one that supports labels in
-    any script.
+    """Write an electrode layout as a DXF drawing in millimetres, in the format of AutoCAD 2007, the first format that
+    supports labels in any script.
 
     Raises `ImportError` if the extra `cad` is not installed.
     """
@@ -50,7 +50,7 @@ def write_dxf(layout: Layout, file: BinaryIO) -> None:
 
 
 class _DxfPen:
-    """Draws circles and polygons on one layer of a drawing."""
+    """Pen that draws circles and polygons on one layer of a DXF drawing."""
 
     def __init__(self, space: Any, layer: str):
         self.space, self.on = space, {"layer": layer}
@@ -63,7 +63,7 @@ class _DxfPen:
 
 
 class _Entity(NamedTuple):
-    """An entity of a drawing: its kind, and its values as far as they are used, in the unit of the drawing."""
+    """An entity of a DXF drawing: its kind, and those of its values that are used, in the unit of the drawing."""
 
     kind: str
     circle: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -75,8 +75,8 @@ class _Entity(NamedTuple):
 
 
 def read_dxf(path: Path, outline: Domain | None) -> Layout:
-    """Read a layout from a drawing with the layers of `write_dxf`. Raises `ValueError` for an invalid drawing, and
-    `ImportError` if the extra `cad` is not installed."""
+    """Read an electrode layout from a DXF drawing with the layers that `write_dxf` writes. Raises `ValueError` for an
+    invalid drawing, and `ImportError` if the extra `cad` is not installed."""
     ezdxf = optional("ezdxf", *_EXTRA_TEXTS)
     check_size(path, MOST_BYTES)
     with read_as("this is not a DXF drawing that is read"):

@@ -1,4 +1,4 @@
-"""Reading and writing of layouts, in millimetres: CSV for spreadsheets, DXF and SVG for laser cutters.
+"""Reading and writing of electrode layouts, in millimetres: CSV for spreadsheets, DXF and SVG for laser cutters.
 
 Contents of each format:
 
@@ -25,8 +25,8 @@ _WRITERS = {".csv": write_csv, ".dxf": write_dxf, ".svg": write_svg}
 
 
 def read_layout(path: str | Path, *, outline: Domain | None = None) -> Layout:
-    """Read a layout of electrodes from a file. The format is determined by the suffix; the name of the layout is that
-    of the file.
+    """Read an electrode layout from a file. The suffix of the file determines the format; the layout has the name of
+    the file.
 
     - `.csv`: one line per electrode, with the columns `x_mm`, `y_mm`, `diameter_mm` and optionally `label` and
       `contact_impedance_ohm_m2`. Lengths may also be in `cm` or `m`. Columns are separated by commas, or by semicolons
@@ -34,21 +34,21 @@ def read_layout(path: str | Path, *, outline: Domain | None = None) -> Layout:
     - `.dxf` (needs the extra `cad`): electrodes are circles on the layer ELECTRODES. The outline is on the layer
       OUTLINE: closed polylines with straight sides, of which the largest is the skin and others are holes, or a single
       circle. A text on the layer LABELS is the label of the circle in which it begins or is centred. Lengths are in the
-      unit of the drawing, or in millimetres if it states none.
+      unit of the drawing, or in millimetres if the drawing states no unit.
     - `.svg`: electrodes are circles in the group ELECTRODES (id, class or Inkscape layer), or all circles if there is
       no such group. The outline is in the group OUTLINE: shapes with straight sides, of which the largest is the skin
-      and others are holes, or a single circle; without this group, it is the only closed shape with straight sides.
-      Texts in the group LABELS are labels in the order of the electrodes. Transforms are applied. The document must
-      state its size with a unit (mm, cm, in, pt, or px of 1/96 inch). The y axis points up in the layout and down in
-      the file.
+      and others are holes, or a single circle; without this group, the outline is the only closed shape with straight
+      sides. Texts in the group LABELS are labels in the order of the electrodes. Transforms are applied. The document
+      must state its size with a unit (mm, cm, in, pt, or px of 1/96 inch). The y axis points up in the layout and down
+      in the file.
 
     **Arguments:**
 
     - `path`: the file.
-    - `outline`: outline of the skin, used if the file contains none.
+    - `outline`: outline of the skin, used if the file contains no outline.
 
-    Raises `FileNotFoundError` if there is no such file, `ImportError` if the extra is missing, and `ValueError` for an
-    invalid layout, naming the line or electrode.
+    Raises `FileNotFoundError` if there is no such file, `ImportError` if the extra `cad` is missing, and `ValueError`
+    for an invalid layout, naming the line or electrode.
 
     **Example:**
 
@@ -68,7 +68,8 @@ def read_layout(path: str | Path, *, outline: Domain | None = None) -> Layout:
 
 
 def write_layout(layout: Layout | SurfaceLayout, path: str | Path) -> None:
-    """Write a layout to a file, in millimetres. The format is determined by the suffix, as in `read_layout`.
+    """Write an electrode layout to a file, in millimetres. The suffix of the file determines the format, as in
+    `read_layout`.
 
     A layout that is read back differs by rounding only (below a millionth of a millimetre), except that a rectangle is
     read as a polygon. DXF and SVG files contain a drawing to scale, with x to the right and y up. The lines to be cut
@@ -81,7 +82,8 @@ def write_layout(layout: Layout | SurfaceLayout, path: str | Path) -> None:
     - `layout`: the layout.
     - `path`: the file, .csv, .dxf or .svg.
 
-    Raises `ValueError` for another suffix or a path that cannot be written; `ImportError` if the extra is missing.
+    Raises `ValueError` for another suffix or a path that cannot be written; `ImportError` if the extra `cad` is
+    missing.
 
     **Example:**
 

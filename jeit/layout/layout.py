@@ -121,7 +121,8 @@ class Layout(Module):
 
     @property
     def known_outline(self) -> Domain:
-        """Outline of the skin, metres. Unlike `outline`, it is never None: raises `ValueError` if it is not known."""
+        """Outline of the skin, metres. Raises `ValueError` if the outline is not known, so that the result is never
+        None."""
         if self.outline is None:
             raise ValueError(
                 f"outline: '{self.name}' does not say the skin's; give it, as in read_layout(…, outline=…)."
@@ -130,7 +131,8 @@ class Layout(Module):
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Bounding box (x_min, x_max, y_min, y_max) of the outline, or of the electrodes if it is not known, metres."""
+        """Bounding box (x_min, x_max, y_min, y_max) of the outline, or of the electrodes if the outline is not known,
+        metres."""
         if self.outline is not None:
             return self.outline.extent
         return bounds(np.asarray(self.centres), np.asarray(self.diameters))
@@ -143,8 +145,8 @@ class Layout(Module):
     def sheet_discs(self, contact_impedance: ArrayLike | None = None) -> SheetDiscs:
         """Create the electrodes for a forward model on a sheet.
 
-        `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if neither is
-        known.
+        `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if the
+        contact impedance is neither given nor known from the layout.
         """
         impedance = self.contact_impedance if contact_impedance is None else contact_impedance
         if impedance is None:

@@ -28,12 +28,12 @@ def ring(
 
     **Arguments:**
 
-    - `radius`: of the circle, metres.
-    - `num_electrodes`: L.
+    - `radius`: radius of the circle, metres.
+    - `num_electrodes`: number L of electrodes.
     - `start_angle`: angle of the first electrode, radians counter-clockwise from +x (default: 12 o'clock).
     - `clockwise`: whether the electrodes follow each other clockwise.
-    - `centre` (x, y): of the circle, metres.
-    - `height`: z of all electrodes, metres.
+    - `centre` (x, y): centre of the circle, metres.
+    - `height`: z coordinate of all electrodes, metres.
 
     Raises `ValueError` for a radius that is not positive or fewer than two electrodes.
 
@@ -53,8 +53,8 @@ def ring(
 
 
 def ring_and_centre(radius: float, num_electrodes: int, **options: Any) -> np.ndarray:
-    """Positions of a `ring` of electrodes and of one more in its centre, the last: (num_electrodes + 1, d) metres. For
-    use with `jeit.protocol.reference_electrode`.
+    """Positions of a `ring` of electrodes and, last, of one electrode in its centre: (num_electrodes + 1, d) metres.
+    See `jeit.protocol.reference_electrode` for the use of the central electrode.
 
     **Arguments:**
 
@@ -78,9 +78,10 @@ def perimeter(domain: Domain, num_electrodes: int, *, start: float = 0.0) -> np.
     **Arguments:**
 
     - `domain`: the outline.
-    - `num_electrodes`: L.
+    - `num_electrodes`: number L of electrodes.
     - `start`: arc length of the first electrode along `domain.boundary`, metres. The boundary of a rectangle begins at
-      its lower left corner; half a pitch keeps electrodes of a square away from the corners if L is a multiple of four.
+      its lower left corner; a start of half the electrode spacing keeps the electrodes of a square away from its
+      corners if L is a multiple of four.
 
     Raises `ValueError` for fewer than two electrodes.
 
@@ -104,7 +105,7 @@ def grid(
 
     - `width`, `height`: distances between the outermost electrodes, metres.
     - `columns`, `rows`: numbers of electrodes along x and along y.
-    - `centre` (x, y): of the grid, metres.
+    - `centre` (x, y): centre of the grid, metres.
 
     Raises `ValueError` for sides that are not positive, and for fewer than one row or column.
 
@@ -127,17 +128,17 @@ def quasi_uniform(domain: Domain, num_electrodes: int, *, margin: float = 0.0, i
     """Positions spread evenly inside any outline: (L, 2) metres.
 
     The positions are the centroids of a centroidal Voronoi tessellation, so that the area around every electrode is
-    about the same. It is computed by Lloyd's algorithm on a fine grid of sample points, starting from farthest-point
-    sampling, and is deterministic.
+    about the same. The tessellation is computed by Lloyd's algorithm on a fine grid of sample points, starting from
+    farthest-point sampling, and is deterministic.
 
     **Arguments:**
 
     - `domain`: the outline.
-    - `num_electrodes`: L.
-    - `margin`: minimum distance to the outline, metres.
+    - `num_electrodes`: number L of electrodes.
+    - `margin`: minimum distance of positions from the outline, metres.
     - `iterations`: maximum number of iterations.
 
-    Raises `ValueError` if the margin leaves no room.
+    Raises `ValueError` if the margin leaves no room for electrodes.
 
     **Example:**
 
@@ -178,8 +179,9 @@ def check_count(num_electrodes: int, minimum: int) -> None:
         raise ValueError(f"Give a whole number of electrodes, at least {minimum}; got {describe(num_electrodes)}.")
 
 
-# Side of the skin of the paper, diameter of the electrodes in its Fig. S4, and distance of electrodes from the edge in
-# the conventional layout, metres. The paper does not state the distance: here 2 mm of hydrogel remain outside.
+# Side of the skin in the paper of Park et al., diameter of the electrodes in its Fig. S4, and distance of electrodes
+# from the edge in the conventional layout, metres. The paper does not state this distance: here 2 mm of hydrogel remain
+# outside the electrodes.
 _PARK_SIDE, DIAMETER, _PARK_EDGE_DISTANCE = 0.2, 6e-3, 2e-3
 _PARK_NAMES = ("park-inner", "park-boundary")
 # Maximum number of electrodes of a built-in layout, since the distances between all pairs are checked.
@@ -198,12 +200,13 @@ def named_layout(name: str, outline: Domain | None = None, *, diameter: float = 
 
     - "park-inner" and "park-boundary": the two designs compared in text S4 of Park et al., Science Robotics 7, eabm7187
       (2022), for the default outline only. The coordinates of "park-inner" are not published; the paper states "as
-      evenly as possible in a square area" and "about 40 mm" apart. Here they are a centroidal Voronoi tessellation with
-      nearest neighbours 31 to 38 mm apart. The centres of "park-boundary" are 5 mm from the edge and 23.75 mm apart,
-      none in a corner, counter-clockwise from the lower left.
+      evenly as possible in a square area" and "about 40 mm" apart. Here the electrodes of "park-inner" form a
+      centroidal Voronoi tessellation with nearest neighbours 31 to 38 mm apart. The centres of "park-boundary" are 5 mm
+      from the edge and 23.75 mm apart, none in a corner, counter-clockwise from the lower left.
     - "grid-CxR": C columns and R rows; each electrode is in the centre of one of C × R equal rectangles that fill the
       bounding box of the skin.
-    - "perimeter-N": N electrodes along the edge of a rectangle or a disk, with 2 mm of skin outside them.
+    - "perimeter-N": N electrodes along the edge of a rectangle or a disk, with 2 mm of skin between the electrodes and
+      the edge.
     - "inner-N": N electrodes spread evenly inside any outline.
 
     **Arguments:**
@@ -212,7 +215,7 @@ def named_layout(name: str, outline: Domain | None = None, *, diameter: float = 
     - `outline`: outline of the skin, by default 200 × 200 mm about the origin.
     - `diameter`: diameter of the electrodes, metres.
 
-    Raises `ValueError` for an unknown name, for a skin that the layout does not exist for, and for electrodes that
+    Raises `ValueError` for an unknown name, for an outline for which the layout does not exist, and for electrodes that
     would overlap.
 
     **Example:**
@@ -306,8 +309,8 @@ def _perimeter_centres(name: str, outline: Domain, diameter: float, number: int)
 
 
 def _inner_centres(outline: Domain, number: int, diameter: float) -> np.ndarray:
-    """Centres spread evenly inside an outline. Those of rectangles are cached, since a study needs the same ones for
-    many parameters."""
+    """Centres of `number` electrodes spread evenly inside an outline. The centres in rectangles are cached, since a
+    study needs the same centres for many parameters."""
     if isinstance(outline, Rectangle):
         return _spread_centres(outline, number, diameter)
     return quasi_uniform(outline, number, margin=diameter / 2)

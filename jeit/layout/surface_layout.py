@@ -21,12 +21,12 @@ from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit_solvers.engines import as_array, has_values
 from jeit_solvers.module import Module
 
-# Minimum number of nodes per position: a coarser surface is refined by halving its triangles.
+# Minimum number of nodes of a surface per electrode position: a coarser surface is refined by dividing its triangles.
 _MIN_NODES_PER_POSITION = 30
-# The surface is not refined any further once it has this many nodes.
+# Number of nodes from which the surface is not refined any further.
 _MAX_NODES = 60_000
-# Number of positions above which they are so close to each other that paths between them are nearly straight: the
-# nearest position is then found by the distance in space and the direction of the normal.
+# Number of electrode positions above which paths between neighbouring positions are nearly straight: the nearest
+# position is then found by the distance in space and the direction of the normal.
 _MAX_GEODESIC_POSITIONS = 128
 
 
@@ -41,18 +41,19 @@ def spread(
     """Positions on a surface, spread evenly over it: (L, 3) metres.
 
     The counterpart of `quasi_uniform` for surfaces: each position is the centroid of the part of the surface that is
-    closer to it than to any other position, by distances along the surface. It is computed by Lloyd's algorithm,
-    starting from farthest-point sampling, and is deterministic.
+    closer to it than to any other position, by distances along the surface. The positions are computed by Lloyd's
+    algorithm, starting from farthest-point sampling, and are deterministic.
 
     **Arguments:**
 
     - `surface`: a surface in space, its triangles, or a shell.
     - `number`: number of positions L.
     - `face`: face of a shell, "inner" or "outer".
-    - `margin`: minimum distance from the edge, metres.
+    - `margin`: minimum distance of positions from the edge of the surface, metres.
     - `iterations`: maximum number of iterations.
 
-    Raises `ValueError` for fewer than one position, a margin that leaves no room, and as `Triangles.of` does.
+    Raises `ValueError` for fewer than one position, a margin that leaves no room for electrodes, and in the same cases
+    as `Triangles.of`.
 
     **Example:**
 
@@ -117,7 +118,7 @@ def _initial_nodes(geodesics: Geodesics, usable: np.ndarray, weight: np.ndarray,
     return np.array(nodes)
 
 
-# Tolerance for discs that overlap.
+# Overlap of two discs that is tolerated.
 _ROUNDING = 1e-9  # m
 
 
@@ -165,9 +166,10 @@ class SurfaceLayout(Module):
         """`diameters` and `contact_impedance` may be one value for all electrodes. Centres are moved to the nearest
         point of the surface, which must be within the radius of the electrode.
 
-        Raises `ValueError` for a mesh that is not a surface in space, for electrodes that are farther from the surface,
-        extend beyond its edge, are as large as its radius of curvature, or overlap, if labels are repeated or not one
-        for each electrode, and for a surface so small or so large that its lengths cannot be in metres.
+        Raises `ValueError` for a mesh that is not a surface in space, for electrodes that are farther from the surface
+        than their radius, extend beyond its edge, are as large as its radius of curvature, or overlap, if labels are
+        repeated or not one for each electrode, and for a surface so small or so large that its lengths cannot be in
+        metres.
         """
         check_kind("surface", surface, Mesh, "a surface in space, such as jeit.mesh.tube(0.03, 0.15)")
         if not surface.is_surface:
@@ -231,8 +233,8 @@ class SurfaceLayout(Module):
     def discs(self, contact_impedance: ArrayLike | None = None, *, sheet: bool = True) -> SurfaceDiscs | FaceDiscs:
         """Create the electrodes for a forward model of the surface as a `sheet`, or else of a layer on the surface.
 
-        `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if neither is
-        known.
+        `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if the
+        contact impedance is neither given nor known from the layout.
         """
         impedance = self.contact_impedance if contact_impedance is None else contact_impedance
         if impedance is None:
@@ -241,8 +243,8 @@ class SurfaceLayout(Module):
 
 
 def _check_apart(centres: np.ndarray, diameters: np.ndarray, labels: Sequence[str]) -> None:
-    """Raise `ValueError` for discs that overlap. Distances are straight lines, since between discs that overlap they
-    hardly differ from those along the surface."""
+    """Raise `ValueError` for discs that overlap. Distances between discs are straight, since for discs that overlap
+    they hardly differ from distances along the surface."""
     gaps = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
     np.fill_diagonal(gaps, np.inf)
     if gaps.min() < -_ROUNDING:

@@ -1,4 +1,4 @@
-"""Reading and writing of layouts as SVG drawings."""
+"""Reading and writing of electrode layouts as SVG drawings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from jeit.layout.csv_file import MOST_BYTES, millimetres
 from jeit.layout.layout import Layout
 from jeit.mesh import Disk, Domain, Polygon
 
-# The quantifiers are possessive, so that a text that is not a number is rejected in one pass, however long it is.
+# Pattern of a number. Its quantifiers are possessive, so that a text that is not a number is rejected in one pass,
+# however long it is.
 NUMBER = r"[-+]?+(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?+\d++)?+"
 # Maximum number in a drawing, so that its square can still be computed after transforms.
 LARGEST = 1e30
@@ -25,7 +26,7 @@ ROUND = ("circle", "ellipse")
 
 
 def transform_of(element: ElementTree.Element) -> np.ndarray:
-    """Matrix (2, 3) of the transform of an element. Raises `ValueError` for a transform that cannot be read."""
+    """Matrix (2, 3) of the transform of an SVG element. Raises `ValueError` for a transform that cannot be read."""
     text, matrix = element.get("transform", "").strip(), np.eye(2, 3)
     if re.fullmatch(r"(\w++\s*+\([^()]*+\)[\s,]*+)*+", text) is None:
         raise ValueError(f"transform of {describe_element(element)} is {describe(text)}, not a list of transforms.")
@@ -68,12 +69,12 @@ def transform_points(points, matrix: np.ndarray) -> np.ndarray:
 
 
 def tag_of(element: ElementTree.Element) -> str:
-    """Tag of an element without its namespace, such as "circle"."""
+    """Tag of an SVG element without its namespace, such as "circle"."""
     return element.tag.split("}")[-1]
 
 
 def describe_element(element: ElementTree.Element) -> str:
-    """Text that names an element in messages."""
+    """Text that names an SVG element in error messages."""
     return (
         f"<{tag_of(element)[:20]} id={describe(element.get('id'))}>"
         if "id" in element.attrib
@@ -82,7 +83,7 @@ def describe_element(element: ElementTree.Element) -> str:
 
 
 def number_of(element: ElementTree.Element, name: str, text: str | None) -> float:
-    """Convert `text`, the value of the attribute `name`, to a number. Raises `ValueError` if it is not one."""
+    """Convert `text`, the value of the attribute `name`, to a number. Raises `ValueError` if `text` is not a number."""
     if text is None or re.fullmatch(NUMBER, text.strip()) is None:
         raise ValueError(f"{name} of {describe_element(element)} is {describe(text)}, not a number.")
     value = float(text)
@@ -161,7 +162,7 @@ def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
 
 
 def _closed_loop(element: ElementTree.Element, loop: np.ndarray, closed: bool) -> np.ndarray:
-    """Vertices of a loop without a repetition of the first. Raises `ValueError` if the loop is not closed."""
+    """Vertices of a loop without a repetition of the first vertex. Raises `ValueError` if the loop is not closed."""
     is_repeated = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-6 * np.ptp(loop))
     if not (closed or is_repeated):
         raise ValueError(f"{describe_element(element)} is not closed; close the skin's outline.")
@@ -180,8 +181,8 @@ _STRAIGHT_SHAPES = ("rect", "polygon", "polyline", "path")
 
 
 def write_svg(layout: Layout, file: BinaryIO) -> None:
-    """Write a layout as a drawing. Both have the same origin; y points down in the drawing, so its y is minus that of
-    the layout."""
+    """Write an electrode layout as an SVG drawing. Layout and drawing have the same origin; the y axis of the drawing
+    points down, so y coordinates in the drawing are minus those of the layout."""
     x_min, x_max, y_min, y_max = layout.extent
     view_left, view_top = millimetres(x_min - _MARGIN), millimetres(-y_max - _MARGIN)
     width, height = millimetres(x_max - x_min + 2 * _MARGIN), millimetres(y_max - y_min + 2 * _MARGIN)
@@ -205,8 +206,8 @@ def write_svg(layout: Layout, file: BinaryIO) -> None:
 
 
 def read_svg(path: Path, outline: Domain | None) -> Layout:
-    """Read a layout from a drawing, written by `write_svg` or by hand. Raises `ValueError` for an invalid or ambiguous
-    drawing."""
+    """Read an electrode layout from an SVG drawing, written by `write_svg` or by hand. Raises `ValueError` for an
+    invalid or ambiguous drawing."""
     check_size(path, MOST_BYTES)
     with read_as("this is not an SVG drawing that is read"):
         root = ElementTree.parse(path, ElementTree.XMLParser(target=_Builder())).getroot()
@@ -251,7 +252,7 @@ def _add_circle(centre, diameter) -> dict[str, str]:
 
 
 class _SvgPen:
-    """Draws circles and polygons into a group of a drawing."""
+    """Pen that draws circles and polygons into a group of an SVG drawing."""
 
     def __init__(self, group: ElementTree.Element):
         self.group = group
@@ -272,8 +273,8 @@ class _Builder(ElementTree.TreeBuilder):
 
 
 def _drawn_shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str | None, np.ndarray]]:
-    """Yield the shapes of a drawing in their order: element, role (that of the element or of an enclosing group), and
-    matrix (2, 3) from its units to metres, with y up."""
+    """Yield the shapes of a drawing in their order: the element; its role, which is the name in `_GROUP_NAMES` of the
+    element or of an enclosing group, or None; and the matrix (2, 3) from the element's units to metres, with y up."""
     stack: list[tuple[ElementTree.Element, str | None, np.ndarray]] = [(root, None, _matrix_to_metres(root))]
     while stack:
         element, role, matrix = stack.pop()
@@ -343,8 +344,8 @@ def _outline_of_shapes(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> D
 
 
 def _single_closed_outline(shapes: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain | None:
-    """Outline of a drawing without a group OUTLINE: its only closed shape with straight sides; None if it has no shape
-    with straight sides."""
+    """Outline of a drawing without a group OUTLINE: its only closed shape with straight sides; None if the drawing has
+    no shape with straight sides."""
     closed_shapes, errors = [], []
     for element, matrix in shapes:
         if tag_of(element) in _STRAIGHT_SHAPES:

@@ -21,8 +21,8 @@ _NEXT_CORNER = np.array([1, 2, 0])
 
 
 def first_crossing(points: np.ndarray, cells: np.ndarray) -> tuple[int, int] | None:
-    """Find a pair of triangles (m, 3) that cross, touch or overlap outside the nodes and edges they share; None if no
-    pair does."""
+    """Indices of two triangles of `cells` (m, 3) that cross, touch or overlap outside the nodes and edges that they
+    share; None if there are no such triangles."""
     tolerance = _TOUCH_TOLERANCE * float(np.ptp(points, axis=0).max())
     for pairs in _near_pairs(points[cells], tolerance):
         num_shared = (cells[pairs[:, 0], :, None] == cells[pairs[:, 1], None, :]).sum(axis=(1, 2))
@@ -41,7 +41,7 @@ def _near_pairs(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
     """Yield pairs (p, 2) of triangles whose bounding boxes overlap, in batches.
 
     Triangles are grouped by size and each group has its own search tree, so that a few large triangles do not widen the
-    search for all others.
+    search for all other triangles.
     """
     centroids = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
@@ -79,8 +79,8 @@ def _intersect(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, toleran
 
 
 def _cross_opposite(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, tolerance: float) -> np.ndarray:
-    """Whether two triangles with one common node intersect elsewhere (p,): the edge of either triangle that is opposite
-    to the common node pierces the other triangle."""
+    """Whether the two triangles of each pair (p, 2), which have one common node, intersect elsewhere: the edge of one
+    triangle that is opposite to the common node pierces the other triangle."""
     is_crossing = np.zeros(len(pairs), bool)
     for segment_triangles, face_triangles in (pairs.T, pairs.T[::-1]):
         segment_cells = cells[segment_triangles]
@@ -126,8 +126,8 @@ def _pierces(start: np.ndarray, end: np.ndarray, corners: np.ndarray, tolerance:
 
 
 def _overlap_in_plane(first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:
-    """Whether pairs of triangles (p, 3, 3) are coplanar and overlap (p,): they do not if the line through an edge of
-    either separates them."""
+    """Whether the two triangles with corners `first` and `second` (p, 3, 3) are coplanar and overlap, as booleans (p,).
+    Coplanar triangles do not overlap if the line through an edge of one of them separates them."""
     normal = np.cross(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0])
     unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     height = np.einsum("pki,pi->pk", second - first[:, :1], unit)
@@ -148,16 +148,16 @@ def _overlap_in_plane(first: np.ndarray, second: np.ndarray, tolerance: float) -
 def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
     """Orient triangles (m, 3) consistently, so that neighbours agree on which side is outside.
 
-    The triangles of a closed surface are made to face outwards; those of an open surface, or if `points` is None, the
-    way that most of them do already. Raises `ValueError` for an edge shared by more than two triangles, a one-sided
-    surface, sheets that meet only in a node, and triangles that cross. Warns if all triangles of a closed surface face
-    inwards.
+    The triangles of a closed surface are turned outwards. The triangles of an open surface, and of any surface if
+    `points` is None, are turned to the side that most of them already face. Raises `ValueError` for an edge shared by
+    more than two triangles, a one-sided surface, parts of the surface that meet only in a node, and triangles that
+    cross. Warns if all triangles of a closed surface face inwards.
     """
     first, second = _pair_edges(cells)
     first_triangle, second_triangle = first // 3, second // 3
     is_odd = topology.odd_permutation(topology.cell_facets(cells))
     # Two triangles have the same orientation if they traverse their common edge in opposite directions; otherwise one
-    # of them must be turned.
+    # of the two must be turned.
     needs_turn = is_odd[first] == is_odd[second]
     is_turned = _triangles_to_turn(first_triangle, second_triangle, needs_turn, cells)
     _check_node_contacts(cells, first, second)
@@ -192,8 +192,8 @@ def enclosed_volume(points: np.ndarray, cells: np.ndarray) -> float:
 
 
 def _pair_edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of rows of `cell_facets` that are the same edge. Raises `ValueError` for an edge of more than two
-    triangles."""
+    """Pairs of rows of `topology.cell_facets(cells)` that contain the same edge. Raises `ValueError` for an edge of
+    more than two triangles."""
     edges = topology.cell_facets(cells)
     first, second, crowded = topology.match_facets(edges, int(cells.max()) + 1)
     if crowded.size:
@@ -210,8 +210,8 @@ def _triangles_to_turn(first: np.ndarray, second: np.ndarray, opposite: np.ndarr
     """Whether each triangle (m,) must be reversed so that all are oriented like triangle 0. Raises `ValueError` for a
     one-sided surface.
 
-    The graph has two nodes per triangle, as given and turned. It falls into two components if the surface has two
-    sides.
+    A graph has two nodes per triangle, one for each orientation, and connects the orientations that match across an
+    edge. The graph falls into two components if the surface has two sides.
     """
     num_triangles = len(cells)
     rows = np.concatenate([first, first + num_triangles])
@@ -227,7 +227,7 @@ def _triangles_to_turn(first: np.ndarray, second: np.ndarray, opposite: np.ndarr
 
 
 def _check_node_contacts(cells: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
-    """Raise `ValueError` if sheets of a surface meet only in a node, so that the triangles around it form several
+    """Raise `ValueError` if parts of a surface meet only in a node, so that the triangles around this node form several
     fans."""
     corner_index = np.arange(cells.size).reshape(cells.shape)
     ends = topology.LOCAL_FACETS[2]

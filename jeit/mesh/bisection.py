@@ -2,8 +2,8 @@
 that a size function allows, `cut` divides cells along a surface.
 
 An edge is split in all the cells around it, so the mesh stays conforming. `bisect` splits an edge at its midpoint, and
-only if it is the longest edge of each of those cells, so that cells keep their shape: Rivara, International Journal for
-Numerical Methods in Engineering 20 (1984) 745.
+only if it is the longest edge of every cell around it, so that cells keep their shape: Rivara, International Journal
+for Numerical Methods in Engineering 20 (1984) 745.
 """
 
 from __future__ import annotations
@@ -84,7 +84,8 @@ def bisect_with_parents(mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]]
 
 
 def cut(mesh: Mesh, level: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray, " n"]]) -> Mesh:
-    """Divide the cells of a mesh along the surface on which `level` is zero, so that no cell lies on both sides of it.
+    """Divide the cells of a mesh along the surface on which `level` is zero, so that no cell lies on both sides of the
+    surface.
 
     Nodes near the surface are moved onto it, except nodes of the boundary. Cells should be small relative to the body
     that the surface bounds (see `bisect`).
@@ -142,15 +143,14 @@ class _SplitMesh:
         return cls(points, cells, facets, np.arange(len(facets)))
 
     def mesh(self, tags) -> Mesh:
-        """Create the mesh, with the `tags` of the original mesh."""
+        """Create a `Mesh` from the arrays, with the `tags` of the original mesh."""
         named = {name: self.facets[np.isin(self.side, np.asarray(index))] for name, index in tags.items()}
         with size_checked():
             return Mesh.create(self.points, self.cells, tags=named)
 
     def split(self, edges: Int[np.ndarray, "e 2"], middles: Float[np.ndarray, "e s"]) -> tuple[_SplitMesh, np.ndarray]:
-        """Split `edges` at their `middles`, metres; no cell may contain two of the edges. Returns the new division, and
-        for
-        each of its cells the index of the cell that contains it."""
+        """Split `edges` at the points `middles`, metres; no cell may contain two of the edges. Returns the arrays after
+        the split and, for each new cell, the index of the old cell that contains it."""
         new_nodes = len(self.points) + np.arange(len(edges))
         cells, origin = _split_simplices(self.cells, edges, new_nodes, len(self.points))
         facets, side = _split_simplices(self.facets, edges, new_nodes, len(self.points))
@@ -158,8 +158,8 @@ class _SplitMesh:
 
 
 def _exceeds_size(split_mesh: _SplitMesh, selected_cells, size) -> Bool[np.ndarray, " m"]:
-    """Whether the longest edge of each cell exceeds the allowed length. Raises `ValueError` for invalid results of
-    `size`."""
+    """Whether the longest edge of each selected cell exceeds the length that `size` allows. Raises `ValueError` if
+    `size` does not return one positive number per cell."""
     cells = split_mesh.cells[selected_cells]
     max_lengths = np.asarray(size(split_mesh.points[cells]))
     if max_lengths.shape != (len(cells),) or not (max_lengths > 0).all():
@@ -171,8 +171,8 @@ def _exceeds_size(split_mesh: _SplitMesh, selected_cells, size) -> Bool[np.ndarr
 
 
 def _move_nodes_onto(split_mesh: _SplitMesh, level) -> tuple[_SplitMesh, Float[np.ndarray, " n"]]:
-    """Move nodes that are near the surface level = 0 onto it, along edges. Nodes of the boundary stay, and nodes whose
-    movement would leave a cell with hardly any volume. Also returns the level at all nodes."""
+    """Move nodes that are near the surface `level` = 0 onto this surface, along edges. Nodes of the boundary stay, and
+    nodes whose movement would leave a cell with hardly any volume. Also returns the values of `level` at all nodes."""
     points, cells = split_mesh.points, split_mesh.cells
     levels = np.asarray(level(points))
     if levels.shape != (len(points),) or not np.isfinite(levels).all():
@@ -203,8 +203,8 @@ def _move_nodes_onto(split_mesh: _SplitMesh, level) -> tuple[_SplitMesh, Float[n
 def _zero_on_edges(
     ends: Float[np.ndarray, "e 2 s"], first_level: Float[np.ndarray, " e"], level
 ) -> Float[np.ndarray, "e s"]:
-    """Locate the point on each edge where the level is zero, by bisection. `first_level` (e,): levels at the first
-    ends; the level at the other ends has the opposite sign."""
+    """Locate the point on each edge where `level` is zero, by bisection. `first_level` (e,): values of `level` at the
+    first ends of the edges; its values at the second ends have the opposite sign."""
     lower, upper = np.zeros((len(ends), 1)), np.ones((len(ends), 1))
     start, direction = ends[:, 0], ends[:, 1] - ends[:, 0]
     for _ in range(_BISECTION_STEPS):
@@ -215,8 +215,8 @@ def _zero_on_edges(
 
 
 def _edges(points, simplices) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "m k"], Int[np.ndarray, " e"]]:
-    """All edges, each with its lower node first; the indices of the edges of each simplex; and the ranks of the edges
-    by length."""
+    """All edges (e, 2) of the simplices, each with its lower-numbered node first; the indices (m, k) of the edges of
+    each simplex; and the ranks (e,) of the edges by length."""
     ends = _edge_nodes(simplices).reshape(-1, 2)
     key, edge_index = np.unique(ends[:, 0] * len(points) + ends[:, 1], return_inverse=True)
     edges = np.stack(np.divmod(key, len(points)), axis=1)
@@ -226,13 +226,13 @@ def _edges(points, simplices) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "
 
 
 def _edge_nodes(simplices) -> Int[np.ndarray, "m k 2"]:
-    """The two nodes of each edge of each simplex, the lower node first."""
+    """The two nodes of each edge of each simplex, the lower-numbered node first."""
     pairs = np.array(list(itertools.combinations(range(simplices.shape[1]), 2)))
     return np.sort(simplices[:, pairs].astype(np.int64), axis=2)
 
 
 def _edge_lengths(ends: Float[np.ndarray, "... 2 s"]) -> Float[np.ndarray, "..."]:
-    """Lengths of edges."""
+    """Lengths (…) of edges with the end points `ends` (…, 2, s)."""
     return np.linalg.norm(ends[..., 1, :] - ends[..., 0, :], axis=-1)
 
 
@@ -247,7 +247,7 @@ def _longest_edge_of_cell(edge_indices, rank) -> Int[np.ndarray, " m"]:
 
 
 def _is_longest_around(edge_indices, rank) -> Bool[np.ndarray, " e"]:
-    """Whether each edge is the longest one of all the cells around it, by the ranks of the edges."""
+    """Whether each edge is the longest edge of every cell that contains it, by the ranks of the edges."""
     return np.bincount(_longest_edge_of_cell(edge_indices, rank), minlength=len(rank)) == np.bincount(
         edge_indices.ravel(), minlength=len(rank)
     )
@@ -270,8 +270,8 @@ def _volumes(points, cells) -> Float[np.ndarray, " m"]:
 
 
 def _split_simplices(simplices, edges, new_nodes, num_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Split each simplex that has one of the `edges` into two at the `new_nodes`. Also returns the index of the
-    original simplex that contains each result."""
+    """Split each simplex that contains one of the `edges` into two, at the edge's new node in `new_nodes`. Also
+    returns, for each resulting simplex, the index of the original simplex that contains it."""
     candidates = np.flatnonzero(_is_node_of(edges, num_points)[simplices].sum(axis=1) > 1)
     split_keys = edges @ [num_points, 1]
     order = np.argsort(split_keys)

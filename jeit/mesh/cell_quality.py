@@ -21,8 +21,9 @@ class Quality(Module):
 
     **Fields**: `dimension`: 2 for triangles, 3 for tetrahedra; `num_points`: number of nodes; `smallest_angle` (m,):
     the smallest angle of a triangle, or the smallest angle between two faces of a tetrahedron, degrees; `radius_ratio`
-    (m,): d times the radius of the inscribed circle or sphere divided by the radius of the circumscribed one, from 0
-    for a flat cell to 1 for a regular one; `shortest_edge`, `longest_edge` (m,): lengths in metres.
+    (m,): `dimension` times the radius of the inscribed circle or sphere divided by the radius of the circumscribed
+    circle or sphere, from 0 for a flat cell to 1 for a regular one; `shortest_edge`, `longest_edge` (m,): lengths in
+    metres.
 
     **Example:**
 
@@ -85,7 +86,8 @@ def _triangle_measures(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         doubled_areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     previous_edges = -np.roll(edges, 1, axis=1)
     angle = np.degrees(np.arctan2(doubled_areas[:, None], (edges * previous_edges).sum(axis=2))).min(axis=1)
-    # r = 2 A / (a + b + c) and R = a b c / (4 A).
+    # Radii of the inscribed circle, r = 2 A / (a + b + c), and of the circumscribed circle, R = a b c / (4 A), of a
+    # triangle with edges a, b, c and area A.
     return angle, 2 * (doubled_areas / length.sum(axis=1)) * (2 * doubled_areas / length.prod(axis=1))
 
 
@@ -100,7 +102,9 @@ def _tetrahedron_measures(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     cosine = np.clip(-(unit[:, first] * unit[:, second]).sum(axis=2), -1.0, 1.0)
     angle = np.degrees(np.arccos(cosine)).min(axis=1)
     volume = np.abs((a * normals[:, 0]).sum(axis=1))
-    # r = 3 V / ΣA; the centre of the circumscribed sphere relative to node 0 is Σ |x_i|² n_i / (2 · 6 V).
+    # The inscribed sphere has the radius 3 V / ΣA, with the volume V and the areas A of the faces. The centre of the
+    # circumscribed sphere relative to node 0 is Σ |x_i|² n_i / (2 · 6 V), with the edges x_i from node 0 and the
+    # normals n_i.
     squares = np.stack([(a**2).sum(1), (b**2).sum(1), (c**2).sum(1)], axis=1)
     circumradius = np.linalg.norm((squares[..., None] * normals[:, :3]).sum(axis=1), axis=1) / (2 * volume)
     return angle, 3 * (volume / area.sum(axis=1)) / circumradius
@@ -129,7 +133,7 @@ def merge_points(points: np.ndarray, cells: np.ndarray, tolerance: float) -> tup
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _STL_HEADER_BYTES = 84
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
-# Distance, relative to the largest coordinate, below which nodes are merged: these files store six digits.
+# Distance, relative to the largest coordinate, below which nodes are merged: .stl and .obj files store six digits.
 _MERGE_TOLERANCE = 2e-6
 # Maximum number of characters of an error message about the content of a file.
 _MAX_MESSAGE = 120

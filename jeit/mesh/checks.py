@@ -15,12 +15,12 @@ from scipy.spatial import KDTree
 
 from jeit.mesh import topology
 
-# Minimum area or volume of a cell, relative to that power of its longest edge: gradients on flatter cells are
-# inaccurate in double precision.
+# Minimum area of a cell divided by the square of its longest edge, or minimum volume divided by the cube: gradients on
+# flatter cells are inaccurate in double precision.
 _MIN_MEASURE = 1e-10
 # Nodes whose distance, relative to the extent of the mesh, is at most this are treated as coincident.
 _COINCIDENT_DISTANCE = 1e-10
-# Three node numbers of a facet are packed into one 64-bit integer.
+# Maximum number of nodes: the three node numbers of a facet are packed into one 64-bit integer.
 MOST_POINTS = 2_000_000
 
 
@@ -132,8 +132,8 @@ def orient(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 
 def check_connected(first: np.ndarray, second: np.ndarray, num_cells: int) -> None:
-    """Raise `ValueError` if the `num_cells` cells are not connected; `first` and `second` list the pairs that share a
-    facet."""
+    """Raise `ValueError` if the `num_cells` cells are not connected; `first` and `second`: indices of the two cells at
+    each interior facet."""
     graph = coo_array((np.ones(len(first)), (first, second)), shape=(num_cells, num_cells))
     num_parts, label = connected_components(graph, directed=False)
     if num_parts > 1:
@@ -145,7 +145,8 @@ def check_connected(first: np.ndarray, second: np.ndarray, num_cells: int) -> No
 
 
 def locate_tags(tags: Mapping[str, ArrayLike], facets: np.ndarray) -> dict[str, np.ndarray]:
-    """Convert tags to indices (t,) into `facets`. Raises `ValueError` for facets that are not among `facets`."""
+    """Convert the facets of each tag to indices (t,) into `facets`. Raises `ValueError` for a tag with a facet that is
+    not in `facets`."""
     located = {}
     for name, value in tags.items():
         if not isinstance(name, str) or not name:
@@ -204,8 +205,8 @@ def size_checked() -> Iterator[None]:
 def warn_large(extent: float, name: str, size_factor: float = 1.0, *, of_file: bool = False) -> None:
     """Warn if a length of `extent` metres is probably in another unit, because the object is too large.
 
-    `size_factor`: size of the object divided by this length; `of_file`: whether the length may come from a file, for
-    which the message suggests a scale. Inside `size_checked` there is no warning.
+    `size_factor`: size of the object divided by `extent`; `of_file`: whether the length may come from a file, for which
+    the message suggests a scale. Inside `size_checked` there is no warning.
     """
     if not size_factor * extent > LARGE or _SIZE_CHECKED.get():
         return

@@ -66,7 +66,7 @@ _reading_lock = threading.Lock()
 
 def meshio_format_of(path: Path) -> str:
     """Name that meshio uses for the format of a file. Raises `ValueError` if the format is not in `FORMATS`, or if the
-    file refers to other files, declares entities, or is too large for memory."""
+    file refers to other files, declares XML entities, or is too large for memory."""
     kind = FORMATS.get(path.suffix.lower())
     if kind is None:
         raise ValueError(
@@ -214,8 +214,8 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
     `jeit.mesh.from_gmsh`).
 
     Groups of boundary facets (Gmsh's physical groups, or meshio's cell sets) become tags. Groups without boundary
-    facets and nodes without cells are omitted. A flat mesh in a plane z = constant becomes 2-D; other triangles become
-    a surface in space. In .stl and .obj files, coincident nodes are merged.
+    facets and nodes without cells are omitted. A flat mesh in a plane z = constant becomes 2-D; a mesh of triangles
+    that is not flat becomes a surface in space. In .stl and .obj files, coincident nodes are merged.
 
     **Arguments:**
 
@@ -224,8 +224,8 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
     - `trusted`: whether to read all formats of meshio without checks, including files that the file refers to. By
       default only the file itself is read, within the memory limit (environment variable JEIT_FILE_GB).
 
-    Raises `FileNotFoundError` if the file does not exist, and `ValueError` if it is not a mesh file, refers to other
-    files, contains cells other than linear triangles or tetrahedra, or a mesh that `Mesh.create` rejects.
+    Raises `FileNotFoundError` if the file does not exist. Raises `ValueError` if the file is not a mesh file, refers to
+    other files, or contains cells other than linear triangles or tetrahedra, or a mesh that `Mesh.create` rejects.
 
     **Example:**
 
@@ -260,10 +260,11 @@ def write(
     cell_data: Mapping[str, ArrayLike] | None = None,
     point_data: Mapping[str, ArrayLike] | None = None,
 ) -> None:
-    """Write a mesh with its tags, or with values on it, in the format given by the file name's extension.
+    """Write a mesh, with its tags or with values per cell and per node, in the format given by the file name's
+    extension.
 
     `.msh` files (Gmsh 2.2) keep the tags, as physical groups, and values per node, but not values per cell; other
-    formats keep both kinds of values, but not the tags. Plane meshes are written at z = 0.
+    formats keep values per node and per cell, but not the tags. Plane meshes are written at z = 0.
 
     **Arguments:**
 
@@ -272,7 +273,7 @@ def write(
     - `cell_data`: values per cell (m, …), by name.
     - `point_data`: values per node (n, …), by name.
 
-    Raises `ValueError` for an unknown format, and for data of the wrong length or complex data.
+    Raises `ValueError` for an unknown format, and for values that are complex or of the wrong number.
 
     **Example:**
 
@@ -328,8 +329,8 @@ def _check_data(argument: str, name: str, value: ArrayLike, length: int) -> np.n
 
 
 def _call_meshio(path: Path, action: Any, *, writing: bool = False) -> Any:
-    """Call `action`, a function of meshio, and raise `ValueError` where meshio prints a message or exits the
-    interpreter."""
+    """Call `action` with the module meshio as its argument, and raise `ValueError` where meshio prints a message or
+    exits the interpreter."""
     import meshio  # takes a tenth of a second
 
     output = io.StringIO()
@@ -356,7 +357,7 @@ def _call_meshio(path: Path, action: Any, *, writing: bool = False) -> Any:
 
 
 def _shorten_message(error: BaseException | str) -> str:
-    """Shorten a message to one line."""
+    """Shorten an error message of meshio to one line."""
     message = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return message if len(message) <= _MAX_MESSAGE else f"{message[: _MAX_MESSAGE - 1]}…"
 
@@ -398,14 +399,14 @@ def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
 
 
 def _create_mesh(points: np.ndarray, cells: np.ndarray, tags: Mapping[str, ArrayLike]) -> Mesh:
-    """Create a mesh; it is two-dimensional if its triangles lie in a plane z = constant."""
+    """Create a mesh, which is two-dimensional if its triangles lie in a plane z = constant."""
     if cells.shape[1] == 3 and points.shape[1] == 3 and np.ptp(points[:, 2]) <= 1e-9 * np.ptp(points, axis=0).max():
         points = points[:, :2]
     return Mesh.create(points, cells, tags=tags)
 
 
 def _facet_groups(content: meshio.Mesh, facet_type: str) -> dict[str, np.ndarray]:
-    """Facets (t, d) of each named group in the file."""
+    """Nodes (t, d) of the facets in each named group of a mesh file."""
     groups: dict[str, list[np.ndarray]] = {}
     facet_dimension = 2 if facet_type == "triangle" else 1
     names = {int(value[0]): name for name, value in content.field_data.items() if int(value[1]) == facet_dimension}

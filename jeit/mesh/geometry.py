@@ -1,5 +1,5 @@
-"""Measures, centroids, normals and P1 gradients of cells and facets. They are differentiable in the points, and
-computed immediately if the points have values."""
+"""Measures, centroids, normals and P1 gradients of cells and facets. These quantities are differentiable with respect
+to the points, and are computed by NumPy unless JAX traces the points."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def check_flat(mesh: Mesh, what: str) -> None:
     **Arguments:**
 
     - `mesh`: any mesh.
-    - `what`: what requires a flat sheet or a solid, a plural noun for the message, such as "rasters".
+    - `what`: plural noun in the error message for what requires a flat sheet or a solid, such as "rasters".
 
     **Example:**
 
@@ -61,13 +61,13 @@ def measures(mesh: Mesh) -> Float[Array, " m"]:
 
 @either_engine
 def gradients(mesh: Mesh) -> Float[Array, "m k s"]:
-    """Gradients (m, d + 1, s), in 1/m, of the d + 1 linear basis functions on every cell, where s is the space
-    dimension.
+    """Gradients (m, d + 1, s), in 1/m, of the d + 1 linear basis functions on every cell, where d is the dimension of
+    the cells and s that of the space.
 
-    φ_i is 1 at node i of the cell and 0 at the others. With E the matrix of edges x_i − x_0, the gradients of φ_1 … φ_d
-    are the columns of E⁻¹, and the gradient of φ_0 is minus their sum. E⁻¹ is computed from cross products of edges
-    divided by the determinant. On a triangle in space with edges a, b and normal n = a × b, the gradients lie in its
-    plane: ∇φ_1 = b × n / |n|² and ∇φ_2 = n × a / |n|².
+    φ_i is 1 at node i of the cell and 0 at its other nodes. With E the matrix of edges x_i − x_0, the gradients of φ_1
+    … φ_d are the columns of E⁻¹, and the gradient of φ_0 is minus their sum. E⁻¹ is computed from cross products of
+    edges divided by the determinant. On a triangle in space with edges a, b and normal n = a × b, the gradients lie in
+    its plane: ∇φ_1 = b × n / |n|² and ∇φ_2 = n × a / |n|².
 
     **Arguments:**
 
@@ -121,10 +121,10 @@ def centroids(mesh: Mesh) -> Float[Array, "m s"]:
 
 
 def normals(mesh: Mesh) -> Float[Array, "m 3"]:
-    """Unit normals (m, 3) of the triangles of a surface in space; outward if it is closed.
+    """Unit normals (m, 3) of the triangles of a surface in space; outward if the surface is closed.
 
-    For a plane mesh they are (0, 0, 1). Raises `ValueError` for a solid, which has normals on its facets but not its
-    cells.
+    The normals of a plane mesh are (0, 0, 1). Raises `ValueError` for a solid, which has normals on its facets but not
+    its cells.
 
     **Arguments:**
 
@@ -165,11 +165,11 @@ def facet_measures(mesh: Mesh) -> Float[Array, " b"]:
 
 
 def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
-    """For each boundary edge (b,) of a 2-D mesh, the number of its loop and the arc length (b,) in metres at which it
-    starts.
+    """For each boundary edge of a 2-D mesh, the number (b,) of the boundary loop that contains the edge, and the arc
+    length (b,) in metres at the start of the edge.
 
     Arc length is measured along `mesh.facets` from the first node of each loop, counter-clockwise on the outer loop;
-    the perimeter of a loop is the sum of its `facet_measures`. Raises `ValueError` in 3-D.
+    the perimeter of a loop is the sum of its `facet_measures`. Raises `ValueError` for a 3-D mesh.
     """
     if mesh.dimension != 2:
         raise ValueError("mesh: arc length is defined on the boundary of 2-D meshes only, this one is 3-D.")
@@ -185,7 +185,7 @@ def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
 def interior_facets(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of cells (f, 2) that share a facet, and the nodes (f, d) of that facet, as NumPy arrays.
 
-    Raises `ValueError` for a mesh that is being traced.
+    Raises `ValueError` for a mesh that is being traced by JAX.
     """
     if not has_values(mesh.cells):
         raise ValueError("interior_facets needs a mesh with values; call it outside jit and vmap.")

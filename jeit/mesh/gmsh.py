@@ -38,7 +38,7 @@ def from_gmsh(
     - `dimension`: 2 or 3, by default the dimension of the geometry; for a solid, 2 yields its surface in space.
     - `scale`: length of the geometry's unit in metres.
     - `scripts`: whether to accept Gmsh scripts (.geo and all other extensions). A script can run any command and open
-      any file, so accept only your own.
+      any file, so accept only scripts that you wrote.
 
     Raises `ImportError` if the gmsh package or a system library that it needs is missing, `FileNotFoundError` if the
     file does not exist, and `ValueError` if Gmsh rejects the geometry, and for scripts unless `scripts` is True.
@@ -100,7 +100,7 @@ def _mesh_with_gmsh(
     path: Path,
     name: str,
 ) -> None:
-    """Mesh the geometry and write it to `path`; error messages refer to the geometry by `name`."""
+    """Mesh the geometry and write the mesh to `path`; error messages refer to the geometry by `name`."""
     try:
         if isinstance(source, (str, Path)):
             gmsh.open(str(source))
@@ -111,7 +111,7 @@ def _mesh_with_gmsh(
             gmsh.option.setNumber("Mesh.MeshSizeMax", cell_size)
         dimension = dimension or max(gmsh.model.getDimension(), 2)
         gmsh.model.mesh.generate(dimension)
-        # If there is any physical group, Gmsh omits all cells that are in none.
+        # If the geometry has any physical group, Gmsh does not write cells that are in no physical group.
         grouped_entities = {
             entity
             for group in gmsh.model.getPhysicalGroups(dimension)
@@ -129,7 +129,7 @@ def _mesh_with_gmsh(
 
 
 class _GmshPen:
-    """Pen that draws into Gmsh's geometry kernel: each stroke becomes a curve loop."""
+    """Pen that draws an outline into Gmsh's geometry kernel: each circle or polygon becomes a curve loop."""
 
     def __init__(self, gmsh: ModuleType):
         self.shape = gmsh.model.occ

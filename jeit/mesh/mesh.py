@@ -17,15 +17,15 @@ from jeit_solvers.module import Module
 class Mesh(Module):
     """A conforming mesh of triangles in the plane or in space (2-D), or of tetrahedra (3-D).
 
-    Create one with functions such as `jeit.mesh.disk` or `jeit.mesh.read`, or from arrays with `Mesh.create`, which
-    checks and orients them. All array fields are pytree leaves, so a mesh can be traced, batched over its points, and
-    differentiated with respect to them.
+    Create a mesh with functions such as `jeit.mesh.disk` or `jeit.mesh.read`, or from arrays with `Mesh.create`, which
+    checks and orients them. All array fields are pytree leaves, so JAX can trace a mesh, batch over its points, and
+    differentiate with respect to them.
 
-    **Fields**: `points` (n, s): coordinates in metres, s = 2 or 3; `cells` (m, d + 1): node indices, positively
-    oriented; `facets` (b, d): boundary edges or triangles, oriented with the domain on the left (2-D) or with outward
-    normals (3-D), and in 2-D ordered head to tail, one loop after the other, the outer loop first; `tags`: names of
-    groups of facets, with their indices into `facets`. Triangles in space form a surface: they are counter-clockwise as
-    seen from outside, and `facets` has shape (0, 2) if the surface is closed.
+    **Fields**: `points` (n, s): coordinates in metres, s = 2 or 3; `cells` (m, d + 1): node indices of the cells of
+    dimension d, positively oriented; `facets` (b, d): boundary edges or triangles, oriented with the domain on the left
+    (2-D) or with outward normals (3-D), and in 2-D ordered head to tail, one loop after the other, the outer loop
+    first; `tags`: names of groups of facets, with their indices into `facets`. Triangles in space form a surface: they
+    are counter-clockwise as seen from outside, and `facets` has shape (0, 2) if the surface is closed.
 
     **Example:**
 
@@ -96,8 +96,8 @@ class Mesh(Module):
 
         In 2-D each loop of `facets` starts at its node of the lowest index; the outer loop runs counter-clockwise,
         holes clockwise. For a surface in space the longest loop comes first. The triangles of a closed surface are
-        oriented outward, those of an open surface the way most of them are given. `points` may be traced by JAX; then
-        checks of their values are skipped, and the cells must already be positively oriented.
+        oriented outward, those of an open surface as most of its triangles are given. `points` may be traced by JAX;
+        the coordinates are then not checked, and the cells must already be positively oriented.
 
         Raises `ValueError` if arrays have the wrong shape or type, or contain NaN or indices out of range; if the mesh
         has degenerate, duplicated or overlapping cells, unused or coincident nodes, facets shared by three cells, or

@@ -1,5 +1,5 @@
-"""Meshes of solids whose cells are smallest at given planes, those in which the edges of electrodes lie. The current
-density is unbounded at the edges of electrodes.
+"""Meshes of solids whose cells are smallest at the planes that contain edges of electrodes, because the current density
+is unbounded at the edges of electrodes.
 
 Along each axis, the cells at the planes are a twentieth of the largest ones (`_SMALLEST_CELL`) and grow away from the
 planes, up to a maximum size that follows from the number of nodes. A box is graded along x, y and z; a solid above any
@@ -21,9 +21,10 @@ from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Disk, Domain, Rectangle
 from jeit.mesh.solids import layer
 
-# Size of the cells at the planes divided by that of the largest cells, and growth of the cell size per length.
+# Size of the cells at the planes divided by that of the largest cells, and growth of the cell size per length away from
+# a plane.
 _SMALLEST_CELL, _CELL_GROWTH = 0.05, 0.8
-# Planes closer to each other than this, relative to the size of the body, are merged.
+# Distance between two planes, relative to the size of the body, below which they are merged.
 _MERGE_DISTANCE = 1e-4
 
 
@@ -31,7 +32,7 @@ def graded_box(outline: Rectangle, height: float, planes: Sequence[Float[np.ndar
     """Mesh of a box above a rectangle, from z = 0 up, with about `num_points` nodes and with cell faces in the given
     `planes`: positions along x, y and z.
 
-    Tags are those of `jeit.mesh.box`.
+    The mesh has the tags of `jeit.mesh.box`.
     """
     x_min, x_max, y_min, y_max = outline.extent
     ends = [(x_min, x_max), (y_min, y_max), (0.0, height)]
@@ -55,7 +56,8 @@ def graded_layers(
     outline: Domain, height: float, planes: Float[np.ndarray, " k"], rims: Float[np.ndarray, "p 2"], num_points: int
 ) -> Mesh:
     """Mesh of a solid above any outline, with thin layers at the heights `planes` and small cells at `rims`, points (p,
-    2) seen from above. Points on the edge of a disk become nodes. Tags are those of `jeit.mesh.layer`."""
+    2) on the rims of electrodes, seen from above. Points of `rims` on the edge of a disk become nodes. The mesh has the
+    tags of `jeit.mesh.layer`."""
     stops = _distinct_positions(planes, 0.0, height)
     area = float(outline.area)
 
@@ -95,7 +97,7 @@ def _divide_axis(stops: Float[np.ndarray, " s"], max_size: float) -> Float[np.nd
     these planes up to `max_size`, metres."""
     node_positions = [stops[:1]]
     for lower, upper in pairwise(stops):
-        # Number of cells before each of many positions.
+        # Number of cells between `lower` and each of many positions.
         samples = np.linspace(lower, upper, 400)
         midpoints = (samples[1:] + samples[:-1]) / 2
         widths = np.minimum(
@@ -111,8 +113,8 @@ def _divide_axis(stops: Float[np.ndarray, " s"], max_size: float) -> Float[np.nd
 
 
 def _largest_cell_size(count_nodes: Callable[[float], float], num_points: int, max_size: float) -> float:
-    """Maximum cell size for which the number of nodes is about `num_points`; `max_size` if even that size gives more
-    nodes."""
+    """Size of the largest cells for which a mesh has about `num_points` nodes; `max_size` if even cells of that size
+    give more nodes."""
     if count_nodes(max_size) >= num_points:
         return max_size
     cell_size: Any = brentq(

@@ -48,18 +48,19 @@ class Solid(Body):
         return self.outline.extent
 
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
-        """Empty, because a solid has no edge along which electrodes follow each other."""
+        """Empty, because a solid, unlike a plane body, has no boundary loops."""
         return ()
 
     def describe(self) -> dict[str, Any]:
-        """Description of the outline, and the thickness."""
+        """Shape and sizes of the outline, and the thickness, in metres."""
         return {**self.outline.describe(), "thickness": float(self.thickness)}
 
     @size_checked()
     def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Refinement = None) -> Mesh:
         """Mesh the solid with layers of tetrahedra that are about as high as the cells of the outline's mesh are wide.
 
-        Tags: 'bottom', 'top', 'side', and those of the outline's mesh. Raises `ValueError` as `jeit.mesh.box` does.
+        The mesh has the tags 'bottom', 'top', 'side', and those of the outline's mesh. Raises `ValueError` as
+        `jeit.mesh.box` does.
         """
         from jeit.mesh.solids import base_counter, choose_layers, layer
 
@@ -110,7 +111,7 @@ class OwnMesh(Body):
         return tuple(as_array(points[loop[:, 0]]) for loop in np.split(facets, loop_starts))
 
     def describe(self) -> dict[str, Any]:
-        """Dimensions, and numbers of nodes and cells."""
+        """Dimensions of the mesh, and numbers of its nodes and cells."""
         return {
             "shape": "mesh",
             "dimension": self.given.dimension,
@@ -125,7 +126,8 @@ class OwnMesh(Body):
 
 
 def as_body(given: Body | Mesh) -> Body:
-    """Convert a mesh to a body; a body is returned unchanged. Raises `ValueError` for anything else."""
+    """Convert a mesh to a body; a body is returned unchanged. Raises `ValueError` for an argument that is neither a
+    body nor a mesh."""
     if isinstance(given, Mesh):
         return OwnMesh(given)
     check_kind("domain", given, Body, "an outline such as Disk(0.05), a Solid, or a Mesh")

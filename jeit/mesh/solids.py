@@ -28,18 +28,19 @@ def disk(
 ) -> Mesh:
     """Mesh a disk; its boundary nodes lie on the circle.
 
-    Without refinement the mesh consists of concentric rings, and node 0 lies at angle 0. Otherwise it is unstructured,
-    and node 0 is the first boundary node counter-clockwise from angle 0. The mesh is a polygon inscribed in the circle:
-    with N boundary nodes, the relative deficit of its area is (2 π² / 3) / N². Every angle is at least 25°.
+    Without refinement or required nodes, the mesh consists of concentric rings, and node 0 lies at angle 0. Any other
+    mesh is unstructured, and its node 0 is the first boundary node counter-clockwise from angle 0. The mesh is a
+    polygon inscribed in the circle: with N boundary nodes, the relative deficit of its area is (2 π² / 3) / N². Every
+    angle is at least 25°.
 
     **Arguments:**
 
-    - `radius`: in metres.
+    - `radius`: radius of the disk in metres.
     - `num_points`: number of nodes, met within about 5 % (default 1,200); or `cell_size`: edge length in metres.
-    - `centre` (x, y): in metres.
+    - `centre` (x, y): centre of the disk in metres.
     - `refine`: one or several `Refine`, or a function that takes points (p, 2) and returns the requested edge lengths
       there (p,) in metres, which are scaled by a common factor if `num_points` is given.
-    - `num_boundary`: number of nodes on the circle, from which cells grow inwards.
+    - `num_boundary`: number of nodes on the circle; the cells grow from the circle inwards.
     - `boundary_points`: angles in radians at which nodes are placed.
     - `interior_points` (k, 2): positions in metres at which nodes are placed.
 
@@ -75,8 +76,8 @@ def rectangle(
 ) -> Mesh:
     """Mesh a rectangle.
 
-    Without refinement the mesh consists of rows of nearly equilateral cells. Node 0 is the lower left corner. The sides
-    are tagged 'left', 'right', 'bottom', 'top'.
+    Without refinement or required nodes, the mesh consists of rows of nearly equilateral cells. Node 0 is the lower
+    left corner. The sides are tagged 'left', 'right', 'bottom', 'top'.
 
     **Arguments:**
 
@@ -143,10 +144,11 @@ def polygon(
 
 
 def stacked_cells(cells: np.ndarray, num_nodes: int, num_layers: int) -> np.ndarray:
-    """Tetrahedra (3 m num_layers, 4) of the prisms above triangles (m, 3); node k · count + i is node i after k layers.
+    """Tetrahedra (3 m num_layers, 4) of the prisms above triangles (m, 3); node k · `num_nodes` + i is node i of the
+    plane mesh after k layers.
 
-    Every prism is divided along the diagonals that rise from its lower-numbered to its higher-numbered node, so that
-    the tetrahedra of neighbouring prisms match.
+    Every side face of a prism is divided along the diagonal that rises from its lower-numbered to its higher-numbered
+    node, so that the tetrahedra of neighbouring prisms match.
     """
     a, b, c = np.sort(cells.astype(np.int64), axis=1).T
     num_nodes_up = num_nodes
@@ -176,18 +178,19 @@ _RENAMED_TAGS = {"bottom": "front", "top": "back"}
 
 
 def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLike | None = None) -> Mesh:
-    """Extrude a plane mesh to a plate from z = 0 to `thickness`; each prism is divided into three tetrahedra.
+    """Extrude a plane mesh to a plate from z = 0 to `thickness`; the prism above each triangle is divided into three
+    tetrahedra.
 
-    Node k · n + i is node i of the plane mesh at the height z = k · thickness / num_layers, or at the k-th of
-    `heights`. Tags: 'bottom' (z = 0), 'top' (z = thickness), 'side', and the tags of the plane mesh for the parts of
-    the side above its edges; tags 'bottom' and 'top' of the plane mesh are renamed to 'front' and 'back'. Every prism
-    is divided along the diagonals that rise from its lower-numbered to its higher-numbered node, so that the tetrahedra
-    of neighbouring prisms match.
+    With n nodes in the plane mesh, node k · n + i is its node i at the height z = k · thickness / num_layers, or at the
+    k-th of `heights`. Tags: 'bottom' (z = 0), 'top' (z = thickness), 'side', and the tags of the plane mesh for the
+    parts of the side above its edges; tags 'bottom' and 'top' of the plane mesh are renamed to 'front' and 'back'.
+    Every side face of a prism is divided along the diagonal that rises from its lower-numbered to its higher-numbered
+    node, so that the tetrahedra of neighbouring prisms match.
 
     **Arguments:**
 
     - `mesh`: a plane mesh.
-    - `thickness`: in metres.
+    - `thickness`: thickness of the plate in metres.
     - `num_layers`: number of layers of prisms.
     - `heights` (num_layers + 1,): heights of the nodes in metres, from 0 to the thickness, instead of equal layers.
 
@@ -237,7 +240,7 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
 
 
 def _check_heights(thickness: float, num_layers: int, heights: ArrayLike | None) -> np.ndarray:
-    """Heights of the nodes, lowest first."""
+    """Heights of the nodes of a layer in metres, lowest first."""
     if heights is None:
         return np.linspace(0.0, thickness, unstructured.check_count("num_layers", num_layers, 1) + 1)
     levels = np.asarray(heights, float)
@@ -270,8 +273,8 @@ def box(
 
     - `width`, `depth`, `height`: lengths along x, y and z, metres.
     - `num_points`: number of nodes, met within about 10 % (default 4,000); or `cell_size`: edge length in metres.
-    - `num_layers`: number of layers along z, by default derived from these.
-    - `refine`: as in `disk`, as seen from above.
+    - `num_layers`: number of layers along z, by default derived from `num_points` or `cell_size`.
+    - `refine`: local refinement as in `disk`, at positions seen from above.
 
     Raises `ValueError` for invalid or contradictory arguments.
 
@@ -307,10 +310,10 @@ def cylinder(
 
     **Arguments:**
 
-    - `radius`, `height`: in metres.
+    - `radius`, `height`: radius and height of the cylinder in metres.
     - `num_points`: number of nodes, met within about 10 % (default 4,000); or `cell_size`: edge length in metres.
-    - `num_layers`: number of layers along z, by default derived from these.
-    - `refine`, `num_boundary`, `boundary_points` (angles): as in `disk`, as seen from above.
+    - `num_layers`: number of layers along z, by default derived from `num_points` or `cell_size`.
+    - `refine`, `num_boundary`, `boundary_points` (angles): as in `disk`, at positions seen from above.
 
     Raises `ValueError` for invalid or contradictory arguments.
 
@@ -351,7 +354,8 @@ def choose_layers(
     if target.cell_size is not None:
         return None, num_layers or max(1, round(height / target.cell_size))
     num_nodes = target.num_points if target.is_requested else 4000
-    # With spacing h in the plane and along z, the number of nodes is n = (1.1 A / h²) (H / h + 1).
+    # A solid of base area A and height H, with node spacing h in the plane and along z, has n = (1.1 A / h²) (H / h +
+    # 1) nodes.
     if num_layers is None:
         spacing = np.cbrt(1.1 * area * height / num_nodes)
         for _ in range(20):

@@ -15,13 +15,13 @@ LOCAL_FACETS = {
 
 
 def cell_facets(cells: np.ndarray) -> np.ndarray:
-    """All facets (m (d + 1), d) of all cells, in the order of the cells, oriented outward."""
+    """All facets (m (d + 1), d) of all `cells` (m, d + 1), in the order of the cells, oriented outward."""
     dimension = cells.shape[1] - 1
     return cells[:, LOCAL_FACETS[dimension]].reshape(-1, dimension)
 
 
 def facet_keys(facets: np.ndarray, num_points: int) -> np.ndarray:
-    """One integer per facet, independent of the order of its nodes."""
+    """One integer per facet that identifies it, independent of the order of its nodes."""
     key = np.zeros(len(facets), dtype=np.int64)
     for column in np.sort(facets.astype(np.int64), axis=1).T:
         key = key * num_points + column
@@ -37,8 +37,8 @@ def odd_permutation(facets: np.ndarray) -> np.ndarray:
 
 
 def match_facets(facets: np.ndarray, num_points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of rows of `facets` with the same nodes, as (first, second, crowded). If a facet occurs three times,
-    `crowded` contains its rows, and no pairs are returned."""
+    """Pairs of rows of `facets` with the same nodes, as (first, second, crowded): `first` and `second` contain the two
+    rows of each pair. If a facet occurs three times, `crowded` contains its three rows, and no pairs are returned."""
     key = facet_keys(facets, num_points)
     order = np.argsort(key, kind="stable")
     sorted_keys = key[order]
@@ -54,7 +54,7 @@ def pair_facets(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Interior facets as pairs of rows of `cell_facets`, and the rows of boundary facets, as (first, second, single).
 
     Raises `ValueError` if a facet belongs to more than two cells, or if the two cells of a facet lie on the same side
-    of it.
+    of the facet.
     """
     facets = cell_facets(cells)
     width = cells.shape[1]
@@ -119,8 +119,8 @@ _PAIRS_PER_BATCH = 250_000
 
 
 def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray:
-    """Check that vertices (k, 2) form a simple loop, and orient it as requested, keeping the first vertex. Raises
-    `ValueError` if they do not."""
+    """Check that vertices (k, 2) form a simple loop, and orient the loop as requested, keeping the first vertex. Raises
+    `ValueError` unless the vertices form a simple loop."""
     try:
         loop = np.asarray(vertices, dtype=float)
     except (TypeError, ValueError) as error:
@@ -151,7 +151,7 @@ def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray
 
 
 def check_apart(outer: np.ndarray, holes: Sequence[np.ndarray]) -> None:
-    """Raise `ValueError` unless every hole lies inside the outline and separate from the others."""
+    """Raise `ValueError` unless every hole lies inside the outline and separate from the other holes."""
     for k, hole in enumerate(holes):
         if not inside(hole, [outer]).all() or _touches(hole, outer):
             raise ValueError(f"holes[{k}]: does not lie strictly inside the outline. Move or shrink it.")
@@ -173,7 +173,7 @@ def inside(points: np.ndarray, loops: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def along(points: np.ndarray, loop: np.ndarray) -> np.ndarray:
-    """Arc length (p,) from the first vertex of a loop to the point of the loop that is nearest to each of points (p,
+    """Arc length (p,) from the first vertex of a loop to the point of the loop that is nearest to each of `points` (p,
     2)."""
     sides = np.roll(loop, -1, axis=0) - loop
     offset = points[:, None] - loop
@@ -215,8 +215,8 @@ def _intersecting_sides(first: np.ndarray, second: np.ndarray, tolerance: float)
 
 
 def _intersects(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, tolerance: float) -> np.ndarray:
-    """Whether each segment from a to b crosses the segment from c to d or comes within `tolerance` of it; all (p,
-    2)."""
+    """Whether each segment from a to b crosses the segment from c to d or comes within `tolerance` of it; `a` to `d`:
+    end points (p, 2)."""
     is_crossing = (_signed_area_of_corner(a, b, c) * _signed_area_of_corner(a, b, d) < 0) & (
         _signed_area_of_corner(c, d, a) * _signed_area_of_corner(c, d, b) < 0
     )

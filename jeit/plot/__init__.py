@@ -1,8 +1,8 @@
 """Plots with matplotlib: meshes, images, solids and surfaces in space, electrodes, sensitivity, voltages, series of
 frames, and choices of the hyperparameter.
 
-Most functions take `ax`, create a new figure if it is not given, and return the axes. Lengths are in metres in the
-arguments and in millimetres in the plots.
+Most functions take axes `ax`, create a new figure if `ax` is not given, and return the axes. Lengths are in metres in
+the arguments and in millimetres in the plots.
 """
 
 from __future__ import annotations

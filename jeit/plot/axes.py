@@ -39,8 +39,9 @@ _TEXT_DISTANCE, _LETTER_WIDTH = 0.04, 0.021
 
 
 def hide_axes(ax: Axes, extent: tuple[float, float, float, float], *, numbered: bool = True) -> None:
-    """Set equal scales, and remove frame and ticks. Around the `extent` (metres), space is left for a scale bar and, if
-    electrodes are `numbered`, for their numbers, as much as the longest text beside the body needs."""
+    """Set equal scales of both axes, and remove frame and ticks. Around the `extent` (metres), space is left for a
+    scale bar and, if electrodes are `numbered`, for their numbers, as much as the longest text beside the body
+    needs."""
     x_min, x_max, y_min, y_max = extent
     size = max(x_max - x_min, y_max - y_min)
     margin = (0.12 if numbered else 0.06) * size
@@ -138,10 +139,10 @@ class ColourScale(Module):
     - `difference`: whether values are changes, drawn with a diverging colour map centred at zero; otherwise, they are
       drawn with a perceptually uniform sequential colour map from the minimum to the maximum.
     - `quantity`: label of the colour bar; default: conductivity or its change.
-    - `unit`: unit of the values, "" for none; default: that of conductivity ("S" for a sheet, "S/m" for a body). The
-      colour bar adds an SI prefix.
+    - `unit`: unit of the values, "" for none; default: the unit of conductivity ("S" for a sheet, "S/m" for a body).
+      The colour bar adds an SI prefix.
     - `limit`: value at the end of the colour bar, in `unit`; default: the maximum magnitude.
-    - `colour_map`: name of a matplotlib colour map to use instead of these.
+    - `colour_map`: name of a matplotlib colour map to use instead of these colour maps.
     - `bar`: whether to draw the colour bar.
 
     Raises `ValueError` for a limit that is negative or not finite.
@@ -165,7 +166,7 @@ class ColourScale(Module):
             raise ValueError(f"limit must be finite and positive, in the values' unit; it is {describe(self.limit)}.")
 
     def of(self, values: np.ndarray, unit: str) -> "FittedScale":
-        """Fit the scale to `values` of any shape; `unit`: their unit, if this scale has none.
+        """Fit the scale to `values` of any shape; `unit`: unit of the values, used if this scale has no unit.
 
         Raises `ValueError` for values that are not finite.
         """
@@ -195,7 +196,7 @@ class ColourScale(Module):
 
 class FittedScale(Module):
     """A colour scale fitted to values. **Fields**: `factor`: conversion of values to the unit of the colour bar;
-    `label`: of the colour bar; `keywords`: arguments of matplotlib functions; `scale`: the original scale."""
+    `label`: label of the colour bar; `keywords`: arguments of matplotlib functions; `scale`: the original scale."""
 
     factor: float
     label: str
@@ -203,13 +204,13 @@ class FittedScale(Module):
     scale: ColourScale
 
     def draw_bar(self, ax: Axes, mappable: ScalarMappable) -> None:
-        """Draw the colour bar of `mappable` beside `ax`, unless the scale has none."""
+        """Draw the colour bar of `mappable` beside `ax`, unless the scale has no colour bar."""
         if self.scale.bar:
             draw_colour_bar(ax, mappable, self.label, show_sign=self.scale.difference)
 
 
 def check_scale(scale: ColourScale) -> None:
-    """Check that `scale` is a `ColourScale`. Raises `ValueError` otherwise."""
+    """Raise `ValueError` if `scale` is not a `ColourScale`."""
     check_kind("scale", scale, ColourScale, "a ColourScale, such as ColourScale(colour_map='viridis')")
 
 

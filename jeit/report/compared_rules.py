@@ -92,12 +92,12 @@ _MAX_MARKED = 8
 
 
 def write_choice(result: ComparedRules, folder: str | Path) -> None:
-    """Write a picture of a comparison of rules, `choice.png`, and its report, `choice.json`.
+    """Write a picture of a comparison of rules for λ, `choice.png`, and a report of the comparison, `choice.json`.
 
     **Arguments:**
 
     - `result`: the comparison.
-    - `folder`: created if needed.
+    - `folder`: folder of the files, created if needed.
 
     Raises `ValueError` for a path that cannot be a folder.
 
@@ -142,7 +142,7 @@ def draw_choice(result: ComparedRules):
 
 
 def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
-    """Draw the image of one rule on its own colour scale, with inclusions marked unless there are more than
+    """Draw the image of one rule with a colour scale of its own, with inclusions marked unless there are more than
     `_MAX_MARKED`."""
     from jeit.plot import ColourScale, plot_image
     from jeit.plot.axes import INK
@@ -169,7 +169,7 @@ def _draw_scale(ax, largest: float, unit: str) -> None:
 
 
 def report_choice(result: ComparedRules) -> dict[str, Any]:
-    """Report of the comparison as plain numbers, strings, lists and dictionaries; unknown values are None.
+    """Report of a comparison of rules for λ as plain numbers, strings, lists and dictionaries; unknown values are None.
 
     **Arguments:**
 

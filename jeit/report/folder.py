@@ -25,8 +25,9 @@ _ENCODING_ERRORS = "backslashreplace"
 
 @contextmanager
 def results(folder: str | Path, names: tuple[str, ...]) -> Iterator[Path]:
-    """Context manager with a temporary folder for files of the given `names`. They are moved to `folder` together once
-    all are written; it is created if needed. Raises `ValueError` if the path cannot be a folder."""
+    """Context manager with a temporary folder for files of the given `names`. The files are moved to `folder` together
+    once all of them are written; `folder` is created if needed. Raises `ValueError` if the path `folder` cannot be a
+    folder."""
     with whole_files(results_folder(folder, names)) as temporary_folder:
         yield temporary_folder
 
@@ -46,8 +47,8 @@ def write_rows(path: Path, columns: Sequence[str], rows: Iterable[Iterable[Any]]
 
 
 def results_folder(folder: str | Path, names: tuple[str, ...]) -> Path:
-    """Check the folder for files of the given `names`, and create it if needed. Raises `ValueError` if it cannot be
-    written to, or contains a folder of one of these names."""
+    """Check the folder for files of the given `names`, and create it if needed. Raises `ValueError` if the folder
+    cannot be written to, or contains a folder of one of these names."""
     path = Path(folder)
     if path.exists() and not path.is_dir():
         raise ValueError(f"folder {path} is a file; give a folder for the results.")
@@ -90,7 +91,7 @@ def describe_electrodes(electrodes: AbstractElectrodes | None) -> dict[str, Any]
 
 
 def version_of(package: str) -> str | None:
-    """Version of an installed package; None if it is not installed."""
+    """Version of an installed package; None if the package is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

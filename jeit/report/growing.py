@@ -93,7 +93,7 @@ class GrowingRows:
                     np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
 
     def _blocks(self) -> Iterator[tuple[float, bytes]]:
-        """Blocks of the file, each with the share of the file that has been read with it."""
+        """Yield the file of rows in blocks, each with the share of the file that has been read up to its end."""
         size = self._file.seek(0, os.SEEK_END)
         self._file.seek(0)
         while block := self._file.read(_BLOCK_BYTES):
@@ -109,8 +109,8 @@ class GrowingRows:
 
 @contextlib.contextmanager
 def reporting_partial_results(rows: GrowingRows) -> Iterator[None]:
-    """Context manager that adds to an `OSError`, such as for a full disk, which frames have been written. Raises
-    `OSError`."""
+    """Context manager that adds to the message of an `OSError`, such as for a full disk, which frames have been
+    written, and raises this `OSError`."""
     try:
         yield
     except OSError as error:
@@ -120,8 +120,9 @@ def reporting_partial_results(rows: GrowingRows) -> Iterator[None]:
 
 
 class Sample:
-    """Evenly spaced sample of a series of numbers of any length: all numbers up to 65,536, then every second, then
-    every fourth, and so on, so that 32,768 to 65,536 are stored."""
+    """Evenly spaced sample of a series of numbers of any length: every number of a series of up to 65,536 numbers,
+    every second number of a longer series, then every fourth, and so on, so that 32,768 to 65,536 numbers are
+    stored."""
 
     def __init__(self) -> None:
         self._values, self._step, self._number = array("d"), 1, 0
@@ -135,5 +136,5 @@ class Sample:
         self._number += 1
 
     def values(self) -> Float[np.ndarray, " k"]:
-        """Return the stored values."""
+        """Return the stored numbers."""
         return np.array(self._values)

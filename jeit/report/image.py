@@ -34,25 +34,25 @@ _PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix",
 def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[float, float] | None = None) -> None:
     """Write `image.png`, `image.npz`, `report.json` and, for a solid, `image.vtu` to a folder.
 
-    Arrays of the NPZ:
+    Arrays of `image.npz`:
 
     - `raster`: (rows, columns), change of conductivity, S (3-D: S/m, at half the height), NaN outside the body; row 0
       is at the top, column 0 at the left.
     - `extent`: (x_min, x_max, y_min, y_max) in metres.
     - `conductivity`: (m,), the change of conductivity per cell.
-    - `background`: the conductivity of the reference.
-    - `points`: (n, d); `cells`: (m, d + 1).
+    - `background`: the conductivity of the body in the reference frame.
+    - `points`: (n, d), nodes of the mesh in metres; `cells`: (m, d + 1), indices of their nodes.
     - `labels`: (rows, columns), if the image was segmented: 0 background, 1 resistive, 2 conductive.
     - `departure`: (m,), for iterative images, logarithm to base 10 of conductivity divided by background.
     - electrodes and inclusions, see `jeit.report.saved_image.saved_extras`, for `jeit view`.
 
-    The VTU has the conductivity and its change per cell, and the electrode of each node. Raises `ValueError` for a path
-    that cannot be a folder.
+    The file `image.vtu` has the conductivity and its change per cell, and the electrode of each node. Raises
+    `ValueError` for a path that cannot be a folder.
 
     **Arguments:**
 
     - `result`: the image.
-    - `folder`: created if needed.
+    - `folder`: folder of the files, created if needed.
     - `truth` (x, y): a known position in metres, marked in the picture of a sheet.
 
     **Example:**
@@ -97,8 +97,8 @@ def _drawn_values(result: ImagedDifference) -> np.ndarray:
 
 
 def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = None):
-    """Draw a result, and return a matplotlib `Figure` that needs no display. For an image of admittivity, the real and
-    imaginary part are drawn.
+    """Draw an imaged difference, and return a matplotlib `Figure` that needs no display. For an image of admittivity,
+    the real and imaginary part are drawn.
 
     **Arguments:**
 
@@ -225,8 +225,8 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
 
 
 def _uncertainty_report(uncertainty: Uncertainty) -> dict[str, Any]:
-    """Report of the uncertainty of the description, on which intervals are based. The position None stands for the
-    default, 0.0175 of the width of the body."""
+    """Report of the uncertainty of the description, on which intervals are based. A position uncertainty of None stands
+    for the default, 0.0175 of the width of the body."""
     return {
         "position": uncertainty.position,
         "position_unit": "m",
@@ -290,8 +290,8 @@ def _inclusion_report(result: ImagedDifference, inclusion: Inclusion) -> dict[st
 
 
 def _interval_report(inclusion: Inclusion) -> dict[str, Any]:
-    """68 % radius of the place of a body, and 68 % intervals of its properties, None at an open end; empty if none were
-    estimated."""
+    """68 % radius of the place of a body, and 68 % intervals of its properties, None at an open end; empty if no
+    intervals were estimated."""
     if inclusion.contrast_interval is None:
         return {}
     return {
@@ -314,7 +314,8 @@ def _size_report(inclusion: Inclusion) -> dict[str, Any]:
 
 
 def _shapes_report(result: ImagedDifference) -> dict[str, Any] | None:
-    """Report of fitted bodies with their outlines, and of bodies left out as artefacts; None if none were fitted."""
+    """Report of fitted bodies with their outlines, and of bodies left out as artefacts; None if no bodies were
+    fitted."""
     if result.shapes is None:
         return None
     body_reports, left_out_reports = (
@@ -376,7 +377,7 @@ def _prior_name(settings: ImagingSettings, dimension: int) -> str | None:
 
 
 def _iteration_report(result: ImagedDifference) -> dict[str, Any]:
-    """Report of the iteration; empty for images without one."""
+    """Report of the iteration; empty for images that were not computed iteratively."""
     reconstruction = result.reconstruction
     if not isinstance(reconstruction, Reconstruction):
         return {}

@@ -20,7 +20,8 @@ _DPI, _MAX_FRAMES = 90, 12
 
 
 def picture(value: Any) -> bytes | None:
-    """PNG of an object; None for one of another kind, and inside `jax.jit` or a derivative."""
+    """Picture of an object as PNG; None for objects of a kind that has no picture, and inside `jax.jit` or a
+    derivative."""
     draw = _DRAW_FUNCTIONS.get(type(value).__name__)
     if draw is None or not has_values(value):
         return None
@@ -30,7 +31,7 @@ def picture(value: Any) -> bytes | None:
 
 
 def page(value: Any) -> str | None:
-    """HTML of an object: its text above its picture, without scripts; None if it has no picture."""
+    """HTML of an object: its text above its picture, without scripts; None if the object has no picture."""
     png = picture(value)
     if png is None:
         return None

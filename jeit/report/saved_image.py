@@ -60,7 +60,7 @@ class SavedImage:
 
     - `mesh`: the mesh of the body.
     - `change`: change of conductivity in every cell (m,), S/m (2-D: S); complex for admittivity.
-    - `background`: conductivity of the reference; None if the file lacks it.
+    - `background`: conductivity of the body in the reference frame; None if the file lacks it.
     - `departure`: (m,), for iterative images, logarithm to base 10 of conductivity divided by background; else None.
     - `electrodes`: electrodes as polygons; None if the file has none.
     - `inclusions`: the inclusions found in the image.
@@ -274,13 +274,13 @@ def write_views(
     - For a surface in space: `surface.png`, seen from the same sides.
     - For a sheet: `image.png`.
 
-    For complex images, the real part is drawn. Raises `ValueError` for planes if the body is not a solid, for a path
-    that cannot be a folder, and as `jeit.plot.plot_solid`.
+    For complex images, the real part is drawn. Raises `ValueError` if `planes` are given for a body that is not a
+    solid, for a path that cannot be a folder, and in the same cases as `jeit.plot.plot_solid`.
 
     **Arguments:**
 
     - `image`: the image.
-    - `folder`: created if needed.
+    - `folder`: folder of the files, created if needed.
     - `camera`: direction of view.
     - `levels`: isosurfaces, as in `jeit.plot.plot_isosurfaces`.
     - `planes`: planes of sections.

@@ -31,12 +31,12 @@ _MAX_NAMED = 8
 
 @dataclass(frozen=True)
 class WrittenStream:
-    """Result of `write_stream`.
+    """Counts and latencies of the frames of a stream: the result of `write_stream`.
 
     - `number`: number of frames.
     - `counts`: number of frames by status.
     - `latency`: (K,) seconds, latencies of the imaged frames, or an evenly spaced sample for long streams.
-    - `first_reason`: reason why the first refused frame was refused; empty if none was.
+    - `first_reason`: reason why the first refused frame was refused; empty if no frame was refused.
     """
 
     number: int
@@ -62,21 +62,21 @@ def write_stream(
     **Arguments:**
 
     - `images`: images of `jeit.inverse.stream`.
-    - `calibration`: calibration of their imager (see `jeit.imaging.prepare_imager`).
-    - `folder`: created if needed.
+    - `calibration`: calibration of the imager of these images (see `jeit.imaging.prepare_imager`).
+    - `folder`: folder of the files, created if needed.
     - `name`: name of the stream, for error messages.
     - `film`: name of the film's file, ending in .gif or, if ffmpeg is installed, .mp4; None for no film.
     - `rate`: frames per second, for titles with times instead of frame numbers, and for the pace of the film.
-    - `progress`: called with every image.
-    - `drawing`: called at the end with the step, "images" or one of `PICTURES`, sometimes followed by a colon and the
-      progress. If it raises, the files written so far remain.
+    - `progress`: function called with every image.
+    - `drawing`: function called at the end with the step, "images" or one of `PICTURES`, sometimes followed by a colon
+      and the progress. If `drawing` raises an error, the files written so far remain.
 
-    The table has the place in metres and the value, S (3-D: S/m), of the maximum change of each image; both are empty
-    for unchanged frames. The NPZ has `conductivity` (frames, cells), NaN for refused frames, `background`, `points` and
-    `cells`. Pictures show evenly spaced frames and mark refused ones; no pictures are drawn if all were refused. Images
-    and pictures of an earlier stream are deleted first; each file is written completely or not at all. Raises
-    `ValueError` for a stream without frames and for values that cannot be a folder, a film or a rate, and `OSError` if
-    the disk is full.
+    `frames.csv` has the place in metres and the value, S (3-D: S/m), of the maximum change of each image; both are
+    empty for unchanged frames. `images.npz` has `conductivity` (frames, cells), NaN for refused frames, `background`,
+    `points` and `cells`. Pictures show evenly spaced frames and mark refused frames; no pictures are drawn if all
+    frames were refused. Images and pictures of an earlier stream are deleted first; each file is written completely or
+    not at all. Raises `ValueError` for a stream without frames and for values that cannot be a folder, a film or a
+    rate, and `OSError` if the disk is full.
 
     **Example:**
 
@@ -207,7 +207,7 @@ class _StreamPictures:
 
 
 def _table_row(frame_image: FrameImage, strongest: StrongestRegion, background: float) -> list[object]:
-    """Values of a frame for the table."""
+    """Values of a frame for its line of `frames.csv`."""
     latency_text = f"{1e3 * frame_image.latency:.3f}"
     if frame_image.conductivity is None:
         return [

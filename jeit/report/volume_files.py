@@ -18,7 +18,7 @@ from jeit.mesh import Mesh, write
 from jeit.mesh.geometry import facet_measures
 from jeit.report.folder import results_folder
 
-# Minimum share of the surface around a node that an electrode must cover for the node to count as under it.
+# Minimum share of the surface around a node that an electrode must cover for the node to count as under the electrode.
 _MIN_COVERED_SHARE = 0.1
 
 
@@ -30,14 +30,15 @@ def write_vtu(
     point_data: Mapping[str, ArrayLike] | None = None,
     electrodes: AbstractElectrodes | None = None,
 ) -> None:
-    """Write a mesh with values on it as VTU file; complex values are written as two arrays. Lengths are in metres.
+    """Write a mesh with values per cell and per node as a VTU file; complex values are written as two arrays. Lengths
+    are in metres.
 
     **Arguments:**
 
     - `path`: the .vtu file.
     - `mesh`: the mesh.
-    - `cell_data`: values (m,) by name.
-    - `point_data`: values (n,) by name.
+    - `cell_data`: values per cell (m,), by name.
+    - `point_data`: values per node (n,), by name.
     - `electrodes`: written as the array "electrode", the number of the electrode at each node, from 1, and 0 for other
       nodes.
 
@@ -72,7 +73,7 @@ def draft_vtu(
 
 
 def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> None:
-    """Write a time series as a .pvd file, which ParaView opens, and one VTU file for each frame.
+    """Write a time series of images as a .pvd file, which ParaView opens, and one VTU file for each frame.
 
     The VTU files are named after the series, such as `breath_0000.vtu`. Either all files are written or none.
 
@@ -81,7 +82,7 @@ def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: 
     - `path`: the .pvd file.
     - `mesh`: the mesh.
     - `times` (F,): seconds.
-    - `cell_data`: values (F, m) by name.
+    - `cell_data`: values per frame and cell (F, m), by name.
 
     Raises `ValueError` for another suffix, and for arrays that do not fit together.
 
@@ -115,7 +116,7 @@ def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: 
 
 
 def write_xdmf(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> None:
-    """Write a time series as a single XDMF file in text format.
+    """Write a time series of images as a single XDMF file in text format.
 
     **Arguments:**
 
@@ -181,7 +182,8 @@ def _real_arrays(data: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
 def _checked_frames(
     mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Check the times and values of a series, and return them as arrays. Raises `ValueError` if they do not fit."""
+    """Check the times and values of a series, and return them as arrays. Raises `ValueError` if they do not fit the
+    mesh and each other."""
     check_kind("mesh", mesh, Mesh, "a Mesh, such as Disk(0.05).mesh()")
     seconds: Sequence | np.ndarray = np.atleast_1d(np.asarray(times, dtype=object))
     if len(seconds) == 0 or not all(is_number(time) for time in seconds):

@@ -5,7 +5,7 @@ The steps:
 1. `outline_nodes`: place nodes along the outline at distances of the cell size;
 2. `fill`: insert circumcentres of cells that are too large, many at a time (Delaunay refinement);
 3. `smooth`: move every free node to the weighted mean of the circumcentres around it (optimal Delaunay
-   triangulation, L. Chen and J. Xu, J. Comput. Math. 22 (2004) 299), triangulating anew each time;
+   triangulation, L. Chen and J. Xu, J. Comput. Math. 22 (2004) 299), triangulating again after each step;
 4. `polish` and `repair` until the smallest angle is large enough.
 """
 
@@ -23,7 +23,8 @@ from jeit.mesh.generate.curve import Curve, Size, divide, is_within
 
 @dataclass
 class Front:
-    """State of the generator: nodes on every curve, by arc length, and fixed and free nodes inside.
+    """State of the mesh generator: arc lengths of the nodes on every boundary curve, and positions of the fixed and
+    free nodes inside.
 
     `guards[k]` contains the arc lengths of the sharp corners of curve k; segments that end there are not divided.
     """
@@ -131,8 +132,8 @@ def smallest_angles(corners: np.ndarray) -> np.ndarray:
 
 
 def select_apart(points: np.ndarray, radius: np.ndarray, priority: np.ndarray) -> np.ndarray:
-    """Select points greedily in order of decreasing `priority`, skipping points within `radius` of a selected one.
-    Returns their indices."""
+    """Select points greedily in order of decreasing `priority`, skipping points within `radius` of a selected point.
+    Returns the indices of the selected points."""
     order = np.argsort(-priority, kind="stable")
     neighbours = KDTree(points[order]).query_ball_point(points[order], radius[order], return_sorted=False)
     is_selected = np.zeros(len(points), bool)
@@ -145,8 +146,8 @@ def select_apart(points: np.ndarray, radius: np.ndarray, priority: np.ndarray) -
 
 
 def clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap: np.ndarray) -> np.ndarray:
-    """Whether each of `points` lies inside the outline, at a distance of more than `gap` from it. `nodes` are the nodes
-    of `front`."""
+    """Whether each of `points` lies inside the outline, at a distance of more than `gap` from the outline. `nodes` are
+    the nodes of `front`."""
     if not len(points):
         return np.zeros(0, bool)
     segments = front.segments()
@@ -176,14 +177,14 @@ _TRIAL_STEPS = np.concatenate([length * _STEP_DIRECTIONS for length in (0.02, 0.
 
 
 def improvable(front: Front, cells: np.ndarray) -> np.ndarray:
-    """Whether each cell can be improved: no cell at a sharp corner can, since the outline determines its shape."""
+    """Whether each cell can be improved; a cell at a sharp corner cannot, since the outline determines its shape."""
     is_sharp = np.zeros(cells.max() + 1, bool)
     is_sharp[: front.num_outline] = front.guarded()
     return np.logical_not(is_sharp[cells].any(axis=1))
 
 
 def missing_segments(front: Front, cells: np.ndarray, num_points: int) -> np.ndarray:
-    """Indices of the outline segments that are not an edge of any cell."""
+    """Indices of the outline segments that are not edges of cells."""
     edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]]).astype(np.int64)
     segments = front.segments().astype(np.int64)
     is_present = np.isin(segments[:, 0] * num_points + segments[:, 1], edges[:, 0] * num_points + edges[:, 1])
@@ -194,7 +195,7 @@ def polish(front: Front, passes: int = 4) -> None:
     """Move the free nodes of the worst cells so that the smallest angle around each of these nodes grows.
 
     Steps in eight directions are tried for each node, because the smallest angle is not differentiable where two cells
-    tie.
+    have equal smallest angles.
     """
     num_held = front.num_held
     for _ in range(passes):
@@ -238,10 +239,11 @@ def polish(front: Front, passes: int = 4) -> None:
 
 def repair(front: Front) -> bool:
     """Insert nodes until all outline segments are edges and every cell has the required minimum angle. Returns False if
-    this fails within the maximum number of rounds.
+    some cell or segment is still bad after the maximum number of rounds.
 
-    J. Ruppert, J. Algorithms 18 (1995) 548: a node is inserted at the circumcentre of a bad cell, unless it would lie
-    too close to an outline segment, which is halved instead. Many cells far enough from each other are treated at once.
+    J. Ruppert, J. Algorithms 18 (1995) 548: a node is inserted at the circumcentre of a bad cell, unless the node would
+    lie too close to an outline segment, which is halved instead. In each round, many cells far enough from each other
+    are treated at once.
     """
     for round_number in range(_MAX_REPAIR_ROUNDS):
         points = front.points()
@@ -271,8 +273,8 @@ def _is_divisible(front: Front) -> np.ndarray:
 
 
 def _recover(front: Front, points: np.ndarray, missing_indices: np.ndarray, *, remove: bool) -> None:
-    """Make missing outline segments appear: remove the free nodes close to them or, if there are none, halve the
-    segments."""
+    """Make missing outline segments appear as edges of cells: remove the free nodes close to them or, if there are
+    none, halve the segments."""
     centres, radii = _diametral_circles(front, points)
     if remove and len(front.free):
         neighbours = KDTree(front.free).query_ball_point(centres[missing_indices], radii[missing_indices])
@@ -388,12 +390,13 @@ def smooth(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
 def generate(
     curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size, front: Front | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mesh the region inside the first of `curves` and outside the others: points (n, 2) and cells (m, 3).
+    """Mesh the region inside the first of `curves` and outside the other curves, which are holes: points (n, 2) and
+    cells (m, 3).
 
     `stops` are arc lengths on each curve, and `fixed` points (f, 2) inside, at which nodes are placed; `size` returns
-    the requested edge length at points (p, 2). If a `front` already filled for this size is given, the first two steps
-    are skipped. Node 0 is the first node of the first curve. Raises `ValueError` if no mesh with the guaranteed minimum
-    angle is found.
+    the requested edge length at points (p, 2). If a `front` already filled for this size is given, the steps
+    `outline_nodes` and `fill` are skipped. Node 0 is the first node of the first curve. Raises `ValueError` if no mesh
+    with the guaranteed minimum angle is found.
     """
     for guard_ratio in (1.0, 0.5, 0.25):
         if front is None:

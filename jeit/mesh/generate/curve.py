@@ -18,7 +18,7 @@ class Curve:
     """A closed curve of `length` metres.
 
     **Fields**: `at`: function that returns the points (p, 2) at arc lengths (p,); `inside`: function that returns
-    whether points are enclosed; `distance`: function that returns the distances of points from the curve, metres;
+    whether the curve encloses points; `distance`: function that returns the distances of points from the curve, metres;
     `corners`: arc lengths of the corners, which always become nodes; `angles`: interior angles of the domain at the
     corners, radians.
     """
@@ -54,7 +54,7 @@ def circle(radius: float, centre: np.ndarray) -> Curve:
 def smooth(length: float, at: Callable[[np.ndarray], np.ndarray], num_chords: int = 720) -> Curve:
     """A closed curve without corners. `at` returns points (p, 2) at arc lengths (p,); the domain lies to the left.
 
-    Enclosure and distances are computed from a polygon of `num_chords` chords.
+    The functions `inside` and `distance` of the curve use a polygon of `num_chords` chords.
     """
     chords = at(length * np.arange(num_chords) / num_chords)
     inscribed = closed_line(chords)
@@ -91,7 +91,7 @@ def closed_line(vertices: np.ndarray) -> Curve:
 
 
 def is_within(curves: list[Curve], points: np.ndarray) -> np.ndarray:
-    """Whether points lie inside the first curve and outside the others, which are holes."""
+    """Whether points lie inside the first curve and outside all other curves, which are holes."""
     result = np.zeros(len(points), bool)
     for curve in curves:
         result ^= curve.inside(points)
@@ -99,7 +99,8 @@ def is_within(curves: list[Curve], points: np.ndarray) -> np.ndarray:
 
 
 def divide(curve: Curve, stops: np.ndarray, size: Size) -> np.ndarray:
-    """Arc lengths of nodes along a curve, including `stops`, at distances of the requested cell size."""
+    """Arc lengths of nodes along a curve, which include `stops` and are spaced by the cell size that `size`
+    requests."""
     stops = np.unique(stops)
     if not len(stops):
         stops = np.zeros(1)

@@ -24,7 +24,7 @@ class TooFewNodes(ValueError):
     """Raised if a plane mesh needs about `min_points` nodes, more than requested.
 
     `solid` is the message for a plane mesh that is the base of a solid, without the leading "num_points: "; {asked} and
-    {least} in it are replaced by numbers of nodes of the solid.
+    {least} in this message are replaced by numbers of nodes of the solid.
     """
 
     def __init__(self, message: str, min_points: int, solid: str):
@@ -34,7 +34,8 @@ class TooFewNodes(ValueError):
 
 @contextmanager
 def nodes_of_solid(num_requested: int | None, count_base_nodes: Callable[[int], int]) -> Iterator[None]:
-    """Convert a `TooFewNodes` error raised within into a `ValueError` about the number of nodes of a solid.
+    """Convert a `TooFewNodes` error raised inside this context into a `ValueError` about the number of nodes of a
+    solid.
 
     `num_requested`: number of nodes requested for the solid; `count_base_nodes`: function that returns how many of a
     solid's nodes lie in its base.
@@ -66,13 +67,13 @@ class Refine(Module):
     half the rim of a disk, `disk(radius, num_points=1200, refine=Refine(edges, factor=5, growth=0.3),
     boundary_points=angles)`, with `edges` the end points of the electrodes and `angles` the angles of these points,
     reduces the maximum error of a voltage between electrodes without current from 2.2 % (uniform rings) to 0.5 %. With
-    10,000 nodes and `factor=8, growth=0.4` it falls below 0.1 % (for contact impedance times conductivity between 0.01
-    and 0.1 radii).
+    10,000 nodes and `factor=8, growth=0.4` the error falls below 0.1 % (for contact impedance times conductivity
+    between 0.01 and 0.1 radii).
 
     **Fields**: `points` (k, 2): coordinates in metres, or None for the whole outline; `cell_size`: in metres; `factor`:
-    ratio of the background cell size to that at the points, at least 1; `growth`: increase of the edge length per
-    length, at most 1 (default 0.35; above 0.7 cells are visibly stretched); `distance`: distance in metres within
-    which cells keep their smallest size.
+    ratio of the background cell size to the cell size at the points, at least 1; `growth`: increase of the edge length
+    per length, at most 1 (default 0.35; above 0.7 cells are visibly stretched); `distance`: distance in metres from the
+    points within which cells keep their smallest size.
 
     **Example:**
 
@@ -123,7 +124,7 @@ class Refine(Module):
         self.distance = float(distance)
 
     def smallest(self, background: float) -> float:
-        """Edge length in metres at the points themselves, for a background cell size in metres."""
+        """Edge length in metres at the refined points, for a background cell size in metres."""
         if self.cell_size is not None:
             return self.cell_size
         assert self.factor is not None
@@ -137,8 +138,8 @@ class SizeField:
     """Requested edge length at any point, for a given background cell size."""
 
     def __init__(self, curves: list[Curve], refine: Refinement, required_nodes: np.ndarray, spacing: np.ndarray):
-        """`required_nodes` (k, 2): positions where nodes must be; `spacing` (k,): distance of each of them to its
-        nearest neighbour or side.
+        """`required_nodes` (k, 2): positions where nodes must be; `spacing` (k,): distance of each of these nodes to
+        the nearest other node or side.
 
         Raises `ValueError` if `refine` contains anything but `Refine` objects.
         """
@@ -187,7 +188,8 @@ def _distance_function(curves: list[Curve], points: np.ndarray | None) -> Callab
 
 
 def _size_at_close_nodes(required_nodes: np.ndarray, spacing: np.ndarray) -> Size:
-    """Size function that limits cells at required nodes to the `spacing` there, growing away from them."""
+    """Size function that limits the edge length at each required node to its `spacing` and lets it grow away from the
+    node."""
     if not len(required_nodes):
         return lambda points: np.full(len(points), np.inf)
     tree = KDTree(required_nodes)
@@ -210,10 +212,11 @@ def _size_at_close_nodes(required_nodes: np.ndarray, spacing: np.ndarray) -> Siz
 
 
 def limited(curves: list[Curve], function: Callable[[np.ndarray], Any], resolution: int = 128) -> Size:
-    """Limit the growth of a user's size function f: min over y of f(y) + growth |x − y|.
+    """Limit the growth of a user's size function f to g = `_USER_SIZE_GROWTH`: min over y of f(y) + g |x − y| at point
+    x.
 
-    The minimum is computed on a grid by Dijkstra's algorithm; where the function itself is smaller, its value is used.
-    Raises `ValueError` if the function does not return one positive, finite size per point.
+    The minimum is computed on a grid by Dijkstra's algorithm; where f(x) itself is smaller than the minimum on the
+    grid, f(x) is used. Raises `ValueError` if the function does not return one positive, finite size per point.
     """
     outline = curves[0].at(np.linspace(0, curves[0].length, 721))
     lower, upper = outline.min(axis=0), outline.max(axis=0)

@@ -1,8 +1,8 @@
 """Structured triangulations: concentric rings of cells in a disk, rows of cells in a rectangle.
 
-Both consist of chains of nodes laid side by side. Where the numbers of nodes of neighbouring chains differ slightly,
-the offset between the chains varies gradually, so that triangles range between equilateral and right-angled, and no
-angle is smaller than about 40°.
+Both triangulations consist of chains of nodes laid side by side. Where the numbers of nodes of neighbouring chains
+differ slightly, the offset between the chains varies gradually, so that triangles range between equilateral and
+right-angled, and no angle is smaller than about 40°.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def ring_disk(num_rings: int, num_boundary: int) -> tuple[np.ndarray, np.ndarray
 def choose_rows(width: float, height: float, num_points: int, cell_size: float | None) -> tuple[int, int]:
     """Numbers of columns and rows for `row_rectangle`, for close to `num_points` nodes or cells of size `cell_size`.
 
-    Raises `ValueError` if so few nodes would make flat cells.
+    Raises `ValueError` if a mesh with so few nodes would have flat cells.
     """
     if cell_size is not None:
         # A cell with base b and height 0.93 b has the area of an equilateral triangle with edge 1.036 b.
@@ -96,7 +96,7 @@ def choose_rows(width: float, height: float, num_points: int, cell_size: float |
         return max(1, round(width / cell_size - 0.5)), max(1, round(height / (_ROW_HEIGHT * cell_size)))
     edge = np.sqrt(width * height / (_ROW_HEIGHT * num_points))
     guessed_rows = height / (_ROW_HEIGHT * edge)
-    # With few nodes, accept a larger deviation from their number rather than stretched cells.
+    # With few nodes, accept a larger deviation from the requested number rather than stretched cells.
     max_deviation = 0.03 if num_points > 200 else 0.1
     best_choice = None
     for num_rows in range(max(1, int(0.6 * guessed_rows)), int(1.5 * guessed_rows) + 3):

@@ -44,7 +44,8 @@ class Target:
 
     @staticmethod
     def create(num_points: int | None, cell_size: float | None) -> Target:
-        """Create from the two arguments of a shape. Raises `ValueError` if both are given or one is out of range."""
+        """Create a target from the two arguments of a mesh function. Raises `ValueError` if both arguments are given or
+        one is out of range."""
         if num_points is not None and cell_size is not None:
             raise ValueError("num_points, cell_size: give one of the two, not both.")
         if cell_size is not None:
@@ -55,7 +56,7 @@ class Target:
 
 
 def check_count(name: str, value: int, minimum: int) -> int:
-    """Convert to an integer. Raises `ValueError` unless it is a whole number of at least `minimum`."""
+    """Convert a count to an integer. Raises `ValueError` unless the count is a whole number of at least `minimum`."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < minimum:
         raise ValueError(f"{name}: expected a whole number of at least {minimum}, got {value!r}.")
     return int(value)
@@ -71,7 +72,8 @@ def check_total(num_points: float, name: str) -> None:
 
 
 def check_positions(name: str, positions: ArrayLike) -> np.ndarray:
-    """Convert `positions` to finite numbers (k,). Raises `ValueError` for anything else."""
+    """Convert `positions` along an outline to an array (k,). Raises `ValueError` for another shape, no positions, NaN
+    or infinity."""
     array = np.asarray(positions, dtype=float)
     if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
         raise ValueError(
@@ -89,7 +91,7 @@ def mesh_within(
     boundary_points: ArrayLike | None = None,
     interior_points: ArrayLike | None = None,
 ) -> Mesh:
-    """Mesh the region inside the first of `curves` and outside the others; its area is `area` m².
+    """Mesh the region of `area` m² inside the first of `curves` and outside the other curves, which are holes.
 
     Nodes are placed at `boundary_points`, arc lengths (k,) in metres on the first curve, and at `interior_points` (k,
     2) in metres. Raises `ValueError` for invalid or contradictory arguments.
@@ -175,8 +177,8 @@ def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> n
 
 
 def _required_spacing(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (k, 2) of required nodes, and the distance (k,) of each to the nearest other one or to the nearest side
-    that it does not lie on."""
+    """Positions (k, 2) of required nodes, and the distance (k,) of each required node to the nearest other one, or to
+    the nearest side that the node does not lie on."""
     chains = [curve.at(stop) for curve, stop in zip(curves, stops, strict=True)]
     required_nodes = np.concatenate([*chains, fixed])
     if len(required_nodes) < 2:
@@ -208,8 +210,8 @@ def _interior_samples(curves: list[Curve]) -> np.ndarray:
 
 
 def _estimate_num_nodes(curves: list[Curve], size: Size, area: float) -> float:
-    """Estimate the number of nodes of a mesh with this size function, from samples inside the domain and along its
-    outline."""
+    """Estimate the number of nodes of a mesh whose cell sizes are given by the function `size`, from samples inside the
+    domain and along its outline."""
     num_nodes = area * float(np.mean(1.0 / size(_interior_samples(curves)) ** 2))
     for curve in curves:
         num_nodes += curve.length * float(np.mean(1.0 / size(curve.at(np.linspace(0, curve.length, 400)))))
@@ -228,7 +230,7 @@ def _fit_cell_size(
     Returns the size function and the outline filled with nodes.
 
     The number of nodes is about ∫ c/h² over the domain, h being the cell size: a first mesh determines the constant c
-    and the sample points, further meshes correct the rest.
+    and the sample points, and further meshes correct the cell size.
     """
     first_num_points = num_points / 4 if num_points > 4000 else num_points
     background = float(np.sqrt(1.1 * area / first_num_points))
@@ -256,8 +258,8 @@ def _fit_cell_size(
 def _correct_background(
     size: Callable[[float], np.ndarray], weight: np.ndarray, background: float, surplus: float, num_points: int
 ) -> float:
-    """Background size for which ∫ 1/h² is its value for the background size `background` divided by 1 + `surplus`,
-    where `surplus` is the relative surplus of nodes."""
+    """Background cell size for which ∫ 1/h², h being the cell size at a point, is smaller by the factor 1 + `surplus`
+    than for the background cell size `background`; `surplus` is the relative surplus of nodes."""
 
     def density_integral(trial: float) -> float:
         return float(np.sum(weight / size(trial) ** 2))

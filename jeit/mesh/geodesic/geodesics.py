@@ -3,12 +3,14 @@
 A wave front propagates over the triangles. From the distances at two corners of a triangle, the triangle and the
 virtual source of the wave are laid into one plane. If the straight line from the source to the third corner crosses the
 side between the two corners, its length is the distance at the third corner; otherwise the shortest path passes through
-one of the two corners. This is exact where the triangles between can be laid into one plane. (Novotni and Klein, WSCG
-2002, 341-347, who extend the fast marching of Kimmel and Sethian, PNAS 95 (1998) 8431-8435, to circular waves.)
+one of the two corners. The distance is exact where the triangles between the source and the corner can be laid into one
+plane. (Novotni and Klein, WSCG 2002, 341-347, who extend the fast marching of Kimmel and Sethian, PNAS 95 (1998)
+8431-8435, to circular waves.)
 
 On other surfaces, Gaussian curvature K changes the curvature of the front: after a path of length d, by about K d/3;
-the formula for a sphere of that curvature is used. Updates only ever lower distances, so the nodes may be processed in
-any order: those that changed, for all sources together, until none changes.
+the formula for a sphere of Gaussian curvature K is used. Updates only ever lower distances, so the nodes may be
+processed in any order: the neighbours of all nodes whose distance has changed are updated, for all sources together,
+until no distance changes.
 """
 
 from __future__ import annotations
@@ -72,8 +74,8 @@ class Geodesics(Module):
 
     @classmethod
     def create(cls, surface: Triangles | Mesh, face: str | None = None) -> "Geodesics":
-        """Prepare distances on a surface, or on the facets of a shell that have the tag `face`. Raises `ValueError` as
-        `Triangles.of` does."""
+        """Prepare geodesic distances on a surface, or on the facets of a shell that have the tag `face`. Raises
+        `ValueError` as `Triangles.of` does."""
         triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
         cells, points = triangles.cells, triangles.points
         node, start, end = (np.roll(cells, -shift, axis=1).ravel() for shift in range(3))
@@ -92,7 +94,7 @@ class Geodesics(Module):
         limit: float = np.inf,
     ) -> Float[np.ndarray, "s p"]:
         """Geodesic distances (s, p), metres, from `sources` (s, 3) to `targets` (p, 3), or (s, n) to all nodes if there
-        are no targets. Points off the surface are projected to the nearest point on it.
+        are no targets. Points off the surface are replaced by the nearest points on the surface.
 
         Distances beyond `limit`, metres, and between disconnected parts are infinite. Raises `ValueError` for points
         farther from the surface than a quarter of its extent.
@@ -122,7 +124,7 @@ class Geodesics(Module):
 
     def _project(self, name: str, places: ArrayLike) -> SurfacePlaces:
         """Nearest points on the surface. Raises `ValueError` with the argument's `name` for points that are too far
-        from it."""
+        from the surface."""
         projected = self.surface.nearest(places)
         extent = float(np.ptp(self.surface.points, axis=0).max())
         off_surface = np.flatnonzero(~(projected.away <= _MAX_OFF_SURFACE * extent))
@@ -143,7 +145,8 @@ class Geodesics(Module):
         return lengths
 
     def owners(self, sources: ArrayLike | SurfacePlaces) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """For each node, the index of the nearest of the `sources` (s, 3) and the geodesic distance to it, metres."""
+        """For each node, the index of the nearest of the `sources` (s, 3) and the geodesic distance to this source,
+        metres."""
         source_places = sources if isinstance(sources, SurfacePlaces) else self.surface.nearest(sources)
         nodes = self.surface.cells[source_places.triangle]
         length = np.linalg.norm(self.surface.points[nodes] - source_places.points[:, None], axis=-1)
@@ -196,8 +199,8 @@ class Geodesics(Module):
         return lengths.reshape(-1, num_nodes), curvatures.reshape(-1, num_nodes)
 
     def _opposite_corners(self, nodes, values):
-        """Return the corners opposite to the sides at the `nodes`, and for each of these corners the entry of `values`
-        that belongs to its node."""
+        """For each of `nodes`, all corners of triangles whose opposite side ends at the node; and, repeated for each of
+        these corners, the node's entry of `values`. Returns the repeated values first."""
         num_corners = self.first[nodes + 1] - self.first[nodes]
         ends = np.cumsum(num_corners)
         offset = np.arange(ends[-1]) - np.repeat(ends - num_corners, num_corners)
@@ -205,7 +208,7 @@ class Geodesics(Module):
 
     def near(self, sources: ArrayLike, targets: SurfacePlaces, limit: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """For each of the `sources` (s, 3), the indices of the targets within a geodesic distance of `limit` metres,
-        and their distances. Only targets within `limit` in a straight line are considered."""
+        and their geodesic distances in metres. Only targets within `limit` in a straight line are considered."""
         source_places = self.surface.nearest(sources)
         tree, neighbours = KDTree(targets.points), []
         for batch_start in range(0, len(source_places.triangle), _SOURCES_PER_BATCH):
@@ -273,9 +276,9 @@ def _triangle_coordinates(start, end, corner):
 
 def _distances_across(start, end, side, x, y, *, same_source: Any = True, curvature: Any = 0.0):
     """Distances at corners, computed from the distances at the `start` and `end` of the opposite sides, and whether the
-    path through the start is the shorter one. Paths across the interior of a side are considered only where
-    `same_source` is True, i.e. where the distances at both of its ends are from the same source. `curvature`: mean
-    Gaussian curvature along the path, 1/m²."""
+    path through the start is shorter than the path through the end. Paths across the interior of a side are considered
+    only where `same_source` is True, i.e. where the distances at both of its ends are from the same source.
+    `curvature`: mean Gaussian curvature along the path, 1/m²."""
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         through_start = np.sqrt(x**2 + y**2) + start
         through_end = np.sqrt((side - x) ** 2 + y**2) + end
@@ -285,7 +288,7 @@ def _distances_across(start, end, side, x, y, *, same_source: Any = True, curvat
             (squared_depth >= 0) & (crossing >= 0) & (crossing <= side) & same_source & (source_depth + y > 0)
         )
         length = np.sqrt((x - source_x) ** 2 + (y + source_depth) ** 2)
-        # Difference between the sagitta of the wave front at the crossing and that of a front in the plane.
+        # Sagitta of the wave front at the crossing, minus the sagitta of a wave front in the plane.
         squared_length = (crossing - source_x) ** 2 + squared_depth
         front_curvature = np.where(
             squared_length > 0, squared_depth / np.where(squared_length > 0, squared_length, 1.0), 0.0
@@ -341,8 +344,8 @@ def _gaussian_curvature(surface: Triangles, corners: _Corners) -> Float[np.ndarr
 
 
 def _lower_distances(lengths, owner, nodes, new_lengths, owner_index) -> np.ndarray:
-    """Lower the distances of `nodes` to the minimum of the new distances `new_lengths`, and store the owner's index.
-    Returns the nodes whose distance has decreased."""
+    """Lower the distances of `nodes` to the minimum of the new distances `new_lengths`, and store the corresponding
+    entry of `owner_index` as their owner. Returns the nodes whose distance has decreased."""
     is_lower = new_lengths < (1 - _MIN_DECREASE) * lengths[nodes]
     nodes, new_lengths, owner_index = nodes[is_lower], new_lengths[is_lower], owner_index[is_lower]
     order = np.lexsort((new_lengths, nodes))

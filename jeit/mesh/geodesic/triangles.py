@@ -15,10 +15,10 @@ _CANDIDATES = 16
 
 
 class SurfacePlaces(Module):
-    """p points on a surface.
+    """A number p of points on a triangulated surface.
 
-    **Fields**: `triangle` (p,): index of the triangle; `weights` (p, 3): barycentric coordinates in it; `points` (p,
-    3): positions, metres; `away` (p,): distance of the originally given point from the surface, metres.
+    **Fields**: `triangle` (p,): index of the triangle; `weights` (p, 3): barycentric coordinates in this triangle;
+    `points` (p, 3): positions, metres; `away` (p,): distance of the originally given point from the surface, metres.
 
     **Example:**
 
@@ -91,7 +91,7 @@ class Triangles(Module):
 
     @property
     def node_areas(self) -> Float[np.ndarray, " n"]:
-        """A third of the area of the triangles at each node, m²."""
+        """A third of the total area of the triangles at each node, m²."""
         return np.bincount(self.cells.ravel(), np.repeat(self.areas / 3, 3), len(self.points))
 
     @property
@@ -134,7 +134,7 @@ class Triangles(Module):
         )
 
     def normals_at(self, places: SurfacePlaces) -> Float[np.ndarray, "p 3"]:
-        """Outward unit normals at points on the surface, interpolated from those at the nodes."""
+        """Outward unit normals at points on the surface, interpolated from the normals at the nodes."""
         interpolated = places.of_nodes(self, self.node_normals)
         return interpolated / np.linalg.norm(interpolated, axis=1, keepdims=True)
 

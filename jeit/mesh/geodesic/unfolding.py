@@ -1,9 +1,9 @@
 """`unfold`: the triangles of a surface around a point, unfolded into the plane of the triangle that contains the point.
 
-The triangle that contains the point keeps its place. Every other triangle is connected to it by the path that crosses
-the fewest triangles, and is rotated about the side that it shares with the previous triangle of this path, until it
-lies in the same plane. On a developable surface, such as a bent sheet, the result does not depend on the path, and
-straight lines in the plane are exactly the geodesics on the triangles. On other surfaces the result depends on the
+The triangle that contains the point keeps its place. Every other triangle is connected to this triangle by the path
+that crosses the fewest triangles, and is rotated about the side that it shares with the previous triangle of this path,
+until it lies in the same plane. On a developable surface, such as a bent sheet, the result does not depend on the path,
+and straight lines in the plane are exactly the geodesics on the triangles. On other surfaces the result depends on the
 path; `Unfolding.exact` is False for the points where it does. The functions take NumPy or JAX arrays and can be
 differentiated and batched.
 """
@@ -30,10 +30,10 @@ class Unfolding(NamedTuple):
     """Unfolded triangles around L points on a surface of m triangles; lengths in metres.
 
     **Fields**: `corners` (m, 3, 2): corners of each triangle in its own plane; `turn` (L, m, 2): cosine and sine of the
-    angle by which they are rotated, and `shift` (L, m, 2): the vector by which they are then translated, to come to lie
-    in the plane of the triangle that contains each point; `place` (L, 2): position of each point in this plane;
-    `reached` (L, m): whether a triangle is unfolded around a point; `exact` (L,): whether the reached triangles are
-    developable and at most 128 triangles away.
+    angle by which the corners are rotated, and `shift` (L, m, 2): the vector by which they are then translated, to come
+    to lie in the plane of the triangle that contains each point; `place` (L, 2): position of each point in this plane;
+    `reached` (L, m): whether a triangle is unfolded around a point; `exact` (L,): whether the reached triangles form a
+    developable surface and are at most 128 triangles away from the point.
 
     **Example:**
 
@@ -62,8 +62,8 @@ class Unfolding(NamedTuple):
 
 
 def unfold(mesh: Mesh, places: Float[Array, "L 3"], max_distance: Float[Array, "L m"]) -> Unfolding:
-    """Unfold the triangles around points on a surface into the plane: those whose centroids lie within a straight
-    distance of each point, and which are connected to the point's own triangle.
+    """Unfold the triangles around points on a surface into the plane: those whose centroids lie within `max_distance`
+    of each point in a straight line, and which are connected to the triangle that contains the point.
 
     **Arguments:**
 
@@ -177,7 +177,8 @@ def _transforms_across_sides(plane_corners, opposite):
 
 def _compose_transforms(previous, turn, shift):
     """Compose the rotations and translations along the path from each triangle to the root. `previous` (L, m): next
-    triangle on that path. Returns the rotation and translation for the whole path, and the triangle where it ends."""
+    triangle on the path from each triangle. Returns the rotation and translation for the whole path, and the triangle
+    where it ends."""
     xp = namespace(previous, turn)
     row = xp.arange(len(previous))[:, None]
     for _ in range(_MAX_DOUBLINGS):

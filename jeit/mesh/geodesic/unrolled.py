@@ -1,10 +1,10 @@
 """`Unrolled`: a curved surface flattened into the plane, in metres, with the stretch of each triangle.
 
-Developable surfaces (cylinders, cones, bent sheets) are flattened without stretch, apart from the deviations of their
-triangles from them. All others are flattened as rigidly as possible: rotations of the triangles and positions of the
-nodes are fitted in turn by least squares (Liu, Zhang, Xu, Gotsman and Gortler, SGP 2008), starting from a conformal map
-(Lévy, Petitjean, Ray and Maillot, SIGGRAPH 2002). A sleeve is cut along a shortest path from one open end to the other,
-a closed surface from one end to the other.
+Developable surfaces (cylinders, cones, bent sheets) are flattened without stretch, apart from the deviations of the
+triangles from the developable surface. All others are flattened as rigidly as possible: rotations of the triangles and
+positions of the nodes are fitted in turn by least squares (Liu, Zhang, Xu, Gotsman and Gortler, SGP 2008), starting
+from a conformal map (Lévy, Petitjean, Ray and Maillot, SIGGRAPH 2002). A sleeve is cut along a shortest path from one
+open end to the other; a closed surface is cut between its two extreme nodes along the axis of its largest extent.
 """
 
 from __future__ import annotations
@@ -204,8 +204,8 @@ def _flatten_rigidly(cells, plane_corners, points: np.ndarray) -> np.ndarray:
 
 
 def _turn_upright(points: np.ndarray, space: np.ndarray) -> np.ndarray:
-    """Rotate so that z points upward, or y or x if z has little slope, and centre at the origin. The map is not
-    mirrored, since the surface is seen from outside."""
+    """Rotate the flat `points` so that the z axis of space points upward, or y or x if z has little slope, and centre
+    them at the origin. The map is not mirrored, since the surface is seen from outside."""
     points = points - points.mean(axis=0)
     for axis in (2, 1, 0):
         height = space[:, axis] - space[:, axis].mean()
@@ -228,7 +228,8 @@ def _is_among(edges, reference_edges) -> np.ndarray:
 
 
 def _cut_to_disk(surface: Triangles, cut) -> tuple[np.ndarray, np.ndarray]:
-    """Cut a surface so that it becomes a disk. Returns its triangles, and for each new node the original node."""
+    """Cut a surface so that it becomes topologically a disk. Returns the triangles after the cut, and for each new node
+    the original node."""
     cells, num_nodes = surface.cells, len(surface.points)
     border = surface.border
     num_loops, label = _border_loops(border, num_nodes)
@@ -265,7 +266,8 @@ def _border_loops(border, num_nodes: int):
 
 
 def _path_along_edges(points, edges, ends, cut, border) -> list[int]:
-    """Nodes of a path along edges from one end to the other, near the requested side and off the border."""
+    """Nodes of a path along edges from the first of the two `ends` to the second, near the point `cut` and off the
+    border."""
     centre = points.mean(axis=0)
     cut_position = np.asarray(cut, float) if cut is not None else None
     spread = np.ptp(points, axis=0).max()
@@ -292,8 +294,8 @@ def _path_along_edges(points, edges, ends, cut, border) -> list[int]:
 
 
 def _split_along_path(cells, path: list[int], num_nodes: int, *, is_closed: bool):
-    """Duplicate the nodes along a path for the triangles on one side of it. On a closed surface, the ends of the path
-    are not duplicated."""
+    """Duplicate the nodes along a path for the triangles on one side of the path. On a closed surface, the ends of the
+    path are not duplicated."""
     doubled_nodes = path[1:-1] if is_closed else path
     path_edges = set(itertools.pairwise(path))
     path_nodes = set(path)

@@ -25,8 +25,8 @@ class Disk(Domain):
 
     **Arguments:**
 
-    - `radius`: in metres, positive.
-    - `centre` (x, y): in metres.
+    - `radius`: radius in metres, positive.
+    - `centre` (x, y): centre in metres.
 
     **Example:**
 
@@ -40,7 +40,8 @@ class Disk(Domain):
     centre: tuple[float, float]
 
     def __init__(self, radius: float, centre: Sequence[float] = (0.0, 0.0)):
-        """`radius` > 0 and `centre` (x, y) are in metres. Raises `ValueError` otherwise."""
+        """`radius` and `centre` (x, y) are in metres. Raises `ValueError` unless the radius is positive and the centre
+        finite."""
         self.radius = check_length("radius", radius, 2)
         self.centre = check_position("centre", centre)
         check_near_origin("centre", self.centre, self.radius)
@@ -94,11 +95,11 @@ class Disk(Domain):
         return offset, xp.sqrt((offset**2).sum(axis=1) + 1e-24)
 
     def describe(self) -> dict:
-        """Shape, radius and centre."""
+        """Name of the shape, radius and centre, in metres."""
         return {"shape": "disk", "radius": float(self.radius), "centre": [float(x) for x in self.centre]}
 
     def draw(self, pen: Pen) -> None:
-        """Draw one circle."""
+        """Draw the disk as one circle."""
         pen.circle(self.centre, self.radius)
 
     @size_checked()

@@ -19,7 +19,7 @@ from jeit_solvers.module import Module
 
 
 class Body(Module):
-    """Base of all bodies: plane outlines (`Domain`), solids above an outline (`Solid`), and given meshes
+    """Base class of all bodies: plane outlines (`Domain`), solids above an outline (`Solid`), and given meshes
     (`OwnMesh`).
 
     **Example:**
@@ -107,23 +107,23 @@ class Domain(Body):
         """Vertices (k, 2), in metres, of the outer edge, counter-clockwise, and of every hole, clockwise.
 
         The first vertex is not repeated. A curved edge is replaced by `num_chords` chords; with 120 chords, the polygon
-        of a circle lies at most 0.04 % of the radius inside it.
+        of a circle lies at most 0.04 % of the radius inside the circle.
         """
 
     @abc.abstractmethod
     def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
-        """Whether each of `points` (…, 2), in metres, lies inside."""
+        """Whether each of `points` (…, 2), in metres, lies inside the outline."""
 
     @abc.abstractmethod
     def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
         """Distance (p,) of `points` (p, 2) from the edge in metres, negative outside.
 
-        It is differentiable almost everywhere; within 1e-12 m of the edge it is smoothed.
+        The distance is differentiable almost everywhere; within 1e-12 m of the edge it is smoothed.
         """
 
     @abc.abstractmethod
     def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
-        """Move those of `points` (p, 2), metres, that lie outside to the nearest point on the edge."""
+        """Move those of `points` (p, 2), metres, that lie outside the outline to the nearest point on its edge."""
 
     @abc.abstractmethod
     def describe(self) -> dict[str, Any]:
@@ -151,8 +151,8 @@ def numerics(*values: Any) -> Any:
 
 def check_length(name: str, value: Any, size_factor: float = 1.0) -> Any:
     """Check a length in metres and convert it to a float; traced values are returned unchanged. Raises `ValueError`
-    unless it is positive, and warns if the object is large: `size_factor` is the object's size divided by this
-    length."""
+    unless the length is positive, and warns if the object is large: `size_factor` is the object's size divided by
+    `value`."""
     if not has_values(value):
         return value
     try:
@@ -180,7 +180,7 @@ def check_near_origin(name: str, coordinates: Any, size: Any) -> None:
 
 def check_position(name: str, value: Any) -> Any:
     """Check a position (x, y) in metres and convert it to two floats; traced values are converted without a check.
-    Raises `ValueError` for anything else."""
+    Raises `ValueError` for anything but two finite numbers."""
     if not has_values(value):
         return jnp.asarray(value)
     array = np.asarray(value, dtype=float)

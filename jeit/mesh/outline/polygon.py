@@ -40,11 +40,12 @@ class Polygon(Domain):
     holes: tuple[Float[Array, "h 2"], ...]
 
     def __init__(self, vertices: ArrayLike, holes: Sequence[ArrayLike] = ()):
-        """`vertices` (k, 2) of the outline and of each of `holes`, in order, in metres, the first vertex not repeated.
+        """`vertices` (k, 2) of the outline and of each of `holes`, in order, in metres, without a repetition of the
+        first vertex.
 
         Either orientation is accepted; the outline is stored counter-clockwise, holes clockwise. Raises `ValueError`
         for fewer than three vertices, repeated vertices, an outline that crosses or touches itself, and holes that are
-        not inside.
+        not inside the outline.
         """
         if not has_values(vertices, holes):
             self.vertices = jnp.asarray(vertices)
@@ -60,7 +61,7 @@ class Polygon(Domain):
 
     @property
     def area(self) -> Float[Array, ""]:
-        """Area inside the outline minus that of the holes, in m² (shoelace formula)."""
+        """Area inside the outline minus the area of the holes, in m² (shoelace formula)."""
         return polyline.area(self.loops())
 
     @property

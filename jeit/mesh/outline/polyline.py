@@ -29,7 +29,7 @@ def length(loop: Loop) -> Float[Array, ""]:
 
 
 def area(loops: Sequence[Loop]) -> Float[Array, ""]:
-    """Area inside the first loop minus that of the holes, m² (shoelace formula)."""
+    """Area inside the first loop minus the area of the holes, m² (shoelace formula)."""
     outer, *holes = (_shoelace(loop) for loop in loops)
     return sum(holes, outer)
 
@@ -67,7 +67,8 @@ def signed_distance(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, " 
 
 
 def nearest(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "p 2"]:
-    """Move those of `points` (p, 2) that lie outside to the nearest point on a side; others are returned unchanged."""
+    """Move those of `points` (p, 2) that lie outside to the nearest point on a side; points inside are returned
+    unchanged."""
     xp = numerics(loops, points)
     point_array, is_inside, nearest_points = _project_onto_loops(xp, loops, points)
     return jnp.asarray(xp.where(is_inside[:, None], point_array, nearest_points))

@@ -26,7 +26,7 @@ class Rectangle(Domain):
     **Arguments:**
 
     - `width`, `height`: lengths along x and along y, metres, positive.
-    - `centre` (x, y): in metres.
+    - `centre` (x, y): centre in metres.
 
     **Example:**
 
@@ -41,8 +41,8 @@ class Rectangle(Domain):
     centre: tuple[float, float]
 
     def __init__(self, width: float, height: float, centre: Sequence[float] = (0.0, 0.0)):
-        """`width` (along x) and `height` (along y), both positive, and `centre` are in metres. Raises `ValueError`
-        otherwise."""
+        """`width` (along x) and `height` (along y), and `centre` (x, y) are in metres. Raises `ValueError` unless width
+        and height are positive and the centre is finite."""
         self.width = check_length("width", width)
         self.height = check_length("height", height)
         self.centre = check_position("centre", centre)
@@ -101,7 +101,7 @@ class Rectangle(Domain):
         return {"shape": "rectangle", **sides, "centre": [float(x) for x in self.centre]}
 
     def draw(self, pen: Pen) -> None:
-        """Draw one loop of four sides."""
+        """Draw the rectangle as one loop of four sides."""
         pen.loop(np.asarray(self.vertices))
 
     @size_checked()
@@ -125,7 +125,7 @@ class Rectangle(Domain):
         return self.tagged(mesh)
 
     def tagged(self, mesh: Mesh) -> Mesh:
-        """Add tags for the sides of the rectangle to a mesh of it."""
+        """Add tags for the sides of the rectangle to a mesh of the rectangle."""
         return Mesh(mesh.points, mesh.cells, mesh.facets, self._side_facets(mesh))
 
     def _mesh_rows(self, target: Target) -> Mesh:

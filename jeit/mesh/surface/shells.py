@@ -49,7 +49,7 @@ def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
 # crease, which is not smoothed.
 _MIN_CREASE_COSINE = np.cos(np.radians(50.0))
 # Number of coefficients of the quadratic surface fitted to neighbours, and minimum ratio of the smallest to the largest
-# eigenvalue of its normal equations.
+# eigenvalue of the normal equations of this fit.
 _NUM_COEFFICIENTS, _MIN_EIGENVALUE_RATIO = 5, 1e-6
 
 
@@ -58,8 +58,8 @@ def node_normals(mesh: Mesh) -> np.ndarray:
 
     A quadratic surface is fitted to the first and second neighbours of each node; on a smooth surface its normal is
     accurate to second order in the cell size, also at the border. At creases, and where there are too few neighbours,
-    the normal is the angle-weighted mean of the normals of the triangles. Computed with NumPy, without derivatives.
-    Raises `ValueError` for a solid.
+    the normal is the angle-weighted mean of the normals of the triangles. The normals are computed with NumPy and have
+    no derivatives. Raises `ValueError` for a solid.
 
     **Arguments:**
 
@@ -137,16 +137,16 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
 
     Like paper, the sheet is not stretched: it is folded along straight lines parallel to the cylinder's axis and stays
     flat between them, so all lengths and all voltages are preserved. The folds run along the rows of nodes if the mesh
-    has rows (`jeit.mesh.rectangle` has them for axis "x"). Otherwise there are `num_folds` strips, and cells are cut
-    where folds cross them; `bend(mesh, numpy.inf)` is the flat sheet with the same cells. Fold lines lie on the
-    cylinder. The upper side becomes the outer one. Tags are kept.
+    has rows (`jeit.mesh.rectangle` has them for axis "x"). Otherwise the sheet is divided into `num_folds` strips, and
+    cells are cut where folds cross them; `bend(mesh, numpy.inf)` is the flat sheet with the same cells. Fold lines lie
+    on the cylinder. The upper side of the sheet becomes the outer side of the surface. Tags are kept.
 
     **Arguments:**
 
     - `mesh`: a plane mesh.
-    - `radius`: radius of the cylinder in metres; a negative one bends the sheet upward.
+    - `radius`: radius of the cylinder in metres; a negative radius bends the sheet upward.
     - `axis`: direction of the cylinder, "x" or "y".
-    - `num_folds`: number of strips, by default about one per cell across.
+    - `num_folds`: number of strips, by default about one per cell across the sheet.
 
     Raises `ValueError` for a mesh that is not a flat sheet, a radius of zero, and a sheet so wide that it would overlap
     itself.
@@ -199,7 +199,7 @@ def _fold_positions(positions: np.ndarray, corners: np.ndarray, bent_axis: int, 
 def _cut_cells(
     points: np.ndarray, cells: np.ndarray, edges: dict[str, np.ndarray], height: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Cut cells and named edges along a line; `height` (n,) are the signed distances of the nodes from it."""
+    """Cut cells and named edges along a line; `height` (n,): signed distances of the nodes from the line."""
     side = np.where(np.abs(height) <= _LINE_TOLERANCE * np.ptp(height), 0, np.sign(height)).astype(int)
     sides = side[cells]
     is_crossed = (sides.min(axis=1) < 0) & (sides.max(axis=1) > 0)
@@ -279,17 +279,16 @@ def shell(
 ) -> Mesh:
     """Mesh a skin on a surface in space: prisms along the normals at the nodes, divided into tetrahedra.
 
-    Node k · n + i is node i of the surface displaced by k · thickness / num_layers. Tags: 'inner', 'outer' and, unless
-    the surface is closed, 'side', and the tags of the surface for the parts of the side.
+    With n nodes in the surface, node k · n + i is its node i displaced by k · thickness / num_layers. Tags: 'inner',
+    'outer' and, unless the surface is closed, 'side', and the tags of the surface for the parts of the side.
 
     **Arguments:**
 
     - `surface`: a surface in space.
-    - `thickness`: in metres.
+    - `thickness`: thickness of the skin in metres.
     - `num_layers`: number of layers of prisms.
     - `outward`: whether the skin extends outward from the surface, or else inward.
-    - `normals` (n, 3): unit vectors at the nodes, if more accurate ones than those of `jeit.mesh.node_normals` are
-      known.
+    - `normals` (n, 3): unit normals at the nodes; default: `jeit.mesh.node_normals`, which may be less accurate.
 
     Raises `ValueError` for a mesh that is not a surface in space, a thickness that is not positive, no layers, a shell
     that intersects itself, and a thickness at which prisms turn inside out, as they do beyond the radius of curvature;

@@ -33,12 +33,12 @@ def tube(
 ) -> Mesh:
     """Mesh the lateral surface of an upright cylinder around the z axis, from z = 0 up: a sleeve, open at both ends.
 
-    Rows of nodes lie on the cylinder, alternately rotated by half the distance of nodes; node 0 lies at angle 0. Tags:
-    'bottom', 'top'. For a part of a cylinder, bend a sheet with `bend`.
+    Rows of nodes lie on the cylinder, every second row rotated by half the distance between nodes; node 0 lies at angle
+    0. Tags: 'bottom', 'top'. For a part of a cylinder, bend a sheet with `bend`.
 
     **Arguments:**
 
-    - `radius`, `height`: in metres.
+    - `radius`, `height`: radius and height of the tube in metres.
     - `num_points`: number of nodes, met within about 5 % (default 1,200); or `cell_size`: edge length in metres; or
       `num_around`: number of nodes around the tube.
 
@@ -71,7 +71,7 @@ def forearm(
 
     **Arguments:**
 
-    - `length`: in metres.
+    - `length`: length of the sleeve in metres.
     - `wrist`, `elbow`: radius of a circular section in metres, or semi-axes (along x, along y) of an elliptical one.
     - `num_points`, `cell_size`, `num_around`: as in `tube`.
 
@@ -113,7 +113,7 @@ def _node_counts(
         return num_per_ring, max(1, round(height / (_ROW_HEIGHT * girth / num_per_ring)))
     target = unstructured.Target.create(num_points, cell_size)
     if target.cell_size is None:
-        # n = (g / h) (H / (0.87 h) + 1)
+        # Number of nodes n = (g / h) (H / (0.87 h) + 1), with the girth g, the height H and the edge length h.
         num_nodes = target.num_points
         edge = np.sqrt(girth * height / (_ROW_HEIGHT * num_nodes))
         for _ in range(30):
@@ -160,7 +160,7 @@ def _sleeve_mesh(height: float, semi_axes: np.ndarray, num_per_ring: int) -> Mes
 
 def _triangles_between_rings(lower_ring: np.ndarray, upper_ring: np.ndarray, lower_is_ahead: int) -> np.ndarray:
     """Triangles between two rings with equal numbers of nodes, offset by half the node spacing; `lower_is_ahead`:
-    whether the lower ring is ahead."""
+    whether the nodes of the lower ring are ahead by this offset."""
     next_low, next_high = np.roll(lower_ring, -1), np.roll(upper_ring, -1)
     if lower_is_ahead:
         return np.concatenate(
@@ -175,11 +175,11 @@ def sphere(radius: float, *, num_points: int | None = None, cell_size: float | N
     """Mesh a closed sphere around the origin.
 
     Every triangle of an icosahedron is divided into k² triangles, which are projected onto the sphere. This makes 10 k²
-    + 2 nodes; k is chosen to come closest to what is requested.
+    + 2 nodes; k is chosen to come closest to the requested number of nodes or cell size.
 
     **Arguments:**
 
-    - `radius`: in metres.
+    - `radius`: radius of the sphere in metres.
     - `num_points`: number of nodes (default 1,200); or `cell_size`: edge length in metres.
 
     Raises `ValueError` for invalid or contradictory arguments.

@@ -48,7 +48,8 @@ def draw_labels(labels: ArrayLike, extent: tuple[float, float, float, float], *,
 
 def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
     """Draw the outlines of bodies in a sheet, see `jeit.inverse.shapes`, on axes in metres; outlines of resistive
-    bodies are dashed. Beside each stands the 68 % interval of its change of conductivity, if it is known."""
+    bodies are dashed. Beside each body stands the 68 % interval of its change of conductivity, if this interval is
+    known."""
     ax = axes_or_new(ax)
     for sign, _, style, name in _STYLES:
         for index, star in enumerate(star for star in stars if star.sign == sign):
@@ -59,8 +60,8 @@ def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
 
 
 def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
-    """Write the interval of each body on the side of its outline that faces the middle of the axes, where no electrodes
-    are; on the other side if another label is there."""
+    """Write the 68 % interval of each body's change of conductivity on the side of its outline that faces the middle of
+    the axes, where no electrodes are; on the other side if another label is there."""
     (x_min, y_min), (x_max, y_max) = ax.dataLim.get_points()
     min_distances, used_positions = 0.3 * np.array([x_max - x_min, 0.2 * (y_max - y_min)]), []
     for star in stars:
@@ -90,8 +91,8 @@ def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
 
 
 def draw_inclusions(inclusions: Sequence[Inclusion], *, ax: Axes | None = None) -> Axes:
-    """Mark every inclusion by its sign at its centroid and a dashed circle of the same area. In 3-D, the circle has the
-    radius of a ball of the same volume, whatever the height of the slice."""
+    """Mark every inclusion by its sign at its centroid and a dashed circle of its area. In 3-D, the circle has the
+    radius of a ball of the inclusion's volume, whatever the height of the slice."""
     ax = axes_or_new(ax)
     halo = [withStroke(linewidth=3, foreground="white")]
     for inclusion in inclusions:
@@ -147,8 +148,8 @@ def draw_shapes(mesh: Mesh, shapes: ElectrodeShapes, *, ax: Axes) -> None:
 
 
 class _MatplotlibPen:
-    """Collector of electrodes to draw, by kind, with the centre of each electrode and whether its number is beside
-    it."""
+    """Collector of electrodes to draw, by kind, with the centre of each electrode and whether the number of the
+    electrode stands beside it."""
 
     def __init__(self):
         self.arcs: list[np.ndarray] = []
@@ -181,9 +182,10 @@ class _MatplotlibPen:
 # Distance of a number from its electrode, and maximum distance of an electrode from the edge for it to lie on the edge,
 # both divided by the size of the body.
 _NUMBER_DISTANCE, _EDGE_TOLERANCE = 0.058, 0.02
-# Factor of this distance for texts that are not centred.
+# Factor of the distance of a number from its electrode for texts that are not centred.
 _ALIGNED_FACTOR = 0.7
-# Minimum free distance outside the outline, divided by the distance of a number, for the number to be outside.
+# Minimum free distance outside the outline, divided by the distance of a number from its electrode, for the number to
+# be outside.
 _MIN_FREE_DISTANCE = 1.6
 
 
@@ -192,9 +194,9 @@ def draw_numbers(
 ) -> None:
     """Draw the numbers of electrodes at `positions`, beginning with `first`: on the electrode, or `beside` it.
 
-    Beside means, for an electrode on the edge of a sheet, outside along the normal, or inside if a notch is too narrow;
-    for an electrode within a sheet, above it; and for a solid seen from above, away from the middle. Electrodes above
-    each other share one text.
+    "Beside" means, for an electrode on the edge of a sheet, outside along the normal, or inside if a notch is too
+    narrow; for an electrode within a sheet, above it; and for a solid seen from above, away from the middle. Electrodes
+    above each other share one text.
     """
     corners = np.asarray(mesh.points)[:, :2]
     number_distance = _NUMBER_DISTANCE * np.ptp(corners, axis=0).max()

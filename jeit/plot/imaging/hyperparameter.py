@@ -14,7 +14,7 @@ from jeit.image.merit import FiguresOfMerit
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.plot.axes import INK, SERIES_COLOURS, SERIES_MARKERS, SOFT, axes_or_new, draw_horizontal_grid, soften_axes
 
-# Colour of each rule; given numbers and other rules are drawn in the colour `INK`.
+# Colour of each rule for λ; given numbers and other rules are drawn in the colour `INK`.
 COLOURS = {
     "gcv": "#d1495b",
     "l-curve": "#1f6fb4",
@@ -24,7 +24,7 @@ COLOURS = {
 }
 # Minimum distance of labelled points on the L-curve, relative to its width and height.
 _MIN_LABEL_DISTANCE = 0.06
-# For each rule: name of its criterion, scale of the axis, and which value is sought.
+# For each rule: name of its criterion, scale of the axis, and the value of the criterion that the rule seeks.
 _CRITERIA = {
     "gcv": ("prediction error (σ²)", "log", "least"),
     "l-curve": ("curvature of the L-curve", "linear", "greatest"),
@@ -35,18 +35,18 @@ _CRITERIA = {
 
 
 def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the curves used in choosing a hyperparameter, and the point chosen.
+    """Draw the curves used in choosing a hyperparameter λ, and the chosen λ on them.
 
     For one choice, the L-curve is drawn for "l-curve", ‖residual‖ against ‖image‖ with the corner marked, and the
-    criterion against λ for other rules. For several choices, the L-curve with all choices is drawn, if there were data,
-    and the criterion of each; these plots are insets of the returned axes. A choice at the edge of its grid is drawn
-    hollow.
+    criterion against λ for other rules. For several choices, the L-curve with all choices is drawn, if λ was chosen
+    from data, and the criterion of each choice; these plots are insets of the returned axes. A choice at the edge of
+    its grid of λ is drawn hollow.
 
     **Arguments:**
 
     - `choices`: a `jeit.inverse.Choice`, or several by name, as from `jeit.inverse.compare_rules`.
     - `title`: title of the plot.
-    - `ax`: axes to draw in; default: new ones.
+    - `ax`: axes to draw in; default: new axes.
 
     Raises `ValueError` for hyperparameters that were given as numbers, which have no curve, and for objects that are
     not choices.
@@ -83,7 +83,7 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
     left_edge = 0.0
     if with_data:
         left_edge = 0.54
-        # Every choice has the whole curve; the one with the most candidates has the finest.
+        # Every choice has the whole L-curve; the choice with the most candidates has the finest one.
         most_detailed = max(with_data, key=lambda choice: choice.candidates.size)
         _draw_l_curve(ax.inset_axes((0, 0, 0.46, 1)), most_detailed, all_choices)
     height = 1 / len(rules)
@@ -205,7 +205,8 @@ _PANELS = (
 def plot_figures_of_merit(
     figures: Mapping[str, FiguresOfMerit], *, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw the five GREIT figures of merit of one or several reconstructions against the distance of the targets.
+    """Draw the five GREIT figures of merit of one or several reconstructions against the distance of the targets from
+    the centre.
 
     Lines connect the means of targets at the same distance; dashed grey lines show the values of a perfect image. The
     five plots are insets of the returned axes.
@@ -262,7 +263,7 @@ def plot_figures_of_merit(
 
 
 def _binned_means(distance: np.ndarray, value: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Sorted distances, rounded to multiples of `tolerance`, and the mean of the values at each."""
+    """Sorted distances, rounded to multiples of `tolerance`, and the mean of the values at each distance."""
     ring, inverse = np.unique(np.round(distance / tolerance), return_inverse=True)
     return ring * tolerance, np.bincount(inverse, value) / np.bincount(inverse)
 

@@ -41,9 +41,9 @@ def plot_mesh(
     **Arguments:**
 
     - `mesh`: the mesh.
-    - `electrodes`: drawn to scale and numbered.
+    - `electrodes`: electrodes, which are drawn to scale and numbered.
     - `title`: title of the plot.
-    - `ax`: axes to draw in; default: new ones.
+    - `ax`: axes to draw in; default: new axes.
 
     Raises `ValueError` for arguments of another type, and for a surface in space.
 
@@ -87,7 +87,8 @@ def draw_outline(mesh: Mesh, ax: Axes) -> None:
 def draw_slice_outline(
     pixels: Float[np.ndarray, "rows columns"], extent: tuple[float, float, float, float], ax: Axes
 ) -> None:
-    """Draw the edge of a slice through a solid, given by `pixels` that are NaN outside it; `extent` in metres."""
+    """Draw the edge of a slice through a solid, given by `pixels` that are NaN outside the solid; `extent` in
+    metres."""
     # Pad by one pixel, so that the edge is closed where it touches the border of the picture.
     is_inside = np.pad(np.isfinite(pixels).astype(float), 1)
     width, height = (extent[1] - extent[0]) / pixels.shape[1], (extent[3] - extent[2]) / pixels.shape[0]
@@ -115,19 +116,19 @@ def plot_image(
     height: float | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw values on a mesh.
+    """Draw values per cell or per node of a mesh in colours.
 
     **Arguments:**
 
     - `mesh`: a plane mesh, or a solid, of which a slice is drawn.
-    - `values`: per cell (m,) or, interpolated, per node (n,).
-    - `electrodes`: drawn to scale and numbered.
-    - `inclusions`: marked by their sign and a circle.
+    - `values`: values to draw, per cell (m,) or, interpolated, per node (n,).
+    - `electrodes`: electrodes, which are drawn to scale and numbered.
+    - `inclusions`: inclusions, which are marked by their sign and a circle.
     - `scale`: colour scale; default: for changes of conductivity in S (3-D: S/m). For conductivity itself, use
       `ColourScale(difference=False)`.
     - `height`: z in metres of the slice through a 3-D mesh; default: half the height.
     - `title`: title of the plot.
-    - `ax`: axes to draw in; default: new ones.
+    - `ax`: axes to draw in; default: new axes.
 
     Raises `ValueError` for values that have another shape, are complex or not finite, for a height outside the mesh,
     and for arguments of another type.
@@ -185,7 +186,7 @@ def plot_raster(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a raster (rows, columns), row 0 at the top, with NaN blank; other arguments as in `plot_image`.
+    """Draw a raster (rows, columns), row 0 at the top, with NaN pixels left blank; other arguments as in `plot_image`.
 
     `extent`: (x_min, x_max, y_min, y_max) in metres. `mesh`: the mesh of the raster, for its outline and the
     `electrodes`. Raises `ValueError` for a raster without finite values, for electrodes without a mesh, and for
@@ -231,7 +232,7 @@ def plot_admittivity(
     figure: Figure | None = None,
     **options: Any,
 ) -> tuple[Axes, Axes]:
-    """Draw σ and ωε of complex values side by side in one figure.
+    """Draw conductivity σ and susceptivity ωε of a complex admittivity σ + iωε side by side in one figure.
 
     **Arguments:**
 
@@ -243,7 +244,7 @@ def plot_admittivity(
     - `titles`: titles of the two plots.
     - `figure`: the figure to draw in; default: a new one.
 
-    Raises `ValueError` for values that are not complex, and as `plot_image`.
+    Raises `ValueError` for values that are not complex, and in the same cases as `plot_image`.
 
     **Example:**
 
@@ -281,7 +282,7 @@ def plot_sensitivity(
     """Draw the sensitivity ‖∂v/∂σ_e‖ / |e| of every cell e, with the norm over all channels, relative to the maximum
     and in decibels.
 
-    The division by the area (3-D: volume) |e| makes the sensitivity independent of the mesh. `conductivity` as in
+    The division by the area (3-D: volume) |e| makes the sensitivity independent of the mesh. `conductivity`: as in
     `model.voltages`, scalar or per cell, in S (3-D: S/m); `height` as in `plot_image`. Raises `ValueError` for a
     conductivity per node.
     """

@@ -59,10 +59,11 @@ def select_frames(num_frames: int, max_frames: int) -> list[int]:
 
 
 class FramePicture:
-    """Picture of one frame at a time on `ax`; `show` replaces the image by the next one.
+    """Picture of one frame of a stream at a time on `ax`; `show` replaces the image by that of another frame.
 
     `fitted`: colour scale of all frames; `number`: whether electrodes are numbered; `bar`: whether a scale bar is
-    drawn. Images are sampled on a raster, in a solid at the `height` z in metres, half its own by default.
+    drawn. Images are sampled on a raster, in a solid at the `height` z in metres, by default half the height of the
+    solid.
     """
 
     def __init__(
@@ -130,7 +131,7 @@ def plot_frames(
 
     - `mesh`, `electrodes`: as for `plot_image`.
     - `changes` (F, m): changes of conductivity, S (3-D: S/m, drawn at half the height); rows of NaN are refused frames.
-    - `titles`: one per frame; default: the numbers of the frames from 0.
+    - `titles`: one title per frame; default: the numbers of the frames from 0.
     - `scale`: colour scale; default: for changes of conductivity.
     - `most`: maximum number of frames on the sheet.
     - `count`: counts of all frames, if `changes` has only some of them.
@@ -182,7 +183,7 @@ def plot_frames(
 
 
 def _count_text(count: FrameCount, num_drawn: int, mesh: Mesh) -> str:
-    """Text on the number of frames drawn and on refused frames."""
+    """Text about the number of frames drawn and about the refused frames of a stream."""
     sentences = [] if num_drawn == count.number else [f"{num_drawn} of {count.number} frames"]
     if count.refused:
         names = ", ".join(count.names[:_MAX_NAMED]) + (" …" if count.refused > _MAX_NAMED else "")
@@ -190,7 +191,8 @@ def _count_text(count: FrameCount, num_drawn: int, mesh: Mesh) -> str:
     return "; ".join([*sentences, *filter(None, [slice_text(mesh, subject="slices")])])
 
 
-# Minimum amplitude for the phase to be drawn: as a share of the maximum amplitude, and as a multiple of its noise.
+# Minimum amplitude for the phase to be drawn: as a share of the maximum amplitude, and as a multiple of the noise of
+# the amplitude.
 _MIN_PHASE_SHARE, _MIN_PHASE_SNR = 0.15, 3.0
 # Minimum number of frames for a spectrum, as for `jeit.image.oscillation`.
 _MIN_FRAMES = 5
@@ -208,8 +210,9 @@ def plot_series(
     and phase of each oscillation; and the mean change of every region over time, with its spectrum if there are enough
     frames.
 
-    The phase is drawn where the amplitude exceeds three times its noise and 15 % of the maximum. `regions`: (m,)
-    booleans by name. `height`: z in metres of the slice through a 3-D mesh; default: half the height.
+    The phase is drawn where the amplitude exceeds three times its noise and 15 % of the maximum. `regions`: cells of
+    each region, (m,) booleans, by name. `height`: z in metres of the slice through a 3-D mesh; default: half the
+    height.
     """
     check_body(series.mesh, electrodes)
     num_rows = len(oscillations)

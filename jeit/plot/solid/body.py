@@ -23,7 +23,8 @@ _EDGE_COSINE = 0.85
 _ELECTRODE_OFFSET, _NUMBER_DISTANCE = 0.06, 0.045
 # Minimum distance between numbers, so that they are readable, divided by the size of the body.
 _MIN_NUMBER_DISTANCE = 0.03
-# Share of the visible body that electrodes may cover before they are drawn translucent, and their opacity then.
+# Share of the visible body that electrodes may cover before they are drawn translucent, and opacity of translucent
+# electrodes.
 _MAX_COVERED_SHARE, _TRANSLUCENT_OPACITY = 0.4, 0.16
 
 
@@ -104,8 +105,8 @@ def _visible_area(scene: Scene, corners: Float[np.ndarray, "*m k 3"]) -> float:
 
 
 def _rims(polygons, electrode, offset: float) -> list[np.ndarray]:
-    """Whether each edge of each polygon is on the rim of its electrode: no other polygon of the electrode shares it.
-    Corners closer than `offset` are taken as equal."""
+    """Whether each edge of each polygon is on the rim of its electrode, i.e. no other polygon of the electrode shares
+    the edge. Corners closer than `offset` are taken as equal."""
     keys = []
     for corners, electrode_index in zip(polygons, electrode.tolist(), strict=True):
         rounded_corners = [tuple(corner) for corner in np.round(corners / offset).astype(np.int64).tolist()]
@@ -118,8 +119,8 @@ def _rims(polygons, electrode, offset: float) -> list[np.ndarray]:
 def number_electrodes(
     ax: Axes, scene: Scene, points, triangles, shapes: ElectrodeShapes, *, number_hidden: bool = True
 ) -> None:
-    """Draw the numbers of electrodes, from 1, outwards of each electrode. Numbers on the side facing away are faint, or
-    are left out unless `number_hidden`.
+    """Draw the numbers of electrodes, from 1, outwards of each electrode. Numbers on the side of the body facing away
+    from the viewer are faint, or are left out unless `number_hidden`.
 
     Electrodes seen close to each other share one text.
     """

@@ -39,7 +39,7 @@ def plot_curved_skin(
     **Arguments:**
 
     - `layout`: the skin.
-    - `values`: one per triangle or per node of `layout.surface`; without values, the surface is grey.
+    - `values`: one value per triangle or per node of `layout.surface`; without values, the surface is grey.
     - `marks`: points (p, 3) in metres by name in the legend, drawn at the nearest points of the surface. Points hidden
       by the surface are left out.
     - `camera`: direction of view.
@@ -109,7 +109,8 @@ def plot_curved_skin(
 
 
 def _visible_points(mesh, points, camera: Camera):
-    """Select the points that the surface does not hide: no part of it is nearer to the viewer on the same ray."""
+    """Select the points that the surface does not hide: no part of the surface is nearer to the viewer on the same
+    ray."""
     corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
     page_corners, depths = camera.on_page(corners), camera.nearness(corners)
     visible = []

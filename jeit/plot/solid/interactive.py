@@ -49,7 +49,7 @@ def view_solid(
     - `mesh`, `values`, `electrodes`, `levels`, `inclusions`, `scale`: as for `plot_isosurfaces`.
     - `off_screen`: whether to draw without a window.
 
-    Raises `ImportError` if PyVista is not installed, and `ValueError` as `plot_isosurfaces`.
+    Raises `ImportError` if PyVista is not installed, and `ValueError` in the same cases as `plot_isosurfaces`.
 
     **Example:**
 
@@ -68,7 +68,8 @@ def view_solid(
     points = 1e3 * np.asarray(mesh.points)
     plotter = pv.Plotter(off_screen=off_screen, window_size=list(_WINDOW_SIZE))
     if not off_screen:
-        # Depth peeling sorts translucent surfaces; without a graphics card it would make them disappear.
+        # Depth peeling sorts translucent surfaces; without a graphics card, depth peeling would make these surfaces
+        # disappear.
         plotter.enable_depth_peeling()
     hull = pv.PolyData.from_regular_faces(points, np.asarray(mesh.facets))
     plotter.add_mesh(hull, color=BODY, opacity=0.12, name="hull")
@@ -122,8 +123,8 @@ def can_view() -> str:
 
 
 def _display_responds(display: str) -> bool:
-    """Whether an X server listens at a display of this machine; True for displays of other machines and for other
-    texts."""
+    """Whether an X server listens at a display of this machine; True, without a check, for displays of other machines
+    and for texts that do not name a display."""
     host, _, display_number = display.rpartition(":")
     server_number = display_number.partition(".")[0]
     if host not in ("", "unix", "localhost") or not server_number.isdecimal() or len(server_number) > 4:

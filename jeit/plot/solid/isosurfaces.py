@@ -62,7 +62,8 @@ def _draw_round(ax: Axes, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray,
 
 HALF = (0.5,)
 OUTER = 0.3
-# Minimum peak of a sign for its isosurfaces to be drawn, relative to the maximum change of either sign.
+# Minimum of the largest change of one sign for isosurfaces of this sign to be drawn, relative to the maximum change of
+# either sign.
 _MIN_PEAK = 0.3
 
 
@@ -82,15 +83,15 @@ def plot_isosurfaces(
     **Arguments:**
 
     - `mesh`: a mesh of tetrahedra.
-    - `values`: per cell (m,) or per node (n,); changes of conductivity in S/m, or as described by `scale`.
-    - `electrodes`: drawn on the body and numbered.
+    - `values`: values per cell (m,) or per node (n,); changes of conductivity in S/m, or as described by `scale`.
+    - `electrodes`: electrodes, which are drawn on the body and numbered.
     - `levels`: shares between 0 and 1. The surface of the highest level is opaque, others are translucent. A sign whose
-      maximum is less than 0.3 of that of the other sign is left out. For absolute images (see
+      maximum change is less than 0.3 of that of the opposite sign is left out. For absolute images (see
       `ColourScale.difference`), levels are fractions of the range from minimum to maximum.
-    - `inclusions`: drawn as their sign and the outline of their form, or of a ball of their volume.
+    - `inclusions`: inclusions, drawn as their sign and the outline of their form, or of a ball of their volume.
     - `camera`: direction of view.
     - `scale`: colour scale; default: for changes of conductivity in S/m.
-    - `ax`: axes to draw in; default: new ones.
+    - `ax`: axes to draw in; default: new axes.
 
     Raises `ValueError` for values of another shape, levels out of range, a mesh that is not a solid, and arguments of
     another type.
@@ -130,7 +131,7 @@ def draw_in_space(
     planes: Sequence[Plane] = (),
 ) -> Axes:
     """Draw isosurfaces as `plot_isosurfaces`, but with a fitted colour scale, without a colour bar, and with the
-    outlines of sections by `planes`. Raises `ValueError` as `plot_isosurfaces`."""
+    outlines of sections by `planes`. Raises `ValueError` in the same cases as `plot_isosurfaces`."""
     check_kind("camera", camera, Camera, "a Camera, such as Camera(azimuth=-60, elevation=25)")
     scene = Scene(camera)
     add_hull(scene, mesh)
@@ -161,7 +162,7 @@ def draw_in_space(
 def level_surfaces(
     mesh: Mesh, values: ArrayLike, levels: Sequence[float], *, is_signed: bool
 ) -> list[tuple[float, float, TriangleSurface]]:
-    """Compute isosurfaces; return the value, the level and the surface of each.
+    """Compute isosurfaces; return the value, the level and the surface of each isosurface.
 
     `levels`: shares of the maximum change of each sign if `is_signed`, otherwise fractions of the range from minimum to
     maximum. Raises `ValueError` for levels that are not between 0 and 1.
@@ -181,7 +182,8 @@ def level_surfaces(
 
 
 def check_levels(levels: Sequence[float]) -> list[float]:
-    """Check levels, and return them as a list. Raises `ValueError` unless they are between 0 and 1."""
+    """Check the levels of isosurfaces, and return them as a list. Raises `ValueError` for a level that is not between 0
+    and 1."""
     shares: Float[np.ndarray, " k"] | Sequence = np.atleast_1d(np.asarray(levels, dtype=object))
     if len(shares) == 0 or not all(is_number(level) and 0 < level < 1 for level in shares):
         level_texts = ", ".join(describe(level) for level in shares[:4]) or "none"

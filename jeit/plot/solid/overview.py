@@ -46,7 +46,7 @@ def plot_solid(
     - `mesh`, `values`, `electrodes`, `levels`, `inclusions`, `camera`, `scale`: as for `plot_isosurfaces`.
     - `figure`: the figure to draw in; default: a new one.
 
-    Raises `ValueError` as `plot_isosurfaces`.
+    Raises `ValueError` in the same cases as `plot_isosurfaces`.
 
     **Example:**
 
@@ -82,7 +82,7 @@ def plot_solid(
         draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted_scale)
         page_points = plane.on_page(np.asarray(mesh.points))
         x, y = (page_points.min(axis=0) + page_points.max(axis=0)) / 2
-        # All slices have the same scale of lengths.
+        # All slices are drawn with the same scale of lengths.
         finish_slice(panel, plane, (x - half_size, x + half_size, y - half_size, y + half_size), draw_cross=True)
     _caption(figure.add_subplot(grid[1, 2]), common_point, levels, inclusions, difference=scale.difference)
     if scale.bar:
@@ -92,8 +92,8 @@ def plot_solid(
 
 
 def strongest_place(mesh: Mesh, image: np.ndarray, inclusions: Sequence[Inclusion] = ()) -> np.ndarray:
-    """Common point (3,) of the slices: the centroid of the first inclusion, or else that of the cell whose value
-    differs most from the median."""
+    """Common point (3,) of the slices: the centroid of the first inclusion, or else the centroid of the cell whose
+    value differs most from the median."""
     if inclusions:
         return np.array(inclusions[0].centroid)
     return np.asarray(centroids(mesh))[np.abs(image - (np.median(image))).argmax()]

@@ -1,4 +1,4 @@
-"""Scenes in space: a camera, and triangles, polygons and lines drawn as seen by it.
+"""Scenes in space: a camera, and triangles, polygons and lines drawn as the camera sees them.
 
 The 3-D axes of matplotlib sort whole objects by depth, so that electrodes would be visible through bodies. Here all
 pieces are sorted by depth, and the projection is parallel, so that one scale bar applies to the whole picture.
@@ -122,8 +122,8 @@ class Scene:
         depth_offset: Float[np.ndarray, "m"] | float = 0.0,
     ) -> None:
         """Add triangles with colours (m, 4). `smooth`: whether to light them as a smooth surface; `is_lit`: whether to
-        darken triangles turned away from the light; `depth_offset`: distance in metres by which they are moved towards
-        the viewer when sorted by depth."""
+        darken triangles turned away from the light; `depth_offset`: distance in metres by which the triangles are moved
+        towards the viewer when sorted by depth."""
         corners = points[triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         if smooth:
@@ -136,8 +136,8 @@ class Scene:
         if is_lit:
             face_colours[:, :3] *= self.camera.light(normals)[:, None]
         nearness = self.camera.nearness(corners.mean(axis=1)) + depth_offset
-        # Edges in the colour of their face close gaps. Translucent triangles have none, as they would be visible as a
-        # net.
+        # Edges in the colour of their face close gaps. Translucent triangles have no edges, as these would be visible
+        # as a net.
         is_opaque = face_colours[:, 3] > 0.99
         self._add(
             corners[:, [0, 1, 2, 2]],
@@ -185,7 +185,7 @@ class Scene:
         self._width.append(width)
 
     def draw(self, ax: Axes) -> None:
-        """Draw all pieces, from the farthest to the nearest."""
+        """Draw all pieces of the scene, from the farthest to the nearest."""
         if not self._corners:
             return
         order = np.argsort(np.concatenate(self._nearness), kind="stable")

@@ -32,14 +32,14 @@ def plot_surface(
 
     **Arguments:**
 
-    - `points` (n, 3): metres.
+    - `points` (n, 3): corners of the triangles, metres.
     - `triangles` (m, 3): indices of points.
-    - `values`: one per triangle or per point; without values, the surface is grey.
+    - `values`: one value per triangle or per point; without values, the surface is grey.
     - `electrodes`: from `jeit.electrodes.shapes_of`, drawn on the surface and numbered.
     - `camera`: direction of view.
     - `scale`: colour scale; default: for changes of sheet conductivity in S.
     - `title`: title of the plot.
-    - `ax`: axes to draw in; default: new ones.
+    - `ax`: axes to draw in; default: new axes.
 
     Raises `ValueError` for arrays of other shapes, values that are not finite, and arguments of another type.
 

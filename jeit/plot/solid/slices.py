@@ -41,11 +41,11 @@ def plot_slice(
     **Arguments:**
 
     - `mesh`: a mesh of tetrahedra.
-    - `values`: per cell (m,), or per node (n,), which are averaged in each cell; changes of conductivity in S/m, or as
-      described by `scale`. The colour scale is fitted to the whole body.
+    - `values`: values per cell (m,), or values per node (n,), which are averaged in each cell; changes of conductivity
+      in S/m, or as described by `scale`. The colour scale is fitted to the whole body.
     - `plane`: the plane.
-    - `electrodes`: drawn where the plane intersects them.
-    - `inclusions`: drawn as the section of their form, or of a ball of their volume.
+    - `electrodes`: electrodes, which are drawn where the plane intersects them.
+    - `inclusions`: inclusions, drawn as the section of their form, or of a ball of their volume.
     - `scale`, `ax`: as for `plot_isosurfaces`.
 
     Raises `ValueError` for a plane that misses the body, values of another shape, and arguments of another type.
@@ -83,11 +83,11 @@ def plot_slices(
     **Arguments:**
 
     - `mesh`, `values`, `electrodes`, `inclusions`, `scale`: as for `plot_slice`.
-    - `axis`: "x", "y" or "z"; the slices are perpendicular to it.
+    - `axis`: "x", "y" or "z"; the slices are perpendicular to this axis.
     - `at`: number of slices, evenly spaced over the body, or their coordinates on the axis in metres.
     - `figure`: the figure to draw in; default: a new one.
 
-    Raises `ValueError` as `plot_slice`.
+    Raises `ValueError` in the same cases as `plot_slice`.
 
     **Example:**
 
@@ -151,8 +151,8 @@ def draw_slice(
     inclusions: Sequence[Inclusion],
     fitted: FittedScale,
 ) -> ScalarMappable:
-    """Draw a section with its outline, electrodes and inclusions in a fitted colour scale; return the mappable for a
-    colour bar."""
+    """Draw a section of a solid image with its outline, electrodes and inclusions in a fitted colour scale; return the
+    mappable for a colour bar."""
     section = cut_by_plane(mesh, plane)
     cells = PolyCollection(section.polygons, edgecolors="face", linewidths=0.4)  # pyright: ignore[reportArgumentType]
     cells.set_array(fitted.factor * image[section.cell])
@@ -169,8 +169,8 @@ def draw_slice(
 
 
 def finish_slice(ax: Axes, plane: Plane, window: tuple[float, float, float, float], *, draw_cross: bool) -> None:
-    """Set equal scales over a `window` (left, right, low, high), and draw a title and, if `draw_cross`, a scale bar and
-    arrows of the axes."""
+    """Set equal scales of both axes over a `window` (left, right, low, high), and draw a title and, if `draw_cross`, a
+    scale bar and arrows of the axes."""
     left, right, low, high = window
     size = max(right - left, high - low)
     margin = 0.08 * size
@@ -239,6 +239,6 @@ def _num_columns(num_panels: int, aspect_ratio: float) -> int:
     """Number of columns of a grid of `num_panels` panels on a landscape page; `aspect_ratio`: ratio of height to width
     of a panel."""
     preferred = max(1, round(float(np.sqrt(1.6 * num_panels * aspect_ratio))))
-    # Among similar numbers of columns, the one with the fewest empty places is chosen.
+    # Among similar numbers of columns, the number with the fewest empty places is chosen.
     candidates = range(max(1, preferred - 1), preferred + 2)
     return min(num_panels, min(candidates, key=lambda columns: (-num_panels % columns, abs(columns - preferred))))
