@@ -97,9 +97,9 @@ def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -
     """Create the surface of a skin with the given `outline`.
 
     A plane surface is given by vertices (K, 2) in metres or an outline such as `Disk`; a curved surface by vertices (K,
-    3) in metres and optionally `points` (T, 3), such as the positions of taps. The curved surface passes through the
-    vertices and points. Raises `ValueError` for invalid outlines, and for surfaces that fold over their best-fitting
-    plane.
+    3) in metres and optionally `points` (T, 3), such as the positions of taps. The curved surface is a smooth surface
+    that passes close to the vertices and points. Raises `ValueError` for invalid outlines, and for surfaces that fold
+    over their best-fitting plane.
     """
     if isinstance(outline, Domain):
         edge, *holes = outline.loops()

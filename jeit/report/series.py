@@ -118,10 +118,10 @@ def write_series(
     - `oscillations`: oscillations of `series_result.series.changes`.
     - `film`: name of the film's file, ending in .gif or .mp4.
 
-    The table has the time in seconds, or the number of the frame, and the mean change of each region, S/m (2-D: S),
-    empty for refused frames. The NPZ has `changes` (F, m), `times` (F,), `background`, `points`, `cells`, `functional`
-    (m,), and, for k oscillations, `frequency` (k,), `amplitude` (k, m) and `phase` (k, m) in radians. Raises
-    `ValueError` for names that cannot be a folder or a film.
+    `regions.csv` has the time in seconds, or the number of the frame, and the mean change of each region, S/m (2-D:
+    S), empty for refused frames. `series.npz` has `changes` (F, m), `times` (F,), `background`, `points`, `cells`,
+    the functional image `functional` (m,), and, for k oscillations, `frequency` (k,), `amplitude` (k, m) and
+    `phase` (k, m) in radians. Raises `ValueError` for names that cannot be a folder or a film.
 
     **Example:**
 

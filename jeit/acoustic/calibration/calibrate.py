@@ -122,16 +122,17 @@ def calibrate_microphones(
 
     - `taps`: the taps, with the positions of taps and microphones.
     - `decay`: "inverse-square", a / (r² + b) as in Park 2022; "exponential", a exp(−r / l); "attenuated", a exp(−r / l)
-      / (r² + b); a subclass of `AbstractDecay`; or "auto", which selects from these three models the one with the
-      smallest median localisation error of left-out taps (four-fold cross-validation over the positions).
+      / (r² + b); a subclass of `AbstractDecay`; or "auto", which compares the median localisation errors of left-out
+      taps (four-fold cross-validation over the positions) and selects, of the models within 5 % of the smallest error,
+      the one with the fewest parameters.
     - `place_error`: standard deviation of each coordinate of the given positions of the microphones, metres; the
       displacements from these positions are estimated too. 0 if the positions are exact.
     - `intensity`: band and windows, for taps given as samples.
     - `progress`: function called with the name of each step when the step begins.
 
-    Raises `ValueError` if fewer than three microphones can be calibrated, if most microphones disagree with the given
-    positions, for an unknown `decay`, a `place_error` that is negative or not finite, for `intensity` given with taps
-    that are intensities, and for arguments of the wrong type.
+    Raises `ValueError` if fewer than three microphones can be calibrated, if most microphones disagree with the
+    given positions and left-out taps are located badly, for an unknown `decay`, a `place_error` that is negative or
+    not finite, for `intensity` given with taps that are intensities, and for arguments of the wrong type.
 
     **Example:**
 

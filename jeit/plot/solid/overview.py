@@ -1,4 +1,4 @@
-"""Overview of a solid image: isosurfaces in space, and slices through the maximum change."""
+"""Overview of a solid image: isosurfaces in space, and slices through the strongest change."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def plot_solid(
     scale: ColourScale = CHANGE,
     figure: Figure | None = None,
 ) -> Figure:
-    """Draw a solid image as isosurfaces in space, beside three perpendicular slices through its maximum change: the
-    centroid of the first of `inclusions`, or else the cell with the maximum change. The outlines of the slices are
-    drawn in space, too.
+    """Draw a solid image as isosurfaces in space, beside three perpendicular slices through its strongest change: the
+    centroid of the first of `inclusions`, or else the cell that differs most from the median. The outlines of the
+    slices are drawn in space, too.
 
     **Arguments:**
 
