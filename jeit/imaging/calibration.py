@@ -20,11 +20,10 @@ from jeit.mesh import Mesh
 from jeit_solvers import one_thread_of_blas
 from jeit_solvers.engines import as_array
 
-# Misfit of the model to the reference up to which the described electrode positions are used; standard deviation of
-# these positions, relative to the width of the body: 2° of a disk; and ratios of the misfit with estimated positions to
-# the misfit with described positions below which the estimated positions are used: with each channel relative to its
-# noise, and with equal weights.
-_MAX_EXACT_MISFIT, _POSITION_DEVIATION, _MAX_RELATIVE_RATIO, _MAX_MISFIT_RATIO = 0.01, 0.0175, 0.7, 2.0
+# Misfit of the model to the reference up to which the described electrode positions are used; and ratios of the misfit
+# with estimated positions to the misfit with described positions below which the estimated positions are used: with
+# each channel relative to its noise, and with equal weights.
+_MAX_EXACT_MISFIT, _MAX_RELATIVE_RATIO, _MAX_MISFIT_RATIO = 0.01, 0.7, 2.0
 
 
 class Clock:
@@ -74,7 +73,7 @@ def calibrated_model(
         if contact is None and contact_method == "each" and not calibration.distinguishes_contacts:
             contact_method = "common"  # the data do not determine one impedance per electrode
             calibration = calibrate(model, voltages, mask=mask, contact=contact_method)
-        position = (base.uncertainty or Uncertainty()).position
+        position = (base.uncertainty or Uncertainty()).position_on(model.mesh)
         calibration = _with_estimated_positions(calibration, model, voltages, mask, position)
         calibration = jax.block_until_ready(calibration)
         if not np.isfinite(calibration.misfit):
@@ -92,7 +91,7 @@ def threads_for(mesh: Mesh) -> AbstractContextManager:
 
 
 def _with_estimated_positions(
-    calibration: Calibration, model: ForwardModel, voltages, mask, deviation: float | None
+    calibration: Calibration, model: ForwardModel, voltages, mask, deviation: float
 ) -> Calibration:
     """The calibration with estimated electrode positions, if these positions explain the reference frame far better.
 
@@ -133,13 +132,11 @@ def relative_misfit(predicted, measured, mask) -> float:
     return float(np.linalg.norm(errors / noise) / np.linalg.norm(measured[mask] / noise))
 
 
-def estimated_positions(model: ForwardModel, voltages, mask, deviation: float | None) -> Placement | None:
+def estimated_positions(model: ForwardModel, voltages, mask, deviation: float) -> Placement | None:
     """Electrode positions estimated from a reference frame; None if the positions cannot be estimated. `deviation`:
-    standard deviation of the described positions, metres, or None for the default."""
+    standard deviation of the described positions, metres."""
     if not isinstance(model.electrodes, AbstractMovableElectrodes) or np.iscomplexobj(voltages):
         return None
-    if deviation is None:
-        deviation = _POSITION_DEVIATION * float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
     try:
         return place_electrodes(model, voltages, deviation=deviation, mask=mask)
     except ValueError:

@@ -177,7 +177,8 @@ class PreparedDifference:
         model_error = self.calibration.model_error
         if model_error is None:  # a reference that the described places explain still leaves them uncertain
             reference = np.asarray(self.reference.voltages)[0]
-            placement = estimated_positions(self.model, reference, self.mask, self.uncertainty.position)
+            deviation = self.uncertainty.position_on(self.mesh)
+            placement = estimated_positions(self.model, reference, self.mask, deviation)
             model_error = placement and placement.error
         uncertainty = self.uncertainty
         model_error = model_error and model_error._replace(drift=uncertainty.drift)

@@ -32,6 +32,7 @@ from jeit.forward.changes import PlacementSensitivity, shift_electrodes
 from jeit.forward.model import select_channels
 from jeit.inverse.channels import IndependentChannels, relative_noise
 from jeit.inverse.nonlinear.problem import check_frame
+from jeit.mesh import Mesh
 from jeit_solvers import Descent, QuadraticModel, ridge_model
 from jeit_solvers.engines import as_array, on_host
 
@@ -41,6 +42,8 @@ _OWN_CONTACT_DEVIATION, _COMMON_CONTACT_DEVIATION, _CONDUCTIVITY_DEVIATION = 1.0
 # Maximum numbers of steps of the two fits, before and after κ is estimated, and the tolerance of their cost, by
 # dimension of the mesh. A step in a solid takes a second.
 _MAX_STEPS, _RTOL = {2: (40, 40), 3: (5, 3)}, {2: 1e-4, 3: 3e-3}
+# Default standard deviation of electrode positions, as a share of the width of the body: 2° of a disk.
+_DEFAULT_POSITION = 0.0175
 # Minimum of κ, which is in units of `relative_noise`: 0.1 means 0.1 % of a voltage.
 _MIN_NOISE = 0.1
 
@@ -75,6 +78,12 @@ class Uncertainty:
                 expected = "metres, 0 or more" if name == "position" else "a share, not per cent"
                 expected += " from 0 to 1" if upper_limit == 1 else ""
                 raise ValueError(f"{name} must be a number, {expected}; it is {describe(value)}.")
+
+    def position_on(self, mesh: Mesh) -> float:
+        """`position`, or its default on a mesh, metres."""
+        if self.position is not None:
+            return float(self.position)
+        return _DEFAULT_POSITION * float(np.ptp(np.asarray(mesh.points), axis=0).max())
 
 
 class Placement(NamedTuple):

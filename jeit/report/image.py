@@ -14,6 +14,7 @@ from jeit.imaging.method import METHODS, ImagingSettings
 from jeit.inverse import Uncertainty
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import Ellipsoid, Star
+from jeit.mesh import Mesh
 from jeit.protocol import Protocol
 from jeit.report.folder import (
     as_plain_values,
@@ -182,7 +183,9 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "mesh": {"points": result.mesh.num_points, "cells": result.mesh.num_cells},
         },
         "protocol": _protocol_report(result.measurement.protocol),
-        "uncertainty": _uncertainty_report(result.reference.uncertainty or Uncertainty()),
+        "uncertainty": _uncertainty_report(
+            result.reference.uncertainty or Uncertainty(), result.calibration.model.mesh
+        ),
         "calibration": _calibration_report(result),
         "noise": None
         if noise is None
@@ -224,11 +227,10 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
     return as_plain_values(content)
 
 
-def _uncertainty_report(uncertainty: Uncertainty) -> dict[str, Any]:
-    """Report of the uncertainty of the description, on which intervals are based. A position uncertainty of None stands
-    for the default, 0.0175 of the width of the body."""
+def _uncertainty_report(uncertainty: Uncertainty, mesh: Mesh) -> dict[str, Any]:
+    """Report of the uncertainty of the description, on which intervals are based."""
     return {
-        "position": uncertainty.position,
+        "position": uncertainty.position_on(mesh),
         "position_unit": "m",
         "contact_drift": uncertainty.drift,
         "size": uncertainty.size,

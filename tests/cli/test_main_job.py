@@ -52,6 +52,7 @@ def test_kit4_three_conductive_inclusions(kit4, run, tmp_path):
     assert report["calibration"]["conductivity"] == pytest.approx(1.318e-3, rel=0.02)
     assert report["calibration"]["contact"] == "each, with the electrode positions"
     assert report["uncertainty"]["contact_drift"] == 0.1
+    assert report["uncertainty"]["position"] == pytest.approx(2 * RADIUS * 0.0175, rel=1e-3)
     assert report["quality"]["rounding_relative_to_difference"] == 0
     assert report["protocol"]["measurements"] == 79 * 16
     assert report["geometry"]["radius"] == RADIUS

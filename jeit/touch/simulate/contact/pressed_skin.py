@@ -285,7 +285,7 @@ class PressedSkin(Module):
         progress: Callable[[str], None] | None = None,
     ) -> TouchedCells:
         """Compute which cells change their conductivity in each of T frames, also due to earlier loads, and by which
-        share. Arguments and errors: see `record`."""
+        share. The arguments are those of `record`, and it raises the same errors."""
         seconds = _check_times(seconds)
         motions = motions_of(motions, len(seconds))
         presses_of_frames = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
