@@ -36,6 +36,8 @@ def axes_or_new(ax: Axes | None, size: tuple[float, float] = (6.4, 5.6)) -> Axes
 
 # Distance of numbers from a body, and width of a digit in a small picture, divided by the size of the body.
 _TEXT_DISTANCE, _LETTER_WIDTH = 0.04, 0.021
+# Minimum distance of the ticks of a colour bar of factors, as a share of its limit.
+_MIN_TICK_SPACING = 0.2
 
 
 def hide_axes(ax: Axes, extent: tuple[float, float, float, float], *, numbered: bool = True) -> None:
@@ -99,21 +101,42 @@ def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
 
 
 def draw_colour_bar(
-    ax: Axes, mappable: ScalarMappable, label: str, *, show_sign: bool = False, position: Axes | None = None
+    ax: Axes,
+    mappable: ScalarMappable,
+    label: str,
+    *,
+    show_sign: bool = False,
+    as_factors: bool = False,
+    position: Axes | None = None,
 ) -> None:
     """Draw a slim colour bar at the right of `ax`, or on the axes `position`; `show_sign`: whether tick labels have a
-    sign, for differences."""
+    sign, for differences; `as_factors`: whether the values are log₁₀ of factors, which the tick labels state."""
     placement: dict[str, Any] = (
         {"ax": ax, "shrink": 0.72, "aspect": 28, "pad": 0.02} if position is None else {"cax": position}
     )
     bar = ax.figure.colorbar(mappable, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]), **placement)
-    if show_sign:
+    if as_factors:
+        ticks = _factor_ticks(mappable.get_clim()[1] or 0.0)
+        bar.set_ticks(list(ticks), labels=list(ticks.values()))
+    elif show_sign:
         bar.ax.yaxis.set_major_formatter(
             lambda value, _: "0" if abs(value) < 1e-12 else f"{value:+g}".replace("-", "−")
         )
     bar.set_label(label, color=INK)
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
     bar.ax.tick_params(length=2, color=SOFT, labelcolor=INK)
+
+
+def _factor_ticks(limit: float) -> dict[float, str]:
+    """Ticks of a colour bar from -`limit` to `limit`, log₁₀ of factors, and their labels, such as "×2" and "÷2"."""
+    factors = [1 + step * 10.0**decade for decade in (-4, -3, -2, -1) for step in (1, 2, 5)]
+    factors += [step * 10.0**decade for decade in range(10) for step in (2, 5, 10)]
+    ticks, spacing = {0.0: "1"}, _MIN_TICK_SPACING * limit
+    for factor in sorted(factors, reverse=True):
+        tick = math.log10(factor)
+        if spacing <= tick <= limit * (1 + 1e-9) and all(abs(tick - other) >= spacing for other in ticks):
+            ticks |= {tick: f"×{factor:g}", -tick: f"÷{factor:g}"}
+    return ticks
 
 
 def with_si_prefix(largest: float, unit: str) -> tuple[float, str]:
@@ -144,6 +167,7 @@ class ColourScale(Module):
     - `limit`: value at the end of the colour bar, in `unit`; default: the maximum magnitude.
     - `colour_map`: name of a matplotlib colour map to use instead of these colour maps.
     - `bar`: whether to draw the colour bar.
+    - `logarithmic`: whether the values are log₁₀ of factors; the colour bar then states the factors.
 
     Raises `ValueError` for a limit that is negative or not finite.
 
@@ -160,6 +184,7 @@ class ColourScale(Module):
     limit: float | None = None
     colour_map: str | None = None
     bar: bool = True
+    logarithmic: bool = False
 
     def __check_init__(self):
         if self.limit is not None and not (is_number(self.limit) and self.limit >= 0):
@@ -203,10 +228,18 @@ class FittedScale(Module):
     keywords: dict
     scale: ColourScale
 
-    def draw_bar(self, ax: Axes, mappable: ScalarMappable) -> None:
-        """Draw the colour bar of `mappable` beside `ax`, unless the scale has no colour bar."""
+    def draw_bar(self, ax: Axes, mappable: ScalarMappable, position: Axes | None = None) -> None:
+        """Draw the colour bar of `mappable` beside `ax`, or on the axes `position`, unless the scale has no colour
+        bar."""
         if self.scale.bar:
-            draw_colour_bar(ax, mappable, self.label, show_sign=self.scale.difference)
+            draw_colour_bar(
+                ax,
+                mappable,
+                self.label,
+                show_sign=self.scale.difference,
+                as_factors=self.scale.logarithmic,
+                position=position,
+            )
 
 
 def check_scale(scale: ColourScale) -> None:
@@ -215,4 +248,4 @@ def check_scale(scale: ColourScale) -> None:
 
 
 CHANGE = ColourScale()
-LOGARITHM = ColourScale(quantity="log₁₀ of conductivity over background", unit="")
+FACTOR = ColourScale(quantity="Conductivity over background", unit="", logarithmic=True)

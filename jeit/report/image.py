@@ -114,7 +114,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     """
     from matplotlib.figure import Figure
 
-    from jeit.plot.axes import CHANGE, LOGARITHM
+    from jeit.plot.axes import CHANGE, FACTOR
     from jeit.plot.imaging.electrodes import draw_labels, draw_outlines
     from jeit.plot.imaging.image import plot_image
 
@@ -126,7 +126,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         electrodes = result.electrodes
         plot_admittivity(result.mesh, np.asarray(result.change), electrodes, figure=figure)
         return figure
-    scale = LOGARITHM if result.iterative else CHANGE
+    scale = FACTOR if result.iterative else CHANGE
     electrodes = result.electrodes
     if result.mesh.dimension == 3:
         from jeit.plot.solid.overview import plot_solid

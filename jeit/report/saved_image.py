@@ -305,10 +305,10 @@ def write_views(
 def drawn_values(image: SavedImage) -> tuple[np.ndarray, "ColourScale"]:
     """Values per cell to draw, and their colour scale: `departure` for iterative images, the real part of the change
     for complex images, otherwise the change of conductivity."""
-    from jeit.plot.axes import CHANGE, LOGARITHM, ColourScale
+    from jeit.plot.axes import CHANGE, FACTOR, ColourScale
 
     if image.departure is not None:
-        return image.departure, LOGARITHM
+        return image.departure, FACTOR
     if np.iscomplexobj(image.change):
         return np.real(image.change), ColourScale(quantity="Change of conductivity σ")
     return np.asarray(image.change), CHANGE

@@ -22,7 +22,7 @@ from jeit.inverse.shapes import Quantities, Star
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Polygon, Rectangle, Solid, centroids, disk, layer, rectangle
 from jeit.plot import ColourScale, plot_image, plot_mesh
-from jeit.plot.axes import extent_of, hide_axes
+from jeit.plot.axes import FACTOR, extent_of, hide_axes
 from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions, draw_outlines
 from jeit.plot.imaging.image import plot_raster, plot_sensitivity
 from jeit.plot.imaging.series import plot_series
@@ -73,6 +73,25 @@ def test_conductivity_is_sequential_and_spans_its_range(mesh, ax):
     drawn = [c for c in ax.collections if c.get_array() is not None]
     assert drawn[0].get_clim() == pytest.approx((1, 3))
     assert colour_bar_label(ax) == "Conductivity (S/m)"
+
+
+@pytest.mark.parametrize(
+    ("limit", "labels"),
+    [
+        (1.0, ["÷10", "÷5", "÷2", "1", "×2", "×5", "×10"]),
+        (0.05, ["÷1.1", "÷1.05", "1", "×1.05", "×1.1"]),
+        (4.0, ["÷10000", "÷1000", "÷100", "÷10", "1", "×10", "×100", "×1000", "×10000"]),
+    ],
+)
+def test_ticks_of_logarithms_are_factors(mesh, ax, limit, labels):
+    values = np.linspace(-limit / 2, limit, mesh.num_cells)
+    plot_image(mesh, values, scale=FACTOR, ax=ax)
+    ticks = ax.figure.axes[-1].yaxis.get_ticklabels()
+    assert [tick.get_text() for tick in sorted(ticks, key=lambda tick: tick.get_position()[1])] == labels
+    factors = [float(label.replace("÷", "1/").split("/")[-1].strip("×")) for label in labels]
+    expected = [np.log10(factor) * (-1 if "÷" in label else 1) for factor, label in zip(factors, labels, strict=True)]
+    np.testing.assert_allclose(sorted(tick.get_position()[1] for tick in ticks), expected, atol=1e-9)
+    assert colour_bar_label(ax) == "Conductivity over background"
 
 
 def test_electrodes_are_drawn_at_their_position_and_width(mesh, electrodes, ax):

@@ -25,7 +25,6 @@ from jeit.plot.axes import (
     ColourScale,
     FittedScale,
     check_scale,
-    draw_colour_bar,
     draw_scale_bar,
     hide_axes,
     with_si_prefix,
@@ -166,13 +165,7 @@ def plot_frames(
         pictures[-1].show(values[frame], frame_titles[frame])
     if scale.bar:
         colour_bar_axes = figure.add_subplot(grid[:, -1])
-        draw_colour_bar(
-            colour_bar_axes,
-            pictures[0].mappable,
-            fitted_scale.label,
-            show_sign=scale.difference,
-            position=colour_bar_axes,
-        )
+        fitted_scale.draw_bar(colour_bar_axes, pictures[0].mappable, colour_bar_axes)
     if count is None:
         refused = [title for title, row in zip(frame_titles, values, strict=True) if not np.isfinite(row).all()]
         count = FrameCount(len(values), len(refused), refused)
@@ -270,9 +263,7 @@ def _draw_frames(
         picture.show(series.changes[frame], series.titles[frame])
         if panel_index == 0:
             colour_bar_axes = figure.add_subplot(grid[:, -1])
-            draw_colour_bar(
-                colour_bar_axes, picture.mappable, fitted_scale.label, show_sign=True, position=colour_bar_axes
-            )
+            fitted_scale.draw_bar(colour_bar_axes, picture.mappable, colour_bar_axes)
 
 
 class _RegionMaps:

@@ -15,7 +15,7 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane
 from jeit.image.plane import AXES
 from jeit.mesh import Mesh, centroids
-from jeit.plot.axes import CHANGE, INK, ColourScale, draw_colour_bar
+from jeit.plot.axes import CHANGE, INK, ColourScale
 from jeit.plot.solid.body import size_of
 from jeit.plot.solid.isosurfaces import HALF, check_drawn, draw_in_space
 from jeit.plot.solid.scene import CORNER_VIEW, Camera
@@ -87,7 +87,7 @@ def plot_solid(
     _caption(figure.add_subplot(grid[1, 2]), common_point, levels, inclusions, difference=scale.difference)
     if scale.bar:
         bar = figure.add_subplot(grid[:, 3])
-        draw_colour_bar(space, mappable(fitted_scale), fitted_scale.label, show_sign=scale.difference, position=bar)
+        fitted_scale.draw_bar(space, mappable(fitted_scale), bar)
     return figure
 
 

@@ -17,7 +17,7 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, cut_by_plane
 from jeit.image.plane import AXES, crossed_edges
 from jeit.mesh import Mesh
-from jeit.plot.axes import CHANGE, INK, ColourScale, FittedScale, axes_or_new, draw_colour_bar, draw_scale_bar
+from jeit.plot.axes import CHANGE, INK, ColourScale, FittedScale, axes_or_new, draw_scale_bar
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import size_of
 from jeit.plot.solid.isosurfaces import check_drawn, draw_body_in_plane
@@ -118,7 +118,7 @@ def plot_slices(
         finish_slice(panel, plane, (left, right, low, high), draw_cross=panel is panels[0])
         if scale.bar and panel is panels[-1]:
             bar = figure.add_subplot(grid[:, columns])
-            draw_colour_bar(panel, mappable, fitted_scale.label, show_sign=scale.difference, position=bar)
+            fitted_scale.draw_bar(panel, mappable, bar)
     return figure
 
 
