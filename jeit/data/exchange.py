@@ -152,7 +152,7 @@ def from_pyeit(mesh: Any, protocol: Any, *, current: float = 1.0) -> ForwardMode
             )
     points, electrode_nodes = np.asarray(mesh.node, float), np.asarray(mesh.el_pos, int)
     cells = np.asarray(mesh.element, int)
-    points = points[:, : cells.shape[1] - 1] # in pyEIT, the nodes of two-dimensional meshes have a coordinate z = 0
+    points = points[:, : cells.shape[1] - 1]  # in pyEIT, the nodes of two-dimensional meshes have a coordinate z = 0
     drive = current * pair_patterns(np.asarray(protocol.ex_mat, int), len(electrode_nodes))
     pairs = [np.asarray(drive_pairs, int)[:, :2] for drive_pairs in protocol.meas_mat]
     measurement = pair_patterns(np.concatenate(pairs), len(electrode_nodes))

@@ -327,7 +327,7 @@ def _spikes(
             break
         direction = np.zeros(len(change))
         direction[worst_channels[0]] = 1
-        for _ in range(2): # projected twice, so that rounding errors do not destroy orthogonality
+        for _ in range(2):  # projected twice, so that rounding errors do not destroy orthogonality
             direction = direction - basis @ (basis.T @ direction)
         direction = direction / np.linalg.norm(direction)
         unexplained_power, gain = float(np.sum(np.abs(residual) ** 2)), float(np.abs(direction @ residual) ** 2)

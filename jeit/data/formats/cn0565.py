@@ -157,7 +157,7 @@ def _frames(content: bytes) -> Iterator[list[float | None]]:
             cells.pop()
         values = [_number(cell) for cell in cells]
         yield [*values, None] if line[2].strip() else values
-        for _ in range(line[2].count(b"!V")): # a line end was lost; later frames keep their indices
+        for _ in range(line[2].count(b"!V")):  # a line end was lost; later frames keep their indices
             yield [None]
 
 

@@ -335,7 +335,7 @@ def frames_of(values: np.ndarray, axes: tuple[str, ...], name: str) -> Inexact[n
     """
     axis_names = tuple(axes or AXES)
     if values.ndim == len(axis_names) - 1:
-        values = np.expand_dims(values, axis_names.index("frames")) # MATLAB omits a last axis of length one
+        values = np.expand_dims(values, axis_names.index("frames"))  # MATLAB omits a last axis of length one
     if values.ndim != len(axis_names):
         raise ValueError(
             f"{name}: the voltages have shape {values.shape}; {', '.join(axis_names)} are {len(axis_names)} axes."
