@@ -177,8 +177,8 @@ def _nearest(nominal_skin: Skin, places: np.ndarray) -> np.ndarray:
 
 
 def _wrong(ways, touches, right, clean, noise: float, places, quick: bool) -> tuple[Table, dict[str, float]]:
-    """A table of mean localisation errors with noise, displaced electrodes and changed contacts, and the errors with
-    changed contacts in metres."""
+    """A table of mean localisation errors with noise, displaced electrodes and changed contacts, and the errors in the
+    last row (contacts that drift by ±10 %) in metres."""
     random = np.random.default_rng(4)
     cases = {f"noise × {times:g}": (clean, times * noise) for times in (0.0, 3.0, 10.0)}
     some = slice(None, None, 5)

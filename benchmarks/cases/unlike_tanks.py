@@ -27,10 +27,10 @@ HEADER = [
 
 
 class Outcome(NamedTuple):
-    """Result for one body. **Fields**: `distance` of the body's inclusion from the body, in units of R, infinite if the
-    body is missed. `holds` (3,): whether the intervals of change, area and strength contain the true values, None
-    without intervals. `width` of the interval of the logarithm of conductivity, NaN if the interval is open. `error` of
-    the logarithm of conductivity at the peak.
+    """Result for one body. **Fields**: `distance` of the body's inclusion from the body, in units of half the tank's
+    width, infinite if the body is missed. `holds` (3,): whether the intervals of change, area and strength contain the
+    true values, None without intervals. `width` of the interval of the logarithm of conductivity, NaN if the interval
+    is open. `error` of the logarithm of conductivity at the peak.
     """
 
     distance: float
