@@ -67,8 +67,9 @@ class Headline:
 
 @dataclass
 class Result:
-    """The result of a benchmark case. `notes`: the contestants and their choices. `wrong`: results that disagree, for
-    which the command fails.
+    """The result of a benchmark case.
+
+    `notes`: the contestants and their choices. `wrong`: results that disagree, for which the command fails.
     """
 
     tables: list[Table]

@@ -172,8 +172,9 @@ def _begin(contestant: Contestant, task: str, folder: Path | None) -> Figures:
 
 
 def _probe(contestant: Contestant, task: str, result: Figures) -> float:
-    """The approximate time of a repeat after compilation, in seconds. Records the peak memory in `result`. A slow call
-    counts as a repeat.
+    """The approximate time of a repeat after compilation, in seconds. Records the peak memory in `result`.
+
+    A slow call counts as a repeat.
     """
     if result.remark or result.seconds:
         return result.first

@@ -96,10 +96,10 @@ def reconstruct(
     model: Model = None,
     quiet: Quiet = False,
 ) -> None:
-    """Image the change of conductivity from REFERENCE to DATA; writes image.png, image.npz, report.json; for solids
-    image.vtu.
+    """Image the change from REFERENCE to DATA; writes image.png, image.npz, report.json; for solids image.vtu.
 
     With --method network, the indentation depth of a skin is imaged: frames.csv, depth.npz, depth.png and report.json.
+
     In Python: `jeit.image_difference` and `jeit.report.write_image`; `jeit.reconstruct` makes absolute images.
     """
     if method == NETWORK or model is not None:

@@ -114,7 +114,9 @@ class DepthView(AbstractView):
     - `still`: frames (frames, channels) of the untouched skin, volts.
     - `title`: title of the page.
 
-    Raises `ValueError` if the number of channels differs from that of the network. **Example:**
+    Raises `ValueError` if the number of channels differs from that of the network.
+
+    **Example:**
 
     ```python
     depths = DepthView(network, rest[None])
