@@ -10,8 +10,8 @@ NOISE = 1e-3  # standard deviation, of each voltage
 
 
 def bodies():
-    """For each sensor by name, a function that creates the forward model for a number of nodes, and the half axes of
-    the path of a touch in metres."""
+    """For each sensor by name, a function that creates the forward model for a number of nodes, and half of the extents
+    of a touch's path along x and y, in metres."""
     import numpy as np
 
     from jeit.electrodes import BoundaryElectrodes, CombinedElectrodes, SheetDiscs
@@ -35,7 +35,7 @@ def bodies():
 
 
 def simulate(model, reach, count: int):
-    """Frames (count, channels) of a touch that moves round the body and halves the conductivity within 15 mm, and a
+    """Frames (count, channels) of a touch that moves over the body and halves the conductivity within 15 mm, and a
     frame of the untouched body."""
     import jax
     import jax.numpy as jnp

@@ -145,8 +145,8 @@ _NON_ARGUMENT_KEYS = {"shape", "thickness"}
 
 
 def described_body(table: GeometryTable, folder: Path, origin: str) -> Body:
-    """Construct the body that the section `[geometry]` of a description specifies; `folder` contains the mesh file, if
-    there is one.
+    """Construct the body that the section `[geometry]` of a description specifies; `folder` contains the mesh file that
+    the section may name.
 
     Raises `ValueError` if the section is not valid, and warns if lengths seem too large to be in metres.
     """

@@ -113,8 +113,9 @@ class Description:
     uncertainty: Uncertainty | None = None
 
     def protocols(self, path: str | Path) -> list[tuple[Protocol, str]]:
-        """The protocols that agree with the description for the data file at `path`. The first has the default values
-        of options that the description does not state, the others have other values, which their text states."""
+        """The protocols that agree with the description for the data file at `path`. The first protocol has the default
+        values of all options that the description does not state; further protocols have other values, which the text
+        beside each protocol states."""
         default_protocol = self.protocol(path)
         if default_protocol is None or self.protocol_section is None:
             return []

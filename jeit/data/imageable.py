@@ -56,7 +56,7 @@ class FrameQuality:
     **Fields**
 
     - `difference`: ‖v - v_reference‖ / ‖v_reference‖ over the usable channels, where v are the voltages of the frame.
-    - `difference_noise`: noise of the difference, in volts and relative to the difference; None if it cannot be
+    - `difference_noise`: noise of the difference, in volts and relative to the difference; None if the noise cannot be
       estimated.
     - `trusted_noise`: noise of the difference in units of `jeit.inverse.relative_noise` of the reference (the expected
       errors of channels relative to each other); None if it cannot be estimated.

@@ -18,10 +18,10 @@ _MEMORY_FACTOR = 4
 
 @dataclass(frozen=True)
 class Format:
-    """A file format. **Fields**: `module`: name of the module that reads it; `endings`: suffixes of its files;
-    `described`: whether a description may accompany a file; `borrows`: whether a file may use the description of
-    another measurement (`like` of `read`); `own_protocol`: whether files state their protocol, so that a description
-    states only the body; `bundled`: name of the bundled description that always applies, or None.
+    """A file format. **Fields**: `module`: name of the module that reads the format; `endings`: suffixes of files in
+    the format; `described`: whether a description may accompany a file; `borrows`: whether a file may use the
+    description of another measurement (`like` of `read`); `own_protocol`: whether files state their protocol, so that a
+    description states only the body; `bundled`: name of the bundled description that always applies, or None.
 
     The module is imported only when a file has one of the suffixes `endings`.
     """

@@ -55,7 +55,7 @@ class RoundSkin(Module):
         return ForwardModel(mesh, electrodes, adjacent(self.num_electrodes, current=self.current))
 
     def electrodes(self) -> BoundaryElectrodes:
-        """The electrodes; the first is at 12 o'clock, and the others follow clockwise."""
+        """The electrodes of the skin; electrode 1 is at 12 o'clock, and the other electrodes follow clockwise."""
         position = ring(self.radius, self.num_electrodes, clockwise=True)
         return BoundaryElectrodes(position, self.electrode_width, self.contact_impedance)
 

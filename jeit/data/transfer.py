@@ -2,7 +2,7 @@
 
 The transfer impedance Z (L, L) of L electrodes is symmetric with rows that sum to zero, so it has L (L - 1) / 2
 independent entries. Any set of patterns that determines Z, such as L - 1 independent currents on all electrodes,
-therefore determines the voltages of every other set.
+therefore determines the voltages of every other set of patterns.
 """
 
 from __future__ import annotations

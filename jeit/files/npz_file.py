@@ -91,8 +91,9 @@ def npy_array(path: Path) -> np.ndarray:
 
 
 def check_archive(path: Path) -> None:
-    """Raise `ValueError` for a file that is not a ZIP archive of arrays and text, for an archive whose content exceeds
-    the memory limit (`check_memory`), and for an archive with an array that is smaller than its header declares."""
+    """Raise `ValueError` for a file that is not a readable ZIP archive, for an archive of arrays and text whose content
+    exceeds the memory limit (`check_memory`), and for an archive with an array that is smaller than its header
+    declares."""
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()

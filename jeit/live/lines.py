@@ -70,7 +70,8 @@ class LineBuffer:
 
 
 def _split_at_words(line: bytes) -> list[bytes]:
-    """Split a line where the word "magnitudes" begins a frame within it. Empty lines are left out."""
+    """Split a line at each word "magnitudes" within it, because the word begins a new frame. Empty lines are left
+    out."""
     starts = [0, *(match.start() for match in _FRAME_WORD.finditer(line) if match.start() > 0), len(line)]
     pieces = (line[start:stop] for start, stop in itertools.pairwise(starts))
     return [piece for piece in pieces if piece.strip()]

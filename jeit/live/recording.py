@@ -75,8 +75,8 @@ class Recorder:
         self._num_other_lengths = self._file_number = self._file_size = 0
 
     def start(self) -> Path:
-        """Begin a recording, unless one is in progress, and return its folder. Raises `OSError` if the folder cannot be
-        created."""
+        """Begin a recording, unless a recording is in progress, and return the folder of the recording. Raises
+        `OSError` if the folder cannot be created."""
         if self._files is not None:
             return self._files.folder
         folder = _new_folder(self.folder)

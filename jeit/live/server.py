@@ -30,10 +30,10 @@ def serve(
     **Arguments:**
 
     - `session`: the session.
-    - `host`, `port`: address at which to listen; port 0 selects a free one.
+    - `host`, `port`: address at which to listen; port 0 selects a free port.
     - `token`: token that the page's address must contain; by default a random token for a host that other machines can
       reach, otherwise none.
-    - `opened`: called with the page's address once it can be opened.
+    - `opened`: function that is called with the page's address once the page can be opened.
     - `stay`: whether to continue until Ctrl-C when the session has ended, so that its last minute can be viewed.
 
     Raises `OSError` if the address is in use or does not belong to this machine, and `ImportError` if the packages of

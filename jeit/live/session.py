@@ -60,8 +60,8 @@ class Result:
 class Session:
     """Live session: records the frames of a source and images them by a view, until the source ends or `stop`.
 
-    One thread reads the frames, and another images them. If imaging is slower than the source, frames are not imaged,
-    but always recorded. Use the session as a context manager, or call `start` and `stop`.
+    One thread reads the frames, and another thread images them. If imaging is slower than the source, frames are not
+    imaged, but always recorded. Use the session as a context manager, or call `start` and `stop`.
 
     **Arguments:**
 

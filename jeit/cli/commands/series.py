@@ -82,7 +82,7 @@ def series(
     """Image all frames of DATA against one reference, linearly and at once, and analyse the changes over time.
 
     Writes series.png (frames, the functional image, maps of amplitude and phase, curves and spectra of regions),
-    series.npz, regions.csv and report.json. Frame after frame as they come: jeit stream.
+    series.npz, regions.csv and report.json. 'jeit stream' images frames one by one as they arrive.
 
     In Python: `jeit.imaging.image_sequence`, `jeit.image.oscillation`, `jeit.report.write_series`.
     """

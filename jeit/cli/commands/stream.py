@@ -90,7 +90,7 @@ def stream(
 ) -> None:
     """Image every frame of DATA as it arrives; faulty frames are refused with a reason, and the stream continues.
 
-    Writes frames.csv line by line (x, y, the centroid of the region around the strongest change, metres, and its peak,
+    Writes frames.csv line by line (x, y: centroid in metres of the region around the strongest change; peak change in
     S), and at the end images.npz with `conductivity` (frames, cells), NaN for frames that were refused, `points`,
     `cells` and `background`; frames.png, some frames on one colour scale; and a film. If all frames were refused, the
     exit status is 1. With --method network, the indentation depth of a skin is imaged: frames.csv, depth.npz, depth.png

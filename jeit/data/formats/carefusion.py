@@ -36,7 +36,7 @@ _NO_RATE_NOTE = "the file says no rate that is known; give it by [data] frame_ra
 
 
 def recognises(path: Path) -> bool:
-    """True for an .eit file that begins with the XML of this format."""
+    """Whether a file is an .eit file that begins with the XML header of Carefusion's format."""
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:

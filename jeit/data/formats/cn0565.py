@@ -88,7 +88,8 @@ def _protocol(
         return like.protocol, ()
     candidates = [pair for pair in sensor_description.protocols(path) if pair[0].num_measurements == num_voltages]
     if candidates:
-        # The kit's patterns rotate from electrode 1, unless the description states another order.
+        # For every drive, the kit measures in the order of electrode numbers, unless the description states another
+        # order.
         protocol, options = next(
             (candidate for candidate in candidates if 'order = "fixed"' in candidate[1]), candidates[0]
         )

@@ -1,10 +1,10 @@
 """Reader of recordings by Dräger's PulmoVista 500 (.eit): a text header, followed by frames of equal size.
 
 Numbers are little-endian. Bytes 0-3 are the version of the format and bytes 4-7 the length of the header text; frames
-begin at byte 16 + this length. The text states the frame rate as "Framerate [Hz]:". A frame of version 50 and later has
-5,495 bytes, one of version 32 has 5,200. A frame begins with 600 numbers of eight bytes. The first 208 and the 208 from
-number 322 on are two parts, whose weighted combination gives the voltages of the adjacent protocol. The maker has not
-published the weights; the weights used here are estimates by users.
+begin at byte 16 + this length. The text states the frame rate as "Framerate [Hz]:". A frame has 5,495 bytes in version
+50 and later, and 5,200 bytes in version 32. A frame begins with 600 numbers of eight bytes. The first 208 numbers, and
+the 208 numbers from number 322 on, are two parts whose weighted sum gives the voltages of the adjacent protocol. The
+maker has not published the weights; the weights used here are estimates by users.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _SCALE_NOTES = (
 
 
 def recognises(path: Path) -> bool:
-    """True for an .eit file whose first bytes name Dräger's software."""
+    """Whether a file is an .eit file whose first bytes name Dräger's software."""
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:

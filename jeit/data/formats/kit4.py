@@ -32,7 +32,7 @@ def read(path: Path) -> Measurement:
 
     Channels are ordered drive by drive. The 16 differences of a drive sum to zero, so 15 are independent; all 16 are
     kept, including differences at driven electrodes (`Measurement.without_driven_channels` masks these channels). The
-    tank has a radius of 0.14 m; electrode 1 is at 12 o'clock, and the others follow clockwise.
+    tank has a radius of 0.14 m; electrode 1 is at 12 o'clock, and the other electrodes follow clockwise.
 
     Raises `ValueError` for a file whose arrays have other shapes.
     """

@@ -36,7 +36,7 @@ def read(path: Path) -> Measurement:
     channels, ordered drive by drive.
 
     NaN entries, from electrodes that are removed in the harder levels of the challenge, are masked. The tank has a
-    radius of 0.115 m and 32 electrodes of 5.625°; electrode 1 is at 12 o'clock, and the others follow
+    radius of 0.115 m and 32 electrodes of 5.625°; electrode 1 is at 12 o'clock, and the other electrodes follow
     counter-clockwise. The current of each drive is its recorded amplitude.
 
     Raises `ValueError` for a file whose arrays have other shapes.

@@ -44,7 +44,7 @@ class _Header:
 
 
 def recognises(path: Path) -> bool:
-    """True for an .eit text file that begins with the number of its header lines."""
+    """Whether a file is an .eit text file that begins with the number of its header lines."""
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:

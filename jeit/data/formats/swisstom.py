@@ -36,7 +36,7 @@ _SCALE_NOTES = (
 
 
 def recognises(path: Path) -> bool:
-    """True for an .eit file that begins with the number of a Swisstom format."""
+    """Whether a file is an .eit file that begins with the number of a Swisstom format."""
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:

@@ -93,8 +93,8 @@ _NUMBER_FORMATS = (
 
 
 class LineNumbers:
-    """Parser of successive lines of numbers. The separators of the first line are used for later lines, until they do
-    not fit a line."""
+    """Parser of successive lines of numbers. The separators are detected in the first line, and again in a later line
+    that they do not fit."""
 
     def __init__(self):
         self._format: _NumberFormat | None = None
@@ -394,8 +394,8 @@ def _are_columns(shape: tuple[int, int], counts: Sequence[int], default_axis: st
 
 
 def _times(column: Float[np.ndarray, " F"], column_name: str) -> tuple[Float[np.ndarray, " F"] | None, str]:
-    """Times in seconds from the first number of each frame, or None if it is no time, and a note. The note is empty if
-    the numbers do not increase."""
+    """Times in seconds from the first number of each frame, or None if these numbers are not times, and a note. The
+    note is empty if the numbers do not increase."""
     if not (np.isfinite(column).all() and (np.diff(column) > 0).all()):
         return None, ""
     if (column == column[0] + np.arange(len(column))).all():

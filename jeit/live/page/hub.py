@@ -25,8 +25,8 @@ _LATENCY_SPAN = 10.0
 class Viewer:
     """State of an open page: the pictures that were sent and are not yet drawn, and the latencies of drawn pictures.
 
-    A page that is slow or suspended does not report pictures as drawn. It receives no further pictures until it
-    resumes, and then the newest picture.
+    A page that is slow or suspended does not report pictures as drawn. Such a page receives no further pictures until
+    it resumes, and then receives the newest picture.
     """
 
     def __init__(self) -> None:
