@@ -1,1 +1,2 @@
-"""Benchmarks: jeit beside others, time and accuracy in one table. `python -m benchmarks` lists the cases."""
+"""Benchmarks: jeit compared with other libraries, with time and accuracy in one table. `python -m benchmarks` lists the
+cases."""

@@ -1,6 +1,6 @@
 """The command of the benchmarks: `python -m benchmarks [CASE …]` from the root of the repository.
 
-Without a case it lists them. See `README.md` in this folder for what is measured and how.
+Without a CASE, the command lists the cases. `README.md` in this folder explains what is measured and how.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from benchmarks.harness.timing import say
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    """Options of the command."""
+    """Parse the options of the command."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Lists the cases, or runs some.")
     parser.add_argument("cases", nargs="*", metavar="CASE", help="cases to run")
     parser.add_argument("--all", action="store_true", help="run every case")
@@ -54,7 +54,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 
 def find(name: str) -> Case:
-    """The case of this name. Raises `CaseFailedError` if its file cannot be imported."""
+    """The benchmark case called `name`. Raises `CaseFailedError` if the module of the case cannot be imported."""
     try:
         return load(name)
     except ImportError as error:
@@ -62,7 +62,7 @@ def find(name: str) -> Case:
 
 
 def list_cases() -> None:
-    """Print every case with its description."""
+    """Print the name and description of every benchmark case."""
     for name in NAMES:
         try:
             case = find(name)
@@ -73,7 +73,8 @@ def list_cases() -> None:
 
 
 def measure(name: str, options: argparse.Namespace) -> tuple[Result, list[str]]:
-    """The result of one case, and the heading with the machine on which it was measured. Raises `CaseFailedError`."""
+    """Run one case; return its result, and the heading that names the machine. Raises `CaseFailedError` if the case
+    ends without a result."""
     case = find(name)
     pictures = machine.ROOT / "docs" / "images" if options.write and case.pictures else None
     case_options = Options(
@@ -94,10 +95,10 @@ def measure(name: str, options: argparse.Namespace) -> tuple[Result, list[str]]:
 
 
 def measure_all(names: Iterable[str], options: argparse.Namespace) -> Iterator[tuple[str, Callable]]:
-    """Yield each case when it is done, with a function that returns what `measure` returns.
+    """Yield the name of each case when it is done, with a function that returns the result of `measure`.
 
-    Cases that measure times run first, one after the other. The others then run in parallel, as many as there are
-    cores. A quick run judges no times, so all of its cases run in parallel.
+    Cases that measure times run first, one after the other. The other cases then run in parallel, as many as there are
+    cores. In a quick run, times are not judged, so all cases run in parallel.
     """
     studies = []
     for name in names:
@@ -116,7 +117,7 @@ def measure_all(names: Iterable[str], options: argparse.Namespace) -> Iterator[t
 
 
 def keep(name: str, result: Result, heading: list[str], options: argparse.Namespace) -> None:
-    """Print a case's report and, if requested, write it to its files. Returns messages about failures."""
+    """Print the report of a case and, if requested, write the report to files. Returns messages about failures."""
     print(f"\n## {name}\n\n{report.text(result, heading)}\n", flush=True)
     if options.write and not result.wrong:
         for line in report.write(load(name), result, heading, NAMES):
@@ -124,7 +125,8 @@ def keep(name: str, result: Result, heading: list[str], options: argparse.Namesp
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the requested cases. Returns 1 if a case fails, results disagree or, in a full run, a figure is missed."""
+    """Run the requested cases. Returns 1 if a case fails, if results disagree or, in a full run, if a required figure
+    is missed."""
     options = parse(arguments)
     if not (options.all or options.cases):
         list_cases()

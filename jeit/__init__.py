@@ -1,6 +1,6 @@
 """jeit: differentiable electrical impedance tomography in JAX.
 
-The most common names, and the packages with further ones:
+The most common names, and the packages that contain further names:
 
 - `read`: reading of measured files (`jeit.data`);
 - `image_difference`: an image from two frames, in one call (`jeit.imaging`, `jeit.report`);

@@ -1,4 +1,4 @@
-"""`python -m jeit` is the `jeit` command."""
+"""`python -m jeit` runs the `jeit` command."""
 
 from __future__ import annotations
 

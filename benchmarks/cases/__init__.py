@@ -1,4 +1,4 @@
-"""The cases: one file each, with its `CASE`. To add a case, write a file and add its name here."""
+"""The benchmark cases: one module each, which defines `CASE`. To add a case, write a module and add its name here."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from importlib import import_module
 
 from benchmarks.harness.case import Case
 
-# In the order in which they run and are reported: times first, then studies of accuracy, which take longest.
+# Names of the cases in the order in which they run and are reported: cases that measure times first, then studies of
+# accuracy, which take longest.
 NAMES = (
     "forward",
     "solver",
@@ -47,7 +48,7 @@ NAMES = (
 
 
 def load(name: str) -> Case:
-    """The case of this name. Raises `ValueError` for an unknown name."""
+    """The benchmark case called `name`. Raises `ValueError` for an unknown name."""
     if name not in NAMES:
         raise ValueError(f"There is no case {name!r}; there are {', '.join(NAMES)}.")
     return import_module(f"benchmarks.cases.{name}").CASE

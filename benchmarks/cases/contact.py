@@ -1,9 +1,9 @@
 """Frames of pressed skins, from loads to voltages: jeit beside one SciPy factorisation per touch.
 
-A round skin of 5,000 nodes is pressed by balls, and by balls, discs and prisms, alone and in pairs: pressure in
-equilibrium with the load on the cells, the material's law, exact changes of voltages. SciPy receives the changed
-conductivities, and its time is that of a few touches, multiplied by their number. Then a stroke in time, and a contact
-on an elastic half-space.
+A round skin of 5,000 nodes is pressed by balls only, and by balls, discs and prisms, alone and in pairs. jeit computes
+the pressure in equilibrium with the load, the change of conductivity by the material's law, and the exact changes of
+voltages. SciPy receives the changed conductivities; its time is measured for a few touches and extrapolated to their
+number. Two further tasks are a stroke in time, and a contact on an elastic half-space.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ BALLS, MIXED, PAIRS = "balls of 15 mm", "balls, discs and prisms", "the same, on
 
 
 def run(options: Options) -> Result:
-    """Sets of touches, a stroke, and a contact."""
+    """Measure sets of touches, a stroke, and a contact."""
     nodes, number = (options.nodes or (600 if options.quick else 5000,))[0], 32 if options.quick else 1024
     rounds, sample = options.rounds or (1 if options.quick else 5), 2 if options.quick else 12
     mesh = Disk(RADIUS).mesh(num_points=nodes)
@@ -74,8 +74,8 @@ def run(options: Options) -> Result:
 
 
 def _plainly(skin: PressedSkin, touches: list, sample: int) -> tuple[float, float]:
-    """Seconds for a touch with its own factorisation, and the largest difference of the changes of voltages, relative
-    to the largest change.
+    """SciPy's seconds per touch with one factorisation per touch, and the largest difference between SciPy's and jeit's
+    changes of voltages, relative to the largest change.
     """
     plain = PlainTouches(skin.model, np.asarray(skin.conductivity))
     chosen = [touches[k] for k in np.linspace(0, len(touches) - 1, sample).astype(int)]
@@ -101,7 +101,7 @@ def _stroke(skin: PressedSkin, number: int, rounds: int) -> list[str]:
 
 
 def _half_space(rounds: int) -> list[str]:
-    """A table row for one contact, whose maximum pressure is compared with Hertz's."""
+    """A table row for one contact on an elastic half-space, whose maximum pressure is compared with Hertz's formula."""
     support, indenter, load = HalfSpace(1e6, 0.5, 128), ball_indenter(0.02), 0.05
     spent = timed(lambda: support.pressure(indenter, load).values.max(), rounds)
     radius = (3 * load * 0.01 / (4 * support.plane_modulus)) ** (1 / 3)

@@ -1,8 +1,8 @@
 """Contacts found in images of pressed skins: the published experiments, and a comparison of contact finders.
 
 Chen et al. 2022 pressed a disk of 100 mm with weights, and detected contacts in back-projected images. Their skin is
-simulated (`benchmarks/problems/contact_frames.py`). Millimetres, profiles and ratios are comparable with theirs, pixel
-values are not.
+simulated (`benchmarks/problems/contact_frames.py`). Distances in millimetres, profiles and ratios are comparable with
+the published figures, pixel values are not.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jeit.touch.contacts import CellFinder, RasterFinder, find_contacts
 from jeit.touch.simulate import DiscIndenter, Press
 
 METHODS = ("one-step", "back-projection")
-# Beyond this distance a detected contact matches none of the true ones, metres.
+# Maximum distance in metres at which a detected contact matches a true contact.
 CUT = 0.015
 AREAS, RATIOS = (415.5, 615.8, 1134.1), (1.0, 1.35, 2.68)
 GRAMS = (100, 200, 400, 700, 1000, 1500, 2000, 2500, 3000, 3500, 3900)
@@ -26,19 +26,20 @@ PLAIN = {"constant": 10.0, "opening": 5, "smoothing": 0.0}
 
 
 class Images:
-    """The frames of a skin as images by one method, and the contacts in them."""
+    """Images of the frames of a skin by one method, and the contacts found in the images."""
 
     def __init__(self, frames: ContactFrames, method: str):
         self.frames, self.reconstruction = frames, frames.reconstruction(method)
         self.noise = frames.image_noise(self.reconstruction)
 
     def found(self, finder, read: np.ndarray) -> list:
-        """Contacts of every frame (n, M)."""
+        """Contacts that `finder` finds in the image of every frame of `read` (frames, channels)."""
         return [find_contacts(finder, one, self.noise) for one in self.frames.images(self.reconstruction, read)]
 
 
 def run(options: Options) -> Result:
-    """The published experiments, then the finders on touches that were not used to choose defaults."""
+    """Repeat the published experiments, then compare contact finders on touches that were not used to choose
+    defaults."""
     nodes = (1500, 600) if options.quick else (4000, 1000)
     quick = options.quick
     frames, single = ContactFrames(nodes=nodes), ContactFrames(nodes=nodes, saturation=SINGLE)
@@ -151,7 +152,8 @@ EXPERIMENTS = {
 
 
 def _layers(frames, single, finder) -> list[str]:
-    """The smallest change that is detected, in standard deviations of a cell: 0.5 N on two layers, 60 N on one."""
+    """The smallest detected change of conductivity, in standard deviations of a cell's noise: 0.5 N on two layers, 60 N
+    on one layer."""
     radius = np.sqrt(226.98e-6 / np.pi)
     figures = []
     for method in METHODS:
@@ -172,7 +174,8 @@ def _layers(frames, single, finder) -> list[str]:
 
 
 def _finders(nodes, quick: bool) -> Table:
-    """Each finder on touches of two materials, three levels of noise, discs and balls, one to three at once."""
+    """A table of the errors of each contact finder, for skins of two materials, three levels of noise, and one to three
+    simultaneous discs and balls."""
     skins = [
         ContactFrames(name, noise, nodes=nodes, seed=7)
         for name in ("velostat", "conductive fabric")
@@ -210,7 +213,8 @@ def _finders(nodes, quick: bool) -> Table:
 
 
 def compared(true: list, found: list) -> tuple[float, list[float]]:
-    """OSPA distance, metres, and the distances of matched contacts."""
+    """OSPA distance (optimal subpattern assignment) between true and found contacts, in metres, and the distances of
+    matched contacts."""
     if not found:
         return CUT, []
     distance = np.linalg.norm(np.array(true)[:, None] - np.array(found), axis=-1)
@@ -221,7 +225,8 @@ def compared(true: list, found: list) -> tuple[float, list[float]]:
 
 
 def _nearest(found: list, place: np.ndarray) -> float:
-    """Distance of the strongest contact, metres. It is the diameter of the skin where there is none."""
+    """Distance in metres of the strongest found contact from `place`; the diameter of the skin if no contact is
+    found."""
     return float(np.linalg.norm(found[0].centroid - place)) if found else 2 * RADIUS
 
 

@@ -1,8 +1,9 @@
-"""kill -9 at random moments: whether the remaining files can be read, and whether the next run gives the undisturbed
-result.
+"""Commands killed by `kill -9` at random moments: whether the remaining files can be read, and whether the next run
+gives the same result as an undisturbed run.
 
-Half of the moments are drawn from all of a command's time, half from the time in which it writes. Studies are resumed
-after every kill, on the same store, until they end. The other commands are run anew after every few kills.
+Half of the moments are drawn from the whole running time of a command, half from the time in which the command writes.
+Studies are resumed after every kill, on the same store, until they end. Other commands are run again from the beginning
+after every few kills.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ from benchmarks.harness.case import Case, Options, Result, Table, judged
 from benchmarks.harness.timing import say
 from benchmarks.problems.killed_commands import Command, study, tank, unreadable, watch
 
-# Kills of a study, of another command, and of any command in a quick run.
+# Number of kills of a study, of another command, and of any command in a quick run.
 KILLS, FEWER, QUICK = 30, 10, 1
-# A command that is not resumed runs to its end after this number of kills.
+# Number of kills after which a command that cannot be resumed runs to its end.
 ANEW = 5
 HEADER = ["command", "kills", "while it wrote", "readable after", "runs that ended after", "equal to undisturbed"]
 
 
 class Survived(NamedTuple):
-    """Counts of kills, of kills after the command had begun to write, of readable remains, of completed runs, of runs
-    with the same bytes as an undisturbed one, and a list of faults.
+    """Numbers of kills, of kills after the command had begun to write, of kills that left readable files, of completed
+    runs, of runs with the same bytes as an undisturbed run, and a list of faults.
     """
 
     kills: int
@@ -40,7 +41,7 @@ class Survived(NamedTuple):
 
 
 def run(options: Options) -> Result:
-    """Every command."""
+    """Kill every command at random moments."""
     kills, random = QUICK if options.quick else KILLS, np.random.default_rng(0)
     rows, asked, wrong = [], [], []
     with tempfile.TemporaryDirectory() as name:
@@ -63,7 +64,7 @@ def run(options: Options) -> Result:
 
 
 def _survive_all(folder: Path, kills: int, random: np.random.Generator, *, quick: bool):
-    """The result of each command, and the command."""
+    """Yield each command with its result."""
     embedded = study(folder / "embedded", "study run")
     yield survive_resumed(embedded, kills, random), embedded
     if not quick:
@@ -82,7 +83,8 @@ def _survive_all(folder: Path, kills: int, random: np.random.Generator, *, quick
 
 
 def survive_resumed(command: Command, kills: int, random: np.random.Generator) -> Survived:
-    """Kill and resume the command until it ends, repeatedly from the beginning."""
+    """Kill and resume a command until it ends, and repeat this from the beginning until it has been killed `kills`
+    times."""
     from jeit.design.study import read_study, study_progress
 
     begun, span, whole = command.whole()
@@ -107,7 +109,7 @@ def survive_resumed(command: Command, kills: int, random: np.random.Generator) -
 
 
 def survive_anew(command: Command, kills: int, random: np.random.Generator) -> Survived:
-    """Kill the command, and every few times let it end, in the same folder."""
+    """Kill a command `kills` times in the same folder, and let it run to its end after every few kills."""
     command.clear(all=True)
     begun, span, whole = command.whole()
     killed = writing = readable = ends = equal = 0
@@ -125,7 +127,7 @@ def survive_anew(command: Command, kills: int, random: np.random.Generator) -> S
         wrong += [f"{command.name}: killed at {moment}: {one}" for one in broken]
         if killed % ANEW and killed < kills:
             continue
-        run_until(command, None)  # with the remains of the killed runs, including caches
+        run_until(command, None)  # with the files that the killed runs left, including caches
         ends += 1
         same = command.written() == whole
         equal += same
@@ -134,20 +136,21 @@ def survive_anew(command: Command, kills: int, random: np.random.Generator) -> S
 
 
 class Moment(NamedTuple):
-    """Seconds after a command is started, or after it has begun to write."""
+    """Moment of a kill: seconds after the start of a command or, if `writing`, after the command has begun to write."""
 
     seconds: float
     writing: bool
 
     @classmethod
     def draw(cls, random: np.random.Generator, begun: float, span: float) -> Moment:
-        """A random moment in all of a command's time, or in the time in which it writes."""
+        """Draw a random moment in the whole running time of a command, or in the time in which the command writes."""
         writing = bool(random.random() < 0.5)
         return cls(float(random.uniform(0.0, span - begun if writing else span)), writing)
 
 
 def run_until(command: Command, moment: Moment | None, *, again: bool = False) -> str:
-    """Run a command, and kill it at a moment: "ended" if it ended before, "killed", or "killed while it wrote"."""
+    """Run a command, and kill it at the `moment`. Returns "ended" if the command ended before, "killed", or "killed
+    while it wrote"."""
     stamp, start = time.time(), time.perf_counter()
     process = command.start(again=again)
     wrote = False

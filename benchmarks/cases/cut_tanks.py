@@ -1,6 +1,7 @@
 """Tanks like the Kuopio challenge's with 0 to 12 missing electrodes: the score of the default segmentation.
 
-Tanks are those of `problems/cut_tanks.py`, solved without jeit. None of them was used when the defaults were set.
+The simulated tanks are those of `problems/cut_tanks.py`, solved without jeit. None of these tanks was used to set the
+defaults.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ METHODS = ("auto", "total-variation")
 
 
 def run(options: Options) -> Result:
-    """One level of every tank in turn. The challenge's score by level."""
+    """Segment the tanks, each at one level in turn; the table states the mean score of the challenge for each level."""
     seeds = range(FIRST, FIRST + (1 if options.quick else TANKS))
     scores: dict[tuple[str, int], list[float]] = {}
     for seed in seeds:

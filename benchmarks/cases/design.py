@@ -1,8 +1,9 @@
 """Maps of touched skins: jeit beside SciPy and scikit-learn.
 
-Exact maps of 48 × 48 touches on a sheet and on a layer, beside one SuperLU factorisation per touch (a few touches of
-each map, multiplied by their number). Linear maps of many layouts in one batch and one by one. k-means of the same
-vectors. The cost of exact maps against the number of nodes.
+Tasks are exact maps of 48 × 48 touches on a sheet and on a layer, compared with one SuperLU factorisation per touch
+(measured for a few touches of each map, multiplied by their number); linear maps of many layouts in one batch and one
+by one; k-means clustering of the voltage changes of all touches; and exact maps of several meshes, which show how the
+time grows with the number of nodes.
 """
 
 from __future__ import annotations
@@ -32,12 +33,13 @@ from jeit_solvers import kmeans
 
 HEADER = ["task", "nodes", "jeit", "opponent", "times jeit's", "compile", "agreement"]
 FASTER, SAME = 30.0, 1e-8
-# Cell sizes in metres: of the map that SciPy computes too, and of maps that show the growth of cost.
+# Cell sizes in metres: first of the map that SciPy computes too, then of maps that show the growth of cost.
 CASES = {"sheet": (3.07e-3, 4.3e-3, 6.3e-3), "layer": (4.34e-3, 6e-3, 8e-3)}
 
 
 class ExactMap(NamedTuple):
-    """Nodes, touches, jeit's time, SciPy's seconds and the largest relative difference (or None)."""
+    """Numbers of nodes and touches of an exact map, jeit's time, SciPy's seconds, and the largest relative difference
+    between both maps (the last two may be None)."""
 
     nodes: int
     touches: int
@@ -46,7 +48,7 @@ class ExactMap(NamedTuple):
     worst: float | None
 
     def row(self, kind: str) -> list[str]:
-        """Its row of the table."""
+        """The row of the table for this map."""
         row = [f"exact map, {kind}, {self.touches} touches", str(self.nodes), duration(self.spent.median)]
         if self.theirs is None:
             return [*row, "", "", duration(self.spent.compile), ""]
@@ -55,7 +57,7 @@ class ExactMap(NamedTuple):
 
 
 def run(options: Options) -> Result:
-    """Exact maps, clusters and batches of layouts."""
+    """Measure exact maps, clusters and batches of layouts."""
     quick, rounds = options.quick, options.rounds or (1 if options.quick else 3)
     cases = {"sheet": (7e-3,)} if quick else CASES
     places, sample = (12, 3) if quick else (48, 12)
@@ -79,7 +81,8 @@ def run(options: Options) -> Result:
 
 
 def exact_map(kind: str, cell_size: float, places: int, sample: int, rounds: int) -> ExactMap:
-    """Touches all over one skin. SciPy's time is that of `sample` touches, if `sample` is not 0."""
+    """Measure the exact map of touches all over one skin. SciPy's time is extrapolated from `sample` touches; SciPy is
+    left out if `sample` is 0."""
     model, conductivity, options = skin(kind, cell_size)
     grid = touch_grid(Rectangle(SIDE, SIDE), places, places)
     touched = touched_cells(model.mesh, Bell(), grid.places, **options)
@@ -98,8 +101,8 @@ def exact_map(kind: str, cell_size: float, places: int, sample: int, rounds: int
 
 
 def many_layouts(numbers: tuple[int, ...], rounds: int) -> tuple[list[list[str]], list[tuple[int, float]]]:
-    """Rows of linear maps of several numbers of layouts, in one batch and one after the other, and seconds of each
-    batch.
+    """Table rows for linear maps of several numbers of layouts, computed in one batch and one after the other, and the
+    seconds of each batch.
     """
     model, conductivity, options = skin("sheet", 6.3e-3)
     touched = touched_cells(model.mesh, Bell(), touch_grid(Rectangle(SIDE, SIDE), 24, 24).places, **options)
@@ -115,7 +118,7 @@ def many_layouts(numbers: tuple[int, ...], rounds: int) -> tuple[list[list[str]]
     for number in numbers:
         moves = 1e-3 * jax.random.normal(jax.random.key(0), (number, 32, 2))
         together = timed(lambda moves=moves: batch(moves), rounds)
-        # One after the other each costs the same, however many there are: a few are timed.
+        # One after the other, every layout takes the same time, so only a few layouts are timed.
         few = moves[:16]
         alone = timed(lambda few=few: [jax.block_until_ready(one(move)) for move in few], rounds).median / len(few)
         same = float(jnp.max(jnp.abs(together.answer[-1] / one(moves[-1]) - 1)))
@@ -131,7 +134,8 @@ def many_layouts(numbers: tuple[int, ...], rounds: int) -> tuple[list[list[str]]
 
 
 def clusters(rounds: int, quick: bool) -> list[str]:
-    """A row for 90 clusters of the changes of 2,304 touches by 94 voltages, beside scikit-learn on one thread."""
+    """A table row for k-means with 90 clusters of 2,304 vectors (touches) of 94 voltage changes, compared with
+    scikit-learn on one thread."""
     model, conductivity, options = skin("sheet", 7e-3 if quick else 5e-3)
     grid, number = touch_grid(Rectangle(SIDE, SIDE), *((12, 12) if quick else (48, 48))), 10 if quick else 90
     touched = touched_cells(model.mesh, Bell(), grid.places, **options)
@@ -156,7 +160,8 @@ def _asked_of_maps(kind: str, found: list[ExactMap]) -> list[Asked]:
 
 
 def _growth(asked: str, cost: list[tuple[int, float]]) -> Asked:
-    """The exponent with which seconds grow, reported but not judged."""
+    """The exponent with which seconds grow with the number of nodes or layouts; it is reported but not judged. `cost`
+    has pairs of number and seconds."""
     return Asked(asked, f"{np.polyfit(*np.log(np.array(cost)).T, 1)[0]:.2f}")
 
 

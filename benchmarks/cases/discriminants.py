@@ -1,8 +1,9 @@
 """Which square of a fabric is touched, by nine classifiers, beside Russo et al. (2017). The fabric is simulated.
 
-The simulation and its variation are in `problems/fabric.py`. Comparable with the paper: the order of methods, what
-grows and falls, and where the quadratic discriminant fails, but not percentages. Tests a day later use changes as they
-are read, as in the paper. With a renewed reference too few squares are misclassified for a comparison.
+The simulation and its variation are in `problems/fabric.py`. Comparable with the paper are the order of methods, the
+signs of trends, and the cases in which the quadratic discriminant fails, but not percentages. Tests a day later use
+changes from the old reference, as in the paper; with a renewed reference, too few squares are misclassified for a
+comparison.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ from benchmarks.problems.classified_squares import DayLater, Learnt, held_out, s
 from benchmarks.problems.fabric import PRESSES, REPETITIONS, Fabric
 from jeit.touch.learnt.methods import CLASSIFIERS
 
-# Observations per class. The study of errors has one more number. With more than MANY these methods would take ten
-# minutes or more.
+# Numbers of observations per class; the study of errors has one more number. With more than MANY observations, these
+# methods would take ten minutes or more.
 SIZES, ERROR_SIZES, MANY = (24, 240, 2400), (24, 240, 1200, 2400), 240
 SLOW = ("boosted-trees", "bagged-trees")
-# For the untouched fabric: drifts, and frames of each.
+# For the untouched fabric: number of random drifts, and number of frames for each drift.
 DRIFTS, FRAMES = 100, 10
 LINEAR, QUADRATIC = "linear-discriminant", "quadratic-discriminant"
-# The paper's accuracies on folds of the training presses, and on tests a day later, per cent.
+# The paper's accuracies in per cent, on held-out folds of the training presses, and on tests a day later.
 TRAINED = {
     "tree": (78, 79, 72),
     "linear-discriminant": (92, 94, 94),
@@ -42,12 +43,13 @@ TESTED = {
     (16, 0.13, 0.015): 91.6, (16, 0.13, 0.010): 77.8, (16, 0.17, 0.015): 88.7, (16, 0.17, 0.010): 80.6,
     (8, 0.13, 0.015): 69.0, (8, 0.13, 0.010): 29.9, (8, 0.17, 0.015): 56.8, (8, 0.17, 0.010): 37.4,
 }  # fmt: skip
-# Number of electrodes, side and target, metres.
+# Key of a fabric: number of electrodes, side of the fabric and side of a square in metres.
 Key = tuple[int, float, float]
 
 
 def run(options: Options) -> Result:
-    """Nine classifiers by three sizes, eight fabrics, errors by distance and by size, no touch, a bent fabric."""
+    """Evaluate nine classifiers for three sizes of training data, eight fabrics, errors by distance and by size,
+    untouched fabrics, and a bent fabric."""
     quick = options.quick
     presses, nodes, sizes = (2, 500, (12,)) if quick else (PRESSES, 2000, SIZES)
     names = (LINEAR, QUADRATIC) if quick else tuple(CLASSIFIERS)
@@ -65,8 +67,8 @@ def run(options: Options) -> Result:
 
 
 def _by_method(fabric: Fabric, names: tuple[str, ...], sizes: tuple[int, ...]):
-    """The paper's first table, the percentage right of held-out observations by method and size, and the seconds per
-    frame of the slowest method.
+    """The paper's first table, the percentages of correctly classified held-out observations by method and size, and
+    the seconds per frame of the slowest method.
     """
     timed = sizes[min(1, len(sizes) - 1)]
     rows, at_random, slowest = [], {name: [] for name in names}, 0.0
@@ -96,7 +98,7 @@ def _by_method(fabric: Fabric, names: tuple[str, ...], sizes: tuple[int, ...]):
 
 
 def _by_fabric(fabrics: dict[Key, Fabric], size: int) -> tuple[Table, dict[Key, tuple[DayLater, DayLater]]]:
-    """The paper's second table, and the test results of each fabric, as read and with a renewed reference."""
+    """The paper's second table, and the test results of each fabric, with the old and with a renewed reference."""
     rows, results = [], {}
     for key, fabric in fabrics.items():
         learnt = Learnt.by(QUADRATIC, *fabric.observations(size)[:2])
@@ -112,7 +114,7 @@ def _by_fabric(fabrics: dict[Key, Fabric], size: int) -> tuple[Table, dict[Key, 
 
 
 def _by_distance(fabrics: dict[Key, Fabric], results: dict[Key, tuple[DayLater, DayLater]]) -> Table:
-    """Errors of squares, centimetre by centimetre."""
+    """A table of the mean errors of squares by their distance from the nearest electrode, in steps of a centimetre."""
     steps = {key: np.floor(1e2 * fabric.distance).astype(int) for key, fabric in fabrics.items()}
     rows = []
     for step in np.unique(np.concatenate([*steps.values()])):
@@ -128,7 +130,8 @@ def _by_distance(fabrics: dict[Key, Fabric], results: dict[Key, tuple[DayLater, 
 
 
 def _by_size(fabrics: dict[int, Fabric], sizes: tuple[int, ...]) -> tuple[Table, dict[int, list[float]]]:
-    """The effect of more observations, by number of electrodes. Errors a day later, mm."""
+    """A table of the errors a day later in millimetres against the number of training observations, and the errors by
+    number of electrodes."""
     rows, errors = [], {number: [] for number in fabrics}
     for number, fabric in fabrics.items():
         for size in sizes:
@@ -144,7 +147,7 @@ def _by_size(fabrics: dict[int, Fabric], sizes: tuple[int, ...]) -> tuple[Table,
 
 
 def _no_touch(fabric: Fabric, size: int) -> Table:
-    """The untouched fabric as one more class."""
+    """A table of the results with the untouched fabric as an additional class."""
     squares = len(fabric.middles)
     features, label, repetition = fabric.observations(size, untouched=True)
     learnt, held = Learnt.by(QUADRATIC, features, label), []
@@ -167,8 +170,9 @@ def _no_touch(fabric: Fabric, size: int) -> Table:
 
 
 def _shares(none, predicted, right, squares: int) -> tuple[np.floating, ...]:
-    """Shares of untouched frames (n,) and touches (…) by their predicted class, with the `right` squares: the columns
-    above.
+    """Fractions of untouched frames that are recognised as untouched, of touches that are missed, and of touches whose
+    predicted square is the `right` one. `none` and `predicted` are the predicted classes of untouched frames and of
+    touches.
     """
     return np.mean(none == squares), np.mean(predicted == squares), np.mean(predicted == right)
 
@@ -178,7 +182,7 @@ def _per_cent(shares) -> list[str]:
 
 
 def _bent(flat: Fabric, bent: Fabric, size: int) -> Table:
-    """The same squares on a flat and on a bent fabric."""
+    """A table of the results for the same squares on a flat and on a bent fabric."""
     rows = []
     for learnt_on, fabric, asked in (("flat", flat, {"flat": flat, "bent": bent}), ("bent", bent, {"bent": bent})):
         observations = fabric.observations(size)
@@ -197,7 +201,7 @@ def _bent(flat: Fabric, bent: Fabric, size: int) -> Table:
 
 
 def _asked(at_random: dict, slowest: float, fabrics: dict[Key, Fabric], results: dict, errors: dict) -> list[Asked]:
-    """The paper's findings, as far as they are comparable. Tests a day later are as read, like the paper's."""
+    """Checks of the paper's findings that are comparable. Tests a day later use the old reference, as in the paper."""
     day = {key: as_read for key, (as_read, _) in results.items()}
     fewer = sum(day[16, *rest].accuracy > day[8, *rest].accuracy for rest in product((0.13, 0.17), (0.015, 0.010)))
     larger = sum(day[*rest, 0.015].accuracy > day[*rest, 0.010].accuracy for rest in product((16, 8), (0.13, 0.17)))
@@ -238,8 +242,8 @@ def _asked(at_random: dict, slowest: float, fabrics: dict[Key, Fabric], results:
 
 
 def _rank_correlation(at_random: dict[str, list[float]], size: int) -> str:
-    """Spearman's rank correlation of rounded percentages, of the methods with an accuracy at this size. None where all
-    are equal.
+    """Text of Spearman's rank correlation between our and the paper's rounded percentages over the methods with an
+    accuracy at this `size`; "–" if all percentages are equal.
     """
     names = [name for name, found in at_random.items() if len(found) > size]
     ours, theirs = [round(at_random[name][size]) for name in names], [TRAINED[name][size] for name in names]

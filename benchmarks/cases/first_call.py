@@ -36,7 +36,7 @@ def image(length):
     reconstruct(model, model.voltages(1.1), 1.0, prior=Gaussian(length), hyperparameter=3.0)
 """
 )
-# A simulated skin, tapped and touched, as in docs/how-to/calibrate-microphones.md.
+# Script that simulates taps and touches on a skin, as in docs/how-to/calibrate-microphones.md.
 _SKIN = """
 import jax
 from jeit.acoustic import Recording, Taps, write_recording, write_taps
@@ -59,10 +59,10 @@ calibrate_microphones(taps).calibration.save("skin.json")
 
 @dataclass(frozen=True)
 class Job:
-    """One command or script: command-line arguments or a script, its limits, and the seconds cold and warm.
+    """A command or a script to be timed: command-line arguments or the script, and the maximum seconds `cold` and
+    `warm`.
 
-    `before`: what the script has done already when the clock starts. `files`: a script that writes the files to be
-    read.
+    `before`: code that runs before the clock starts. `files`: a script that writes the files to be read.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Job:
 
 
 def jobs(options: Options) -> list[Job]:
-    """Those that can run here: measured tanks need their data."""
+    """The jobs that can run on this machine: jobs on measured tanks need the data."""
     few = [
         Job("import jeit", script="import jeit", cold=2.0),
         Job("jeit demo", ("demo",), cold=8.0, warm=4.0),
@@ -95,7 +95,7 @@ def jobs(options: Options) -> list[Job]:
         ]
     return [
         *few,
-        # Together they may take 8 s.
+        # The following two jobs together may take 8 s.
         Job("jeit calibrate-microphones", ("calibrate-microphones", "taps.npz"), files=_SKIN, warm=4.0),
         Job("jeit locate", ("locate", "recording.npz", "-c", "skin.json"), files=_CALIBRATED, warm=4.0),
         Job("jeit layout compare", ("layout", "compare", "park-inner", "park-boundary"), warm=15.0),
@@ -109,7 +109,7 @@ def jobs(options: Options) -> list[Job]:
 
 
 def run(options: Options) -> Result:
-    """Each job cold, with no cache of compiled code, and warm, median of three."""
+    """Time each job cold, without a cache of compiled code, and warm (median of three runs)."""
     rows, checks = [], []
     for job in jobs(options):
         with tempfile.TemporaryDirectory() as folder:
@@ -136,7 +136,7 @@ def _again(job: Job, folder: Path) -> tuple[float, float]:
 def seconds(job: Job, folder: Path) -> tuple[float, float]:
     """Wall and CPU seconds of a job in a fresh process, with its caches in `folder`.
 
-    Raises `RuntimeError` if it fails. Of a job with something done `before`, only the part after that counts.
+    Raises `RuntimeError` if the job fails. The code `before` of a job is not counted.
     """
     environment = dict(os.environ, XDG_CACHE_HOME=str(folder / "cache"), MPLCONFIGDIR=str(folder / "matplotlib"))
     for name in ("JAX_COMPILATION_CACHE_DIR", "JEIT_COMPILATION_CACHE", "PYTHONDONTWRITEBYTECODE"):
@@ -163,7 +163,7 @@ def _children() -> float:
 
 
 def _fifteen_lines() -> str:
-    """README's example, up to its image."""
+    """The example of README.md, up to the computation of the image."""
     block = re.search(r"## Fifteen lines\n+```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     assert block is not None
     return block.group(1).split("plot_image(")[0]

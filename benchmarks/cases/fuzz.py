@@ -1,4 +1,5 @@
-"""Randomly corrupted files for every reader and some commands: accepted, refused in one clear error, or a fault."""
+"""Randomly corrupted files are given to every reader and to some commands: a file is accepted, refused with one clear
+error, or causes a fault."""
 
 from __future__ import annotations
 
@@ -10,13 +11,14 @@ from benchmarks.harness.case import Case, Options, Result, Table, judged
 from benchmarks.harness.timing import say
 
 ROOT = Path(__file__).resolve().parents[2]
-# Inputs of files, 200 for each reader, and of commands, which take a second each.
+# Number of corrupted files for readers (200 for each reader), for commands (a second each), and for readers in a quick
+# run.
 FILES, COMMANDS, QUICK = 6200, 200, 310
 HEADER = ["reader or command", "tried", "one clear error", "accepted", "faults", "slowest"]
 
 
 def run(options: Options) -> Result:
-    """Both, by the fuzzer's own command."""
+    """Corrupt files for readers and for commands, by the fuzzer's own command."""
     counts = [("--files", QUICK)] if options.quick else [("--files", FILES), ("--commands", COMMANDS)]
     rows, wrong = [], []
     for which, number in counts:

@@ -1,8 +1,9 @@
 """Five Gauss-Newton iterations: jeit beside pyEIT and SciPy.
 
-From the homogeneous background to noisy voltages of a disk with 16 electrodes. With complete electrodes, jeit and SciPy
-minimise the same function, so their images must be equal. pyEIT has point electrodes and a different regularisation, so
-the misfit is compared. See the folder's `README.md` for the contestants and the timing.
+The iterations start from the homogeneous background and fit noisy voltages of a disk with 16 electrodes. With the
+complete electrode model, jeit and SciPy minimise the same function, so their images must be equal. pyEIT has point
+electrodes and a different regularisation, so only the misfit is compared. See the folder's `README.md` for the
+contestants and the timing.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ from benchmarks.problems.accuracy import difference
 HEADER = ["nodes", "electrodes", "contestant", "one image", "times jeit's", "compile", "misfit", "error of image"]
 HEADER += ["peak memory"]
 NODES, ROUNDS, BUDGET, LIMIT = (1150, 5000), 15, 6.0, 600.0
-# Required ratios of time to pyEIT, up to a number of nodes, and to SciPy.
+# Required ratios of pyEIT's time to jeit's, each up to a number of nodes, and of SciPy's time to jeit's.
 AGAINST_PYEIT, AGAINST_SCIPY = ((2000, 100.0), (np.inf, 500.0)), 4.0
-# Images at the minimum of one function, after five steps.
+# Maximum relative difference of images after five steps of minimising the same function.
 AGREEMENT = 1e-6
 
 
 def pose(num_points: int, model: str):
-    """The problem's arrays, and jeit's model, which simulates the voltages and computes every misfit."""
+    """The arrays of a problem, and a function of jeit's model that simulates the voltages and computes every misfit."""
     arrays = problem.make(num_points, 16, model)
     simulator = JeitContestant(arrays)
     voltages, rest = (np.asarray(simulator.tasks[task](0)) for task in ("64 conductivities", "homogeneous"))
@@ -43,7 +44,7 @@ def pose(num_points: int, model: str):
 
 
 def run(options: Options) -> Result:
-    """Both electrode models on every mesh."""
+    """Run both electrode models on every mesh."""
     pyeit = None if options.without_pyeit else environment.python("pyeit", create=not options.quick)
     scipy = dict.fromkeys(("scipy plain", "scipy tuned"), sys.executable)
     matches = {"complete": scipy, "point": {} if pyeit is None else {"pyeit": pyeit}}
@@ -66,7 +67,7 @@ def run(options: Options) -> Result:
 
 @dataclass
 class Match:
-    """One problem: the contestants, their times, and each one's image, misfit and distance from the truth."""
+    """Results of one problem: the time, image, misfit and distance from the truth of each contestant."""
 
     nodes: int
     electrodes: str
@@ -78,7 +79,7 @@ class Match:
 
     @property
     def rows(self) -> list[list[str]]:
-        """Its rows of the table."""
+        """The rows of the table for this match."""
         mine, rows = self.figures["jeit"], []
         for name, one in self.figures.items():
             row = [str(self.nodes), self.electrodes, name, cell(one), ratio(one, mine), duration(one.compile)]
@@ -89,12 +90,13 @@ class Match:
 
     @property
     def asked(self) -> list[Asked]:
-        """The required figures beside the measured ones. Nothing is required against the tuned baseline."""
+        """The required figures, compared with the measured figures. Nothing is required in comparison with the tuned
+        baseline."""
         return [_asked(self, name) for name in self.figures if name not in ("jeit", "scipy tuned")]
 
     @property
     def wrong(self) -> list[str]:
-        """Images of the same objective that differ."""
+        """Messages about contestants whose images differ although they minimise the same function."""
         mine, wrong = self.images["jeit"], []
         for name, image in self.images.items():
             if name.startswith("scipy") and difference(image, mine) > AGREEMENT:
@@ -103,7 +105,7 @@ class Match:
 
     @property
     def headline(self) -> Headline | None:
-        """jeit beside the faster SciPy."""
+        """The headline: jeit compared with the faster SciPy contestant."""
         others = {name: self.figures[name] for name in self.images if name.startswith("scipy")}
         if not others:
             return None
@@ -116,7 +118,8 @@ class Match:
 
 
 def play(num_points: int, model: str, opponents: dict[str, str], options: Options) -> Match:
-    """One problem. `opponents`: name: interpreter. One that does not run is left out, and a note says why."""
+    """Run one problem. `opponents`: Python interpreter of each opponent by name. An opponent that does not run is left
+    out, and a note states why."""
     arrays, predict = pose(num_points, model)
     rounds, budget = options.rounds or (2 if options.quick else ROUNDS), 0.5 if options.quick else BUDGET
     nodes, contestants, notes = len(arrays["points"]), [], []

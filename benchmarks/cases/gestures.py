@@ -2,9 +2,9 @@
 simulated.
 
 The simulation and the differences between people are in `problems/touching_people.py` and `jeit.touch.simulate.people`.
-Comparable with the paper: that one person's gestures are classified better than many people's, and which gestures are
-confused, but not percentages. The paper's folds are random, so that every person is in the training data. Held-out
-people are not.
+Comparable with the paper are the finding that one person's gestures are classified better than many people's, and the
+pairs of gestures that are confused, but not percentages. The paper's folds are random, so that every person is in the
+training data. Here, people are also held out from the training data.
 """
 
 from __future__ import annotations
@@ -34,20 +34,21 @@ from jeit.touch.reports.touch_watch import WrittenWatch, draw_watch
 from jeit.touch.simulate.people import GESTURES
 
 FOLDS = 15
-# The paper's percentages right of each gesture, of one person and of 35.
+# The paper's percentages of correctly classified gestures, for one person and for 35 people.
 PAPER = {"one person": (85, 83, 97, 93, 93, 97), "many people": (84, 61, 89, 58, 65, 87)}
 PAIRS = (("tap", "pat"), ("pat", "tap"), ("stroke", "scratch"), ("scratch", "stroke"))
-# Of those pairs, per cent.
+# The paper's percentages of the first gesture of each pair that are classified as the second.
 CONFUSED = {"one person": (14, 15, 7, 7), "many people": (15, 27, 37, 34)}
 THEIRS, HIS = "logit-boost", "seven"
 MINUTE = 60.0  # number of gestures in the stream
-# Where sets are kept from one run to the next.
+# Folder in which simulated gesture sets are kept for later runs.
 STORE = Path(tempfile.gettempdir()) / "jeit-gestures"
 
 
 @dataclass
 class Experiment:
-    """Touches (n,) with their numbers of gesture and person, and the number of recordings without a touch."""
+    """Detected touches, the numbers of their true gestures (`right`) and persons, and the number of recordings without
+    a detected touch (`missed`)."""
 
     name: str
     touches: list[StreamTouch]
@@ -58,7 +59,7 @@ class Experiment:
 
     @classmethod
     def of(cls, name: str, sheet: Sheet, made: GestureSet) -> Experiment:
-        """The touches detected in a set."""
+        """Detect the touches in a gesture set."""
         found = sheet.touches(made)
         there = [number for number, one in enumerate(found) if one is not None]
         touches = [one for one in found if one is not None]
@@ -67,7 +68,8 @@ class Experiment:
         return cls(name, touches, right, made.person[there], len(found) - len(there), cut_off)
 
     def confusion(self, method: str, form: str, folds: np.ndarray) -> np.ndarray:
-        """Shares (6, 6), per cent, of each gesture that were classified as each."""
+        """Confusion matrix (6, 6): percentages of each true gesture (row) that are classified as each gesture
+        (column)."""
         odds = held_out_odds(method, FEATURE_FORMS[form](self.touches).values, self.right, folds)
         counts = np.zeros((len(GESTURES), len(GESTURES)))
         np.add.at(counts, (self.right, odds.argmax(axis=1)), 1)
@@ -75,7 +77,8 @@ class Experiment:
 
 
 def run(options: Options) -> Result:
-    """One person and many, by every classifier, held out at random and by person, and the time of a classification."""
+    """Evaluate every classifier on one person and on many people, held out at random and by person, and time a
+    classification."""
     quick = options.quick
     sheet = Sheet(fine=1300, nodes=900) if quick else Sheet()
     sizes = (
@@ -140,7 +143,8 @@ def run(options: Options) -> Result:
 
 
 def _gestures(name: str, confusion: np.ndarray, paper: tuple[int, ...] | None = None) -> list[str]:
-    """The percentage right of each gesture and on average, the paper's in brackets."""
+    """A table row: percentage of correctly classified recordings of each gesture and on average, with the paper's
+    percentages in brackets."""
     own = [*confusion.diagonal(), confusion.diagonal().mean()]
     if paper is None:
         return [name, *(f"{value:.0f}" for value in own)]
@@ -157,11 +161,12 @@ def _caption(experiments: dict[str, Experiment], folds: int) -> str:
 
 @dataclass
 class Live:
-    """The classification of a stream of `frames` with a number of `touches`.
+    """Results of the classification of a stream with a number of `frames` and `touches`.
 
-    Of these `detected`, and classified `right`. Detections without a touch, `false`. The 99th percentile of seconds
-    from a frame to its events, `followed`, from the frame after a touch to its classification, `named`, and from the
-    touch's last frame, `after_end`. The median of `named`, `usual`.
+    `detected` touches are detected and `right` are classified correctly; `false` is the number of detections without a
+    touch. Times in seconds (99th percentiles): `followed`, from a frame to its events; `named`, from the frame after a
+    touch to the classification; `after_end`, from the last frame of a touch to the classification. `usual`: median of
+    `named`.
     """
 
     frames: int
@@ -175,7 +180,7 @@ class Live:
     usual: float
 
     def table(self) -> Table:
-        """The table of all of it."""
+        """The table of all results of the stream."""
         rows = [
             ["touches in the stream, by people who are not in the training data", f"{self.touches}"],
             ["of these detected", f"{self.detected}"],
@@ -190,7 +195,7 @@ class Live:
 
 
 def _live(sheet: Sheet, made: GestureSet, best: tuple[str, str], options: Options) -> Live:
-    """A stream of four people who are not in the training data, processed frame by frame."""
+    """Classify a stream of four people who are not in the training data, frame by frame."""
     model = learn_gestures(sheet.description, made, method=best[0], form=best[1]).model
     stream = sheet.stream(4, 5 if options.quick else 60, 3, store=None if options.quick else STORE)
     still = stream.voltages[stream.seconds < 1.0]
@@ -218,7 +223,7 @@ def _live(sheet: Sheet, made: GestureSet, best: tuple[str, str], options: Option
 
 
 def _draw_timeline(path: Path, watch: TouchWatch, watched: list[WatchedFrame]) -> None:
-    """The first minute of the stream."""
+    """Draw the first minute of the stream."""
     shown = [one for one in watched if one.second < MINUTE]
     touches = tuple(touch for one in shown for touch in one.ended)
     seconds, peaks = (np.array([getattr(one, name) for one in shown]) for name in ("second", "peak"))
@@ -226,7 +231,7 @@ def _draw_timeline(path: Path, watch: TouchWatch, watched: list[WatchedFrame]) -
 
 
 def _draw(output: Path, many: Experiment, best: tuple[str, str]) -> None:
-    """Confusion matrices of many people's gestures, each person held out."""
+    """Draw confusion matrices of the gestures of many people, with each person held out from the training data."""
     from jeit.touch.plots import plot_confusion
 
     labels = np.array(GESTURES)[many.right]
@@ -238,7 +243,7 @@ def _draw(output: Path, many: Experiment, best: tuple[str, str]) -> None:
 
 
 def _asked(found: dict, best: tuple[str, str], live: Live) -> list[Asked]:
-    """The paper's findings, as far as they are comparable."""
+    """Checks of the paper's findings that are comparable."""
     one, many = (found[name, THEIRS, HIS] for name in PAPER)
     left_out = found["by person", *best].diagonal().mean()
     asked = [

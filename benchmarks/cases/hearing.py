@@ -1,8 +1,8 @@
 """Localising touches by sound: jeit beside plain NumPy and SciPy.
 
-25 microphones, 200 × 200 pixels, frames with the noise of the simulated skin. Both minimise the paper's loss, so their
-maps and places must agree. Without a map, SciPy starts from the loudest microphone. Then two tasks that only jeit has:
-the likelihood, and a recording of 25 channels at 40 kHz processed to a track.
+25 microphones, 200 × 200 pixels, frames with the noise of the simulated skin. jeit and SciPy minimise the paper's loss,
+so their maps and positions must agree. Without a map, SciPy starts from the loudest microphone. Two further tasks are
+jeit's only: the likelihood, and the processing of a recording of 25 channels at 40 kHz to a track.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ HEADER = ["task", "jeit, a frame", "frames a second", "NumPy and SciPy", "times 
 MAPS, PLACES, ALL = "maps, the paper's loss", "map and refined place", "all maps kept, and places"
 LIKELY = "place without a map, likelihood"
 FASTER, WITH_MAPS, WITHOUT_MAPS, RECORDING = 20.0, 500.0, 20_000.0, 0.2
-# Maps relative to their largest value. Places in metres.
+# Maximum differences of maps, relative to the largest value, and of positions, in metres.
 SAME_MAP, SAME_PLACE = 1e-10, 1e-6
 
 
 def frames(number: int):
-    """MicrophoneArray, and intensities (F, M) of F touches with noise according to it, the floor and ν."""
+    """A microphone array, and intensities (touches, microphones) of `number` touches with the noise of the array's
+    decay models, noise floor and degrees of freedom ν."""
 
     skin = SoundingSkin(jax.random.key(0))
     microphones = np.asarray(skin.microphones)
@@ -43,7 +44,7 @@ def frames(number: int):
     received = expected_power(skin, places) * np.exp(0.3 * random.standard_normal((number, 1))) * 3.0
     spread = np.sqrt(4 * received * floor / freedom + 2 * floor**2 / freedom)
     power = received + spread * random.standard_normal(received.shape)
-    # The decay models that approximately fit the noise-free skin best.
+    # Parameters of the decay models that approximately fit the noise-free skin best.
     squared = np.sum((microphone_grid(13)[:, None] - microphones) ** 2, axis=-1)
     response = expected_power(skin, microphone_grid(13))
     b = np.full(len(microphones), 1.3e-4)
@@ -54,7 +55,7 @@ def frames(number: int):
 
 
 def run(options: Options) -> Result:
-    """Every task, then the recording, and the required figures."""
+    """Run every task, then the recording, and check the required figures."""
     number, rounds = (8, 2) if options.quick else (32, options.rounds or 15)
     duel = Duel(number)
     rows, spent, theirs = [], {}, {}
@@ -67,7 +68,7 @@ def run(options: Options) -> Result:
             row[3:5] = [duration(theirs[name]), times(theirs[name] / spent[name])]
         rows.append([*row, ""])
         say(" | ".join(rows[-1]))
-    # Last, so that nothing is compiled before it is timed.
+    # Agreement is computed last, so that no function is compiled before it is timed.
     map_error, place_error = duel.agreement()
     same = {MAPS: f"{map_error:.0e}", PLACES: f"{1e6 * place_error:.2g} µm"}
     for row in rows:
@@ -89,7 +90,7 @@ def run(options: Options) -> Result:
 
 
 class Duel:
-    """Frames with and without maps, jeit's localisers and SciPy's."""
+    """Frames, jeit's localisers with and without maps, and SciPy's localiser."""
 
     def __init__(self, number: int):
         self.array, self.power = frames(max(number, 4096))
@@ -99,7 +100,8 @@ class Duel:
         self.mapped = Localiser.create(self.array, method="consistency", map_shape=(200, 200))
 
     def agreement(self) -> tuple[float, float]:
-        """Largest relative difference of maps, and median distance in metres of places inside the skin."""
+        """Largest relative difference between jeit's and SciPy's maps, and median distance in metres between their
+        positions inside the skin."""
         maps, estimate = np.asarray(self.mapped.maps(self.few)), self.mapped(self.few)
         theirs = np.stack([self.plain.locate(frame) for frame in self.few])
         inside = np.abs(theirs).max(axis=1) < 0.1 - 1e-9
@@ -108,7 +110,8 @@ class Duel:
         return float(worst), float(np.median(apart))
 
     def tasks(self):
-        """Name: jeit's function, SciPy's for one frame (or None), and the number of frames that jeit's processes."""
+        """For each task by name: jeit's function, SciPy's function for one frame (or None), and the number of frames
+        that jeit's function processes."""
         mapped, plain, few, many, power = self.mapped, self.plain, self.few, self.many, self.power
         coarse, likelihood = Localiser.create(self.array, method="consistency"), Localiser.create(self.array)
         likely_maps = Localiser.create(self.array, map_shape=(200, 200))
@@ -125,7 +128,7 @@ class Duel:
 
 
 def recording(rounds: int) -> tuple[Timed, int]:
-    """From samples at 40 kHz to a smoothed track, and samples of a channel."""
+    """Time of processing samples at 40 kHz to a smoothed track, and number of samples of a channel."""
 
     skin = SoundingSkin(jax.random.key(0), readout=Readout(multiplexed=False))
     taps = simulate_calibration_taps(skin, jax.random.key(1), microphone_grid(9), repeats=1)
@@ -140,7 +143,7 @@ def recording(rounds: int) -> tuple[Timed, int]:
 
 
 def _asked(spent: dict[str, float], theirs: dict[str, float]) -> list[Asked]:
-    """The required figures from the seconds of a frame, jeit's and SciPy's."""
+    """Checks of the required figures, from jeit's seconds per frame (`spent`) and SciPy's (`theirs`)."""
 
     def at_least(asked: str, measured: float, least: float, unit: str) -> Asked:
         return judged(asked, f"{measured:,.0f}{unit}", measured >= least)

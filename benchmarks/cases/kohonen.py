@@ -1,8 +1,9 @@
-"""Kohonen's map of a skin's frames: the published experiments, beside one-step images of the same frames.
+"""Kohonen's self-organising map of a skin's frames: the published experiments, compared with one-step images of the
+same frames.
 
 Pugach et al. 2015 trained a map on 208 voltages of a disk of 200 mm under a weight of 100 g. Their skin is simulated
-(`benchmarks/problems/weighed_skins.py`). Places, ratios and the order of time constants are comparable, seconds are
-not. No frame for evaluation is in the training data.
+(`benchmarks/problems/weighed_skins.py`). Positions, ratios and the order of time constants are comparable with the
+paper, seconds are not. No frame for evaluation is in the training data.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ from jeit.touch.simulate import BarIndenter, DiscIndenter, Press, PrismIndenter,
 LEARNT, JUDGED, TRIALS = 10_000, 1000, 200
 RATES, THEIR_SECONDS = (0.01, 0.005, 0.001), (4.2, 7.7, 19.6)
 SHAPES = ((13, 16), (32, 32), (64, 64))
-# ε and ρ as published. Their durations are not published: frames of each phase for one round of ten thousand.
+# Numbers of frames in the ordering and tuning phases, for one round of ten thousand frames (durations are not
+# published), and the published initial and final values of the learning rate ε and the radius ρ.
 PUBLISHED = MapSchedule(2000, 8000, (0.01, 0.001), (16.0, 1.0))
 GRAMS, WEIGHTS = (2.3, 6.3, 20.3, 52.3, 102.3), (100.0, 50.0, 20.0)
 APART, NEAR = 0.06, 0.02  # m: between weights, and of a touch from its weight
@@ -56,7 +58,7 @@ def _circle(diameter: float) -> np.ndarray:
     return diameter / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-# Their contact areas.
+# Outlines of the contact areas of the four objects.
 OUTLINES = {
     "prism": [_rectangle(0.06, 0.0)],
     "cube": [_rectangle(0.03, 0.03)],
@@ -66,7 +68,7 @@ OUTLINES = {
 
 
 def run(options: Options) -> Result:
-    """All experiments, with figures where an output folder is given."""
+    """Run all experiments, and draw figures if an output folder is given."""
     quick = options.quick
     learnt, judged_by, trials, nodes = (300, 60, 12, 800) if quick else (LEARNT, JUDGED, TRIALS, 4000)
     disk, square = WeighedSkin("disk", nodes), WeighedSkin("square", nodes)
@@ -184,7 +186,7 @@ def _row(name: str, estimated: np.ndarray, right: np.ndarray) -> list[str]:
 
 
 def _imaged(disk: WeighedSkin, fresh: np.ndarray, rest: np.ndarray, quick: bool) -> np.ndarray:
-    """Places (n, 2) of the strongest inclusion of one-step images on some 1,024 cells."""
+    """Positions (frames, 2) of the strongest inclusion in one-step images on about 1,024 cells."""
     model = disk.model(300 if quick else 560)
     noise = disk.skin.material.noise * float(np.sqrt(np.mean(rest**2)))
     linear = one_step(model, float(disk.skin.conductivity[0]), prior=Laplace(), noise=noise)
@@ -193,7 +195,8 @@ def _imaged(disk: WeighedSkin, fresh: np.ndarray, rest: np.ndarray, quick: bool)
 
 
 def _sensitivity(disk: WeighedSkin, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places (10,) along a diameter, metres, and the mean change (5, 10) of transfer resistance under five weights."""
+    """Positions (10,) along a diameter in metres, and mean changes (5, 10) of transfer resistance under five weights at
+    these positions."""
     along = np.array([*np.linspace(-0.08, 0.08, 9), 0.09])
     touches = [[Press(DiscIndenter(DISC), grams * GRAVITY, (x, 0.0)) for x in along] for grams in GRAMS]
     read = [disk.skin.voltages_under(disk.skin.touched(some)) * disk.skin.gain for some in touches]
@@ -261,7 +264,7 @@ def _several(disk: WeighedSkin, placed: PlacedMap, rest: np.ndarray, trials: int
 
 
 def _topology(disk, square, placed, frames, learnt: int, schedule):
-    """Quality of the maps of both skins, and the arrays for their figures."""
+    """A table of the quality of the maps of both skins, the arrays for the figures, and the trustworthiness."""
     other, there = square.presses(30, learnt)
     again = PlacedMap.learn(SelfOrganisingMap.fit(other, jax.random.key(1), schedule=schedule), other, there)
     rows, trust, drawings = [], [], {}
@@ -283,7 +286,8 @@ def _topology(disk, square, placed, frames, learnt: int, schedule):
 
 
 def _shapes(placed: PlacedMap, pressed: dict[str, np.ndarray], rest: np.ndarray) -> Table:
-    """Length and width, root mean square times √12, of the part of the map that four objects of one load activate."""
+    """A table of the length and width of the part of the map that each of four objects of equal load activates (root
+    mean square distances times √12)."""
     rows = []
     for name, frame in pressed.items():
         shares = neuron_shares(placed, frame, rest)
@@ -303,7 +307,7 @@ def _shapes(placed: PlacedMap, pressed: dict[str, np.ndarray], rest: np.ndarray)
 
 
 def _draw(folder: Path, curves, located, drawings, multi, pressed, sensed) -> None:
-    """One figure of everything that the paper shows."""
+    """Draw one figure of all results that the paper shows."""
     import matplotlib.pyplot as plt
 
     from jeit.touch.plots import plot_map

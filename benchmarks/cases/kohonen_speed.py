@@ -25,7 +25,7 @@ FRAMES, SHAPE, ASKED_S, TIMES, FRAME_S = 10_000, (32, 32), 5.0, 20.0, 0.2e-3
 
 
 def run(options: Options) -> Result:
-    """Training by both, then one frame."""
+    """Time the training by jeit and MiniSom, then the evaluation of one frame."""
     number, nodes, turns = (300, 800, 2) if options.quick else (FRAMES, 4000, 5)
     skin = WeighedSkin("disk", nodes)
     frames, places = skin.presses(10, number)
@@ -84,7 +84,7 @@ def run(options: Options) -> Result:
 
 
 def _minisom(start, frames, order, rates, radii) -> np.ndarray:
-    """MiniSom's final weights. In the tuning phase a very small radius leaves the winner alone."""
+    """MiniSom's final weights. In the tuning phase, the radius is so small that only the winning neuron learns."""
     theirs = MiniSom(*start.shape)
     radii = np.append(radii, np.full(len(order) - len(radii), 0.01))
     theirs._weights = start.copy()

@@ -1,8 +1,8 @@
 """The Kuopio Tomography Challenge 2023 on its four training targets.
 
-Difficulty level l leaves out electrodes 1 to 2(l - 1), as injectors and as meters. The seven levels are made from the
-complete data by masking frame and reference. `jeit reconstruct --segment` with its defaults, which were set on
-simulated tanks (`problems/cut_tanks.py`), beside total variation.
+Difficulty level l leaves out electrodes 1 to 2(l - 1), for current injection and for measurement. The seven levels are
+produced from the complete data by masking frame and reference. `jeit reconstruct --segment` with its defaults, which
+were set on simulated tanks (`problems/cut_tanks.py`), is compared with total variation.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ from jeit.imaging import ImagingSettings, image_difference
 
 LEVELS, TARGETS = range(1, 8), range(1, 5)
 METHOD, OTHER = "auto", "total-variation"
-# Mean scores of all levels, and of those from the fourth on.
+# Required mean scores over all levels, and over the levels from the fourth on.
 ALL, HARD = 0.8, 0.7
 
 
 def run(options: Options) -> Result:
-    """All levels of all targets, or one of each in a quick run. Without the challenge's data, nothing."""
+    """Segment all levels of all targets, or one level of one target in a quick run; nothing without the challenge's
+    data."""
     asked = f"mean score of all levels ≥ {ALL}", f"mean score of levels 4 to 7 ≥ {HARD}"
     folder = _folder(options.data)
     if folder is None:
@@ -59,7 +60,7 @@ def _folder(data: Path | None) -> Path | None:
 def scores(
     folder: Path, method: str, num_points: int = 2000, levels=LEVELS, targets=TARGETS, report=print
 ) -> np.ndarray:
-    """Scores (levels, targets)."""
+    """The challenge's scores (levels, targets) of the segmentations by `method`."""
     reference = read(folder / "ref.mat")
     table = np.zeros((len(levels), len(targets)))
     settings = ImagingSettings(method=method, segment=True, num_points=num_points)

@@ -1,9 +1,9 @@
 """Speed of learnt skins: training, prediction of one frame and of many, beside scikit-learn's own estimators.
 
-Presses on a simulated disk with 16 electrodes, 208 channels, on a mesh finer than that of the images. Each method
-learns places from 2,000 presses, and predicts 10,000 frames together and one alone: from voltages to places with their
-deviations, with a check for dead channels and unusual frames. scikit-learn's estimators predict places alone, from
-standardised changes.
+Presses are simulated on a disk with 16 electrodes, 208 channels, on a mesh finer than that of the images. Each method
+learns positions from 2,000 presses, and predicts 10,000 frames together and one frame alone: from voltages to positions
+with their standard deviations, with a check for dead channels and unusual frames. scikit-learn's estimators predict
+positions only, from standardised changes.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ HEADER = ["method", "features", "learnt in", "one frame"]
 
 
 def run(options: Options) -> Result:
-    """Every method alone, then all of them, without and with a model of the skin."""
+    """Measure every method separately, then all methods together, without and with a model of the skin."""
     number, many = (60, 300) if options.quick else (PRESSES, FRAMES)
     model, presses, frames, reference, right = _skin(number, 100 if options.quick else FRESH)
     asked_of = np.resize(frames, (many, frames.shape[1]))
@@ -68,7 +68,8 @@ def run(options: Options) -> Result:
 
 
 def _skin(number: int, fresh: int):
-    """A model, presses on a finer one with their changes, new frames, the reference (M,), and places (n, 2), m."""
+    """A model, presses simulated on a finer model, new frames, the reference (channels,), and the positions (frames, 2)
+    of the new frames in metres."""
     electrodes = BoundaryElectrodes(ring(RADIUS, 16), width=0.008, contact_impedance=300.0)
     model, fine = (ForwardModel(Disk(RADIUS).mesh(num_points=n), electrodes, adjacent(16)) for n in (400, 2500))
     skin, rng = PressedSkin(jax.random.key(0), fine, material("velostat")), np.random.default_rng(0)
@@ -86,7 +87,7 @@ def _skin(number: int, fresh: int):
 
 
 def _one(predict: Callable[[np.ndarray], Any], frames: np.ndarray) -> float:
-    """Median seconds of a frame, one after the other."""
+    """Median seconds for the prediction of one frame."""
     spent = []
     for frame in frames[:300]:
         start = time.perf_counter()
@@ -96,7 +97,8 @@ def _one(predict: Callable[[np.ndarray], Any], frames: np.ndarray) -> float:
 
 
 def _rivals(presses: Presses, asked_of, frames, reference, right) -> list[list[str]]:
-    """Rows of scikit-learn's ridge regression, nearest neighbours and random forest, with its defaults."""
+    """Table rows of scikit-learn's ridge regression, nearest neighbours and random forest, with scikit-learn's
+    defaults."""
     from sklearn.ensemble import RandomForestRegressor
     from sklearn.linear_model import RidgeCV
     from sklearn.neighbors import KNeighborsRegressor

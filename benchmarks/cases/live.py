@@ -2,7 +2,7 @@
 
 A separate process sends the frames of a simulated tank at 60 frames/s, with a series of faults: garbage, half a line,
 another number of channels, no readings, twice the rate, and nothing while it is unplugged and plugged in again. Latency
-is from the moment at which a frame was written to that at which its picture was made. A browser is not part of it.
+is the time from the moment at which a frame was written until its picture was computed; a browser is not included.
 """
 
 from __future__ import annotations
@@ -36,17 +36,18 @@ from jeit.live.sources import open_source
 from jeit.live.views.conductivity import ConductivityView
 
 RATE = 60.0
-# Seconds of each stream, and between faults, also of a quick run.
+# Seconds of each stream and seconds between faults, in a full run (False) and in a quick run (True).
 LENGTHS = {False: (600.0, 7.0), True: (10.0, 1.2)}
-# The first minute fills the store of pictures. Memory may grow by this fraction from a quarter of the stream on. Limits
-# of the median and 99th percentile of latency, seconds, and the least number of pictures per second.
+# Fraction by which memory may grow after a quarter of the stream (the first minute fills the store of pictures); limits
+# of the median and the 99th percentile of latency in seconds; least number of pictures per second.
 GROWTH, MEDIAN, HIGH, PICTURES = 0.05, 0.05, 0.1, 20.0
 _LINES = 997
 
 
 class Streamed(NamedTuple):
-    """Planted faults, by kind, frames sent completely, and of these recorded in order, the session's counters, seconds
-    from writing a frame to its picture, pictures per second, and memory in MB at a quarter and at the end.
+    """Result of a stream: simulated faults by kind, numbers of frames sent completely and of frames recorded in order,
+    the state of the session, seconds from writing a frame to its picture, pictures per second, and memory in MB at a
+    quarter and at the end of the stream.
     """
 
     planted: Counter[str]
@@ -59,7 +60,7 @@ class Streamed(NamedTuple):
 
 
 def run(options: Options) -> Result:
-    """Linear images, and Gauss-Newton."""
+    """Stream with linear images, and with Gauss-Newton images."""
     if os.name != "posix":
         return Result([], notes=["Pseudo-terminals are needed, which this system does not have."])
     seconds, period = LENGTHS[options.quick]
@@ -118,7 +119,7 @@ def run(options: Options) -> Result:
 
 
 def stream(view: AbstractView, reference, frames: np.ndarray, folder: Path, seconds: float, period: float) -> Streamed:
-    """Play a device for a number of seconds, and read it."""
+    """Simulate a device for a number of seconds, and read, record and image its frames."""
     lines, link, log = (folder / name for name in ("lines.txt", "device", "log"))
     lines.write_text("".join(", ".join(map(repr, one)) + "\n" for one in frames.tolist()))
     recorder = Recorder(folder / "recordings", reference=reference)
@@ -174,15 +175,17 @@ class _Noting(AbstractView):
 
 
 def _latencies(written: list[float], made: list[tuple[float, float]]) -> np.ndarray:
-    """Seconds from the last frame written before an arrival to the picture."""
+    """Latency of each picture: seconds from the writing of the last frame before its arrival until the picture was
+    computed."""
     arrived, done = np.array(made).T
     before = np.searchsorted(written, arrived, side="right") - 1
-    # A frame may arrive before the writer has recorded the time.
+    # A frame may arrive before the device has recorded the time of writing.
     return done - np.minimum(np.array(written)[np.maximum(before, 0)], arrived)
 
 
 def _in_order(recorded: np.ndarray, expected: np.ndarray) -> int:
-    """How many of the expected frames were recorded, in their order, with others between them."""
+    """Number of the expected frames that were recorded in the same order; other recorded frames may lie between
+    them."""
     place = found = 0
     for one in expected:
         while place < len(recorded) and not np.array_equal(recorded[place], one):
@@ -194,14 +197,14 @@ def _in_order(recorded: np.ndarray, expected: np.ndarray) -> int:
 
 
 def _frames(tank: SimulatedSensor) -> np.ndarray:
-    """Different frames (997, M) of one rotation, with noise."""
+    """997 different frames (997, channels) of one rotation of the rod, with noise."""
     states = tank.states[np.arange(_LINES) * len(tank.states) // _LINES]
     noise = 1e-4 * np.sqrt(np.mean(states**2))
     return states + noise * np.random.default_rng(0).standard_normal(states.shape)
 
 
 def _recorded(folder: Path) -> np.ndarray:
-    """Frames of all parts of a recording."""
+    """Frames of all files of a recording, concatenated."""
     parts = [folder / "frames.csv", *(folder / f"frames-{part}.csv" for part in range(2, 100))]
     return np.concatenate([np.asarray(read(one).voltages) for one in parts if one.exists()])
 

@@ -1,8 +1,8 @@
 """Latency from a frame's last byte to the picture in a browser: a simulated tank, imaged and drawn by Chromium.
 
-The page reports each picture once it is painted, and the server records when the report arrives. The report's transfer
-is included, so that only one clock is used. Simulation, imaging, server and browser share the machine's cores. The
-browser has no window, and paints without a graphics card.
+The page reports each picture once it is painted, and the server records the arrival of the report. Latency includes the
+transfer of the report, so that only one clock is used. Simulation, imaging, server and browser share the machine's
+cores. The browser has no window, and paints without a graphics card.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 def run(options: Options) -> Result:
-    """Linear images, and Gauss-Newton, in windows of two sizes."""
+    """Measure linear images and Gauss-Newton images, in browser windows of two sizes."""
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     try:
         from playwright.sync_api import sync_playwright

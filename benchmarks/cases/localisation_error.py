@@ -1,11 +1,11 @@
 """Errors of touches located by sound, beside the Cramér-Rao bound.
 
-The simulated skin of 200 × 200 mm is not the fitted model: it has echoes from the edges, attenuation that grows with
-frequency, different gains, and noise at which a source 55 mm away is just as loud. It is calibrated on a 13 × 13 grid
-of taps 15 mm apart (three at each place) and tested on another, 12.5 mm apart: the paper's experiment (ten bursts of a
-vibrator at each place), single taps against the signal-to-noise ratio beside the Cramér-Rao bound, ten bursts against
-the number of microphones, and ten bursts with microphones that are not at their given positions and gains that changed
-after the calibration.
+The simulated skin of 200 × 200 mm differs from the fitted model: it has echoes from the edges, attenuation that grows
+with frequency, different gains, and noise that is as loud as a source 55 mm away. The skin is calibrated on a 13 × 13
+grid of taps 15 mm apart (three taps at each position) and tested on another grid, 12.5 mm apart. The tests are the
+paper's experiment (ten bursts of a vibrator at each position); single taps at several signal-to-noise ratios, compared
+with the Cramér-Rao bound; ten bursts with several numbers of microphones; and ten bursts with microphones that are
+displaced from their given positions and gains that changed after the calibration.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from jeit.acoustic.simulate.propagation import expected_power, noise_power
 from jeit.layout import grid
 
 RATIOS = (0, 5, 10, 15, 20, 25, 30, 35, 40)
-# Limits: mean and standard deviation of the paper's loss, metres, and the fraction by which the likelihood must be
-# better.
+# Limits: mean and standard deviation of the errors with the paper's loss, metres, and the fraction by which the errors
+# with the likelihood must be smaller.
 PAPER, BETTER = (6.6e-3, 3.8e-3), 0.25
 # Standard deviations of the coordinates of the microphones, metres, and of the gains, as fractions of the intensities.
 CHANGES = ((0.0, 0.0), (1e-3, 0.05), (2e-3, 0.1), (3e-3, 0.2))
@@ -35,8 +35,8 @@ METHODS = ("consistency", "likelihood")
 
 
 def calibrated(skin, given=None):
-    """The calibration of a skin from taps. `given`: stated positions (M, 2) of its microphones in metres, by default
-    the true ones.
+    """The calibration of a skin from taps. `given`: stated positions (microphones, 2) in metres, by default the true
+    positions.
     """
 
     sound = simulate_calibration_taps(skin, jax.random.key(1), grid(0.18, 0.18, 13, 13))
@@ -46,7 +46,8 @@ def calibrated(skin, given=None):
 
 
 def averaged_intensities(skin, places, bursts: int):
-    """Intensities (P, M) at places (P, 2), averaged over bursts, the floor (M,), ν, and which are usable (P, M)."""
+    """Intensities (positions, microphones) of sources at `places` (positions, 2), averaged over bursts; noise floor
+    (microphones,); degrees of freedom ν; and mask (positions, microphones) of usable intensities."""
 
     sound = simulate_calibration_taps(skin, jax.random.key(2), places, repeats=bursts)
     taps = Taps(np.asarray(skin.microphones), CORNERS, sound.positions, samples=sound.samples, rate=sound.rate)
@@ -57,12 +58,12 @@ def averaged_intensities(skin, places, bursts: int):
 
 
 def errors(calibration, skin, places, bursts: int, pad: int):
-    """Distances (P,) in metres of each method's places, the fraction of 95 % ellipses of the likelihood that contain
-    the truth, and the root mean square error of the Cramér-Rao bound.
+    """Errors (positions,) in metres of the positions by each method, the fraction of the likelihood's 95 % ellipses
+    that contain the true position, and the root mean square error by the Cramér-Rao bound.
     """
 
     power, floor, freedom, usable = averaged_intensities(skin, places, bursts)
-    order = np.arange(pad) % len(places)  # one shape for all: compiled once
+    order = np.arange(pad) % len(places)  # the same shape for all tests, so that code is compiled once
     measured = Intensities(np.arange(pad), power[order], floor=floor, freedom=freedom, usable=usable[order])
     microphone_array, use, _ = microphones_in_use(measured, calibration)
     found = {name: Localiser.create(microphone_array, method=name)(measured.power, use) for name in METHODS}
@@ -80,14 +81,14 @@ def errors(calibration, skin, places, bursts: int, pad: int):
 
 
 def spread(values) -> str:
-    """Mean ± standard deviation, millimetres."""
+    """Text of the mean ± standard deviation in millimetres."""
     return f"{1e3 * np.mean(values):.1f} ± {1e3 * np.std(values):.1f}"
 
 
 def paper_table(skin, calibration, pad: int, sides=(0.15, 0.18)) -> tuple[Table, dict]:
-    """The paper's experiment, the same nearer to the edge, and the distances of the first.
+    """A table of the paper's experiment, and of the same experiment nearer to the edge, and the errors of the first.
 
-    `sides`: of the touched square, metres.
+    `sides`: sides of the touched squares in metres.
     """
     header = ["13 × 13 places, mm", "the paper's loss", "likelihood", "in the 95 % ellipse"]
     rows, first = [["paper, measured", "6.6 ± 3.8", "", ""]], None
@@ -100,7 +101,8 @@ def paper_table(skin, calibration, pad: int, sides=(0.15, 0.18)) -> tuple[Table,
 
 
 def ratio_table(skin, calibration, ratios, pad: int) -> tuple[Table, dict[str, list[float]], list[float]]:
-    """Single taps against the signal-to-noise ratio: root mean square errors and their bounds, in metres."""
+    """A table of single taps at several signal-to-noise ratios, root mean square errors by method, and Cramér-Rao
+    bounds, in metres."""
     places = grid(0.15, 0.15, 13, 13)
     loudest = 10 * np.log10((expected_power(skin, places) / noise_power(skin)).max(axis=1).mean())
     curve: dict[str, list[float]] = {"paper's loss": [], "likelihood": []}
@@ -121,7 +123,8 @@ def ratio_table(skin, calibration, ratios, pad: int) -> tuple[Table, dict[str, l
 
 
 def microphone_table(sides, pad: int) -> Table:
-    """Ten bursts against the number of microphones, in a square of `sides` places."""
+    """A table of the errors with ten bursts for several numbers of microphones; `sides` are the numbers of microphones
+    along a side."""
     rows = []
     for side in sides:
         few = SoundingSkin(jax.random.key(0), microphone_grid(side))
@@ -132,7 +135,8 @@ def microphone_table(sides, pad: int) -> Table:
 
 
 def change_table(changes) -> Table:
-    """Ten bursts at each place, located with the defaults, after changes of places and gains."""
+    """A table of the errors with ten bursts at each position, located with the defaults, after changes of microphone
+    positions and gains."""
     header = ["microphones off, mm", "gains changed, %", "median, mm", "greatest, mm", "in the 95 % ellipse"]
     given, places, rows = microphone_grid(5), grid(0.15, 0.15, 13, 13), []
     for place, gain in changes:
@@ -155,7 +159,7 @@ def change_table(changes) -> Table:
 
 
 def draw(ratios, curve: dict[str, list[float]], bounds: list[float], path: Path) -> None:
-    """Errors of single taps against the signal-to-noise ratio."""
+    """Draw the errors of single taps against the signal-to-noise ratio."""
     from matplotlib.figure import Figure
 
     from jeit.acoustic.plots import plot_error_curve
@@ -167,7 +171,7 @@ def draw(ratios, curve: dict[str, list[float]], bounds: list[float], path: Path)
 
 
 def run(options: Options) -> Result:
-    """The tables and, where an output folder is given, the curve."""
+    """Compute the tables and, if an output folder is given, draw the curve."""
     skin, ratios, pad = SoundingSkin(jax.random.key(0)), (20,) if options.quick else RATIOS, 256
     calibration = calibrated(skin)
     paper, off = paper_table(skin, calibration, pad, (0.15,) if options.quick else (0.15, 0.18))

@@ -1,7 +1,7 @@
-"""One to three strong bodies in a tank, metal, plastic or both: the default image beside one step.
+"""One to three strong bodies in a tank, metal, plastic or both: the default image compared with one-step images.
 
-Tanks are those of `problems/mixed_tanks.py`, solved without jeit, with 1 % noise on every voltage. None of them was
-used when the defaults were set.
+The simulated tanks are those of `problems/mixed_tanks.py`, solved without jeit, with 1 % noise on every voltage. None
+of these tanks was used to set the defaults.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ HEADER = ["channels", "image", "tanks", "bodies", "median / R", "beyond 0.12 R",
 
 
 def run(options: Options) -> Result:
-    """All tanks, by the kind of channels and together."""
+    """Image all tanks; the table has a row for each kind of channels, and a row for all tanks."""
     seeds = range(FIRST, FIRST + (3 if options.quick else TANKS))
     rows: dict[tuple[str, str], list[tuple[np.ndarray, int]]] = {}
     refused = []

@@ -1,9 +1,9 @@
 """Pats, tickles, strokes, wind and no touch classified by sound, beside Park et al. (2022). All data are simulated.
 
 The simulation and the differences between people are in `problems/sounding_people.py` and
-`jeit.acoustic.simulate.people`. The paper augments first and splits at random after, so that copies of one window, and
-windows of one recording, are on both sides. With held-out recordings or people they are not. Comparable: the effect of
-each split on the same network, but not percentages.
+`jeit.acoustic.simulate.people`. The paper augments the data first and then splits them at random, so that copies of one
+window, and windows of one recording, are both in the training and in the test data. With held-out recordings or people
+they are not. The effect of each split on the same network is comparable with the paper, percentages are not.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from jeit.touch.listening import Levels, ModalityNetwork, SoundImages, sound_ima
 from jeit.touch.listening.learners import LEARNERS, NetworkListener, TrainingSet
 from jeit.touch.listening.modality_network import NUM_COPIES
 
-# Where sets and training states are kept from one run to the next.
+# Folder in which simulated sets and training states are kept for later runs.
 STORE = Path(tempfile.gettempdir()) / "jeit-modality"
 PEOPLE, CLIPS, SEED = 10, 8, 1
-# Folds by person, of two people each.
+# Number of folds by person, of two people each.
 FOLDS = 5
-# Maximum number of batches of the paper's schedule, of our own, and for shuffled labels.
+# Maximum number of training batches of the paper's schedule, of our schedule, and for shuffled labels.
 BATCHES, OWN_BATCHES, SHUFFLED_BATCHES = 1000, 400, 100
-# Decibels by which the copies of the paper's split differ from each window.
+# Standard deviation in decibels by which the augmented copies in the paper's split differ from each window.
 _COPIED = 2.0
 PAPER = 98.7
 METHODS = tuple(LEARNERS)
@@ -40,14 +40,16 @@ METHODS = tuple(LEARNERS)
 
 @dataclass
 class Experiment:
-    """A set and training on it. `folder` is for the states of networks. Training has few batches if `quick`."""
+    """A set of sound windows, and the training of classifiers on it. `folder` keeps the training states of networks.
+    Training has few batches if `quick`."""
 
     sounds: SoundSet
     folder: Path | None
     quick: bool = False
 
     def learnt(self, method: str, name: str, images: SoundImages, right: np.ndarray, groups: np.ndarray):
-        """A model trained on these windows. `name` distinguishes its training state from others."""
+        """A model trained on the windows `images` with the classes `right`. `name` identifies the training state in the
+        folder."""
         batches = OWN_BATCHES if method == "network" else BATCHES
         batches = 3 if self.quick else SHUFFLED_BATCHES if "shuffled" in name else batches
         kept = None if self.folder is None else self.folder / f"{name}-{batches}.training"
@@ -56,8 +58,8 @@ class Experiment:
         )
 
     def by_person(self, method: str, variants: list[tuple[float, int]], number: int = 25) -> np.ndarray:
-        """Confusion counts (V, C, C) of the windows of each fold's held-out people, in each of the `variants` of noise
-        and microphones.
+        """Confusion counts (variants, classes, classes) of the windows of held-out people, for each of the `variants`
+        of noise and microphones.
 
         Training uses `number` microphones without additional noise.
         """
@@ -74,7 +76,8 @@ class Experiment:
         return counts
 
     def by_recording(self, method: str, *, shuffled: bool = False) -> float:
-        """Fraction right of a fifth of the clips, held out. Training labels are `shuffled` on request."""
+        """Fraction of correctly classified windows in a held-out fifth of the clips. If `shuffled`, training labels are
+        shuffled."""
         sounds = self.sounds
         out = sounds.clip % 5 == 4
         order = np.random.default_rng(0).permutation(int((~out).sum())) if shuffled else slice(None)
@@ -83,20 +86,21 @@ class Experiment:
         return float(np.mean(model.log_odds(images[out]).argmax(axis=1) == sounds.right[out]))
 
     def as_the_paper(self, method: str) -> float:
-        """Fraction right of a tenth of all copies, drawn at random: windows are copied with noise first."""
+        """Fraction of correctly classified windows in a random tenth of all copies, where windows are copied with noise
+        before the split."""
         sounds, rng = self.sounds, np.random.default_rng(0)
         copies = [_noisy(sounds.images[0.0, 25], rng) for _ in range(NUM_COPIES)]
         images, right = SoundImages.concatenate(copies), np.tile(sounds.right, NUM_COPIES)
         deal = rng.permutation(len(right))
         part = np.empty(len(right), int)
         part[deal] = np.arange(len(right)) * 10 // len(right)
-        # One of the nine tenths, drawn at random too, stops the training.
+        # One of the nine training tenths, also drawn at random, determines when training stops.
         train, test = part < 9, part == 9
         model = self.learnt(method, f"{method}-paper", images[train], right[train], part[train])
         return float(np.mean(model.log_odds(images[test]).argmax(axis=1) == right[test]))
 
     def untrained(self) -> float:
-        """Fraction right of an untrained network."""
+        """Fraction of windows that an untrained network classifies correctly."""
         images = self.sounds.images[0.0, 25]
         network = ModalityNetwork.draw(jax.random.key(0), images.intensity.shape[1] + 64, 41, len(MODALITIES))
         predicted = NetworkListener.from_network(network, Levels.from_images(images)).log_odds(images).argmax(axis=1)
@@ -104,7 +108,7 @@ class Experiment:
 
 
 def run(options: Options) -> Result:
-    """Three splits by every method, noise and microphones, and times."""
+    """Evaluate every method with three splits, with noise and fewer microphones, and measure times."""
     if options.quick:
         experiment = Experiment(sound_set(2, 2, SEED), None, quick=True)
     else:
@@ -115,7 +119,7 @@ def run(options: Options) -> Result:
     splits, persons, rows = {}, {}, []
     nothing = experiment.untrained(), experiment.by_recording("paper-network", shuffled=True)
     for method in METHODS:
-        # On the two easier splits networks are trained by the paper's schedule alone.
+        # On the two easier splits, networks are trained only by the paper's schedule.
         leaky, fair = (None, None)
         if method != "network":
             leaky, fair = experiment.as_the_paper(method), experiment.by_recording(method)
@@ -175,7 +179,7 @@ def _percent(counts: np.ndarray) -> str:
 
 
 def _noisy(images: SoundImages, rng: np.random.Generator) -> SoundImages:
-    """A copy with normal noise on its decibels."""
+    """A copy of the images with normal noise added to the decibels."""
     parts = [
         power * 10 ** (_COPIED / 10 * rng.standard_normal(power.shape, np.float32))
         for power in (images.intensity, images.spectrum)
@@ -184,7 +188,7 @@ def _noisy(images: SoundImages, rng: np.random.Generator) -> SoundImages:
 
 
 def _seconds(experiment: Experiment) -> dict[str, float]:
-    """Seconds for one window of 25 microphones: its image, and each method's evaluation."""
+    """Seconds for one window of 25 microphones: computation of the image, and evaluation by each method."""
     sounds = experiment.sounds
     sound = Recording(np.random.default_rng(0).standard_normal((25, 4928)), 10_000.0)
     images = sounds.images[0.0, 25]

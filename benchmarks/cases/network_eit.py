@@ -1,10 +1,11 @@
-"""Networks that image a skin, beside linear and iterated images of the same frames.
+"""Networks that image a skin, compared with linear and iterated images of the same frames.
 
-Park et al. 2022 image 200 × 200 × 10 mm of hydrogel, 32 inner electrodes and 94 pairs, by a network, and locate a ball
-of 15 mm with 4.2 ± 2.9 mm. Their skin is simulated (`benchmarks/problems/imaged_touches.py`), as a sheet. Networks are
-trained on a coarse mesh, and evaluated on a finer one whose electrodes and contacts deviate from their description.
-Rivals choose their hyperparameter by separate places. Networks are trained here, unless `--data` names a folder with
-`unrolled` and `three-stages`, folders of `jeit learn image`.
+Park et al. 2022 image 200 × 200 × 10 mm of hydrogel with 32 inner electrodes and 94 electrode pairs by a network, and
+locate a ball of 15 mm with an error of 4.2 ± 2.9 mm. Their skin is simulated as a sheet
+(`benchmarks/problems/imaged_touches.py`). Networks are trained on a coarse mesh, and evaluated on a finer mesh whose
+electrodes and contacts deviate from their description. The hyperparameters of the other methods are chosen by touches
+at separate positions. This case trains the networks, unless `--data` names a folder with `unrolled` and `three-stages`,
+folders of `jeit learn image`.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ from jeit.touch.simulate import depth_maps
 from jeit.touch.simulate.contact.indent_sets import image_places
 
 SHAPE = (48, 48)
-# Factors of the λ of the noise figure.
+# Factors by which the λ chosen by the noise figure is multiplied.
 WEIGHTS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 ASKED_MEAN, ASKED_RATIO, ASKED_FRAME, ASKED_EACH = 4.2e-3, 0.8, 16.7e-3, 0.2e-3
 Maps = Callable[[np.ndarray], np.ndarray]
 
 
 def run(options: Options) -> Result:
-    """All experiments, with figures where an output folder is given."""
+    """Run all experiments, and draw figures if an output folder is given."""
     quick = options.quick
     nominal_skin = problem.park_skin()
     noise = detection_noise(nominal_skin)
@@ -120,7 +121,7 @@ _SPREADS = (
 
 
 def _networks(options: Options, nominal_skin: Skin, quick: bool) -> dict[str, ImageNetwork]:
-    """One network of each design, read where it exists, otherwise trained."""
+    """One network of each design, read from a file if it exists, otherwise trained."""
     found = {}
     for design in DESIGNS:
         own = None if options.data is None else options.data / design
@@ -134,7 +135,7 @@ def _networks(options: Options, nominal_skin: Skin, quick: bool) -> dict[str, Im
 
 
 def _linear(nominal_skin: Skin, prior, noise: float, places: np.ndarray, tuning: np.ndarray, right: np.ndarray) -> Maps:
-    """A one-step image on the pixels, with the λ that locates the tuning touches best."""
+    """Function that computes one-step images on the pixels, with the λ that locates the tuning touches best."""
     rest = np.asarray(nominal_skin.model.voltages(nominal_skin.model_conductivity))
     nearest = _nearest(nominal_skin, places)
     background, own = float(nominal_skin.model_conductivity), {}
@@ -153,7 +154,7 @@ def _linear(nominal_skin: Skin, prior, noise: float, places: np.ndarray, tuning:
 
 
 def _iterated(nominal_skin: Skin, noise: float, places: np.ndarray) -> Maps:
-    """Four Gauss-Newton steps per frame, as in a stream."""
+    """Function that computes images by four Gauss-Newton steps per frame, as in a stream."""
     rest = np.asarray(nominal_skin.model.voltages(nominal_skin.model_conductivity))
     background = float(nominal_skin.model_conductivity)
     imager = Imager.create(nominal_skin.model, background, reference=jnp.asarray(rest), noise=noise * np.abs(rest))
@@ -161,7 +162,7 @@ def _iterated(nominal_skin: Skin, noise: float, places: np.ndarray) -> Maps:
 
     def maps(changes):
         found = np.zeros((len(changes), *SHAPE))
-        # Every frame alone, from the background: in a stream each would start from the last one's touch.
+        # Every frame starts from the background: in a stream, a frame would start from the previous frame's touch.
         for number, change in enumerate(changes):
             one = imager.estimate(jnp.asarray(rest * (1 + change)), weighing, imager.start)
             if np.isfinite(np.asarray(one.conductivity)).all():
@@ -176,7 +177,8 @@ def _nearest(nominal_skin: Skin, places: np.ndarray) -> np.ndarray:
 
 
 def _wrong(ways, touches, right, clean, noise: float, places, quick: bool) -> tuple[Table, dict[str, float]]:
-    """Mean errors against noise, displaced electrodes, and contacts. Also returns those of the last, metres."""
+    """A table of mean localisation errors with noise, displaced electrodes and changed contacts, and the errors in the
+    last row (contacts that drift by ±10 %) in metres."""
     random = np.random.default_rng(4)
     cases = {f"noise × {times:g}": (clean, times * noise) for times in (0.0, 3.0, 10.0)}
     some = slice(None, None, 5)
@@ -203,10 +205,10 @@ def _wrong(ways, touches, right, clean, noise: float, places, quick: bool) -> tu
 
 
 def _pairs(ways, judged_by, noise: float, places, number: int) -> tuple[Table, dict[str, float]]:
-    """How often two balls are distinguished.
+    """A table of the fraction of pairs of balls that each method distinguishes, and these fractions.
 
-    There is a peak within 15 mm of each, and between them no more than 0.8 of the lower one, which is more than half of
-    the map's largest depth.
+    Two balls are distinguished if the map has a peak within 15 mm of each ball, if the depth between the peaks is at
+    most 0.8 times the lower peak, and if the lower peak is more than half of the map's largest depth.
     """
     touches, right = problem.pair_touches(number)
     changes = judged_by.changes(touches)
@@ -229,7 +231,8 @@ def _pairs(ways, judged_by, noise: float, places, number: int) -> tuple[Table, d
 def _shapes(
     ways, judged_by, noise, places, number, nominal_skin: Skin, output: Path | None
 ) -> tuple[Table, dict[str, float]]:
-    """Fraction of squared depth that maps of unseen bodies miss, each map scaled to miss least."""
+    """A table of the fraction of squared depth that the maps of unseen bodies do not explain, with each map scaled to
+    the best fit."""
     touches, names = problem.shape_touches(number)
     right = depth_maps(touches, places) / float(nominal_skin.thickness)
     changes = judged_by.changes(touches)

@@ -1,9 +1,10 @@
-"""Nonlinear least-squares solvers on the same inverse problems: jeit's, optimistix's and jaxopt's.
+"""Nonlinear least-squares solvers of jeit, optimistix and jaxopt on the same inverse problems.
 
 jeit's Gauss-Newton and Levenberg-Marquardt solve each step in the smaller of the spaces of data and of images. They are
-compared with the same methods of optimistix and jaxopt, for the stacked residuals of data and prior, and with jaxopt's
-bounded solvers. All start from the background and run to their own tolerance of 1e-6 (or 200 steps, the bounded ones
-2,000). Their objectives are compared with jeit's minimum to rounding.
+compared with the same methods of optimistix and jaxopt, applied to the stacked residuals of data and prior, and with
+jaxopt's bounded solvers. All solvers start from the background and run to their own tolerance of 1e-6 (at most 200
+steps; bounded solvers 2,000). The objectives that they reach are compared with the minimum that jeit computes to
+rounding errors.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from jeit.inverse.nonlinear.solvers import minimise_between
 from jeit_solvers import Descent, lbfgsb, projected_gradient
 
 MOST_STEPS, MOST_BOUNDED_STEPS, TOLERANCE = 200, 2000, 1e-6
-# A solver has converged if its objective exceeds the least one by no more than this fraction.
+# A solver has converged if its objective exceeds the minimum by at most this fraction.
 REACHED = 1e-3
 NODES, ROUNDS, BUDGET = 500, 5, 4.0
 QUICK = ("jeit Gauss-Newton", "optimistix Gauss-Newton")
@@ -33,7 +34,7 @@ HEADER = ["solver", "iterations", "objective above the least", "misfit", "time",
 
 
 def run(options: Options) -> Result:
-    """Every solver on every problem."""
+    """Run every solver on every problem."""
     nodes = (options.nodes or (150 if options.quick else NODES,))[0]
     tables, asked = [], []
     for name, inversion, minimum in problems(nodes, quick=options.quick):
@@ -45,7 +46,7 @@ def run(options: Options) -> Result:
 
 
 def _contest(name: str, inversion, minimum, options: Options) -> tuple[list[list[str]], list[Asked]]:
-    """The table's rows of one problem, and whether jeit's solvers reach the least objective."""
+    """The table's rows for one problem, and checks of whether jeit's solvers reach the minimum."""
     least, rows, asked, own = float(inversion.cost(minimum)), [], [], float("nan")
     for label, solve in solvers().items():
         if options.quick and label not in QUICK:
@@ -72,7 +73,8 @@ def _contest(name: str, inversion, minimum, options: Options) -> tuple[list[list
 
 
 def problems(num_points: int, *, quick: bool = False):
-    """Name, inversion and its minimum: a touch halves the conductivity, simulated on a finer mesh with 0.1 % noise."""
+    """Name, inversion and minimum of each problem: a touch halves the conductivity, simulated on a finer mesh with 0.1
+    % noise."""
     for name, (make, reach) in list(bodies().items())[: 1 if quick else None]:
         model = make(num_points)
         frames, _ = simulate(make(2 * num_points), reach, 8)
@@ -96,7 +98,8 @@ def problems(num_points: int, *, quick: bool = False):
 
 
 def solvers():
-    """Name: function of an inversion that returns coefficients and iterations, to be compiled."""
+    """For each solver by name, a function of an inversion that returns coefficients and number of iterations, to be
+    compiled."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         import jaxopt

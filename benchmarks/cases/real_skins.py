@@ -1,9 +1,11 @@
-"""Skins that others have built and recorded: trained on their recordings, for places of touches and for pressed keys.
+"""Skins that other groups have built and recorded: learnt from the recordings, for positions of touches and for pressed
+keys.
 
 Recordings are public, at github.com/lorcan2440/EIT_Touch_Sensor (one and two fingers on gelatine),
 github.com/DSHardman/WeightedActivationMaps (a probe on a hydrogel) and github.com/DSHardman/HandProbing (six keys, and
-places on a hand). They are searched under `--data FOLDER`. Trained on the first 80 % in time, tested on the last 20 %,
-beside ridge regression on raw differences, and logistic regression on raw and standardised ones.
+places on a hand). The recordings are searched for under `--data FOLDER`. Models are trained on the first 80 % of the
+time and tested on the last 20 %, and compared with ridge regression on raw differences, and with logistic regression on
+raw and standardised differences.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from benchmarks.harness.timing import say
 from jeit.touch import LearntSkin, Presses, Touches
 
 LEARNT = 0.8
-# Limits: fraction of ridge's error, and percentage points above logistic regression.
+# Limits: maximum fraction of the error of ridge regression, and minimum percentage points above logistic regression.
 PLACES, KEYS = 0.75, 5.0
 WHERE = [
     "skin",
@@ -43,7 +45,8 @@ WHICH = ["skin", "presses", "channels", "learnt", "keys right", "patterns right"
 
 @dataclass(frozen=True)
 class Recording:
-    """Frames (N, M), their reference if they have one, and places of K fingers (N, K, 2), metres, or keys (N, K)."""
+    """Recording of N frames (N, M) of M channels, the reference or None, and positions of K fingers (N, K, 2) in
+    metres, or K keys (N, K)."""
 
     name: str
     frames: np.ndarray
@@ -57,7 +60,7 @@ class Recording:
 
 
 def run(options: Options) -> Result:
-    """Every available recording. Without any, nothing."""
+    """Learn and test every available recording; nothing without recordings."""
     better, ahead = f"error ≤ {PLACES:g}× ridge's", f"≥ {KEYS:g} points above logistic regression on raw changes"
     asked = [f"places: {better}", f"keys: {ahead}"]
     folder = options.data or Path(os.environ.get("JEIT_DATA", ROOT.parent / "shared" / "data"))
@@ -99,7 +102,8 @@ def recordings(folder: Path) -> Iterator[Recording]:
 
 
 def _gelatine(path: Path, name: str) -> Recording:
-    """Sheets of voltages, already as changes, and of places: x of one or two fingers, then y, metres."""
+    """Recording on gelatine from a spreadsheet with voltage changes, and with positions in metres: x of one or two
+    fingers, then y."""
     from openpyxl import load_workbook
 
     book = load_workbook(path, read_only=True)
@@ -109,7 +113,8 @@ def _gelatine(path: Path, name: str) -> Recording:
     )
     places = places.reshape(len(places), 2, 2).transpose(0, 2, 1)
     there = np.isfinite(places).all(axis=(0, 2))
-    # Each row has the frame of the preceding press: with its own place no prediction is better than chance.
+    # Each row contains the frame of the preceding press: with the position in the same row, no prediction is better
+    # than chance.
     return Recording(name, frames[1:], None, places[:-1, there])
 
 
@@ -128,7 +133,8 @@ def _ask(skin: LearntSkin, one: Recording, rows: slice) -> Touches:
 
 
 def _places(one: Recording) -> tuple[list[str], float]:
-    """A row, and jeit's error beside ridge's. Each finger has its own model."""
+    """A table row for positions, and the ratio of jeit's error to that of ridge regression. Each finger has its own
+    model."""
     from sklearn.linear_model import RidgeCV
 
     learnt, asked = _cut(one)
@@ -141,7 +147,7 @@ def _places(one: Recording) -> tuple[list[str], float]:
         ridge = RidgeCV(np.logspace(-8, 6, 29)).fit(one.changes[learnt], finger[learnt])
         theirs.append(np.linalg.norm(ridge.predict(one.changes[asked]) - right, axis=1))
     spent = time.perf_counter() - start
-    # A frame without a prediction has the error of the skin's centre.
+    # A frame without a prediction counts as located at the centre of the skin.
     error, plain, ratio = (np.concatenate(each) for each in (errors, theirs, ratios))
     guess = np.linalg.norm(one.places - one.places[learnt].mean(axis=0), axis=-1).mean()
     error = np.where(np.isfinite(error), error, guess)
@@ -152,8 +158,8 @@ def _places(one: Recording) -> tuple[list[str], float]:
 
 
 def _keys(one: Recording) -> tuple[list[str], tuple[float, float]]:
-    """A row, and the percentage points by which jeit is ahead of logistic regression on raw differences, for each key
-    and for whole patterns.
+    """A table row for keys, and the percentage points by which jeit is better than logistic regression on raw
+    differences, for single keys and for whole patterns of keys.
     """
     learnt, asked = _cut(one)
     start = time.perf_counter()
@@ -178,7 +184,7 @@ def _logistic(values: np.ndarray, one: Recording, learnt: slice, asked: slice) -
 
 
 def _right(predicted: np.ndarray, keys: np.ndarray) -> tuple[float, float]:
-    """Percentages right of the keys, and of whole patterns."""
+    """Percentages of correctly predicted keys, and of correctly predicted patterns of all keys."""
     return 100 * float(np.mean(predicted == keys)), 100 * float(np.mean((predicted == keys).all(axis=1)))
 
 

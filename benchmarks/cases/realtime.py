@@ -1,8 +1,9 @@
 """Frame rates: a touch moves over two sensors, streamed frame by frame.
 
-Frames are simulated on finer meshes, with noise. For each sensor: the latency of every frame, linear and with four
-Gauss-Newton iterations, the distance of those images from converged ones, and the time of the parts of an iteration,
-beside the time that their arithmetic takes at the speed of a large matrix product.
+Frames are simulated on finer meshes, with noise. For each sensor, the case measures the latency of every frame, for
+linear images and with four Gauss-Newton iterations; the distance of the latter images from converged images; and the
+time of the parts of an iteration, compared with the time that the same number of operations takes in a large matrix
+product.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class Streamed(NamedTuple):
 
 
 def run(options: Options) -> Result:
-    """Both sensors."""
+    """Measure both sensors."""
     nodes, count = (options.nodes or (200 if options.quick else NODES,))[0], 20 if options.quick else FRAMES
     rows, asked, parts, headline = [], [], [], None
     sensors = list(bodies().items())[:1] if options.quick else bodies().items()
@@ -77,7 +78,7 @@ def run(options: Options) -> Result:
 
 
 def stream_all(imager: Imager, frames: np.ndarray) -> Streamed:
-    """All frames, one after the other. The stream compiles before its first frame."""
+    """Image all frames, one after the other. The stream compiles before the first frame."""
     found = list(stream(imager, iter(frames)))
     assert all(one.imaged for one in found)
     latency = 1e3 * np.array([one.latency for one in found])
@@ -85,7 +86,8 @@ def stream_all(imager: Imager, frames: np.ndarray) -> Streamed:
 
 
 def _error(model, images: list, frames: np.ndarray, common: dict) -> float:
-    """Largest distance of some images from converged ones, relative to the latter's difference from the background."""
+    """Largest distance of some images from converged images, relative to the difference of the converged images from
+    the background."""
     longer, every = GaussNewton(max_steps=30, rtol=1e-12), Parametrisation(informative=0.0)
     exact = Imager.create(model, 1.0, solver=longer, parametrisation=every, **common)
     weighing, errors = exact.weighing(exact.mask), []
@@ -105,12 +107,13 @@ def _asked(name: str, linear: Streamed, found: Streamed, error: float) -> list[A
 
 
 def _median(function, *arguments, rounds: int = 100) -> float:
-    """Median seconds of a call."""
+    """Median seconds of a call of `function`."""
     return timed(lambda: function(*arguments), rounds).median
 
 
 def breakdown(imager) -> list[tuple[str, float, float]]:
-    """(part, milliseconds, milliseconds at the speed of a large matrix product) of one Gauss-Newton iteration."""
+    """Parts of one Gauss-Newton iteration: name, measured milliseconds, and milliseconds at the speed of a large matrix
+    product."""
     from jeit.forward.system import cell_conductivity
     from jeit_solvers import factorise, ridge_model, solve
 

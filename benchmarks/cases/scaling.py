@@ -1,8 +1,8 @@
 """The direct solver from a thousand nodes up, in the plane and in space, beside PARDISO.
 
-One matrix of a forward model, with newly assembled values, for the loads of 32 electrodes: factorised and solved, as
-for fields, and factorised and multiplied (bᵀA⁻¹b), which suffices for voltages. The analysis of the pattern is timed
-separately. Every repeat has another matrix. A second table has larger solids, solved by multigrid.
+Tasks for one matrix A of a forward model, with newly assembled values, and the loads b of 32 electrodes: factorise and
+solve, as for fields; and factorise and multiply (bᵀA⁻¹b), which suffices for voltages. The analysis of the sparsity
+pattern is timed separately. Every repeat has another matrix. A second table has larger solids, solved by multigrid.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from benchmarks.problems import matrices
 MINE, OTHER, ITERATIVE = "jeit's fronts", "PARDISO", "jeit's multigrid"
 SOLVED, MULTIPLIED = "factorise and solve", "factorise and multiply"
 SIZES = {"disk": (1_000, 5_000, 20_000, 100_000), "cylinder": (1_000, 10_000, 20_000, 50_000, 100_000, 280_000)}
-# Maximum ratio of time to PARDISO's for voltages, and maximum residual of a solution relative to its load.
+# Maximum ratio of jeit's time to PARDISO's for voltages, and maximum residual of a solution relative to its load.
 ASKED, ACCURATE = 1.2, 1e-12
-# Nodes of the cylinders that multigrid solves. Limits of seconds and bytes for voltages of the largest, including its
-# mesh, and of the residual of a solution.
+# Numbers of nodes of the cylinders that multigrid solves. Limits of seconds and megabytes for the voltages of the
+# largest cylinder, including meshing, and of the residual of a solution.
 LARGE, SECONDS, MEGABYTES, CLOSE = (50_000, 280_000, 1_000_000), 300.0, 12_000, 1e-10
 LARGE_HEADER = ["nodes", "mesh and matrices", "32 solutions", "residual", "peak memory of the solutions"]
 HEADER = ["body", "nodes", "plan", "operations", "voltages: factor, multiply", "fields: factor, 32 solves"]
@@ -37,7 +37,7 @@ HEADER += ["peak memory: jeit / PARDISO"]
 
 
 def run(options: Options) -> Result:
-    """Every body and size, one after the other."""
+    """Measure every body and size, one after the other."""
     python = environment.python("pardiso", create=not options.quick)
     interpreters = {MINE: sys.executable, OTHER: python}
     sizes = {"disk": (500,), "cylinder": (800,)} if options.quick else SIZES
@@ -71,7 +71,8 @@ def run(options: Options) -> Result:
 
 
 def _problem(body: str, count: int) -> dict[str, np.ndarray]:
-    """Matrices of a forward model of about `count` nodes with random conductivities, and its electrodes' loads."""
+    """Matrices of a forward model of about `count` nodes with random conductivities, and the loads of its
+    electrodes."""
     from jeit.electrodes import BoundaryElectrodes, FacePatches
     from jeit.electrodes.face_patches import body_mesh
     from jeit.forward.system import System
@@ -108,7 +109,8 @@ def _play(
     options: Options,
     tasks: tuple[str, ...] = (SOLVED, MULTIPLIED),
 ):
-    """Figures of each contestant and task, the largest residual, details of the plan, and why some did not run."""
+    """Figures of each contestant and task, the largest residual, details of the analysis, and the reasons why
+    contestants did not run."""
     found: dict[tuple[str, str], Figures] = {}
     remarks, left = [], 0.0
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
@@ -135,7 +137,7 @@ def _play(
 
 
 def _large(options: Options, asked: list, wrong: list[str]) -> Table:
-    """Cylinders that multigrid solves."""
+    """A table of cylinders that multigrid solves."""
     rows = []
     counts = (800,) if options.quick else tuple(one for one in options.nodes or LARGE if one >= min(LARGE))
     for count in counts:
@@ -156,7 +158,7 @@ def _large(options: Options, asked: list, wrong: list[str]) -> Table:
 
 
 def _growth(points: list[tuple[int, float, float]]) -> str:
-    """Exponents of the growth of time with the number of nodes, from the larger half of the sizes."""
+    """Text of the exponents with which time grows with the number of nodes, from the larger half of the sizes."""
     nodes, mine, other = np.array(points[len(points) // 2 - 1 :]).T
     terms = [f"{name} as nodes to the {np.polyfit(np.log(nodes), np.log(one), 1)[0]:.2f}"
             for name, one in (("jeit", mine), (OTHER, other)) if np.isfinite(one).all()]  # fmt: skip
@@ -164,7 +166,7 @@ def _growth(points: list[tuple[int, float, float]]) -> str:
 
 
 def _draw(path: Path, seconds: dict[str, list[tuple[int, float, float]]]) -> None:
-    """Seconds over nodes, both logarithmic, with the growth that nested dissection has."""
+    """Draw seconds against nodes on logarithmic axes, with the theoretical growth of nested dissection."""
     from matplotlib.figure import Figure
 
     figure = Figure((7.0, 4.5), layout="constrained")

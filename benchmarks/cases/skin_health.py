@@ -1,8 +1,9 @@
 """Damage detected from frames: cuts, dead electrodes and torn wires, false alarms, and errors of touches beside cuts.
 
 Park et al. 2022 cut and repaired their skin, and saw no artefacts afterwards. They publish no figures, so the limits
-are jeit's own: 95 % of cuts of the full depth, 1 % of false alarms, and errors of places, farther than 25 mm from the
-cut (12.5 on the skin of half the size), at most 1.2 times those of the undamaged skin.
+are jeit's own: at least 95 % of cuts of the full depth are detected, at most 1 % of alarms are false, and touches
+farther than 25 mm from the cut (12.5 mm on the skin of half the size) have errors of at most 1.2 times those on the
+undamaged skin.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from jeit.touch import watch
 from jeit.touch.health import EventKind
 
 SKINS = {"park": "hydrogel, 200 mm, 32 inner electrodes, 94 pairs", "round": "film, 100 mm, 16 electrodes, 208"}
-# Seconds of a sequence of touches, of a recording with damage, and the time at which it begins.
+# Seconds of a sequence of touches, seconds of a recording with damage, and time in seconds at which the damage begins.
 SEQUENCE, RECORDING, BEGINS = 60.0, 90.0, 30.0
 # These have no limit.
 SEED = 1
@@ -26,7 +27,7 @@ HEADER = ["skin", "what", "recordings", "detected", "named correctly", "detected
 
 
 def run(options: Options) -> Result:
-    """Sequences without damage, then with every kind of it."""
+    """Monitor sequences of touches without damage, then with every kind of damage."""
     quick = options.quick
     rows, asked = [], []
     for name in ("park",) if quick else SKINS:
@@ -131,7 +132,8 @@ def far(skin: DamagedSkin, number: int, cut) -> list:
 
 
 def apart(true: np.ndarray, path: np.ndarray) -> float:
-    """Mean distance, metres, between a path (n, 2) and a detected one (k, 2), in both directions."""
+    """Mean distance in metres between the true path of a cut (n, 2) and the detected path (k, 2), averaged over both
+    directions."""
     parts = [np.linspace(a, b, 50) for a, b in itertools.pairwise(path)]
     distance = np.linalg.norm(true[:, None] - np.concatenate(parts), axis=-1)
     return 0.5 * float(distance.min(axis=0).mean() + distance.min(axis=1).mean())

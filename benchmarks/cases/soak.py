@@ -1,7 +1,7 @@
 """An endless stream: a million frames through linear images, and thousands through Gauss-Newton.
 
-Frames are faulty in bursts, each of a known kind. Memory must not grow, every bad frame must be named for its fault,
-and no good one refused.
+Some frames are faulty, in bursts of a known kind of fault. Memory must not grow, the reported reason of every bad frame
+must name its fault, and no good frame may be refused.
 """
 
 from __future__ import annotations
@@ -22,16 +22,17 @@ from jeit.inverse import Imager, stream
 from jeit.inverse.nonlinear import GaussNewton, OneStep
 
 SENSOR, NODES, BASE = "disk, 16 electrodes", 1193, 400
-# Frames, frames from one burst to the next, and maximum frames of a burst: linear, and by Gauss-Newton. Then those of a
-# quick run.
+# Number of frames, frames from one burst of faults to the next, and maximum frames of a burst, for linear images and
+# for Gauss-Newton; in a full run (False) and in a quick run (True).
 LENGTHS = {False: ((1_000_000, 2000, 400), (20_000, 400, 80)), True: ((20_000, 400, 80), (500, 50, 10))}
-# Megabytes by which memory may grow from a tenth of the stream to its end: fluctuations of the allocator.
+# Megabytes by which memory may grow from a tenth of the stream to its end, due to fluctuations of the allocator.
 GROWTH = 8.0
 
 
 class Soaked(NamedTuple):
-    """Memory in MB at a tenth, half and all of a stream, seconds of each good frame and of each bad one, bad frames
-    that were named for their fault, by kind, and good ones that were refused or reported as partial.
+    """Results of a stream: memory in MB after a tenth, half and all of the stream, seconds of each good frame and of
+    each bad frame, numbers of bad frames whose fault was named, by kind, and number of good frames that were refused or
+    reported as partial.
     """
 
     memory: list[float]
@@ -42,7 +43,7 @@ class Soaked(NamedTuple):
 
 
 def run(options: Options) -> Result:
-    """Both kinds of images."""
+    """Measure linear images and Gauss-Newton images."""
     nodes = (options.nodes or (200 if options.quick else NODES,))[0]
     make, reach = bodies()[SENSOR]
     model = make(nodes)
@@ -79,7 +80,7 @@ def run(options: Options) -> Result:
 
 
 def soak(imager: Imager, frames: DisturbedFrames) -> Soaked:
-    """Look at every image, and keep none."""
+    """Image all frames and check the status of each image; no image is kept."""
     latency, bad = np.full(frames.number, np.nan), np.full(frames.number, False)
     named, accused, memory = dict.fromkeys(KINDS, 0), 0, []
     marks = {int(share * frames.number) for share in (0.1, 0.5, 1.0)}

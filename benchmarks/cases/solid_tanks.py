@@ -1,4 +1,4 @@
-"""One or two balls or columns in boxes and cylinders, with the default image. Tanks are those of
+"""One or two balls or columns in boxes and cylinders, imaged with the defaults. The simulated tanks are those of
 `problems/solid_tanks.py`.
 """
 
@@ -22,7 +22,7 @@ HEADER += ["off / r", "volume", "contrast", "± 1 σ", "reported as", "others", 
 
 
 def run(options: Options) -> Result:
-    """All tanks, one row each."""
+    """Image all tanks; the table has one row for each tank."""
     rows, off, contrasts, spurious, missed, held, refused = [], [], [], 0, 0, 0, []
     tanks = [(seed, False) for seed in range(FIRST, FIRST + TANKS)]
     tanks += [(seed, True) for seed in range(FIRST_COLUMNS, FIRST_COLUMNS + COLUMNS)]

@@ -10,11 +10,11 @@ from benchmarks.harness.tables import duration
 from benchmarks.harness.timing import say
 
 LIMIT = 1200.0
-# Nodes of a body to be imaged without limits of time and memory, and the images that are made of one.
+# Number of nodes of a body that is imaged without limits of time and memory, and the images that are computed for it.
 LARGE = 50_000
 AT_LARGE = ("one step, NOSER", "one step, Gaussian", "Gauss-Newton, Gaussian, with error bars")
-# A box of 0.17 × 0.255 × 0.17 m with plates of 8 × 8 cm, as published tanks have, a ball, and noise of 0.1 % of the
-# change.
+# Script that simulates a box of 0.17 × 0.255 × 0.17 m with plates of 8 × 8 cm, like published tanks, with a ball, and
+# noise of 0.1 % of the change.
 _SETUP = """
 import itertools, time
 import numpy as np
@@ -67,8 +67,8 @@ _MEMORY = 2048.0
 
 
 def run(options: Options) -> Result:
-    """Every image in a process of its own, with mesh and model ready before the clock starts. Large bodies have a
-    subset.
+    """Compute every image in a separate process, with mesh and model ready before the clock starts. For large bodies,
+    only some of the images are computed.
     """
     rows, checks, wrong = [], [], []
     for nodes in options.nodes or (1500 if options.quick else 20_000,):

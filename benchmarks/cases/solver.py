@@ -1,8 +1,8 @@
-"""The sparse direct solver alone beside SuperLU and CHOLMOD (sparsax).
+"""jeit's sparse direct solver alone, compared with SuperLU and CHOLMOD (sparsax).
 
-One task: factorise a finite-element matrix with newly assembled values, and solve for 16 right-hand sides, in double
-precision, also for a batch of matrices of one pattern. Every repeat has another matrix. The analysis of a pattern
-(orderings, plans) is not timed, and compilation is separate.
+The task is to factorise a finite-element matrix with newly assembled values, and to solve for 16 right-hand sides, in
+double precision, also for a batch of matrices with the same sparsity pattern. Every repeat has another matrix. The
+analysis of a pattern (orderings, plans) is not timed, and compilation is timed separately.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MINE, BOTH = "jeit's solver", "factorise and solve"
 OPPONENTS = ("SuperLU", "sparsax")
 TASKS = (BOTH, "batch", "factorise", "solve")
 DISKS = (1150, 5000, 20_000)
-# A direct solver with a larger residual than this fraction of a right-hand side has failed.
+# Maximum residual of a direct solver, as a fraction of a right-hand side.
 ACCURATE = 1e-10
 HEADER = ["mesh", "nodes", "task", "jeit", "SuperLU", "", "sparsax", "", "compile: jeit / sparsax"]
 HEADER += ["residual: jeit / SuperLU / sparsax", "peak memory: jeit / SuperLU / sparsax"]
@@ -34,7 +34,7 @@ PLANS = ["mesh", "nodes", "jeit's plan", "factor: jeit / SuperLU", "SuperLU's or
 
 
 def run(options: Options) -> Result:
-    """Every mesh, one after the other."""
+    """Measure the matrices of every mesh, one after the other."""
     jax = [f"{name}=={version(name)}" for name in ("jax", "jaxlib")]
     python = environment.python("sparsax", *jax, create=not options.quick)
     interpreters = {MINE: sys.executable, "SuperLU": sys.executable, "sparsax": python}
@@ -62,7 +62,7 @@ def run(options: Options) -> Result:
 
 
 def _enter(stack: ExitStack, interpreters: dict[str, str | None], path: Path, limit: float):
-    """The contestants that run, and why others do not."""
+    """Start the contestants; return those that run, and the reasons why others do not."""
     playing, reasons = [], {}
     for name, python in interpreters.items():
         if python is None:
@@ -78,7 +78,7 @@ def _enter(stack: ExitStack, interpreters: dict[str, str | None], path: Path, li
 
 
 def _play(problem, playing: list[Contestant], reasons: dict[str, str], rounds: int, budget: float, folder: Path):
-    """The table's rows, the errors, and the figures of a single matrix."""
+    """The table's rows for one problem, messages about inaccurate solutions, and the figures of a single matrix."""
     rows, wrong, alone = [], [], {}
     for task in TASKS:
         share = len(problem["values"]) if task == "batch" else 1
@@ -100,7 +100,7 @@ def _play(problem, playing: list[Contestant], reasons: dict[str, str], rounds: i
 
 
 def _residual(problem, path: Path) -> float:
-    """The larger residual of a contestant's first and last solution, or that of its only one."""
+    """The larger of the residuals of a contestant's first and last solution."""
     solutions = results_in(path)[0]
     if solutions.ndim == 2:
         return matrices.residual(problem, 0, solutions)
@@ -108,7 +108,7 @@ def _residual(problem, path: Path) -> float:
 
 
 def _plan(details: dict[str, dict]) -> list[str]:
-    """The analysis of the pattern, as text."""
+    """Text on the analysis of the sparsity pattern by each contestant."""
     superlu, cholmod = details.get("SuperLU", {}), details.get("sparsax", {})
     sizes = [f"{one['factor MB']:.1f} MB" if one else "–" for one in (details[MINE], superlu)]
     made = [duration(details[MINE]["plan"]), " / ".join(sizes)]
@@ -116,7 +116,7 @@ def _plan(details: dict[str, dict]) -> list[str]:
 
 
 def _headline(mesh: str, nodes: int, figures: dict[str, Figures], row: list[str]) -> Headline:
-    """A single matrix beside the fastest opponent."""
+    """The headline: jeit's time for a single matrix, compared with the fastest opponent."""
     others = {name: one for name, one in figures.items() if name in OPPONENTS and one.seconds and not one.remark}
     job = f"sparse factorisation and 16 solves, {mesh.split()[0]}, {nodes:,} nodes"
     if not others:

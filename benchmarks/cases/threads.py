@@ -29,7 +29,7 @@ def _layer() -> ForwardModel:
 
 
 def run(options: Options) -> Result:
-    """A sheet and a layer, with NumPy's engine: concrete values are never compiled."""
+    """Measure a sheet and a layer, with jeit's NumPy engine, because concrete values are never compiled."""
     calls = THREADS if options.quick else CALLS
     rows, right = [], []
     for name, make in (("disk", lambda: _disk(1000)), ("layer", _layer)):

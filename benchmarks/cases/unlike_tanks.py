@@ -1,8 +1,8 @@
 """Estimates of bodies in tanks that deviate from their description: places, and coverage of 68 % intervals.
 
-Sheets are those of `problems/unlike_tanks.py`, solids of `problems/unlike_solids.py`. jeit's defaults were set on some
-kinds of error. The others were kept back. Defaults were set on other tanks. Results of this case for tanks with a
-height were the reason to examine those.
+Sheets are those of `problems/unlike_tanks.py`, solids those of `problems/unlike_solids.py`. jeit's defaults were set on
+other tanks with some kinds of error; the other kinds of error were kept back. Results of this case were the reason to
+examine tanks with a height.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ HEADER = [
 
 
 class Outcome(NamedTuple):
-    """**Fields**: `distance` of a body's inclusion, in units of R, infinite if it is missed. `holds` (4,): whether the
-    circle of the place and the intervals of change, area and strength contain the truth, None without intervals.
-    `radius` of the circle of the place, in units of R. `width` of the interval of the logarithm of conductivity, NaN
-    where it is open. `error` of the logarithm of conductivity at the peak.
+    """Result for one body. **Fields**: `distance` of the body's inclusion from the body, in units of half the tank's
+    width, infinite if the body is missed. `holds` (4,): whether the circle of the place and the intervals of change,
+    area and strength contain the true values, None without intervals. `radius` of the circle of the place, in units of
+    half the tank's width. `width` of the interval of the logarithm of conductivity, NaN if the interval is open.
+    `error` of the logarithm of conductivity at the peak.
     """
 
     distance: float
@@ -42,7 +43,7 @@ class Outcome(NamedTuple):
 
 
 def run(options: Options) -> Result:
-    """All tanks, by the kind of their errors."""
+    """Image all tanks; the table has a row for each kind of error."""
     drawn = [(draw, seed) for seed in range(FIRST, FIRST + TANKS)]
     drawn += [(unlike_solids.draw, seed) for seed in range(FIRST_SOLID, FIRST_SOLID + SOLIDS)]
     rows: dict[str, list[tuple[list[Outcome], int]]] = {}
@@ -83,7 +84,7 @@ def run(options: Options) -> Result:
 
 
 def outcome(tank: Tank, body: Body, one: Inclusion | None, background: float) -> Outcome:
-    """The estimate of a `body` of a tank. `background`: conductivity of the reference."""
+    """Compare the inclusion `one` with the `body` of a tank. `background`: conductivity of the reference."""
     if one is None:
         return Outcome(np.inf, None, np.nan, np.nan, np.nan)
     distance = float(np.linalg.norm(np.array(one.centroid) - body.centre)) / tank.size
@@ -109,7 +110,8 @@ def _holds(value: float, interval: tuple[float | None, float | None]) -> bool:
 
 
 def _coverage(rows) -> np.ndarray:
-    """Fractions of bodies with intervals whose place, change, area and strength they contain."""
+    """Fractions (4,) of bodies with intervals for which the circle of the place and the intervals of change, area and
+    strength contain the true values."""
     held = [one.holds for outcomes, _ in rows for one in outcomes if one.holds is not None]
     return np.mean(held, axis=0) if held else np.full(4, np.nan)
 

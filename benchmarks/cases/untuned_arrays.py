@@ -1,9 +1,10 @@
-"""jeit's defaults for acoustic localisation on 200 random arrays, beside each decay model and a plain fit.
+"""jeit's defaults for acoustic localisation on 200 random arrays of microphones, compared with each decay model and a
+plain fit.
 
-The decay of sound, echoes of the edges, gains, noise, number and places of microphones, and accuracy and places of taps
-are all drawn by a generator that uses none of jeit's decay models (`benchmarks/problems/simulated_arrays.py`). Choices
-were made on arrays of other seeds and other ranges, `DEVELOPMENT` there. Then arrays on which sound decays ever faster
-than a / (r² + b).
+The decay of sound, echoes from the edges, gains, noise, number and positions of microphones, and accuracy and positions
+of taps are all drawn by a generator that uses none of jeit's decay models (`benchmarks/problems/simulated_arrays.py`).
+jeit's defaults were set on arrays of other seeds and other ranges (`DEVELOPMENT` in that module). A second table has
+arrays on which sound decays increasingly faster than a / (r² + b).
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from jeit.acoustic.decay import DECAYS
 
 # Seed of the first array, and number of arrays.
 SEED, ARRAYS = 70_000, 200
-# Limit of the arrays that a plain fit locates, metres, and of the median relative to the best fixed model's.
+# Maximum median error in metres of the plain fit for an array that jeit must not refuse, and maximum excess of jeit's
+# median error over that of the best fixed model, as a fraction.
 WITHIN, WORSE = 0.01, 0.1
 LENGTHS = (0.035, 0.05, 0.065, 0.08)
 PLAIN = "plain fit"
@@ -27,17 +29,17 @@ NAMES = (PLAIN, *DECAYS, AUTO)
 
 
 def locate_by_each(array) -> dict[str, Located]:
-    """The results of each method for an array."""
+    """The results of each method for an array, by name of the method."""
     return {PLAIN: plainly_located(array)} | located_by_each(array)
 
 
 def medians(found: list[dict[str, Located]], name: str) -> np.ndarray:
-    """Medians over the touches of each array, metres, infinite where it is refused."""
+    """Median errors over the touches of each array, metres, for the method `name`; infinite if it refuses the array."""
     return np.array([one[name].median for one in found])
 
 
 def arrays_table(found: list[dict[str, Located]]) -> Table:
-    """A row for each method: refusals, errors, and coverage of ellipses among located touches."""
+    """A table with a row for each method: refused arrays, errors, and coverage of ellipses among located touches."""
     header = ["decay model", "refused", "of those the plain fit locates", "median, mm", "9 of 10 arrays, mm", "best"]
     header += ["in the 68 % ellipse", "in the 95 % ellipse", "silence taken for touch"]
     least = np.min([medians(found, name) for name in DECAYS], axis=0)
@@ -59,7 +61,7 @@ def arrays_table(found: list[dict[str, Located]]) -> Table:
 
 
 def steep_table(lengths) -> Table:
-    """Medians on 25 microphones under 200 × 200 mm, two arrays of each length."""
+    """A table of median errors with 25 microphones under 200 × 200 mm, for two arrays of each attenuation length."""
     rows = []
     for length in lengths:
         found = [locate_by_each(steep_array(length, seed)) for seed in (0, 1)]
@@ -71,7 +73,7 @@ def steep_table(lengths) -> Table:
 
 
 def run(options: Options) -> Result:
-    """Both tables, and the required figures."""
+    """Compute both tables, and check the required figures."""
     number, lengths = (4, LENGTHS[1:2]) if options.quick else (ARRAYS, LENGTHS)
     found = []
     for k in range(number):
@@ -82,7 +84,8 @@ def run(options: Options) -> Result:
 
 
 def asked(found: list[dict[str, Located]]) -> list[Asked]:
-    """None refused that the plain fit locates, and the median beside that of the best fixed model."""
+    """Checks that no array is refused that the plain fit locates, and that the median error is close to that of the
+    best fixed model."""
     lost = sum(bool(one[AUTO].message) and one[PLAIN].median < WITHIN for one in found)
     mine = np.median(medians(found, AUTO))
     fixed = {name: float(np.median(medians(found, name))) for name in DECAYS}

@@ -1,1 +1,1 @@
-"""Measurement: contestants in processes of their own, their turns, their memory, the machine, and tables."""
+"""Measurement: contestants in separate processes, their turns, their memory, the machine, and tables of results."""

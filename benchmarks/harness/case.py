@@ -1,4 +1,4 @@
-"""The interface of every case: its options and its result."""
+"""The interface of every benchmark case: options and result."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ MET, MISSED, NOT_MEASURED, NOT_JUDGED = "met", "missed", "not measured", "not ju
 
 @dataclass(frozen=True)
 class Options:
-    """The options of a case. `None` and empty mean the case's own choice.
+    """The options of a benchmark case. If an option is `None` or empty, the case chooses the value.
 
     `quick`: a smoke run on small problems. `output`: folder for figures. `data`: folder of measured data. `nodes` and
-    `electrodes`: sizes, for the cases that have a choice. `rounds`: turns of each contestant. `time_limit`: seconds of
-    one call, after which a contestant has given up.
+    `electrodes`: numbers of nodes and electrodes, for cases in which they can be chosen. `rounds`: turns of each
+    contestant. `time_limit`: maximum seconds of one call of a contestant.
     """
 
     quick: bool = False
@@ -31,7 +31,7 @@ class Options:
 
 @dataclass
 class Table:
-    """Rows of text under a header. Each row has a job, its time, its accuracy and its memory."""
+    """Table of results: rows of text under a header. Each row has a job, its time, its accuracy and its memory."""
 
     header: list[str]
     rows: list[list[str]]
@@ -49,13 +49,14 @@ class Asked:
 
 
 def judged(asked: str, measured: str, met: bool) -> Asked:
-    """A measured figure, and whether it meets the requirement."""
+    """A required figure, the measured figure, and whether it meets the requirement."""
     return Asked(asked, measured, MET if met else MISSED)
 
 
 @dataclass
 class Headline:
-    """The case in one row of the README: the job, jeit's figure, the best opponent's, their ratio, the accuracy."""
+    """The result of a case in one row of the README: the job, jeit's figure, the best opponent's figure, their ratio,
+    and the accuracy."""
 
     job: str
     jeit: str
@@ -66,7 +67,7 @@ class Headline:
 
 @dataclass
 class Result:
-    """The result of a case.
+    """The result of a benchmark case.
 
     `notes`: the contestants and their choices. `wrong`: results that disagree, for which the command fails.
     """
@@ -80,12 +81,12 @@ class Result:
     peak_memory: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain lists and dictionaries, for JSON."""
+        """The result as plain lists and dictionaries, for JSON."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> Result:
-        """The inverse of `as_dict`."""
+        """Create a result from the return value of `as_dict`."""
         headline = plain["headline"]
         return cls(
             **plain
@@ -99,11 +100,11 @@ class Result:
 
 @dataclass(frozen=True)
 class Case:
-    """A name, a one-line description, and the function that measures the case.
+    """A benchmark case: name, one-line description, and the function that measures it.
 
-    `minutes`: its approximate duration on two quiet cores. `page`: a page of the documentation, and the name of the
-    markers in it between which its tables are written. `pictures`: whether it draws any. `timed`: whether its figures
-    are times. A case whose figures are not may run in parallel with another.
+    `minutes`: approximate duration on two quiet cores. `page`: a page of the documentation, and the name of the markers
+    in the page between which the tables are written. `pictures`: whether the case draws pictures. `timed`: whether the
+    figures are times. A case whose figures are not times may run in parallel with another case.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Contestants in their processes, with interleaved turns: time, compile time and memory."""
+"""Contests of contestants in separate processes with interleaved turns, which measure time, compile time and memory."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ import numpy as np
 
 from benchmarks.harness.machine import ROOT, same_for_all
 
-# After its last task a pool of BLAS threads spins for a while: the pause lets it sleep before the next turn.
+# After its last task, a pool of BLAS threads occupies the processor for a while; this pause in seconds lets it sleep
+# before the next turn.
 REST = 0.06
 TURN = 0.1
-# A call of more than this, in seconds, is timed alone, without a warm-up call.
+# A call that takes longer than this, in seconds, is timed alone, without a warm-up call.
 SLOW = 1.0
-# A first call of more than this, in seconds, is not counted as compilation, and is not repeated.
+# A first call that takes longer than this, in seconds, is not counted as compilation, and is not repeated.
 LONG = 60.0
 
 
@@ -32,9 +33,10 @@ class GaveUpError(Exception):
 
 @dataclass
 class Figures:
-    """The figures of one contestant for one task: seconds of each call, of the first one, and peak memory in MB.
+    """The figures of one contestant for one task: seconds of each call, seconds of the first call, and peak memory in
+    MB.
 
-    `remark`: why there are none.
+    `remark`: reason why there are no figures.
     """
 
     seconds: list[float] = field(default_factory=list)
@@ -44,12 +46,12 @@ class Figures:
 
     @property
     def median(self) -> float:
-        """Median time of one repeat in seconds. NaN if it gave up."""
+        """Median time of one repeat in seconds; NaN if the contestant gave up."""
         return statistics.median(self.seconds) if self.seconds else float("nan")
 
     @property
     def compile(self) -> float:
-        """The time of the first call beyond a later one: compilation, in seconds."""
+        """Compile time in seconds: the time of the first call minus that of a later call."""
         return max(self.first - self.median, 0.0) if self.seconds else float("nan")
 
 
@@ -90,7 +92,8 @@ class Contestant:
         return answer
 
     def ask(self, **command) -> dict:
-        """Send a command, wait for its answer. Raises `GaveUpError`."""
+        """Send a command to the worker process and return the answer. Raises `GaveUpError` if there is none within the
+        limit."""
         if self._process.poll() is not None:
             raise GaveUpError("not running")
         try:
@@ -101,14 +104,14 @@ class Contestant:
         return self._receive(self.limit)
 
     def save(self, task: str, path: Path) -> list[np.ndarray]:
-        """Save the results of a task for the first conductivity."""
+        """Let the contestant save the results of a task for the first conductivity, and return them."""
         self.ask(do="save", task=task, path=str(path))
         results = results_in(path)
         path.unlink()
         return results
 
     def close(self) -> None:
-        """End the process."""
+        """End the worker process."""
         self._process.kill()
         self._process.wait()
         self._listener.join()
@@ -124,7 +127,7 @@ class Contestant:
 
 
 def results_in(path: Path) -> list[np.ndarray]:
-    """The arrays that a contestant has saved."""
+    """Read the arrays that a contestant has saved."""
     with np.load(path) as arrays:
         return [arrays[name] for name in arrays.files]
 
@@ -132,11 +135,11 @@ def results_in(path: Path) -> list[np.ndarray]:
 def compete(
     contestants: list[Contestant], task: str, *, rounds: int, budget: float, folder: Path | None = None
 ) -> dict[str, Figures]:
-    """Median times of a task. Contestants take turns, so that a drift of the machine affects all of them.
+    """Measure the times of a task. Contestants take turns, so that changes of the machine's speed affect all of them.
 
-    Each turn makes as many calls as fit in `TURN` seconds (at most 25), after one that is not timed. `budget`: seconds
-    a contestant may use in all. A slow one has fewer rounds, at least one (its first, if that is very long). `folder`:
-    for the results of the first conductivity, NAME.npz.
+    Each turn makes as many calls as fit in `TURN` seconds (at most 25), after one call that is not timed. `budget`:
+    seconds that a contestant may use in all rounds. A slow contestant has fewer rounds, at least one round (the first
+    call, if it is very long). `folder`: folder for the results of the first conductivity, NAME.npz.
     """
     playing = [one for one in contestants if task in one.tasks]
     figures = {one.name: _begin(one, task, folder) for one in playing}
@@ -159,7 +162,7 @@ def compete(
 
 
 def _begin(contestant: Contestant, task: str, folder: Path | None) -> Figures:
-    """Figures with the time of the first call, whose results are saved in the folder."""
+    """Figures with the time of the first call of a task, whose results are saved in the folder."""
     saved = {} if folder is None else {"path": str(folder / f"{contestant.name}.npz")}
     try:
         first = contestant.ask(do="first", task=task, **saved)["seconds"]
@@ -169,7 +172,7 @@ def _begin(contestant: Contestant, task: str, folder: Path | None) -> Figures:
 
 
 def _probe(contestant: Contestant, task: str, result: Figures) -> float:
-    """The approximate time of a repeat after compilation, in seconds. Records its peak memory.
+    """The approximate time of a repeat after compilation, in seconds. Records the peak memory in `result`.
 
     A slow call counts as a repeat.
     """

@@ -16,10 +16,11 @@ REQUIREMENTS = Path(__file__).parents[1] / "opponents" / "requirements"
 
 
 def python(opponent: str, *also: str, create: bool = True) -> str | None:
-    """Interpreter of an opponent's environment in `.cache/` of the repository. None if it is missing or cannot be
-    created.
+    """Python interpreter of an opponent's environment in `.cache/` of the repository; None if the environment is
+    missing or cannot be created.
 
-    Its packages are pinned in `opponents/requirements/OPPONENT.txt`, and in `also` (pip's requirements).
+    The packages of the environment are pinned in `opponents/requirements/OPPONENT.txt`, and in `also` (pip's
+    requirements).
     """
     requirements = REQUIREMENTS / f"{opponent}.txt"
     key = hashlib.sha256(requirements.read_bytes() + " ".join((sys.version, *also)).encode()).hexdigest()[:12]

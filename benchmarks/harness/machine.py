@@ -1,4 +1,4 @@
-"""The origin of figures: the machine, the versions, the commit, the day."""
+"""The conditions under which figures were measured: the machine, the versions, the commit, the day."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 CORES = 2
 PACKAGES = ("jeit", "jax", "jaxlib", "numpy", "scipy", "equinox", "lineax")
-# Files that affect figures. RESULTS.md, README.md and pages of docs/ are written by the command itself.
+# Files that affect figures. RESULTS.md, README.md and pages of docs/ are written by the command of the benchmarks.
 MEASURED = ("jeit", "solvers", "benchmarks", "pyproject.toml", ":!benchmarks/RESULTS.md")
 
 
@@ -24,7 +24,8 @@ def use_cores(count: int = CORES) -> None:
 
 
 def same_for_all() -> dict[str, str]:
-    """The environment of every measured process: the same number of threads, and no compiled code."""
+    """The environment variables of every measured process: the same number of threads, and no cache of compiled
+    code."""
     environment = dict(os.environ)
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         environment[variable] = str(CORES)

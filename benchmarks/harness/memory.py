@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def peak_memory() -> float | None:
-    """Peak resident memory of this process in MB since `reset_peak_memory` (Linux), else None."""
+    """Peak resident memory of this process in MB since `reset_peak_memory`; None on systems other than Linux."""
     try:
         status = Path("/proc/self/status").read_text()
     except OSError:

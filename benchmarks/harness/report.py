@@ -1,4 +1,5 @@
-"""A case's result as text, and its files: `RESULTS.md`, the README's table, a page of the documentation."""
+"""A case's result as text, and the files in which it is written: `RESULTS.md`, README.md, a page of the
+documentation."""
 
 from __future__ import annotations
 
@@ -28,7 +29,7 @@ def tables(result: Result) -> str:
 
 
 def text(result: Result, heading: list[str]) -> str:
-    """The heading, tables, notes and required figures of a result."""
+    """Text of the heading, tables, notes and required figures of a result."""
     spent = f"{duration(result.seconds)} in all"
     if result.peak_memory is not None:
         spent += f"; the case's own process took {result.peak_memory:.0f} MB at most"
@@ -42,7 +43,7 @@ def text(result: Result, heading: list[str]) -> str:
 
 
 def section(case: Case, result: Result, heading: list[str]) -> str:
-    """A case's section of `RESULTS.md`, with its row of the README in a comment."""
+    """Text of a case's section of `RESULTS.md`, with the case's row of the README's table in a comment."""
     parts = [f"## {case.name}", f"{case.description[:1].upper()}{case.description[1:]}.", text(result, heading)]
     if result.headline is not None:
         parts.insert(1, f"<!-- headline {json.dumps(vars(result.headline), ensure_ascii=False)} -->")
@@ -50,7 +51,7 @@ def section(case: Case, result: Result, heading: list[str]) -> str:
 
 
 def sections(path: Path) -> dict[str, str]:
-    """The sections of a file by the name of their case."""
+    """The sections of a file such as `RESULTS.md`, by name of the case."""
     if not path.exists():
         return {}
     found = re.split(r"^(?=## )", path.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
@@ -58,15 +59,15 @@ def sections(path: Path) -> dict[str, str]:
 
 
 def headlines(known: dict[str, str]) -> dict[str, Headline]:
-    """The README's rows that the sections contain."""
+    """The rows of the README's table that are stored in the sections `known`, by name of the case."""
     found = {name: re.search(r"<!-- headline (.*) -->", one) for name, one in known.items()}
     return {name: Headline(**json.loads(row.group(1))) for name, row in found.items() if row is not None}
 
 
 def keep(path: Path, name: str, new: str, order: tuple[str, ...]) -> dict[str, str]:
-    """Replace or add one case's section in the file, and return all sections.
+    """Replace or add the section `new` of the case `name` in a file, and return all sections.
 
-    The file is replaced atomically, so that a run that is stopped leaves the old one or the new one.
+    The file is replaced atomically, so that a run that is stopped leaves the old or the new file.
     """
     known = sections(path) | {name: new}
     known = {one: known[one] for one in order if one in known}
@@ -77,7 +78,7 @@ def keep(path: Path, name: str, new: str, order: tuple[str, ...]) -> dict[str, s
 
 
 def readme_table(known: dict[str, str]) -> str:
-    """At most eight rows for the README."""
+    """The README's table, with at most eight rows."""
     rows = list(headlines(known).values())[:MOST_ROWS]
     header = ["job", "jeit", "best opponent", "times jeit's", "accuracy"]
     cells = [[one.job, one.jeit, one.opponent, one.ratio, one.accuracy] for one in rows]
@@ -85,7 +86,8 @@ def readme_table(known: dict[str, str]) -> str:
 
 
 def write(case: Case, result: Result, heading: list[str], order: tuple[str, ...], root: Path = ROOT) -> list[str]:
-    """Write the case's section, the README's table, and the case's page if any. Returns messages about failures."""
+    """Write the case's section, the README's table, and the case's page of the documentation, if any. Returns messages
+    about failures."""
     known = keep(root / "benchmarks" / RESULTS.name, case.name, section(case, result, heading), order)
     pages = [("README.md", "benchmark", readme_table(known))]
     if case.page is not None:

@@ -1,4 +1,4 @@
-"""One case in a process of its own: `python -m benchmarks.harness.run_case NAME OPTIONS.pickle RESULT.json`.
+"""Run one case in a separate process: `python -m benchmarks.harness.run_case NAME OPTIONS.pickle RESULT.json`.
 
 Each case thus has its own memory and no compiled code, and a case that crashes does not affect the others.
 """
@@ -19,11 +19,12 @@ from benchmarks.harness.memory import peak_memory
 
 
 class CaseFailedError(Exception):
-    """A case ended without a result."""
+    """Error raised if a case ended without a result."""
 
 
 def run_apart(name: str, options: Options) -> Result:
-    """The case's result, from a process of its own. Raises `CaseFailedError` if it ends without one."""
+    """Run a case in a separate process and return the result. Raises `CaseFailedError` if the process ends without a
+    result."""
     with tempfile.TemporaryDirectory() as folder:
         option_file, answer = Path(folder, "options"), Path(folder, "result")
         option_file.write_bytes(pickle.dumps(options))
@@ -35,7 +36,8 @@ def run_apart(name: str, options: Options) -> Result:
 
 
 def run_here(name: str, options: Options) -> Result:
-    """The case's result, with its seconds and this process's peak memory. A quick run's figures are not judged."""
+    """Run a case in this process and return the result, with the seconds and the peak memory of this process. Figures
+    of a quick run are not judged."""
     from benchmarks.cases import load
 
     start = time.perf_counter()
@@ -49,7 +51,7 @@ def run_here(name: str, options: Options) -> Result:
 
 
 def main() -> None:
-    """Run the case that the command line names, and save its result."""
+    """Run the case that the command line names, and save the result."""
     name, option_file, answer = sys.argv[1:]
     result = run_here(name, pickle.loads(Path(option_file).read_bytes()))
     Path(answer).write_text(json.dumps(result.as_dict()), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Figures as text, and tables of them as Markdown."""
+"""Figures as text, and tables of figures as Markdown."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from benchmarks.harness.contest import Figures
 
 
 def duration(seconds: float) -> str:
-    """A time with three digits and a suitable unit."""
+    """Text of a time with three digits and a suitable unit."""
     if math.isnan(seconds):
         return "–"
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
@@ -25,21 +25,21 @@ def times(value: float) -> str:
 
 
 def cell(figures: Figures | None, share: int = 1) -> str:
-    """Median time of a contestant, divided by `share`, or why there is none."""
+    """Text of the median time of a contestant, divided by `share`, or of the reason why there is none."""
     if figures is None:
         return "–"
     return figures.remark if figures.remark or not figures.seconds else duration(figures.median / share)
 
 
 def ratio(figures: Figures | None, reference: Figures) -> str:
-    """Ratio to the reference."""
+    """Text of the ratio of a contestant's median time to that of the `reference`."""
     if figures is None or figures.remark or not figures.seconds or not reference.seconds:
         return ""
     return times(figures.median / reference.median)
 
 
 def megabytes(*figures: Figures | None) -> str:
-    """Peak memory of each, separated by slashes."""
+    """Text of the peak memory of each contestant, separated by slashes."""
     return " / ".join("–" if one is None or one.peak is None else f"{one.peak:.0f} MB" for one in figures)
 
 
@@ -54,7 +54,8 @@ def markdown(header: list[str], rows: list[list[str]], *, padded: bool = True) -
 
 
 def write_between_markers(path: Path, text: str, name: str = "benchmark") -> None:
-    """Replace the text between the markers of this name in a file. Raises `ValueError` if it has no markers."""
+    """Replace the text between the markers called `name` in a file. Raises `ValueError` if the file has no such
+    markers."""
     begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
     content = path.read_text(encoding="utf-8")
     if content.count(begin) != 1 or content.count(end) != 1:

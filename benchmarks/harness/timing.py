@@ -1,4 +1,4 @@
-"""Times of functions within one process: the first call separate from later ones, of which the median counts."""
+"""Times of functions within one process: the time of the first call, and the median time of later calls."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ class Timed(NamedTuple):
 
 
 def timed(function: Callable[[], Any], rounds: int, budget: float = float("inf")) -> Timed:
-    """Call once, then `rounds` times, or fewer (at least once) if those take more than `budget` seconds.
+    """Time a function: call it once, then `rounds` times, or fewer times (at least once) if these calls take more than
+    `budget` seconds.
 
     The function waits for the results of JAX.
     """
@@ -39,7 +40,7 @@ def timed(function: Callable[[], Any], rounds: int, budget: float = float("inf")
 def least_times(functions: dict[str, Callable[[], Any]], repeats: int = 15, budget: float = 4.0) -> dict[str, float]:
     """Least time in seconds of each function, with interleaved repeats, as many as fit in `budget` seconds.
 
-    For choosing the fastest of several alternatives, not for figures.
+    Least times serve to choose the fastest of several alternatives, and are not reported as figures.
     """
     least, start = dict.fromkeys(functions, float("inf")), time.perf_counter()
     for _ in range(repeats):
@@ -53,5 +54,5 @@ def least_times(functions: dict[str, Callable[[], Any]], repeats: int = 15, budg
 
 
 def say(text: str) -> None:
-    """Progress, separate from the report."""
+    """Print progress to standard error, separate from the report."""
     print(text, file=sys.stderr, flush=True)

@@ -1,9 +1,8 @@
-"""One contestant in a process of its own: reads commands from standard input, writes answers to standard output, as
-JSON lines.
+"""Worker: runs one contestant in a separate process, reads commands from standard input and writes answers to standard
+output, as JSON lines.
 
-Run as `python -m benchmarks.harness.worker CONTESTANT PROBLEM.npz`. Contestants have processes of their own so that
-pyEIT and sparsax can have their own environments, so that memory is measured for each, and so that turns can be
-interleaved.
+Run as `python -m benchmarks.harness.worker CONTESTANT PROBLEM.npz`. Separate processes allow pyEIT and sparsax to have
+their own environments, memory to be measured for each contestant, and turns to be interleaved.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ def answer(contestant, command: dict) -> dict:
 
 
 def main() -> None:
-    """Serve until standard input closes."""
+    """Answer commands until standard input closes."""
     name, path = sys.argv[1:]
     # Output printed by a library must not mix with the answers.
     channel = os.fdopen(os.dup(1), "w")

@@ -1,8 +1,9 @@
-"""The contestants: one file for each opponent at each kind of task, and jeit at the same tasks.
+"""The contestants: one module for each opponent and kind of task, and modules in which jeit solves the same tasks.
 
-`CONTESTANTS` names those that run in processes of their own: the module, the class, and its arguments after the
-problem's arrays. A contestant has `tasks` (name: function of the number of the repeat), a `description`, and may have
-`details` (name: text or number) and `in_si(task, results)`.
+`CONTESTANTS` names the contestants that run in separate processes: the module, the class, and the arguments of the
+class after the problem's arrays. A contestant has `tasks` (for each name of a task, a function of the number of the
+repeat), a `description`, and may have `details` (text or number by name) and a method `in_si(task, results)` that
+converts results to SI units.
 """
 
 CONTESTANTS: dict[str, tuple[str, str, tuple[str, ...]]] = {

@@ -1,4 +1,4 @@
-"""jeit at every task, through its public interface."""
+"""jeit as a contestant at every task of the case `forward`, through its public interface."""
 
 from __future__ import annotations
 
@@ -64,11 +64,12 @@ class JeitContestant:
             self.tasks[GAUSS_NEWTON] = lambda k: ready(imager.estimate(measured[k % count], every, start).conductivity)
 
     def voltages(self, conductivity) -> np.ndarray:
-        """Voltages (M,) in volts for a conductivity (m,) in siemens."""
+        """Voltages (channels,) in volts for a conductivity (cells,) in siemens."""
         return np.asarray(self._model.voltages(jnp.asarray(conductivity)))
 
     def _imager(self, problem):
-        """NOSER on log σ, with all basis functions, so that opponents can minimise the same function."""
+        """Imager of log σ with the NOSER prior and all basis functions, so that opponents can minimise the same
+        function."""
         return Imager.create(
             self._model,
             self._background,

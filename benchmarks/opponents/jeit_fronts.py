@@ -1,4 +1,5 @@
-"""The sparse direct solver of concrete matrices: factorisation in NumPy, with solutions or with products alone."""
+"""jeit's sparse direct solver of concrete (not traced) matrices as a contestant: factorisation in NumPy, with solutions
+or only with products bᵀA⁻¹b."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Conjugate gradients with multigrid, for concrete matrices: levels are computed anew for each matrix."""
+"""jeit's conjugate gradients with multigrid as a contestant, for concrete (not traced) matrices: the multigrid levels
+are computed anew for each matrix."""
 
 from __future__ import annotations
 

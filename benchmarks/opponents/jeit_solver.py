@@ -1,4 +1,5 @@
-"""The sparse direct solver under jit: factorisation, solution, and both, for one matrix and for a batch."""
+"""jeit's sparse direct solver under `jax.jit` as a contestant: factorisation, solution, and both, for one matrix and
+for a batch."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from jeit_solvers import SparsityPattern, analyse, factorise, in_turn, solve
 
 
 def factorise_and_solve(plan, values, load):
-    """The task: from newly assembled values (nnz,) of a matrix and a load (n, k) to the solution (n, k)."""
+    """Solve the task: from newly assembled `values` (nonzeros,) of an n × n matrix and a `load` (n, k) of k right-hand
+    sides, compute the solution (n, k)."""
     return solve(plan, factorise(plan, values), load)
 
 

@@ -1,6 +1,7 @@
-"""Intel's PARDISO (oneMKL, through pypardiso) at the sparse solver's task, in an environment of its own.
+"""Intel's PARDISO (oneMKL, through pypardiso) as a contestant at the sparse solver's task, in a separate environment.
 
-The pattern is analysed once. Every repeat factorises another matrix of it, with oneMKL's default settings.
+The sparsity pattern is analysed once. Every repeat factorises another matrix of this pattern, with oneMKL's default
+settings.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Park 2022 in a plain implementation: a / (r² + b) of each microphone by least squares of logarithms, and the pixel of
-least loss, for any array.
+"""Plain implementation of the localisation of Park et al. (2022) for any array: the decay a / (r² + b) of each
+microphone is fitted by least squares of logarithms, and a touch is located at the pixel of least loss.
 
-It refuses nothing.
+The implementation refuses no array.
 """
 
 from __future__ import annotations
@@ -9,13 +9,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-# Trial values of b, as fractions of the square of the skin's longer side, and number of iterations with the taps'
-# strengths.
+# Trial values of b, as fractions of the square of the skin's longer side, and number of iterations that alternate with
+# the estimation of the taps' strengths.
 _TRIED, _ROUNDS = np.geomspace(1e-6, 1.0, 40), 10
 
 
 class PlainConsistency:
-    """For one array: microphones (M, 2), corners of a rectangle (4, 2), intensities (T, M) of taps at places (T, 2)."""
+    """Localiser for one array: M microphones (M, 2), corners of a rectangle (4, 2), intensities (T, M) of T taps at
+    places (T, 2)."""
 
     def __init__(self, microphones, outline, places, power, pixels: int = 100):
         self.microphones = microphones
@@ -23,7 +24,7 @@ class PlainConsistency:
         squared = ((places[:, None] - microphones) ** 2).sum(axis=-1)
         tried = _TRIED * np.ptp(outline, axis=0).max() ** 2
         known = np.where((power > 0) & self.received, np.log(np.maximum(power, 1e-300)), np.nan)
-        # (B, T, M): residual of the logarithm after removal of the decay.
+        # Residual (B, T, M) of the logarithm of intensity after removal of the decay, for B trial values of b.
         left = known + np.log(squared + tried[:, None, None])
         self.b = np.full(len(microphones), tried[len(tried) // 2])
         self.a = np.ones(len(microphones))
@@ -42,7 +43,7 @@ class PlainConsistency:
         self.inverse = ((away + self.b) / self.a)[:, self.received]
 
     def __call__(self, power: Float[np.ndarray, "N M"]) -> Float[np.ndarray, "N 2"]:
-        """The place of each touch."""
+        """Position (touches, 2) of each touch, from intensities `power` (touches, microphones)."""
         received = power[:, self.received]
         found = np.empty((len(received), 2))
         for k, one in enumerate(received):

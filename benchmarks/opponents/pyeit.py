@@ -1,7 +1,7 @@
-"""pyEIT on the same mesh, protocol and conductivities, in pyEIT's own environment.
+"""pyEIT as a contestant, on the same mesh, protocol and conductivities as jeit, in a separate environment.
 
-pyEIT has point electrodes only, one node each, so it is compared with jeit's point electrode model. It drives 1 A, and
-its Jacobian is -∂v/∂σ. `in_si` converts both for the comparison, outside the timed part.
+pyEIT has point electrodes only, one node each, so it is compared with jeit's point electrode model. pyEIT drives 1 A,
+and its Jacobian is -∂v/∂σ. `in_si` converts voltages and Jacobian for the comparison, outside the timed part.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from pyeit.mesh import PyEITMesh
 
 from benchmarks.problems.disk import GAUSS_NEWTON, STEPS
 
-# Of fifteen tested settings (its three methods, weights from 1e-4 to 1e4, decreasing and constant, with its example's
-# among them), the one whose images are closest to the truth. Its misfit is within 5 % of the lowest.
+# Of fifteen tested settings (pyEIT's three methods, weights from 1e-4 to 1e4, decreasing and constant, including the
+# setting of pyEIT's example), this setting gives the images closest to the truth. Its misfit is within 5 % of the
+# lowest misfit.
 SETTING = {"method": "kotre", "p": 0.5, "lamb": 0.1}
 
 
@@ -30,7 +31,7 @@ class PyeitContestant:
         num_drives = len(drive)
         drive_pairs = np.stack([drive.argmax(axis=1), drive.argmin(axis=1)], axis=1)
         pairs = np.stack([measurement.argmax(axis=1), measurement.argmin(axis=1)], axis=1)
-        # pyEIT requires equally many channels for every drive, drive by drive: adjacent protocols have that.
+        # pyEIT requires equally many channels for every drive, ordered drive by drive, as in adjacent protocols.
         if not np.array_equal(drive_index, np.repeat(np.arange(num_drives), len(drive_index) // num_drives)):
             raise ValueError("pyEIT needs channels drive by drive, equally many for each.")
         current = drive.max()
@@ -57,7 +58,7 @@ class PyeitContestant:
         }
         if "measured" in problem:
             measured, solver = problem["measured"] / current, JAC(mesh, protocol)
-            # `setup` inverts once for linear images, which `gn` does not use: only its parameters are needed.
+            # `setup` would invert a matrix for linear images, which `gn` does not use: only the parameters are needed.
             solver.params, solver.is_ready = SETTING, True
             self.description += f", {SETTING}"
             self.tasks[GAUSS_NEWTON] = lambda k: solver.gn(
@@ -65,7 +66,8 @@ class PyeitContestant:
             )
 
     def in_si(self, task, results):
-        """Volts, and volts per siemens, at the problem's current. Images are in siemens already."""
+        """Convert results to volts, and Jacobians to volts per siemens, at the problem's current. Images are already in
+        siemens."""
         if task == GAUSS_NEWTON:
             return results
         if isinstance(results, tuple):

@@ -10,7 +10,8 @@ from benchmarks.harness.timing import Timed, timed
 
 
 def kmeans(vectors: np.ndarray, number: int, rounds: int, draws: int) -> tuple[Timed, float]:
-    """Clusters of vectors (n, d), 10 restarts, and the median inertia of several runs."""
+    """Time k-means with `number` clusters of vectors (n, d) and 10 restarts; also return the median inertia of several
+    runs."""
     from sklearn.cluster import KMeans
     from threadpoolctl import threadpool_limits
 

@@ -1,10 +1,11 @@
-"""The opponent written with SciPy alone: complete electrode model, SuperLU, Jacobian by field products.
+"""Baseline opponent written with SciPy alone: complete electrode model, SuperLU, Jacobian by products of fields.
 
 Everything that does not depend on the conductivity is done once, in the constructor: element matrices, the sparse map
 from conductivity to matrix entries, gradients, the fill-reducing ordering (timed, the fastest kept) and the way the
-products are formed (timed, the fastest kept). The rest is the least cost per conductivity for a user of SciPy.
+products are formed (timed, the fastest kept). The remaining computation is the least cost per conductivity for a user
+of SciPy.
 
-Two strengths:
+The baseline has two strengths:
 
 - `plain`: SuperLU in its best ordering, as the SciPy manual offers it, and products drive by drive;
 - `tuned`: the ordering found once and reused (`NATURAL` on the permuted matrix, panels of one column, which suit these
@@ -34,11 +35,13 @@ ORDERINGS: dict[str, dict[str, Any]] = {
 
 
 class ScipyBaseline:
-    """Voltages and Jacobian of a 2-D body of given conductivity per cell, with NumPy and SciPy only.
+    """Voltages and Jacobian of a two-dimensional body with one conductivity per cell, computed with NumPy and SciPy
+    only.
 
-    `problem` holds plain arrays: `points` (n, 2), `cells` (m, 3), `drive` (S, L), `measurement` (K, L),
-    `drive_index` and `measurement_index` (M,), and either `position` (L, 2), `width` (L,), `contact_impedance` (L,)
-    of arcs on the boundary, or `nodes` (L,) of point electrodes. SI units. `choose=False` skips the timing of choices.
+    `problem` contains plain arrays in SI units, for n nodes, m cells, S drives, K measurement patterns, M channels and
+    L electrodes: `points` (n, 2), `cells` (m, 3), `drive` (S, L), `measurement` (K, L), `drive_index` and
+    `measurement_index` (M,), and either `position` (L, 2), `width` (L,), `contact_impedance` (L,) of arcs on the
+    boundary, or `nodes` (L,) of point electrodes. `choose=False` skips the timing of choices.
     """
 
     def __init__(
@@ -60,38 +63,42 @@ class ScipyBaseline:
 
     @property
     def reciprocal_pairs(self) -> list[tuple[int, int]]:
-        """Channels of equal reading, each pair once. -1 for one without a duplicate."""
+        """Pairs of reciprocal channels, which have equal readings, each pair once; the second index is -1 for a channel
+        without a duplicate."""
         return [(channel, twin) for channel, twin, _, _ in self._reciprocal]
 
     @property
     def ways(self) -> list[Any]:
-        """All ways of forming the Jacobian's products."""
+        """All ways of forming the products of fields in the Jacobian."""
         ways = [self._by_drive, self._by_channel, self._by_matrix_products]
         return [*ways, self._by_reciprocal_pair] if self.tuned else ways
 
     @property
     def choices(self) -> str:
-        """The ordering and the way of forming products that were fastest on this mesh."""
+        """Text of the ordering and the way of forming products that were fastest on this mesh."""
         return f"{self.ordering}; {self.product.__name__.strip('_').replace('_', ' ')}"
 
     # The timed part, which depends on the conductivity.
 
     def voltages(self, conductivity: np.ndarray) -> np.ndarray:
-        """Voltages (M,) in volts for a conductivity (m,) in siemens."""
+        """Voltages (channels,) in volts for a conductivity (cells,) in siemens."""
         return self._solve(conductivity)[0]
 
     def voltages_and_jacobian(self, conductivity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Voltages (M,) and their derivative (M, m) with respect to the conductivity of every cell."""
+        """Voltages (channels,) and their derivative (channels, cells) with respect to the conductivity of every
+        cell."""
         voltages, fields = self._solve(conductivity)
         return voltages, self.product(self._gradients(fields))
 
     def matrix(self, conductivity: np.ndarray) -> scipy.sparse.csc_matrix:
-        """Stiffness and contact mass (n, n): only the values change, by one sparse product."""
+        """Sum (n, n) of stiffness matrix and contact mass matrix. Only the values depend on the conductivity; one
+        sparse product computes them."""
         values = self._value_map @ conductivity + self._constant_values
         return scipy.sparse.csc_matrix((values, self._indices, self._indptr), (self.num_points, self.num_points))
 
     def _solve(self, conductivity):
-        """Voltages (M,), and potentials (n, P) of the P distinct drive and measurement patterns."""
+        """Voltages (channels,), and potentials (n, P) at the n nodes for the P distinct drive and measurement
+        patterns."""
         solve = self._factor(self.matrix(conductivity))
         unit = solve(self._load)  # (n, L): fields of unit electrode potentials, or of unit currents
         if self.is_point:
@@ -107,11 +114,13 @@ class ScipyBaseline:
         return table[self.measurement_index, self.drive_index], fields
 
     def _gradients(self, fields):
-        """∇u times the root of the cell's area, (2, P, m), for fields (n, P)."""
+        """Gradients ∇u times the square root of the cell's area, (2, P, m), of the P potentials u in `fields` (n,
+        P)."""
         stacked = self._gradient @ np.ascontiguousarray(fields)
         return np.ascontiguousarray(stacked.T).reshape(-1, 2, self.num_cells).transpose(1, 0, 2)
 
-    # Three ways of forming J[k, e] = -∫_e ∇u_drive(k) · ∇u_measurement(k). The fastest on this mesh is kept.
+    # Three ways of forming J[k, e] = -∫_e ∇u_drive(k) · ∇u_measurement(k) for channel k and cell e. The fastest way on
+    # this mesh is kept.
 
     def _by_drive(self, gradients):
         jacobian = np.empty((len(self.drive_index), self.num_cells))
@@ -159,7 +168,7 @@ class ScipyBaseline:
             self._nodes = problem["nodes"]
             self._load = np.zeros((count, len(self._nodes)), order="F")
             self._load[self._nodes, np.arange(len(self._nodes))] = 1.0
-            # Grounding one node through 1 S does not change currents that sum to zero.
+            # Grounding one node through 1 S changes no voltages, because currents sum to zero.
             self._contact = scipy.sparse.coo_matrix(([1.0], ([0], [0])), (count, count))
             return
         mass, load, area = contact_integrals(
@@ -168,7 +177,8 @@ class ScipyBaseline:
         self._contact, self._load, self._diagonal = mass, np.asfortranarray(load), np.diag(area)
 
     def _set_up_assembly(self):
-        """Map (nnz, m) from conductivity to the values of the matrix in compressed-column order."""
+        """Compute the sparse map (nonzeros, cells) from conductivity to the values of the matrix in compressed-column
+        order."""
         corners = self.points[self.cells]
         edge = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)  # edge opposite each corner
         first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -198,7 +208,7 @@ class ScipyBaseline:
         self._constant_values = np.bincount(place[entries:], contact.data, len(unique))
 
     def _set_up_fields(self):
-        """Drive and measurement patterns that are proportional are solved for once."""
+        """Find the distinct drive and measurement patterns: proportional patterns are solved for only once."""
         patterns, drive_field, drive_scale = _distinct(self.drive, np.empty((0, self.drive.shape[1])))
         patterns, measurement_field, measurement_scale = _distinct(self.measurement, patterns)
         self._patterns = patterns
@@ -226,7 +236,7 @@ class ScipyBaseline:
         self._reciprocal = pairs
 
     def _choose_ordering(self, matrix):
-        """Time every candidate on this matrix (factor and solve together) and keep the fastest."""
+        """Time every candidate ordering on this matrix (factorisation and solution together) and keep the fastest."""
         candidates = {name: _superlu(options) for name, options in ORDERINGS.items()}
         if self.tuned:
             permutation = np.argsort(scipy.sparse.linalg.splu(matrix, **SYMMETRIC).perm_c)
@@ -249,7 +259,8 @@ def _superlu(options):
 
 
 def _distinct(rows, known):
-    """Directions among `rows` not yet in `known`, the direction of each row, and its length along it."""
+    """Directions of `rows` (patterns) including those in `known`, each once; the index of each row's direction, and the
+    factor of each row along it."""
     directions, which, scale = list(known), [], []
     for row in rows:
         size = np.abs(row).max()

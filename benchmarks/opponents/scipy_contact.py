@@ -7,9 +7,11 @@ import scipy.sparse
 
 
 def contact_integrals(points, cells, position, width, contact_impedance):
-    """Contact mass (n, n) sparse, load (n, L) and admittance (L,) of arcs on the boundary polygon.
+    """Sparse contact mass (n, n), load (n, L) and admittance (L,) of L arcs on the boundary polygon of a mesh with n
+    nodes.
 
-    Over the covered piece [a, b] of an edge with ends i, j: ∫φ_iφ_j/z, ∫φ_i/z and (b - a)/z, summed over edges.
+    For the basis functions φ and the contact impedance z, the entries are ∫φ_iφ_j/z, ∫φ_i/z and (b - a)/z over the
+    covered piece [a, b] of an edge with ends i, j, summed over edges.
     """
     edges = _boundary(cells)
     length = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)

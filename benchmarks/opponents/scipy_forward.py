@@ -1,4 +1,4 @@
-"""The SciPy baseline at every task."""
+"""The SciPy baseline as a contestant at every task of the case `forward`."""
 
 from __future__ import annotations
 

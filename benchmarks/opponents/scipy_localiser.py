@@ -1,7 +1,8 @@
-"""Localisation in a plain NumPy and SciPy implementation: frame by frame, each a map over pixels and a refinement.
+"""Plain implementation of localisation by sound in NumPy and SciPy: for each frame, a map of the loss over pixels, and
+a refinement.
 
-Text S2 of Park 2022: the loss on a raster, its least pixel, then a bounded solver from there. Constants (distances,
-responses) are computed once.
+As in Text S2 of Park et al. (2022), the loss is computed on a grid of pixels, and a bounded solver starts from the
+pixel of least loss. Constants (distances, responses) are computed once.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import scipy.optimize
 
 
 class PlainLocaliser:
-    """For one array: microphones (M, 2), a and b (M,) of the decay model, half the skin's width (m), pixels a side."""
+    """Localiser for one array: M microphones (M, 2), parameters a and b (M,) of the decay model a / (r² + b), half of
+    the skin's width in metres, pixels along a side."""
 
     def __init__(self, microphones, a, b, half: float, pixels: int):
         self.microphones, self.a, self.b, self.half = microphones, a, b, half
@@ -21,13 +23,14 @@ class PlainLocaliser:
         self.inverse = (squared + b[:, None, None]) / a[:, None, None]
 
     def map(self, intensity: np.ndarray) -> np.ndarray:
-        """The loss of one frame on the raster, relative to the square of the loudest intensity."""
+        """The loss of one frame at every pixel, relative to the square of the largest intensity."""
         loudest = intensity.argmax()
         strength = (intensity / intensity[loudest])[:, None, None] * self.inverse
         return np.sum((strength[loudest] - strength) ** 2, axis=0)
 
     def locate(self, intensity: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-        """The least pixel of the map, or `start`, refined within the skin by L-BFGS-B with the exact gradient."""
+        """Position of least loss within the skin, found by L-BFGS-B with the exact gradient from `start` or else from
+        the pixel of least loss."""
         loudest = intensity.argmax()
         relative = intensity / intensity[loudest] / self.a
         if start is None:
@@ -46,5 +49,5 @@ class PlainLocaliser:
         return found.x
 
     def locate_near(self, intensity: np.ndarray) -> np.ndarray:
-        """Refined from the loudest microphone, without a map."""
+        """Position found by L-BFGS-B from the microphone with the largest intensity, without a map."""
         return self.locate(intensity, self.microphones[intensity.argmax()])

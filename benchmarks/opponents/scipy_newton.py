@@ -1,15 +1,15 @@
 """Gauss-Newton with SciPy alone, on the forward model of `scipy_baseline.py`.
 
-Minimises ½ Σ ((v_i(σ) - f_i) / s_i)² + ½ ‖c‖² over c, with log σ = log σ₀ + τ c, by full steps. The cells' standard
-deviations τ are NOSER's, (Σ_i J_ie²)^(-1/4) / λ at the background. Writing J for ∂v/∂c / s and r for (v - f) / s, the
-next c is either of
+Minimises ½ Σ ((v_i(σ) - f_i) / s_i)² + ½ ‖c‖² over c, with log σ = log σ₀ + τ c, by full steps, for a frame f with
+noise s. The cells' standard deviations τ are those of the NOSER prior, (Σ_i J_ie²)^(-1/4) / λ at the background. With J
+for ∂v/∂c / s and r for (v - f) / s, for m cells and M channels, the next c is computed by either of
 
     (JᵀJ + 1)⁻¹ Jᵀ (J c - r)        m equations, in the space of images
     Jᵀ (J Jᵀ + 1)⁻¹ (J c - r)       M equations, in the space of data
 
-and the faster one on this mesh is kept, together with the way of forming J that suits it. The `tuned` strength also
-averages reciprocal channels, which halves the rows of J, and forms half of the symmetric product (`syrk`). All dense
-algebra goes through SciPy's BLAS: NumPy has another one, and the threads of the two disturb each other.
+The faster equation on this mesh is kept, together with the fastest way of forming J for it. The `tuned` strength also
+averages reciprocal channels, which halves the rows of J, and forms only half of the symmetric product (`syrk`). All
+dense algebra uses SciPy's BLAS: NumPy has another BLAS, and the threads of both disturb each other.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from benchmarks.opponents.scipy_baseline import ScipyBaseline
 
 
 class ScipyNewton:
-    """A fixed number of steps from the background, for frames (M,) in volts."""
+    """Gauss-Newton with a fixed number of steps from the background, for frames (channels,) in volts."""
 
     def __init__(self, baseline: ScipyBaseline, problem: dict[str, np.ndarray], num_steps: int):
         self.baseline, self.num_steps = baseline, num_steps
@@ -40,11 +40,11 @@ class ScipyNewton:
 
     @property
     def choice(self) -> str:
-        """The space and the products that were fastest."""
+        """Text of the space (data or images) and the way of forming products that were fastest."""
         return ", ".join(way.__name__.strip("_").replace("_", " ") for way in (self._step, self._product))
 
     def conductivity(self, frame: np.ndarray) -> np.ndarray:
-        """σ (m,) in siemens after the steps."""
+        """Conductivity (cells,) in siemens after the steps, for one frame."""
         self.baseline.product = self._product
         coefficients = np.zeros(self.baseline.num_cells)
         for _ in range(self.num_steps):
@@ -57,7 +57,8 @@ class ScipyNewton:
         return self._step(*self._weigh(voltages, jacobian, conductivity * self.deviation, frame), coefficients)
 
     def _combine(self, noise, pairs):
-        """The channels that represent themselves and their duplicates, and the deviations to divide them by."""
+        """Indices of the channels that remain after averaging of reciprocal pairs, and the factors by which their
+        residuals are weighted."""
         if not self.baseline.tuned or any(twin < 0 for _, twin in pairs):
             return None, 1 / noise
         channel, twin = np.array(pairs).T
@@ -67,7 +68,7 @@ class ScipyNewton:
         return channel, np.sqrt(2) / noise[channel]
 
     def _weigh(self, voltages, jacobian, slope, frame):
-        """r (M,), and Jᵀ (m, M) in Fortran order, which BLAS accepts without a copy."""
+        """Weighted residual r (M,), and Jᵀ (m, M) in Fortran order, which BLAS accepts without a copy."""
         if self._rows is not None:
             frame = (frame[self._rows] + frame[self._twin]) / 2
             voltages, jacobian = voltages[self._rows], jacobian[self._rows]
@@ -89,7 +90,8 @@ class ScipyNewton:
         return _solve(matrix, dgemv(1.0, jacobian, dgemv(1.0, jacobian, coefficients, trans=1) - residual))
 
     def _choose(self, frame):
-        """Time whole iterations in either space, then with every way of forming J, and keep the fastest."""
+        """Time whole iterations in the spaces of data and images, then with every way of forming J, and keep the
+        fastest."""
         start = np.zeros(self.baseline.num_cells)
 
         def iterate(step, product) -> None:

@@ -9,11 +9,11 @@ import scipy.sparse.linalg
 
 
 class Permuted:
-    """A matrix of fixed pattern in a given order, factorised with that order."""
+    """Factorisation of matrices with a fixed sparsity pattern in a given ordering of the unknowns."""
 
     def __init__(self, matrix, permutation):
         self.permutation = permutation
-        # Applying the permutation to the places of the values gives the new place of each value.
+        # Applying the permutation to the indices of the values gives the new index of each value.
         places = scipy.sparse.csc_matrix(
             (np.arange(1, matrix.nnz + 1, dtype=float), matrix.indices, matrix.indptr), matrix.shape
         )

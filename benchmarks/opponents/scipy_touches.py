@@ -1,7 +1,9 @@
-"""Voltages of a touched skin in a plain SciPy implementation: the touched cells change, and the whole is solved anew.
+"""Plain SciPy implementation of the voltages of a touched skin: the conductivity of the touched cells changes, and the
+whole system is solved anew.
 
-Per touch: the changed element matrices are added to the sparse matrix, with one SuperLU factorisation (minimum degree
-of Aᵀ + A, symmetric mode, no pivoting off the diagonal), one solve for all electrodes, and the voltages of all pairs.
+For each touch, the changes of element matrices are added to the sparse matrix A; then follow one SuperLU factorisation
+(minimum degree of Aᵀ + A, symmetric mode, no pivoting off the diagonal), one solution for all electrodes, and the
+voltages of all electrode pairs.
 """
 
 from __future__ import annotations
@@ -12,7 +14,8 @@ from scipy.sparse.linalg import splu
 
 
 class PlainTouches:
-    """For one `model` of jeit (its mesh, contact integrals and protocol) and conductivity (m,)."""
+    """Voltages of a touched skin, for one forward `model` of jeit (of which mesh, contact integrals and protocol are
+    used) and a conductivity (cells,)."""
 
     def __init__(self, model, conductivity: np.ndarray):
         from jeit.forward.system import stiffness
@@ -32,7 +35,7 @@ class PlainTouches:
         self.before = self.voltages(self.matrix)
 
     def voltages(self, matrix) -> np.ndarray:
-        """Voltages of the protocol, from a matrix of stiffness and contacts."""
+        """Voltages of the protocol's channels, from the sum `matrix` of stiffness and contact matrices."""
         factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         product = self.load.T @ factor.solve(self.load)
         impedance = np.linalg.inv((np.diag(self.load.sum(axis=0)) - product)[:-1, :-1])  # against the ground
@@ -40,7 +43,7 @@ class PlainTouches:
         return table[self.protocol.measurement_index, self.protocol.drive_index]
 
     def change(self, cells: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Change of the voltages, where the conductivity of `cells` (c,) becomes (1 + change) times its value."""
+        """Change of the voltages when the conductivity of `cells` (indices) becomes (1 + change) times its value."""
         kept = change != 0
         cells, change = cells[kept], np.maximum(change[kept], 1e-9 - 1.0)
         nodes = self.cells[cells]

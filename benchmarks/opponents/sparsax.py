@@ -1,7 +1,9 @@
-"""sparsax, CHOLMOD through XLA's foreign functions, at the solver's task, in an environment of its own.
+"""sparsax (CHOLMOD through XLA's foreign functions) as a contestant at the sparse solver's task, in a separate
+environment.
 
-It analyses a pattern once, remembers the last factor, and factorises anew when the values change: every repeat has
-another matrix. Its three kinds of factorisation are timed, and the fastest on this matrix is kept.
+sparsax analyses a sparsity pattern once, keeps the last factor, and factorises anew when the values change; every
+repeat has another matrix. The three kinds of factorisation of sparsax are timed, and the fastest on this matrix is
+kept.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ class Sparsax:
     """`tasks` maps a task's name to a function of the number of the repeat, which selects the matrix."""
 
     def __init__(self, problem: dict[str, np.ndarray]):
-        # sparsax reads the upper triangle, problems contain the lower.
+        # sparsax reads the upper triangle of a matrix, problems contain the lower triangle.
         row, column = jnp.asarray(problem["columns"], jnp.int32), jnp.asarray(problem["rows"], jnp.int32)
         every, load = jnp.asarray(problem["values"]), jnp.asarray(problem["load"])
         each, count, size = list(every), len(every), len(problem["load"])

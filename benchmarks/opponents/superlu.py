@@ -1,4 +1,5 @@
-"""SciPy's SuperLU at the solver's task: all its orderings are timed, and the fastest on this matrix is kept."""
+"""SciPy's SuperLU as a contestant at the sparse solver's task: all orderings of SuperLU are timed, and the fastest on
+this matrix is kept."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ class SuperLU:
         load, count = problem["load"], len(problem["values"])
         self._matrices = [symmetric(problem, number) for number in range(count)]
         order = np.argsort(splu(self._matrices[0], **ORDERINGS["MMD_AT_PLUS_A, symmetric mode"]).perm_c)
-        # The values would arrive in this order, as they do for jeit's solver.
+        # The matrices are permuted before timing, because values could be assembled in this order, as for jeit's
+        # solver.
         permuted = [matrix[order][:, order].tocsc() for matrix in self._matrices]
 
         def kept(k: int) -> tuple[Any, Callable[[np.ndarray], np.ndarray]]:

@@ -1,1 +1,1 @@
-"""The problems of the contestants, as plain arrays, and references for their results."""
+"""The problems that the contestants solve, as plain arrays, and reference solutions."""

@@ -1,4 +1,4 @@
-"""References for the results: each other, and the exact solutions for the homogeneous disk."""
+"""Accuracy of results: differences between contestants, and from exact solutions for the homogeneous disk."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from jeit.forward.exact import ConductingDisk, arc_transfer_impedance, point_tra
 
 
 def difference(result: np.ndarray, reference: np.ndarray) -> float:
-    """Relative difference in the Euclidean (Frobenius) norm."""
+    """Relative difference of a result from a reference in the Euclidean (Frobenius) norm."""
     return float(np.linalg.norm(result - reference) / np.linalg.norm(reference))
 
 
 def exact_voltages(problem: dict[str, np.ndarray]) -> np.ndarray:
-    """Voltages (M,) of the homogeneous disk: point electrodes at their places, or arcs equally spaced on the circle."""
+    """Exact voltages (channels,) of the homogeneous disk, for point electrodes at any positions, or for arcs equally
+    spaced on the circle."""
     disk = ConductingDisk(radius=problems.RADIUS, conductivity=float(problem["background"]))
     if "nodes" in problem:
         x, y = problem["points"][problem["nodes"]].T

@@ -18,7 +18,7 @@ from benchmarks.problems.fabric import REPETITIONS, Fabric
 from jeit.touch.learnt.extras import one_thread
 from jeit.touch.learnt.methods import CLASSIFIERS, log_odds
 
-# Of six sixths, and of the observations in one.
+# Indices of the sixths of the observations that are held out, and maximum number of tested observations of a sixth.
 HELD_OUT, MOST = (2, 5), 2000
 
 
@@ -33,7 +33,8 @@ class Learnt:
 
     @classmethod
     def by(cls, name: str, features: Float[np.ndarray, "N M"], label: Int[np.ndarray, " N"]) -> Learnt:
-        """The method of this name, trained on observations and their classes."""
+        """Train the classifier called `name` on `features` (observations, channels) and the class of each observation,
+        `label`."""
         mean, deviation = features.mean(axis=0), features.std(axis=0)
         start = time.perf_counter()
         with one_thread():
@@ -41,17 +42,17 @@ class Learnt:
         return cls(model, mean, deviation, time.perf_counter() - start)
 
     def predict(self, features: Float[np.ndarray, "*n M"]) -> Int[np.ndarray, "*n"]:
-        """The predicted class of each."""
+        """The predicted class of each observation."""
         flat = (features.reshape(-1, features.shape[-1]) - self.mean) / self.deviation
         return log_odds(self.model, flat).argmax(axis=1).reshape(features.shape[:-1])
 
 
 @dataclass(frozen=True)
 class DayLater:
-    """Results of tests a day later: `accuracy`, per cent, and `off` (C,), mm.
+    """Results of tests a day later for C squares: `accuracy` in per cent, and `off` (C,) in millimetres.
 
-    `off` is the mean distance of the predicted square from each touched one. Its mean is the paper's average Euclidean
-    error.
+    `off` is the mean distance of the predicted square from each touched square. The mean of `off` is the paper's
+    average Euclidean error.
     """
 
     accuracy: float
@@ -59,7 +60,7 @@ class DayLater:
 
     @classmethod
     def both(cls, learnt: Learnt, fabric: Fabric) -> tuple[DayLater, DayLater]:
-        """Results for a fabric's squares, as they are read, and with a renewed reference."""
+        """Results for the squares of a fabric, with the old reference, and with a renewed reference."""
         return cls._of(learnt, fabric, anew=False), cls._of(learnt, fabric, anew=True)
 
     @classmethod
@@ -71,14 +72,16 @@ class DayLater:
 
     @property
     def cells(self) -> list[str]:
-        """Accuracy, error, and its deviation among the squares."""
+        """Texts of the accuracy, and of the mean error ± its standard deviation among the squares."""
         return [f"{self.accuracy:.1f} %", f"{self.off.mean():.1f} ± {self.off.std():.1f} mm"]
 
 
 def held_out(name: str, features, label, repetition) -> tuple[float, float]:
-    """Per cent right of observations (N, M), of which one sixth was held out: at random, and one repetition of six.
+    """Percentages of correctly classified observations in a held-out sixth, which is drawn at random, or is one of six
+    repetitions.
 
-    The sixths `HELD_OUT` in turn. Of each at most about `MOST` are tested.
+    `features` (observations, channels) are the data. The sixths `HELD_OUT` are held out in turn; at most about `MOST`
+    observations of each are tested.
     """
     random = np.random.default_rng(0).permutation(len(label)) % REPETITIONS
 
@@ -95,7 +98,7 @@ def held_out(name: str, features, label, repetition) -> tuple[float, float]:
 
 
 def seconds_of_a_frame(learnt: Learnt, fabric: Fabric, rounds: int = 30) -> float:
-    """The median time of one frame."""
+    """The median seconds for the classification of one frame."""
     frame, spent = fabric.asked(anew=False)[0, :1], []
     for _ in range(rounds):
         start = time.perf_counter()

@@ -1,8 +1,9 @@
-"""Frames of a pressed skin of 100 mm, simulated on a finer mesh than that of its images, after Chen et al. 2022.
+"""Frames of a pressed skin of 100 mm after Chen et al. 2022, simulated on a finer mesh than that of the images.
 
-Variation is that of the material, fixed before any accuracy was computed: noise, gains, and drift over up to twenty
-seconds since the skin equalled its model. The noise given to the finders is that of untouched frames over the same
-time. One layer changes along the sheet by a hundredth of the change of two layers (chosen: no figure is published).
+The simulated variation is that of the material, fixed before any accuracy was computed: noise, gains, and drift over up
+to twenty seconds from the time at which the skin equals its model. Contact finders receive the noise of untouched
+frames over the same time. The conductance of one layer along the sheet changes by a hundredth of the change of two
+layers (an assumption: no figure is published).
 """
 
 from __future__ import annotations
@@ -27,14 +28,15 @@ from jeit.touch.simulate import DiscIndenter, Press, PressDraws, PressedSkin, ba
 RADIUS, GRAVITY, SECONDS = 0.05, 9.81, 20.0
 SINGLE = 0.01
 LOADS = {"velostat": (0.5, 10.0), "conductive fabric": (0.3, 2.5)}
-# Least distance between simultaneous touches, at which two can be distinguished at all, metres.
+# Least distance in metres between simultaneous touches, at which two touches can still be distinguished, and margin to
+# the edge.
 APART, MARGIN = 0.022, 0.008
 
 
 @dataclass
 class ContactFrames:
-    """A skin of `name`, with `noise` times the material's and `saturation` times its change, and the imaging method:
-    "one-step" or "back-projection". `nodes` of the skin and of its images.
+    """Frames of a skin of the material `name`, whose noise and saturated change are those of the material times `noise`
+    and `saturation`, and images of the frames. `nodes`: numbers of nodes for the simulation and for the images.
     """
 
     name: str = "velostat"
@@ -45,7 +47,7 @@ class ContactFrames:
 
     @cached_property
     def models(self) -> list[ForwardModel]:
-        """The models of the skin and of its images."""
+        """The forward models of the skin and of the images."""
         own = material(self.name)
         electrodes = BoundaryElectrodes(ring(RADIUS, 16), 0.008, 0.006 / (own.conductivity * own.thickness))
         return [ForwardModel(Disk(RADIUS).mesh(num_points=n), electrodes, adjacent(16)) for n in self.nodes]
@@ -59,15 +61,15 @@ class ContactFrames:
 
     @cached_property
     def before(self) -> np.ndarray:
-        """A hundred untouched frames over twenty seconds, volts."""
+        """A hundred frames (100, 208) of the untouched skin over twenty seconds, in volts."""
         return self.empty(1, 100)
 
     def empty(self, key: int, number: int) -> np.ndarray:
-        """Untouched frames (number, 208), five for every drift."""
+        """Frames (number, 208) of the untouched skin in volts, five for every random drift."""
         return self.frames(10_000 * key, [()] * number, at_once=5)
 
     def frames(self, key: int, presses: list, at_once: int = 1) -> np.ndarray:
-        """Frames (n, 208) of presses, volts, `at_once` of one drift, those of one time after those of another."""
+        """Frames (n, 208) of presses in volts. `at_once` successive frames share one random drift."""
         parts = [presses[first : first + at_once] for first in range(0, len(presses), at_once)]
         times = np.random.default_rng(key).uniform(0, SECONDS, len(parts))
         read = [
@@ -77,14 +79,14 @@ class ContactFrames:
         return np.concatenate(read)
 
     def reconstruction(self, method: str) -> LinearReconstruction:
-        """The linear images of that name."""
+        """The linear reconstruction by `method`, "one-step" or "back-projection"."""
         conductivity = float(self.skin.conductivity[0])
         if method == "back-projection":
             return back_projection(self.models[1], conductivity)
         return one_step(self.models[1], conductivity, noise=self.before.std(axis=0))
 
     def images(self, reconstruction: LinearReconstruction, frames: np.ndarray) -> np.ndarray:
-        """Changes (n, m) from the mean of the untouched frames, S."""
+        """Images (frames, cells) of the conductivity change from the mean of the untouched frames, in S."""
         return np.asarray(reconstruction.image(frames - self.before.mean(axis=0)))
 
     def image_noise(self, reconstruction: LinearReconstruction) -> ImageNoise:
@@ -92,7 +94,7 @@ class ContactFrames:
         return ImageNoise.of_frames(reconstruction, self.before)
 
     def touches(self, key: int, number: int) -> list[tuple[Press, ...]]:
-        """One to three simultaneous discs and balls, of many sizes, loads and places, far enough apart to be
+        """Draw one to three simultaneous discs and balls of many sizes, loads and positions, far enough apart to be
         distinguished.
         """
         shapes = [
@@ -111,7 +113,7 @@ class ContactFrames:
 
 
 def weight(grams: float, place, radius: float = 0.0115) -> Press:
-    """A weight on a flat disc of a `radius`, at a place, metres."""
+    """Press of a weight that stands on a flat disc of the given `radius` at `place`, in metres."""
     return Press(DiscIndenter(2 * radius), 1e-3 * grams * GRAVITY, place)
 
 

@@ -1,9 +1,9 @@
 """Tanks like the Kuopio challenge's, with missing electrodes, drawn at random and solved without jeit.
 
-32 electrodes, 76 drives, every adjacent difference read, and one to four strong bodies, metal or plastic: disks,
-triangles to hexagons, bars, crosses, L and T. As in a real tank, electrodes are slightly displaced and vary in width
-and contact, the electrodes' channels have gains and offsets, one contact is sometimes loose, and the bath drifts
-between the two frames. Mesh and solver are those of `mixed_tanks`.
+Tanks have 32 electrodes, 76 drives, measurements of all differences of adjacent electrodes, and one to four strong
+bodies of metal or plastic: disks, triangles to hexagons, bars, crosses, L and T shapes. As in a real tank, electrodes
+are slightly displaced and vary in width and contact, the electrodes' channels have gains and offsets, one contact is
+sometimes loose, and the bath drifts between the two frames. Mesh and solver are those of `mixed_tanks`.
 """
 
 from __future__ import annotations
@@ -28,25 +28,27 @@ RADIUS, ELECTRODES, CURRENT = 0.115, 32, 1.47e-3
 CONDUCTIVITY, CONTACT = 7.5e-4, 0.01
 _WIDTH = np.radians(5.625) * RADIUS
 _SPACING, _APART, _FROM_WALL = 0.032, 0.1, 0.04
-# Standard deviations: place (m), width and contact (relative), gain, offset (V), drift of the bath, noise.
+# Standard deviations: position (m), width and contact impedance (relative) of electrodes, gain, offset (V), drift of
+# the bath, noise.
 _PLACE, _UNEVEN, _CONTACT, _GAIN, _OFFSET, _DRIFT, _NOISE = 3e-4, 0.05, 0.7, 0.005, 8e-3, 0.03, 2e-3
 
 
 class Tank(NamedTuple):
-    """**Fields**: `frame` and `reference` of all electrodes. `truth` (256, 256), with the challenge's labels."""
+    """Simulated tank. **Fields**: `frame` and `reference` of all electrodes. `truth` (256, 256): pixels with the
+    challenge's labels."""
 
     frame: Measurement
     reference: Measurement
     truth: np.ndarray
 
     def without(self, number: int) -> Tank:
-        """The same with the first `number` electrodes missing."""
+        """The same tank with the first `number` electrodes missing."""
         frame, reference = (without(one, range(number)) for one in self[:2])
         return Tank(frame, reference, self.truth)
 
 
 def without(measurement: Measurement, gone: Sequence[int]) -> Measurement:
-    """A measurement as it would be without some electrodes."""
+    """The measurement with the channels masked that would be missing without the electrodes `gone`."""
     if not len(gone):
         return measurement
     mask = np.asarray(measurement.mask) & measurement.protocol.mask_without(list(gone))
@@ -63,7 +65,7 @@ def protocol() -> Protocol:
 
 
 def draw(seed: int) -> Tank:
-    """A tank, reproducible from its seed."""
+    """Draw a tank, reproducible from its seed."""
     rng = np.random.default_rng(seed)
     bodies = _bodies(rng)
     points, cells = _mesh([outline for outline, _ in bodies], rng)
@@ -76,7 +78,7 @@ def draw(seed: int) -> Tank:
         "position": RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=1),
         "width": _WIDTH * (1 + _UNEVEN * rng.normal(size=ELECTRODES)),
         "contact_impedance": CONTACT * np.exp(_CONTACT * rng.normal(size=ELECTRODES)),
-        # Unit currents into every electrode but the last, and out of the last, with all potentials.
+        # Unit currents enter at every electrode but the last and leave at the last; all potentials are measured.
         "drive": (np.eye(ELECTRODES) - np.eye(ELECTRODES)[-1])[:-1],
         "measurement": np.eye(ELECTRODES),
         "drive_index": np.repeat(np.arange(ELECTRODES - 1), ELECTRODES),
@@ -94,7 +96,7 @@ def draw(seed: int) -> Tank:
     def measured(factor, name):
         bath = CONDUCTIVITY * np.exp(_DRIFT * rng.normal())
         potential = current @ solver.voltages(bath * factor).reshape(ELECTRODES - 1, ELECTRODES)
-        # The electronics read every electrode against one of the drive's.
+        # The electronics measure every electrode against one of the driven electrodes.
         against = potential[np.arange(plan.num_drives), np.argmin(np.asarray(plan.drive), axis=1)]
         read = gain * (potential - against[:, None]) + offset
         voltages = (read[:, 1:] - read[:, :-1]).ravel()
@@ -131,7 +133,7 @@ def _bodies(rng) -> list[tuple[np.ndarray, float]]:
 
 
 def _outline(rng) -> np.ndarray:
-    """Corners (n, 2) about the origin, in units of the tank's radius."""
+    """Corners (n, 2) of a random body about the origin, in units of the tank's radius."""
     kind, size = rng.integers(6), rng.uniform(0.15, 0.33)
     if kind == 0:
         return _turned(np.array([[size, 0.0]]), 2 * np.pi * np.arange(48) / 48)
@@ -161,7 +163,7 @@ def _turned(points: np.ndarray, angle) -> np.ndarray:
 
 
 def _along(outline: np.ndarray, spacing: float) -> np.ndarray:
-    """Points along a polygon, about `spacing` apart, none of them a corner."""
+    """Points along a polygon, about `spacing` apart, without the corners."""
     found = []
     for start, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         number = max(1, round(float(np.linalg.norm(end - start)) / spacing))
@@ -170,7 +172,7 @@ def _along(outline: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def _beside(outline: np.ndarray, distance: float) -> np.ndarray:
-    """Points on both sides of a polygon."""
+    """Points on both sides of the edges of a polygon, at the given `distance`."""
     ahead, behind = _along(outline, _SPACING / 2), []
     for start, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         number = max(1, round(float(np.linalg.norm(end - start)) / (_SPACING / 2)))
@@ -181,7 +183,7 @@ def _beside(outline: np.ndarray, distance: float) -> np.ndarray:
 
 
 def _mesh(outlines, rng) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 2) of the unit disk and cells (m, 3), aligned with the bodies' outlines."""
+    """Mesh of the unit disk: nodes (n, 2) and cells (m, 3) that are aligned with the bodies' outlines."""
     angle = 2 * np.pi * np.arange(1024) / 1024
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rings = [circle, 0.9925 * circle[::2], 0.98 * circle[1::4], 0.96 * circle[2::8]]

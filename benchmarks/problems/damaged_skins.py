@@ -1,8 +1,9 @@
-"""Skins that are cut, lose electrodes and are repaired: simulated on fine meshes of their own, monitored on coarse
-ones.
+"""Skins that are cut, lose electrodes and are repaired: simulated on fine meshes, monitored with models on coarse
+meshes.
 
-Variation is that of the materials, fixed before any figure was computed. Touches are trapezoids in time, with loads and
-durations as below, at 5 frames per second. Parameters and limits: Park et al. 2022, and jeit's requirements.
+The simulated variation is that of the materials, fixed before any figure was computed. The load of a touch is a
+trapezoid in time, with the fractions and durations below, at 5 frames per second. Parameters and limits are those of
+Park et al. 2022, and jeit's requirements.
 """
 
 from __future__ import annotations
@@ -25,17 +26,18 @@ from jeit.touch.simulate import DiscIndenter, Press, PressDraws, PressedSkin, ba
 from jeit.touch.simulate.damage import Cut, ElectrodeFault, draw_cut, mend_cut
 
 RATE, PATIENCE = 5.0, 30.0
-# Fractions of the load at onset and release of a touch, the median and spread of the logarithm of its duration in
-# seconds, and those of the pauses.
+# Fractions of the load during onset and release of a touch; median in seconds of the duration of a touch, and standard
+# deviation of its logarithm; minimum and maximum pause between touches in seconds.
 RISE, LASTS, BETWEEN = (0.25, 0.6, 1.0), (1.5, 0.5), (1.0, 8.0)
-# Farther from a cut than this, touches must be located as before, metres.
+# Distance from a cut in metres beyond which touches must be located as accurately as before the cut.
 APART = 0.025
 
 
 @dataclass
 class DamagedSkin:
-    """A skin by `name`, "park" (hydrogel, 32 inner electrodes, 94 pairs) or "round" (two films, 16 electrodes, 208
-    channels), with the `seed` of all random draws, `nodes` of the skin and of its images, and a `pool` of touches.
+    """A skin that is damaged. `name`: "park" (hydrogel, 32 inner electrodes, 94 pairs) or "round" (two films, 16
+    electrodes, 208 channels); `seed` of all random draws; `nodes`: numbers of nodes for the simulation and for the
+    images; `pool`: number of simulated touches.
     """
 
     name: str
@@ -58,11 +60,11 @@ class DamagedSkin:
 
     @cached_property
     def scale(self) -> float:
-        """Ratio of lengths to those of the paper's skin."""
+        """Ratio of the lengths of this skin to those of the paper's skin."""
         return 1.0 if self.name == "park" else 0.5
 
     def model(self, nodes: int, cut: Cut | None = None) -> ForwardModel:
-        """Model of the skin, refined along a cut."""
+        """Forward model of the skin with about `nodes` nodes, refined along a cut."""
         mesh = self.outline.mesh(num_points=nodes, refine=None if cut is None else cut.refine(1e-3 * self.scale))
         if self.name == "park":
             layout = named_layout("park-inner")
@@ -94,12 +96,12 @@ class DamagedSkin:
 
     @cached_property
     def touches(self) -> np.ndarray:
-        """Changes (pool, 3, M) by touches at the fractions of their load."""
+        """Voltage changes (pool, 3, channels) due to touches at the fractions `RISE` of their load."""
         return changes(self.skin, self.presses(1, self.pool))
 
     @cached_property
     def health(self) -> SkinHealth:
-        """Learnt from two minutes of touches."""
+        """Monitor of the skin's health, learnt from two minutes of touches."""
         seconds = np.arange(0, 120, 1 / RATE)
         frames = self.read(self.skin, 2, seconds, self.touches)
         sign = -1 if self.name == "park" else 1
@@ -109,9 +111,10 @@ class DamagedSkin:
     def read(
         self, skin: PressedSkin, number: int, seconds: np.ndarray, touches, later=None, more: float | np.ndarray = 0.0
     ) -> np.ndarray:
-        """Frames (T, M) of touches one after the other, of `touches`.
+        """Simulate frames (times, channels) of touches that are drawn from `touches` and follow each other.
 
-        From the time of `later` on, a (time, skin, touches), they are of another skin. `more` (T, M), volts, is added.
+        `later`: time, skin and touches; from this time on, frames are those of the other skin. `more` (times,
+        channels): voltages in volts that are added to the frames.
         """
         random = np.random.default_rng([self.seed, number])
         change = [np.zeros((len(seconds), self.skin.gain.size)) for _ in range(2)]
@@ -126,7 +129,8 @@ class DamagedSkin:
             for out, some in zip(change, parts, strict=True):
                 out[rows] += some[which % len(some), profile[: len(rows)]]
             start += lasts + random.uniform(*BETWEEN)
-        # Voltages at rest are of the skin's own mesh, and the change by damage is added: another mesh is not damage.
+        # Voltages at rest are computed on the skin's own mesh, and the change by damage is added, because the
+        # difference between two meshes is not damage.
         at_rest = self.at_rest(self.skin)
         rest = [at_rest, at_rest if later is None else at_rest + self.at_rest(later[1]) - self.at_rest(skin)]
         found = [
@@ -138,7 +142,7 @@ class DamagedSkin:
 
     @staticmethod
     def at_rest(skin: PressedSkin) -> np.ndarray:
-        """Voltages (M,) of an untouched skin without noise."""
+        """Voltages (channels,) of an untouched skin without noise."""
         return np.asarray(skin.model.voltages(skin.conductivity))
 
     def cut(self, number: int, depth: float = 1.0) -> Cut:
@@ -146,7 +150,7 @@ class DamagedSkin:
         return draw_cut(self.key(number), self.outline, length=span, depth=depth, margin=4e-3 * self.scale)
 
     def damaged(self, cut: Cut) -> tuple[PressedSkin, PressedSkin, PressedSkin]:
-        """Undamaged, cut and repaired, all on one mesh."""
+        """The undamaged, the cut and the repaired skin, all on one mesh."""
         whole = self.whole(cut)
         mesh = whole.model.mesh
         torn = cut.conductivity(mesh, whole.conductivity, self.material.thickness)
@@ -159,7 +163,8 @@ class DamagedSkin:
         )
 
     def fault(self, number: int, kind: str, seconds: np.ndarray, begins: float) -> tuple[int, np.ndarray]:
-        """An electrode, and changes (T, M) of voltages by its fault."""
+        """Draw an electrode; return its index, and the voltage changes (times, channels) due to a fault of the
+        electrode that begins at `begins`."""
         electrode = int(np.random.default_rng([self.seed, number]).integers(self.skin.model.protocol.num_electrodes))
         there, more = seconds >= begins, np.zeros((len(seconds), self.skin.gain.size))
         fault = ElectrodeFault(electrode, kind)  # pyright: ignore[reportArgumentType]
@@ -167,7 +172,8 @@ class DamagedSkin:
         return electrode, more
 
     def off(self, health: SkinHealth, skin: PressedSkin, presses: list[Press], number: int) -> np.ndarray:
-        """Errors of located presses, metres, in images about a new reference. NaN where nothing is detected."""
+        """Errors of the located presses in metres, in images relative to a new reference; NaN for a press that is not
+        detected."""
         rest = self.at_rest(skin)
         exact = rest + np.concatenate([np.zeros((10, 1, rest.size)), changes(skin, presses, (1.0,))])[:, 0]
         frames = self.skin.read(self.key(number), exact, np.array([20.0]))
@@ -183,7 +189,8 @@ class DamagedSkin:
 
 
 def changes(skin: PressedSkin, presses: list[Press], shares: tuple[float, ...] = RISE) -> np.ndarray:
-    """Changes (n, s, M) of voltages by presses at s fractions of their load, each solved anew, volts."""
+    """Voltage changes (presses, fractions, channels) in volts due to presses at the fractions `shares` of their load,
+    each solved anew."""
     model, rest = skin.model, np.broadcast_to(skin.conductivity, skin.model.mesh.num_cells)
     parts = [Press(one.indenter, share * one.load, one.position, one.angle) for one in presses for share in shares]
     touched = skin.touched(parts, held=1.0)

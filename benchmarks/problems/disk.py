@@ -1,4 +1,4 @@
-"""The problem of every contestant: a disk, its electrodes, its protocol, as plain arrays."""
+"""The problem that all contestants solve: a disk, its electrodes and its protocol, as plain arrays."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ def make(
     conductivities: int = NUM_CONDUCTIVITIES,
     frames: int = NUM_FRAMES,
 ) -> dict[str, np.ndarray]:
-    """Arrays of one problem: mesh, electrodes, adjacent protocol, conductivities (c, m) and frames (f, M).
+    """Arrays of one problem: mesh, electrodes, adjacent protocol, conductivities (conductivities, cells) and frames
+    (frames, channels).
 
     `model`: "complete" (arcs covering half of the boundary, with contact impedance) or "point" (boundary nodes).
-    Centres of arcs are points of the boundary polygon itself, so that every contestant integrates the same arcs.
+    Centres of arcs lie on the boundary polygon of the mesh, so that every contestant integrates the same arcs.
     """
     from jeit.mesh import Disk
     from jeit.protocol import adjacent
@@ -66,7 +67,8 @@ def make(
 
 
 def measure(problem: dict[str, np.ndarray], voltages, rest) -> None:
-    """Add `measured` (c, M), the conductivities' voltages with `noise` (M,) in volts, and NOSER's λ."""
+    """Add to the problem the voltages `measured` (conductivities, channels) with noise, the standard deviation `noise`
+    (channels,) in volts, and the λ of the NOSER prior."""
     problem["noise"] = NOISE * np.abs(rest) + 1e-2 * NOISE * np.abs(rest).max()
     random = np.random.default_rng(3)
     problem["measured"] = voltages + problem["noise"] * random.normal(size=np.shape(voltages))
@@ -74,7 +76,8 @@ def measure(problem: dict[str, np.ndarray], voltages, rest) -> None:
 
 
 def _smooth_conductivities(centroids, count, random):
-    """Conductivities (count, m) in siemens, each with two bumps up or down by about a factor of two."""
+    """Conductivities (count, cells) in siemens, each with two smooth increases or decreases by about a factor of
+    two."""
     conductivities = np.full((count, len(centroids)), CONDUCTIVITY)
     for conductivity in conductivities:
         for _ in range(2):
@@ -85,5 +88,5 @@ def _smooth_conductivities(centroids, count, random):
 
 
 def save(problem: dict[str, np.ndarray], path: Path) -> None:
-    """Write the arrays for the workers."""
+    """Write the arrays of a problem to an NPZ file for the worker processes."""
     np.savez(path, allow_pickle=False, **problem)

@@ -1,13 +1,15 @@
-"""Meshes of a disk that are not jeit's: given points with a jittered grid between them, triangulated by SciPy."""
+"""Meshes of a disk that are generated without jeit: given points with a jittered grid between them, triangulated by
+SciPy."""
 
 import numpy as np
 from scipy.spatial import Delaunay
 
 
 def meshed_disk(fixed: np.ndarray, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 2) of the unit disk, the `fixed` ones (k, 2) first, and counter-clockwise cells (m, 3).
+    """Nodes (n, 2) of a mesh of the unit disk, with the k `fixed` points (k, 2) first, and counter-clockwise cells (m,
+    3).
 
-    `fixed` includes the boundary. The others are about `spacing` apart.
+    `fixed` includes the boundary. The other nodes are about `spacing` apart.
     """
     steps = np.arange(-1, 1, spacing)
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)

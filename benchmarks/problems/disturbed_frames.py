@@ -13,7 +13,7 @@ from jeit.inverse.streaming.stream import FrameStatus
 
 
 class Kind(NamedTuple):
-    """The expected status of such frames, and a word of the reported reason."""
+    """Kind of faulty frames: the expected status, and a word of the reason that must be reported."""
 
     status: FrameStatus
     word: str
@@ -33,11 +33,12 @@ KINDS = {
 
 @dataclass
 class DisturbedFrames:
-    """`number` frames (M,) in volts, with bursts of up to `longest` faulty frames that begin every `period`.
+    """Iterator over `number` frames (M,) in volts, with bursts of up to `longest` faulty frames that begin every
+    `period` frames.
 
-    Frames are those of `base` (F, M) in turn, with noise of their own. `rest` (M,) is one of the untouched sensor, and
-    `touching` (L, M) states which channels an electrode takes part in. During iteration, `kind` of the last frame
-    (empty for a good one) and the dead `electrode` are available.
+    Frames are those of `base` (F, M) in turn, with new noise. `rest` (M,) is a frame of the untouched sensor, and
+    `touching` (L, M) states in which of the M channels each of the L electrodes takes part. During iteration, the
+    `kind` of the last frame (empty for a good frame) and the dead `electrode` are available.
     """
 
     base: np.ndarray

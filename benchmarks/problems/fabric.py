@@ -1,18 +1,18 @@
 """A fabric whose squares are pressed one at a time, simulated after Russo et al. (2017).
 
-It is a square with electrodes along its edge and opposite drive. A finger presses the squares of a chess board about
-its centre with 10 to 100 kPa, within 1 mm of their centres. The training data are six repetitions of twenty presses of
-each square, ten minutes apart, read as medians of 160 samples. The test data are twenty presses of each square a day
-later, four for each of five random drifts of a day, either as they are or with a reference, one scan, renewed up to ten
-minutes before. Drift and noise are those of the material.
+The fabric is a square with electrodes along its edge and opposite drives. A finger presses the squares of a chess board
+in the middle of the fabric with 10 to 100 kPa, within 1 mm of their centres. The training data are six repetitions of
+twenty presses of each square, ten minutes apart, read as medians of 160 samples. The test data are twenty presses of
+each square a day later, four for each of five random drifts over a day, either with the old reference or with a
+reference of one scan that is renewed up to ten minutes before. Drift and noise are those of the material.
 
-**Bent** round a cylinder along y, the sheet conducts as before, with two exceptions. The conductor lies half of the
-sensor's 1.5 mm outside the neutral layer: at a radius R it is stretched by 0.75 mm / R round the bend, and its
-resistance in that direction grows 5 times as much, a gauge factor (chosen). And a flat finger touches the ridge first:
-its gap is x² / 2R.
+**Bent** round a cylinder along y, the sheet conducts as before, with two exceptions. First, the conductor lies half of
+the sensor's 1.5 mm outside the neutral layer: at a radius R it is stretched by 0.75 mm / R round the bend, and its
+resistance in that direction grows 5 times as much (an assumed gauge factor). Second, a flat finger touches the ridge
+first: the gap between finger and fabric is x² / 2R.
 
-All this was fixed before accuracies were computed, except the number of days: with a single day its random drift
-determined the result.
+All parameters were fixed before accuracies were computed, except the number of days: with a single day, the random
+drift of this day determined the result.
 """
 
 from __future__ import annotations
@@ -46,23 +46,24 @@ class OnCylinder(AbstractIndenter):
     radius: float
 
     def gap(self, points):
-        """The indenter's gap, and x² / 2R."""
+        """Gap between the bent skin and the indenter in metres: the gap to a flat skin plus x² / 2R."""
         return self.indenter.gap(points) + np.asarray(points)[..., 0] ** 2 / (2 * self.radius)
 
     @property
     def reach(self) -> float:
-        """The indenter's reach."""
+        """Reach of the indenter in metres."""
         return self.indenter.reach
 
 
 class Fabric:
-    """Readings of C squares of width `target`, metres, on a fabric of `side` metres with a number of `electrodes`.
+    """Readings of presses on C squares of width `target` (metres) on a fabric of `side` metres with a number of
+    `electrodes`.
 
-    `squares`: their numbers along x and y. `bend`: radius of a cylinder round which the fabric is bent, metres. All
-    readings are changes of M voltages from the initial ones of the untouched fabric, without noise, whose deviation is
-    `noise`, volts: `features` (T, C + 1, P, M) of T repetitions of P presses, the last class untouched, and `tests` (C
-    + 1, P, M) a day later, one day after the other. Centres `middles` (C, 2) of squares and `places` (L, 2) of
-    electrodes, metres.
+    `squares`: numbers of squares along x and y. `bend`: radius in metres of a cylinder round which the fabric is bent.
+    All readings are changes in volts of M voltages from the initial voltages of the untouched fabric, without noise;
+    the standard deviation of noise is `noise`. `features` (T, C + 1, P, M): T repetitions of P presses of each square,
+    the last class untouched. `tests` (C + 1, P, M): presses a day later, one day after the other. `middles` (C, 2) and
+    `places` (L, 2): centres of squares and of electrodes in metres.
     """
 
     def __init__(
@@ -80,14 +81,15 @@ class Fabric:
         self.places = perimeter(outline, electrodes, start=side / (electrodes // 4) / 2)
         contacts = BoundaryElectrodes(self.places, 0.4 * 4 * side / electrodes, 1e-2)
         mesh = outline.mesh(num_points=nodes)
-        # The paper has 96 voltages of 16 electrodes, the distinct drives', and 32 of 8, all drives'.
+        # The paper has 96 voltages with 16 electrodes (distinct drives), and 32 voltages with 8 electrodes (all
+        # drives).
         model = ForwardModel(mesh, contacts, opposite(electrodes, drives="all" if electrodes == 8 else "distinct"))
         own = material("conductive fabric")
         stretched = np.diag([1 / (1 + GAUGE * OUTSIDE / bend), 1.0])
         conductivity = np.broadcast_to(own.conductivity * own.thickness * stretched, (mesh.num_cells, 2, 2))
         self._skin = PressedSkin(jax.random.key(0), model, replace(own, noise=0.0), conductivity=conductivity)
         self._rest = self._skin.rest()
-        # Medians of samples are noisier than means, by a quarter.
+        # The noise of medians of samples is larger than that of means by a quarter.
         self.noise = own.noise * float(np.sqrt(np.mean(self._rest**2))) * 1.25 / np.sqrt(SAMPLES)
         x, y = ((np.arange(count) - (count - 1) / 2) * target for count in squares or SQUARES[target])
         self.middles = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -109,7 +111,8 @@ class Fabric:
     def observations(
         self, number: int, *, untouched: bool = False
     ) -> tuple[Float[np.ndarray, "N M"], Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
-        """About `number` observations per class, with noise, their classes and repetitions. `untouched` is class C."""
+        """About `number` training observations per class, with noise, and their classes and repetitions. If
+        `untouched`, the untouched fabric is included as class C."""
         features = self.features if untouched else self.features[:, :-1]
         repetitions, classes, presses, channels = features.shape
         own = min(presses, max(1, number // repetitions))
@@ -119,16 +122,17 @@ class Fabric:
         return self._noisy(exact, 1), label, np.repeat(np.arange(repetitions), classes * own * medians)
 
     def asked(self, *, anew: bool) -> Float[np.ndarray, "C P M"]:
-        """Presses a day later, with noise, and with a reference renewed up to ten minutes before, if `anew`."""
+        """Readings of presses a day later, with noise; if `anew`, with a reference that is renewed up to ten minutes
+        before."""
         if not anew:
             return self._noisy(self.tests[:-1], 2)
         return self._noisy(self.tests[:-1] - self.tests[-1] + self._later, 2) - self._reference()
 
     def untouched(self, number: int, each: int, *, anew: bool) -> Float[np.ndarray, "n M"]:
-        """The untouched fabric a day later, `each` frames after each of `number` drifts, or after the drifts of the
-        tests in turn.
+        """Readings of the untouched fabric a day later: `each` frames after each of `number` random drifts or, unless
+        `anew`, after the drifts of the tests in turn.
 
-        With noise, as for `asked`.
+        Noise is added, and the reference is renewed if `anew`, as in `asked`.
         """
         if not anew:
             return self._noisy(np.repeat(np.resize(self.tests[-1], (number, self._rest.size)), each, axis=0), 3)
@@ -136,11 +140,12 @@ class Fabric:
 
     @property
     def distance(self) -> Float[np.ndarray, " C"]:
-        """Distance of the squares' centres from that of the nearest electrode, metres."""
+        """Distance of each square's centre from the centre of the nearest electrode, metres."""
         return np.linalg.norm(self.middles[:, None] - self.places, axis=-1).min(axis=1)
 
     def _drifts(self, number: int) -> Float[np.ndarray, "n M"]:
-        """Drift of the untouched fabric within ten minutes of its reference, from the initial voltages, volts."""
+        """Drift of the untouched fabric's voltages from the initial voltages, within ten minutes of a renewed
+        reference, in volts."""
         seconds = np.random.default_rng(4).uniform(0, 60 * MINUTES, number)
         return np.concatenate([self._changes(int(DAY) + one, [()], each) for one, each in enumerate(seconds, start=1)])
 
@@ -151,7 +156,7 @@ class Fabric:
         return exact + self.noise * np.random.default_rng(seed).normal(size=exact.shape)
 
     def _reference(self) -> Float[np.ndarray, " M"]:
-        """The noise of the mean of a scan's medians, volts."""
+        """Random noise of a reference in volts, which is the mean of the medians of a scan."""
         return self.noise * np.random.default_rng(5).normal(size=self.tests.shape[-1]) / np.sqrt(SCAN / SAMPLES)
 
 

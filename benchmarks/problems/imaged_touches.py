@@ -1,8 +1,8 @@
-"""Touches for the evaluation of image networks: on a finer mesh, with electrodes and contacts that deviate from the
-description.
+"""Touches for the evaluation of imaging networks, simulated on a finer mesh, with electrodes and contacts that deviate
+from the description.
 
-Variation is that of the project's notes on fair simulations, fixed before any figure was computed: contact impedances
-±10 %, electrodes ±0.5 mm (uniform), noise for a limit of detection of 0.7 N.
+The simulated variation was fixed before any figure was computed: contact impedances ±10 %, electrode positions ±0.5 mm
+(uniform), noise for a limit of detection of 0.7 N.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ APART = 0.041
 
 @dataclass(frozen=True)
 class Wrong:
-    """Deviations from the description that networks have: half widths of uniform distributions.
+    """Deviations of a simulated skin from the description that networks use: half widths of uniform distributions.
 
-    Of the logarithm of contact impedances, of the electrodes' places, metres, and `drift`, of logarithms of contact
-    impedances after the reference.
+    `contact`: of logarithms of contact impedances; `place`: of electrode positions, in metres; `drift`: of logarithms
+    of contact impedances, after the reference.
     """
 
     contact: float = 0.1
@@ -45,12 +45,13 @@ class Wrong:
 
 
 def park_skin(cell: float | None = None) -> Skin:
-    """200 × 200 × 10 mm of hydrogel with 32 inner electrodes and 94 pairs, as a sheet."""
+    """The skin of Park et al., 200 × 200 × 10 mm of hydrogel with 32 inner electrodes and 94 pairs, as a sheet with
+    cells of size `cell` metres."""
     return Skin.create(named_layout("park-inner"), num_layers=0, cell_size=cell)
 
 
 class JudgedSkins:
-    """Skins with different deviations. Touches are read by one after the other."""
+    """Skins with different deviations from their description. Successive touches are measured by the skins in turn."""
 
     def __init__(self, wrong: Wrong | None = None, *, seed: int = 77, skins: int = SKINS, cell: float = CELL):
         wrong = Wrong() if wrong is None else wrong
@@ -69,7 +70,7 @@ class JudgedSkins:
             self.drifts.append(plain.with_layout(after) if wrong.drift else None)
 
     def changes(self, touches) -> np.ndarray:
-        """Relative changes (n, M) by touches, without noise."""
+        """Relative voltage changes (touches, channels) due to touches, without noise."""
         found = np.zeros((len(touches), self.plain.model.protocol.num_measurements))
         for number, (skin, after) in enumerate(zip(self.skins, self.drifts, strict=True)):
             own = range(number, len(touches), len(self.skins))
@@ -85,19 +86,21 @@ class JudgedSkins:
 
 
 def grid_touches() -> tuple[list[list[Indent]], np.ndarray]:
-    """A ball of 15 mm, 7.5 mm deep, at 15 × 15 places, and the places."""
+    """Touches of a ball of 15 mm diameter, 7.5 mm deep, at 15 × 15 positions, and the positions."""
     places = touches_away_from_the_edge(park_skin().outline, TIP / 2, PLACES, PLACES).places
     return [[Indent(ball_indenter(TIP), TIP_DEPTH, place)] for place in places], places
 
 
 def tuning_touches(number: int = 60) -> tuple[list[list[Indent]], np.ndarray]:
-    """The same ball elsewhere, for the rivals' choice of hyperparameters."""
+    """Touches of the ball of `grid_touches` at other positions, by which the hyperparameters of other methods are
+    chosen."""
     places = np.random.default_rng(5).uniform(-0.09, 0.09, (number, 2))
     return [[Indent(ball_indenter(TIP), TIP_DEPTH, place)] for place in places], places
 
 
 def pair_touches(number: int, apart: float = APART, seed: int = 9) -> tuple[list[list[Indent]], np.ndarray]:
-    """Two balls at a given distance, anywhere, and their places (n, 2, 2)."""
+    """Touches of two balls at the distance `apart`, at random positions, and the positions (touches, 2, 2) of both
+    balls."""
     random, places = np.random.default_rng(seed), []
     while len(places) < number:
         one, angle = random.uniform(-0.085, 0.085, 2), random.uniform(0, 2 * np.pi)
@@ -109,7 +112,7 @@ def pair_touches(number: int, apart: float = APART, seed: int = 9) -> tuple[list
 
 
 def unseen_shapes() -> dict[str, object]:
-    """Five bodies unlike those in the training data."""
+    """Five indenters unlike those in the training data, by name."""
     along = np.linspace(-1, 1, 41)
     x, y = np.meshgrid(along, along)
     triangle = np.where((y > -0.5) & (y < 1 - 1.732 * np.abs(x)), 0.0, np.nan)
@@ -133,7 +136,8 @@ def unseen_shapes() -> dict[str, object]:
 
 
 def shape_touches(number: int, seed: int = 13) -> tuple[list[list[Indent]], list[str]]:
-    """Unseen bodies in turn, rotated and placed at random, 2 to 7 mm deep, and their names."""
+    """Touches of the bodies of `unseen_shapes` in turn, rotated and placed at random, 2 to 7 mm deep, and the names of
+    the bodies."""
     random, shapes = np.random.default_rng(seed), unseen_shapes()
     names = [list(shapes)[one % len(shapes)] for one in range(number)]
     touches = []

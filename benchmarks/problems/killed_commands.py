@@ -1,4 +1,4 @@
-"""Commands to be killed: their input, their output, and whether that can be read and is correct."""
+"""Commands that are killed: their input, their output, and checks of whether the output can be read and is correct."""
 
 from __future__ import annotations
 
@@ -40,11 +40,12 @@ _FRAMES, _NODES = 60, 400
 
 @dataclass(frozen=True)
 class Command:
-    """One of jeit's commands, run in `folder`.
+    """A command of jeit that is run in `folder`.
 
-    Its `arguments`, those to `resume` with, where they differ, its `output`, `begun`, a pattern of files that exist
-    once it writes, `same`, files whose bytes do not depend on when it ends, `environment`, variables of its own, and
-    `afresh`, what is deleted before each run.
+    `arguments`: arguments of the command; `resume`: arguments to resume it, if they differ; `output`: file or folder of
+    the results; `begun`: pattern of files that exist once the command writes; `same`: files whose bytes do not depend
+    on when the command ends; `environment`: additional environment variables; `afresh`: paths that are deleted before
+    each run.
     """
 
     name: str
@@ -58,7 +59,7 @@ class Command:
     environment: dict[str, str] = field(default_factory=dict)
 
     def start(self, *, again: bool = False) -> subprocess.Popen:
-        """A process of it, with the arguments for resuming if `again`."""
+        """Start a process of the command, with the arguments for resuming if `again`."""
         arguments = self.resume if again and self.resume else self.arguments
         command = [sys.executable, "-m", "jeit", *arguments]
         environment = os.environ | {"XDG_CACHE_HOME": str(self.folder / "cache")} | self.environment
@@ -67,7 +68,8 @@ class Command:
         )
 
     def whole(self) -> tuple[float, float, dict[str, bytes]]:
-        """Seconds until it writes, until it ends, and its output, undisturbed."""
+        """Run the command undisturbed; return the seconds until it writes, the seconds until it ends, and its
+        output."""
         start, stamp, begun = time.perf_counter(), time.time(), 0.0
         process = self.start()
         while process.poll() is None:
@@ -78,7 +80,7 @@ class Command:
         return begun, time.perf_counter() - start, self.written()
 
     def writes(self, stamp: float) -> bool:
-        """Whether a run that was started at this second of the clock has begun to write."""
+        """Whether a run that was started at the time `stamp` has begun to write."""
         for path in self.output.parent.glob(self.begun):
             with contextlib.suppress(FileNotFoundError):
                 if path.stat().st_mtime >= stamp:
@@ -86,24 +88,26 @@ class Command:
         return False
 
     def ended(self, process: subprocess.Popen) -> None:
-        """Wait for its end. Raises `RuntimeError` where it fails or prints anything."""
+        """Wait for the end of a process of the command. Raises `RuntimeError` if the command fails or prints
+        anything."""
         error_output = process.communicate()[1]
         if process.returncode or error_output:
             raise RuntimeError(f"{self.name}: status {process.returncode}: {error_output.strip()}")
 
     def written(self) -> dict[str, bytes]:
-        """The files that must be the same, by their names: all of them unless some are named."""
+        """Contents, by name, of the output files that must be the same in every run: the files `same`, or all files if
+        `same` is empty."""
         names = self.same or [str(one.relative_to(self.output)) for one in self.output.rglob("*") if one.is_file()]
         return {name: (self.output / name).read_bytes() for name in names if (self.output / name).exists()}
 
     def clear(self, *, all: bool = False) -> None:
-        """Delete what must not exist before a run, or all output."""
+        """Delete the paths `afresh`, which must not exist before a run; if `all`, also delete all output."""
         for path in (*self.afresh, *([self.output] if all else [])):
             shutil.rmtree(path, ignore_errors=True)
 
 
 def unreadable(folder: Path) -> list[str]:
-    """Files of a folder that are incomplete, and why."""
+    """Messages about files of a folder that are incomplete."""
     wrong = []
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         look = _LOOKS.get(path.suffix)
@@ -148,7 +152,8 @@ _LOOKS: dict[str, Callable[[Path], object]] = {
 
 
 def study(folder: Path, name: str, scheduler: str | None = None) -> Command:
-    """A study of twelve points in as many chunks, exact maps, by the workers of a scheduler where one is given."""
+    """Command that runs a design study of twelve points in twelve chunks with exact maps, by the workers of a Dask
+    `scheduler` if it is given."""
     folder.mkdir(parents=True)
     (folder / "study.toml").write_text(STUDY, "utf-8")
     options = ("study.toml", "--quiet", *(() if scheduler is None else ("--scheduler", scheduler)))
@@ -157,7 +162,8 @@ def study(folder: Path, name: str, scheduler: str | None = None) -> Command:
 
 
 def tank(folder: Path) -> dict[str, Command]:
-    """A stream, an image, and the same image with nothing compiled, of a disk with a moving touch."""
+    """Commands that stream frames, compute an image, and compute the same image without cached compiled code, for a
+    disk with a moving touch."""
     from benchmarks.problems.touched_sensors import bodies, simulate
     from jeit.data import Measurement, write_table
     from jeit.mesh import Disk
@@ -200,7 +206,7 @@ def tank(folder: Path) -> dict[str, Command]:
 
 
 def watch(folder: Path) -> Command:
-    """Gestures on a small sheet, classified as they end."""
+    """Command that classifies gestures on a small sheet, each when it ends."""
     import jax
 
     from jeit.electrodes import PointElectrodes

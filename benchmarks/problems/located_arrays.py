@@ -1,4 +1,4 @@
-"""Errors of located touches of an array, with different decay models."""
+"""Errors of touches located by an array of microphones, with different decay models."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ ELLIPSES = (-2 * np.log(1 - 0.68), -2 * np.log(1 - 0.95))
 
 @dataclass(frozen=True)
 class Located:
-    """For N touches: `off` (N,), metres from their true places, infinite where none was located.
+    """Results for N touches. `off` (N,): distances in metres of located from true positions, infinite for touches that
+    were not located.
 
-    `square` (N,): the same squared, in units of the covariance. The `status` of each. `message`: the error message of
-    the calibration, empty where there is none. The `decay` that was fitted, and the fraction of the `silence` that was
+    `square` (N,): squared distances in units of the covariance. `status` of each touch. `message`: error message of the
+    calibration, empty without an error. `decay`: fitted decay model. `silence`: fraction of silent intervals that were
     reported as a touch.
     """
 
@@ -38,20 +39,22 @@ class Located:
         return float(np.median(self.off))
 
     def held(self, ellipse: int) -> float:
-        """Fraction of the located touches that the 68 (0) or 95 % (1) ellipse contains."""
+        """Fraction of the located touches whose true position lies in the 68 % ellipse (`ellipse` 0) or 95 % ellipse
+        (1)."""
         found = np.isfinite(self.square)
         return float(np.mean(self.square[found] < ELLIPSES[ellipse])) if found.any() else np.nan
 
 
 def taps_of(array: SimulatedArray) -> Taps:
-    """Taps as from a user: samples, or intensities."""
+    """Taps for the calibration of an array, in one of the forms in which users give them: samples or intensities."""
     if array.sampled:
         return Taps(array.microphones, array.outline, array.places, samples=array.taps, rate=RATE)
     return Taps(array.microphones, array.outline, array.places, power=array.intensity(array.taps)[0])
 
 
 def touches_of(array: SimulatedArray) -> tuple[Recording | Intensities, np.ndarray]:
-    """The recording of touches and silence, and the middle of each in time, (N + SILENT,) s."""
+    """The recording of N touches and `SILENT` silent intervals, and the middle of each in time (N + SILENT,), in
+    seconds."""
     middle = SAMPLES / RATE * np.arange(len(array.touches) + SILENT) + ONSET + BURST / 2
     if array.sampled:
         return Recording(array.sound, RATE), middle
@@ -60,8 +63,8 @@ def touches_of(array: SimulatedArray) -> tuple[Recording | Intensities, np.ndarr
 
 
 def located_by_each(array: SimulatedArray) -> dict[str, Located]:
-    """Results of jeit with every decay model, and with that which "auto" chooses: a recording located with the
-    defaults.
+    """Results of jeit's defaults after calibration with every decay model, and with the model that "auto" chooses, by
+    name of the model.
     """
     fits, refused = fit_each_decay(taps_of(array))
     far = np.full(len(array.touches), np.inf)
@@ -75,7 +78,7 @@ def located_by_each(array: SimulatedArray) -> dict[str, Located]:
 
 
 def located(array: SimulatedArray, fit: CalibrationFit) -> Located:
-    """Results of jeit's defaults, after this calibration."""
+    """Results of jeit's defaults after the calibration `fit`."""
     recording, middle = touches_of(array)
     found = locate(recording, fit.calibration)
     nearest = np.abs(found.times[:, None] - middle[:-SILENT]).argmin(axis=0)
@@ -86,14 +89,14 @@ def located(array: SimulatedArray, fit: CalibrationFit) -> Located:
     if known.any():
         covariance = found.covariance[nearest][known]
         square[known] = np.einsum("ni,nij,nj->n", offset[known], np.linalg.inv(covariance), offset[known])
-    # Without the first of them, which the last touch may reach.
+    # The first silent interval is left out, because the last touch may reach into it.
     silence = float(np.mean(found.status[found.times >= middle[1 - SILENT]] != "no touch"))
     law = fit.calibration.microphone_array.decay.name
     return Located(np.where(known, off, np.inf), square, tuple(found.status[nearest]), "", law, silence)
 
 
 def plainly_located(array: SimulatedArray) -> Located:
-    """Results of the plain fit, from the same bursts."""
+    """Results of the plain fit (`PlainConsistency`), from the same bursts."""
     plain = PlainConsistency(array.microphones, array.outline, array.places, array.intensity(array.taps)[0])
     off = np.linalg.norm(plain(array.intensity(array.stretches[:-SILENT])[0]) - array.touches, axis=1)
     return Located(off, np.full(len(off), np.nan))

@@ -1,16 +1,17 @@
-"""Finite-element matrices with newly assembled values, for solvers alone: plain arrays."""
+"""Finite-element matrices with newly assembled values, as plain arrays, for the comparison of solvers alone."""
 
 from __future__ import annotations
 
 import numpy as np
 
 NUM_RIGHT_HAND_SIDES = 16
-# Matrices in a batch, below and above this number of nodes.
+# Number of matrices in a batch, for less (MANY) and more (FEW) than SMALL nodes.
 MANY, FEW, SMALL = 64, 16, 3000
 
 
 def meshes(disks: tuple[int, ...], solids: bool = True):
-    """Name: jeit's mesh: disks of about `disks` nodes, a box (9,922 nodes) and a layer (14,885)."""
+    """jeit's meshes by name: disks of about `disks` nodes, and, if `solids`, a box (9,922 nodes) and a layer (14,885
+    nodes)."""
     from jeit.mesh import box, disk, layer
 
     found = {f"disk {count}": disk(1.0, num_points=count) for count in disks}
@@ -21,9 +22,10 @@ def meshes(disks: tuple[int, ...], solids: bool = True):
 
 
 def make(mesh) -> dict[str, np.ndarray]:
-    """Stiffness matrices of random conductivities, from 0.1 to 10, and a resistive layer all over the boundary.
+    """Stiffness matrices for random conductivities from 0.1 to 10, with a resistive layer all over the boundary.
 
-    `rows`, `columns` (nnz,) of the lower triangle, `values` (matrices, nnz), `load` (n, 16) to solve for; and the mesh.
+    Returns `rows` and `columns` (nonzeros,) of the lower triangle, `values` (matrices, nonzeros), right-hand sides
+    `load` (nodes, 16), and the mesh.
     """
     import jax
     import jax.numpy as jnp
@@ -55,7 +57,7 @@ def make(mesh) -> dict[str, np.ndarray]:
 
 
 def symmetric(problem: dict[str, np.ndarray], number: int):
-    """One of the matrices, with both triangles, as SciPy's compressed columns (n, n)."""
+    """The matrix `number` of a problem, with both triangles, in SciPy's compressed-column format (nodes, nodes)."""
     from scipy.sparse import coo_array
 
     rows, columns, values = problem["rows"], problem["columns"], problem["values"][number]
@@ -66,6 +68,6 @@ def symmetric(problem: dict[str, np.ndarray], number: int):
 
 
 def residual(problem: dict[str, np.ndarray], number: int, solution: np.ndarray) -> float:
-    """Residual of a solution (n, 16), relative to the load, in the Frobenius norm."""
+    """Residual of a solution (nodes, 16) for the matrix `number`, relative to the load, in the Frobenius norm."""
     left = symmetric(problem, number) @ solution - problem["load"]
     return float(np.linalg.norm(left) / np.linalg.norm(problem["load"]))

@@ -1,8 +1,9 @@
 """Tanks with one to three strong bodies, drawn at random and solved without jeit: metal, plastic, or both.
 
-Mesh and solver are not jeit's: rings of points on the bodies' outlines and a jittered grid, triangulated by SciPy,
-solved by `scipy_baseline`. Tanks differ in size, electrodes and the fraction of the boundary that they cover, contact
-impedance, currents, channels, and in the number, size, place, shape and conductivity of the bodies.
+Mesh and solver are independent of jeit: points in rings on the bodies' outlines and in a jittered grid are triangulated
+by SciPy, and `scipy_baseline` solves for the voltages. Tanks differ in size, electrodes and the fraction of the
+boundary that they cover, contact impedance, currents, channels, and in the number, size, place, shape and conductivity
+of the bodies.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ _SPACING = 0.035
 
 
 class Body(NamedTuple):
-    """**Fields**: `centre` (2,) and `radius`, of a disk of the same area, in units of the tank's radius. `corners`, 0
-    of a disk, 4 of a square. `turned`, radians. `factor`, its conductivity over the background's.
+    """Body in a tank. **Fields**: `centre` (2,), and `radius` of a disk of the same area, in units of the tank's
+    radius. `corners`: 0 for a disk, 4 for a square. `turned`: angle of rotation in radians. `factor`: conductivity of
+    the body divided by that of the background.
     """
 
     centre: np.ndarray
@@ -43,16 +45,16 @@ class Body(NamedTuple):
 
     @property
     def sign(self) -> int:
-        """+1 of a conductive body, -1 of a resistive one."""
+        """+1 for a conductive body, -1 for a resistive body."""
         return 1 if self.factor > 1 else -1
 
     def outline(self, number: int, grown: float = 0.0) -> np.ndarray:
-        """Points (number, 2) of the outline, moved outwards by `grown`."""
+        """Points (number, 2) of the body's outline, moved outwards by `grown`."""
         angle = 2 * np.pi * (np.arange(number) + 0.5) / number
         return self.centre + (self._reach(angle) + grown)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """Which of points (n, 2) are inside it."""
+        """Mask of the `points` (points, 2) that lie inside the body."""
         offset = points - self.centre
         return np.hypot(*offset.T) < self._reach(np.arctan2(offset[:, 1], offset[:, 0]))
 
@@ -65,7 +67,8 @@ class Body(NamedTuple):
 
 
 class Tank(NamedTuple):
-    """**Fields**: `frame`, the tank with its bodies, and `reference`, without them. `bodies`. `radius`, metres."""
+    """Simulated tank. **Fields**: `frame`, measured with the `bodies`; `reference`, measured without bodies; `radius`
+    in metres."""
 
     frame: Measurement
     reference: Measurement
@@ -74,7 +77,7 @@ class Tank(NamedTuple):
 
 
 def draw(seed: int, noise: float = NOISE) -> Tank:
-    """A tank, reproducible from its seed."""
+    """Draw a tank, reproducible from its seed."""
     rng = np.random.default_rng(seed)
     radius = np.exp(rng.uniform(np.log(0.02), np.log(0.2)))
     count = int(rng.choice([16, 16, 32]))
@@ -117,7 +120,8 @@ def draw(seed: int, noise: float = NOISE) -> Tank:
 def matched(tank: Tank, inclusions: Sequence[Inclusion]) -> tuple[np.ndarray, int]:
     """Distance of each body, in units of the tank's radius, from the nearest inclusion of the same sign.
 
-    It is infinite where there is none within `REACH`. Also the number of inclusions that match no body.
+    The distance is infinite if there is no such inclusion within `REACH`. Also returns the number of inclusions that
+    match no body.
     """
     if not inclusions:
         return np.full(len(tank.bodies), np.inf), 0
@@ -169,7 +173,7 @@ def _bodies(rng) -> tuple[Body, ...]:
 
 
 def _mesh(bodies, rng) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 2) of the unit disk and cells (m, 3), aligned with the bodies' outlines."""
+    """Mesh of the unit disk: nodes (n, 2) and cells (m, 3) that are aligned with the bodies' outlines."""
     angle = 2 * np.pi * np.arange(512) / 512
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rings = [circle, 0.985 * circle[::2], 0.96 * circle[1::4]]

@@ -1,7 +1,7 @@
-"""A serial device simulated on a pseudo-terminal, in a process of its own, with a series of faults.
+"""A serial device with a series of faults, simulated on a pseudo-terminal in a separate process.
 
-The arguments are those of `play`. A link names the pseudo-terminal, as links of udev name devices: when the device is
-unplugged the link disappears, and when it is plugged in again it names another one.
+The arguments are those of `play`. A symbolic link names the pseudo-terminal, like the links of udev: when the device is
+unplugged, the link disappears; when the device is plugged in again, the link names another pseudo-terminal.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from pathlib import Path
 ENTRY = struct.Struct("<id")
 """Record of each frame sent completely: the number of its line, and `time.monotonic()` after that."""
 FAULTS = ("garbage", "half a line", "another number of channels", "no readings", "twice the rate", "unplugged")
-# Seconds for which the rate is doubled and the device unplugged, of rest before that, and of waiting for the reader.
+# Seconds for which the frame rate is doubled, for which the device is unplugged, of rest before it is unplugged, and of
+# waiting for the reader.
 _DOUBLED, _UNPLUGGED, _REST, _PATIENCE = 2.0, 1.0, 0.1, 5.0
 
 
@@ -28,7 +29,8 @@ class _Terminal:
         self.link, self.leader = link, -1
 
     def plug(self) -> None:
-        """Create a pseudo-terminal, named by the link. A write to it that nobody reads fails instead of blocking."""
+        """Create a pseudo-terminal, and let the link name it. Writing to the terminal fails, instead of blocking, if
+        nobody reads."""
         self.leader, self.follower = os.openpty()
         tty.setraw(self.follower)
         os.set_blocking(self.leader, False)
@@ -37,7 +39,7 @@ class _Terminal:
         beside.replace(self.link)
 
     def unplug(self) -> None:
-        """Remove it, once all is read: data that a device has not sent are not lost."""
+        """Remove the pseudo-terminal once all bytes have been read, so that no sent data are lost."""
         end = time.monotonic() + _PATIENCE
         while self._unread() and time.monotonic() < end:
             time.sleep(1e-3)
@@ -50,7 +52,7 @@ class _Terminal:
         return struct.unpack("i", fcntl.ioctl(self.follower, termios.FIONREAD, b"\0" * 4))[0]
 
     def send(self, content: bytes) -> None:
-        """Write all of it, as fast as it is read."""
+        """Write all bytes of `content`, as fast as they are read."""
         while content:
             try:
                 content = content[os.write(self.leader, content) :]
@@ -59,10 +61,10 @@ class _Terminal:
 
 
 def play(lines: Path, link: Path, log: Path, seconds: float, rate: float, period: float) -> None:
-    """Send `lines`, a frame each, repeatedly for a number of `seconds`, at `rate` frames/s, with a fault every `period`
-    seconds.
+    """Send the lines of the file `lines`, one frame each, repeatedly for a number of `seconds`, at `rate` frames/s,
+    with a fault every `period` seconds.
 
-    Record each frame sent completely in `log`, and print each planted fault.
+    Record each frame that is sent completely in the file `log`, and print each simulated fault.
     """
     frames = lines.read_bytes().splitlines(keepends=True)
     terminal, noise = _Terminal(link), random.Random(0)
@@ -92,7 +94,7 @@ def play(lines: Path, link: Path, log: Path, seconds: float, rate: float, period
                     terminal.unplug()
                     time.sleep(_UNPLUGGED)
                     terminal.plug()
-                    # A device that is plugged in sends once it is opened.
+                    # A device that is plugged in begins to send when the reader has opened it.
                     time.sleep(_UNPLUGGED)
                     due = time.monotonic()
             terminal.send(frames[number % len(frames)])

@@ -1,10 +1,11 @@
 """Random arrays of microphones and the sound that they receive, computed in NumPy without jeit's decay models.
 
-A source on a rectangular layer is received by microphones beneath it. Sound takes the straight path and those of images
-in the edges, each with its own reflection. Along a path of length ρ its amplitude falls as a power of ρ, or as in a
-body nearby and as in a sheet at a distance, and as exp(−α(f) ρ), with α growing with frequency. Paths add with their
-phases. Effects that do not depend on distance are added: coupling that differs from place to place, leaks between
-channels, gains, noise, taps that are slightly displaced from their stated places, and dead microphones.
+Microphones beneath a rectangular layer receive the sound of a source on the layer. Sound travels along the straight
+path and along the paths from mirror images of the source in the edges, each edge with its own reflection. Along a path
+of length ρ, the amplitude falls as a power of ρ, or as in a three-dimensional body nearby and as in a sheet at a
+distance, and as exp(−α(f) ρ), where α grows with the frequency f. Paths add with their phases. Effects that do not
+depend on distance are added: coupling that differs from place to place, leaks between channels, gains, noise, taps that
+are slightly displaced from their stated places, and dead microphones.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 RATE, SAMPLES = 2500.0, 500
-# Start and length of a burst, in seconds of its 0.2. The rest is silence.
+# Start and length of a burst in seconds, within an interval of 0.2 s. The rest of the interval is silence.
 ONSET, BURST = 0.06, 0.06
 SILENT = 5
 _LOW, _HIGH, _NOMINAL = 60.0, 900.0, 200.0
@@ -26,17 +27,17 @@ _LOW, _HIGH, _NOMINAL = 60.0, 900.0, 200.0
 class Ranges:
     """Intervals of the random parameters.
 
-    Each is drawn uniformly, or uniformly in the logarithm where both ends are positive and far apart (`side`,
-    `attenuation`, `speed`). Metres, hertz, decibels.
+    Parameters are drawn uniformly, or uniformly in the logarithm if both ends are positive and far apart (`side`,
+    `attenuation`, `speed`). Units are metres, hertz and decibels.
     """
 
     side: tuple[float, float] = (0.08, 0.4)
     aspect: tuple[float, float] = (0.4, 1.0)
     microphones: tuple[int, int] = (6, 36)
     depth: tuple[float, float] = (0.001, 0.012)
-    # Of intensity: the length at which it decays by a factor e, at 200 Hz, the probability that it does not, the power
-    # of the distance with which it spreads, and the probability that it spreads as in a body nearby and as in a sheet
-    # at a distance instead.
+    # Length at which the intensity decays by a factor e at 200 Hz, probability that it does not decay, power of the
+    # distance with which the intensity falls by spreading, and probability that it instead spreads as in a
+    # three-dimensional body nearby and as in a sheet at a distance.
     attenuation: tuple[float, float] = (0.02, 0.3)
     lossless: float = 0.15
     frequency_exponent: tuple[float, float] = (0.0, 1.5)
@@ -56,7 +57,8 @@ class Ranges:
     dead: float = 0.15
 
 
-# The ranges for the choice of jeit's defaults, and those for their single evaluation: other numbers, other intervals.
+# The ranges for the choice of jeit's defaults, and the ranges for the single evaluation of the defaults, with other
+# intervals.
 DEVELOPMENT = Ranges(
     side=(0.12, 0.3),
     aspect=(0.6, 1.0),
@@ -83,12 +85,13 @@ REPORTED = Ranges()
 
 @dataclass(frozen=True)
 class SimulatedArray:
-    """The description of an array, and the sound that it receives.
+    """The description of an array of microphones, and the sound that it receives.
 
-    `microphones` (M, 2), corners of its `outline` (4, 2), stated `places` (T, 2) of the taps, metres, and the sound of
-    the taps, `taps` (T, M, S). True places of the touches, `touches` (N, 2), and their `sound` one after the other with
-    `SILENT` silent intervals of the same length, (M, (N + SILENT) S), at `RATE`. `sampled`: whether the data are
-    samples or the `intensity` of each burst above the floor. `law`: the decay of sound, as text.
+    For M microphones, T taps, N touches and S samples per interval, in metres: positions `microphones` (M, 2), corners
+    `outline` (4, 2), stated positions `places` (T, 2) of the taps, sound `taps` (T, M, S) of the taps, true positions
+    `touches` (N, 2) of the touches, and their `sound` one after the other, followed by `SILENT` silent intervals of the
+    same length, (M, (N + SILENT) S), sampled at `RATE`. `sampled`: whether the data are samples or the `intensity` of
+    each burst above the floor. `law`: decay of sound, as text.
     """
 
     microphones: Float[np.ndarray, "M 2"]
@@ -101,19 +104,20 @@ class SimulatedArray:
     law: str
 
     def intensity(self, sound: Float[np.ndarray, "N M S"]) -> tuple[Float[np.ndarray, "N M"], Float[np.ndarray, " M"]]:
-        """Mean squares of each burst above the floor, and that floor, from the silence before the taps' bursts."""
+        """Mean square of each burst above the noise floor, and the noise floor, which is estimated from the silence
+        before the taps."""
         quiet, loud = round(ONSET * RATE), round((ONSET + BURST) * RATE)
         floor = (self.taps[:, :, : quiet - 10] ** 2).mean(axis=(0, 2))
         return (sound[:, :, quiet:loud] ** 2).mean(axis=2) - floor, floor
 
     @property
     def stretches(self) -> Float[np.ndarray, "L M S"]:
-        """The sound of the touches, one by one, and the silence."""
+        """The sound of each touch and of each silent interval."""
         return self.sound.reshape(len(self.microphones), -1, SAMPLES).swapaxes(0, 1)
 
 
 def draw_array(ranges: Ranges, seed: int, *, touches: int = 40) -> SimulatedArray:
-    """The array drawn from `ranges` with `seed`, reproducibly."""
+    """Draw an array from `ranges`, reproducible from `seed`."""
     rng = np.random.default_rng(seed)
     layer = _Layer.drawn(ranges, rng)
     count = len(layer.microphones)
@@ -132,7 +136,7 @@ def draw_array(ranges: Ranges, seed: int, *, touches: int = 40) -> SimulatedArra
     where = 0.9 * layer.size * (rng.random((touches, 2)) - 0.5)
     touched = layer.listen(where, np.exp(spread * rng.normal(size=touches)), rng)
     touched = np.concatenate([touched, np.zeros((SILENT, *touched.shape[1:]))])
-    # Level of the mean tap above the noise, at the microphone that receives it best.
+    # Mean square of the mean tap at the microphone that receives it best, from which the noise follows.
     loudest = (tap_sound[:, :, round(ONSET * RATE) :] ** 2).mean(axis=2).max(axis=1).mean() * (SAMPLES / RATE) / BURST
     level = loudest * 10 ** (-rng.uniform(*ranges.signal_to_noise) / 10)
     noise = np.sqrt(level * 10 ** (0.1 * rng.normal(size=count)))
@@ -147,10 +151,10 @@ def draw_array(ranges: Ranges, seed: int, *, touches: int = 40) -> SimulatedArra
 
 
 def steep_array(length: float, seed: int = 0, **changed: Any) -> SimulatedArray:
-    """25 microphones under 200 × 200 mm in which intensity falls as exp(−r / `length`) beside its spreading, with
-    reflecting edges.
+    """An array of 25 microphones under 200 × 200 mm, in which intensity falls as exp(−r / `length`) in addition to
+    spreading, with reflecting edges.
 
-    a / (r² + b) alone does not describe it.
+    The decay model a / (r² + b) alone does not describe this array.
     """
     steep = {"side": (0.2, 0.2), "aspect": (1.0, 1.0), "microphones": (25, 25), "attenuation": (length, length)}
     plain = {
@@ -212,7 +216,7 @@ class _Layer:
         return cls(size, microphones, depth, gain, leak, loss[band], *drawn_values[1:])
 
     def listen(self, places: np.ndarray, strengths: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Sound of a burst at each of `places` (N, 2) at the microphones, (N, M, SAMPLES), without noise."""
+        """Sound (N, M, SAMPLES) at M microphones of bursts at `places` (N, 2), without noise."""
         result = np.empty((len(places), len(self.microphones), SAMPLES))
         times = np.arange(SAMPLES) / RATE - ONSET
         envelope = np.where((times >= 0) & (times <= BURST), np.sin(np.pi * np.clip(times / BURST, 0, 1)), 0.0)
@@ -225,7 +229,8 @@ class _Layer:
         return result
 
     def _transfer(self, place: np.ndarray) -> np.ndarray:
-        """(M, F): all paths, with their phases, coupling and gain."""
+        """Transfer function (microphones, frequencies) from `place` to the microphones: the sum of all paths with their
+        phases, times coupling and gain."""
         images, echoes = zip(*(self._images(axis, place[axis]) for axis in range(2)), strict=True)
         x, y = np.meshgrid(*images, indexing="ij")
         echo = np.outer(*echoes).ravel()
@@ -240,7 +245,8 @@ class _Layer:
         return (self.gain * coupling)[:, None] * total
 
     def _images(self, axis: int, coordinate: float) -> tuple[np.ndarray, np.ndarray]:
-        """Images of a coordinate in the two edges of an axis, two orders, and the fraction that each returns."""
+        """Mirror images of a coordinate in the two edges of an axis, up to the second order, and the reflected fraction
+        of the amplitude for each image."""
         side, (low, high) = self.size[axis], self.reflection[axis]
         images = [coordinate, -side - coordinate, side - coordinate, coordinate - 2 * side, coordinate + 2 * side]
         return np.array(images), np.array([1.0, low, high, low * high, low * high])
@@ -252,7 +258,8 @@ class _Layer:
 
 
 def _arranged(size: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Microphones in a grid, an irregular grid, at random with a least distance, or along the edge and inside."""
+    """Positions of microphones in a regular grid, in an irregular grid, at random with a least distance, or along the
+    edge and inside."""
     way = rng.integers(4)
     if way < 2:
         columns = max(2, round(np.sqrt(count * size[0] / size[1])))

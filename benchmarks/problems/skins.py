@@ -8,7 +8,7 @@ SIDE, THICKNESS = 0.2, 0.01
 
 
 def skin(kind: str, cell_size: float):
-    """A "sheet" or a "layer": model of the paper's inner layout, conductivity (m,), and the arguments for
+    """Forward model of a "sheet" or a "layer" with the paper's inner layout, conductivity (cells,), and arguments for
     `touched_cells`.
 
     `cell_size` in metres.

@@ -1,6 +1,7 @@
-"""Boxes and cylinders with one or two balls or columns in them, drawn at random and solved on meshes cut along these.
+"""Boxes and cylinders with one or two balls or columns, drawn at random and solved on meshes that follow the surfaces
+of these bodies.
 
-Those meshes differ from, and are finer than, those of the images. Tanks differ in size, electrodes, contact impedances,
+The meshes differ from those of the images, and are finer. Tanks differ in size, electrodes, contact impedances,
 currents and measurements, and in number, size, place and conductivity of the balls. Columns stand in cylinders with a
 ring of tall strips, as in most tanks.
 """
@@ -32,8 +33,9 @@ _REACH = 2.0
 
 
 class Ball(NamedTuple):
-    """**Fields**: `centre` (3,) and `radius`, metres. `factor`, its conductivity over the bath's. `height` of the tank,
-    metres, for a column through it instead of a ball.
+    """Ball or column in a tank. **Fields**: `centre` (3,) and `radius` in metres. `factor`: conductivity of the ball
+    divided by that of the bath. `height`: height of the tank in metres, for a column through the tank instead of a
+    ball.
     """
 
     centre: np.ndarray
@@ -47,18 +49,20 @@ class Ball(NamedTuple):
         return np.pi * self.radius**2 * (4 / 3 * self.radius if self.height is None else self.height)
 
     def level(self, points: np.ndarray) -> np.ndarray:
-        """Distance of points (n, 3) outside it, metres."""
+        """Distance in metres of `points` (points, 3) from the surface of the body, negative inside."""
         along = 3 if self.height is None else 2
         return np.linalg.norm((points - self.centre)[..., :along], axis=-1) - self.radius
 
     def edge(self, corners: np.ndarray) -> np.ndarray:
-        """Maximum length of edges of cells (m, 4, 3), metres: short on the surface."""
+        """Maximum length in metres of the edges of cells with `corners` (cells, 4, 3): short for cells on the surface
+        of the body, otherwise infinite."""
         outside, edge = self.level(corners), _EDGE if self.height is None else _COLUMNS_EDGE
         return np.where((outside.min(axis=1) < 0) & (outside.max(axis=1) > 0), edge * self.radius, np.inf)
 
 
 class SolidTank(NamedTuple):
-    """**Fields**: `frame`, the tank with its balls, and `reference`, without; `balls`; `kind`, of `KINDS`."""
+    """Simulated tank. **Fields**: `frame`, measured with the `balls`; `reference`, measured without balls; `kind`, one
+    of `KINDS`."""
 
     frame: Measurement
     reference: Measurement
@@ -67,7 +71,7 @@ class SolidTank(NamedTuple):
 
 
 def draw(seed: int, *, columns: bool = False) -> SolidTank:
-    """A tank, reproducible from its seed. With `columns` in place of balls it is a cylinder with strips."""
+    """Draw a tank, reproducible from its seed. With `columns` instead of balls, the tank is a cylinder with strips."""
     rng = np.random.default_rng(seed)
     kind = "strips" if columns else KINDS[int(rng.integers(len(KINDS)))]
     domain, electrodes, protocol = empty_tank(rng, kind)
@@ -94,7 +98,8 @@ def draw(seed: int, *, columns: bool = False) -> SolidTank:
 
 
 def mesh_along(domain: Solid, electrodes: FacePatches, balls: Sequence[Ball]) -> tuple[Mesh, np.ndarray]:
-    """A mesh with faces on the surfaces of the balls, and the conductivity of each cell over the bath's."""
+    """A mesh with cell faces on the surfaces of the balls, and the conductivity of each cell divided by that of the
+    bath."""
     mesh = body_mesh(domain, electrodes, _NODES)
     for ball in balls:
         mesh = bisect(mesh, ball.edge)
@@ -137,14 +142,16 @@ def empty_tank(rng, kind: str) -> tuple[Solid, FacePatches, Protocol]:
 
 
 def _by_number(rng, own: Callable[..., Protocol], count: int, current: float, most: int) -> Protocol:
-    """Patterns by the electrodes' numbers: trigonometric, opposite, up to `most` skipped, or the kind's `own`."""
+    """Draw a protocol that depends only on the numbers of the electrodes: trigonometric, opposite, with up to `most`
+    skipped electrodes, or the tank kind's `own` protocol."""
     kind = (trigonometric, own, opposite, skip)[int(rng.integers(4))]
     skipped = (int(rng.integers(1, most + 1)),) if kind is skip else ()
     return kind(count, *skipped, current=current)
 
 
 def _pairs(rng, current: float) -> Protocol:
-    """Drives across each of two rings and between them, measured between neighbours of a ring and vertically."""
+    """Protocol with drives across each of two rings and between the rings, and measurements between neighbours in a
+    ring and between the rings."""
     one, ring = np.eye(32), np.arange(16)
     across = int(rng.integers(3, 9))
     ends = [(a + r, (a + across) % 16 + r) for r in (0, 16) for a in ring] + [(a, (a + across) % 16 + 16) for a in ring]
@@ -154,7 +161,8 @@ def _pairs(rng, current: float) -> Protocol:
 
 
 def balls_in(rng, domain: Solid, *, middle: bool) -> tuple[Ball, ...]:
-    """Balls anywhere, or at half the height, since one ring of strips does not distinguish above from below."""
+    """Draw balls at any position or, if `middle`, at half of the height, because one ring of strips does not
+    distinguish above from below."""
     number, balls = int(rng.integers(1, 3)), []
     height = domain.thickness
     disk = isinstance(domain.outline, Disk)
@@ -174,9 +182,10 @@ def balls_in(rng, domain: Solid, *, middle: bool) -> tuple[Ball, ...]:
 
 
 def matched(tank: SolidTank, places: Sequence[np.ndarray], signs: Sequence[int]) -> tuple[np.ndarray, int]:
-    """The index of the detected body, at `places`, metres, for each ball, and the number of bodies that match no ball.
+    """For each ball, the index of the matching detected body, and the number of detected bodies that match no ball.
+    `places`: positions of the detected bodies in metres.
 
-    It is the nearest of the same sign within two radii, -1 where there is none.
+    The matching body is the nearest body of the same sign within two radii; the index is -1 if there is none.
     """
     if not len(places):
         return np.full(len(tank.balls), -1), 0

@@ -1,7 +1,7 @@
 """People on the simulated skin of Park et al. (2022): windows of sound, with more noise and with fewer microphones.
 
-25 microphones under 200 × 200 × 10 mm, sampled at 10 kHz. The differences between people, and their loudness relative
-to the noise, are in `jeit.acoustic.simulate.people`, fixed before accuracies were computed.
+The skin has 25 microphones under 200 × 200 × 10 mm, sampled at 10 kHz. The differences between people, and their
+loudness relative to the noise, are in `jeit.acoustic.simulate.people`, fixed before accuracies were computed.
 """
 
 from __future__ import annotations
@@ -18,21 +18,22 @@ from jeit.acoustic.simulate import SoundingPerson, SoundingSkin, simulate_sound_
 from jeit.acoustic.simulate.people import MODALITIES, SOUND_MANNERS
 from jeit.touch.listening import SoundImages, sound_images
 
-# Decibels of additional noise, and the remaining ones of the skin's 5 × 5 microphones: every other one of the grid, the
-# square of its corners, and the one at the centre.
+# Decibels of additional noise, and the microphones that are used of the skin's 5 × 5: all, every other microphone of
+# the grid, the four diagonal neighbours of the centre, and the microphone at the centre.
 LOUDER = (0.0, 5.0, 10.0, 15.0, 20.0)
 FEWER = {25: tuple(range(25)), 9: (0, 2, 4, 10, 12, 14, 20, 22, 24), 4: (6, 8, 16, 18), 1: (12,)}
 # Every other window of a clip is used, 0.2 s apart: the windows between them share most of their sound.
 _EVERY = 2
-# To be increased when the simulation of a set changes.
+# Version of stored sets, which must be increased when the simulation changes.
 _VERSION = 1
 
 
 @dataclass(frozen=True)
 class SoundSet:
-    """W windows: `images`, by (decibels of additional noise, microphones).
+    """W windows of sound. `images`: sound images by decibels of additional noise and number of microphones.
 
-    For each window the number of its class of `MODALITIES`, `right` (W,), of its `person` and its `clip`.
+    `right` (W,), `person` (W,), `clip` (W,): indices of each window's class in `MODALITIES`, of its person and of its
+    clip.
     """
 
     images: dict[tuple[float, int], SoundImages]
@@ -42,9 +43,9 @@ class SoundSet:
 
 
 def sound_set(people: int, each: int, seed: int, *, store: Path | None = None) -> SoundSet:
-    """`each` clips of every modality by `people` persons drawn from `seed`, 2.9 s long.
+    """Sound set of `each` clips of every modality by `people` persons drawn from `seed`; clips are 2.9 s long.
 
-    Read from the folder `store` where they exist, otherwise simulated and written there.
+    The set is read from the folder `store` if it exists there, otherwise simulated and written there.
     """
     decides = people, each, seed, SOUND_MANNERS, LOUDER, FEWER, _EVERY, _VERSION
     path = None if store is None else store / f"sounds-{hashlib.sha256(repr(decides).encode()).hexdigest()[:12]}.npz"

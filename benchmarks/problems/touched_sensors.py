@@ -1,7 +1,7 @@
 """Sensors with a moving touch, and the frames that they measure.
 
-The sheet of Silvera Tawil et al. 2011 (320 × 200 mm, 16 electrodes round it and one in its centre, 224 voltages) and a
-disk of 16 electrodes (208 voltages).
+The sensors are the sheet of Silvera Tawil et al. 2011 (320 × 200 mm, 16 electrodes along the edge and one at the
+centre, 224 voltages) and a disk of 16 electrodes (208 voltages).
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ NOISE = 1e-3  # standard deviation, of each voltage
 
 
 def bodies():
-    """Name: function that creates the model for a number of nodes."""
+    """For each sensor by name, a function that creates the forward model for a number of nodes, and half of the extents
+    of a touch's path along x and y, in metres."""
     import numpy as np
 
     from jeit.electrodes import BoundaryElectrodes, CombinedElectrodes, SheetDiscs
@@ -34,7 +35,8 @@ def bodies():
 
 
 def simulate(model, reach, count: int):
-    """Frames (count, M) of a touch moving round the body, half the conductivity within 15 mm, and one at rest."""
+    """Frames (count, channels) of a touch that moves over the body and halves the conductivity within 15 mm, and a
+    frame of the untouched body."""
     import jax
     import jax.numpy as jnp
     import numpy as np

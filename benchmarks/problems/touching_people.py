@@ -1,9 +1,9 @@
 """The sheet of Silvera Tawil et al. (2011), and people who touch it, simulated: sets of gestures, imaged and segmented.
 
-320 × 200 mm, 16 electrodes 10 mm from the edge and one at the centre, eyelets of 7 mm, 1.8 mA through adjacent
-electrodes, 224 potentials against the centre, 60 frames/s. Simulated with complete electrodes on a mesh of some 2,000
-nodes, imaged by one NOSER step on a mesh of 1,193. The differences between people are in `jeit.touch.simulate.people`,
-fixed before accuracies were computed.
+The sheet has 320 × 200 mm, 16 electrodes 10 mm from the edge and one at the centre, eyelets of 7 mm, 1.8 mA through
+adjacent electrodes, 224 potentials against the centre, 60 frames/s. It is simulated with the complete electrode model
+on a mesh of about 2,000 nodes, and imaged by one step with the NOSER prior on a mesh of 1,193 nodes. The differences
+between people are in `jeit.touch.simulate.people`, fixed before accuracies were computed.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ from jeit.touch.simulate.people import MANNERS, GestureStream, Person, simulate_
 
 SIDES, INSET, EYELET, CURRENT, CONTACT = (0.32, 0.2), 0.01, 0.007, 1.8e-3, 1e-3
 NODES, FINE_NODES = 1193, 2000
-# To be increased when the simulation of a set changes.
+# Version of stored sets, which must be increased when the simulation changes.
 _VERSION = 1
 
 
 class Sheet:
-    """The sheet: the simulated `skin` with `fine` nodes, its imager `linear`, its `outline` and `description`."""
+    """The sheet: `skin`, simulated with `fine` nodes; `linear`, the one-step reconstruction; `outline` and
+    `description`."""
 
     def __init__(self, fine: int = FINE_NODES, nodes: int = NODES):
         self.outline = Rectangle(*SIDES)
@@ -60,11 +61,11 @@ class Sheet:
         )
 
     def level(self, made: GestureSet) -> TouchLevel:
-        """The level of images of the untouched sheet."""
+        """The noise level of images of the untouched sheet, above which touches are detected."""
         return TouchLevel.of_untouched(self.linear.mesh, np.asarray(self.linear.image(made.untouched - made.reference)))
 
     def touches(self, made: GestureSet) -> list[StreamTouch | None]:
-        """The longest touch of each recording, or none where none was detected."""
+        """The longest touch in each recording of a gesture set; None for a recording without a detected touch."""
         level, found = self.level(made), []
         for number in range(len(made)):
             seconds, changes = made.changes(number)
@@ -73,9 +74,9 @@ class Sheet:
         return found
 
     def gestures(self, people: int, each: int, seed: int, *, store: Path | None = None) -> GestureSet:
-        """`each` times each gesture by `people` persons drawn from `seed`.
+        """Gesture set with each gesture `each` times by `people` persons drawn from `seed`.
 
-        Read from the folder `store` where they exist, otherwise simulated and written there.
+        The set is read from the folder `store` if it exists there, otherwise simulated and written there.
         """
         path = self._path("gestures", store, people, each, seed)
         if path is not None and path.exists():
@@ -89,7 +90,8 @@ class Sheet:
         return made
 
     def stream(self, people: int, number: int, seed: int, *, store: Path | None = None) -> GestureStream:
-        """`number` gestures one after another by several people, drawn from `seed`, and stored as `gestures` are."""
+        """Stream of `number` gestures one after another by `people` persons drawn from `seed`, stored like the sets of
+        `gestures`."""
         path = self._path("stream", store, people, number, seed)
         if path is not None and path.exists():
             with np.load(path, allow_pickle=False) as kept:
@@ -103,8 +105,8 @@ class Sheet:
         return made
 
     def _path(self, kind: str, store: Path | None, *sizes: int) -> Path | None:
-        """Path of such a set: its name contains everything that determines the set, except the code, which the version
-        represents.
+        """Path of a stored set: the file name contains a hash of all parameters that determine the set; `_VERSION`
+        represents the code.
         """
         if store is None:
             return None

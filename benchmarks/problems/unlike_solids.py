@@ -1,7 +1,8 @@
 """Cylinders and boxes that deviate from their description, with one or two balls or columns in them.
 
-Voltages are computed on a mesh along the balls, different from and finer than that of an image. Errors are those of
-`problems/unlike_tanks.py`: of electrodes along both directions of their face, of contacts, size, gains and digits.
+Voltages are computed on a mesh that follows the surfaces of the balls, and that differs from the mesh of images and is
+finer. The deviations are those of `problems/unlike_tanks.py`: of electrode positions in both directions along a face,
+of contacts, size, gains and digits.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from jeit.mesh import Disk, Solid
 from jeit_solvers.engines import as_array, on_host
 
 ERRORS = tuple(kind for kind in KINDS if kind != "in space")
-# Fraction of the room between an electrode and the edge of its face that a shift may use.
+# Maximum shift of an electrode, as a fraction of the distance between the electrode and the edge of its face.
 _ROOM = 0.9
 
 
 def draw(seed: int) -> Tank:
-    """A tank, reproducible from its seed. Its kind of error is `seed` modulo the number of kinds."""
+    """Draw a tank, reproducible from its seed. The kind of deviation is `seed` modulo the number of kinds."""
     rng = np.random.default_rng(seed)
     kind, form = ERRORS[seed % len(ERRORS)], FORMS[seed // len(ERRORS) % len(FORMS)]
     while True:
@@ -76,9 +77,10 @@ def _draw(rng, kind: str, form: str) -> Tank:
 
 
 def _moved(electrodes: FacePatches, domain: Solid, degrees: np.ndarray) -> FacePatches:
-    """The patches moved by `degrees` (L, 2) of the perimeter: around a cylinder column by column and upwards ring by
-    ring, or along the two edges of a face of a box all of a face alike, so that a mesh can follow their edges. Shifts
-    upwards end before the rim."""
+    """The patches shifted by `degrees` (electrodes, 2) of the perimeter. On a cylinder, all patches of a column are
+    shifted equally around it, and all patches of a ring equally upwards; on a box, all patches of a face are shifted
+    equally along the two edges of the face, so that a mesh can follow the patches' edges. Upward shifts end before the
+    rim."""
     shift = degrees / 360 * domain.outline.perimeter
     place = np.asarray(electrodes.position).copy()
     group = _rings(place) if isinstance(domain.outline, Disk) else _faces(place, domain)
@@ -102,12 +104,12 @@ def _moved(electrodes: FacePatches, domain: Solid, degrees: np.ndarray) -> FaceP
 
 
 def _rings(place: np.ndarray) -> np.ndarray:
-    """The number of the ring of each patch, from below."""
+    """The index of the ring of each patch, counted from below."""
     return np.unique(place[:, 2], return_inverse=True)[1]
 
 
 def _faces(place: np.ndarray, domain: Solid) -> np.ndarray:
-    """The number of the face of each patch: two across x, two across y, the lower and the upper one."""
+    """The index of the face of each patch: the two faces across x, the two across y, the lower face, the upper face."""
     x_min, x_max, y_min, y_max = domain.extent[:4]
     walls = [(0, x_min), (0, x_max), (1, y_min), (1, y_max), (2, 0.0), (2, domain.thickness)]
     return np.argmax([np.isclose(place[:, axis], at) for axis, at in walls], axis=0)

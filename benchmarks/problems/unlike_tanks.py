@@ -1,9 +1,9 @@
 """Sheets that deviate from their description: disks, rectangles and polygons with one to three round bodies.
 
-Voltages are computed on another, finer mesh, for electrodes that are displaced from their description, with contacts
-that differ. Some tanks have one more kind of error. Tanks of the kind "in space" have a height, upright bodies, and
-strips that cover part of the height, and are described as sheets. The defaults of jeit were set on other tanks of the
-kinds `SET_ON`. Those `KEPT_BACK` are never used for that.
+Voltages are computed on another, finer mesh, for electrodes that are displaced from their description, with different
+contact impedances. Some tanks have one more kind of deviation. Tanks of the kind "in space" have a height, upright
+bodies, and electrodes that cover part of the height, but are described as sheets. The defaults of jeit were set on
+other tanks of the kinds `SET_ON`; the kinds `KEPT_BACK` are never used to set defaults.
 """
 
 from __future__ import annotations
@@ -33,13 +33,14 @@ _SIZE = 0.1
 REACH = 0.3
 """Distance, in units of half the width of a tank, within which an inclusion may be a body's."""
 _NODES = 7000
-# Least distance between the two ends of a strip, in units of its width.
+# Least distance between the two ends of a strip, in units of the strip's width.
 _STRAIGHT = 0.98
 
 
 class Body(NamedTuple):
-    """**Fields**: `centre` (d,) and `radius`, metres; `change` of conductivity relative to the background; `measure`:
-    area of the cells that are the body, m², or volume, m³; `axes`: along how many axes it ends."""
+    """Body in a tank. **Fields**: `centre` (2,) or (3,) and `radius` in metres; `change` of conductivity relative to
+    the background; `measure`: area of the body's cells in m², or volume in m³; `axes`: number of axes along which the
+    body is bounded."""
 
     centre: np.ndarray
     radius: float
@@ -49,13 +50,14 @@ class Body(NamedTuple):
 
     @property
     def strength(self) -> float:
-        """Area or volume times (σ/σ₀ - 1) / (σ/σ₀ + axes - 1), m² or m³."""
+        """Strength of the body: area or volume times (σ/σ₀ - 1) / (σ/σ₀ + axes - 1), in m² or m³, for the
+        conductivities σ of the body and σ₀ of the background."""
         return self.measure * self.change / (self.axes + self.change)
 
 
 class Tank(NamedTuple):
-    """**Fields**: `frame`: the tank with its `bodies`; `reference`: without them; `kind` of its errors; `outline`;
-    `noise`: of each voltage, relative; `size`: half of the width, metres."""
+    """Simulated tank. **Fields**: `frame`: measured with the `bodies`; `reference`: measured without bodies; `kind` of
+    deviation; `outline`; `noise`: relative noise of each voltage; `size`: half of the width in metres."""
 
     frame: Measurement
     reference: Measurement
@@ -67,7 +69,7 @@ class Tank(NamedTuple):
 
 
 def draw(seed: int) -> Tank:
-    """A tank, reproducible from its seed. Its kind of error is `seed` modulo the number of kinds."""
+    """Draw a tank, reproducible from its seed. The kind of deviation is `seed` modulo the number of kinds."""
     rng = np.random.default_rng(seed)
     kind, outline = KINDS[seed % len(KINDS)], ("disk", "rectangle", "polygon")[seed // len(KINDS) % 3]
     while True:
@@ -144,12 +146,12 @@ def _draw(rng, kind: str, outline: str) -> Tank:
 
 
 def gains(rng, kind: str, number: int) -> np.ndarray:
-    """Gains (number,) of channels, up to 5 % apart if this is the `kind` of error."""
+    """Gains (number,) of channels, with a standard deviation of up to 5 % if `kind` is "gains", otherwise 1."""
     return 1 + (kind == "gains") * rng.uniform(0, 0.05) * rng.normal(size=number)
 
 
 def recorded(rng, kind: str, voltages: np.ndarray, noise: float) -> np.ndarray:
-    """Voltages with noise, relative, and rounded to two or three digits if few digits are the `kind` of error."""
+    """Voltages with relative `noise`, and rounded to two or three digits if the `kind` of deviation is few digits."""
     deviation = noise * np.hypot(voltages, 0.02 * np.median(np.abs(voltages)))
     voltages = voltages + deviation * rng.normal(size=voltages.shape)
     if kind == "few digits":
@@ -159,7 +161,8 @@ def recorded(rng, kind: str, voltages: np.ndarray, noise: float) -> np.ndarray:
 
 
 def matched(tank: Tank, inclusions: Sequence[Inclusion]) -> tuple[list[Inclusion | None], int]:
-    """For each body the nearest inclusion of its sign within `REACH`, and the number of spurious inclusions."""
+    """For each body, the nearest inclusion of the same sign within `REACH`, or None; and the number of inclusions that
+    match no body."""
     found: list[Inclusion | None] = [None] * len(tank.bodies)
     if not inclusions:
         return found, 0
@@ -174,9 +177,10 @@ def matched(tank: Tank, inclusions: Sequence[Inclusion]) -> tuple[list[Inclusion
 
 
 def _electrodes(place, width, contact, height: float | None, covered: float) -> BoundaryElectrodes | FacePatches:
-    """Arcs on the edge of a sheet, or in a tank with a `height`, strips half way up that cover a part of it.
+    """Electrodes: arcs on the edge of a sheet or, in a tank with a `height`, strips at half of the height that cover
+    the fraction `covered` of the height.
 
-    `contact` is that of the sheet, ohm·m.
+    `contact` is the contact impedance on the sheet in ohm·m.
     """
     if height is None:
         return BoundaryElectrodes(place, width, contact)
@@ -195,7 +199,7 @@ def _outline(name: str, rng) -> Domain:
 
 
 def _along(edge: np.ndarray, lengths: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Points of a closed outline at these arc lengths."""
+    """Points of a closed outline at the arc lengths `places`."""
     arc = np.append(0, np.cumsum(lengths))
     closed = np.vstack([edge, edge[:1]])
     places = places % arc[-1]
@@ -203,13 +207,13 @@ def _along(edge: np.ndarray, lengths: np.ndarray, places: np.ndarray) -> np.ndar
 
 
 def drawn_change(rng) -> float:
-    """Change of a body's conductivity relative to the background: -30 to -99 %, or +42 to +1,000 %."""
+    """Draw the change of a body's conductivity relative to the background: -30 to -99 %, or +42 to +1,000 %."""
     contrast = np.exp(rng.uniform(np.log(0.35), np.log(4.6)))
     return float(np.expm1(-contrast)) if rng.random() < 0.5 else float(np.expm1(min(contrast, 2.4)))
 
 
 def _bodies(rng, domain: Domain) -> tuple[Body, ...]:
-    """One to three bodies that are separate and off the edge."""
+    """Draw one to three bodies that are separate from each other and from the edge."""
     number, (x_min, x_max, y_min, y_max) = int(rng.integers(1, 4)), domain.extent
     while True:
         bodies: list[Body] = []

@@ -1,7 +1,8 @@
 """Skins of 200 mm under weights, after Pugach et al. 2015: a disk and a square of one film, 16 electrodes on the edge.
 
-Variation is that of the material, fixed before any accuracy was computed. A weight stands on a disc of 16.25 mm, as
-theirs do where they specify it. Places are anywhere on the skin where the disc does not extend beyond it.
+The simulated variation is that of the material, fixed before any accuracy was computed. A weight stands on a disc of
+16.25 mm, which is the size that the paper specifies. Positions are anywhere on the skin where the disc does not extend
+beyond the edge.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ OUTLINES: dict[str, Domain] = {"disk": Disk(RADIUS), "square": Rectangle(2 * RAD
 
 @dataclass
 class WeighedSkin:
-    """A skin of the outline of that name, simulated with `nodes` nodes."""
+    """A skin with the outline `name` ("disk" or "square"), simulated with `nodes` nodes."""
 
     name: str = "disk"
     nodes: int = 4000
 
     def model(self, nodes: int) -> ForwardModel:
-        """Model of the skin, on a mesh with `nodes` nodes."""
+        """Forward model of the skin, on a mesh with `nodes` nodes."""
         outline, own = OUTLINES[self.name], material("velostat")
         places = perimeter(outline, 16, start=outline.perimeter / 32)
         electrodes = BoundaryElectrodes(places, 0.01, 1e-3 / (own.conductivity * own.thickness))
@@ -44,7 +45,7 @@ class WeighedSkin:
         return PressedSkin(jax.random.key(0), self.model(self.nodes), material("velostat"))
 
     def presses(self, seed: int, number: int, grams: float = GRAMS) -> tuple[np.ndarray, np.ndarray]:
-        """Frames (number, 208) under one weight, and its places (number, 2)."""
+        """Frames (number, 208) of the skin under one weight, and positions (number, 2) of the weight in metres."""
         load = grams * GRAVITY
         draws = PressDraws([DiscIndenter(DISC)], OUTLINES[self.name], (load, load), margin=DISC / 2)
         drawn = draws.draw(jax.random.key(seed), number)
@@ -52,7 +53,8 @@ class WeighedSkin:
         return self.skin.frames(jax.random.key(seed + 1), drawn), places
 
     def several(self, seed: int, number: int, grams: tuple[float, ...], apart: float):
-        """Frames (number, 208) under several weights at once, and their places (number, k, 2), at least `apart`."""
+        """Frames (number, 208) of the skin under k weights at once, and positions (number, k, 2) of the weights, at
+        least `apart` metres from each other."""
         random = np.random.default_rng(seed)
         inside, places = OUTLINES[self.name].signed_distance, []
         while len(places) < number:

@@ -1,4 +1,4 @@
-"""Checks of arguments, and helpers that word messages and what consoles and notebooks show of objects."""
+"""Checks of arguments, and helpers that word error messages and the texts of objects in consoles and notebooks."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ import numpy as np
 
 from jeit_solvers.engines import has_values
 
-# Types whose values are shown in messages, and maximum number of characters of a value; for other types, the name of
-# the type is shown.
+# Types whose values are shown in error messages, and maximum number of characters of a value; for other types, the name
+# of the type is shown.
 _SHOWN_TYPES, _MAX_TEXT = (str, bytes, int, float, complex, type(None)), 60
 
 
 def check_kind(name: str, value: Any, kind: type | tuple[type, ...], expected: str) -> None:
-    """Raise `ValueError` with the argument's `name` unless `value` is an instance of `kind`; `expected` describes what
-    is expected, with an example."""
+    """Raise `ValueError` with the argument's `name` unless `value` is an instance of `kind`; `expected` describes a
+    valid value, with an example."""
     if not isinstance(value, kind):
         raise ValueError(f"{name} must be {expected}; it is {describe(value)}.")
 
@@ -62,7 +62,7 @@ def _scalar(value: Any) -> Any:
 
 def real_array(name: str, argument: Any, expected: str) -> np.ndarray:
     """Convert an argument to a float64 array. Raises `ValueError` with the argument's `name` for rows of different
-    lengths and for anything but real numbers; `expected` describes what is expected."""
+    lengths and for anything but real numbers; `expected` describes a valid value."""
     try:
         values = np.asarray(argument)
     except (ValueError, TypeError):
@@ -72,7 +72,7 @@ def real_array(name: str, argument: Any, expected: str) -> np.ndarray:
     return values.astype(float)
 
 
-# Percentage below which the value is not stated exactly.
+# Percentage below which only "less than" this percentage is stated.
 _MIN_PERCENT = 0.001
 
 
@@ -83,7 +83,8 @@ def counted(number: int, noun: str) -> str:
 
 
 def percent(value: float | None) -> str:
-    """A ratio in per cent with two significant digits, all digits before the decimal point, and no exponent."""
+    """Text of a ratio in per cent, with two significant digits, all digits before the decimal point, and no
+    exponent."""
     if value is None:
         return "not known"
     percentage = 100 * float(value)
@@ -95,7 +96,7 @@ def percent(value: float | None) -> str:
 
 
 def signed_percent(change: float) -> str:
-    """A relative change in per cent, with its sign and two significant digits."""
+    """Text of a relative change in per cent, with its sign and two significant digits."""
     return f"{float(f'{100 * change:.2g}'):+g} %"
 
 
@@ -104,8 +105,8 @@ Interval = tuple[float | None, float | None]
 
 
 def interval_text(interval: Interval, format_end: Callable[[float], str]) -> str:
-    """Text of an interval, whose ends `format_end` formats. If one end is open, "at least" or "at most" the known end,
-    or "beyond" it if it is a decrease, because "at most -90 %" might mean a smaller one."""
+    """Text of an interval, whose ends `format_end` formats. If one end is open, the text is "at least" or "at most" the
+    known end; for a decrease it is "beyond" the known end, because "at most -90 %" might mean a smaller decrease."""
     lower_end, upper_end = interval
     if lower_end is None:
         if upper_end is None:
@@ -121,14 +122,14 @@ _MAX_READING = 1e12
 
 
 def readings(values: np.ndarray) -> np.ndarray:
-    """Replace values that are not readings by NaN: infinite values, and values beyond any instrument (1e12)."""
+    """Replace values that no instrument can measure by NaN: infinite values, and absolute values above 1e12."""
     with np.errstate(invalid="ignore", over="ignore"):
         return np.where(np.abs(values) <= _MAX_READING, values, np.nan)
 
 
 def check_key(key: Any, name: str = "key") -> None:
-    """Raise `ValueError` with the argument's `name` unless `key` is a single JAX random key, of either the new or the
-    old type."""
+    """Raise `ValueError` with the argument's `name` unless `key` is a single JAX random key, of the new type
+    (`jax.random.key`) or the old type (`jax.random.PRNGKey`)."""
     if isinstance(key, (jax.Array, np.ndarray)):
         is_new_type = jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
         if is_new_type or (key.dtype == np.uint32 and key.ndim == 1):
@@ -143,7 +144,7 @@ IN_MILLIMETRES = "were millimetres given for metres?"
 
 def check_metres(name: str, value: Any, maximum: float = np.inf, limit: str = "") -> None:
     """Raise `ValueError` with the argument's `name` unless `value` is a positive length in metres of at most `maximum`;
-    `limit` describes that maximum in words."""
+    `limit` describes `maximum` in words."""
     if not (is_number(value) and value > 0):
         raise ValueError(f"{name} must be a positive length in metres; it is {describe(value)}.")
     if value > maximum:
@@ -165,8 +166,8 @@ def check_not_negative(name: str, value: float) -> None:
 
 
 def check_name(argument: str, value: Any, names: Iterable[str], otherwise: str = "") -> None:
-    """Raise `ValueError` with the `argument` unless `value` is one of `names`; `otherwise` describes what else is
-    accepted."""
+    """Raise `ValueError`, with the name of the `argument`, unless `value` is one of `names`; `otherwise` describes
+    other values that are accepted."""
     known_names = list(names)
     if not (isinstance(value, str) and value in known_names):
         problem = f"it is {describe(value)}{did_you_mean(value, known_names)}"
@@ -174,8 +175,8 @@ def check_name(argument: str, value: Any, names: Iterable[str], otherwise: str =
 
 
 def did_you_mean(value: Any, names: Iterable[str]) -> str:
-    """Question, in brackets, that proposes the name most similar to the given one or beginning with it; empty if none
-    is."""
+    """Question, in brackets, that proposes the name most similar to `value`, or a name that begins with `value`; empty
+    if no name is similar."""
     known_names, word = list(names), value.lower() if isinstance(value, str) else ""
     completions = [name for name in known_names if word and name.startswith(word)]
     matches = difflib.get_close_matches(word, known_names, n=1) or completions
@@ -183,7 +184,8 @@ def did_you_mean(value: Any, names: Iterable[str]) -> str:
 
 
 def listed(names: Iterable[Any], max_names: int = 8) -> str:
-    """List the first names, such as those in a file, in one short line, with the number of remaining names."""
+    """One short line of text with the first `max_names` names, such as those of arrays in a file, and the number of
+    remaining names."""
     texts = [str(name) for name in names]
     shown_texts = [name if len(name) <= 24 else f"{name[:23]}…" for name in texts[:max_names]]
     remainder = f" and {len(texts) - max_names} more" if len(texts) > max_names else ""
@@ -192,7 +194,8 @@ def listed(names: Iterable[Any], max_names: int = 8) -> str:
 
 def check_has_values(name: str, tree: Any, purpose: str, instead: str) -> None:
     """Raise `ValueError` with the argument's `name` for a pytree that contains values traced by `jax.jit`, `jax.vmap`
-    or a derivative; `purpose` describes what the values are needed for, `instead` what to give or do."""
+    or a derivative; `purpose` describes what the values are needed for, and `instead` what the user should give or
+    do."""
     if not has_values(tree):
         raise ValueError(
             f"{name} is traced, inside jax.jit, jax.vmap or a derivative, and {purpose} its values: {instead}."
@@ -200,7 +203,7 @@ def check_has_values(name: str, tree: Any, purpose: str, instead: str) -> None:
 
 
 def brief(describe_object: Callable[[], str], instance: Any) -> str:
-    """Return the text of an object from `describe_object`, or only its class if it cannot be described: JAX
+    """Text of an object from `describe_object`; only the name of its class if `describe_object` fails, because JAX
     temporarily replaces arrays by other objects."""
     try:
         return describe_object()
@@ -209,13 +212,14 @@ def brief(describe_object: Callable[[], str], instance: Any) -> str:
 
 
 def picture(instance: Any) -> bytes | None:
-    """PNG of an object for a notebook (`_repr_png_`), or None if it has none, such as a traced one.
+    """PNG of an object for a notebook (`_repr_png_`), or None for an object without a picture, such as a traced object.
 
-    The report that draws it is imported by its name, for the objects are of lower layers.
+    `jeit.report`, which draws the picture, is imported by name, because the packages of the objects must not import it.
     """
     return importlib.import_module("jeit.report.notebook").picture(instance)
 
 
 def page(instance: Any) -> str | None:
-    """HTML of an object for a notebook (`_repr_html_`): its text, and its picture; or None if it has none."""
+    """HTML of an object for a notebook (`_repr_html_`): its text and its picture; None for an object without a
+    picture."""
     return importlib.import_module("jeit.report.notebook").page(instance)

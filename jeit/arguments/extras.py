@@ -6,7 +6,7 @@ import importlib
 from importlib.util import find_spec
 from types import ModuleType
 
-# For each extra, the module that is imported and the package that contains it.
+# For each extra, the modules that are imported and the packages that contain them.
 EXTRAS = {
     "mesh": {"gmsh": "gmsh"},
     "cad": {"ezdxf": "ezdxf"},
@@ -26,7 +26,8 @@ _MAX_REASON = 120
 
 
 def need_extra(extra: str, task: str) -> None:
-    """Raise `ImportError`, naming what to install, if a package of `extra` is missing; `task` names what needs it."""
+    """Raise `ImportError`, with the command to install it, if a package of `extra` is missing; `task` names what needs
+    the package."""
     missing_packages = [package for module, package in EXTRAS[extra].items() if _is_missing(module)]
     if missing_packages:
         names = " and ".join(", ".join(missing_packages).rsplit(", ", 1))
@@ -34,7 +35,7 @@ def need_extra(extra: str, task: str) -> None:
 
 
 def optional(module: str, task: str, otherwise: str = "") -> ModuleType:
-    """Import a module of an extra; `task` names what needs it.
+    """Import a module of an optional package; `task` names what needs the module.
 
     Raises `ImportError` if the import fails: the message states the reason, what to install, and the alternative
     `otherwise`.
@@ -53,7 +54,7 @@ def optional(module: str, task: str, otherwise: str = "") -> ModuleType:
 
 
 def how_to_install(extra: str) -> str:
-    """The command that installs jeit with an extra."""
+    """The command that installs jeit with an extra (a group of optional packages)."""
     return f"pip install 'jeit[{extra}]', or in a clone '.[{extra}]'"
 
 

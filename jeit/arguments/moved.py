@@ -10,7 +10,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
-# For each package that exported names in version 0.2, the new modules of the names that have moved unchanged.
+# For each package that exported names in version 0.2, the new modules of the names that moved without being renamed.
 _MOVED = {
     "jeit.imaging": {
         "jeit.touch": "LearntGestures NamedTouch TouchImages TouchWatch WatchedFrame doubts_of learn_gestures "
@@ -61,7 +61,7 @@ _SOUNDS = {
 _MARKS = {"Marks": "MapMarks", "plot_pairs": "plot_position_errors"}
 _DAMAGE = {"mended": "mend_cut", "Mishap": "DamageEvent", "record_mishaps": "record_damage"}
 _TRAINING = {"Objective": "TrainingObjective", "Plan": "TrainingPlan", "fit": "fit_network"}
-# For each package, the room whose names its renamed names are now, and the new name for each old one.
+# For each package of version 0.2, the package that now contains its renamed names, and the new name for each old name.
 _RENAMED = (
     ("jeit.acoustic.plots", "jeit.acoustic", _MARKS),
     ("jeit.acoustic.simulate", "jeit.acoustic", _SOUNDS),
@@ -102,10 +102,10 @@ _MOVED_PAGES = {
 
 
 def with_moved_names(page: str, find: Callable[[str], Any] | None = None) -> Callable[[str], Any]:
-    """The `__getattr__` of a package from which names have moved; `find` is the `__getattr__` for the names it still
-    has.
+    """The `__getattr__` of a package from which names have moved; `find` is the `__getattr__` for the names that the
+    package still has.
 
-    Modules of the package that have moved as a whole can still be imported.
+    Modules of the package that have moved can still be imported under their old names.
     """
     for old_module in _MOVED_PAGES:
         if old_module.rpartition(".")[0] == page:

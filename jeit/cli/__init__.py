@@ -1,6 +1,6 @@
-"""The `jeit` command line: one file for each command, and `app`, which combines the commands.
+"""The `jeit` command line: one module for each command, and the module `app`, which combines the commands.
 
-Commands import other modules only when they run, so that `jeit --help` responds quickly.
+Modules of commands import other modules only when a command runs, so that `jeit --help` responds quickly.
 """
 
 from __future__ import annotations

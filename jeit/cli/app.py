@@ -24,8 +24,8 @@ from jeit.cli.options import (
 )
 from jeit.start import discarded_damaged, quick_compilation
 
-# Commands that run the same compiled program many times. Full optimisation by the compiler makes a frame three times as
-# fast.
+# Commands that run the same compiled program many times. Full optimisation by the compiler makes the computation of a
+# frame three times as fast.
 _FULLY_OPTIMISED = (
     "study",
     "live",
@@ -46,7 +46,7 @@ _MAX_MESSAGE = 390
 
 
 def application(commands: Iterable[str] = COMMANDS) -> typer.Typer:
-    """Create the command-line application with the given commands."""
+    """Create the command-line application with the commands that `commands` names."""
     app = typer.Typer(
         name="jeit",
         add_completion=False,
@@ -78,7 +78,7 @@ def _print_version_or_help(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command with `arguments` (default: those of the process), and return its exit status.
+    """Run the command `jeit` with `arguments` (default: the arguments of the process), and return the exit status.
 
     Exit status: 0 for success, 1 for an error in the data or in given values, 2 for wrong usage of the command, 130 if
     stopped. Errors are reported in one line on standard error; JEIT_DEBUG=1 shows the traceback instead.
@@ -162,14 +162,14 @@ def _print_error(message: str, status: int) -> int:
 
 
 def _one_line(message: str) -> str:
-    """Convert text to one line of printable characters, shortened in the middle if it is too long."""
+    """Convert an error message to one line of printable characters, shortened in the middle if it is too long."""
     line = "".join(letter if letter.isprintable() else "�" for letter in " ".join(message.split()))
     half_length = (_MAX_MESSAGE - 3) // 2
     return line if len(line) <= _MAX_MESSAGE else f"{line[:half_length]} … {line[-half_length:]}"
 
 
 def _create_warning_printer() -> Callable[..., None]:
-    """Create a function that prints each warning only once, since the same objects are often created repeatedly."""
+    """Create a function that prints each warning only once, because the same objects are often created repeatedly."""
     printed_texts: set[str] = set()
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:
@@ -184,8 +184,9 @@ def _create_warning_printer() -> Callable[..., None]:
 
 
 def _set_up_process(*, compile_quickly: bool) -> None:
-    """Set up the process. `compile_quickly`: whether to compile quickly, for commands that spend most of their time on
-    compilation. XLA_FLAGS set by the user take precedence."""
+    """Set the process up for a command: compiler flags, warnings and garbage collection. `compile_quickly`: whether to
+    compile with few optimisations, for commands that spend most of their time on compilation. XLA_FLAGS set by the user
+    take precedence."""
     if compile_quickly:
         os.environ.setdefault("XLA_FLAGS", quick_compilation())
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # hides messages about fonts and unwritable folders

@@ -1,4 +1,4 @@
-"""Table of all commands and their modules, which are imported only when a command is called."""
+"""Table of all commands of `jeit` and their modules, which are imported only when a command is called."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ COMMANDS = {
 
 
 def check_method(method: str | None, others: Iterable[str]) -> None:
-    """Check `--method`. Raises `ValueError` unless it is "network" or among `others`."""
+    """Check the option `--method`. Raises `ValueError` unless the method is "network" or among `others`."""
     from jeit.arguments import check_name
 
     if method is not None:

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 _MAX_TABLE_WIDTH = 80
 # Minimum duration of a step, in seconds, for which the elapsed time is shown.
 _MIN_SHOWN_SECONDS = 2.0
-# Number of completed parts of a step in its progress text, and minimum completed share for an estimate of the remaining
-# time. Texts such as "12 of at most 60" do not match.
+# Pattern of a progress text such as "12 of 60" (completed parts of a step), and minimum completed fraction for an
+# estimate of the remaining time. Texts such as "12 of at most 60" do not match.
 _PROGRESS, _MIN_SHARE = re.compile(r"(\d[\d,]*) of (\d[\d,]*)"), 0.05
 _PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
@@ -39,8 +39,8 @@ def plain_console() -> Console:
 class Steps:
     """Progress on standard output: the current step with a spinner, and completed steps with their duration.
 
-    Call it with the name of each step when the step begins; `report` shows the progress within the step. Prints nothing
-    if `quiet`.
+    Call the object with the name of each step when the step begins; `report` shows the progress within the step.
+    Nothing is printed if `quiet`.
     """
 
     def __init__(self, console: Console, *, quiet: bool):
@@ -59,7 +59,7 @@ class Steps:
 
     @property
     def under_way(self) -> str:
-        """Name of the current step; empty before the first."""
+        """Name of the current step; empty before the first step."""
         return self._step
 
     def report(self, detail: str) -> None:
@@ -110,14 +110,14 @@ class _StepLine:
 
 
 def _rounded_duration(seconds: float) -> str:
-    """Format a duration with one or two digits, the accuracy of the estimate."""
+    """Format an estimated duration with one or two digits, which is the accuracy of the estimate."""
     if seconds < 100:
         return f"{seconds:.0f} s" if seconds < 10 else f"{5 * round(seconds / 5)} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def pairs(title: str, rows: list[tuple[str, str]]) -> Table:
-    """Create a table of names and values."""
+    """Create a table with the `title`, and a name and a value in each row."""
     table = Table(title=title, title_justify="left", title_style="bold", show_header=False, box=None, padding=(0, 2))
     table.add_column(style="dim")
     table.add_column(overflow="fold")
@@ -127,7 +127,7 @@ def pairs(title: str, rows: list[tuple[str, str]]) -> Table:
 
 
 def say_written(console: Console, first: Path, *others: str) -> None:
-    """Print the names of the written files: the `first` with its folder, the others without it."""
+    """Print the names of the written files: the `first` with its folder, the `others` without the folder."""
     console.print(Text("Written:", "dim"), ", ".join([str(first), *others]), soft_wrap=True)
 
 
@@ -151,7 +151,7 @@ def in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
 
 
 def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, *, background: float | None = None) -> Table:
-    """Create a table with a row for each inclusion: kind, place, size, and peak change of conductivity.
+    """Create a table with a row for each inclusion: kind, position, size, and peak change of conductivity.
 
     `unit`: unit of conductivity. `background`: conductivity of the reference, if known.
     """
@@ -169,8 +169,8 @@ def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Tabl
     """Create a table of fitted bodies with 68 % intervals of their size, change of conductivity and strength, and the
     68 % radius of their place.
 
-    `background`: conductivity of the reference, S/m (2-D: S). If the data leave an end of an interval open, only the
-    other end is given.
+    `background`: conductivity of the reference, S/m (2-D: S). If the data determine only one end of an interval, only
+    this end is given.
     """
     noun, unit, _ = _size_format(inclusions)
     rows = []
@@ -196,7 +196,7 @@ def _three_digits(value: float, sign: str = "") -> str:
 
 
 def with_interval(value: float | None, interval: Interval | None, format_value: Callable[[float], str]) -> str:
-    """A value above its interval, as text; only the interval where one of its ends is open."""
+    """Text of a value with its interval on the next line; only the interval if one of its ends is open."""
     if value is None or interval is None:
         return "not known" if value is None else format_value(value)
     text = interval_text(interval, format_value)
@@ -210,7 +210,7 @@ def _size_format(inclusions: "Sequence[Inclusion]") -> tuple[str, str, int]:
 
 
 def _inclusion_table_with(inclusions: "Sequence[Inclusion]", columns: list[str], rows: list[list[str]]) -> Table:
-    """Create a table of inclusions by kind and place, with more `columns`, in 80 characters."""
+    """Create a table of inclusions with their kind and position, and further `columns`, at most 80 characters wide."""
     dimension = max((len(inclusion.centroid) for inclusion in inclusions), default=2)
     table_style = {"box": None, "padding": (0, 2), "collapse_padding": True}
 

@@ -1,4 +1,4 @@
-"""Frames from standard input, with their times from a given rate or from the clock."""
+"""Frames from standard input, with their times from a given frame rate or from the clock."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-# Minimum waiting time for a frame to count as live, as a share of the usual interval between frames; number of
-# consecutive live frames after which earlier frames are taken to be read; and maximum time for reading earlier frames,
-# in seconds.
+# Minimum waiting time for a frame to count as live, as a fraction of the usual interval between frames; number of
+# consecutive live frames after which all earlier frames are considered read; and maximum time for reading earlier
+# frames, in seconds.
 _MIN_WAIT_SHARE, _NUM_LIVE_FRAMES, _MAX_CATCH_UP_SECONDS = 0.4, 3, 5.0
 
 
 class LiveFrames:
     """Iterator of pairs (time in seconds, frame) over `lines`, the frames that `parse_frames` returns.
 
-    With a `rate`, in frames/s, all frames are used. Without it, times come from the clock, and frames that arrived
-    before reading began are skipped and counted in `left_out`. If all frames have already arrived, such as from a file,
-    none is skipped, and the `usual_rate` is used.
+    With a `rate`, in frames/s, all frames are used. Without a `rate`, times come from the clock, and frames that
+    arrived before reading began are skipped and counted in `left_out`. If all frames have already arrived, e.g. from a
+    file, no frame is skipped, and times follow from the `usual_rate`.
     """
 
     def __init__(self, lines: Iterator[object], rate: float | None, usual_rate: float):
@@ -30,15 +30,15 @@ class LiveFrames:
 
     @property
     def rate_seen(self) -> float:
-        """Frame rate in frames/s: the given rate, the mean rate of the frames read, or the usual rate."""
+        """Frame rate in frames/s: the given rate, else the mean rate of the frames read, else the usual rate."""
         if self.rate is not None:
             return self.rate
         seconds = [second for second, _ in self.read_frames]
         return (len(seconds) - 1) / seconds[-1] if len(seconds) > 1 and seconds[-1] > 0 else self.usual_rate
 
     def untouched(self, span: float) -> Float[np.ndarray, "u M"]:
-        """Read the frames of the first `span` seconds; iteration returns them again. Raises `ValueError` if there are
-        none."""
+        """Read the frames (frames, channels) of the first `span` seconds; iteration returns these frames again. Raises
+        `ValueError` if there are none."""
         self._catch_up()
         while not self.read_frames or self.read_frames[-1][0] < span:
             frame = self._next()
@@ -59,7 +59,8 @@ class LiveFrames:
             yield self._second(), frame
 
     def _catch_up(self) -> None:
-        """Skip frames that arrived before reading began. If the input ends with them, keep them and use a rate."""
+        """Skip frames that arrived before reading began. If the input ends with these frames, keep them, with times
+        from the usual rate."""
         if not self.by_clock:
             return
         skipped_frames, num_consecutive, start = [], 0, time.monotonic()
@@ -90,5 +91,5 @@ class LiveFrames:
         return max(second, self.read_frames[-1][0] if self.read_frames else 0.0)
 
     def _next(self) -> object | None:
-        """Wait for the next frame; None after the last."""
+        """Wait for the next frame, and return it; None after the last frame."""
         return next(self.lines, None)

@@ -1,4 +1,4 @@
-"""Options and arguments shared by several commands."""
+"""Command-line options and arguments shared by several commands, and functions that check options."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ _OUTPUT_OPTIONS = ("output", "page", "film")
 
 
 def remembering_files(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a command so that its input files are recorded for `make_folder`."""
+    """Wrap a command so that its input files are recorded; `make_folder` checks that no output overwrites them."""
 
     @wraps(command)
     def call(**values: Any) -> Any:
@@ -97,7 +97,7 @@ class StoppedError(Exception):
 
 
 def reporting_when_stopped(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a command so that Ctrl-C raises `StoppedError`, since typer does not report `KeyboardInterrupt`."""
+    """Wrap a command so that Ctrl-C raises `StoppedError`, because typer does not report `KeyboardInterrupt`."""
 
     @wraps(command)
     def call(*arguments: Any, **values: Any) -> Any:
@@ -111,7 +111,8 @@ def reporting_when_stopped(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextmanager
 def naming_options(options: dict[str, str]) -> Iterator[None]:
-    """Context manager that replaces arguments by the names of their `options` in error messages; see `in_options`."""
+    """Context manager that replaces names of Python arguments by names of `options` in error messages; see
+    `in_options`."""
     try:
         yield
     except (ValueError, FileNotFoundError) as error:
@@ -129,7 +130,8 @@ def read_file(
     like: "Measurement | None" = None,
     key: str | None = None,
 ) -> "Measurement":
-    """Read the measured file given as `option`, "DATA" or "--reference", which is named in error messages."""
+    """Read the measured file at `path`. Error messages name the `option` by which the user gave it, "DATA" or
+    "--reference"."""
     from jeit.data import read
 
     with naming_options({"path": option, "key": "--reference-key" if option == "--reference" else "--key"}):
@@ -144,8 +146,8 @@ def read_pair(
     description: str | None,
     keys: tuple[str | None, str | None] = (None, None),
 ) -> "tuple[Measurement, Measurement | None]":
-    """Read DATA and its reference. `frames`: range of the frames of the reference, or of DATA without one, that are
-    used as reference. `keys`: names of the arrays of DATA and of the reference."""
+    """Read DATA and its reference. `frames`: range of the frames that are used as reference, from the reference file
+    or, without such a file, from DATA. `keys`: names of the arrays of voltages in DATA and in the reference file."""
     key, reference_key = keys
     reference = data if reference is None and reference_key is not None else reference
     reference_measurement = (
@@ -157,7 +159,7 @@ def read_pair(
 
 
 def reference_of_frames(measurement: "Measurement", frames: str) -> "Measurement":
-    """Return the `frames` of a measurement that --reference-frames names, such as "0-17" or "5"."""
+    """Return the frames of a measurement that the option --reference-frames selects, such as "0-17" or "5"."""
     match = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", frames.strip())
     first_frame, last_frame = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
     if not first_frame <= last_frame < measurement.num_frames:
@@ -169,7 +171,8 @@ def reference_of_frames(measurement: "Measurement", frames: str) -> "Measurement
 
 
 def in_options(message: str, options: dict[str, str]) -> str:
-    """Replace Python arguments by options in an error message, at its beginning or where written as `name=`.
+    """Replace names of Python arguments by names of options in an error message, at its beginning or where written as
+    `name=`.
 
     For options in millimetres, whose names end in "-mm", the question whether lengths were given in metres is removed.
     """
@@ -187,29 +190,30 @@ def in_options(message: str, options: dict[str, str]) -> str:
 
 
 def check_positive(options: dict[str, float]) -> None:
-    """Check options that must be positive and finite. Raises `ValueError` otherwise."""
+    """Raise `ValueError` unless the values of all `options` are positive and finite."""
     for name, value in options.items():
         if not 0 < value < float("inf"):
             raise ValueError(f"{name} must be positive; it is {value:g}.")
 
 
 def check_at_least(options: dict[str, tuple[int | None, int]]) -> None:
-    """Check options, given as pairs of value and minimum. Raises `ValueError` for values below their minimum."""
+    """Raise `ValueError` if an option, given as a pair of value and minimum, has a value below the minimum."""
     for name, (value, minimum) in options.items():
         if value is not None and value < minimum:
             raise ValueError(f"{name} must be at least {minimum}; it is {value}.")
 
 
 def check_within(name: str, value: float, minimum: float, maximum: float, unit: str = "") -> None:
-    """Check an option that must be a number from `minimum` to `maximum`. Raises `ValueError` otherwise."""
+    """Raise `ValueError` unless the option `name` has a `value` from `minimum` to `maximum`."""
     if not minimum <= value <= maximum:
         unit = f" {unit}" if unit else ""
         raise ValueError(f"{name} must be from {minimum:g} to {maximum:g}{unit}; it is {value:g}.")
 
 
 def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json", "image.vtu")) -> None:
-    """Create the folder for result files of the given names before the computation; `remove_empty_folders` undoes it.
-    Raises `ValueError` if the path cannot be a folder, and if a result would overwrite an input file of the command."""
+    """Create the folder for result files with the given `names` before the computation; `remove_empty_folders` removes
+    it if it stays empty. Raises `ValueError` if `output` cannot be a folder, and if a result would overwrite an input
+    file of the command."""
     for name in names:
         if any((output / name).exists() and (output / name).samefile(input_file) for input_file in _INPUT_FILES):
             raise ValueError(

@@ -1,5 +1,5 @@
-"""Handling of Ctrl-C and SIGTERM during streaming: the frames received are written, and the exit status is that of the
-signal that stopped the command."""
+"""Handling of Ctrl-C and SIGTERM during streaming: the frames received so far are written, and the exit status is that
+of the signal."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from jeit.cli.options import remove_empty_folders
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _END_OF_FRAMES = object()
-# Interval between reports of the number of frames received, in seconds.
+# Interval in seconds between reports of the number of frames received.
 _REPORT_INTERVAL = 0.25
 
 
@@ -29,8 +29,8 @@ class _StoppedError(Exception):
 
 class Stopping:
     """Context manager that stops a stream on Ctrl-C and SIGTERM: the iterator of `until` ends after the current frame,
-    or at once while waiting for the next. A second signal, or a signal before the first frame, stops the command at
-    once."""
+    or at once while waiting for the next frame. A second signal, or a signal before the first frame, stops the command
+    at once."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -116,8 +116,8 @@ class Stopping:
 
 
 class FrameCounter:
-    """Counter of frames that reports the number received a few times per second. `number`: total number of frames, if
-    known."""
+    """Counter of frames that reports the number of frames received a few times per second. `number`: total number of
+    frames, if known."""
 
     def __init__(self, step: Steps, num_frames: int | None = None):
         self._step, self._total_text = step, "" if num_frames is None else f" of {num_frames:,}"

@@ -1,4 +1,4 @@
-"""Measured data: readers for files, checks of the measurements, and export.
+"""Measured data: readers of data files, checks of the measurements, and export.
 
 `read(path)` returns a `Measurement`, which contains voltages, mask, protocol, electrodes and body. `check_imageable`
 checks whether a frame can be imaged against a reference.

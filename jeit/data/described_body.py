@@ -1,5 +1,5 @@
-"""Construction of body and electrodes from the sections `[geometry]` and `[electrodes]` of a description, and checks
-that they fit together."""
+"""Construction of body and electrodes from the sections `[geometry]` and `[electrodes]` of a description file, and
+checks that the electrodes lie on the body."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from jeit.data.description_tables import ElectrodesTable, FacetsTable, GeometryTable, MeshTable, PlacedTable
 
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
-# Size of the body divided by the length that a key gives.
+# Size of the body divided by the length that a key of `[geometry]` gives.
 _SIZE_FACTORS = {"radius": 2.0, "width": 1.0, "depth": 1.0, "height": 1.0, "thickness": 1.0}
 
 
 def warn_large_body(table: GeometryTable, body: Body, origin: str) -> None:
-    """Warn if lengths in `[geometry]` of the file `origin` are so large that they seem to be in another unit than
+    """Warn if lengths in `[geometry]` of the description file `origin` are so large that they seem not to be in
     metres."""
     from jeit.data.description_tables import PolygonTable  # already imported when the table was read
 
@@ -68,15 +68,15 @@ def _extent(points) -> float:
     return float(np.ptp(np.asarray(points), axis=0).max())
 
 
-# Maximum distance of an electrode from the surface as a fraction of its smaller dimension, and maximum overhang beyond
-# the wall as a fraction of its height.
+# Maximum distance of an electrode from the surface as a fraction of the electrode's smaller dimension, and maximum
+# overhang beyond the wall as a fraction of the wall's height.
 _MAX_SURFACE_DISTANCE = 0.1
 _MAX_OVERHANG = 0.02
 
 
 def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
-    """Raise `ValueError` for electrodes that lie off the surface, that coincide, that are wider than the body
-    (patches), or that extend above or below the wall."""
+    """Raise `ValueError` for electrodes that lie off the surface of a solid, that coincide, that are wider than the
+    body (patches), or that extend above or below its wall."""
     if isinstance(electrodes, FacePatches):
         height = np.asarray(electrodes.height)
         smaller_sizes = np.minimum(electrodes.width, height)
@@ -109,7 +109,8 @@ def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
 
 
 def _surface_distance(body: Solid, points: Float[np.ndarray, "L 3"]):
-    """Return the distance of points (L, 3) from the surface, in metres, and whether the wall is nearer than a lid."""
+    """Distances of points (points, 3) from the surface of a solid, in metres, and whether the wall is nearer than the
+    top and bottom."""
     z = points[:, 2]
     wall_distances, lid_distances = (
         np.asarray(body.outline.signed_distance(points[:, :2])),
@@ -144,9 +145,10 @@ _NON_ARGUMENT_KEYS = {"shape", "thickness"}
 
 
 def described_body(table: GeometryTable, folder: Path, origin: str) -> Body:
-    """Construct the body of a table `[geometry]`; the file of a mesh is looked for in `folder`.
+    """Construct the body that the section `[geometry]` of a description specifies; `folder` contains the mesh file that
+    the section may name.
 
-    Raises `ValueError` if it is not valid, and warns if lengths are too large for metres.
+    Raises `ValueError` if the section is not valid, and warns if lengths seem too large to be in metres.
     """
     with size_checked():
         body = _body(table, folder, origin)
@@ -183,9 +185,10 @@ def _mesh_from_file(table: MeshTable, folder: Path, origin: str) -> OwnMesh:
 
 
 def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str) -> AbstractElectrodes:
-    """Construct the electrodes of a table `[electrodes]`, on a body if one is described.
+    """Construct the electrodes that the section `[electrodes]` of a description specifies, on the `body` if it is
+    described.
 
-    Raises `ValueError` if they are not valid.
+    Raises `ValueError` if the electrodes are not valid.
     """
     try:
         if table.kind == "facets":
@@ -213,7 +216,7 @@ def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str)
 
 
 def _with_description_key(message: str) -> str:
-    """Replace the argument name at the beginning of a message about electrodes by the corresponding key of the
+    """Replace the argument name at the beginning of an error message about electrodes by the corresponding key of the
     description."""
     argument, colon, problem = message.partition(": ")
     key = {"position": "positions", "positions": "positions", "width": "width", "height": "height"}.get(argument)
@@ -221,7 +224,7 @@ def _with_description_key(message: str) -> str:
 
 
 def _facets(table: FacetsTable, body: Body | None) -> AbstractElectrodes:
-    """Electrodes that are named groups of facets of the mesh."""
+    """Electrodes that are named groups of boundary facets of the body's mesh."""
     if not isinstance(body, OwnMesh):
         raise ValueError("kind = 'facets' is of facets that a mesh has names for: give [geometry] mesh.")
     return plates(body.given, table.tags, table.contact_impedance)
@@ -255,7 +258,7 @@ def _positions(table: PlacedTable, body: Body | None, origin: str) -> np.ndarray
 
 
 def _edge_positions(table: PlacedTable, outline: Domain, num_electrodes: int) -> np.ndarray:
-    """Positions (L, 2) along the edge of an outline."""
+    """Positions (electrodes, 2) of electrodes along the edge of an outline."""
     if table.layout == "perimeter":
         return perimeter(outline, num_electrodes, start=table.start)
     if not isinstance(outline, Disk):
@@ -270,6 +273,7 @@ def _edge_positions(table: PlacedTable, outline: Domain, num_electrodes: int) ->
 
 
 def located(error: Exception | str, origin: str, key: str) -> ValueError:
-    """Return a `ValueError` that names the file and the key that an error concerns, cut to 400 characters."""
+    """Return a `ValueError` with the text of `error`, preceded by the file `origin` and the `key`, cut to 400
+    characters."""
     text = str(error).removeprefix(f"{origin}: ")
     return ValueError(f"{origin[:80]}: {text if text.startswith(key) else f'{key}: {text}'}"[:400])

@@ -1,7 +1,8 @@
 """Construction of the protocol that the section `[protocol]` of a description specifies.
 
-Systems that drive all electrodes at once publish a matrix of the measured currents, with one column per pattern, beside
-voltages indexed by electrode, pattern and frame: `[protocol] kind = "measured"`.
+Files of systems that drive all electrodes at once contain a matrix of the measured currents, with one column per
+current pattern, and voltages indexed by electrode, pattern and frame. They are described by `[protocol] kind =
+"measured"`.
 """
 
 from __future__ import annotations
@@ -24,20 +25,20 @@ if TYPE_CHECKING:
 
 PROTOCOL_ARRAYS = ("drive", "measurement", "drive_index", "measurement_index")
 _CURRENT_UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
-# Keys that are not passed to a constructor as options.
+# Keys of `[protocol]` that are not passed to a constructor as options.
 _NON_OPTION_KEYS = {"kind", "number", "name", "current", "current_from_name", "current_unit"}
-# Keys whose values are indices of electrodes, from 0.
+# Keys of `[protocol]` whose values are indices of electrodes, counted from 0.
 _ELECTRODE_KEYS = ("common", "reference", "pairs", "drive_pairs", "measurement_pairs")
-# Estimated memory of a protocol in use: bytes for every channel in addition to its pattern, and number of copies of the
+# Estimated memory of a protocol: bytes for every channel in addition to its patterns, and number of copies of the
 # patterns.
 _BYTES_PER_CHANNEL, _NUM_COPIES = 64, 2
 
 
 def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:
-    """The protocol of a table `[protocol]` for the file at `path`. `num_electrodes`: number of electrodes, None if they
-    are not described.
+    """The protocol that the section `[protocol]` of a description specifies for the data file at `path`.
+    `num_electrodes`: number of electrodes, None if the electrodes are not described.
 
-    Raises `ValueError` if the table is not a valid protocol, or if the protocol would not fit in memory.
+    Raises `ValueError` if the section is not a valid protocol, or if the protocol would not fit in memory.
     """
     try:
         if table.kind == "matrices":
@@ -55,14 +56,14 @@ def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: P
         raise located(error, origin, "protocol") from None
 
 
-# Options that a description may leave out, and their possible values; the default of the constructor comes first.
+# Options of protocols that a description may leave out, and their possible values; the constructor's default is first.
 _OPTION_VALUES = {"driven_electrodes": (False, True), "order": ("rotating", "fixed"), "reciprocal": ("all", "half"),
          "drives": ("distinct", "all")}  # fmt: skip
 
 
 def variants(table: ProtocolTable) -> list[tuple[ProtocolTable, str]]:
-    """Return the table, then copies of it with other values of the options that it does not state, each with the text
-    that states these options in a description."""
+    """Return `table`, then copies of it with other values of the options that `table` does not state, each with the
+    text that states these options in a description."""
     fields = type(table).model_fields
     open_options = [name for name in _OPTION_VALUES if name in fields and name not in table.model_fields_set]
     open_options = [name for name in open_options if fields[name].default in _OPTION_VALUES[name]]
@@ -79,7 +80,7 @@ def variants(table: ProtocolTable) -> list[tuple[ProtocolTable, str]]:
 
 
 def _construct(table: ConstructedTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:
-    """Call the protocol constructor that `kind` names."""
+    """Call the protocol constructor that the key `kind` of `[protocol]` names."""
     # For a protocol with a reference electrode, `num_boundary` counts only the electrodes on the boundary.
     num_references = 1 if table.kind == "reference_electrode" else 0
     num_boundary = (
@@ -136,7 +137,7 @@ def _check_size(num_drives: int, num_measurements: int, num_electrodes: int, num
 
 
 def _current_amplitude(table: DrivenTable, path: Path) -> float:
-    """Amplitude of the current in amperes."""
+    """Amplitude of the drive current in amperes, from `[protocol]` or from the name of the file at `path`."""
     unit = _CURRENT_UNITS[table.current_unit]
     if table.current_from_name is None:
         assert table.current is not None
@@ -151,8 +152,8 @@ def _current_amplitude(table: DrivenTable, path: Path) -> float:
 
 
 def number_in_name(pattern: str, name: str) -> float | None:
-    """Return the first number, such as 30 or 0.5, in the file `name` at the position of {current} in the `pattern`; *
-    in the pattern matches any text. None if the name does not match."""
+    """Return the first number, such as 30 or 0.5, at the position of {current} of the `pattern` in the file name
+    `name`; * in the pattern matches any text. None if the name does not match the pattern."""
     prefix, _, suffix = pattern.partition("{current}")
     start = 0
     while start < len(name):
@@ -176,8 +177,8 @@ def _number_end(text: str, start: int) -> int:
 
 
 def _matches(pattern: str, text: str) -> bool:
-    """Whether a text matches a pattern in which * stands for any text. Each part is matched at its first occurrence, so
-    no part is searched for twice."""
+    """Whether a text matches a pattern in which * stands for any text. Each part between two * is matched at its first
+    occurrence, so no part is searched for twice."""
     first_part, *later_parts = pattern.split("*")
     if not later_parts:
         return pattern == text
@@ -194,9 +195,10 @@ def _matches(pattern: str, text: str) -> bool:
 
 
 def protocol_of_file(table: MeasuredTable, path: Path) -> Protocol:
-    """The protocol whose currents, and measurement patterns if named, are stored in the .mat or .npz file at `path`.
+    """The protocol whose currents are stored in the .mat or .npz file at `path`; measurement patterns are also read if
+    `table` names their variable.
 
-    Raises `ValueError` if the file or a variable does not exist, and if the matrices are not a valid protocol.
+    Raises `ValueError` if the file or a variable in it does not exist, and if the matrices are not a valid protocol.
     """
     keys = (table.drive_key,) if table.measurement_key is None else (table.drive_key, table.measurement_key)
     drive, *measurement_matrices = (
@@ -213,7 +215,7 @@ def protocol_of_file(table: MeasuredTable, path: Path) -> Protocol:
         else measurement_patterns(drive.shape[1], table.measurement, table.reference)
     )
     check_memory(f"{path.name}: the protocol", 64 * len(drive) * len(measurement))
-    # Currents measured by an instrument sum to zero only within its errors.
+    # Currents measured by an instrument sum to zero only within measurement errors.
     drive = _balanced(drive, table.drive_key, path) * _CURRENT_UNITS[table.current_unit]
     measurement_name = table.measurement_key or table.measurement
     name = table.name or f"{len(drive)} measured currents, {measurement_name}, {drive.shape[1]} electrodes"
@@ -243,7 +245,7 @@ def _checked_matrix(values: np.ndarray, key: str, path: Path) -> np.ndarray:
 
 
 def _balanced(drive: np.ndarray, key: str, path: Path) -> np.ndarray:
-    """Currents minus their mean; raises `ValueError` if the mean is not small."""
+    """Currents of each drive minus their mean over the electrodes; raises `ValueError` if a mean is not small."""
     net_currents, largest_currents = np.abs(drive.sum(axis=1)), np.abs(drive).max(axis=1)
     worst_index = int(np.argmax(net_currents - 0.05 * largest_currents))
     if net_currents[worst_index] > 0.05 * largest_currents[worst_index]:

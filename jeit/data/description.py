@@ -1,6 +1,6 @@
 """Descriptions: small TOML files beside measured data that state what the numbers in a table mean.
 
-Sections of a description (`tank6cm.toml` in this folder is an example; only `[protocol]` is required):
+A description has these sections, of which only `[protocol]` is required (`tank6cm.toml` in this folder is an example):
 
 - `[geometry]`: the body, in metres. `shape` = "disk" (`radius`, `centre`), "rectangle" (`width`, `height`, `centre`) or
   "polygon" (`vertices`, `holes`) is a sheet, or, with a `thickness`, a solid from z = 0 upwards; "box" (`width`,
@@ -9,27 +9,28 @@ Sections of a description (`tank6cm.toml` in this folder is an example; only `[p
   (1e-3 for millimetres).
 - `[electrodes]`: `kind` = "boundary" (`width`), "disc" (`radius`; in a sheet or on the surface of a solid), "patch" (on
   a solid: `width`, `height`), "point", or "facets" (`tags`: names of groups of facets of the mesh); `contact_impedance`
-  in ohm·m² (on the edge of a sheet in ohm·m). Their positions follow from `layout` = "ring" (disk, cylinder: `number`,
-  `start_angle_degrees`, `clockwise`) or "perimeter" (`number`, `start`), on a solid at each height z in `levels` (a
-  number or a list), numbered level after level; or from `positions`, each of two or three coordinates.
+  in ohm·m² (on the edge of a sheet in ohm·m). The positions of the electrodes follow from `layout` = "ring" (disk,
+  cylinder: `number`, `start_angle_degrees`, `clockwise`) or "perimeter" (`number`, `start`), on a solid at each height
+  z in `levels` (a number or a list), numbered level after level; or from `positions`, each of two or three coordinates.
 - `[protocol]`: `kind` = name of a constructor in `jeit.protocol`, with its arguments and the amplitude: `current` in
   amperes, or in `current_unit`; or `current_from_name`, the name of the data file with {current} in place of the number
-  and * for any text, such as "*_{current}uA_*". Or `kind` = "matrices" with `drive` (S, L) in amperes and `measurement`
-  (K, L); "channels" with both of these and `drive_index` (M,) and `measurement_index` (M,), counted from 0; or
-  "optimal" with `transfer`, optionally `other`, both (L, L) in ohm, and `current` or `power`. Or "measured", for a .mat
-  or .npz data file that holds the currents in the variable `drive_key` (default "current_patterns"), one pattern per
-  column, or per row with `patterns_in` = "rows"; `measurement` states how the potentials of all electrodes are read:
-  "mean-removed" (minus the mean of all), "mean" (against the mean of the others), "adjacent", or "against" an electrode
-  `reference`; alternatively `measurement_key` names a matrix of measurement patterns in the file.
+  and * for any text, such as "*_{current}uA_*". Or `kind` = "matrices" with `drive` (drives, electrodes) in amperes and
+  `measurement` (measurement patterns, electrodes); "channels" with both matrices, and `drive_index` and
+  `measurement_index` of each channel, counted from 0; or "optimal" with the transfer impedance `transfer`, optionally
+  `other`, both (electrodes, electrodes) in ohm, and `current` or `power`. Or "measured", for a .mat or .npz data file
+  that contains the currents in the variable `drive_key` (default "current_patterns"), one pattern per column, or per
+  row with `patterns_in` = "rows". In that case `measurement` states how the potentials of all electrodes are read:
+  "mean-removed" (minus the mean of all), "mean" (against the mean of the other electrodes), "adjacent", or "against" an
+  electrode `reference`; alternatively `measurement_key` names a matrix of measurement patterns in the file.
 - `[data]`: `frames_in` = "columns" or "rows"; `delimiter`, `skip_rows`; `time_column`, whether the first number of a
   frame is its time; `complex_pairs`, `component`; `gain`, or `gains`, one for each measurement pattern of the protocol;
   `polarity`, `unit`, `saturation`; `frame_names`; `keys`: variables to read from a .mat or .npz file; `axes`: order of
   the axes of a three-dimensional array (default: electrodes, patterns, frames); `frames` = "all", or "mean" for their
-  average; `frame_rate` in frames per second. What is left out of arrangement and `polarity` is found from the numbers,
-  with a note.
-- `[uncertainty]`: standard deviations of what is described: `position` of electrodes in metres, or `position_degrees`
-  on a disk or cylinder; `contact_drift_percent`, from the reference to a frame; `size_percent` of the body;
-  `other_percent` of the difference. See `jeit.inverse.Uncertainty`.
+  average; `frame_rate` in frames per second. If the arrangement or the `polarity` is left out, it is detected from the
+  numbers, and a note states the result.
+- `[uncertainty]`: standard deviations: `position` of electrodes in metres, or `position_degrees` on a disk or cylinder;
+  `contact_drift_percent`, change of contact impedances from the reference to a frame; `size_percent` of the body;
+  `other_percent`, other errors of the difference between frame and reference. See `jeit.inverse.Uncertainty`.
 - `[notes]`: `text`, a list of sentences that are copied to the notes of the measurement.
 """
 
@@ -64,8 +65,8 @@ _VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
 
 @dataclass(frozen=True)
 class TableLayout:
-    """Arrangement of the numbers in a data file, from the section `[data]` of its description. None: it is detected
-    from the numbers."""
+    """Arrangement of the numbers in a data file, from the section `[data]` of the file's description. A property that
+    is None is detected from the numbers."""
 
     frames_in: str | None = None
     delimiter: str | None = None
@@ -86,12 +87,13 @@ class TableLayout:
 
 @dataclass(frozen=True)
 class Description:
-    """A checked description of measured data, with the body, the electrodes and the protocol, as `load_description`
-    reads it from a TOML file. docs/reference/description.md explains its sections.
+    """A checked description of measured data: the body, the electrodes and the protocol, as `load_description` reads
+    them from a TOML file. docs/reference/description.md explains the sections of the file.
 
-    **Fields**: `origin`: the file, for messages; `title`; `domain`: the body, or None; `electrodes`: the electrodes, or
-    None; `layout`: how a table holds the voltages; `notes`: assumptions, in sentences; `protocol_section`: the table
-    that describes the protocol; `uncertainty`: how accurately electrodes and body are known, or None.
+    **Fields**: `origin`: name of the TOML file, for messages; `title`; `domain`: the body, or None; `electrodes`: the
+    electrodes, or None; `layout`: arrangement of the voltages in the data file; `notes`: assumptions, in sentences;
+    `protocol_section`: the table that describes the protocol; `uncertainty`: how accurately electrodes and body are
+    known, or None.
 
     **Example:**
 
@@ -111,8 +113,9 @@ class Description:
     uncertainty: Uncertainty | None = None
 
     def protocols(self, path: str | Path) -> list[tuple[Protocol, str]]:
-        """The protocols that agree with the description, each with the text of the options that it does not state:
-        first `protocol`, for which they have their default values, then protocols with other values."""
+        """The protocols that agree with the description for the data file at `path`. The first protocol has the default
+        values of all options that the description does not state; further protocols have other values, which the text
+        beside each protocol states."""
         default_protocol = self.protocol(path)
         if default_protocol is None or self.protocol_section is None:
             return []
@@ -126,7 +129,8 @@ class Description:
         return candidates
 
     def protocol(self, path: str | Path) -> Protocol | None:
-        """The protocol of the file at `path`, or None if none is described. The name of the file may state the current.
+        """The protocol of the data file at `path`; None if no protocol is described. The name of the data file may
+        state the current.
 
         Raises `ValueError`, with file and section named, if the section `[protocol]` is not a valid protocol.
         """
@@ -150,19 +154,19 @@ class Description:
 
     @property
     def reading(self) -> tuple[Reading, int | None]:
-        """For current patterns stored in the data file: how the potentials of all electrodes are read, and the
-        reference electrode, if there is one."""
+        """If current patterns are stored in the data file: the way in which the potentials of all electrodes are read,
+        such as "adjacent", and the index of the reference electrode or None."""
         section = self.protocol_section
         if section is None or section.kind != "measured":
             return "mean-removed", None
         return section.measurement, section.reference
 
     def model(self, path: str | Path, *, num_points: int | None = None) -> ForwardModel:
-        """A forward model of the body on which the file at `path` was measured. A new mesh has about `num_points`
-        nodes; for a body given as a mesh, leave `num_points` out.
+        """A forward model of the described body with the protocol of the data file at `path`. A new mesh has about
+        `num_points` nodes; `num_points` is not given for a body that is described by a mesh.
 
-        Raises `ValueError` if geometry, electrodes or protocol are not described, and if `num_points` is missing or has
-        no effect.
+        Raises `ValueError` if geometry, electrodes or protocol are not described, if `num_points` is missing, and if
+        `num_points` is given with a mesh.
         """
         domain, electrodes, protocol = self.domain, self.electrodes, self.protocol(path)
         if domain is None or electrodes is None or protocol is None:
@@ -174,13 +178,14 @@ class Description:
 
 
 def load_description(which: str | Path) -> Description:
-    """Read a description from a TOML file, or by the name of a bundled one ("tank6cm").
+    """Read a description of measured data from a TOML file, or a description that is part of jeit by its name
+    ("tank6cm").
 
     **Arguments:**
 
-    - `which`: a TOML file, or the name of a bundled description.
+    - `which`: path of a TOML file, or name of a description that is part of jeit.
 
-    Raises `ValueError` with the section and key at fault.
+    Raises `ValueError`, with the faulty section and key, for an invalid description.
 
     **Example:**
 
@@ -201,9 +206,10 @@ def load_description(which: str | Path) -> Description:
 
 
 def parse_description(table: dict[str, Any], origin: str, folder: str | Path = ".") -> Description:
-    """Check a description given as nested dictionaries; files named in it are looked for in `folder`.
+    """Check a description given as nested dictionaries and return it; relative file names in the description refer to
+    `folder`.
 
-    Raises `ValueError` with the keys at fault.
+    Raises `ValueError`, with the faulty keys, for an invalid description.
     """
     # Imported here because importing pydantic takes longer than most operations on a description.
     from jeit.data.description_tables import DescriptionTable
@@ -225,7 +231,8 @@ def parse_description(table: dict[str, Any], origin: str, folder: str | Path = "
 
 
 def _uncertainty(table: UncertaintyTable, domain: Body | None, origin: str) -> Uncertainty:
-    """Uncertainty from its table. Raises `ValueError` for degrees of a body that is not round."""
+    """Uncertainty from the section `[uncertainty]`. Raises `ValueError` if `position_degrees` is given for a body that
+    is not round."""
     position = table.position
     if table.position_degrees is not None:
         outline = domain.outline if isinstance(domain, Solid) else domain
@@ -252,7 +259,7 @@ def _layout(data: DataTable) -> TableLayout:
         scale=scale,
         polarity=data.polarity,
         gains=() if data.gains is None else tuple(data.gains.tolist()),
-        # The saturation level is given in the numbers of the file, but compared with voltages from which the gain is
+        # The saturation level is given in the unit of the file, but compared with voltages from which the gain is
         # removed.
         saturation=None if data.saturation is None else data.saturation * abs(scale),
         frame_names=tuple(data.frame_names),

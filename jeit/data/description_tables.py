@@ -1,4 +1,4 @@
-"""The tables of a description: for each key its type, range and unit."""
+"""The sections of a description file as tables: type, range and unit of each key."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ Sizes = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-9, 1e3, "m", s
 PlanePoint = Annotated[np.ndarray, Numbers(((2, 2),), -1e3, 1e3, "m")]
 PolygonVertices = Annotated[np.ndarray, Numbers(((3, _MAX_VERTICES), (2, 2)), -1e3, 1e3, "m")]
 Positions = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES), (2, 3)), -1e3, 1e3, "m")]
-# A single number means one ring of electrodes, just as a single size applies to all electrodes.
+# A single number means one ring of electrodes; likewise, a single size applies to all electrodes.
 Levels = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 0, 1e3, "m", single=True)]
-# For arcs on the edge of a sheet the contact impedance is in ohm·m.
+# For electrodes on the edge of a sheet the contact impedance is in ohm·m.
 Impedances = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-15, 1e12, "ohm·m²", single=True)]
 Patterns = Annotated[np.ndarray, Numbers(((1, math.inf), (2, MOST_ELECTRODES)), -1e12, 1e12)]
 Pairs = Annotated[np.ndarray, Numbers(((1, math.inf), (2, 2)), 0, MOST_ELECTRODES, kind=int)]
@@ -39,7 +39,7 @@ _UNKNOWN_IMPEDANCE = "; if it is not known, write {}, which the reference frame 
 
 
 class DiskTable(Table):
-    """Table of a disk or, with a thickness, of a cylinder."""
+    """Section `[geometry]` of a disk or, with a thickness, of a cylinder."""
 
     subject = "a disk"
     shape: Literal["disk"]
@@ -49,7 +49,7 @@ class DiskTable(Table):
 
 
 class RectangleTable(Table):
-    """Table of a rectangle or, with a thickness, of a box."""
+    """Section `[geometry]` of a rectangle or, with a thickness, of a box."""
 
     subject = "a rectangle"
     shape: Literal["rectangle"]
@@ -60,7 +60,7 @@ class RectangleTable(Table):
 
 
 class PolygonTable(Table):
-    """Table of a polygon or, with a thickness, of an upright solid with that base."""
+    """Section `[geometry]` of a polygon or, with a thickness, of an upright prism over the polygon."""
 
     subject = "a polygon"
     shape: Literal["polygon"]
@@ -81,7 +81,7 @@ class PolygonTable(Table):
 
 
 class BoxTable(Table):
-    """Table of a box."""
+    """Section `[geometry]` of a box."""
 
     subject = "a box"
     shape: Literal["box"]
@@ -91,7 +91,7 @@ class BoxTable(Table):
 
 
 class CylinderTable(Table):
-    """Table of a cylinder."""
+    """Section `[geometry]` of a cylinder."""
 
     subject = "a cylinder"
     shape: Literal["cylinder"]
@@ -100,7 +100,7 @@ class CylinderTable(Table):
 
 
 class MeshTable(Table):
-    """Table of a mesh in a file beside the description. `scale`: length of its unit in metres."""
+    """Section `[geometry]` of a mesh in a file beside the description. `scale`: length of the mesh's unit in metres."""
 
     subject = "a mesh"
     mesh: Word
@@ -108,7 +108,7 @@ class MeshTable(Table):
 
 
 class PlacedTable(Table):
-    """Base class of the tables of electrodes with positions, i.e. of all kinds except facets."""
+    """Base class of the sections `[electrodes]` with positions, i.e. of all kinds except facets."""
 
     layout: Literal["ring", "perimeter"] | None = None
     number: Annotated[int, _ELECTRODE_COUNT] | None = None
@@ -133,7 +133,7 @@ class PlacedTable(Table):
 
 
 class BoundaryTable(PlacedTable):
-    """Table of electrodes that are arcs on the edge of a sheet. `contact_impedance` in ohm·m."""
+    """Section `[electrodes]` of electrodes that are arcs on the edge of a sheet. `contact_impedance` in ohm·m."""
 
     subject = "electrodes of kind 'boundary'"
     hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("0.01 (ohm·m)")}
@@ -143,7 +143,7 @@ class BoundaryTable(PlacedTable):
 
 
 class DiscTable(PlacedTable):
-    """Table of electrodes that are discs."""
+    """Section `[electrodes]` of electrodes that are discs."""
 
     subject = "electrodes of kind 'disc'"
     hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("1e-3 (ohm·m²)")}
@@ -153,7 +153,7 @@ class DiscTable(PlacedTable):
 
 
 class PatchTable(PlacedTable):
-    """Table of electrodes that are rectangles on a solid."""
+    """Section `[electrodes]` of electrodes that are rectangles on a solid."""
 
     subject = "electrodes of kind 'patch'"
     hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("1e-3 (ohm·m²)")}
@@ -164,14 +164,14 @@ class PatchTable(PlacedTable):
 
 
 class PointTable(PlacedTable):
-    """Table of electrodes that are points."""
+    """Section `[electrodes]` of electrodes that are points."""
 
     subject = "electrodes of kind 'point'"
     kind: Literal["point"]
 
 
 class FacetsTable(Table):
-    """Table of electrodes that are named groups of facets of a mesh."""
+    """Section `[electrodes]` of electrodes that are named groups of boundary facets of a mesh."""
 
     subject = "electrodes of kind 'facets'"
     hints: ClassVar[dict[str, str]] = {"contact_impedance": _UNKNOWN_IMPEDANCE.format("1e-3 (ohm·m²)")}
@@ -181,7 +181,7 @@ class FacetsTable(Table):
 
 
 class DrivenTable(Table):
-    """Base class of the tables of protocols with a current amplitude."""
+    """Base class of the sections `[protocol]` with a current amplitude."""
 
     number: Annotated[int, _ELECTRODE_COUNT] | None = None
     name: Word | None = None
@@ -210,7 +210,7 @@ class DrivenTable(Table):
 
 
 class AdjacentTable(DrivenTable):
-    """Table of the arguments of `jeit.protocol.adjacent`."""
+    """Section `[protocol]` with the arguments of `jeit.protocol.adjacent`."""
 
     subject = "the protocol 'adjacent'"
     kind: Literal["adjacent"]
@@ -220,7 +220,7 @@ class AdjacentTable(DrivenTable):
 
 
 class SkipTable(DrivenTable):
-    """Table of the arguments of `jeit.protocol.skip`."""
+    """Section `[protocol]` with the arguments of `jeit.protocol.skip`."""
 
     subject = "the protocol 'skip'"
     kind: Literal["skip"]
@@ -232,7 +232,7 @@ class SkipTable(DrivenTable):
 
 
 class OppositeTable(DrivenTable):
-    """Table of the arguments of `jeit.protocol.opposite`."""
+    """Section `[protocol]` with the arguments of `jeit.protocol.opposite`."""
 
     subject = "the protocol 'opposite'"
     kind: Literal["opposite"]
@@ -242,7 +242,7 @@ class OppositeTable(DrivenTable):
 
 
 class AgainstOneTable(DrivenTable):
-    """Table of the arguments of `jeit.protocol.all_against_one`."""
+    """Section `[protocol]` with the arguments of `jeit.protocol.all_against_one`."""
 
     subject = "the protocol 'all_against_one'"
     kind: Literal["all_against_one"]
@@ -253,7 +253,7 @@ class AgainstOneTable(DrivenTable):
 
 
 class ReferenceTable(DrivenTable):
-    """Table of the arguments of `jeit.protocol.reference_electrode`. `number`: number of electrodes on the boundary."""
+    """Section `[protocol]` with the arguments of `jeit.protocol.reference_electrode`. `number`: boundary electrodes."""
 
     subject = "the protocol 'reference_electrode'"
     kind: Literal["reference_electrode"]
@@ -264,7 +264,7 @@ class ReferenceTable(DrivenTable):
 
 
 class TwoTerminalTable(DrivenTable):
-    """Table of the arguments of `jeit.protocol.two_terminal`."""
+    """Section `[protocol]` with the arguments of `jeit.protocol.two_terminal`."""
 
     subject = "the protocol 'two_terminal'"
     kind: Literal["two_terminal"]
@@ -272,14 +272,14 @@ class TwoTerminalTable(DrivenTable):
 
 
 class AllAtOnceTable(DrivenTable):
-    """Base class of the tables of protocols that drive all electrodes at once: how their potentials are read."""
+    """Base class of sections `[protocol]` that drive all electrodes at once and state how potentials are read."""
 
     measurement: Reading = "mean-removed"
     reference: Annotated[int, _ELECTRODE_INDEX] | None = None
 
 
 class TrigonometricTable(AllAtOnceTable):
-    """Table of the arguments of `jeit.protocol.trigonometric`."""
+    """Section `[protocol]` with the arguments of `jeit.protocol.trigonometric`."""
 
     subject = "the protocol 'trigonometric'"
     kind: Literal["trigonometric"]
@@ -287,15 +287,15 @@ class TrigonometricTable(AllAtOnceTable):
 
 
 class HaarTable(AllAtOnceTable):
-    """Table of the arguments of `jeit.protocol.haar`."""
+    """Section `[protocol]` with the arguments of `jeit.protocol.haar`."""
 
     subject = "the protocol 'haar'"
     kind: Literal["haar"]
 
 
 class OptimalTable(Table):
-    """Table of the arguments of `jeit.protocol.optimal`. `transfer`, `other`: transfer impedances in ohm; `drives`:
-    number of drive patterns; `power`: watts."""
+    """Section `[protocol]` with the arguments of `jeit.protocol.optimal`. `transfer`, `other`: transfer impedances in
+    ohm; `drives`: number of drive patterns; `power` in watts."""
 
     subject = "the protocol 'optimal'"
     kind: Literal["optimal"]
@@ -317,8 +317,8 @@ class OptimalTable(Table):
 
 
 class MeasuredTable(Table):
-    """Table of a protocol whose currents are stored in the data file. `drive_key`, `measurement_key`: names of its
-    matrices."""
+    """Section `[protocol]` for currents that are stored in the data file. `drive_key`, `measurement_key`: names of the
+    matrices in the data file."""
 
     subject = "a protocol of measured currents"
     kind: Literal["measured"]
@@ -332,7 +332,7 @@ class MeasuredTable(Table):
 
 
 class BipolarTable(DrivenTable):
-    """Table of the arguments of `jeit.protocol.bipolar`."""
+    """Section `[protocol]` with the arguments of `jeit.protocol.bipolar`."""
 
     subject = "the protocol 'bipolar'"
     kind: Literal["bipolar"]
@@ -343,7 +343,7 @@ class BipolarTable(DrivenTable):
 
 
 class MatricesTable(Table):
-    """Table of a protocol that combines every drive pattern, in amperes, with the measurement patterns chosen by
+    """Section `[protocol]` that combines every drive pattern, in amperes, with the measurement patterns selected by
     `select`."""
 
     subject = "a protocol of matrices"
@@ -355,8 +355,8 @@ class MatricesTable(Table):
 
 
 class ChannelsTable(Table):
-    """Table of a protocol that gives for each channel the indices, from 0, of its drive pattern (in amperes) and
-    measurement pattern."""
+    """Section `[protocol]` that gives for each channel the indices, counted from 0, of its drive pattern (in amperes)
+    and of its measurement pattern."""
 
     subject = "a protocol of channels"
     kind: Literal["channels"]
@@ -368,7 +368,7 @@ class ChannelsTable(Table):
 
 
 class DataTable(Table):
-    """Table of the arrangement of the numbers in a file."""
+    """Section `[data]`: arrangement of the numbers in the data file."""
 
     subject = "[data]"
     frames_in: Literal["rows", "columns"] | None = None
@@ -399,14 +399,14 @@ class DataTable(Table):
 
 
 class NotesTable(Table):
-    """Table of sentences that are copied to the notes of the measurement."""
+    """Section `[notes]`: sentences that are copied to the notes of the measurement."""
 
     subject = "[notes]"
     text: Annotated[list[Annotated[str, Field(max_length=10_000)]], FailFast()] = Field(default=[])
 
 
 class UncertaintyTable(Table):
-    """Table of how accurately the sensor is described."""
+    """Section `[uncertainty]`: standard deviations of the described properties of the sensor."""
 
     subject = "[uncertainty]"
     position: Annotated[float, Number(0, 1e3, "m")] | None = None
@@ -448,7 +448,7 @@ _PROTOCOL = OneOf(
 
 
 class DescriptionTable(Table):
-    """Table of a whole description."""
+    """All sections of a description file."""
 
     subject = "a description"
     title: Annotated[str, Field(max_length=1000)] = ""

@@ -1,4 +1,5 @@
-"""Exchange with other programs: measurements written to NPZ with a TOML description, and models of EIDORS and pyEIT."""
+"""Exchange with other programs: export of measurements to NPZ with a TOML description, and import of forward models of
+EIDORS and pyEIT."""
 
 from __future__ import annotations
 
@@ -23,20 +24,22 @@ from jeit.protocol.patterns import pair_patterns
 
 
 def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]:
-    """Write a measurement to an NPZ file and its description to a TOML file of the same name; return both paths.
+    """Write a measurement to an NPZ file, and its description to a TOML file of the same name; return the paths of both
+    files.
 
-    The NPZ file holds `voltages` (F, M) in volts, `mask` (F, M), `frame_names`, `notes`, `times` (F,) in seconds if
-    known, and the protocol: `drive` (S, L) in amperes, `measurement` (K, L), `drive_index` (M,), `measurement_index`
-    (M,), `protocol_name`. The TOML file holds geometry, electrodes, protocol and uncertainty, so it also describes
-    other tables of the same sensor. `read` restores the measurement.
+    The NPZ file contains, for F frames, M channels, S drives, K measurement patterns and L electrodes, `voltages` (F,
+    M) in volts, `mask` (F, M), `frame_names`, `notes`, `times` (F,) in seconds if known, and the protocol: `drive` (S,
+    L) in amperes, `measurement` (K, L), `drive_index` (M,), `measurement_index` (M,), `protocol_name`. The TOML file
+    contains geometry, electrodes, protocol and uncertainty, so it also describes other data files of the same sensor.
+    `read` restores the measurement.
 
     **Arguments:**
 
     - `measurement`: the measurement.
-    - `path`: the .npz file.
+    - `path`: path of the .npz file.
 
-    Raises `ValueError` for another suffix, and for electrodes or bodies that a description cannot express (a mesh or an
-    outline of your own, and electrodes on its facets).
+    Raises `ValueError` for a suffix other than .npz, and for a body or electrodes that a description cannot express (a
+    mesh or an outline of your own, and electrodes on facets of a mesh).
 
     **Example:**
 
@@ -115,22 +118,22 @@ def assignments(section: dict[str, Any]) -> list[str]:
 
 
 def _toml(value) -> str:
-    """TOML text of a string, a number or a nested list, as JSON writes it; floats are written by `repr`, so no digits
-    are lost."""
+    """TOML text of a string, a number or a nested list, in the form of JSON; floats are written with all digits
+    (`repr`)."""
     return json.dumps(value, ensure_ascii=False)
 
 
 def from_pyeit(mesh: Any, protocol: Any, *, current: float = 1.0) -> ForwardModel:
-    """The forward model of a mesh and a protocol of pyEIT: point electrodes, drive and measurement pairs in the same
-    order. With the conductivity `mesh.perm`, voltages are those of `EITForward.solve_eit`.
+    """Convert a mesh and a protocol of pyEIT to a forward model with point electrodes and the same order of channels.
+    With the conductivity `mesh.perm`, the model gives the voltages of pyEIT's `EITForward.solve_eit`.
 
     **Arguments:**
 
     - `mesh`: a `pyeit.mesh.PyEITMesh`.
     - `protocol`: a `pyeit.eit.protocol.PyEITProtocol`.
-    - `current`: amplitude, amperes; pyEIT drives 1 A.
+    - `current`: amplitude of the drive current in amperes; pyEIT uses 1 A.
 
-    Raises `ValueError` for objects without the fields of these classes, and as `Mesh.create`.
+    Raises `ValueError` for objects without the fields of these classes, and for an invalid mesh (see `Mesh.create`).
 
     **Example:**
 
@@ -149,7 +152,7 @@ def from_pyeit(mesh: Any, protocol: Any, *, current: float = 1.0) -> ForwardMode
             )
     points, electrode_nodes = np.asarray(mesh.node, float), np.asarray(mesh.el_pos, int)
     cells = np.asarray(mesh.element, int)
-    points = points[:, : cells.shape[1] - 1]  # pyEIT gives meshes of the plane a coordinate z = 0
+    points = points[:, : cells.shape[1] - 1]  # in pyEIT, the nodes of two-dimensional meshes have a coordinate z = 0
     drive = current * pair_patterns(np.asarray(protocol.ex_mat, int), len(electrode_nodes))
     pairs = [np.asarray(drive_pairs, int)[:, :2] for drive_pairs in protocol.meas_mat]
     measurement = pair_patterns(np.concatenate(pairs), len(electrode_nodes))
@@ -159,19 +162,19 @@ def from_pyeit(mesh: Any, protocol: Any, *, current: float = 1.0) -> ForwardMode
 
 
 def from_eidors(path: str | Path, variable: str | None = None) -> ForwardModel:
-    """The forward model of a `fwd_model` of EIDORS, saved by `save('tank.mat', 'fwd_model', '-v7')`: nodes, elements,
-    electrodes with their contact impedances, and stimulation with its signs.
+    """Read a forward model of EIDORS, saved by `save('tank.mat', 'fwd_model', '-v7')`: nodes, elements, electrodes with
+    their contact impedances, and stimulation and measurement patterns with their signs.
 
-    Electrodes of one node are point electrodes. Files are read by SciPy; take them from people you trust. Lengths are
-    those of the file, in metres.
+    Electrodes of one node become point electrodes. SciPy reads the file, so read only files from people you trust.
+    Lengths in the file must be in metres.
 
     **Arguments:**
 
     - `path`: the .mat file.
-    - `variable`: name in the file of a `fwd_model`, or of a model or image that has one; by default the only such
-      variable.
+    - `variable`: name of the variable that is a `fwd_model`, or a model or image that contains one; needed only if the
+      file has several such variables.
 
-    Raises `ValueError` for files without a model, and for electrodes of no boundary facets.
+    Raises `ValueError` for a file without a forward model, and for electrodes that consist of no boundary facets.
 
     **Example:**
 
@@ -218,7 +221,7 @@ def from_eidors(path: str | Path, variable: str | None = None) -> ForwardModel:
 
 
 def _forward_model(value: Any) -> dict[str, Any] | None:
-    """Return the `fwd_model` that a variable is or contains; None if there is none."""
+    """Return the EIDORS forward model (`fwd_model`) that a variable is or contains; None if there is none."""
     if not isinstance(value, dict):
         return None
     if {"nodes", "elems", "electrode", "stimulation"} <= value.keys():

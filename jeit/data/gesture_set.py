@@ -27,7 +27,7 @@ def join(measurements: Sequence[Measurement]) -> Measurement:
 
     **Arguments:**
 
-    - `measurements`: of the same set-up.
+    - `measurements`: measurements of the same set-up.
 
     **Example:**
 
@@ -63,8 +63,9 @@ _FRAME_KEYS, _TIME_KEYS = ("voltages", "frames"), ("seconds", "time")
 
 @dataclass(frozen=True)
 class FrameRecording:
-    """Frames of a file. **Fields**: `frames`: (F, M) volts, NaN for missing readings; `seconds`: (F,) times, None if
-    unknown; `reference`: (M,) or (r, M) volts of the untouched skin, or None; `name`: name of the file.
+    """F frames of M channels from a file. **Fields**: `frames`: (F, M) voltages in volts, NaN for missing readings;
+    `seconds`: (F,) times of the frames, None if unknown; `reference`: one frame (M,) or several frames (r, M) of the
+    untouched skin in volts, or None; `name`: name of the file.
 
     **Example:**
 
@@ -81,22 +82,23 @@ class FrameRecording:
 
 
 def read_frame_recording(path: str | Path, description: Description | None = None) -> FrameRecording:
-    """Read the frames of a file.
+    """Read recorded frames, their times and a reference from a file.
 
-    An NPZ file holds `frames` or `voltages` (F, M), and optionally `seconds` or `time` (F,), and `reference` (M,) or
-    (r, M) of the untouched skin. A table (.csv, .txt, .dat, .npy) has one frame per row unless `[data]` of the
-    description states otherwise; its frames named "reference" are taken as the reference. If it has a column more than
-    the protocol has channels, the first column holds the times, as `jeit.data.read` finds them.
+    An NPZ file of F frames and M channels contains `frames` or `voltages` (F, M), and optionally times `seconds` or
+    `time` (F,), and `reference`, one frame (M,) or several frames (r, M) of the untouched skin. A table (.csv, .txt,
+    .dat, .npy) has one frame per row unless `[data]` of the description states otherwise; its frames named "reference"
+    are taken as the reference. If the table has one column more than the protocol has channels, the first column
+    contains the times, as in `jeit.data.read`.
 
     Without a description, or without a protocol in it, any number of channels is accepted, and voltages keep the unit
-    of the file. Raises `FileNotFoundError`, and `ValueError` for another kind of file, for a number of channels that
-    differs from that of the protocol, and for times that decrease, are not finite, or do not match the number of
-    frames.
+    of the file. Raises `FileNotFoundError` if the file does not exist, and `ValueError` for a file that is neither NPZ
+    nor a table, for a number of channels that differs from that of the protocol, and for times that decrease, are not
+    finite, or do not match the number of frames.
 
     **Arguments:**
 
-    - `path`: the file.
-    - `description`: of the sensor, with the protocol.
+    - `path`: path of the file.
+    - `description`: description of the sensor, with the protocol.
 
     **Example:**
 
@@ -135,7 +137,7 @@ def read_frame_recording(path: str | Path, description: Description | None = Non
 
 
 def _table(path: Path, arrays: dict[str, np.ndarray], layout: TableLayout) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The numbers of a file, arranged as in the file, and the names of its columns, if it has any."""
+    """The numbers of a file, arranged as in the file, and the names of the columns, if the file has any."""
     if not arrays:
         values, heading = table.numbers(path, layout)
         return np.atleast_2d(values), heading
@@ -146,7 +148,7 @@ def _table(path: Path, arrays: dict[str, np.ndarray], layout: TableLayout) -> tu
 
 
 def _frames(values: np.ndarray, layout: TableLayout, name: str, num_channels: int | None) -> Float[np.ndarray, "F M"]:
-    """Frames of a table, in volts."""
+    """Voltages (frames, channels) of a table, in volts."""
     if values.dtype.kind not in "iufc":
         raise ValueError(f"frames are {values.dtype}; give numbers, in volts.")
     frames = table.frames_from(values, layout, name)
@@ -188,13 +190,13 @@ _ARRAY_NAMES = ("gesture", "person", "start", "seconds", "voltages", "reference"
 
 @dataclass(frozen=True)
 class GestureSet:
-    """n recordings of one gesture each, concatenated: F frames in total, M channels.
+    """Labelled recordings of one gesture each: n recordings with F frames in total and M channels, concatenated.
 
     **Fields**: `gesture`: (n,) name of each gesture; `person`: (n,) name or number of the person of each recording;
-    `start`: (n + 1,) index of the first frame of each recording, and last the number of frames F; `seconds`: (F,)
-    times, from 0 in each recording; `voltages`: (F, M) volts, NaN for missing readings; `reference`: (M,) volts, mean
-    of frames of the untouched skin before the recordings; `untouched`: (u, M) frames of the untouched skin, recorded
-    over as long a time as the recordings.
+    `start`: (n + 1,) index of the first frame of each recording, followed by the number of frames F; `seconds`: (F,)
+    times of the frames, from 0 in each recording; `voltages`: (F, M) volts, NaN for missing readings; `reference`: (M,)
+    volts, mean of frames of the untouched skin before the recordings; `untouched`: (u, M) volts, u frames of the
+    untouched skin, recorded over as long a time as the gestures.
 
     **Example:**
 
@@ -214,7 +216,7 @@ class GestureSet:
     untouched: Float[np.ndarray, "u M"]
 
     def __post_init__(self):
-        """Raises `ValueError` for arrays whose shapes do not match, and for wrong types of values."""
+        """Check the fields: raises `ValueError` for arrays whose shapes do not match, and for wrong types of values."""
         for name, dtype_kinds, expected in (
             ("gesture", "U", "text"),
             ("person", "iuU", "whole numbers or text"),
@@ -256,29 +258,30 @@ class GestureSet:
             raise ValueError("seconds must be finite.")
 
     def __len__(self) -> int:
-        """Number of recordings."""
+        """Number n of recordings."""
         return len(self.gesture)
 
     def recording(self, number: int) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T M"]]:
-        """Times (T,), seconds, and voltages (T, M) of one recording."""
+        """Times (frames,) in seconds and voltages (frames, channels) in volts of one recording."""
         frames = slice(self.start[number], self.start[number + 1])
         return self.seconds[frames], self.voltages[frames].astype(float)
 
     def changes(self, number: int) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T M"]]:
-        """Times (T,), seconds, and changes (T, M) from the reference, volts, of one recording."""
+        """Times (frames,) in seconds and voltage changes (frames, channels) from the reference, in volts, of one
+        recording."""
         seconds, voltages = self.recording(number)
         return seconds, voltages - self.reference
 
     def write(self, path: str | Path) -> None:
-        """Write the set to an NPZ file. Raises `OSError` if the file cannot be written."""
+        """Write the gesture set to an NPZ file. Raises `OSError` if the file cannot be written."""
         with written_whole(path) as file:
             np.savez_compressed(file, **{name: getattr(self, name) for name in _ARRAY_NAMES})
 
     @classmethod
     def read(cls, path: str | Path) -> "GestureSet":
-        """Read a file written by `write`; without the array `person`, all recordings are attributed to one person.
-        Raises `OSError` if there is no file and `ValueError` if it is of another kind. Nothing in the file is
-        executed."""
+        """Read a gesture set from a file written by `write`; without the array `person`, all recordings are attributed
+        to one person. Raises `OSError` if the file does not exist and `ValueError` if it is not a gesture set. Nothing
+        in the file is executed."""
         try:
             arrays = npz_arrays(Path(path), *_ARRAY_NAMES, otherwise="not a set of gestures")
             if "gesture" in arrays:

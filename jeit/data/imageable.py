@@ -1,4 +1,4 @@
-"""Checks of whether frames can be imaged: against their reference, by their noise, and for spikes in single
+"""Checks of whether measured frames can be imaged: comparison with the reference, noise, and spikes in single
 channels."""
 
 from __future__ import annotations
@@ -21,28 +21,31 @@ from jeit.data.quality import (
 from jeit.inverse import relative_noise
 from jeit_solvers.engines import as_array
 
-# Maximum fraction of impossible signs. A quarter means that half of the voltages are noise, as noise has the wrong sign
-# half of the time.
+# Maximum fraction of voltages with an impossible sign. A quarter means that half of the voltages are noise, because
+# noise has the wrong sign half of the time.
 MOST_IMPOSSIBLE_SIGNS = 0.25
-# Fraction of impossible signs above which the polarity is reversed: noise alone yields only one half.
+# Fraction of voltages with an impossible sign above which the polarity is reversed: noise alone yields only one half.
 MOST_OPPOSITE_SIGNS = 0.75
-# Maximum reciprocity error of a difference. An error r corresponds to a ratio of noise to signal of r / sqrt(2 - r²),
-# here one half.
+# Maximum reciprocity error of the difference between frame and reference. A reciprocity error r corresponds to a ratio
+# of noise to signal of r / sqrt(2 - r²), here one half.
 MOST_DIFFERENCE_RECIPROCITY_ERROR = 0.63
-# Cosine of the angle between a frame and its reference below which one of them has the opposite sign.
+# Cosine of the angle between a frame and its reference below which the frame or the reference has the opposite
+# polarity.
 _MIN_COSINE = -0.5
-# Maximum share of a difference that is rounding of the voltages.
+# Maximum fraction of the difference between frame and reference that is due to rounding of the voltages.
 _MAX_ROUNDING = 0.7
-# A spike contradicts the other channels by this many robust standard deviations and by more than the typical change
-# of a channel, and explains this share of the unexplained power; maximum number of spikes in a frame.
+# A spike deviates from the value that the other channels imply by this many robust standard deviations and by more than
+# the typical change of a channel, and explains this fraction of the unexplained power; maximum number of spikes in a
+# frame.
 _SPIKE_DEVIATIONS, _SPIKE_SHARE, _MAX_SPIKES = 10.0, 0.5, 8
-# Of two channels that contradict each other, one is at fault if it changed by this factor more than the other.
+# Of two channels that contradict each other, one is faulty if its change is larger than that of the other by this
+# factor.
 _FAULT_RATIO = 3.0
-# Minimum share of a channel that the other channels leave undetermined; smaller values are rounding errors.
+# Minimum fraction of a channel that the other channels leave undetermined; smaller fractions are rounding errors.
 _MIN_FREE_SHARE = 1e-6
-# Maximum number of operations to find which changes a body can cause; these take up to a second.
+# Maximum number of operations to find which voltage changes a body can cause; the search takes up to a second.
 _MAX_OPERATIONS = 2e9
-# Maximum number of distinct masks of frames for which these changes are found.
+# Maximum number of distinct masks of frames for which the possible voltage changes are found.
 _MAX_MASKS = 8
 
 
@@ -52,16 +55,16 @@ class FrameQuality:
 
     **Fields**
 
-    - `difference`: ‖v - v_reference‖ / ‖v_reference‖ over the usable channels.
-    - `difference_noise`: noise of the difference, in volts and relative to the difference; None if it cannot be
+    - `difference`: ‖v - v_reference‖ / ‖v_reference‖ over the usable channels, where v are the voltages of the frame.
+    - `difference_noise`: noise of the difference, in volts and relative to the difference; None if the noise cannot be
       estimated.
-    - `trusted_noise`: noise of the difference in units of `jeit.inverse.relative_noise` of the reference, the expected
-      error of channels relative to each other; None if it cannot be estimated.
+    - `trusted_noise`: noise of the difference in units of `jeit.inverse.relative_noise` of the reference (the expected
+      errors of channels relative to each other); None if it cannot be estimated.
     - `rounding`: standard deviation of the difference due to rounding of the voltages, relative to the difference; 0 if
-      they are not rounded.
-    - `difference_reciprocity_error`: relative reciprocity error of the difference, or None.
-    - `impossible_signs`: fraction of voltages whose sign is impossible on a passive body, the larger of the fractions
-      of frame and reference; or None.
+      the voltages are not rounded.
+    - `difference_reciprocity_error`: relative reciprocity error of the difference; None if no channels are reciprocal.
+    - `impossible_signs`: fraction of voltages whose sign is impossible on a passive body (the larger of the fractions
+      of frame and reference); None if no sign is known.
     - `usable_channels`: number of channels that are usable in both frame and reference.
     - `reason`: why the frame cannot be imaged; empty if it can.
 
@@ -84,12 +87,12 @@ class FrameQuality:
 
     @property
     def imageable(self) -> bool:
-        """True if no check rules out imaging the frame."""
+        """Whether the frame can be imaged, i.e. no check found a reason against it."""
         return not self.reason
 
 
 def check_same_setup(measurement: Measurement, reference: Measurement) -> None:
-    """Raise `ValueError` unless both were measured with the same electrodes, patterns, currents and unit."""
+    """Raise `ValueError` unless measurement and reference have the same electrodes, patterns, currents and unit."""
     ours, theirs = measurement.protocol, reference.protocol
     if ours.num_electrodes != theirs.num_electrodes:
         raise ValueError(
@@ -144,24 +147,25 @@ def check_same_setup(measurement: Measurement, reference: Measurement) -> None:
 
 
 def assess(measurement: Measurement, reference: Measurement) -> list[FrameQuality]:
-    """Judge each frame of `measurement` for difference imaging against the mean of the frames of `reference`.
+    """Check for each frame of `measurement` whether its difference from the mean frame of `reference` can be imaged.
 
     A frame cannot be imaged if
 
-    - more than a quarter of its voltages, or of those of the reference, have an impossible sign (`impossible_signs`):
-      at least half of the voltages are then smaller than the noise or the offset of the instrument;
+    - more than a quarter of the voltages of the frame, or of the reference, have an impossible sign
+      (`impossible_signs`): at least half of the voltages are then smaller than the noise or the offset of the
+      instrument;
     - the reciprocity error of the frame, of the reference, or of their difference exceeds 0.63, so that noise exceeds
-      half of the signal. In the difference, channels are weighted as in images (`jeit.inverse.relative_noise`), because
-      driven electrodes read large voltages that are mostly due to contacts;
-    - the cosine of the angle between its voltages and those of the reference is less than -0.5: no change of a passive
-      body reverses all voltages, so one of them has the opposite polarity;
-    - it does not differ from the reference at all, or its difference is mostly rounding of the voltages;
+      half of the signal. In the difference, channels are weighted as in imaging (`jeit.inverse.relative_noise`),
+      because voltages on driven electrodes are large and mostly due to contact impedances;
+    - the cosine of the angle between the voltages of frame and reference is less than -0.5: no change of a passive body
+      reverses all voltages, so the frame or the reference has the opposite polarity;
+    - the frame does not differ from the reference, or the difference is mostly rounding of the voltages;
     - the number of usable channels is smaller than the number of electrodes.
 
     In the available measured data sets, usable frames have at most 0.18 impossible signs and a reciprocity error of at
     most 0.21; a frame measured with too small a current has 0.54 impossible signs.
 
-    Raises `ValueError` if the two are not from the same set-up (`check_same_setup`).
+    Raises `ValueError` if measurement and reference are not from the same set-up (`check_same_setup`).
     """
     check_same_setup(measurement, reference)
     mean = reference.mean_frame()
@@ -214,20 +218,21 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
 
 
 def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool = False) -> Measurement:
-    """Mask spikes: single channels of a frame whose change from the mean of `reference` contradicts that of all others.
-    A note lists them.
+    """Mask spikes: single channels of a frame whose change from the mean of `reference` contradicts the changes of all
+    other channels. A note lists the masked channels.
 
     The voltages of every body follow from its symmetric transfer impedance, which has fewer entries than most protocols
-    have channels. The part of a frame's change that no symmetric matrix explains is noise, or a spike where one channel
-    leaves more of it unexplained than all others together. If that does not determine which of two reciprocal channels
-    is at fault, both are masked. Nothing is found in protocols whose channels are all independent, and in protocols of
-    more than about 40 electrodes, for which the search would take too long.
+    have channels. The part of a frame's change that no symmetric matrix explains is noise, or a spike if one channel
+    contributes more to this part than all other channels together. If it remains unknown which of two reciprocal
+    channels is faulty, both are masked. No spikes are found in protocols whose channels are all independent, and in
+    protocols of more than about 40 electrodes, for which the search would take too long.
 
     **Arguments:**
 
     - `measurement`: the frames.
     - `reference`: frames of the undisturbed body, from the same set-up.
-    - `fill`: replace spikes by the values that the other channels determine, and mask only the remaining ones.
+    - `fill`: replace spikes by the values that the other channels determine, and mask only spikes that they do not
+      determine.
 
     **Example:**
 
@@ -256,7 +261,7 @@ def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool 
             is_spike = np.isin(np.arange(len(change)), _spikes(change, basis, rounding[mask]))
             spikes[frame, mask] = is_spike
             if fill and is_spike.any():
-                # Rows of the basis that those of the other channels span are determined by them.
+                # A channel is determined by the other channels if their rows of the basis span its row.
                 weights = basis[is_spike] @ np.linalg.pinv(basis[~is_spike])
                 is_determined = np.linalg.norm(weights @ basis[~is_spike] - basis[is_spike], axis=1) < _MIN_FREE_SHARE
                 determined_channels = np.flatnonzero(mask)[is_spike][is_determined]
@@ -273,7 +278,7 @@ def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool 
 
 
 def _listed_spikes(spikes: Bool[np.ndarray, "F M"]) -> str:
-    """Channels with spikes, and their frames if there are several."""
+    """Text that lists the channels with spikes, and their frames if there are several frames."""
     frames, channels = np.nonzero(spikes)
     labels = [
         f"channel {k + 1}" + (f" of frame {f}" if len(spikes) > 1 else "")
@@ -285,8 +290,9 @@ def _listed_spikes(spikes: Bool[np.ndarray, "F M"]) -> str:
 def _possible_changes(
     measurement: Measurement, weight: Float[np.ndarray, " M"], mask: Bool[np.ndarray, " M"]
 ) -> Float[np.ndarray, "n r"] | None:
-    """Orthonormal basis (n, r) of the changes of the n usable channels, divided by `weight`, that a symmetric transfer
-    impedance can give; None if that is all of them, or takes too long to find."""
+    """Orthonormal basis (n, r) of the r-dimensional space of changes of the n usable channels, divided by `weight`,
+    that a change of a symmetric transfer impedance can cause. None if every change is possible, or if the computation
+    would take too long."""
     drive = np.asarray(measurement.protocol.channel_drive)[mask]
     measurements = np.asarray(measurement.protocol.channel_measurement)[mask]
     row, column = np.triu_indices(drive.shape[1])
@@ -302,10 +308,11 @@ def _possible_changes(
 def _spikes(
     change: Inexact[np.ndarray, " n"], basis: Float[np.ndarray, "n r"], rounding: Float[np.ndarray, " n"]
 ) -> list[int]:
-    """Indices of the channels with spikes in a change (n,), weighted; `rounding`: its standard deviation.
+    """Indices of the channels with spikes in a weighted `change` (n,) of n channels; `rounding` (n,): standard
+    deviation of the change due to rounding.
 
-    A channel that may read anything adds its unit vector to the basis. The power that this vector explains, `gain`, is
-    compared with the power that was unexplained before.
+    Allowing a suspected channel to read anything adds its unit vector to the basis. The power that this vector
+    explains, `gain`, is compared with the power that the basis alone leaves unexplained.
     """
     residual, free_share = change - basis @ (basis.T @ change), 1 - np.sum(basis**2, axis=1)
     is_remaining, faulty, spikes = np.ones(len(change), bool), [], []
@@ -320,7 +327,7 @@ def _spikes(
             break
         direction = np.zeros(len(change))
         direction[worst_channels[0]] = 1
-        for _ in range(2):  # twice, for orthogonality
+        for _ in range(2):  # projected twice, so that rounding errors do not destroy orthogonality
             direction = direction - basis @ (basis.T @ direction)
         direction = direction / np.linalg.norm(direction)
         unexplained_power, gain = float(np.sum(np.abs(residual) ** 2)), float(np.abs(direction @ residual) ** 2)
@@ -336,16 +343,16 @@ def _spikes(
 
 
 def _faulty_channels(change: Inexact[np.ndarray, " n"], channels: np.ndarray) -> list[int]:
-    """Return the faulty ones among one or two channels that contradict the others or each other: the channel that
-    changed far more, or both."""
+    """Return the faulty channels among one or two channels that contradict the other channels or each other: the
+    channel that changed far more, or both."""
     size = np.abs(change[channels])
     is_single = size.max() > _FAULT_RATIO * size.min()
     return [int(channels[size.argmax()])] if is_single else channels.tolist()
 
 
 def rounding_of_difference(frame: Measurement, reference: Measurement) -> Float[np.ndarray, " M"]:
-    """Standard deviation (M,), volts, of the difference of two frames due to the rounding of both; 0 where a channel is
-    not usable in both."""
+    """Standard deviation (channels,), in volts, of the difference of two frames due to the rounding of both; 0 for
+    channels that are not usable in both frames."""
     deviations = [
         rounding_deviation(np.asarray(measurement.voltages)[0], np.asarray(measurement.mask)[0])
         for measurement in (frame, reference)
@@ -355,15 +362,15 @@ def rounding_of_difference(frame: Measurement, reference: Measurement) -> Float[
 
 
 def check_imageable(measurement: Measurement, reference: Measurement) -> list[FrameQuality]:
-    """Judge each frame for difference imaging, and raise an error if one cannot be imaged, such as for noise as large
-    as the signal.
+    """Check whether each frame can be imaged against a reference, and raise an error if not, e.g. because the noise is
+    as large as the signal.
 
     **Arguments:**
 
     - `measurement`: the frames to image.
     - `reference`: frames of the undisturbed body, from the same set-up.
 
-    Raises `ValueError` with the reason.
+    Raises `ValueError`, with the reason, if a frame cannot be imaged.
 
     **Example:**
 
@@ -390,7 +397,7 @@ def _rejection_reason(
     cosine: float,
 ) -> str:
     """Why a frame cannot be imaged; empty if it can. `own_errors`: reciprocity errors of frame and reference by name;
-    `cosine`: cosine of the angle between them."""
+    `cosine`: cosine of the angle between frame and reference."""
     if num_usable < num_electrodes:
         return (
             f"only {counted(num_usable, 'channel')} usable in both it and its reference, for {num_electrodes} "
@@ -432,7 +439,7 @@ def _rejection_reason(
 
 
 def _cosine(first: np.ndarray, second: np.ndarray) -> float:
-    """Cosine of the angle between two frames as vectors: 1 if they differ by a positive factor only, 0 if one is
-    zero."""
+    """Cosine of the angle between two frames as vectors: 1 if the frames differ by a positive factor only, 0 if one
+    frame is zero."""
     size = float(np.linalg.norm(first) * np.linalg.norm(second))
     return float(np.real(np.vdot(first, second))) / size if size > 0 else 0.0

@@ -1,4 +1,4 @@
-"""Measurements: frames of voltages with protocol, electrodes and body."""
+"""Measurements: frames of voltages with their protocol, electrodes and body."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from jeit_solvers.module import Module
 
 
 class Measurement(Module):
-    """Frames of measured (or simulated) voltages.
+    """F frames of M measured (or simulated) voltages each.
 
     Build a measurement with `screen`, which looks for bad channels, or with a reader (`jeit.data.read`).
 
     **Fields**
 
     - `voltages`: (F, M) volts, real or complex; NaN only where masked.
-    - `mask`: (F, M) True for usable voltages.
+    - `mask`: (F, M) booleans, True for usable voltages.
     - `protocol`: drive and measurement patterns of the M channels.
     - `electrodes`: positions and sizes of the electrodes (an object of `jeit.electrodes`), or None if they are not
       known.
@@ -76,8 +76,8 @@ class Measurement(Module):
         times: ArrayLike | None = None,
         uncertainty: Uncertainty | None = None,
     ):
-        """`voltages` and `mask`: (F, M), or (M,) for one frame; `times`: (F,). Raises `ValueError` if shapes disagree,
-        if times do not increase, and if `domain` is not a body."""
+        """`voltages` and `mask`: (frames, channels), or (channels,) for one frame; `times`: (frames,). Raises
+        `ValueError` if these shapes disagree, if times do not increase, and if `domain` is not a body."""
         self.voltages = as_array(_frames(voltages))
         self.mask = as_array(_frames(mask))
         self.protocol = protocol
@@ -142,21 +142,22 @@ class Measurement(Module):
 
     @property
     def frame_rate(self) -> float | None:
-        """Mean frame rate in frames per second; None if there are no times, or fewer than two frames."""
+        """Mean frame rate in frames per second; None if the times are not known, or if there are fewer than two
+        frames."""
         if self.times is None or self.num_frames < 2:
             return None
         times = np.asarray(self.times)
         return float((len(times) - 1) / (times[-1] - times[0]))
 
     def at_rate(self, rate: float) -> "Measurement":
-        """The same frames with times from 0, at `rate` frames per second. Raises `ValueError` unless `rate` is a
+        """The same frames with times from 0 s, at `rate` frames per second. Raises `ValueError` unless `rate` is a
         positive number."""
         if not (is_number(rate) and rate > 0):
             raise ValueError(f"rate must be positive, frames in a second; it is {describe(rate)}.")
         return self._replace(self.voltages, self.mask, times=np.arange(self.num_frames) / float(rate))
 
     def frames(self, which: slice | ArrayLike) -> "Measurement":
-        """Selected frames in the order of time, given as a slice, as increasing indices from 0, or as a mask (F,).
+        """The frames that `which` selects: a slice, increasing indices from 0, or a boolean mask (frames,).
 
         Raises `ValueError` for frames that do not exist, and if no frame is selected.
         """
@@ -173,14 +174,16 @@ class Measurement(Module):
         return self._frames(indices)
 
     def frame(self, which: int | str) -> "Measurement":
-        """A single frame as a measurement, given by its index from 0 (negative from the end) or by its name.
+        """A single frame as a measurement, selected by its index from 0 (negative: counted from the end) or by its
+        name.
 
         Raises `ValueError` for a frame that does not exist.
         """
         return self._frames(np.array([self.frame_number(which)]))
 
     def frame_number(self, which: int | str) -> int:
-        """The index, from 0, of a frame given as in `frame`. Raises `ValueError` for a frame that does not exist."""
+        """The index, counted from 0, of the frame that has the index or name `which`. Raises `ValueError` for a frame
+        that does not exist."""
         if isinstance(which, str):
             if which not in self.frame_names:
                 known_names = ", ".join(self.frame_names) or "none: give a number"
@@ -194,9 +197,9 @@ class Measurement(Module):
         return which % self.num_frames
 
     def split_reference(self) -> tuple["Measurement", "Measurement"]:
-        """The frames to image, and the reference frame in the file (the frame named "reference").
+        """Split the measurement into the frames to image and the reference frame (the frame named "reference").
 
-        Raises `ValueError` if the file has no frame of that name, or no other frame.
+        Raises `ValueError` if no frame is named "reference", or if there is no other frame.
         """
         if "reference" not in self.frame_names or self.num_frames < 2:
             alternative = "say which (--reference-frames 0-17; measurement.frames(slice(0, 18))), or "
@@ -210,18 +213,20 @@ class Measurement(Module):
         return self._frames(others), self._frames(np.array([index]))
 
     def mean_frame(self) -> "Measurement":
-        """The mean of the usable voltages over all frames; a channel that is usable in no frame stays masked."""
+        """The mean of the usable voltages over all frames, as a measurement of one frame; a channel that is usable in
+        no frame stays masked."""
         mean, usable = _mean(self.voltages, self.mask)
         return self._replace(mean, usable, frame_names=(), times=None)
 
     def filled(self, value: float = 0.0) -> Inexact[Array, "F M"]:
-        """(F, M) voltages with `value` in place of masked ones."""
+        """Voltages (frames, channels) in volts, with `value` in place of masked voltages."""
         return _filled(self.voltages, self.mask, value)
 
     def masked(self, usable: ArrayLike, reason: str) -> "Measurement":
         """The same measurement with fewer usable channels.
 
-        `usable`: boolean, (M,) or (F, M); `reason`: added to the notes. Raises `ValueError` for another shape.
+        `usable`: boolean, (channels,) or (frames, channels); `reason`: text that is added to the notes. Raises
+        `ValueError` if `usable` has another shape.
         """
         usable_array = jnp.asarray(usable)
         if usable_array.dtype != bool or usable_array.shape not in ((self.num_channels,), self.mask.shape):
@@ -237,7 +242,8 @@ class Measurement(Module):
         return self._replace(self.voltages, mask, notes=(*self.notes, note))
 
     def without_electrodes(self, electrodes: int | Sequence[int]) -> "Measurement":
-        """Mask the channels that drive or measure any of `electrodes` (counted from 0), e.g. missing or broken ones.
+        """Mask the channels that drive or measure any of `electrodes` (counted from 0), e.g. missing or broken
+        electrodes.
 
         Raises `ValueError` for electrodes that do not exist.
         """
@@ -245,8 +251,8 @@ class Measurement(Module):
         return self.masked(self.protocol.mask_without(electrodes), f"electrodes {numbers} left out.")
 
     def without_driven_channels(self) -> "Measurement":
-        """Mask the channels that measure on an electrode that carries current, because they include its contact
-        impedance."""
+        """Mask the channels that measure on an electrode that carries current, because their voltages include the
+        contact impedance of this electrode."""
         usable = ~self.protocol.channels_on_driven_electrodes()
         return self.masked(usable, "they measure on driven electrodes.")
 
@@ -278,7 +284,7 @@ def _check_times(times: np.ndarray, num_frames: int) -> None:
 
 
 def _frames(values):
-    """Values of one frame (M,) or of several frames, as an array (F, M)."""
+    """Values of one frame (channels,) or of several frames, as an array (frames, channels)."""
     return np.atleast_2d(on_host(values)) if has_values(values) else jnp.atleast_2d(values)
 
 

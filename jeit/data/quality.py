@@ -1,10 +1,10 @@
 """Quality of measurements, judged from the voltages alone, without a model of the body.
 
-These are reciprocity, noise, signs that no passive body can produce, and the order of electrodes along an edge.
+Criteria are reciprocity, noise, signs that no passive body can produce, and the order of electrodes along an edge.
 
-Electrodes may be numbered in any order. An order that does not follow the edge is nevertheless reported, because two
+Electrodes may be numbered in any order. A numbering that does not follow the edge is nevertheless reported, because two
 exchanged rows in a table of positions spoil every image without being noticed. The report adds whether the signs of the
-voltages, which depend on the order, agree with it.
+voltages, which depend on the order, agree with the numbering.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from jeit.mesh.topology import along
 from jeit.protocol import Protocol
 from jeit.protocol.reciprocity import transfer_between_drives
 
-# Maximum number of frames from which a recording is judged; a longer one is sampled evenly.
+# Maximum number of frames from which a recording is judged; longer recordings are sampled evenly.
 _MAX_FRAMES = 32
-# Rounding: largest number of significant digits, relative accuracy of multiples of a step (single precision), and
-# smallest number of voltages that can show it.
+# Detection of rounding: largest number of significant digits, relative accuracy of multiples of a step (single
+# precision), and smallest number of voltages that can show rounding.
 _MAX_DIGITS, _RELATIVE_ACCURACY, _MIN_VOLTAGES = 5, 1e-6, 16
 
 
@@ -51,18 +51,19 @@ class NoiseEstimate:
 
 
 def reciprocity_error(measurement: Measurement, deviation: Float[np.ndarray, " M"] | None = None) -> float | None:
-    """Relative deviation from reciprocity: ‖T - Tᵀ‖ / ‖T‖, where T is the transfer between drives; None if no two
+    """Relative deviation from reciprocity: ‖T - Tᵀ‖ / ‖T‖ for the matrix T of transfer between drives; None if no two
     usable channels are related by reciprocity.
 
-    T_ij is the voltage that drive pattern i would read while drive j flows, combined from the measured channels (see
-    `jeit.protocol.reciprocity.transfer_between_drives`). It is symmetric for every body, so an asymmetry is due to
-    noise, drift, gain errors, or a wrong protocol. Independent noise of relative size ε yields about √2 ε.
+    T_ij is the voltage that drive pattern i would read as a measurement pattern while drive j flows, combined from the
+    measured channels (see `jeit.protocol.reciprocity.transfer_between_drives`). T is symmetric for every body, so an
+    asymmetry is due to noise, drift, gain errors, or a wrong protocol. Independent noise of relative size ε yields an
+    error of about √2 ε.
 
     **Arguments:**
 
     - `measurement`: the frames.
-    - `deviation` (M,): expected errors of the channels, relative to each other; the entries of T are divided by the
-      errors that follow from them. By default all channels are weighted equally.
+    - `deviation` (channels,): expected errors of the channels, relative to each other; the entries of T are divided by
+      their expected errors, which follow from `deviation`. By default all channels are weighted equally.
 
     **Example:**
 
@@ -80,8 +81,8 @@ def reciprocity_error(measurement: Measurement, deviation: Float[np.ndarray, " M
 
 
 def channel_reciprocity_error(measurement: Measurement) -> Float[np.ndarray, "F M"]:
-    """(F, M) volts: each voltage minus the value predicted by its reciprocal channel; NaN for channels without a
-    reciprocal one.
+    """Each voltage (frames, channels) minus the value predicted by its reciprocal channel, in volts; NaN for channels
+    without a reciprocal channel.
 
     **Arguments:**
 
@@ -107,15 +108,15 @@ def channel_reciprocity_error(measurement: Measurement) -> Float[np.ndarray, "F 
 
 
 def estimate_noise(measurement: Measurement) -> NoiseEstimate | None:
-    """Estimate the noise of a single voltage, from reciprocity or else from repeated frames; None if neither is
-    available.
+    """Estimate the noise of a single voltage from reciprocity, or else from repeated frames; None without reciprocal
+    channels and repeated frames.
 
-    - Reciprocity: two channels that must be equal differ by √2 standard deviations; combinations of channels are
-      treated likewise. The estimate includes drift and gain errors, which cancel in a difference of two frames: to
-      obtain the noise of a difference, apply the function to the difference.
+    - Reciprocity: two channels that must be equal differ by √2 standard deviations of the noise; combinations of
+      channels are treated likewise. The estimate includes drift and gain errors, which cancel in a difference of two
+      frames: to obtain the noise of a difference, pass the difference as the measurement.
     - Repeated frames (8 or more, without frame names): differences of successive frames.
 
-    The estimator is robust: 1.4826 times the median absolute value, unaffected by outliers in up to half of the
+    The estimate is 1.4826 times the median absolute difference; it is robust against outliers in up to half of the
     channels.
 
     **Arguments:**
@@ -144,13 +145,14 @@ def estimate_noise(measurement: Measurement) -> NoiseEstimate | None:
 
 
 def expected_signs(protocol: Protocol, order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " M"]:
-    """(M,) sign that each voltage has on every passive body; 0 if the sign depends on the body.
+    """Sign (M,) that the voltage of each of the M channels has on every passive body; 0 if the sign depends on the
+    body.
 
     On the boundary of a simply connected sheet the potential falls monotonically from source to sink along both arcs
     between them: a local extremum elsewhere would contradict the maximum principle, whatever the (positive)
-    conductivity. The sign of a voltage between two electrodes of the same arc is therefore known. `order` lists the
-    electrodes as they follow each other along the boundary. Channels that do not drive and measure by pairs of
-    electrodes get 0.
+    conductivity. The sign of a voltage between two electrodes of the same arc is therefore known. `order` (L,) lists
+    the L electrodes as they follow each other along the boundary. The sign is 0 for channels that do not drive and
+    measure by pairs of electrodes.
     """
     num_electrodes = protocol.num_electrodes
     rank = np.empty(num_electrodes, dtype=int)
@@ -158,8 +160,8 @@ def expected_signs(protocol: Protocol, order: Int[np.ndarray, " L"]) -> Int[np.n
     drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
     uses_pairs = (np.count_nonzero(drive, axis=1) == 2) & (np.count_nonzero(measurement, axis=1) == 2)
     source = rank[drive.argmax(axis=1)]
-    # Ranks counted from the source: the potential falls along the arc from 0 to sink, and rises along the arc from sink
-    # to num_electrodes.
+    # Ranks are positions along the boundary counted from the source: the potential falls from rank 0 to sink, and rises
+    # from sink to num_electrodes.
     sink = (rank[drive.argmin(axis=1)] - source) % num_electrodes
     plus = (rank[measurement.argmax(axis=1)] - source) % num_electrodes
     minus = (rank[measurement.argmin(axis=1)] - source) % num_electrodes
@@ -173,17 +175,17 @@ def expected_signs(protocol: Protocol, order: Int[np.ndarray, " L"]) -> Int[np.n
 def impossible_signs(
     measurement: Measurement, order: Int[np.ndarray, " L"] | None = None
 ) -> Float[np.ndarray, " F"] | None:
-    """(F,) fraction of the usable voltages whose sign is impossible on a passive body (real part of complex voltages).
+    """Fraction of the usable voltages of each frame whose sign is impossible on a passive body.
 
-    Voltages that are pure noise have the wrong sign half of the time, so the fraction of noisy channels is about twice
-    the value returned. Returns None if the electrodes are not known to lie along the boundary of an outline, or if no
-    channel has a known sign. See `expected_signs`.
+    The sign of a complex voltage is that of its real part. Voltages that are pure noise have the wrong sign half of the
+    time, so the fraction of noisy channels is about twice the returned fraction. Returns None if the electrodes are not
+    known to lie along the boundary of an outline, or if no channel has a known sign. See `expected_signs`.
 
     **Arguments:**
 
     - `measurement`: the frames.
-    - `order` (L,): the electrodes as they follow each other along the boundary; by default it is found from their
-      positions.
+    - `order` (electrodes,): the electrodes as they follow each other along the boundary; by default the order is found
+      from the positions of the electrodes.
 
     **Example:**
 
@@ -204,8 +206,8 @@ def impossible_signs(
 
 
 def boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
-    """(L,) the electrodes in their order along the outer edge, from their positions; None if they are not known to lie
-    on it."""
+    """Indices (electrodes,) of the electrodes in their order along the outer edge of the body; None if they are not
+    known to lie on the edge."""
     electrodes, domain = measurement.electrodes, measurement.domain
     if not isinstance(electrodes, BoundaryElectrodes) or domain is None:
         return None
@@ -216,18 +218,19 @@ def boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
 
 
 def reciprocity_noise(measurement: Measurement, deviation: Float[np.ndarray, " M"]) -> float | None:
-    """Noise of the channels estimated from reciprocity, in units of `deviation` (M,), the expected errors of channels
-    relative to each other. Robust like `estimate_noise`. None if no two usable channels are related by reciprocity."""
+    """Noise of the channels estimated from reciprocity, in units of `deviation` (channels,), the expected errors of
+    channels relative to each other. The estimator is as robust as `estimate_noise`. None if no two usable channels are
+    related by reciprocity."""
     error, noise, _ = _asymmetry(measurement, deviation)
     return _robust_deviation(error / noise) if error.size else None
 
 
 def rounding_deviation(voltages: Float[np.ndarray, " M"], mask: Bool[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
-    """Standard deviation (M,) of the rounding of voltages, volts; zero where none is found.
+    """Standard deviation (channels,) of the rounding errors of voltages, in volts; zero if no rounding is found.
 
     Voltages may be rounded to a number of significant digits, or to multiples of a step, such as that of a converter.
-    The coarsest rounding that agrees with all usable voltages is taken; its error is uniform within ± half a step.
-    Reciprocal voltages are rounded in the same way, so reciprocity does not show this error.
+    The coarsest rounding that agrees with all usable voltages is assumed; the rounding error is uniform within ± half a
+    step. Reciprocal voltages are rounded in the same way, so reciprocity does not show the rounding error.
     """
     voltage_magnitudes, mask = np.abs(np.real(np.asarray(voltages))), np.asarray(mask)
     values = voltage_magnitudes[mask & (voltage_magnitudes > 0)]
@@ -246,7 +249,7 @@ def rounding_deviation(voltages: Float[np.ndarray, " M"], mask: Bool[np.ndarray,
 
 
 def _are_multiples(values: np.ndarray, step: np.ndarray) -> bool:
-    """Whether values are multiples of their steps, with quotients of at most `_MAX_DIGITS` digits."""
+    """Whether each value is a multiple of its step, with a quotient of at most `_MAX_DIGITS` digits."""
     quotients = values / step
     remainders = np.abs(quotients - np.round(quotients))
     return bool(
@@ -257,12 +260,13 @@ def _are_multiples(values: np.ndarray, step: np.ndarray) -> bool:
 def _asymmetry(
     measurement: Measurement, deviation: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Asymmetry of the transfer T between drives. Returns the entries of T - Tᵀ (watts), their standard deviation for
-    noise of the given `deviation` (default: one volt per channel), and the entries of T with its diagonal, to which the
-    asymmetry is compared; the last are divided by their noise if `deviation` is given.
+    """Asymmetry of the matrix T of transfer between drives (`reciprocity_error`). Returns the entries of T - Tᵀ
+    (watts), their standard deviation for noise of the given `deviation` (default: one volt per channel), and the
+    entries of T with its diagonal, to which the asymmetry is compared. The entries of T are divided by their noise if
+    `deviation` is given.
 
-    The diagonal is included because for the currents that show a change best (`jeit.protocol.optimal`) the change lies
-    in the diagonal alone.
+    The diagonal is included because for the optimal currents of `jeit.protocol.optimal` a change of the body alters
+    only the diagonal.
     """
     protocol = measurement.protocol
     frames = np.unique(np.linspace(0, measurement.num_frames - 1, _MAX_FRAMES).round().astype(int))
@@ -285,7 +289,7 @@ def _asymmetry(
         noise = np.hypot(gain[row, column], gain[column, row])
         size = np.sqrt((np.abs(upper_entries) ** 2 + np.abs(lower_entries) ** 2) / 2)
         diagonal_drives = np.flatnonzero(np.diag(is_known))
-        # In ‖T‖² a diagonal entry counts once, and an off-diagonal pair, which is one entry here, counts twice.
+        # In ‖T‖² a diagonal entry counts once; a pair of off-diagonal entries, which is one entry here, counts twice.
         diagonal = np.abs(transfer[:, diagonal_drives, diagonal_drives]) / np.sqrt(2)
         if deviation is not None:
             size, diagonal = size / noise, diagonal / (np.sqrt(2) * gain[diagonal_drives, diagonal_drives])
@@ -306,15 +310,15 @@ def _robust_deviation(values: np.ndarray) -> float:
     return float(1.4826 * np.median(np.abs(values)))
 
 
-# Maximum number of electrodes listed in a note.
+# Maximum number of electrodes that a note lists.
 _MAX_LISTED = 40
-# Maximum difference between the fractions of impossible signs of two orders that can be due to noise.
+# Maximum difference, between two orders of electrodes, of the fractions of impossible signs that can be due to noise.
 _MAX_CHANCE_DIFFERENCE = 0.01
 
 
 def order_note(measurement: Measurement) -> str | None:
-    """A sentence that reports electrodes not numbered in their order along the edge; None if they are, or do not lie on
-    an edge."""
+    """A sentence that reports that electrodes are not numbered in their order along the edge; None if they are, or if
+    they do not lie on an edge."""
     order = boundary_order(measurement)
     if order is None or len(order) < 4 or follows(order):
         return None
@@ -340,13 +344,14 @@ def order_note(measurement: Measurement) -> str | None:
 
 
 def follows(order: Int[np.ndarray, " L"]) -> bool:
-    """Whether the numbers of electrodes in this order increase, or decrease, by one all the way round."""
+    """Whether the electrode numbers in `order` increase by one all the way round, or decrease by one."""
     steps = (np.roll(order, -1) - order) % len(order)
     return bool((steps == 1).all() or (steps == len(order) - 1).all())
 
 
 def _starting_at_first(order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " L"]:
-    """The order rotated to begin at the first electrode, in the direction in which most numbers increase."""
+    """The cyclic `order` of electrodes rotated to begin at the first electrode, in the direction in which most numbers
+    increase."""
     steps = (np.roll(order, -1) - order) % len(order)
     if (steps == len(order) - 1).sum() > (steps == 1).sum():
         order = order[::-1]

@@ -12,18 +12,18 @@ from jeit.arguments import check_name, listed
 from jeit.data.measurement import Measurement
 from jeit.files import check_memory
 
-# Maximum bytes of memory per byte of text.
+# Maximum bytes of memory per byte of a text file.
 _MEMORY_FACTOR = 4
 
 
 @dataclass(frozen=True)
 class Format:
-    """A file format. **Fields**: `module`: name of the module that reads it; `endings`: suffixes of its files;
-    `described`: whether a description may accompany a file; `borrows`: whether a file may use the description of
-    another measurement; `own_protocol`: whether files state their protocol, so that a description states only the body;
-    `bundled`: name of the bundled description that always applies, or None.
+    """A file format. **Fields**: `module`: name of the module that reads the format; `endings`: suffixes of files in
+    the format; `described`: whether a description may accompany a file; `borrows`: whether a file may use the
+    description of another measurement (`like` of `read`); `own_protocol`: whether files state their protocol, so that a
+    description states only the body; `bundled`: name of the bundled description that always applies, or None.
 
-    The module is imported only when a file has one of the suffixes.
+    The module is imported only when a file has one of the suffixes `endings`.
     """
 
     module: str
@@ -35,7 +35,7 @@ class Format:
 
     @property
     def reader(self) -> Any:
-        """The module that reads the format, with `DESCRIPTION`, `recognises(path)` and `read(path)`."""
+        """The module that reads files of this format; it defines `DESCRIPTION`, `recognises(path)` and `read(path)`."""
         return importlib.import_module(f"jeit.data.formats.{self.module}")
 
     def recognises(self, path: Path) -> bool:
@@ -44,7 +44,7 @@ class Format:
 
 
 _TABLES = (".csv", ".txt", ".dat", ".npy", ".npz")
-# The first format that recognises a file reads it. To add a format, write a module like kit4.py and list it here.
+# A file is read by the first format that recognises it. To add a format, write a module like kit4.py and list it here.
 FORMATS: dict[str, Format] = {
     "kit4": Format("kit4", (".mat",)),
     "ktc2023": Format("ktc2023", (".mat",)),
@@ -64,13 +64,15 @@ FORMATS: dict[str, Format] = {
     ),
     "openeit": Format("openeit", (".txt", ".csv", ".dat", ".log", ".bin"), described=True, borrows=True),
     "table": Format("table", _TABLES, described=True, borrows=True),
-    # A table of 208 rows of real and imaginary pairs, with the bundled description; used only if named explicitly.
+    # A table with 208 rows of pairs of real and imaginary parts and a bundled description; used only if named
+    # explicitly.
     "tank6cm": Format("table", (), bundled="tank6cm"),
 }
 
 
 def format_with_protocol(path: Path) -> str | None:
-    """Name of the format of a file that states its protocol, so that only the body is to be described; or None."""
+    """Name of the format of a file if files of this format state their protocol, so that a description needs to state
+    only the body; otherwise None."""
     if not path.is_file():
         return None
     return next(
@@ -92,15 +94,15 @@ def read(
 
     - `path`: the data file; or a folder of Sciospec files, one per frame, which are read in the order of their names.
     - `format`: a name in `FORMATS` ("kit4", "ktc2023", "eidors", "sciospec", "draeger", "carefusion", "swisstom",
-      "goettingen", "cn0565", "quadrupoles", "openeit", "table", "tank6cm"); by default it is recognised from the
-      content.
-    - `description`: a TOML file, or the name of a bundled one, that states the meaning of the numbers (tables, EIDORS
-      files) or the body measured (files of instruments). By default it is looked for beside the data.
-    - `like`: a measurement of the same sensor, such as the reference, whose description applies to a table that has
-      none.
-    - `key`: name of the array of voltages in a .mat or .npz file, in place of `[data] keys`.
+      "goettingen", "cn0565", "quadrupoles", "openeit", "table", "tank6cm"); by default the format is recognised from
+      the content.
+    - `description`: a TOML file, or the name of a bundled description, that states the meaning of the numbers (tables,
+      EIDORS files) or the measured body (files of instruments). By default a description beside the data file is used.
+    - `like`: a measurement of the same sensor, such as the reference; its description is used for a table without a
+      description.
+    - `key`: name of the array of voltages in a .mat or .npz file, in place of `[data] keys` of the description.
 
-    Raises `ValueError` if the file does not exist, is of no known format, or violates its format.
+    Raises `ValueError` if the file does not exist, has no known format, or violates its format.
 
     **Example:**
 
@@ -137,8 +139,8 @@ def read(
 
 
 def _recognise(file: Path, description: str | Path | None, like: Measurement | None) -> str:
-    """Return the name of the format of a file. Raises `ValueError`, with what the file probably is, if it has no known
-    format."""
+    """Return the name of the format of a file. If the file has no known format, raises `ValueError` that states what
+    the file probably is."""
     has_description = description is not None or like is not None
     for name, candidate in FORMATS.items():
         if candidate.recognises(file):
@@ -187,7 +189,7 @@ def _recognise(file: Path, description: str | Path | None, like: Measurement | N
 
 
 _HEAD_BYTES = 65536
-# Marks by which damaged and misnamed files of a format are recognised.
+# For each format, a regular expression that recognises damaged files and files with a wrong suffix.
 _FORMAT_MARKS = {
     "draeger": rb"Draeger EIT-Software|Framerate \[Hz\]:",
     "carefusion": rb"E\0I\0T\0_\0F\0i\0l\0e",
@@ -195,7 +197,7 @@ _FORMAT_MARKS = {
     "cn0565": rb"(?m)^!V[ \t]*[0-9A-Fa-f]",
     "openeit": rb"(?mi)^\s{0,40}magnitudes\s{0,40}:",
 }
-# First bytes of files of other programs, and what to do with these.
+# First bytes of files of other programs, and the advice to the user.
 _OTHER_PROGRAMS = {
     b"PK\x03\x04": "a spreadsheet or another archive: export its numbers as CSV",
     b"\x89HDF": "HDF5: save the arrays as .npz, or by MATLAB with `save(name, '-v7')`",
@@ -206,8 +208,8 @@ _OTHER_PROGRAMS = {
 
 
 def _check_mark(file: Path) -> None:
-    """Raise `ValueError` if a file has the mark of a format that does not recognise it; the message states what is
-    damaged, or that the suffix is wrong."""
+    """Raise `ValueError` if a file that no format recognises has the mark (`_FORMAT_MARKS`) of a format; the message
+    states what is damaged, or that the suffix is wrong."""
     with file.open("rb") as content:
         head = content.read(_HEAD_BYTES)
     for name, mark in _FORMAT_MARKS.items():

@@ -1,7 +1,7 @@
 """Simulated measurements of a round piezoresistive skin while it is pressed.
 
-No openly licensed measurement of a tactile skin exists; simulated ones replace it, and are marked as such in their
-notes.
+No openly licensed measurement of a tactile skin exists; simulated measurements replace it, and their notes state that
+they are simulated.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jeit_solvers.module import Module
 class RoundSkin(Module):
     """A round conductive sheet with electrodes along its edge, measured with the adjacent (neighbouring) protocol.
 
-    The defaults are those of Chen et al. (2022): a film of 100 mm diameter, 16 electrodes, 208 voltages.
+    The defaults describe the skin of Chen et al. (2022): a film of 100 mm diameter, 16 electrodes, 208 voltages.
 
     **Fields**: `radius` in metres; `num_electrodes`; `electrode_width` in metres; `contact_impedance` in ohm·m;
     `conductivity`: sheet conductivity in siemens; `current` in amperes; `num_points`: number of nodes of the mesh for
@@ -55,7 +55,7 @@ class RoundSkin(Module):
         return ForwardModel(mesh, electrodes, adjacent(self.num_electrodes, current=self.current))
 
     def electrodes(self) -> BoundaryElectrodes:
-        """The electrodes; the first is at 12 o'clock, and the others follow clockwise."""
+        """The electrodes of the skin; electrode 1 is at 12 o'clock, and the other electrodes follow clockwise."""
         position = ring(self.radius, self.num_electrodes, clockwise=True)
         return BoundaryElectrodes(position, self.electrode_width, self.contact_impedance)
 
@@ -64,11 +64,12 @@ class RoundSkin(Module):
 def pressed_conductivity(
     points: Float[Array, "m 2"], background: float, position, radius: float, strength: float
 ) -> Float[Array, " m"]:
-    """Conductivity (m,) at `points` of a sheet pressed by a sphere: σ₀ (1 + strength √(1 - (r / radius)²)).
+    """Conductivity (m,) in siemens at m `points` of a sheet pressed by a sphere: σ₀ (1 + strength √(1 - (r /
+    radius)²)).
 
-    `background` is σ₀, in siemens. The change has the shape of the Hertzian pressure under a sphere: relative change
-    `strength` in the middle of a contact of `radius` metres around `position`, zero at its edge. The conductivity is
-    assumed to increase with pressure.
+    `background` is σ₀ in siemens, r the distance from `position` in metres. The change has the shape of the Hertzian
+    pressure under a sphere: the relative change is `strength` at `position`, and zero outside `radius` metres. The
+    conductivity is assumed to increase with pressure.
     """
     xp = namespace(points, position)
     squared = xp.sum((points - xp.asarray(position)) ** 2, axis=-1) / radius**2
@@ -90,8 +91,8 @@ def simulate_press(
 
     - `skin`: the skin.
     - `key`: key of the random noise (`jax.random.key`).
-    - `position` (x, y): of the press, metres.
-    - `radius`: of the contact, metres.
+    - `position`: coordinates (x, y) of the press in metres.
+    - `radius`: radius of the contact area in metres.
     - `strength`: maximum relative change of conductivity.
     - `noise`: standard deviation of the noise in each voltage relative to the root mean square of all voltages (1e-4:
       80 dB).

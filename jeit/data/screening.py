@@ -1,4 +1,4 @@
-"""Screening of raw voltages into a `Measurement`: unusable voltages are masked, with the reason in the notes."""
+"""Conversion of raw voltages to a `Measurement`: unusable voltages are masked, and the notes state the reason."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Body, Mesh
 from jeit.protocol import Protocol
 
-# Maximum number of superfluous columns, such as times, for which an error about the shape suggests them.
+# Maximum number of superfluous columns, such as times, that an error about the shape suggests as the cause.
 _MAX_EXTRA_COLUMNS = 4
 # Maximum plausible voltage on an electrode, in volts.
 _MAX_VOLTAGE = 1000.0
@@ -34,30 +34,30 @@ def screen(
     frame_names: tuple[str, ...] = (),
     notes: tuple[str, ...] = (),
 ) -> Measurement:
-    """Convert raw voltages to a `Measurement`; unusable voltages are masked, with notes on why.
+    """Convert raw voltages to a `Measurement`; unusable voltages are masked, and notes state why.
 
-    Masked are voltages that
+    Voltages are masked if they
 
-    - `mask` excludes;
+    - are excluded by `mask`;
     - are NaN, infinite, or larger than 1e12 V;
     - are saturated;
-    - belong to a drive that reads nothing at all because its current did not flow, or read an electrode all of whose
-      drives are of this kind;
+    - belong to a drive whose voltages are all nearly zero because its current did not flow, or are read at an electrode
+      through which no current flowed in any drive;
     - belong to a frame that is all zero.
 
     A note is also added if electrodes are not numbered in their order along the edge.
 
     **Arguments:**
 
-    - `voltages` (M,) or (F, M): volts.
+    - `voltages` (M,) or (F, M): voltages of M channels, for one frame or F frames, in volts.
     - `protocol`: drive and measurement patterns of the M channels.
     - `electrodes`, `domain`: the electrodes and the body, if they are known.
     - `mask` (M,) or (F, M): True for usable voltages.
-    - `saturation`: volts at which the instrument saturates; by default, voltages stuck at exactly the same extreme
-      value are taken as saturated.
+    - `saturation`: voltage at which the instrument saturates, in volts; by default, voltages that share exactly the
+      same extreme value are considered saturated.
     - `name`, `source`, `frame_names`, `notes`: as in `Measurement`.
 
-    Raises `ValueError` if the shape does not fit the protocol, or no usable voltage is left.
+    Raises `ValueError` if the shape of `voltages` does not fit the protocol, or if no usable voltage is left.
 
     **Example:**
 
@@ -112,8 +112,8 @@ def screen(
 
 
 def _hint_of_number(number: int, channels: int) -> str:
-    """What may be wrong if `number` numbers are not frames of a protocol with so many `channels`: lines that are
-    missing, or another number of electrodes."""
+    """Text on what may be wrong if `number` numbers are not complete frames of `channels` voltages: missing lines, or
+    another number of electrodes."""
     if 0 < channels - number <= channels // 4:
         return f" They are {number} numbers, {channels - number} fewer than a frame has: is a line missing?"
     counts = {
@@ -163,7 +163,7 @@ def _saturated(values: np.ndarray, usable: np.ndarray, saturation: float | None)
             levels, level_index, counts = np.unique(row[row_usable], return_inverse=True, return_counts=True)
             for extreme in (0, len(levels) - 1):
                 # A coarse converter or a simulated symmetric body also produces exactly equal extremes, but then values
-                # in between repeat as often; in saturated data only the extreme value repeats.
+                # between them repeat as often; in saturated data only the extreme value repeats.
                 other_counts = np.delete(counts, [0, len(levels) - 1]) if len(levels) > 2 else np.zeros(1)
                 if levels[extreme] != 0 and counts[extreme] >= 4 and counts[extreme] >= 4 * other_counts.max(initial=0):
                     result[frame, np.flatnonzero(row_usable)[level_index == extreme]] = True
@@ -173,8 +173,8 @@ def _saturated(values: np.ndarray, usable: np.ndarray, saturation: float | None)
 def _current_flow(
     values: np.ndarray, usable: np.ndarray, protocol: Protocol
 ) -> tuple[Bool[np.ndarray, "F S"], Bool[np.ndarray, "F S"]]:
-    """Masks (F, S) of the drives without current, whose voltages are a thousand times smaller than those of the median
-    drive, and of the drives with current. Drives without a usable voltage are in neither mask."""
+    """Masks (frames, drives) of the drives without current, whose voltages are a thousand times smaller than those of
+    the median drive, and of the drives with current. Both masks are False for drives without a usable voltage."""
     index = np.asarray(protocol.drive_index)
     largest = np.full((values.shape[0], protocol.num_drives), -1.0)
     np.maximum.at(largest.T, index, np.where(usable, np.abs(values), -1.0).T)

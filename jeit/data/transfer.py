@@ -1,8 +1,8 @@
-"""The transfer impedance of a measurement, and the voltages that the same body would give under other patterns.
+"""The transfer impedance of a measured body, and the voltages that the body would give under other patterns.
 
 The transfer impedance Z (L, L) of L electrodes is symmetric with rows that sum to zero, so it has L (L - 1) / 2
 independent entries. Any set of patterns that determines Z, such as L - 1 independent currents on all electrodes,
-therefore determines the voltages of every other set.
+therefore determines the voltages of every other set of patterns.
 """
 
 from __future__ import annotations
@@ -15,24 +15,25 @@ from jeit.data.measurement import Measurement
 from jeit.files import check_memory
 from jeit.protocol import Protocol
 
-# Singular values smaller than this fraction of the largest one belong to combinations that were not measured.
+# Singular values smaller than this fraction of the largest singular value belong to combinations of entries of the
+# transfer impedance that were not measured.
 _MIN_SINGULAR_VALUE = 1e-9
-# Estimated number of copies of the equations in memory while they are solved.
+# Estimated number of copies of the equations' matrix in memory while the equations are solved.
 _NUM_COPIES = 4
 
 
 def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]:
-    """The transfer impedance (F, L, L) of every frame, in ohm: potentials of all electrodes, minus their mean, for a
-    unit current into each.
+    """The transfer impedance (F, L, L) of F frames and L electrodes, in ohm: column l has the potentials of all
+    electrodes, minus their mean, per ampere into electrode l.
 
-    It is the symmetric matrix that fits the usable voltages in the least-squares sense.
+    The transfer impedance is the symmetric matrix that fits the usable voltages in the least-squares sense.
 
     **Arguments:**
 
     - `measurement`: the frames.
 
-    Raises `ValueError` if the voltages do not determine it, because there are too few patterns or the voltages of
-    driven electrodes are missing.
+    Raises `ValueError` if the voltages do not determine the transfer impedance, because there are too few patterns or
+    the voltages of driven electrodes are missing.
 
     **Example:**
 
@@ -72,8 +73,8 @@ def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]
 
 def as_driven(reference: Measurement, measurement: Measurement) -> Measurement:
     """The reference converted to the protocol of a measurement on the same electrodes. The reference is returned
-    unchanged if only the amplitude of the currents differs, or if its patterns do not determine the voltages of that
-    protocol."""
+    unchanged if only the amplitude of the currents differs, or if its patterns do not determine the voltages of the
+    other protocol."""
     ours, theirs = measurement.protocol, reference.protocol
     if ours.num_electrodes != theirs.num_electrodes or ours.same_patterns(theirs) or _proportional(ours, theirs):
         return reference
@@ -95,11 +96,11 @@ def _proportional(ours: Protocol, theirs: Protocol) -> bool:
 
 
 def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
-    """Convert a measurement to the voltages that another `protocol` on the same electrodes would have measured.
+    """Compute the voltages that another `protocol` on the same electrodes would have measured.
 
-    This is meant for a reference that was measured with other currents than the frames. Noise is amplified where the
-    measured patterns barely determine the new voltages. Raises `ValueError` for another number of electrodes, and as
-    `transfer_impedance`.
+    A typical use is a reference that was measured with other currents than the frames. Noise is amplified if the
+    measured patterns barely determine the new voltages. Raises `ValueError` for another number of electrodes, and if
+    the measured voltages do not determine the transfer impedance.
 
     **Arguments:**
 

@@ -1,7 +1,7 @@
-"""Estimation of what a description does not state from the voltages: the order of channels, the measured channels, and
-the sign.
+"""Estimation, from the voltages, of properties that a description does not state: the order of channels, the measured
+channels, and the sign of the voltages.
 
-The order is the one that obeys reciprocity. The sign is known wherever electrodes follow each other along an edge, see
+The order of channels must obey reciprocity. The sign is known if electrodes follow each other along an edge, see
 `jeit.data.quality.expected_signs`.
 """
 
@@ -20,21 +20,23 @@ from jeit.mesh import Solid
 from jeit.protocol import Protocol
 from jeit.protocol.patterns import shares_electrode
 
-# Maximum reciprocity error for which the described order is trusted, and maximum ratio to it of the error of an order
-# that replaces it.
+# Maximum reciprocity error for which the described order of channels is trusted, and maximum ratio of the error of
+# another order to the error of the described order for which the other order is used.
 _MAX_TRUSTED_ERROR, _MAX_ERROR_RATIO = 0.25, 0.4
-# Cosine of the angle between a frame and its reference below which one of them has the opposite sign.
+# Cosine of the angle between a frame and its reference below which the frame or the reference has the opposite sign.
 _OPPOSITE_COSINE = -0.5
 
 
 def fitting_protocol(
     frames: Inexact[np.ndarray, "F M"], protocols: Sequence[tuple[Protocol, str]], like: Measurement | None = None
 ) -> tuple[Protocol | None, tuple[str, ...]]:
-    """The protocol among `protocols`, the described one first, that has as many channels as the frames and obeys
-    reciprocity; and a note if it is not the described one. None if there is none.
+    """Select the protocol among the candidates `protocols` that has as many channels as the frames and obeys
+    reciprocity. Returns the protocol, None without candidates, and a note if it is not the described protocol
+    `protocols[0]`.
 
-    The described protocol is used unless it violates reciprocity and another one does not. With a measurement `like` of
-    the same sensor, its protocol comes first, because properties detected in the reference apply to the frames.
+    The described protocol is used unless it violates reciprocity and another candidate does not. If a measurement
+    `like` of the same sensor is given, its protocol is the first candidate, because properties detected in the
+    reference apply to the frames.
     """
     if not protocols:
         return None, ()
@@ -59,7 +61,7 @@ def fitting_protocol(
 
 
 def _mean_frame_error(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> float:
-    """Reciprocity error of the mean frame; infinite if it cannot be computed."""
+    """Reciprocity error of the mean of the frames; infinite if it cannot be computed."""
     values = readings(np.atleast_2d(frames))
     is_known = np.isfinite(values).all(axis=0)
     mean = np.where(is_known, np.where(np.isfinite(values), values, 0).mean(axis=0), 0)
@@ -70,7 +72,7 @@ def _mean_frame_error(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) ->
 
 
 def driven_zeros(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> Bool[np.ndarray, " M"]:
-    """Channels (M,) that measure on a driven electrode and are zero in every frame, so were not measured."""
+    """Mask (channels,) of the channels on driven electrodes that are zero in every frame, i.e. were not measured."""
     shared = shares_electrode(np.asarray(protocol.drive), np.asarray(protocol.measurement))
     driven = shared[np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)]
     zero = (np.atleast_2d(frames) == 0).all(axis=0)
@@ -78,8 +80,9 @@ def driven_zeros(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> Bool
 
 
 def with_signs(measurement: Measurement, like: Measurement | None = None) -> Measurement:
-    """The measurement with the signs that a passive body gives, if all its voltages have one sign, as magnitudes have,
-    or the opposite sign of those of the same sensor, `like`; with a note if any is changed."""
+    """The measurement with corrected signs of the voltages, and a note if a sign is changed. If all voltages have the
+    same sign, i.e. are magnitudes, they receive the signs of a passive body; if they have the opposite signs of `like`,
+    a measurement of the same sensor, all signs are reversed."""
     values, usable = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     if like is not None and like.protocol.same_patterns(measurement.protocol):
         common_channels = usable.all(axis=0) & np.asarray(like.mask).all(axis=0)
@@ -115,8 +118,8 @@ def _with_voltages(measurement: Measurement, values, note: str) -> Measurement:
 
 
 def _signs(measurement: Measurement) -> Float[np.ndarray, " M"] | None:
-    """Signs (M,) of the voltages of a passive body, 0 where they depend on it; None if electrodes are not known to
-    follow each other along an edge, or around a solid at one height."""
+    """Signs (channels,) of the voltages of a passive body, 0 for signs that depend on the body; None if electrodes are
+    not known to follow each other along an edge, or around a solid at one height."""
     order = boundary_order(measurement)
     if order is None and isinstance(measurement.domain, Solid) and measurement.electrodes is not None:
         height = np.asarray(getattr(measurement.electrodes, "position", np.zeros((0, 3))))[:, -1]
@@ -127,7 +130,7 @@ def _signs(measurement: Measurement) -> Float[np.ndarray, " M"] | None:
 
 def channel_gains(measurement: Measurement) -> tuple[Float[np.ndarray, " K"] | None, float | None]:
     """Gains of the measurement patterns, with a geometric mean of 1, for which the first frame obeys reciprocity best,
-    and the reciprocity error that is left; None if reciprocity does not determine them."""
+    and the remaining reciprocity error; None if reciprocity does not determine the gains."""
     protocol, values = measurement.protocol, np.asarray(measurement.voltages)[0]
     pairs, ratio = protocol.reciprocal_pairs()
     is_used = np.asarray(measurement.mask)[0] & (values != 0)

@@ -1,8 +1,8 @@
-"""Safe reading and writing of files: files from any source are read within limits, as plain numbers and text, and files
-are written either completely or not at all.
+"""Safe reading and writing of files: only numbers and text are read, within limits on size, and a file is written
+either completely or not at all.
 
-Nothing in a file is executed, and its size is checked before memory is allocated for its content: see
-`jeit/files/limits.py` for the limits, and how to raise them.
+Nothing in a file is executed, and the size of its content is checked before memory is allocated. `jeit/files/limits.py`
+states the limits, and how to raise them.
 """
 
 from __future__ import annotations

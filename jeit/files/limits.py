@@ -1,5 +1,5 @@
-"""Limits on files that are read: memory, number of electrodes, nesting; and readers of text, TOML and JSON within
-them."""
+"""Limits on files that are read (memory, number of electrodes, nesting), and readers of text, TOML and JSON files that
+respect the limits."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class TooLarge(ValueError):
 
 
 def check_memory(name: str, size: float) -> None:
-    """Raise `TooLarge`, a `ValueError`, if the content of the file `name` needs more memory than allowed: `size` is in
-    bytes.
+    """Raise `TooLarge`, a `ValueError`, if `size`, the memory in bytes for the content of the file `name`, exceeds the
+    limit.
 
     The limit is a gigabyte, or the value of the environment variable JEIT_FILE_GB, in gigabytes.
     """
@@ -46,13 +46,13 @@ def check_electrodes(name: str, num_electrodes: int) -> None:
 
 
 def most_bytes() -> float:
-    """Maximum memory in bytes for the content of a file, from the environment. Raises `ValueError` if the variable is
-    not a positive number."""
+    """Maximum memory in bytes for the content of a file, from the environment variable JEIT_FILE_GB. Raises
+    `ValueError` if the variable is not a positive number."""
     return 1e9 * _max_gigabytes()
 
 
 def _max_gigabytes() -> float:
-    """Maximum memory in gigabytes for the content of a file, from the environment."""
+    """Maximum memory in gigabytes for the content of a file, from the environment variable JEIT_FILE_GB."""
     try:
         gigabytes = float(os.environ.get(_LIMIT_VARIABLE, _DEFAULT_GIGABYTES))
     except ValueError:
@@ -74,8 +74,8 @@ ALL = "; there are "
 
 
 def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) -> str:
-    """Combine several faults in the file `origin` into one message: the first of the `sentences` in any case, further
-    ones as far as there is room, and up to ten of the `keys` of the others."""
+    """Combine several faults in the file `origin` into one error message. It contains the first of the `sentences`,
+    further sentences as far as there is room, and the `keys` of up to ten of the remaining faults."""
     first_sentence = cut(f"{cut(origin, 2 * KEY)}: {sentences[0]}", _MAX_MESSAGE - 20)
     num_shown = 1
     for num_sentences in range(min(len(sentences), _MAX_SENTENCES), 0, -1):
@@ -103,7 +103,8 @@ def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) 
 
 
 def _further_faults(keys: Sequence[str], num_faults: int, max_keys: int) -> list[str]:
-    """Sentences about `num_faults` further faults; at most `max_keys` of them are named by their keys."""
+    """Sentences about `num_faults` further faults in a file; at most `max_keys` faults are named by their keys in the
+    file."""
     named_keys = keys[:max_keys]
     sentences = [f"Wrong too: {', '.join(named_keys)}."] if named_keys else []
     return [*sentences, f"And {num_faults - len(named_keys)} more."] if num_faults > len(named_keys) else sentences
@@ -119,11 +120,11 @@ _MAX_REASON = 120
 
 @contextmanager
 def read_as(message: str) -> Iterator[None]:
-    """Context for reading files with other packages: their errors become a `ValueError` with the text `message`, such
-    as "not a readable WAV file", and the reason in brackets. Errors about a missing file or missing permission are
-    passed on.
+    """Context for reading files with other packages: errors of these packages become a `ValueError` with the text
+    `message`, such as "not a readable WAV file", and the reason in brackets. Errors about a missing file or missing
+    permission are raised unchanged.
 
-    Warnings of the packages are suppressed, since a file that can be read counts as valid.
+    Warnings of the packages are suppressed, because a file that can be read counts as valid.
     """
     try:
         with warnings.catch_warnings():
@@ -141,17 +142,18 @@ def reason(error: Exception) -> str:
     return text if len(text) <= _MAX_REASON else f"{text[: _MAX_REASON - 1]}…"
 
 
-# Maximum size in bytes of a hand-written file; bytes of memory per byte of text.
+# Maximum size in bytes of a hand-written TOML file; bytes of memory per byte of text.
 _MAX_TOML_BYTES, _BYTES_PER_CHARACTER = 2**22, 4
 # Maximum number of parts of a dotted key.
 _MAX_KEY_PARTS = 32
 
 
 def read_text(path: str | Path, *, encoding: str = "utf-8", max_bytes: int | None = None) -> str:
-    """Read the text of a file of at most `max_bytes` bytes, or at most what fits in memory (`check_memory`).
+    """Read the text of a file of at most `max_bytes` bytes; without `max_bytes`, the memory limit of `check_memory`
+    applies.
 
-    Raises `ValueError`, with the file's name, for larger files, `UnicodeError`, which is a `ValueError`, for files that
-    are not text, and `OSError` if the file does not exist.
+    Raises `ValueError`, with the file's name, if the file is larger, `UnicodeError` (a `ValueError`) if it is not text,
+    and `OSError` if it does not exist.
     """
     path = Path(path)
     check_size(path, max_bytes)
@@ -174,7 +176,7 @@ def check_size(path: Path, max_bytes: int | None = None) -> None:
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """Read the tables of a hand-written TOML file. Raises `ValueError`, with the file's name and the line, for invalid
+    """Read the content of a hand-written TOML file. Raises `ValueError`, with the file's name and the line, for invalid
     TOML, and `OSError` if the file does not exist."""
     return parsed_toml(read_text(path, max_bytes=_MAX_TOML_BYTES), Path(path).name)
 
@@ -192,7 +194,7 @@ def parsed_toml(text: str, name: str) -> dict[str, Any]:
 
 
 def _max_dots(line: str) -> int:
-    """Maximum number of dots in a key on a line of TOML: the parser's time grows with its square."""
+    """Maximum number of dots in a key on a line of TOML: the parser's time grows with the square of that number."""
     if "=" not in line:
         return line.count(".") if line.lstrip().startswith("[") and "," not in line else 0
     prefixes = [part.rpartition("{")[2].rpartition(",")[2] for part in line.split("=")[:-1]]

@@ -1,7 +1,7 @@
-"""Reader of numeric variables in MATLAB files, with error messages that say what to do.
+"""Reader of numeric variables in MATLAB files, with error messages that tell the user what to do.
 
-Numeric arrays of format 5 ("MAT-File Format" by The MathWorks) are decoded here instead of by SciPy, whose reader can
-be crashed by crafted files. Nothing is decompressed beyond the size that the file declares.
+This module decodes numeric arrays of format 5 ("MAT-File Format" by The MathWorks) without SciPy, because crafted files
+can crash SciPy's reader. Compressed data are decompressed only up to the size that the file declares.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ import scipy.io
 from jeit.arguments import listed
 from jeit.files.limits import check_memory, read_as
 
-# Length in bytes of the file header, and of the beginning of an element, which holds flags, shape and name; type
+# Length in bytes of the file header, and of the beginning of an element, which contains flags, shape and name; type
 # numbers of elements.
 _HEADER_BYTES, _PREFIX_BYTES = 128, 4096
 _MATRIX_TYPE, _COMPRESSED_TYPE = 14, 15
-# Class numbers of arrays in the file: of sparse arrays, and of numeric arrays with their NumPy types.
+# Numbers that identify classes of arrays in the file: the number of sparse arrays, and the NumPy types of numeric
+# arrays by number.
 _SPARSE_CLASS = 5
 _NUMERIC_CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
 # NumPy types of stored numbers by their type number in the file; flag of complex arrays.
 _STORED_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _COMPLEX_FLAG = 0x800
-# Maximum number of bytes of one number in memory, and of everything else in an element.
+# Maximum number of bytes of one number in memory, and of the parts of an element other than its numbers.
 _MAX_NUMBER_BYTES, _MAX_OTHER_BYTES = 16, 2**16
 
 
@@ -50,7 +51,7 @@ class _Variable(NamedTuple):
 
 
 def variable_names(path: Path) -> set[str]:
-    """Names of the variables in a .mat file. Raises `ValueError` when it is not a readable .mat file."""
+    """Names of the variables in a .mat file. Raises `ValueError` if the file is not a readable .mat file."""
     if _is_format_4(path):
         with read_as(_unreadable_message(path)):
             return {name for name, _, _ in scipy.io.whosmat(str(path))}
@@ -58,7 +59,8 @@ def variable_names(path: Path) -> set[str]:
 
 
 def shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """Shapes of the numeric variables in a .mat file, by name. Raises `ValueError` as `variable_names`."""
+    """Shapes of the numeric variables in a .mat file, by name. Raises `ValueError` if the file is not a readable .mat
+    file."""
     if _is_format_4(path):
         with read_as(_unreadable_message(path)):
             return {name: shape for name, shape, kind in scipy.io.whosmat(str(path)) if kind != "char"}
@@ -70,8 +72,8 @@ def shapes(path: Path) -> dict[str, tuple[int, ...]]:
 
 
 def load(path: Path, *names: str) -> dict[str, np.ndarray]:
-    """Read those of the variables `names` that are numeric. Sparse matrices are converted to dense arrays; the key
-    "" holds the names of all variables in the file. Other variables are not unpacked.
+    """Read the numeric variables among `names` from a .mat file. Sparse matrices are converted to dense arrays; the key
+    "" contains the names of all variables in the file. Other variables are not decompressed.
 
     Raises `ValueError` if the file cannot be read, and if the variables would not fit in memory (`check_memory`).
     """
@@ -92,7 +94,7 @@ def load(path: Path, *names: str) -> dict[str, np.ndarray]:
 
 
 def numbers(content: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
-    """The numeric variable `key`. Raises `ValueError` if it is missing or not numeric."""
+    """The numeric variable `key` of a .mat file. Raises `ValueError` if the variable is missing or not numeric."""
     if key not in content and key in content[""]:
         raise ValueError(f"{path.name}: variable '{key}' holds other things, not numbers.")
     if key not in content:
@@ -104,7 +106,7 @@ def numbers(content: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
 
 
 def _dense_arrays(content: dict, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Arrays that SciPy read from a file of format 4, with sparse matrices converted to dense arrays."""
+    """Arrays `names` that SciPy read from a .mat file of format 4; sparse matrices are converted to dense arrays."""
     arrays = {name: content[name] for name in names if name in content}
     return {name: value.toarray() if hasattr(value, "toarray") else value for name, value in arrays.items()}
 
@@ -114,15 +116,15 @@ def _unreadable_message(path: Path) -> str:
 
 
 def _is_format_4(path: Path) -> bool:
-    """Whether a file is of format 4, which begins with a number below 5,000, where other formats begin with text.
-    Raises `TooLarge`."""
+    """Whether a .mat file is of format 4, which begins with a number below 5,000; other formats begin with text. Raises
+    `TooLarge` if the file exceeds the memory limit."""
     check_memory(path.name, path.stat().st_size)
     with path.open("rb") as file:
         return 0 in file.read(4)
 
 
 def _variables(path: Path) -> list[_Variable]:
-    """Headers of the variables in a file of format 5. Raises `ValueError` for other formats."""
+    """Headers of the variables in a .mat file of format 5. Raises `ValueError` for other formats."""
     content = path.read_bytes()
     if len(content) >= _HEADER_BYTES and (content[:8] == b"\x89HDF\r\n\x1a\n" or 2 in content[124:126]):
         raise ValueError(
@@ -133,7 +135,8 @@ def _variables(path: Path) -> list[_Variable]:
 
 
 def _elements(content: bytes) -> Iterator[_Variable]:
-    """Headers of the arrays in the file, in their order; of compressed arrays only the beginning is decompressed."""
+    """Headers of the arrays in a .mat file, in the order of the file; only the beginning of a compressed array is
+    decompressed."""
     if len(content) < _HEADER_BYTES or content[126:128] not in (b"IM", b"MI"):
         raise ValueError("it is of another kind")
     order = "<" if content[126:128] == b"IM" else ">"
@@ -155,8 +158,8 @@ def _elements(content: bytes) -> Iterator[_Variable]:
 
 
 def _header(prefix: bytes, order: str) -> tuple[str, tuple[int, ...], int, bool, int]:
-    """Name, shape, class, whether complex, and offset of the numbers, read from the first three sub-elements of an
-    array."""
+    """Name, shape, class number, whether the array is complex, and offset of its numbers in bytes; read from the first
+    three sub-elements of an array in a .mat file."""
     _, flags, offset = _sub_element(prefix, 0, order)
     _, shape, offset = _sub_element(prefix, offset, order)
     _, name, offset = _sub_element(prefix, offset, order)
@@ -168,8 +171,8 @@ def _header(prefix: bytes, order: str) -> tuple[str, tuple[int, ...], int, bool,
 
 
 def _sub_element(content: bytes, offset: int, order: str) -> tuple[int, bytes, int]:
-    """Type and bytes of a sub-element, and the offset of the next one. Sub-elements of four bytes or less are stored
-    inside their own tag."""
+    """Type number and bytes of a sub-element of a .mat file, and the offset of the next sub-element. A sub-element of
+    at most four bytes is stored inside its own tag."""
     kind = struct.unpack_from(f"{order}I", content, offset)[0]
     if kind >> 16:
         kind, size, start, next_offset = kind & 0xFFFF, kind >> 16, offset + 4, offset + 8
@@ -182,7 +185,7 @@ def _sub_element(content: bytes, offset: int, order: str) -> tuple[int, bytes, i
 
 
 def _numbers(content: bytes, offset: int, order: str) -> tuple[np.ndarray, int]:
-    """Numbers of a sub-element, and the offset of the next one."""
+    """Numbers of a sub-element of a .mat file, and the offset of the next sub-element."""
     kind, raw_bytes, offset = _sub_element(content, offset, order)
     if kind not in _STORED_TYPES:
         raise ValueError(f"an array of it is stored as type {kind}")
@@ -190,7 +193,7 @@ def _numbers(content: bytes, offset: int, order: str) -> tuple[np.ndarray, int]:
 
 
 def _values(variable: _Variable) -> np.ndarray:
-    """The numbers of a variable as an array of its shape; sparse matrices are converted to dense arrays."""
+    """The numbers of a variable of a .mat file as an array; a sparse matrix is converted to a dense array."""
     content, offset, order = _decompressed(variable), variable.numbers_start, variable.order
     rows = column_starts = None
     if variable.kind == _SPARSE_CLASS:
@@ -209,8 +212,8 @@ def _values(variable: _Variable) -> np.ndarray:
 
 
 def _decompressed(variable: _Variable) -> bytes:
-    """Content of an element without its tag, decompressed. Raises `ValueError` if it is larger than its shape
-    implies."""
+    """Decompressed content of an element of a .mat file, without its tag. Raises `ValueError` if the content is larger
+    than the declared shape implies."""
     if not variable.is_compressed:
         return variable.content
     max_bytes = variable.size + _MAX_OTHER_BYTES

@@ -1,5 +1,5 @@
-"""Safe reading of NPZ and NPY files: only numbers and text, never objects that could be executed, and no more data than
-the headers declare."""
+"""Safe reading of NPZ and NPY files: only numbers and text are read, never objects that could be executed, and no more
+data than the headers declare."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 from jeit.files.limits import TooLarge, check_memory, reason
 
 _NUM_COPIES = 2
-# Maximum size in bytes of an archive member that is not an array, such as a JSON header.
+# Maximum size in bytes of a file in an NPZ archive that is not an array, such as a JSON header.
 _MAX_TEXT_BYTES = 2**24
 _NPY_MARK, _ZIP_MARK = b"\x93NUM", b"PK\x03\x04"
 # Errors that NumPy and zipfile raise for files that are damaged, encrypted, or compressed by an unknown method.
@@ -40,12 +40,11 @@ FAULTS = (
 def npz_arrays(
     path: Path, *keys: str, otherwise: str = "not an NPZ file", read_all: bool = False
 ) -> dict[str, np.ndarray]:
-    """Read the arrays `keys` of an NPZ file, or all arrays if `read_all`, omitting missing ones. The entry "" contains
-    the names of all arrays in the file.
+    """Read the arrays `keys` of an NPZ file, or all arrays if `read_all`; missing arrays are omitted. The entry "" of
+    the result contains the names of all arrays in the file.
 
-    Other arrays are not read. Raises `ValueError` for files that are not NPZ files (with the text `otherwise`), damaged
-    files, arrays of objects, and arrays that exceed the memory limit (`check_memory`); `OSError` if the file does not
-    exist.
+    Raises `ValueError` for files that are not NPZ files (with the text `otherwise`), damaged files, arrays of objects,
+    and arrays that exceed the memory limit (`check_memory`). Raises `OSError` if the file does not exist.
     """
     with path.open("rb") as file:
         mark = file.read(4)
@@ -74,8 +73,8 @@ def npz_arrays(
 
 
 def npy_array(path: Path) -> np.ndarray:
-    """Read the array of an NPY file. Raises `ValueError` as `npz_arrays` does, and `OSError` if the file does not
-    exist."""
+    """Read the array of an NPY file. Raises `ValueError` for the same faults as `npz_arrays`, and `OSError` if the file
+    does not exist."""
     with path.open("rb") as file:
         try:
             header = _header(file)
@@ -92,8 +91,9 @@ def npy_array(path: Path) -> np.ndarray:
 
 
 def check_archive(path: Path) -> None:
-    """Raise `ValueError` for a file that is not an archive, and for an archive of arrays and text whose content exceeds
-    the memory limit (`check_memory`), or in which an array is smaller than its header declares."""
+    """Raise `ValueError` for a file that is not a readable ZIP archive, for an archive of arrays and text whose content
+    exceeds the memory limit (`check_memory`), and for an archive with an array that is smaller than its header
+    declares."""
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
@@ -110,7 +110,8 @@ def check_archive(path: Path) -> None:
 
 
 def need(arrays: dict[str, np.ndarray], *keys: str) -> None:
-    """Raise `ValueError` if one of the arrays `keys` is missing; the message lists the arrays of the file."""
+    """Raise `ValueError` if one of the arrays `keys` is missing in `arrays`; the message lists the arrays of the
+    file."""
     missing_keys = [key for key in keys if key not in arrays]
     if missing_keys:
         array_names = ", ".join(str(name)[:40] for name in arrays[""][:12]) or "nothing"
@@ -123,17 +124,17 @@ class _Header(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Size of the data in bytes."""
+        """Size of the array's data in bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
     @property
     def memory(self) -> int:
-        """Memory in bytes for two copies of the data in double precision."""
+        """Memory in bytes for two copies of the array in double precision."""
         return _NUM_COPIES * math.prod(self.shape) * max(self.dtype.itemsize, 8)
 
 
 def _header(file: IO[bytes]) -> _Header:
-    """Read the header of an array."""
+    """Read the header of an array (shape and type) from an NPY file."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise ValueError(f"an array of it is in format {version}")
@@ -147,7 +148,8 @@ def _header(file: IO[bytes]) -> _Header:
 
 
 def _member_header(archive: zipfile.ZipFile, name: str, member: zipfile.ZipInfo) -> _Header:
-    """Read the header of an archive member, and check that the member is as large as the header declares."""
+    """Read the header of an array in an NPZ archive, and check that the stored array is as large as the header
+    declares."""
     if not member.filename.endswith(".npy"):
         raise ValueError(f"'{name[:40]}' in it is a file of another kind")
     with archive.open(member) as file:

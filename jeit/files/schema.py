@@ -1,4 +1,5 @@
-"""Validation of hand-written files: tables of keys with types, ranges and units. All faults are reported at once.
+"""Validation of hand-written TOML and JSON files against tables of keys with types, ranges and units. All faults of a
+file are reported at once.
 
 A table is defined by a class derived from `Table`, with one line per key:
 
@@ -31,15 +32,16 @@ from jeit.files.limits import ALL, KEY, cut, faults_message
 
 # Maximum number of characters of a list of names in a message.
 _MAX_LIST_LENGTH = 160
-# Keys of sizes that a message mentions along with the shape that is probably meant.
+# Keys of sizes that an error message mentions together with the shape that the user probably means.
 _SIZE_KEYS = ("radius", "width", "depth", "height", "vertices", "tags")
 _MAX_FLOAT = sys.float_info.max
-# Maximum number of unknown keys of a table that are examined.
+# Maximum number of unknown keys of a table that are checked and reported.
 _MAX_UNKNOWN_KEYS = 100
 
 
 class Table(BaseModel):
-    """Base class of the tables of a file: rejects unknown keys, and text or booleans where a number is expected."""
+    """Base class of the tables of a hand-written file: rejects unknown keys, and text or booleans where a number is
+    expected."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True, defer_build=True)
 
@@ -51,7 +53,7 @@ class Table(BaseModel):
     @model_validator(mode="wrap")
     @classmethod
     def _word_faults(cls, value: Any, validate: Callable[[Any], Any]) -> Any:
-        """Convert each fault to a sentence that begins with the key."""
+        """Validate a table of a file, and convert each fault to a sentence that begins with the faulty key."""
         if isinstance(value, Mapping) and len(value) > len(cls.model_fields) + _MAX_UNKNOWN_KEYS:
             # Otherwise each of possibly a million unknown keys would be reported.
             unknown = itertools.islice((key for key in value if key not in cls.model_fields), _MAX_UNKNOWN_KEYS)
@@ -67,8 +69,8 @@ class Table(BaseModel):
 
     @classmethod
     def _with_known_spelling(cls, table: Mapping[Any, Any]) -> dict[Any, Any]:
-        """Return the table; text values that differ from an allowed word only by hyphens and underscores are replaced
-        by that word."""
+        """Copy of the table, in which text values that differ from an allowed word only by hyphens and underscores are
+        replaced by the allowed word."""
         key_annotations = {key: field.annotation for key, field in cls.model_fields.items()}
         return {
             key: spelled(value, _allowed_words(key_annotations[key])) if key in key_annotations else value
@@ -120,14 +122,15 @@ Words = Annotated[list[Word], FailFast()]
 
 
 def spelled(value: Any, words: Iterable[str]) -> Any:
-    """Return the word in `words` that differs from `value` by hyphens and underscores alone, or `value`."""
+    """Return the word in `words` that differs from `value` only by hyphens and underscores; `value` if there is no such
+    word."""
     if not isinstance(value, str):
         return value
     return next((word for word in words if word.replace("_", "-") == value.replace("_", "-")), value)
 
 
 def _allowed_words(annotation: Any) -> list[str]:
-    """Words that a key with this annotation may have."""
+    """Words that are allowed as the value of a key with this type annotation."""
     arguments = get_args(annotation)
     if get_origin(annotation) is Literal:
         return [argument for argument in arguments if isinstance(argument, str)]
@@ -135,8 +138,8 @@ def _allowed_words(annotation: Any) -> list[str]:
 
 
 def fault(message: str, key: str = "") -> PydanticCustomError:
-    """Error for checks of a table to raise: the message `message` about the `key` in the table, or about the table
-    itself. The name is put before the message."""
+    """Error that the checks of a table raise: a `message` about the `key` in the table, or about the whole table if
+    `key` is empty. The name of the key or table is put before the message."""
     return PydanticCustomError("fault", "{said}", {"said": message, "key": key})
 
 
@@ -144,8 +147,8 @@ def fault(message: str, key: str = "") -> PydanticCustomError:
 class Number:
     """Annotation of a key whose value is a number from `low` to `high`, an integer if the key has type int.
 
-    If the type is a list, the key can be swept: its value is a number, or a list of distinct numbers. `beyond`: message
-    about numbers that are too large.
+    If the type is a list, the key can be swept: its value is a number, or a list of distinct numbers. `beyond`: error
+    message for numbers that are too large.
     """
 
     low: float
@@ -167,7 +170,7 @@ class Number:
         return core_schema.no_info_plain_validator_function(read)
 
     def read(self, value: Any, is_integer: bool = False, otherwise: str = "") -> float:
-        """Check and convert a number. Raises `fault` for invalid values."""
+        """Check a value and convert it to a number. Raises the error `fault` for invalid values."""
         if not _is_number(value, is_integer):
             expected = "a whole number" if is_integer else "a number"
             raise fault(f"must be {expected}{otherwise}, {self.span}; it is {describe(value)}.")
@@ -181,14 +184,15 @@ class Number:
 
     @property
     def span(self) -> str:
-        """The range and the unit, as text."""
+        """The allowed range and the unit, as text."""
         low = "above 0" if 0 < self.low < 1e-300 else f"from {_number_text(self.low)}"
         high = " up" if low[0] == "f" else ""
         high = high if math.isinf(self.high) else f" to {_number_text(self.high)}"
         return f"{low}{high}{f' {self.unit}' if self.unit else ''}"
 
     def _hint(self, value: float) -> str:
-        """Propose a value for a number that is off by a factor of 1000; not for units without such prefixes."""
+        """Text that proposes a value for a number that is too large or too small by a factor of 1000; empty for units
+        without a prefix such as milli."""
         if self.unit in ("", "%", "degrees") or math.isinf(self.high) or abs(value) > 1e100:
             return ""
         for is_larger, metric in ((True, "metres"), (False, "micrometres")):
@@ -203,10 +207,11 @@ class Number:
 
 @dataclass(frozen=True)
 class Numbers:
-    """Annotation of a key whose value is an array of numbers from `low` to `high`, of integers, or of booleans; `kind`
-    is the type.
+    """Annotation of a key whose value is an array of numbers from `low` to `high`, or of booleans; `kind` is the type
+    of the items.
 
-    `axes`: minimum and maximum length of each axis. `single`: whether one number for all is accepted, too.
+    `axes`: minimum and maximum length of each axis. `single`: whether a single number instead of an array is accepted,
+    too.
     """
 
     axes: tuple[tuple[int, float], ...]
@@ -270,8 +275,8 @@ class Numbers:
 
 
 class Swept:
-    """Annotation of a key whose value is a list of distinct items; a value that is not a list counts as a list of
-    one."""
+    """Annotation of a key whose value is a list of distinct items; a value that is not a list counts as a list of one
+    item."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         def read(value: Any, validate: Callable[[list], list]) -> list:
@@ -295,10 +300,12 @@ Several = Annotated[list[Item], FailFast(), Swept()]
 
 
 class OneOf:
-    """Annotation of a key whose value is one of several tables, chosen by the word under `key` in it.
+    """Annotation of a key whose value is one of several kinds of table; the word under `key` in the value selects the
+    kind.
 
-    Without that word, the table with a default for `key` is chosen. If the key `mark` is present, the table `other` is
-    chosen. `meant`: other words that users may write, and the valid word that each probably means.
+    If `key` is missing, the kind with a default for `key` is selected. If `alternative_key` is present, the kind
+    `alternative_table` is selected. `synonyms`: other words that users may write, and the valid word that each probably
+    means.
     """
 
     def __init__(
@@ -333,7 +340,8 @@ class OneOf:
         return self.tables[word].model_validate({**value, self.key: word})
 
     def _suggestion(self, word: Any) -> str:
-        """Text that proposes the valid word that is probably meant by `word`, with the sizes that it needs."""
+        """Text that proposes the valid word that is probably meant by `word`, with the keys of sizes that this kind of
+        table needs."""
         valid_word = self.synonyms.get(word.lower().rstrip("s")) if isinstance(word, str) else None
         if valid_word is None:
             return ""
@@ -346,8 +354,9 @@ class OneOf:
 
 
 def validated(table: type[T], content: Any, origin: str) -> T:
-    """Validate `content` and return the table. Raises one `ValueError` of at most 400 characters that begins with
-    `origin`, the file's name, and has a sentence on each faulty key, or on as many as there is room for."""
+    """Validate the `content` of a file and return it as a `table`. Raises one `ValueError` of at most 400 characters,
+    which begins with `origin`, the file's name, and has a sentence about each faulty key, or about as many keys as
+    there is room for."""
     try:
         return table.model_validate(content)
     except ValidationError as error:
@@ -358,20 +367,20 @@ def validated(table: type[T], content: Any, origin: str) -> T:
 
 
 def not_among(value: Any, words: Iterable[str], suggestion_text: str = "") -> str:
-    """Message about a word that is not one of `words`; `suggestion_text`: text that proposes a word, if known."""
+    """Error message for a value that is not one of `words`; `suggestion_text`: text that proposes a word."""
     known_words = [*words]
     suggestion = suggestion_text or did_you_mean(value[:KEY] if isinstance(value, str) else value, known_words)
     return f"must be one of {_list_names(known_words)}; it is {describe(value)}{suggestion}."
 
 
 def _fault_path(error: Any) -> tuple[int | str, ...]:
-    """Path of keys to a fault."""
+    """Path of keys and indices that leads to a faulty value in a file."""
     key = error.get("ctx", {}).get("key")
     return (*error["loc"], key) if key else error["loc"]
 
 
 def _full_key_name(path: tuple[int | str, ...]) -> str:
-    """Full name of the key that a fault is about, such as microphones[3].b."""
+    """Full name of a faulty key in a file, such as microphones[3].b."""
     name = ""
     for part in path:
         name += f"[{part}]" if isinstance(part, int) else f"{'.' if name else ''}{_short_key(part)}"
@@ -384,7 +393,7 @@ def _short_key(name: str) -> str:
 
 
 def _swept_values(value: Any) -> list:
-    """Values of a swept key as a list."""
+    """The value of a swept key as a list; a single value becomes a list of one item."""
     if not isinstance(value, list):
         return [value]
     if not value:

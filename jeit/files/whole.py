@@ -1,5 +1,5 @@
-"""Atomic writing of files: a new file is written beside the old one, and replaces it once it is completely on the
-disk."""
+"""Atomic writing of files: a new file is written beside the old file, and replaces the old file once it is completely
+on the disk."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 
 def boot_identifier() -> str:
-    """Identifier of the current boot of the system, which containers share; "" if unknown."""
+    """Identifier of the current boot of the operating system, which is the same in all containers; "" if unknown."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
@@ -23,7 +23,7 @@ def boot_identifier() -> str:
 
 
 def is_alive(pid: object) -> bool:
-    """Whether a process of this machine is running; True if unknown."""
+    """Whether the process `pid` of this machine is running; True if unknown."""
     if os.name != "posix" or not isinstance(pid, int) or isinstance(pid, bool) or pid <= 0:
         return True
     try:
@@ -40,8 +40,8 @@ _UNFINISHED_NAME = re.compile(r"\.jeit-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.part")
 
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[BinaryIO]:
-    """Context that yields a file to write to, which replaces `path` once it is completely on the disk. If the process
-    is killed before that, the old file remains.
+    """Context that yields a temporary file to write to, which replaces `path` once it is completely on the disk. If the
+    process is killed earlier, the old file remains.
 
     A link at `path` is replaced, not followed. Raises `OSError` if the file cannot be written.
     """
@@ -60,7 +60,8 @@ def written_whole(path: str | Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def whole_files(folder: Path) -> Iterator[Path]:
-    """Context that yields a folder to write several files to, which are moved to `folder` once all of them are written.
+    """Context that yields a temporary folder to write several files to; the files are moved to `folder` once all of
+    them are written.
 
     Links in `folder` with the same names are replaced, not followed. Raises `OSError` if the files cannot be written.
     """
@@ -79,7 +80,7 @@ def whole_files(folder: Path) -> Iterator[Path]:
 
 
 def clear_unfinished(folder: Path) -> None:
-    """Remove unfinished files that killed processes of this machine have left in a folder."""
+    """Remove unfinished temporary files that killed processes of this machine have left in a folder."""
     with suppress(OSError):
         for path in folder.iterdir():
             match = _UNFINISHED_NAME.fullmatch(path.name)

@@ -1,4 +1,4 @@
-"""Image a device's frames while they come: sources of frames, recordings, and a page in the browser."""
+"""Live imaging of the frames that a device sends: sources of frames, recordings, and a page in the browser."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Connections that deliver bytes: standard input, a serial device, and a server. The last two are made again when they
-are lost."""
+"""Connections that deliver bytes: standard input, a serial device, and a TCP server. Lost connections to a device or
+server are made again."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from jeit.arguments.extras import optional
 
 _MAX_READ_BYTES = 65536
 _ERRNO_PREFIX = re.compile(r"^\[Errno \d+\] ")
-# Maximum time in seconds until a server answers.
+# Maximum time in seconds in which a server must answer.
 _CONNECT_TIMEOUT = 5.0
 _DEFAULT_BAUD, _MAX_BAUD = 115_200, 20_000_000
 
 
 class AbstractConnection(abc.ABC):
-    """Base class of connections. **Attribute** `reconnects`: whether to connect again when the connection is lost."""
+    """Base class of connections that deliver bytes. **Attribute** `reconnects`: whether to connect again when the
+    connection is lost."""
 
     reconnects: bool = True
 
@@ -32,18 +33,19 @@ class AbstractConnection(abc.ABC):
 
     @abc.abstractmethod
     def read(self, timeout: float) -> bytes | None:
-        """Wait for bytes, and return them. Returns b"" if none arrive within `timeout` seconds, and None at the end.
+        """Wait for bytes, and return them. Returns b"" if no bytes arrive within `timeout` seconds, and None at the end
+        of the data.
 
         Raises `OSError` if the connection is lost.
         """
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Disconnect; does nothing if there is no connection."""
+        """Disconnect; does nothing if the connection is not open."""
 
 
 class StandardInput(AbstractConnection):
-    """Bytes of standard input, or of another open file."""
+    """Connection that delivers the bytes of standard input, or of another open file."""
 
     reconnects = False
 
@@ -64,11 +66,12 @@ class StandardInput(AbstractConnection):
         return os.read(self.descriptor, _MAX_READ_BYTES) or None
 
     def close(self) -> None:
-        """Do nothing: the file is closed by the program that opened it."""
+        """Do nothing: the program that opened the file closes it."""
 
 
 class SerialPort(AbstractConnection):
-    """A serial device at `port`, such as /dev/ttyACM0 or COM3, with 8 data bits, no parity and one stop bit.
+    """Connection to a serial device at `port`, such as /dev/ttyACM0 or COM3, with 8 data bits, no parity and one stop
+    bit.
 
     Raises `ImportError` without pyserial.
     """
@@ -82,7 +85,7 @@ class SerialPort(AbstractConnection):
         """Connect; see `AbstractConnection.open`."""
         try:
             self.device = self.serial.Serial(self.port, self.baud, timeout=0.2, exclusive=True)
-        except ValueError as error:  # a rate that the driver does not know
+        except ValueError as error:  # a baud rate that the driver does not support
             raise OSError(str(error)) from None
         except OSError as error:
             port_names = ", ".join(self._list_ports()) or "none"
@@ -96,7 +99,7 @@ class SerialPort(AbstractConnection):
             device.timeout = timeout
             first = device.read(1)
             return first + device.read(min(device.in_waiting, _MAX_READ_BYTES)) if first else b""
-        except TypeError:  # closed by another thread
+        except TypeError:  # the port was closed by another thread
             raise OSError("the port was closed") from None
 
     def close(self) -> None:
@@ -107,7 +110,7 @@ class SerialPort(AbstractConnection):
                 device.close()
 
     def _list_ports(self) -> list[str]:
-        with suppress(Exception):  # a system whose devices cannot be listed
+        with suppress(Exception):  # on some systems, devices cannot be listed
             from serial.tools import list_ports
 
             return sorted(port_info.device for port_info in list_ports.comports())[:8]
@@ -115,7 +118,7 @@ class SerialPort(AbstractConnection):
 
 
 class Server(AbstractConnection):
-    """A TCP server that sends frames to all connected clients."""
+    """Connection to a TCP server that sends frames to all connected clients."""
 
     def __init__(self, host: str, port: int):
         self.host, self.port = host, port
@@ -124,7 +127,7 @@ class Server(AbstractConnection):
     def open(self) -> None:
         """Connect; see `AbstractConnection.open`."""
         self.socket = socket.create_connection((self.host, self.port), timeout=_CONNECT_TIMEOUT)
-        # A server whose cable is unplugged sends nothing, not even an end.
+        # A server whose cable is unplugged sends nothing, not even the end of the connection.
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
 
     def read(self, timeout: float) -> bytes | None:

@@ -14,18 +14,18 @@ from jeit.live.pictures import LiveFrame
 from jeit.live.sources import CONNECTED, ENDED, AbstractSource
 
 # Minimum pause in seconds between two listings of the folder; minimum ratio of the pause to the duration of a listing,
-# for folders of many files; and time in seconds after which a file that cannot be read is refused, since the instrument
-# may still be writing it.
+# for folders of many files; and time in seconds after which an unreadable file is refused (earlier, the instrument may
+# still be writing it).
 _MIN_PAUSE, _PAUSE_FACTOR, _READ_TIMEOUT = 0.02, 4.0, 2.0
 
 
 class WatchedFolder(AbstractSource):
-    """Source of the frames in files that appear in a folder, in the order of their names. Files that exist already are
+    """Source of the frames in files that appear in a folder, in the order of file names. Files that already exist are
     left out, unless a `rate` in frames/s is given.
 
-    A file is read when its size is the same in two successive listings. `description`, `reference`: as `description`
-    and `like` of `jeit.data.read`. For a file that cannot be read, the error message is delivered as text, which a view
-    refuses.
+    A file is read when its size is the same in two successive listings of the folder. `description`, `reference`: as
+    `description` and `like` of `jeit.data.read`. For a file that cannot be read, the source delivers a frame whose
+    values are the error message, which views refuse.
     """
 
     def __init__(
@@ -69,8 +69,8 @@ class WatchedFolder(AbstractSource):
         self.connection = ENDED
 
     def _list_sizes(self) -> dict[str, int]:
-        """Return the sizes of the files in the folder by name. Hidden and temporary files are left out, since programs
-        write them before they rename them."""
+        """Sizes of the files in the folder by name. Hidden and temporary files are left out, because programs write
+        such files first and then rename them."""
         with os.scandir(self.folder) as entries:
             sizes = {}
             for entry in entries:
@@ -81,12 +81,12 @@ class WatchedFolder(AbstractSource):
                         and entry.is_file()
                     ):
                         sizes[entry.name] = entry.stat().st_size
-                except OSError:  # removed meanwhile
+                except OSError:  # the file was removed after the listing
                     continue
             return sizes
 
     def _read_file(self, name: str, size: int) -> Iterator[LiveFrame]:
-        """Yield the frames of a file if it is complete."""
+        """Yield the frames of a file if the file is complete."""
         previous_size, size_time = self._pending_files.get(name, (-1, time.monotonic()))
         if size != previous_size:
             size_time = time.monotonic()

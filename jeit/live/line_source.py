@@ -1,5 +1,5 @@
-"""Sources of frames: the lines of a connection, which is made again whenever it is lost; and frames that are read
-ahead."""
+"""Two sources of frames: lines that arrive on a connection, which is made again if it is lost; and another source that
+is read ahead in a separate thread."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from jeit.live.pictures import LiveFrame
 from jeit.live.sources import CONNECTED, ENDED, AbstractSource
 
 # Times in seconds: maximum wait for bytes in one read; initial and maximum delay before connecting again, which is
-# doubled with each failure; silence of a device after which it is reported; minimum interval between reported comments
-# of a device.
+# doubled with each failure; time without data after which a device is reported as silent; minimum interval between
+# reported comments of a device.
 _READ_TIMEOUT, _INITIAL_DELAY, _MAX_DELAY, _SILENCE_TIMEOUT, _MIN_NOTE_INTERVAL = 0.2, 0.25, 2.0, 3.0, 2.0
-# Maximum number of frames that wait for a program that does not read them yet.
+# Maximum number of frames that wait until the program reads them.
 _MAX_AHEAD = 20_000
 
 
 class LineSource(AbstractSource):
     """Source of the frames in the lines of a connection.
 
-    A line that is not a frame is delivered as text, which a view refuses. So are the remainder of a line when the
-    connection is lost, and a line that the device had begun before the connection. `rate`: maximum number of frames/s,
-    for lines that have all arrived already.
+    A line that is not a frame is delivered as text, which views refuse. Incomplete lines are also delivered as text: a
+    line that the loss of the connection cut off, and a line that the device began before the connection was made.
+    `rate`: maximum number of frames/s, for lines that have all arrived already.
     """
 
     def __init__(self, name: str, connection: AbstractConnection, reading: LineReading, rate: float | None = None):
@@ -51,7 +51,7 @@ class LineSource(AbstractSource):
             self.connection = ENDED
 
     def _connect(self) -> bool:
-        """Try to connect until it succeeds. Returns False if the source is closed before."""
+        """Try to connect until a connection is made. Returns False if the source is closed before that."""
         delay, last_error = _INITIAL_DELAY, ""
         while not self.closing.is_set():
             try:
@@ -71,7 +71,7 @@ class LineSource(AbstractSource):
         return False
 
     def _read_until_lost(self) -> Iterator[LiveFrame]:
-        """Yield frames until the connection is lost, or the source has ended or is closed."""
+        """Yield frames until the connection is lost, the source has ended, or the source is closed."""
         buffer, last_arrival, is_first = LineBuffer(), time.monotonic(), self.device.reconnects
         while not self.closing.is_set():
             try:
@@ -104,8 +104,8 @@ class LineSource(AbstractSource):
             yield from self._parse_line(remainder, time.monotonic())
 
     def _parse_line(self, line: bytes, arrived: float, *, is_first: bool = False) -> Iterator[LiveFrame]:
-        """Yield the frame in a line, if there is one. `is_first`: whether the connection may have begun within the
-        line."""
+        """Yield the frame in a line, if the line is not a comment. `is_first`: whether the connection may have begun
+        within the line."""
         values = self.reading(line)
         note = self.reading.note
         if note and note != self._last_note and (values is not None or arrived - self._note_time > _MIN_NOTE_INTERVAL):
@@ -124,8 +124,9 @@ class LineSource(AbstractSource):
 
 
 class ReadAhead(AbstractSource):
-    """Source that reads another source in a separate thread, so that frames keep the time of their arrival, and none is
-    lost, while a program prepares to image them. At most 20,000 frames wait; the loss of later ones is reported.
+    """Source that reads another source in a separate thread, so that frames keep the time of their arrival, and no
+    frame is lost, while a program prepares to image them. At most 20,000 frames wait; the loss of later frames is
+    reported.
     """
 
     def __init__(self, source: AbstractSource):

@@ -1,4 +1,5 @@
-"""Conversion of the bytes of a device to lines, and of the numbers in a line to volts, as the readers of files do."""
+"""Conversion of the bytes that a device sends to lines, and of the numbers in a line to volts, as in the readers of
+files."""
 
 from __future__ import annotations
 
@@ -19,13 +20,13 @@ from jeit.data.formats.text import LineNumbers
 MAX_LINE_BYTES = 2**18
 """Maximum length of a line in bytes. Longer lines are truncated."""
 _LINE_ENDS = re.compile(rb"[\r\n]")
-# Some devices of OpenEIT send no line ends, so a frame begins at this word.
+# Some OpenEIT devices send no line ends, so a frame begins at the word "magnitudes".
 _FRAME_WORD = re.compile(rb"magnitudes\s{0,40}:", re.IGNORECASE)
 _COMMENTS = ("#", "%", "//")
 # Maximum number of characters that are kept of a line that is not a frame.
 _MAX_TEXT_LENGTH = 400
 # Maximum relative difference from the reference for which a number is considered complete, and for which a frame is
-# used to determine the volts per number; maximum number of frames used for this purpose.
+# used to determine the factors from numbers to volts; maximum number of frames from which the factors are determined.
 _MAX_DIFFERENCE, _MAX_TRIES = 0.5, 20
 
 
@@ -41,7 +42,8 @@ class LineBuffer:
         self._is_truncated = False
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Append a chunk of bytes, and return the lines that are now complete, without line ends and empty lines."""
+        """Append a chunk of bytes to the buffer, and return the lines that are now complete, without line ends and
+        empty lines."""
         lines = []
         *complete_parts, remainder = _LINE_ENDS.split(data)
         for part in complete_parts:
@@ -55,7 +57,7 @@ class LineBuffer:
         return lines
 
     def take_remainder(self) -> bytes:
-        """Remove the incomplete line at the end, and return it."""
+        """Remove the incomplete line at the end of the buffer, and return it."""
         line = bytes(self._line) + ("…".encode() if self._is_truncated else b"")
         self._line.clear()
         self._is_truncated = False
@@ -68,18 +70,20 @@ class LineBuffer:
 
 
 def _split_at_words(line: bytes) -> list[bytes]:
-    """Split a line where the word "magnitudes" begins a frame within it. Empty lines are left out."""
+    """Split a line at each word "magnitudes" within it, because the word begins a new frame. Empty lines are left
+    out."""
     starts = [0, *(match.start() for match in _FRAME_WORD.finditer(line) if match.start() > 0), len(line)]
     pieces = (line[start:stop] for start, stop in itertools.pairwise(starts))
     return [piece for piece in pieces if piece.strip()]
 
 
 class LineReading:
-    """Converts lines to frames (M,) in volts, as `jeit.data.read` converts a file of such lines.
+    """Converts lines of numbers to frames (channels,) in volts, as `jeit.data.read` converts a file of the same lines.
 
-    `description`, `reference`: as `description` and `like` of `jeit.data.read`. The factor of each channel (unit, gain,
-    sign) is determined from the first frame that resembles the reference. Without a description and a reference,
-    numbers are volts. Raises `ValueError` for a description that is not valid, or whose frames are not single lines.
+    `description`, `reference`: as `description` and `like` of `jeit.data.read`. The factor from number to volts of each
+    channel (unit, gain, sign) is determined from the first frame that resembles the reference. Without a description
+    and a reference, numbers are volts. Raises `ValueError` for an invalid description, or if a frame of the described
+    file is not a single line.
     """
 
     def __init__(self, description: str | Path | None = None, reference: Measurement | None = None):
@@ -100,7 +104,8 @@ class LineReading:
 
     def begins_whole(self, values: np.ndarray) -> bool:
         """Whether the first number of a frame may be complete. If the connection began within a line, the first number
-        may be a part of a number, which differs much from that of the reference. True without a reference."""
+        may be a part of a number; it then differs much from the first number of the reference. True without a
+        reference."""
         reference_frame = self._reference_frame()
         if values.shape != reference_frame.shape or not np.isfinite(reference_frame[0]):
             return True
@@ -127,8 +132,8 @@ class LineReading:
         return row * self._volts_per_number(row, "magnitudes: " if word else "")
 
     def _volts_per_number(self, row: np.ndarray, word: str) -> Float[np.ndarray, " M"]:
-        """Return the volts per number of each channel. Each frame determines those of the channels that the reader does
-        not mask, until all are known."""
+        """Return the factor from number to volts of each channel. Each frame `row` determines the factors of the
+        channels that the reader of files does not mask, until all factors are known."""
         if self._num_tries >= _MAX_TRIES:
             return self._channel_factors
         self._num_tries += 1
@@ -154,7 +159,8 @@ class LineReading:
         return self._channel_factors
 
     def _fill_factors(self, factor: np.ndarray, row: np.ndarray) -> Float[np.ndarray, " M"]:
-        """Replace unknown factors by the median magnitude of the known ones, with the sign given by the reference."""
+        """Replace unknown factors from numbers to volts by the median magnitude of the known factors, with the sign
+        given by the reference."""
         is_known = np.isfinite(factor)
         if is_known.all() or not is_known.any():
             return np.where(is_known, factor, 1.0)
@@ -164,9 +170,9 @@ class LineReading:
         return np.where(is_known, factor, sign * np.median(np.abs(factor[is_known])))
 
     def _read_volts(self, row: np.ndarray, word: str) -> Float[np.ndarray, " M"]:
-        """Convert a line to volts with the reader of files."""
+        """Convert the numbers of a line to volts with the reader of files."""
         source = "" if self.reference is None else self.reference.source
-        name = f"{Path(source).stem if source else 'line'}.txt"  # the name may state the current
+        name = f"{Path(source).stem if source else 'line'}.txt"  # the file name may state the current
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / name
             cells = ", ".join("0" if word and not np.isfinite(number) else repr(number) for number in row.tolist())

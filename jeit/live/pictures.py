@@ -1,4 +1,5 @@
-"""Data exchanged by the parts of a live session: frames of a source, and the picture that a view computes from each."""
+"""Data exchanged by the parts of a live session: frames of a source, and the picture that a view computes from each
+frame."""
 
 from __future__ import annotations
 
@@ -14,11 +15,11 @@ from jeit.inverse.streaming.stream import FrameStatus
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """A frame as a source delivers it.
+    """A frame of a live session, as a source delivers it.
 
-    **Fields**: `number`: position in order of arrival, from 0; `second`: time since the session began, seconds;
-    `arrived`: `time.monotonic()` when its last byte was read; `values`: voltages (M,), volts, NaN for a channel without
-    a reading, or the text of a line that is no frame.
+    **Fields**: `number`: index in order of arrival, from 0; `second`: time since the session began, seconds; `arrived`:
+    `time.monotonic()` when the frame's last byte was read; `values`: voltages (channels,) in volts, NaN for a channel
+    without a reading, or the text of a line that is not a frame.
 
     **Example:**
 
@@ -38,9 +39,9 @@ class LiveFrame:
 class Marker:
     """A position that a view estimates, such as that of a contact, a touch or a sound.
 
-    **Fields**: `x`, `y`: metres; `label`: text beside it, such as "2.1 N" or "stroke 93 %"; `radius`: radius of the
-    region that contains the position with a probability of 68 %, metres, NaN if unknown; `track`: number of the contact
-    to which it belongs, so that the path of the contact can be drawn, or None.
+    **Fields**: `x`, `y`: metres; `label`: text beside the marker, such as "2.1 N" or "stroke 93 %"; `radius`: radius of
+    the region that contains the position with a probability of 68 %, metres, NaN if unknown; `track`: number of the
+    contact to which the marker belongs, so that the path of the contact can be drawn, or None.
 
     **Example:**
 
@@ -61,8 +62,8 @@ class Marker:
 class Picture:
     """Picture that a view computes from one frame.
 
-    **Fields**: `pixels` (H, W): float32 image in the scene's unit, row 0 at the largest y, NaN outside the body; None
-    for a refused frame or a view without an image; `markers`: estimated places; `status`, `reason`: as in
+    **Fields**: `pixels` (rows, columns): float32 image in the scene's unit, row 0 at the largest y, NaN outside the
+    body; None for a refused frame or a view without an image; `markers`: estimated positions; `status`, `reason`: as in
     `jeit.inverse.streaming.FrameImage`; `events`: sentences for the page's list of events, such as a named gesture.
 
     **Example:**
@@ -84,10 +85,11 @@ class Picture:
 class Scene:
     """Description of a view, which a page receives once, before the first picture.
 
-    **Fields**: `title`; `quantity`, `unit`: what pixels are, such as "conductivity change", "S/m"; `diverging`: whether
-    colours are centred on zero; `extent`: x of left and right edge, y of lower and upper edge of the image, metres;
-    `outline`: closed curves of the body, metres, each (n, 2); `electrodes`: a curve (n, 2) of each electrode, metres;
-    `names`: their names; `channels`: a name for each channel (M,), such as "1-2 → 3-4"; `notes`: remarks for the user.
+    **Fields**: `title`; `quantity`, `unit`: quantity and unit of the pixels, such as "conductivity change", "S/m";
+    `diverging`: whether colours are centred on zero; `extent`: x of left and right edge, y of lower and upper edge of
+    the image, metres; `outline`: closed curves of the body's edge, metres, each of n points (n, 2); `electrodes`: a
+    curve (n, 2) of each electrode, metres; `names`: names of the electrodes; `channels`: name of each channel, such as
+    "1-2 → 3-4"; `notes`: remarks for the user.
 
     **Example:**
 
@@ -110,7 +112,7 @@ class Scene:
 
 
 class AbstractView(abc.ABC):
-    """Base class of views, which turn frames into pictures, one after another, in the order of their numbers.
+    """Base class of views, which compute pictures from frames, one after another, in the order of frame numbers.
 
     **Attributes**: `scene`: description of the view, which a page receives before the first picture.
 
@@ -126,11 +128,12 @@ class AbstractView(abc.ABC):
 
     @abc.abstractmethod
     def picture(self, frame: LiveFrame) -> Picture:
-        """Compute the picture of a frame. The picture of a refused frame has no pixels, and states the reason."""
+        """Compute the picture of a frame. If the view refuses the frame, the picture has no pixels and states the
+        reason."""
 
     @abc.abstractmethod
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
-        """Take the mean of frames (N, M) of the undisturbed sensor, volts, as the new reference.
+        """Take the mean of `frames` (frames, channels) of the undisturbed sensor, in volts, as the new reference.
 
         Raises `ValueError` for frames that cannot be a reference; the old reference is then kept.
         """

@@ -1,4 +1,4 @@
-"""Preparation of a source and the view of its sensor, for the command and for programs."""
+"""Preparation of a source of frames and of the view that computes pictures, for `jeit live` and for programs."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from jeit.live.views.conductivity import ConductivityView
 
 # Names of the files of learnt models in a folder.
 _NETWORK_FILE, _SKIN_FILE, _GESTURES_FILE = "network.jeit", "skin.skops", "gestures.skops"
-# Minimum and maximum number of frames of an undisturbed sensor from which a reference is computed.
+# Minimum and maximum number of frames of the undisturbed sensor from which a reference is computed.
 _MIN_FRAMES, _MAX_FRAMES = 3, 10_000
-# Period in seconds in which the connection of a source is checked; time in seconds within which the lines arrive that
+# Period in seconds with which the connection of a source is checked; time in seconds within which lines arrive that
 # were sent before they could be read.
 _POLL_PERIOD, _BURST_TIME = 0.3, 0.05
 
 
 class Prepared(NamedTuple):
-    """A source, and the view of its sensor, as from `prepare`.
+    """A source of frames, and the view that computes pictures from the frames, as returned by `prepare`.
 
-    **Fields**: `source`, `view`: what `jeit.live.frames` and `jeit.live.Session` take; `reference`: the measurement of
-    the undisturbed sensor, None if only its frames are known.
+    **Fields**: `source`, `view`: arguments of `jeit.live.frames` and `jeit.live.Session`; `reference`: the measurement
+    of the undisturbed sensor, None if only frames without a protocol are known.
 
     **Example:**
 
@@ -62,26 +62,29 @@ def prepare(
     untouched: float = 1.0,
     progress: Callable[[str], None] | None = None,
 ) -> Prepared:
-    """Open a source, and prepare the view of its sensor.
+    """Open a source of frames, and prepare the view that computes pictures from the frames.
 
-    Without `model` and `calibration`, the view is the change of conductivity (`ConductivityView`).
+    Without `model` and `calibration`, the view shows the change of conductivity (`ConductivityView`).
 
     **Arguments:**
 
     - `source`: as in `open_source`; with a `model`, a recording is read as by `jeit touch predict`, and with a
       `calibration` as by `jeit locate`.
     - `reference`: measured file of the undisturbed sensor, which states the protocol and the electrodes.
-    - `description`: a TOML file or the name of a bundled one, which describes the frames without a `reference`.
-    - `model`: file or folder of `jeit touch fit`, `jeit touch gestures` or `jeit learn image`: places and forces
-      (`LearntSkinView`), gestures (`GestureView`, which needs a description) or depth (`DepthView`).
-    - `calibration`: file of `jeit calibrate-microphones`: loss maps and places of sounds (`SoundView`).
+    - `description`: a TOML file, or the name of a bundled description, that describes the frames; needed without a
+      `reference`.
+    - `model`: file or folder written by `jeit touch fit`, `jeit touch gestures` or `jeit learn image`. The view shows
+      positions and forces (`LearntSkinView`), gestures (`GestureView`, which needs a description) or depth
+      (`DepthView`).
+    - `calibration`: file written by `jeit calibrate-microphones`. The view shows loss maps and positions of sounds
+      (`SoundView`).
     - `contacts`: whether to find the contacts in the change of conductivity (`ContactsView`).
     - `settings`: how changes of conductivity are imaged.
-    - `rate`: frames/s of a recording, and for gestures.
-    - `untouched`: time from the beginning, seconds, whose frames are the reference if none is given.
+    - `rate`: frames/s of a recording, or of the frames from which gestures are classified.
+    - `untouched`: time from the beginning, in seconds, whose frames are the reference if no `reference` is given.
     - `progress`: called with the name of each step when it begins.
 
-    Raises `ValueError` if an argument is missing or does not match the others, and as the views and readers do.
+    Raises `ValueError` if an argument is missing or does not match the other arguments, and if a view or reader does.
 
     **Example:**
 
@@ -124,7 +127,7 @@ def prepare(
 
 @contextmanager
 def _closed_on_failure(source: AbstractSource) -> Iterator[None]:
-    """Close a source, which may be read by a thread of its own, if what is prepared for it fails."""
+    """Context that closes a source, which may be read by a thread of its own, if an error is raised in the context."""
     try:
         yield
     except BaseException:
@@ -139,13 +142,13 @@ def first_frames(
     *,
     rate: float | None = None,
 ) -> tuple[Float[np.ndarray, "N M"], AbstractSource]:
-    """Read the frames of the first `seconds` of a source, and return them with a source of those that follow.
+    """Read the frames of the first `seconds` of a source; return these frames and a source of the frames that follow.
 
-    Lines that were sent before the program could read them arrive all at once. The number of frames is therefore
-    `seconds` times the frame rate: `rate`, frames/s, or else that of the frames that arrive one after the other.
-    Frames that are not numbers, or have another length than most, are left out. A recording is nevertheless played from
-    its beginning. `report` is called with the name of the task, and with the reason of any wait for the device. Raises
-    `ValueError` if fewer than three frames remain.
+    Lines that were sent before the program could read them arrive all at once. The number of returned frames is
+    therefore `seconds` times the frame rate: `rate`, in frames/s, or else the rate of the frames that arrive one after
+    the other. Frames that are not numbers, or whose length differs from that of most frames, are left out. The returned
+    source plays a recording from its beginning. `report` is called with the name of the task, and with the reason of
+    any wait for the device. Raises `ValueError` if fewer than three frames remain.
     """
     if isinstance(source, PlayedRecording):
         return _frames_of_usual_length(list(source.frames[source.seconds <= seconds]), seconds), source
@@ -155,7 +158,7 @@ def first_frames(
 
 @contextmanager
 def _report_connection(source: AbstractSource, task: str, report: Callable[[str], None]) -> Iterator[None]:
-    """Report a task, and each change of the state of the source's connection."""
+    """Context that reports the name of a `task`, and each change of the state of the source's connection."""
     done_event = threading.Event()
 
     def report_changes() -> None:
@@ -203,7 +206,8 @@ def _read_first_frames(
 
 
 def _arrival_rate(frames: list[LiveFrame]) -> float | None:
-    """Frame rate in frames/s, without the first frames that arrived all at once; None if all frames did."""
+    """Rate of arrival in frames/s, without the first frames, which arrived all at once; None if all frames arrived at
+    once."""
     arrivals = np.array([frame.arrived for frame in frames])
     later_arrivals = arrivals[arrivals > (arrivals[:1] + _BURST_TIME)]
     return (
@@ -214,7 +218,8 @@ def _arrival_rate(frames: list[LiveFrame]) -> float | None:
 
 
 def _frames_of_usual_length(rows: list[np.ndarray], seconds: float) -> Float[np.ndarray, "N M"]:
-    """Return the frames of the most frequent length as one array. Raises `ValueError` if there are fewer than three."""
+    """Return the frames of the most frequent length as one array. Raises `ValueError` if there are fewer than three
+    such frames."""
     lengths = [len(row) for row in rows]
     usual_length = max(set(lengths), key=lengths.count, default=0)
     rows = [row for row in rows if len(row) == usual_length]
@@ -227,7 +232,7 @@ def _frames_of_usual_length(rows: list[np.ndarray], seconds: float) -> Float[np.
 
 
 class _ContinuedSource(AbstractSource):
-    """A source of which some frames have been read already. `remaining`: iterator over the other frames."""
+    """A source of which some frames have been read already. `remaining`: iterator over the frames that follow."""
 
     def __init__(self, source: AbstractSource, remaining: Iterator[LiveFrame]):
         self._source, self._remaining = source, remaining
@@ -248,8 +253,8 @@ class _ContinuedSource(AbstractSource):
 
 
 def _prepare_sound(source: str, calibration: str | Path, rate: float | None) -> tuple[AbstractSource, AbstractView]:
-    """Create the source of intensities and the view of a calibrated array of microphones. A file may contain samples or
-    intensities."""
+    """Create the source of intensities and the view of a calibrated array of microphones. The file `source` may contain
+    sound samples or intensities."""
     from jeit.acoustic import Calibration, read_recording
     from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
     from jeit.live.views.sound import SoundView
@@ -273,7 +278,7 @@ def _prepare_model(
     untouched: float,
     report_step: Callable[[str], None],
 ) -> Prepared:
-    """Create the source of frames, and the view of a learnt model."""
+    """Create the source of frames, and the view of the learnt model in the file or folder `path`."""
     from jeit.touch import GestureModel, LearntSkin
 
     model = _read_model(path)
@@ -324,9 +329,9 @@ def _prepare_model(
 
 
 def _read_model(path: Path):
-    """Read the learnt skin, gestures or network from a file, or from the file in a folder.
+    """Read a learnt skin, learnt gestures or a network from a file, or from the only file of a model in a folder.
 
-    Raises `ValueError` for a path without any, and for a folder with several.
+    Raises `ValueError` if there is no file of a model at `path`, and for a folder with several files of models.
     """
     if path.is_dir():
         file_names = [name for name in (_SKIN_FILE, _GESTURES_FILE, _NETWORK_FILE) if (path / name).is_file()]

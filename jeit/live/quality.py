@@ -1,4 +1,5 @@
-"""Quality of a live stream: noise, reciprocity, and electrodes that are dead or drift, from its latest frames."""
+"""Quality of the frames of a live session, computed from the latest frames: noise, reciprocity, and electrodes that are
+dead or drift."""
 
 from __future__ import annotations
 
@@ -15,26 +16,27 @@ from jeit.live.pictures import LiveFrame
 
 # Number of latest frames from which the quality is computed, and minimum number of frames.
 _NUM_FRAMES, _MIN_FRAMES = 32, 8
-# Number of successive medians of these frames that are kept to detect drift.
+# Number of successive medians over the latest frames that are kept to detect drift.
 _NUM_MEDIANS = 40
 # A reading is lost if it is missing, or if its relative difference from the reference exceeds the first number. An
-# electrode is dead if the second number, a fraction, of its readings is lost, without those of other dead electrodes.
-# It drifts if the median relative difference of its readings exceeds the third number, and also the fourth number times
-# that of all other readings.
+# electrode is dead if at least the fraction `_DEAD_SHARE` of its readings is lost, not counting readings on other dead
+# electrodes. An electrode drifts if the median relative difference of its readings exceeds the third number, and also
+# the fourth number times the median difference of all other readings.
 _LOST_DIFFERENCE, _DEAD_SHARE, _DRIFT_DIFFERENCE, _DRIFT_RATIO = 0.5, 0.7, 0.05, 3.0
-# Number of parts of the frames of a reference whose means are compared, and minimum number of frames of a part; ratio
-# of the deviation of these means to that expected from noise above which the sensor is considered disturbed.
+# The frames of a reference are divided into parts, whose means are compared: number of parts, minimum number of frames
+# of a part, and ratio of the deviation of the means to the deviation expected from noise above which the sensor is
+# considered disturbed.
 _NUM_PARTS, _MIN_PART_FRAMES, _DISTURBANCE_RATIO = 4, 2, 4.0
-# Factor by which a frame rate must change to be reported, and number of successive calls for which the change must
+# Factor by which the frame rate must change for a report, and number of successive calls for which the change must
 # last.
 _MIN_RATE_RATIO, _NUM_RATE_CALLS = 1.4, 3
 
 
 @dataclass(frozen=True)
 class Quality:
-    """**Fields**: `noise`: standard deviation of a reading from frame to frame, relative to the root mean square of a
-    frame; `reciprocity`: as `jeit.data.reciprocity_error`, of the mean of the latest frames; both None if unknown;
-    `dead`, `drifting`: numbers of electrodes, from 0."""
+    """Quality of the latest frames. **Fields**: `noise`: standard deviation of a reading from frame to frame, relative
+    to the root mean square of a frame; `reciprocity`: `jeit.data.reciprocity_error` of the mean of the latest frames;
+    both None if unknown; `dead`, `drifting`: indices, from 0, of dead and of drifting electrodes."""
 
     noise: float | None = None
     reciprocity: float | None = None
@@ -44,9 +46,10 @@ class Quality:
 
 @np.errstate(all="ignore")  # readings of faulty frames may overflow
 def change_during(frames: Float[np.ndarray, "N M"]) -> float | None:
-    """Relative change of a sensor during frames (N, M): the largest difference of the mean of a quarter of the frames
-    from the mean of all frames, divided by the latter. None if the noise, which is estimated from successive frames,
-    explains the change or is as large in a single frame, and for fewer than eight frames."""
+    """Relative change of a sensor during `frames` (frames, channels): the largest norm of the difference between the
+    mean of a quarter of the frames and the mean of all frames, divided by the norm of the mean of all frames. None for
+    fewer than eight frames, and if the change is explained by noise, which is estimated from successive frames, or is
+    not larger than the noise of a single frame."""
     frames = np.asarray(frames, float)[:, np.isfinite(frames).all(axis=0)]
     if len(frames) < _NUM_PARTS * _MIN_PART_FRAMES or not frames.size:
         return None
@@ -61,7 +64,7 @@ def change_during(frames: Float[np.ndarray, "N M"]) -> float | None:
 
 
 class QualityWatch:
-    """Computes the quality of the latest frames of a sensor. It can be used by several threads.
+    """Computes the quality of the latest frames of a sensor. Several threads can use one object.
 
     `reference`: a measurement of the undisturbed sensor; without it, only the noise is estimated.
     """
@@ -80,7 +83,7 @@ class QualityWatch:
             )
 
     def renew(self, frames: Float[np.ndarray, "N M"]) -> None:
-        """Replace the reference by the mean of these frames."""
+        """Replace the reference by the mean of `frames` (frames, channels)."""
         is_finite = np.isfinite(frames)
         total = np.where(is_finite, frames, 0.0).sum(axis=0)
         mean = np.where(is_finite.any(axis=0), total / np.maximum(is_finite.sum(axis=0), 1), np.nan)
@@ -89,7 +92,7 @@ class QualityWatch:
             self._medians.clear()
 
     def add(self, frame: LiveFrame) -> None:
-        """Add a frame. Text and frames of another number of channels are left out."""
+        """Add a frame to the latest frames. Text, and frames with another number of channels, are left out."""
         values = frame.values
         if isinstance(values, str) or values.ndim != 1 or values.dtype.kind not in "iuf":
             return
@@ -102,7 +105,7 @@ class QualityWatch:
 
     @np.errstate(all="ignore")  # squares of numbers that are no voltages may overflow
     def assess(self) -> Quality:
-        """Compute the quality of the latest frames. To be called about every half second."""
+        """Compute the quality of the latest frames. Call this method about every half second."""
         with self._lock:
             if len(self._frames) < _MIN_FRAMES:
                 return Quality()
@@ -163,7 +166,7 @@ class RateWatch:
 
 
 def _relative_noise(frames: Float[np.ndarray, "F M"]) -> float | None:
-    """Estimate the relative noise from second differences in time, which a steady change does not affect."""
+    """Estimate the relative noise of frames from second differences in time, which a linear change does not affect."""
     rms = np.sqrt(np.nanmean(frames**2)) if np.isfinite(frames).any() else 0.0
     second_differences = frames[:-2] - 2 * frames[1:-1] + frames[2:]
     second_differences = second_differences[np.isfinite(second_differences)]
@@ -175,8 +178,8 @@ def _relative_noise(frames: Float[np.ndarray, "F M"]) -> float | None:
 def _find_dead(
     is_lost: Bool[np.ndarray, " M"], is_readable: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
 ) -> list[int]:
-    """Find the electrodes most of whose readings are lost. The worst electrode is found first, and its channels are
-    left out in the search for the next."""
+    """Find the electrodes most of whose readings are lost. The electrode with the largest fraction of lost readings is
+    found first; its channels are left out in the search for the next dead electrode."""
     dead_electrodes: list[int] = []
     is_remaining = is_readable.copy()
     while is_remaining.any():
@@ -196,7 +199,8 @@ def _find_dead(
 def _find_drifting(
     drift: Float[np.ndarray, " M"], has_drift_data: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
 ) -> list[int]:
-    """Find the electrodes whose readings have changed for a long time, and much more than those of the others."""
+    """Find the electrodes whose readings have changed for a long time, and much more than the readings of other
+    electrodes."""
     drifting_electrodes: list[int] = []
     is_remaining = has_drift_data.copy()
     while True:

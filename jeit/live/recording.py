@@ -29,9 +29,10 @@ from jeit.live.pictures import LiveFrame
 FRAMES, REFUSED, EVENTS = "frames.csv", "refused.csv", "events.csv"
 REFERENCE, DESCRIPTION = "reference.npz", "description.toml"
 # Maximum memory in bytes of frames that wait for a slow or full disk. Times in seconds: between attempts to write to a
-# full disk, between synchronisations of the files with the disk, and maximum time that the end of a recording takes.
+# full disk, between synchronisations of the files with the disk, and maximum duration of ending a recording.
 _MAX_WAITING_BYTES, _RETRY_PERIOD, _SYNC_PERIOD, _END_TIMEOUT = 64_000_000, 1.0, 2.0, 10.0
-# Maximum size in bytes of a file of frames. A reader needs eight times as much memory, and may use a gigabyte.
+# Maximum size in bytes of a file of frames. Readers need memory of eight times the file size, which is limited to a
+# gigabyte.
 _MAX_FILE_SIZE = 100_000_000
 # Prefix of the names of files of frames; number of successive frames with another number of channels after which a new
 # file is begun.
@@ -43,13 +44,13 @@ class Recorder:
     """Writes recordings, each into a new folder named by date and time.
 
     Frames are written in a separate thread. If the disk is full, frames wait in memory, up to 64 MB, and are written
-    when there is room again. The file always ends with a complete frame.
+    when the disk has space again. The file always ends with a complete frame.
 
     **Arguments:**
 
     - `folder`: the folder below which recordings are written.
-    - `reference`: a measurement of the undisturbed sensor, which is written beside the frames, with a description that
-      reads them.
+    - `reference`: a measurement of the undisturbed sensor; it is written beside the frames, with a description with
+      which `jeit.data.read` reads the frames.
 
     **Example:**
 
@@ -74,8 +75,8 @@ class Recorder:
         self._num_other_lengths = self._file_number = self._file_size = 0
 
     def start(self) -> Path:
-        """Begin a recording, unless one is in progress, and return its folder. Raises `OSError` if the folder cannot be
-        created."""
+        """Begin a recording, unless a recording is in progress, and return the folder of the recording. Raises
+        `OSError` if the folder cannot be created."""
         if self._files is not None:
             return self._files.folder
         folder = _new_folder(self.folder)
@@ -122,7 +123,8 @@ class Recorder:
         if not self._has_usual_length(values):
             self._queue_line(REFUSED, _format_row(frame.second, " ".join(map(repr, values.tolist()))))
             return
-        # Readers recognise a column of times by its increase, so each time is at least a microsecond later.
+        # Readers recognise a column of times by its increase, so each time is at least a microsecond later than the
+        # previous time.
         self._last_microsecond = max(round(1e6 * frame.second), self._last_microsecond + 1)
         line = f"{self._last_microsecond / 1e6:.6f},{','.join(map(repr, values.astype(float).tolist()))}\n".encode()
         if self._file_size + len(line) > _MAX_FILE_SIZE:
@@ -131,8 +133,8 @@ class Recorder:
         self._queue_line(FRAMES if self._file_number == 1 else f"frames-{self._file_number}.csv", line)
 
     def _has_usual_length(self, values: np.ndarray) -> bool:
-        """Whether a frame has as many channels as the others. If the sensor is unknown, a new file is begun after three
-        frames with another number of channels."""
+        """Whether a frame has as many channels as the other recorded frames. If the number of channels of the sensor is
+        unknown, a new file is begun after three successive frames with another number of channels."""
         if values.dtype.kind not in "iuf":
             return False
         if self._frame_length is None:
@@ -149,12 +151,13 @@ class Recorder:
         return True
 
     def mark(self, second: float, label: str) -> None:
-        """Record an event."""
+        """Record an event with the text `label` at the time `second`."""
         if self._files is not None:
             self._queue_line(EVENTS, _format_row(second, label))
 
     def renew(self, second: float, frames: np.ndarray) -> None:
-        """Write frames (N, M) of a new reference to the folder of the recording, and record the time as an event."""
+        """Write the frames (frames, channels) of a new reference to the folder of the recording, and record the change
+        of the reference as an event at the time `second`."""
         if self._files is None:
             return
         name = f"reference-{second:.3f}s.npy"
@@ -166,7 +169,8 @@ class Recorder:
         self.mark(second, f"new reference, {name}")
 
     def state(self) -> dict[str, Any] | None:
-        """Folder, number of frames and bytes written, and problem of the recording in progress; None without one."""
+        """Folder of the recording in progress, numbers of frames and bytes written, and problem, if any; None if no
+        recording is in progress."""
         with self._changed:
             files = self._files
             if files is None:
@@ -215,7 +219,8 @@ class Recorder:
         files.close()
 
     def _next_line(self, files: _RecordingFiles) -> tuple[str, bytes] | None:
-        """Wait for a line to write, and return it without removing it from the queue; None when the recording ends."""
+        """Wait for a line to write, and return the line without removing it from the queue; None when the recording
+        ends."""
         with self._changed:
             while not self._lines or self._files is not files:
                 if self._is_ending(files):
@@ -237,7 +242,8 @@ class _RecordingFiles:
         self._sizes: dict[str, int] = {}
 
     def write(self, name: str, line: bytes) -> None:
-        """Write a complete line. Raises `OSError` if it cannot be written; the file is then unchanged."""
+        """Append a complete line to the file `name`. Raises `OSError` if the line cannot be written; the file is then
+        unchanged."""
         if name not in self._descriptors:
             self._create_file(name, line)
         self._append_line(self._descriptors[name], self._sizes[name], line)
@@ -246,7 +252,7 @@ class _RecordingFiles:
         self.frames += name.startswith(_FRAMES_PREFIX)
 
     def _create_file(self, name: str, line: bytes) -> None:
-        """Create a file with its header line, and close the previous file of frames."""
+        """Create the file `name` with its header line, and close the previous file of frames."""
         heading = b"second,text\n"
         if name.startswith(_FRAMES_PREFIX):
             heading = ("second," + ",".join(f"v{index + 1}" for index in range(line.count(b","))) + "\n").encode()
@@ -263,7 +269,8 @@ class _RecordingFiles:
 
     @staticmethod
     def _append_line(descriptor: int, size: int, line: bytes) -> None:
-        """Append a line to a file of the given `size`. If that fails, the file is truncated to this size."""
+        """Append a line to a file of the given `size`. If the line cannot be written completely, the file is truncated
+        to this size."""
         try:
             num_written = os.write(descriptor, line)
             while num_written < len(line):
@@ -301,7 +308,7 @@ def _new_folder(folder: Path) -> Path:
 
 
 def _write_reference(reference: Measurement, folder: Path) -> None:
-    """Write the reference, and a description that reads frames.csv."""
+    """Write the reference, and a description with which frames.csv can be read, to `folder`."""
     try:
         _, description = write_table(reference, folder / REFERENCE)
     except ValueError:  # a body that a description cannot express
@@ -312,7 +319,7 @@ def _write_reference(reference: Measurement, folder: Path) -> None:
 
 
 def _format_row(second: float, text: str) -> bytes:
-    """Format a line of a table of times and texts."""
+    """Format a line of a CSV table of times in seconds and texts."""
     buffer = io.StringIO()
     csv.writer(buffer, lineterminator="\n").writerow([f"{second:.6f}", " ".join(text.split())])
     return buffer.getvalue().encode("utf-8", "replace")

@@ -1,4 +1,5 @@
-"""Server of the page of a live session. By default, only this machine can connect; other hosts require a token."""
+"""Web server of the page of a live session. By default, only this machine can connect; an address that other machines
+can reach requires a token."""
 
 from __future__ import annotations
 
@@ -29,12 +30,14 @@ def serve(
     **Arguments:**
 
     - `session`: the session.
-    - `host`, `port`: address at which to listen; port 0 selects a free one.
-    - `token`: token that the address must contain; by default a random one for a host that other machines can reach.
-    - `opened`: called with the page's address once it can be opened.
-    - `stay`: whether to stay until Ctrl-C when the session has ended, so that its last minute can be looked at.
+    - `host`, `port`: address at which to listen; port 0 selects a free port.
+    - `token`: token that the page's address must contain; by default a random token for a host that other machines can
+      reach, otherwise none.
+    - `opened`: function that is called with the page's address once the page can be opened.
+    - `stay`: whether to continue until Ctrl-C when the session has ended, so that its last minute can be viewed.
 
-    Raises `OSError` if the address is taken or not this machine's, and `ImportError` without the extra `live`.
+    Raises `OSError` if the address is in use or does not belong to this machine, and `ImportError` if the packages of
+    the extra `live` are not installed.
 
     **Example:**
 
@@ -78,7 +81,7 @@ def serve(
 
 
 def check_port(host: str, port: int) -> None:
-    """Raise `OSError` with a remedy if a page cannot be served at `host` and `port`."""
+    """Raise `OSError`, with advice to the user, if a page cannot be served at `host` and `port`."""
     _open_socket(host, port).close()
 
 
@@ -88,7 +91,8 @@ def _stop_at_end(hub: Hub, server: object) -> None:
 
 
 def _open_socket(host: str, port: int) -> socket.socket:
-    """Return a socket that listens at a host and port. Raises `OSError` with a remedy if that fails."""
+    """Return a socket that listens at a host and port. Raises `OSError`, with advice to the user, if it cannot be
+    opened."""
     if not 0 <= port <= 65535:
         raise OSError(f"port: {port} is none; they go from 1 to 65535, and 0 takes a free one")
     try:
@@ -108,7 +112,8 @@ def _open_socket(host: str, port: int) -> socket.socket:
 
 
 def _page_address(host: str, port: int, token: str | None) -> str:
-    """Address of the page. If the host is unspecified (0.0.0.0), the address is the one that other machines reach."""
+    """URL of the page. For the unspecified host 0.0.0.0, the URL contains the address under which other machines reach
+    this machine."""
     displayed_host = host
     try:
         if ip_address(host).is_unspecified:
@@ -122,7 +127,7 @@ def _page_address(host: str, port: int, token: str | None) -> str:
 
 
 def _own_address() -> str:
-    """Address of this machine in its network. No data are sent."""
+    """IP address of this machine in its network. The function sends no data."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))

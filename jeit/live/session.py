@@ -1,4 +1,4 @@
-"""Live session: frames are read, recorded and imaged in separate threads, and the results are published."""
+"""Live session: frames are read, recorded and imaged in separate threads, and the pictures are published."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from jeit.live.quality import Quality, QualityWatch, RateWatch, change_during
 from jeit.live.recording import Recorder
 from jeit.live.sources import ENDED, MAX_MESSAGES, AbstractSource
 
-# Maximum time in seconds for which frames wait to be imaged. Older frames are left out of the view.
+# Maximum time in seconds for which frames wait to be imaged. Older frames are not imaged.
 _MAX_WAIT = 0.05
 # Maximum memory in bytes of the pictures that are kept; maximum number of waiting frames; maximum number of different
-# reasons that are counted.
+# reasons of refused frames that are counted.
 _MAX_BYTES, _MAX_WAITING, _MAX_REASONS = 128_000_000, 256, 30
 _NUMBER_PATTERN = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
-# Number of frames over which the latency is computed; time in seconds over which the rate is measured; period in
-# seconds in which the quality of the frames is computed.
+# Number of frames over which the latency is computed; time in seconds over which the frame rate is measured; period in
+# seconds with which the quality of the frames is computed.
 _NUM_LATENCIES, _RATE_SPAN, _QUALITY_PERIOD = 600, 2.0, 0.5
 # Number of successive frames with another number of channels after which the change is reported; maximum number of
 # frames of a reference.
 _NUM_OTHER_LENGTHS, _MAX_REFERENCE_FRAMES = 3, 10_000
-# Maximum length of the name of an event; time in seconds for which the events of skipped frames are kept for a program
-# that is busy.
+# Maximum length of the name of an event; time in seconds for which the events of skipped frames are kept for a busy
+# program.
 _MAX_LABEL_LENGTH, _EVENT_HISTORY = 200, 30.0
 
 
@@ -41,8 +41,8 @@ _MAX_LABEL_LENGTH, _EVENT_HISTORY = 200, 30.0
 class Result:
     """A frame and its picture.
 
-    **Fields**: `frame`: the frame; `picture`: picture that the view computed from it; `latency`: time from the frame's
-    last byte until the picture was computed, seconds.
+    **Fields**: `frame`: the frame; `picture`: picture that the view computed from the frame; `latency`: time from the
+    frame's last byte until the picture was computed, seconds.
 
     **Example:**
 
@@ -58,19 +58,19 @@ class Result:
 
 
 class Session:
-    """A source whose frames are recorded and turned into pictures by a view, until the source ends or `stop`.
+    """Live session: records the frames of a source and images them by a view, until the source ends or `stop`.
 
-    One thread reads the frames, and another images them. If imaging falls behind, frames are left out of the view, but
-    never of the recording. Use the session as a context manager, or call `start` and `stop`.
+    One thread reads the frames, and another thread images them. If imaging is slower than the source, frames are not
+    imaged, but always recorded. Use the session as a context manager, or call `start` and `stop`.
 
     **Arguments:**
 
-    - `source`: the source.
-    - `view`: the view of its frames.
+    - `source`: source of the frames.
+    - `view`: view that computes a picture from each frame.
     - `recorder`: recorder that records the frames after `record(True)` is called.
     - `history`: time in seconds for which results are kept, with at most 128 MB of memory.
     - `reference`: a measurement of the undisturbed sensor, with which frames are compared to assess their quality; by
-      default that of the recorder.
+      default the reference of the recorder.
 
     **Example:**
 
@@ -114,7 +114,7 @@ class Session:
 
     @property
     def scene(self) -> Scene:
-        """Description of the view, which is drawn around its pictures."""
+        """Scene of the view: outline, electrodes and names, which are drawn around the pictures."""
         return self.view.scene
 
     def __enter__(self) -> Session:
@@ -125,7 +125,7 @@ class Session:
         self.stop()
 
     def start(self) -> None:
-        """Start the threads. Raises `RuntimeError` if they were started before."""
+        """Start the threads. Raises `RuntimeError` if the session was started before."""
         if self._threads:
             raise RuntimeError("A session starts once; make another for the same source.")
         self._threads = [
@@ -156,8 +156,8 @@ class Session:
                 self._changed.wait(0.5)
 
     def newest(self, after: int, timeout: float) -> Result | None:
-        """Return the newest result if the number of its frame is above `after`; otherwise wait for such a result, at
-        most `timeout` seconds. Returns None if there is none by then, or if the session has ended."""
+        """Return the newest result if its frame number is above `after`; otherwise wait for a newer result, at most
+        `timeout` seconds. Returns None if no newer result arrives, or if the session has ended."""
         end = time.monotonic() + timeout
         with self._changed:
             while not (self._results and self._results[-1].frame.number > after):
@@ -168,7 +168,7 @@ class Session:
             return self._results[-1]
 
     def result(self, number: int) -> Result | None:
-        """Return the last kept result whose frame has at most this `number`; None if there is none."""
+        """Return the last kept result whose frame number is at most `number`; None if there is no such result."""
         with self._changed:
             for result in reversed(self._results):
                 if result.frame.number <= number:
@@ -176,7 +176,7 @@ class Session:
         return None
 
     def with_events(self, result: Result, after: int) -> Result:
-        """Add to a result the events of the kept results before it whose frame number is above `after`."""
+        """Add to `result` the events of earlier kept results whose frame number is above `after`."""
         with self._changed:
             skipped_results = [
                 skipped_result
@@ -197,7 +197,7 @@ class Session:
             self._num_requested, self._collected_frames = count, []
 
     def mark(self, label: str) -> None:
-        """Mark an event now, also in the recording."""
+        """Mark an event named `label` at the present time, also in the recording."""
         label = " ".join(label.split())[:_MAX_LABEL_LENGTH] or "event"
         second = time.monotonic() - self.source.begun
         self.say(f"Event: {label}")
@@ -205,7 +205,7 @@ class Session:
             self.recorder.mark(second, label)
 
     def record(self, on: bool) -> None:
-        """Begin a recording in a new folder, or end the one in progress. Failures are reported in `state`."""
+        """Begin a recording in a new folder (`on`), or end the current recording. `state` reports failures."""
         if self.recorder is None:
             if on:
                 self.say("There is nowhere to record to.")
@@ -223,11 +223,11 @@ class Session:
         self.say(f"Recording into {folder}.")
 
     def say(self, sentence: str) -> None:
-        """Keep a message for the user."""
+        """Add `sentence` to the messages for the user."""
         self._messages.append((time.monotonic() - self.source.begun, sentence[:300]))
 
     def state(self) -> dict[str, Any]:
-        """Counters, rate, latency, quality, connection, recording and messages, in types that JSON can represent."""
+        """Counters, frame rate, latency, quality, connection, recording and messages, in types of JSON."""
         with self._changed:
             latencies = np.array(self._latencies)
             counters = {
@@ -288,7 +288,7 @@ class Session:
                     self._collect_reference_frame(frame)
                     self._changed.notify_all()
                 self._compare_length(frame)
-        except Exception as error:  # devices and files raise exceptions of many types; the page reports them
+        except Exception as error:  # devices and files raise errors of many types; the page reports the errors
             self.say(f"The source failed: {error}")
         finally:
             with self._changed:
@@ -319,7 +319,7 @@ class Session:
                 self.say(sentence)
 
     def _collect_reference_frame(self, frame: LiveFrame) -> None:
-        """Keep a frame for the new reference, if one was requested."""
+        """Keep a frame for the new reference, if a new reference was requested."""
         if not self._num_requested or isinstance(frame.values, str):
             return
         if self._num_channels is not None and frame.values.shape != (self._num_channels,):
@@ -331,7 +331,7 @@ class Session:
             self._reference, self._num_requested, self._collected_frames = np.array(self._collected_frames), 0, []
 
     def _next_frame(self) -> LiveFrame | None:
-        """Wait for the next frame to image; None at the end."""
+        """Wait for the next frame to image, and return it; None at the end."""
         with self._changed:
             while not self._waiting_frames:
                 if self._ended:
@@ -404,7 +404,7 @@ class Session:
             self.say(event)
 
     def _count_reason(self, reason: str) -> None:
-        """Count a reason. Reasons that differ only in their numbers are counted together."""
+        """Count a reason why a frame was refused. Reasons that differ only in numbers are counted together."""
         pattern = _NUMBER_PATTERN.sub("#", reason)
         if pattern not in self._reasons and len(self._reasons) >= _MAX_REASONS:
             pattern, reason = "", "other reasons"
@@ -414,12 +414,12 @@ class Session:
 def frames(source: AbstractSource, view: AbstractView, *, recorder: Recorder | None = None) -> Iterator[Result]:
     """Yield the newest result of a view each time the program asks, until the source has ended.
 
-    Frames that arrive while the program is busy are skipped; their events are added before those of the next result.
+    Frames that arrive while the program is busy are skipped; their events precede the events of the next result.
 
     **Arguments:**
 
-    - `source`: the source.
-    - `view`: the view of its frames.
+    - `source`: source of the frames.
+    - `view`: view that computes a picture from each frame.
     - `recorder`: recorder that records all frames.
 
     **Example:**
@@ -443,6 +443,6 @@ def frames(source: AbstractSource, view: AbstractView, *, recorder: Recorder | N
 
 
 def _result_size(result: Result) -> int:
-    """Memory of a result, bytes."""
+    """Memory of a result in bytes."""
     pixels, values = result.picture.pixels, result.frame.values
     return 500 + (0 if pixels is None else pixels.nbytes) + (len(values) if isinstance(values, str) else values.nbytes)

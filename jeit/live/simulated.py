@@ -1,4 +1,5 @@
-"""Simulated sources, which need no device: a tank in which a rod moves on a circle, and a skin that is stroked."""
+"""Simulated sources of frames, which need no device: a tank in which a rod moves on a circle, and a skin that is
+stroked."""
 
 from __future__ import annotations
 
@@ -25,8 +26,9 @@ _NUM_NODES = 1800
 # revolution in seconds; number of simulated positions between adjacent electrodes.
 _ROD_RADIUS, _ORBIT_RADIUS, _ROD_CONDUCTIVITY, _REVOLUTION_TIME, _STEPS_PER_ELECTRODE = 0.012, 0.05, 0.05, 8.0, 20
 # Skin: radius of the finger's contact, half the length of a stroke, and distance of the stroke from the centre, in
-# metres; relative change of conductivity; numbers of states of a stroke and of the pause after it; duration of both
-# together in seconds; and number of electrodes by which each stroke is rotated relative to the previous one.
+# metres; relative change of conductivity; numbers of simulated states of a stroke and of the pause after the stroke;
+# duration of stroke and pause together in seconds; and number of electrodes by which each stroke is rotated relative to
+# the previous stroke.
 (
     _FINGER_RADIUS,
     _HALF_STROKE,
@@ -40,15 +42,15 @@ _ROD_RADIUS, _ORBIT_RADIUS, _ROD_CONDUCTIVITY, _REVOLUTION_TIME, _STEPS_PER_ELEC
 
 
 class SimulatedSensor(AbstractSource):
-    """Frames of a simulated sensor whose state repeats itself, with Gaussian noise.
+    """Source of frames of a simulated sensor whose states repeat periodically, with Gaussian noise.
 
     **Arguments:**
 
     - `name`: name of the sensor.
     - `reference`: a measurement of the undisturbed sensor.
-    - `rest`: voltages (M,) of the undisturbed sensor, volts.
-    - `changes`: changes (K, M) of these voltages in the K states of a period, volts.
-    - `places`: positions (K, 2) of the rod or finger in these states, metres; NaN for none.
+    - `rest`: voltages (M,) of the M channels of the undisturbed sensor, volts.
+    - `changes`: changes (K, M) of the voltages from `rest` in the K states of a period, volts.
+    - `places`: positions (K, 2) of the rod or finger in the K states, metres; NaN for a state without a rod or finger.
     - `period`: duration of a period, seconds.
     - `rate`: frames/s.
     - `limit`: number of frames after which the source ends; by default it does not.
@@ -84,7 +86,8 @@ class SimulatedSensor(AbstractSource):
         self._random = np.random.default_rng(seed)
 
     def truth(self, second: float) -> tuple[float, float] | None:
-        """Position (x, y) of the rod or finger in the frame at `second` in metres; None if there is none."""
+        """True position (x, y) of the rod or finger at the time `second`, in metres; None if nothing touches the
+        sensor."""
         x, y = self._places[self._state_index(second)].tolist()
         return None if np.isnan(x) else (x, y)
 
@@ -106,8 +109,8 @@ class SimulatedSensor(AbstractSource):
 
 def simulated_tank(rate: float = 60.0, *, limit: int | None = None, seed: int = 0) -> SimulatedSensor:
     """Create a simulated round tank: a sheet of diameter 200 mm with 16 electrodes and the adjacent protocol (208
-    voltages), in which an insulating rod of radius 12 mm moves on a circle of radius 50 mm, anticlockwise from the x
-    axis, once in 8 s.
+    voltages). A poorly conducting rod of radius 12 mm moves on a circle of radius 50 mm, anticlockwise from the x axis,
+    once in 8 s.
 
     **Arguments:**
 
@@ -191,17 +194,17 @@ _SIMULATED_SENSORS = {"tank": simulated_tank, "skin": simulated_skin}
 
 
 def open_simulated(text: str, rate: float | None = None) -> SimulatedSensor:
-    """Create the simulated source that "demo", "demo:tank" or "demo:skin" names. Raises `ValueError` for another
-    name."""
+    """Create the simulated source with the name "demo", "demo:tank" or "demo:skin". Raises `ValueError` for other
+    names."""
     kind = text.partition(":")[2] or "tank"
     check_name("demo", kind, _SIMULATED_SENSORS)
     return _SIMULATED_SENSORS[kind](60.0 if rate is None else rate)
 
 
 def _rotate_changes(changes: Float[np.ndarray, "n M"], pitches: int) -> Float[np.ndarray, "n M"]:
-    """Return the changes of voltages (n, M) after an anticlockwise rotation of the bodies by `pitches` pitches of the
-    electrodes. The channels are permuted: the 16 electrodes are numbered clockwise, and each drive has equally many
-    channels."""
+    """Return the voltage changes (states, channels) after an anticlockwise rotation of the touching bodies by `pitches`
+    electrode spacings. The rotation permutes the channels, because the 16 electrodes are numbered clockwise, and each
+    drive has equally many channels."""
     return np.roll(changes.reshape(len(changes), 16, -1), -pitches, axis=1).reshape(changes.shape)
 
 

@@ -1,5 +1,5 @@
-"""Sources of frames: their base class, recordings, and the source that a text such as `serial:/dev/ttyACM0@115200`
-names."""
+"""Sources of frames: the base class, recordings, and opening of a source by a text such as
+`serial:/dev/ttyACM0@115200`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from jeit.imaging.stream_preparation import frames_of
 from jeit.live.pictures import LiveFrame
 
 ENDED, CONNECTED = "ended", "connected"
-# Maximum number of messages that are kept, and maximum number of characters of each.
+# Maximum number of messages that are kept, and maximum number of characters of a message.
 MAX_MESSAGES, _MAX_MESSAGE_LENGTH = 50, 300
 # Frame rate of a recording without times, in frames/s.
 _DEFAULT_RATE = 10.0
@@ -33,8 +33,8 @@ class AbstractSource(abc.ABC):
     - `name`: name of the source as the user gave it, for messages.
 
     **Attributes**: `name`; `connection`: "connected", "waiting: …" with the reason, or "ended"; `begun`:
-    `time.monotonic()` of second 0; `messages`: the last 50 reports about the connection, as pairs of second and
-    sentence.
+    `time.monotonic()` at the beginning of the session (second 0); `messages`: the last 50 reports about the connection,
+    as pairs of time in seconds and sentence.
 
     **Example:**
 
@@ -56,19 +56,21 @@ class AbstractSource(abc.ABC):
         """Yield frames as they arrive, until the source has ended or is closed."""
 
     def close(self) -> None:
-        """End the iteration soon, even while it waits for a device."""
+        """End the iteration over frames soon, even while it waits for a device."""
         self.closing.set()
 
     def end_when_lost(self) -> None:
-        """End when the connection is lost, instead of reconnecting. Sources without connections end in any case."""
+        """Make the source end when the connection is lost, instead of connecting again. Sources without a connection
+        end in any case."""
         return
 
     def say(self, sentence: str) -> None:
-        """Keep a report about the source, with its time."""
+        """Add `sentence`, a report about the source, to the messages, with the present time."""
         self.messages.append((time.monotonic() - self.begun, sentence[:_MAX_MESSAGE_LENGTH]))
 
     def frame(self, values: np.ndarray | str, arrived: float | None = None) -> LiveFrame:
-        """Create the next frame, with its number. `arrived`: `time.monotonic()` of its last byte, by default now."""
+        """Create the next frame of the source, with the next number. `arrived`: `time.monotonic()` when the frame's
+        last byte was read, by default now."""
         arrived = time.monotonic() if arrived is None else arrived
         new_frame = LiveFrame(self._num_frames, arrived - self.begun, arrived, values)
         self._num_frames += 1
@@ -76,8 +78,8 @@ class AbstractSource(abc.ABC):
 
 
 class PlayedRecording(AbstractSource):
-    """Source that plays the frames (F, M) of a recording: at `rate` frames/s if given, otherwise at their `times` (F,)
-    in seconds if given, otherwise at ten frames/s."""
+    """Source that plays the `frames` (frames, channels) of a recording: at `rate` frames/s if given, otherwise at
+    `times` (frames,) in seconds if given, otherwise at ten frames/s."""
 
     def __init__(
         self,
@@ -112,22 +114,22 @@ def open_source(
     description: str | Path | None = None,
     reference: Measurement | None = None,
 ) -> AbstractSource:
-    """Open the source that a text names.
+    """Open the source of frames that `text` names.
 
     - "-": lines on standard input. "serial:PORT@BAUD": lines of a serial device. "tcp:HOST:PORT": lines of a server.
-    - a folder: files that an instrument writes into it, each with one or more frames; files that exist already are left
-      out, unless a `rate` is given. A file: a recording, played at its own rate.
+    - a folder: files that an instrument writes into the folder, each with one or more frames; files that already exist
+      are left out, unless a `rate` is given. A file: a recording, played at its own frame rate.
     - "demo": a simulated tank in which a rod moves on a circle; "demo:skin": a simulated skin that is stroked.
 
     **Arguments:**
 
-    - `text`: the text.
-    - `rate`: frames/s of a recording or of lines that have all arrived already.
+    - `text`: name of the source, as listed above.
+    - `rate`: frames/s at which a recording, or lines that have all arrived already, are played.
     - `description`: description of the frames, as `description` of `jeit.data.read`.
     - `reference`: a measurement of the undisturbed sensor, as `like` of `jeit.data.read`.
 
-    Raises `ValueError` for a text that does not name a source and for a rate that is not positive, and as
-    `jeit.data.read` does for a recording.
+    Raises `ValueError` for a text that does not name a source, for a rate that is not positive, and for a recording
+    that `jeit.data.read` cannot read.
 
     **Example:**
 

@@ -19,11 +19,11 @@ import jax
 
 def take_double_precision() -> None:
     """Set JAX to double precision: a light touch changes voltages by 1e-4, for which single precision is not accurate
-    enough. If the user has set JAX_ENABLE_X64, it takes precedence; single precision then raises a warning about its
-    cost (docs/explanation/numerics.md).
+    enough. A value of JAX_ENABLE_X64 that the user has set takes precedence; single precision then raises a warning
+    about the accuracy that it costs (docs/explanation/numerics.md).
 
-    Products of matrices in single precision keep its 24 bits: on graphics processors JAX would round their factors to
-    11 bits. A precision that the user has set (JAX_DEFAULT_MATMUL_PRECISION) takes precedence.
+    Products of single-precision matrices keep all 24 bits: on graphics processors, JAX would by default round the
+    factors to 11 bits. A value of JAX_DEFAULT_MATMUL_PRECISION that the user has set takes precedence.
     """
     if jax.config.jax_default_matmul_precision is None:  # pyright: ignore[reportAttributeAccessIssue]
         jax.config.update("jax_default_matmul_precision", "highest")
@@ -41,10 +41,10 @@ def take_double_precision() -> None:
 
 
 def quick_compilation() -> str:
-    """A value of the environment variable XLA_FLAGS for fast compilation, to be set before JAX computes anything.
+    """Value of the environment variable XLA_FLAGS for fast compilation; it must be set before JAX computes anything.
 
     Code without optimisation compiles in a quarter of the time. The flags depend on the version of jaxlib, because XLA
-    aborts the process at unknown flags.
+    (JAX's compiler) aborts the process at unknown flags.
     """
     fusion = " --xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith("0.10.") else ""
     return f"--xla_backend_optimization_level=0{fusion}"
@@ -54,9 +54,9 @@ _refuses_compilation = False
 
 
 def refuse_compiled_code_in_forks() -> None:
-    """Make compiled code raise `RuntimeError` in processes forked after JAX has started. Such a process lacks JAX's
-    threads, so a compiled program would wait forever. Methods that run in NumPy still work, and a process forked before
-    JAX has started is not restricted."""
+    """Make compiled code raise `RuntimeError` in processes forked after JAX has started. A forked process lacks JAX's
+    threads, so a compiled program would wait forever. Methods of jeit that run in NumPy still work, and a process
+    forked before JAX has started is not restricted."""
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=_refuse_in_child)
 
@@ -77,7 +77,7 @@ def _has_started() -> bool:
 
 
 def _raise_at_compilation(event: str, duration_secs: float, **_: str | int) -> None:
-    """Listener to JAX's monitoring events that raises after tracing, before a program is compiled."""
+    """Listener to JAX's monitoring events that raises `RuntimeError` after tracing, before a program is compiled."""
     del duration_secs
     if event.startswith("/jax/core/compile"):
         raise RuntimeError(
@@ -117,8 +117,8 @@ def keep_compiled_code() -> None:
 
 
 def discarded_damaged(warning: str) -> bool:
-    """Whether a warning is JAX's message that it could not read a cached program; if so, all cached files of that name
-    are deleted.
+    """Whether a warning is JAX's message that it could not read a cached program; if so, all cached files with the
+    program's name are deleted.
 
     Otherwise JAX, which does not overwrite cached files, would compile the program again and repeat the warning in
     every later process.
@@ -143,8 +143,8 @@ def _processor() -> str:
 
 
 def _discard_oldest(folder: Path) -> None:
-    """Delete the least recently used files beyond the limits, and empty files, which a full disk leaves and JAX cannot
-    read."""
+    """Delete the least recently used cached programs beyond the limits on number and size, and empty files: a full disk
+    leaves them, and JAX cannot read them."""
     files = sorted(_file_usage(folder), reverse=True)
     total_bytes = 0
     for file_index, (_, num_bytes, path) in enumerate(files):
@@ -154,7 +154,7 @@ def _discard_oldest(folder: Path) -> None:
 
 
 def _file_usage(folder: Path) -> Iterator[tuple[float, int, Path]]:
-    """Time of last use, size in bytes, and path of each file."""
+    """Time of last use, size in bytes, and path of each file in the cache folder."""
     for path in folder.glob("*/*"):
         with contextlib.suppress(FileNotFoundError):  # another process may delete the file
             status = path.stat()

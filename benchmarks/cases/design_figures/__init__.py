@@ -1,7 +1,8 @@
 """Every figure of docs/reference/layout-figures.md.
 
-The paper's two layouts touched all over, for several margins, thicknesses and kinds of touch, optimised layouts, and
-measurements selected from all possible ones. The figures are of accuracy, not of time.
+The figures are for the paper's two electrode layouts with touches all over the skin, for several margins, thicknesses
+and kinds of touch; for optimised layouts; and for measurements selected from all possible measurements. They concern
+accuracy, not time.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ PICTURE = "design-thickness.png"
 
 
 def run(options: Options) -> Result:
-    """Five tables and, where an output folder is given, the figure of thickness."""
+    """Compute five tables and, if an output folder is given, draw the figure of thickness."""
     setting = touches.QUICK if options.quick else touches.Setting()
     say("both layouts touched")
     changed = {name: touches.changes(name, setting.places, setting.mesh) for name in touches.LAYOUTS}
@@ -27,7 +28,7 @@ def run(options: Options) -> Result:
 
 
 def _improved(quick: bool) -> list[Table]:
-    """Improvements over the paper's layouts and measurements."""
+    """Tables of the improvements over the paper's layouts and measurements."""
     say("layouts optimised")
     sizes = ((300, 600), (6, 8), 2, 2) if quick else ((1300, 6000), (16, 24), 4, 60)
     optimised = layouts.optimised(*sizes)

@@ -10,8 +10,8 @@ CONDUCTANCE = 2e-3
 
 
 def optimised(nodes: tuple[int, int], columns: tuple[int, int], starts: int, steps: int) -> Table:
-    """Layouts before and after optimisation, on a sheet of 2 mS, evaluated on a finer mesh (nodes and touches along a
-    side of each).
+    """A table of layouts before and after optimisation, on a sheet of 2 mS. `nodes` and `columns` are the numbers of
+    nodes, and of touches along a side, for optimisation and for evaluation on a finer mesh.
     """
     import jax
 
@@ -73,10 +73,11 @@ def optimised(nodes: tuple[int, int], columns: tuple[int, int], starts: int, ste
 
 
 def selected(name: str, number: int, cell_sizes: tuple[float, float], correlations, noises, count: int) -> Table:
-    """A table of `number` selected pairs of a layout: the fraction of information kept.
+    """A table of the fraction of information that `number` selected electrode pairs of a layout keep.
 
-    For correlation lengths of the prior, metres, and noise relative to each voltage. Cell sizes are of the sheet and
-    under electrodes, metres. The median is of `count` random selections.
+    Rows are for `correlations` (correlation lengths of the prior in metres) and `noises` (relative to each voltage).
+    `cell_sizes` are those of the sheet and under electrodes, in metres. The table states the median of `count` random
+    selections for comparison.
     """
     import jax
 
@@ -97,7 +98,7 @@ def selected(name: str, number: int, cell_sizes: tuple[float, float], correlatio
     random = random_selections(jax.random.key(0), protocol.num_measurements, number, count)
     rows = []
     for correlation in correlations:
-        # Conductance varies by a quarter: 2.5 of 10 mm pressed in.
+        # Conductance varies by a quarter, as if a layer of 10 mm were indented by 2.5 mm.
         product = (0.25 * conductance) ** 2 * Gaussian(correlation).covariance_product(mesh, jacobian)
         for noise in noises:
             candidates = Candidates.create(jacobian, product, noise * voltages)

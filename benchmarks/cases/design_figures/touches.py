@@ -1,4 +1,4 @@
-"""The paper's two layouts on a layer, touched all over, for the case `design_figures`.
+"""The paper's two electrode layouts on a layer with touches all over it, for the case `design_figures`.
 
 Text S4 and Figs. S11 and S12 of Park et al., Science Robotics 7, eabm7187 (2022).
 """
@@ -23,9 +23,9 @@ MARGIN, PAIRS, THICKNESS = 10e-3, 94, 10e-3
 
 
 class Setting(NamedTuple):
-    """Places along a side, clusters, margins to the edge in metres, the mesh of the comparison (cell size in metres,
-    layers of cells), that of the study of thickness (cell size, and layers for each thickness, metres) and of its check
-    with finer layers, and shapes of touches.
+    """Settings of the study: number of touches along a side, number of clusters (taxels), margins to the edge in
+    metres, mesh of the comparison (cell size in metres, layers of cells), mesh of the study of thickness (cell size;
+    thickness in metres and layers of cells), meshes with finer layers for a check, and shapes of touches.
     """
 
     places: int = 48
@@ -33,7 +33,7 @@ class Setting(NamedTuple):
     margins: tuple[float, ...] = (0.0, 5e-3, 10e-3, 15e-3)
     mesh: tuple[float, int] = (4.5e-3, 5)
     study_cell: float = 7e-3
-    # Cells 1.25 mm high throughout.
+    # All cells are 1.25 mm high.
     study: tuple[tuple[float, int], ...] = ((5e-3, 4), (7.5e-3, 6), (10e-3, 8), (15e-3, 12), (20e-3, 16))
     check: tuple[tuple[float, int], ...] = ((10e-3, 16),)
     shapes: tuple[str, ...] = ("bell", "hemisphere")
@@ -50,7 +50,8 @@ def changes(
     indentation: AbstractIndentation | None = None,
     contrast: float = 0.0,
 ) -> Array:
-    """Changes (n, 496) of the voltages of all pairs at 1 mA, by touches all over the skin of 1 S/m."""
+    """Changes (touches, 496) of the voltages of all electrode pairs at 1 mA, due to touches all over a skin of 1
+    S/m."""
     from jeit.design import sensitivity_map, touch_grid
     from jeit.electrodes import FaceDiscs
     from jeit.forward import ForwardModel
@@ -69,7 +70,8 @@ def changes(
 def response_of(
     name: str, setting: Setting, changed: Array, margin: float = MARGIN, pairs: int = PAIRS
 ) -> SkinResponse:
-    """The layout's response farther than `margin` from the edge with the nearest `pairs`, from all changes."""
+    """The response of the layout `name` to touches farther than `margin` metres from the edge, measured with the
+    `pairs` nearest electrode pairs; `changed` has the changes of all pairs."""
     import jax
 
     from jeit.design import find_taxels, touches_away_from_the_edge
@@ -90,22 +92,22 @@ def response_of(
 
 
 def area(figures: dict) -> str:
-    """Mean ± standard deviation of the taxels' areas."""
+    """Text of the mean ± standard deviation of the taxels' areas, in cm²."""
     return f"{figures['taxel_area_cm2']['mean']:.1f} ± {figures['taxel_area_cm2']['std']:.1f}"
 
 
 def largest(figures: dict) -> str:
-    """Area of the largest taxel."""
+    """Text of the area of the largest taxel, in cm²."""
     return f"{figures['taxel_area_cm2']['max']:.0f}"
 
 
 def blind(figures: dict) -> str:
-    """The blind spot."""
+    """Text of the fraction of the skin in which touches are not detected (blind spot), in per cent."""
     return f"{100 * figures['blind_spot_fraction']:.1f} %"
 
 
 def comparison_table(setting: Setting, changed: dict[str, Array]) -> Table:
-    """Both layouts for several margins, and with all pairs, beside the paper."""
+    """A table of both layouts for several margins, and with all electrode pairs, compared with the paper."""
     from jeit.design.comparison import comparison_figures
 
     rows = [["Park et al. 2022", "94", "33 %", "", "12.6 ± 1.4", "41", "30.5 ± 27.3", "112"]]
@@ -122,7 +124,7 @@ def comparison_table(setting: Setting, changed: dict[str, Array]) -> Table:
 
 
 def thickness_table(setting: Setting) -> tuple[Table, dict[float, list[SkinResponse]]]:
-    """Both layouts on layers of several thicknesses, and their responses."""
+    """A table of both layouts on layers of several thicknesses, and the responses by thickness."""
     from jeit.design.comparison import comparison_figures
 
     rows, studied = [], {}
@@ -141,7 +143,8 @@ def thickness_table(setting: Setting) -> tuple[Table, dict[float, list[SkinRespo
 
 
 def kinds_table(setting: Setting, changed: dict[str, Array]) -> Table:
-    """Both layouts for a bell and a hemisphere, insulating and conducting ten times as well as the skin."""
+    """A table of both layouts for bell-shaped and hemispherical touches, which are insulating or conduct ten times as
+    well as the skin."""
     from jeit.design import Bell, Hemisphere
     from jeit.design.comparison import comparison_figures
 
@@ -167,7 +170,8 @@ def kinds_table(setting: Setting, changed: dict[str, Array]) -> Table:
 
 
 def draw_thickness(studied: dict[float, list[SkinResponse]], path) -> None:
-    """Distributions of sensitivity and of the taxels' areas for each thickness, metres, as in Fig. S12."""
+    """Draw the distributions of sensitivity and of the taxels' areas for each thickness (metres), as in Fig. S12 of the
+    paper."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 

@@ -1,7 +1,8 @@
-"""Voltages, Jacobians, linear images and batches of them: jeit beside SciPy and pyEIT on the same disks.
+"""Voltages, Jacobians, linear images, and batches of these: jeit compared with SciPy and pyEIT on the same disks.
 
-Meshes, protocols and conductivities are the same for all. Every contestant has its own process, and turns are
-interleaved. Arcs with contact impedance are compared with SciPy, point electrodes with pyEIT, which has no others.
+Meshes, protocols and conductivities are the same for all contestants. Every contestant runs in its own process, and
+their turns are interleaved. The complete electrode model is compared with SciPy, the point electrode model with pyEIT,
+which has no other.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from benchmarks.harness.case import Case, Headline, Options, Result
 from benchmarks.harness.tables import cell, markdown, ratio
 from benchmarks.harness.timing import say
 
-# Sizes of the meshes for each number of electrodes. Figures are judged for 16 electrodes only. With 32, the voltages
-# and the Jacobian show the growth of cost.
+# Numbers of nodes of the meshes for each number of electrodes. Figures are judged for 16 electrodes only. With 32
+# electrodes, voltages and Jacobian show the growth of cost.
 NODES = {16: (1150, 5000, 20_000), 32: (5000,)}
 
 
 def run(options: Options) -> Result:
-    """All matches, one after the other."""
+    """Run all matches, one after the other."""
     python = None if options.without_pyeit else environment.python("pyeit", create=not options.quick)
     matches: list[Match] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -31,7 +32,7 @@ def run(options: Options) -> Result:
             for model in ("complete", "point"):
                 say(f"{num_points} nodes, {num_electrodes} electrodes, {model} electrode model …")
                 matches.append(play(num_points, num_electrodes, model, settings, matches, Path(folder)))
-                # A run that is stopped has reported its results so far.
+                # A run that is stopped has reported its previous results.
                 shown = table(matches[-1:])
                 say(markdown(shown.header, shown.rows))
     wrong = [
@@ -44,7 +45,7 @@ def run(options: Options) -> Result:
 
 
 def _plan(options: Options, python: str | None):
-    """Electrodes, nodes and settings of each pair of matches."""
+    """Yield the number of electrodes, the number of nodes and the settings of each pair of matches."""
     rounds, budget, limit = options.rounds or 15, 2.0, options.time_limit or 120.0
     if options.quick:
         yield 16, 200, Settings(options.rounds or 2, 0.5, limit, python, TASKS[:-1])
@@ -56,7 +57,7 @@ def _plan(options: Options, python: str | None):
 
 
 def _headline(matches: list[Match]) -> Headline | None:
-    """The Jacobian at about 5,000 nodes with 16 electrodes, beside the fastest opponent."""
+    """The headline: the Jacobian at about 5,000 nodes with 16 electrodes, compared with the fastest opponent."""
     fitting = [one for one in matches if one.model == "complete" and one.num_electrodes == 16]
     if not fitting:
         return None

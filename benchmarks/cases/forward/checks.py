@@ -1,4 +1,4 @@
-"""The required figures, beside those measured."""
+"""The required figures of the case `forward`, compared with the measured figures."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _batches(matches: list[Match]) -> Iterator[Asked]:
             if match.num_electrodes != 16 or many is None or one is None:
                 continue
             each = many.median / 64
-            # The medians of two such series differ by 5 % on a quiet machine.
+            # On a quiet machine, medians of two repeated measurements differ by 5 %.
             yield judged(
                 f"{batch}, {match.num_points} nodes: per item no more than one alone ({alone})",
                 f"{duration(each)} against {duration(one.median)}",

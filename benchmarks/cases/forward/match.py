@@ -15,7 +15,7 @@ from benchmarks.problems import disk as problems
 from benchmarks.problems.accuracy import difference, exact_voltages
 
 TASKS = ("voltages", "voltages and Jacobian", "linear image", "1000 linear images", "64 conductivities", "64 Jacobians")
-# Above this size 64 Jacobians, or pyEIT's dense inverse with its copies, do not fit in this part of free memory.
+# Maximum fraction of the free memory for 64 Jacobians, or for pyEIT's dense inverse with its copies.
 MEMORY_SHARE = 0.5
 # Results of direct solvers on the same discretisation may differ by the condition number times rounding.
 AGREEMENT = 1e-9
@@ -23,7 +23,7 @@ AGREEMENT = 1e-9
 
 @dataclass
 class Settings:
-    """Limits of time, and the interpreter that has pyEIT (None: without it)."""
+    """Settings of a match: limits of time, and the Python interpreter with pyEIT (None: pyEIT is left out)."""
 
     rounds: int
     budget: float
@@ -34,7 +34,7 @@ class Settings:
 
 @dataclass
 class Match:
-    """Figures of all contestants at all tasks on one problem."""
+    """Figures of all contestants for all tasks on one problem."""
 
     num_points: int
     num_cells: int
@@ -48,7 +48,7 @@ class Match:
 
     @property
     def agreed(self) -> bool:
-        """Whether every result equals the opponent's, to rounding."""
+        """Whether every result of jeit equals the opponent's result up to rounding errors."""
         return all(value < AGREEMENT for value in self.accuracy.values())
 
 
@@ -79,7 +79,7 @@ def play(
         jeit = enter("jeit", sys.executable)
         if jeit is None:
             raise RuntimeError("jeit itself does not run; see the messages above.")
-        # Before anything else compiles what they share.
+        # The first calls are timed before other tasks compile the code that the tasks share.
         first = {task: jeit.ask(do="first", task=task)["seconds"] for task in TASKS[:2]}
         if model == "complete":
             problem["reconstruction"] = jeit.save("reconstruction matrix", folder / "matrix.npz")[0]
@@ -95,7 +95,8 @@ def play(
 def _play_tasks(
     match: Match, contestants: list[Contestant], settings: Settings, before: list[Match], folder: Path
 ) -> None:
-    """Figures of every task that fits, and the differences of jeit's results from the first opponent's."""
+    """Measure every task that fits in memory, and the differences of jeit's results from those of the first
+    opponent."""
     for task in settings.tasks:
         if (match.model == "point" and task not in TASKS[:2]) or not _fits(match, task):
             continue
@@ -116,8 +117,8 @@ def _fits(match: Match, task: str) -> bool:
 
 
 def _foresee(match: Match, task: str, settings: Settings, before: list[Match]) -> dict[str, Figures]:
-    """The predicted reason why pyEIT cannot finish, or "". For its Jacobian it inverts the dense matrix: n³ operations,
-    three copies of n².
+    """Figures of pyEIT with the predicted reason why it cannot finish, or an empty dictionary. For the Jacobian, pyEIT
+    inverts the dense matrix of n nodes: n³ operations, three copies of n² numbers.
     """
     if match.model != "point" or task != "voltages and Jacobian" or settings.pyeit_python is None:
         return {}
@@ -134,7 +135,7 @@ def _foresee(match: Match, task: str, settings: Settings, before: list[Match]) -
 
 
 def _compare(match: Match, task: str, results: list[list[np.ndarray]]) -> None:
-    """Relative differences between jeit's results and the first opponent's."""
+    """Record the relative differences between jeit's results and those of the first opponent."""
     for name, mine, other in zip(("v", "J"), *results, strict=False):
         label = name if task in TASKS[:2] else ""
         match.accuracy[f"{task} {label}".strip()] = difference(np.asarray(mine), np.asarray(other))

@@ -26,7 +26,7 @@ HEADER = [
 
 
 def table(matches: list[Match]) -> Table:
-    """All figures, task by task."""
+    """A table of all figures, ordered by task."""
     tasks = list(dict.fromkeys(task for match in matches for task in match.figures))
     return Table(HEADER, [_row(task, match) for task in tasks for match in matches if task in match.figures])
 

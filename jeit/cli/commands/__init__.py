@@ -1,1 +1,2 @@
-"""Commands, one file each: a command parses its options, calls functions of jeit, and prints the results."""
+"""Commands of `jeit`, one module each: a command parses its options, calls functions of jeit, and prints the
+results."""

@@ -1,4 +1,5 @@
-"""`jeit choose`: comparison of the rules for the hyperparameter on a measured file, with the image of each."""
+"""`jeit choose`: comparison of the rules for the regularisation hyperparameter on a measured file, with the image of
+each rule."""
 
 from __future__ import annotations
 
@@ -54,7 +55,8 @@ def choose(
     as_is: AsIs = False,
     quiet: Quiet = False,
 ) -> None:
-    """Compare the rules that choose the hyperparameter of DATA's image; writes choice.png and choice.json."""
+    """Compare the rules that choose the regularisation hyperparameter of DATA's image; writes choice.png and
+    choice.json."""
     from jeit.cli.console import Steps, plain_console, say_written
     from jeit.imaging import ImagingSettings, compare_on_data
     from jeit.report import write_choice
@@ -81,7 +83,7 @@ def choose(
 
 
 def show(console, result: "ComparedRules") -> None:
-    """Print a row for every rule, and the reason to doubt its choice."""
+    """Print a row for every rule, with the chosen hyperparameter and the reason to doubt the choice, if any."""
     from rich.table import Table
 
     from jeit.arguments import percent

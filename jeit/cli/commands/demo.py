@@ -20,7 +20,8 @@ def demo(
     ),
     quiet: Quiet = False,
 ) -> None:
-    """Press a simulated skin (100 mm across, 16 electrodes), image it, and compare. Needs no data."""
+    """Simulate a press on a skin (diameter 100 mm, 16 electrodes), image it, and compare image and truth. Needs no
+    data."""
     import jax
     import numpy as np
 

@@ -1,4 +1,5 @@
-"""`jeit describe`: find out what a file of voltages may be, write a description of it, and image its first frame."""
+"""`jeit describe`: find out how the voltages in a file may have been measured, write a description of the file, and
+image its first frame."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from jeit.cli.options import Data, Key, Quiet, Reference, ReferenceKey, make_fol
 if TYPE_CHECKING:
     from jeit.imaging.describe import Findings
 
-# For each shape the names of its sizes in a description, and of the layout of its electrodes.
+# For each shape of a body, the names of its sizes in a description, and the name of the layout of its electrodes.
 _SHAPES = {
     "disk": (("radius",), "ring"),
     "rectangle": (("width", "height"), "perimeter"),
@@ -25,7 +26,7 @@ _SHAPES = {
 }
 _DESCRIPTION_FILE = "description.toml"
 _WRITTEN_FILES = (_DESCRIPTION_FILE, "image.png", "image.npz", "report.json", "image.vtu")
-# Explanations that are listed.
+# Maximum number of explanations that are listed.
 _MAX_LISTED = 5
 
 
@@ -57,7 +58,8 @@ def describe(
     ] = Path("."),
     quiet: Quiet = False,
 ) -> None:
-    """Find out what a file that nobody has described may be: electrodes, protocol, order of channels, signs, frames.
+    """Find out how the voltages in a file without a description may be arranged: electrodes, protocol, channels, signs,
+    frames.
 
     Lists the explanations with the evidence for each, writes a commented description.toml, and images the first frame
     that differs from REFERENCE, or from the array --reference-key. In Python:
@@ -141,7 +143,8 @@ def describe(
 
 @contextmanager
 def _naming_sizes() -> Iterator[None]:
-    """Context manager that names the options --shape, --width and --height in errors about what they describe."""
+    """Context manager that names the options --shape, --width and --height in error messages about bodies and
+    electrodes."""
     try:
         yield
     except ValueError as error:
@@ -155,7 +158,8 @@ def _naming_sizes() -> Iterator[None]:
 
 
 def _value_or_prompt(option: str, value: Any, question: str, example: str) -> Any:
-    """The value of an option, asked for on a terminal. Raises `ValueError` if there is none."""
+    """The `value` of an option; if it is missing, the user is asked on a terminal. Raises `ValueError` without a value
+    and without a terminal."""
     if value is not None:
         return value
     if not sys.stdin.isatty():
@@ -164,7 +168,8 @@ def _value_or_prompt(option: str, value: Any, question: str, example: str) -> An
 
 
 def _body_tables(shape: str, width: float | None, height: float | None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Tables `[geometry]` and `[electrodes]` of a description. Raises `ValueError`."""
+    """Sections `[geometry]` and `[electrodes]` of a description, from the options. Raises `ValueError` for invalid
+    values."""
     name, _, sizes_text = shape.partition(":")
     try:
         numbers = [float(number) for number in sizes_text.split(",")]
@@ -191,7 +196,7 @@ def _body_tables(shape: str, width: float | None, height: float | None) -> tuple
 
 
 def _print_findings(console, data: Path, findings: "Findings") -> None:
-    """Print the explanations that were found."""
+    """Print the explanations of the file that were found."""
     from jeit.arguments import counted, percent
     from jeit.cli.console import pairs
 

@@ -9,7 +9,8 @@ import typer
 
 from jeit.cli.options import Description, Format, Key, read_file
 
-# Solids with a given outline: their name, and the words of a description for their sizes if they differ.
+# For each outline, the name of the upright solid over it, and the keys of a description for the solid's sizes if they
+# differ.
 _SOLIDS = {
     "rectangle": ("box", {"height": "depth", "thickness": "height"}),
     "disk": ("cylinder", {"thickness": "height"}),
@@ -22,7 +23,7 @@ def info(
     format: Format = None,
     description: Description = None,
 ) -> None:
-    """Say what DATA holds: frames, electrodes, protocol, noise, and what was assumed or masked."""
+    """Print what DATA contains: frames, electrodes, protocol, noise, assumptions, and masked voltages."""
     from jeit.arguments import counted, percent
     from jeit.cli.console import pairs, plain_console, scaled
     from jeit.data.imageable import MOST_IMPOSSIBLE_SIGNS
@@ -55,7 +56,7 @@ def info(
 
 
 def _body_text(body: dict[str, Any]) -> str:
-    """Shape and size of a body, in the words of a description."""
+    """Text on the shape and size of a body, with the words that a description uses."""
     from jeit.arguments import counted
 
     if body["shape"] == "mesh":

@@ -96,9 +96,9 @@ def reconstruct(
     model: Model = None,
     quiet: Quiet = False,
 ) -> None:
-    """Image what changed between REFERENCE and DATA; writes image.png, image.npz, report.json; of solids image.vtu.
+    """Image the change from REFERENCE to DATA; writes image.png, image.npz, report.json; for solids image.vtu.
 
-    With --method network, how deep a skin is indented: frames.csv, depth.npz, depth.png and report.json.
+    With --method network, the indentation depth of a skin is imaged: frames.csv, depth.npz, depth.png and report.json.
 
     In Python: `jeit.image_difference` and `jeit.report.write_image`; `jeit.reconstruct` makes absolute images.
     """
@@ -165,12 +165,12 @@ def reconstruct(
         say_written(console, output / "image.png", "image.npz", "report.json", *solid_files)
 
 
-# Share of the difference above which rounding is reported.
+# Fraction of the difference between frame and reference above which rounding of the voltages is reported.
 _MIN_ROUNDING = 2e-3
 
 
 def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> None:
-    """Print the result; `frame_given`: whether the frame was given by the user."""
+    """Print the result of imaging; `frame_given`: whether the user selected the frame."""
     import numpy as np
 
     from jeit.arguments import counted, percent
@@ -241,7 +241,7 @@ def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> N
 
 
 def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
-    """Text on the bodies fitted as shapes: outlines in a sheet, surfaces in a solid."""
+    """Text on the bodies that were fitted as shapes: outlines in a sheet (`dimension` 2), surfaces in a solid."""
     from jeit.arguments import counted, percent
     from jeit.inverse.shapes import Ellipsoid
 

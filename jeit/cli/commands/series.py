@@ -79,10 +79,10 @@ def series(
     as_is: AsIs = False,
     quiet: Quiet = False,
 ) -> None:
-    """Image all frames of DATA against one reference, linearly and in one go, and describe what happens over time.
+    """Image all frames of DATA against one reference, linearly and at once, and analyse the changes over time.
 
     Writes series.png (frames, the functional image, maps of amplitude and phase, curves and spectra of regions),
-    series.npz, regions.csv and report.json. Frame after frame as they come: jeit stream.
+    series.npz, regions.csv and report.json. 'jeit stream' images frames one by one as they arrive.
 
     In Python: `jeit.imaging.image_sequence`, `jeit.image.oscillation`, `jeit.report.write_series`.
     """
@@ -149,7 +149,7 @@ def series(
 
 
 def _parse_band(text: str) -> "float | tuple[float, float]":
-    """A frequency, or a band of them. Raises `ValueError`."""
+    """A frequency, or a band of frequencies, in hertz. Raises `ValueError` for an invalid text."""
     number_texts = text.split("-")
     try:
         numbers = [float(number_text) for number_text in number_texts]
@@ -161,7 +161,8 @@ def _parse_band(text: str) -> "float | tuple[float, float]":
 
 
 def _parse_region(text: str) -> tuple[str, list[float]]:
-    """The shape and the numbers of a region. Raises `ValueError`."""
+    """The shape and the numbers of a region of interest, such as "ball:0,0,0.02". Raises `ValueError` for an invalid
+    text."""
     name, _, numbers_text = text.partition(":")
     try:
         return name, [float(number_text) for number_text in numbers_text.split(",")]
@@ -170,7 +171,7 @@ def _parse_region(text: str) -> tuple[str, list[float]]:
 
 
 def _region_mask(text: str, parsed: tuple[str, list[float]], mesh: "Mesh"):
-    """Cells of a region. Raises `ValueError`."""
+    """Mask of the mesh's cells in a region of interest. Raises `ValueError` if the region does not fit the mesh."""
     from jeit.image import ball_region, box_region, half_region
 
     (name, numbers), d = parsed, mesh.dimension

@@ -88,12 +88,13 @@ def stream(
     model: Model = None,
     quiet: Quiet = False,
 ) -> None:
-    """Image every frame of DATA as it comes; bad frames are refused with the reason, and the stream goes on.
+    """Image every frame of DATA as it arrives; faulty frames are refused with a reason, and the stream continues.
 
-    Writes frames.csv line by line (x, y, the centroid of the region around the strongest change, metres, and its peak,
+    Writes frames.csv line by line (x, y: centroid in metres of the region around the strongest change; peak change in
     S), and at the end images.npz with `conductivity` (frames, cells), NaN for frames that were refused, `points`,
-    `cells` and `background`; frames.png, some frames on one colour scale; and a film. If all were refused, the exit
-    status is 1. With --method network, how deep a skin is indented: frames.csv, depth.npz, depth.png and report.json.
+    `cells` and `background`; frames.png, some frames on one colour scale; and a film. If all frames were refused, the
+    exit status is 1. With --method network, the indentation depth of a skin is imaged: frames.csv, depth.npz, depth.png
+    and report.json.
     """
     if method == NETWORK or model is not None:
         unused = {

@@ -34,12 +34,12 @@ def view(
     slices: Annotated[int, typer.Option(help="Slices in the grid.")] = 9,
     quiet: Quiet = False,
 ) -> None:
-    """Look into IMAGE: a window where PyVista and a display are there, else pictures in a folder 'view' beside it.
+    """View IMAGE in a window if PyVista and a display are available, else write pictures to a folder 'view' beside it.
 
-    Of a solid: overview.png, isosurfaces.png from four sides, slices.png, and planes.png of slices of your own; of a
-    skin in space surface.png; of a sheet image.png.
+    Pictures of a solid are overview.png, isosurfaces.png from four sides, slices.png, and planes.png of slices that you
+    choose; of a curved skin surface.png; of a sheet image.png.
 
-    In Python: `jeit.report.read_image` and `jeit.report.write_views`; `jeit.plot.view_solid` makes the window.
+    In Python: `jeit.report.read_image` and `jeit.report.write_views`; `jeit.plot.view_solid` opens the window.
     """
     from jeit.cli.console import plain_console, say_written
     from jeit.plot.solid import interactive
@@ -67,7 +67,7 @@ def view(
 
 
 def _plane(text: str):
-    """The plane that `text` spells, in millimetres. Raises `ValueError`."""
+    """The slicing plane that `text` specifies, in millimetres. Raises `ValueError` for an invalid text."""
     from jeit.arguments import describe
     from jeit.image import Plane
 

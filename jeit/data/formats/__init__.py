@@ -1,6 +1,6 @@
 """Readers of measured data, one module per file format: published data sets, instruments, and plain tables.
 
 Files of instruments do not state the positions of the electrodes; a description beside them (`[geometry]`,
-`[electrodes]`) does. Properties of a format that are not published, such as the scale of the voltages, are stated in
-the notes of the measurement.
+`[electrodes]`) does. The notes of a measurement state assumptions on properties of a format that are not published,
+such as the scale of the voltages.
 """

@@ -1,9 +1,10 @@
 """Reader of recordings by Carefusion's Goe-MF II (.eit): XML in UTF-16, followed by binary segments.
 
 `<Header>N bytes</Header>` gives the offset of the first segment. A segment begins with six little-endian integers of
-four bytes: its type, a channel, the number of its frame from 0, the bytes per item, the number of items, and one of
-unknown meaning; the items follow. Type 3 is a frame of 256 numbers of four bytes; the 208 numbers from the 48th on are
-the adjacent voltages. Type 7 is an image of 912 numbers. Other types are waveforms.
+four bytes: the type of the segment, a channel, the frame number counted from 0, the bytes per item, the number of
+items, and an integer of unknown meaning; the items follow. Type 3 is a frame of 256 numbers of four bytes; the 208
+numbers from the 48th on are the voltages of the adjacent protocol. Type 7 is an image of 912 numbers. Other types are
+waveforms.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _NO_RATE_NOTE = "the file says no rate that is known; give it by [data] frame_ra
 
 
 def recognises(path: Path) -> bool:
-    """True for an .eit file that begins with the XML of this format."""
+    """Whether a file is an .eit file that begins with the XML header of Carefusion's format."""
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:
@@ -43,8 +44,8 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
-    """Read all frames. Raises `ValueError` if the header does not state its length, and if there is no complete
-    frame."""
+    """Read all frames of a Carefusion recording. Raises `ValueError` if the header does not state its length, and if
+    there is no complete frame."""
     content = content_of(path)
     match = re.search(r"<Header>\s{0,9}([0-9]{1,9}) bytes</Header>", _decode_head(content[:_HEAD_BYTES]))
     if match is None or not _HEAD_BYTES // 8 < int(match[1]) < len(content):
@@ -67,7 +68,8 @@ def _decode_head(content: bytes) -> str:
 
 
 def _frames(content: bytes, start: int) -> tuple[list[np.ndarray], int]:
-    """Voltages of every complete frame, and number of bytes left over by a truncated last segment."""
+    """Voltages of every complete frame after byte `start`, and number of remaining bytes of a truncated last
+    segment."""
     frames, offset = [], start
     while offset + 4 * _NUM_HEADER_INTEGERS <= len(content):
         kind, _, _, item_size, num_items, _ = (

@@ -1,10 +1,11 @@
-"""Reader of what Analog Devices' CN0565 kit sends over its serial line, as terminals and programs record it.
+"""Reader of recorded output of Analog Devices' CN0565 kit, which sends text over a serial line.
 
 A frame is a line that begins with "!V": integers of 32 bits in hexadecimal digits, separated by commas, alternately the
-real and the imaginary part of a voltage. The electrodes drive one after another, each against the electrode at the
-force distance; for each drive the electrodes sense in the order of their numbers, each against the one at the sense
-distance, without the pairs that contain a driven electrode. With 8, 16 or 32 electrodes and both distances 1, the
-default of the kit's programs, there are 40, 208 or 928 voltages. Other lines are answers to commands and messages.
+real and the imaginary part of a voltage. Drives begin at each electrode in turn; the current flows between this
+electrode and the electrode that is the force distance away. For each drive, voltages are measured from each electrode
+in turn to the electrode that is the sense distance away, without the pairs that contain a driven electrode. With 8, 16
+or 32 electrodes and both distances 1, the default of the kit's programs, there are 40, 208 or 928 voltages. Other lines
+are answers to commands and messages.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ from jeit.data.unstated import with_signs
 from jeit.protocol import Protocol
 
 DESCRIPTION = "lines of Analog Devices' CN0565 kit ('!V' and hexadecimal numbers), of 8, 16 or 32 electrodes"
-# A terminal may write the time before a frame.
+# A terminal program may write the time before a frame.
 _FRAME_LINE = re.compile(rb"^[^!\r\n]{0,80}!V[ \t]{0,8}([0-9A-Fa-fxX, \t]*)(.*)$", re.MULTILINE)
 _HEXADECIMAL = re.compile(rb"(?:0[xX])?([0-9A-Fa-f]{1,8})")
-# Number of bytes read to recognise a file; minimum count of numbers in a line of data.
+# Number of bytes read to recognise a file; minimum number of numbers in a frame.
 _HEAD_BYTES, _MIN_NUMBERS = 65536, 8
 _ELECTRODE_COUNTS = (8, 16, 32)
 _ASSUMED_CURRENT = 1e-3
@@ -46,7 +47,7 @@ _DISTANCE_HINT = (
 
 
 def recognises(path: Path) -> bool:
-    """True for a file with a line of the kit near its start."""
+    """Whether a file contains a frame of a CN0565 kit near its start."""
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
     return any(len(words) >= _MIN_NUMBERS for words in _frames(head))
@@ -55,11 +56,12 @@ def recognises(path: Path) -> bool:
 def read(
     path: Path, description: str | Path | None = None, like: Measurement | None = None, key: str | None = None
 ) -> Measurement:
-    """Read all frames. A `[protocol]` in the description states other distances than 1, or the current; without a
-    description, the body and the protocol are those of `like`, a measurement of the same sensor.
+    """Read all frames of a CN0565 recording. The section `[protocol]` of the description states the current, and
+    distances other than 1; without a description, the body and the protocol are those of `like`, a measurement of the
+    same sensor.
 
-    Raises `ValueError` as `numbers`, for a number of voltages that distances of 1 do not give unless a protocol is
-    described, and for a `key`, because there are no arrays.
+    Raises `ValueError` if `numbers` does, if no protocol is described and the number of voltages does not agree with
+    distances of 1, and if a `key` is given, because the file contains no arrays.
     """
     if key is not None:
         raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
@@ -81,12 +83,13 @@ def read(
 def _protocol(
     path: Path, sensor_description: Description, num_voltages: int, like: Measurement | None
 ) -> tuple[Protocol, tuple[str, ...]]:
-    """The protocol of `num_voltages` voltages, and notes on what is assumed."""
+    """The protocol of a recording with `num_voltages` voltages per frame, and notes on assumptions."""
     if like is not None and like.protocol.num_measurements == num_voltages:
         return like.protocol, ()
     candidates = [pair for pair in sensor_description.protocols(path) if pair[0].num_measurements == num_voltages]
     if candidates:
-        # The kit counts from electrode 1, unless the description says otherwise.
+        # For every drive, the kit measures in the order of electrode numbers, unless the description states another
+        # order.
         protocol, options = next(
             (candidate for candidate in candidates if 'order = "fixed"' in candidate[1]), candidates[0]
         )
@@ -117,10 +120,10 @@ def _protocol(
 
 
 def numbers(path: Path) -> tuple[Complex[np.ndarray, "F M"], tuple[str, ...]]:
-    """Return the voltages of each frame, in steps of the converter, and notes. Frames in which characters were lost,
-    because they are longer or shorter than most, or have a cell that is not a number, are NaN.
+    """Read the voltages of each frame, in steps of the converter, and notes. Frames in which characters were lost, i.e.
+    that are longer or shorter than most frames or have a cell that is not a number, are NaN.
 
-    Raises `ValueError` if there is no frame, or if most have an odd number of numbers.
+    Raises `ValueError` if there is no frame, or if most frames have an odd number of numbers.
     """
     frames = list(_frames(content_of(path)))
     if not frames:
@@ -155,12 +158,12 @@ def _frames(content: bytes) -> Iterator[list[float | None]]:
             cells.pop()
         values = [_number(cell) for cell in cells]
         yield [*values, None] if line[2].strip() else values
-        for _ in range(line[2].count(b"!V")):  # a line end is lost; the frames keep their places in time
+        for _ in range(line[2].count(b"!V")):  # a line end was lost; later frames keep their indices
             yield [None]
 
 
 def _number(cell: bytes) -> float | None:
-    """A whole number of 32 bits with its sign, or None."""
+    """The signed 32-bit integer in a cell of hexadecimal digits; None if the cell is not a number."""
     match = _HEXADECIMAL.fullmatch(cell)
     if match is None:
         return None

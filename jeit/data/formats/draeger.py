@@ -1,10 +1,10 @@
 """Reader of recordings by Dräger's PulmoVista 500 (.eit): a text header, followed by frames of equal size.
 
 Numbers are little-endian. Bytes 0-3 are the version of the format and bytes 4-7 the length of the header text; frames
-begin at byte 16 + this length. The text states the frame rate as "Framerate [Hz]:". A frame of version 50 and later has
-5,495 bytes, one of version 32 has 5,200. It begins with 600 numbers of eight bytes, of which the first 208 and the 208
-from number 322 on are the two parts of the adjacent voltages. The maker has not published
-the weights of the two parts; those used here are estimates by users.
+begin at byte 16 + this length. The text states the frame rate as "Framerate [Hz]:". A frame has 5,495 bytes in version
+50 and later, and 5,200 bytes in version 32. A frame begins with 600 numbers of eight bytes. The first 208 numbers, and
+the 208 numbers from number 322 on, are two parts whose weighted sum gives the voltages of the adjacent protocol. The
+maker has not published the weights; the weights used here are estimates by users.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ DESCRIPTION = "Dräger PulmoVista (.eit): 208 adjacent voltages a frame, with th
 # Bytes per frame for each version of the format. Frames of version 31 are too short for the known layout.
 _FRAME_BYTES = {0x20: 5200, 0x33: 5495}
 _HEADER_MARK, _PREFIX_BYTES = b"---Draeger EIT-Software", 16
-# Index of the first number of the second part, and the weights of both parts.
+# Index of the first number of the second part of the voltages, and the weights of both parts.
 _SECOND_PART, _WEIGHTS = 322, (9.8242e-4, 1.9607e-4)
 _SCALE_NOTES = (
     "the scale of the voltages is an estimate, not published: trust relative changes, not volts.",
@@ -38,7 +38,7 @@ _SCALE_NOTES = (
 
 
 def recognises(path: Path) -> bool:
-    """True for an .eit file whose first bytes name Dräger's software."""
+    """Whether a file is an .eit file whose first bytes name Dräger's software."""
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:
@@ -46,8 +46,8 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
-    """Read all frames. Raises `ValueError` for an unknown version, a file without a complete frame, and a header
-    without a rate."""
+    """Read all frames of a Dräger recording. Raises `ValueError` for an unknown version, a file without a complete
+    frame, and a header without a frame rate."""
     content = content_of(path)
     version, length = (int(number) for number in np.frombuffer(content[:8].ljust(8, b"\0"), "<i4"))
     if version not in _FRAME_BYTES:
@@ -70,7 +70,7 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
 
 
 def _rate(header: bytes, path: Path) -> float:
-    """Frame rate in frames per second."""
+    """Frame rate in frames per second, from the header."""
     match = re.search(rb"Framerate \[Hz\]:[ \t]{0,40}([0-9]{1,6}(?:[.,][0-9]{1,6})?)", header)
     rate = 0.0 if match is None else float(match[1].replace(b",", b"."))
     if not rate > 0:

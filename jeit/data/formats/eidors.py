@@ -1,8 +1,8 @@
 """Reader of EIDORS-style voltage vectors in a .mat file.
 
-The protocol is stored in the file (`stim`, `meas`, `meas_stim`), or given by `[protocol]` of a description. For a
-description, note that EIDORS drives -I at the first electrode of a pair and +I at the second, and measures first minus
-second, so that adjacent data are positive: set `polarity = "reversed"`.
+The protocol is stored in the file (`stim`, `meas`, `meas_stim`), or described by the section `[protocol]` of a
+description. EIDORS drives -I at the first electrode of a pair and +I at the second, and measures first minus second, so
+that voltages of the adjacent protocol are positive: a description must state `polarity = "reversed"`.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from jeit.protocol import Protocol, from_channels
 
 DESCRIPTION = "EIDORS-style vectors (.mat with stim, meas, meas_stim, or any with a TOML description)"
 PATTERN = ("stim", "meas", "meas_stim")
-# Usual names of the homogeneous (reference) vectors and of the inhomogeneous vectors.
+# Usual names of homogeneous (reference) voltage vectors and of inhomogeneous voltage vectors.
 REFERENCE_NAMES = ("v_h", "vh")
 OBJECT_NAMES = ("v_i", "vi")
 
 
 def recognises(path: Path) -> bool:
-    """True for a .mat file that holds stimulation and measurement patterns."""
+    """Whether a file is a .mat file that contains stimulation and measurement patterns of EIDORS."""
     return path.suffix.lower() == ".mat" and set(PATTERN) <= matlab.variable_names(path)
 
 
 def find_description(path: Path) -> Path | None:
-    """The description beside a file, or None: a TOML file of the same name, or `description.toml` in the same folder if
-    the file holds no patterns of its own."""
+    """The description beside a file: a TOML file of the same name, or `description.toml` in the same folder if the file
+    contains no patterns; None if there is none."""
     sibling, shared = path.with_suffix(".toml"), path.parent / "description.toml"
     if sibling.is_file():
         return sibling
@@ -45,13 +45,13 @@ def find_description(path: Path) -> Path | None:
 def read(
     path: Path, description: str | Path | None = None, like: Measurement | None = None, key: str | None = None
 ) -> Measurement:
-    """Read the array `key`, else those named by `[data] keys` of the description, else the variables vh, vi, v_h, v_i,
-    else the only array that has as many numbers as frames of the protocol.
+    """Read voltages from a .mat file: the array `key`, else the arrays named by `[data] keys` of the description, else
+    the variables vh, vi, v_h, v_i, else the only array whose size fits the number of channels of the protocol.
 
-    A file with `stim` (L, S) in amperes, `meas` (M, L) and `meas_stim` (M,), counted from 1, defines its own protocol.
-    `like`: as in `jeit.data.formats.table.read`.
+    A file with `stim` (electrodes, drives) in amperes, `meas` (channels, electrodes) and `meas_stim` (channels,), the
+    drive of each channel counted from 1, defines its own protocol. `like`: see `jeit.data.formats.table.read`.
 
-    Raises `ValueError` if neither the file nor a description defines the protocol, or if no vector is found.
+    Raises `ValueError` if neither the file nor a description defines the protocol, or if no voltages are found.
     """
     description_source = description if description is not None else find_description(path)
     if description_source is None and like is not None and not recognises(path):
@@ -92,7 +92,7 @@ def read(
         if len(lengths) > 1:
             raise ValueError(f"{path.name}: variables {', '.join(keys)} differ in length ({sorted(lengths)}).")
         table = np.stack([vector.ravel() for vector in vectors], axis=1)
-    # A matrix holds one frame per column, as in EIDORS, unless the numbers say otherwise.
+    # A matrix contains one frame per column, as in EIDORS, unless the number of channels shows that rows are frames.
     frames = frames_in_table(table, channel_counts(protocols), sensor_description.layout, default_axis="columns")
     frames = frames._replace(notes=(*key_notes, *frames.notes))
     measurement = measurement_in(path, sensor_description, frames, protocols, like=like)

@@ -1,11 +1,11 @@
 """Reader of Göttingen's MCEIT recordings (.get), written by Goe-MF II, Viasys, Carefusion, and Dräger's systems before
 2007.
 
-A file consists of frames of 256 little-endian numbers of four bytes, without a header: 208 adjacent voltages, then 16
-currents, 16 voltages of the drives and 16 auxiliary inputs. Dräger's systems write a text before the frames, which ends
-with two empty lines. Systems that do not measure channels which reciprocity makes redundant write zeros there. The
-frame rate is stated in the record of the measurement, a text file of the same name with the suffix .prl, as "Framerate
-= 13 per second".
+A file consists of frames of 256 little-endian numbers of four bytes, without a header: 208 voltages of the adjacent
+protocol, then 16 currents, 16 voltages of the drives and 16 auxiliary inputs. Dräger's systems write a text before the
+frames, which ends with two empty lines. Some systems do not measure channels that are redundant by reciprocity, and
+write zeros for them. A text file of the same name with the suffix .prl states the frame rate, as "Framerate = 13 per
+second".
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from jeit.data.measurement import Measurement
 DESCRIPTION = "Göttingen MCEIT (.get): 208 adjacent voltages a frame"
 # Bytes per frame; the beginning and the end of Dräger's text, and its maximum length in bytes.
 _FRAME_BYTES, _HEADER_MARK, _HEADER_END, _MAX_TEXT_BYTES = 1024, b"---Draeger EIT-Software", b"\r\n\r\n\r\n", 65536
-# Bytes that occur in text; minimum share of finite numbers in a frame, and their maximum magnitude.
+# Bytes that occur in text; minimum fraction of finite numbers in a frame, and maximum magnitude of these numbers.
 _TEXT_BYTES, _MIN_FINITE_SHARE, _MAX_VALUE = frozenset(b"\t\r\n" + bytes(range(32, 127))), 0.9, 1e9
 _SCALE_NOTE = "neither unit nor gain of the voltages is known: trust relative changes, not volts."
 _NO_RATE_NOTE = "the file says no rate, nor a record beside it (.prl); give it by [data] frame_rate."
@@ -37,8 +37,8 @@ _RATE = re.compile(rb"Framerate\s*=\s*(\d+(?:\.\d+)?)\s*per second", re.IGNORECA
 
 
 def recognises(path: Path) -> bool:
-    """True for a .get file that begins with Dräger's text, or whose first frame may be voltages: neither text nor
-    numbers beyond any instrument."""
+    """Whether a file is a .get file that begins with Dräger's text, or whose first frame may be voltages: neither text
+    nor numbers too large for any instrument."""
     if path.suffix.lower() != ".get":
         return False
     with path.open("rb") as file:
@@ -55,7 +55,8 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
-    """Read all frames. Raises `ValueError` for a file without a complete frame or without any voltage."""
+    """Read all frames of a .get recording. Raises `ValueError` for a file without a complete frame or without any
+    voltage."""
     content, frames_start = content_of(path), 0
     if content.startswith(_HEADER_MARK):
         header_end = content.find(_HEADER_END, 0, _MAX_TEXT_BYTES)
@@ -77,7 +78,8 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
 
 
 def _recorded_rate(path: Path) -> float | None:
-    """Frame rate in frames per second from the record beside a file; None if there is no record, or no rate in it."""
+    """Frame rate in frames per second from the .prl file beside a recording; None if there is no such file, or no rate
+    in it."""
     for suffix in (".prl", ".PRL"):
         record_path = path.with_suffix(suffix)
         if record_path.is_file():

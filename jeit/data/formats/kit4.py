@@ -17,23 +17,24 @@ VARIABLES = (frozenset({"Uel", "CurrentPattern", "MeasPattern"}),)
 """Variables of its files."""
 RADIUS = 0.14
 ELECTRODE_WIDTH = 0.025
-# Initial value for calibration, in ohm·m: the empty tank fits about 1e-4 m / 1.3 mS.
+# Initial contact impedance for calibration, in ohm·m: a fit to the empty tank gives about 1e-4 m / 1.3 mS.
 CONTACT_IMPEDANCE = 0.08
 
 
 def recognises(path: Path) -> bool:
-    """True for a .mat file with the three variables of the archive."""
+    """Whether a file is a .mat file with the three variables of the KIT4 archive."""
     return path.suffix.lower() == ".mat" and VARIABLES[0] <= matlab.variable_names(path)
 
 
 def read(path: Path) -> Measurement:
-    """Read one file of the archive: one frame of 79 drives × 16 cyclic differences = 1,264 channels.
+    """Read one file of the KIT4 archive: one frame of 79 drives × 16 differences of neighbouring electrodes = 1,264
+    channels.
 
-    Channels are ordered drive by drive. The 16 differences of a drive sum to zero, so 15 are independent; all are kept,
-    including those on driven electrodes (`Measurement.without_driven_channels` masks these). The tank has a radius of
-    0.14 m; electrode 1 is at 12 o'clock, and the others follow clockwise.
+    Channels are ordered drive by drive. The 16 differences of a drive sum to zero, so 15 are independent; all 16 are
+    kept, including differences at driven electrodes (`Measurement.without_driven_channels` masks these channels). The
+    tank has a radius of 0.14 m; electrode 1 is at 12 o'clock, and the other electrodes follow clockwise.
 
-    Raises `ValueError` for a file of another shape.
+    Raises `ValueError` for a file whose arrays have other shapes.
     """
     keys = "Uel", "CurrentPattern", "MeasPattern"
     content = matlab.load(path, *keys)

@@ -19,12 +19,12 @@ VARIABLES = (frozenset({"Mpat", "Inj", "Uel"}), frozenset({"Mpat", "Injref", "Ue
 """Variables of its files, and of the reference."""
 RADIUS = 0.115
 ELECTRODE_ANGLE = np.radians(5.625)
-# Initial value for calibration, in ohm·m. The empty tank fits a contact impedance of nearly zero.
+# Initial contact impedance for calibration, in ohm·m. A fit to the empty tank gives nearly zero.
 CONTACT_IMPEDANCE = 0.01
 
 
 def recognises(path: Path) -> bool:
-    """True for a .mat file with the variables of the challenge."""
+    """Whether a file is a .mat file with the variables of the Kuopio Tomography Challenge 2023."""
     if path.suffix.lower() != ".mat":
         return False
     names = matlab.variable_names(path)
@@ -32,13 +32,14 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path) -> Measurement:
-    """Read one file: one frame of 76 drives × 31 differences of neighbours = 2,356 channels, ordered drive by drive.
+    """Read one file of the challenge: one frame of 76 drives × 31 differences of neighbouring electrodes = 2,356
+    channels, ordered drive by drive.
 
-    NaN entries (electrodes missing in the harder levels) are masked. The tank has a radius of 0.115 m and 32 electrodes
-    of 5.625°; electrode 1 is at 12 o'clock, and the others follow counter-clockwise. The current of each drive is its
-    recorded amplitude.
+    NaN entries, from electrodes that are removed in the harder levels of the challenge, are masked. The tank has a
+    radius of 0.115 m and 32 electrodes of 5.625°; electrode 1 is at 12 o'clock, and the other electrodes follow
+    counter-clockwise. The current of each drive is its recorded amplitude.
 
-    Raises `ValueError` for a file of another shape.
+    Raises `ValueError` for a file whose arrays have other shapes.
     """
     suffix = "" if "Inj" in matlab.variable_names(path) else "ref"
     keys = f"Inj{suffix}", f"Uel{suffix}", "Mpat"

@@ -1,10 +1,10 @@
-"""Reader of lines of an OpenEIT device: the word "magnitudes" and the numbers of a frame, as the firmware sends them
-and the dashboard records them, with or without line ends.
+"""Reader of the text that OpenEIT devices send: the word "magnitudes" and the numbers of a frame, as OpenEIT's
+dashboard records them, with or without line ends.
 
-The number of numbers states the protocol of the firmware: 32, 192 or 896 of 8, 16 or 32 electrodes, driven in opposite
-pairs from every electrode; 928 of 32, driven in adjacent pairs; 28 of all pairs of 8, of the first device. Measurements
-are adjacent, in the order of the electrodes. The numbers are magnitudes of impedances, ohms; zero where the device
-reports an open circuit.
+The number of numbers in a frame shows the protocol of the firmware: 32, 192 or 896 for 8, 16 or 32 electrodes driven in
+opposite pairs, from every electrode; 928 for 32 electrodes driven in adjacent pairs; 28 for all pairs of 8 electrodes,
+with the first device. Measurement pairs are adjacent, in the order of the electrodes. The numbers are magnitudes of
+impedances in ohms, and zero for an open circuit.
 """
 
 from __future__ import annotations
@@ -32,10 +32,11 @@ from jeit.protocol import Protocol
 DESCRIPTION = "lines of an OpenEIT device ('magnitudes: …'), of 8, 16 or 32 electrodes"
 _FRAME_WORD = re.compile(rb"\s{0,40}magnitudes\s{0,40}:", re.IGNORECASE)
 _NUMBER = re.compile(rb"\d{1,30}(?:\.\d{0,30})?(?:[eE][-+]?\d{1,3})?")
-# Number of bytes that must contain the first word, and number of bytes from which a file is recognised.
+# Number of bytes at the start that must contain the word "magnitudes", and number of bytes from which a file is
+# recognised.
 _WORD_SEARCH_BYTES, _HEAD_BYTES = 4096, 2_000_000
 _ASSUMED_CURRENT = 1e-3
-# Tables [protocol] of the firmware by their number of channels.
+# Section [protocol] for each protocol of the firmware, by number of channels.
 _PROTOCOL_TABLES: dict[int, dict[str, Any]] = {
     **{
         channels: {"kind": "opposite", "number": count, "drives": "all", "order": "fixed"}
@@ -47,8 +48,8 @@ _PROTOCOL_TABLES: dict[int, dict[str, Any]] = {
 
 
 def recognises(path: Path) -> bool:
-    """True for a file that begins with the word "magnitudes", or has it after a few lines, and states the protocol by
-    the number of its numbers."""
+    """Whether a file has the word "magnitudes" near its start, and frames whose length belongs to a protocol of the
+    OpenEIT firmware."""
     with path.open("rb") as file:
         head = file.read(_WORD_SEARCH_BYTES)
         first_word = _FRAME_WORD.search(head)
@@ -61,10 +62,11 @@ def recognises(path: Path) -> bool:
 def read(
     path: Path, description: str | Path | None = None, like: Measurement | None = None, key: str | None = None
 ) -> Measurement:
-    """Read all frames. A `[protocol]` in the description takes precedence over that of the firmware, which completes
-    what it does not state; without a description, the body is that of `like`, a measurement of the same sensor.
+    """Read all frames of an OpenEIT recording. The section `[protocol]` of the description takes precedence over the
+    firmware's protocol, which only determines options that the section does not state; without a description, the body
+    is that of `like`, a measurement of the same sensor.
 
-    Raises `ValueError` as `numbers`, and for a `key`, because there are no arrays.
+    Raises `ValueError` if `numbers` does, and if a `key` is given, because the file contains no arrays.
     """
     if key is not None:
         raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
@@ -99,11 +101,11 @@ def _have_same_channels(first: Protocol, second: Protocol) -> bool:
 
 
 def numbers(path: Path) -> tuple[Float[np.ndarray, "F M"], tuple[str, ...]]:
-    """Return the numbers of each frame, and notes. NaN stands for a reading of zero, which an open circuit gives, for a
-    cell that is not a number, for a last number that may be cut off, and for all numbers of frames that are longer or
-    shorter than most, because characters were lost.
+    """Read the numbers of each frame of an OpenEIT recording, and notes. NaN replaces zero (an open circuit), a cell
+    that is not a number, a last number that may be cut off, and all numbers of frames that are longer or shorter than
+    most frames because characters were lost.
 
-    Raises `ValueError` if the frames belong to no protocol of the firmware, or to two.
+    Raises `ValueError` if the frames belong to no protocol of the firmware, or to two protocols.
     """
     content = content_of(path)
     frames = list(frames_in(content))
@@ -136,8 +138,8 @@ def numbers(path: Path) -> tuple[Float[np.ndarray, "F M"], tuple[str, ...]]:
     elif content[-1:].isdigit() and lengths[-1] == frame_length:
         frames[-1][-1] = np.nan
         notes.append("nothing follows the last number, which may be cut off: masked.")
-    # Frames between which a word is lost appear as one long frame; its length gives the number of frames, so that
-    # later frames keep their index in time.
+    # Frames between which the word "magnitudes" is lost appear as one long frame; its length shows the number of lost
+    # frames, so that later frames keep their indices.
     frame_indices = np.cumsum([0, *(max(1, round(length / frame_length)) for length in lengths)])
     is_complete = np.zeros(frame_indices[-1], bool)
     is_complete[
@@ -156,7 +158,7 @@ def numbers(path: Path) -> tuple[Float[np.ndarray, "F M"], tuple[str, ...]]:
 
 def frames_in(content: bytes) -> Iterator[array]:
     """Yield the numbers of each frame; NaN for a cell that is not a number. Empty cells, and words after the last
-    number, are left out."""
+    number of a frame, are left out."""
     word_spans = [(match.start(), match.end()) for match in _FRAME_WORD.finditer(content)]
     for (_, start), (stop, _) in itertools.pairwise([*word_spans, (len(content), 0)]):
         cells = [cell.split() for cell in content[start:stop].split(b",")]
@@ -167,17 +169,17 @@ def frames_in(content: bytes) -> Iterator[array]:
 
 
 def _usual_length(lengths: list[int]) -> int:
-    """Most common length of the frames except the last, which may be cut off."""
+    """Most common length of all frames except the last frame, which may be cut off."""
     return Counter(lengths[:-1] or lengths).most_common(1)[0][0] if lengths else 0
 
 
 def _cell_value(words: list[bytes], *, is_last: bool) -> float:
-    """Return the number in a cell, NaN if there is none; words may follow the last number of a frame."""
+    """The number in a cell of `words`, NaN if the cell is not a number; words may follow the last number of a frame."""
     is_number = _NUMBER.fullmatch(words[0]) and (is_last or len(words) == 1)
     value = float(words[0]) if is_number else np.nan
     return value if np.isfinite(value) else np.nan
 
 
 def protocol_table(path: Path) -> dict[str, Any]:
-    """The table `[protocol]`, without the current, of a file that `recognises` accepts."""
+    """The section `[protocol]` of a description, without the current, for a file of OpenEIT."""
     return _PROTOCOL_TABLES[numbers(path)[0].shape[1]]

@@ -1,14 +1,14 @@
-"""Reader of text with a line for each measurement: the numbers of its four electrodes, and the measured values.
+"""Reader of text files with one line per measurement: the numbers of the four electrodes, and the measured values.
 
 Loggers write a table whose heading names the columns: electrodes `a, b, m, n` (current enters at a and leaves at b; the
 voltage is the potential at m minus that at n), or `f_plus, f_minus, s_plus, s_minus` and similar names; `real` and
-`imag`, `u`, or `r` and `i`; `frame`, `time` if there are several. Geoelectric programs (pyGIMLi, BERT, ResIPy) write
-the unified data format (.ohm, .shm, .dat): the number of electrodes, a line with the coordinates of each, the number of
-measurements, a comment with the names of the columns, and a line for each measurement, electrodes counted from 1. Units
-follow a name: `u/mV`, `i [mA]`.
+`imag`, `u`, or `r` and `i`; `frame` and `time` if there are several frames. Geoelectric programs (pyGIMLi, BERT,
+ResIPy) write the unified data format (.ohm, .shm, .dat): the number of electrodes, a line with the coordinates of each
+electrode, the number of measurements, a comment with the names of the columns, and a line for each measurement, with
+electrodes counted from 1. A unit follows the name of a column: `u/mV`, `i [mA]`.
 
-Channels are sorted by their electrodes; the order of the lines has no effect. With a reference of the same sensor,
-frames have its channels; channels without a line are masked.
+Channels are sorted by their electrodes; the order of the lines has no effect. If a reference of the same sensor is
+given, frames have the channels of the reference; channels without a line are masked.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from jeit.protocol import from_channels
 DESCRIPTION = "text with a line for each measurement: electrodes a, b, m, n and the voltage or resistance"
 _HEAD_BYTES, _MAX_HEADING_LINES = 65536, 400
 # Names, in letters and digits, of the four electrodes: current enters at the first and leaves at the second; the
-# voltage is that of the third minus that of the fourth.
+# voltage is the potential of the third minus that of the fourth.
 _ELECTRODE_NAMES = (
     ("a", "b", "m", "n"),
     ("c1", "c2", "p1", "p2"),
@@ -62,8 +62,8 @@ _ASSUMED_CURRENT = 1e-3
 
 
 class _QuadrupoleTable(NamedTuple):
-    """Content of a file: `names` and `scales` of the columns; `rows` of numbers; `positions` of the electrodes, or
-    None; whether the file has the unified data format, `is_unified`; and `notes`."""
+    """Content of a file: `names` of the columns, and `scales`, their units in SI units; `rows` of numbers; `positions`
+    of the electrodes, or None; `is_unified`, whether the file has the unified data format; and `notes`."""
 
     names: list[str]
     scales: list[float]
@@ -73,13 +73,13 @@ class _QuadrupoleTable(NamedTuple):
     notes: tuple[str, ...]
 
     def column(self, name: str) -> Float[np.ndarray, " R"] | None:
-        """The column of a name in `_COLUMN_NAMES`, in SI units, or None."""
+        """The values of the column `name`, a key of `_COLUMN_NAMES`, in SI units; None if there is no such column."""
         column_index = next((k for k, column_name in enumerate(self.names) if column_name in _COLUMN_NAMES[name]), None)
         return None if column_index is None else self.scales[column_index] * self.rows[:, column_index]
 
 
 def recognises(path: Path) -> bool:
-    """True for text whose heading names four electrodes and a voltage or resistance."""
+    """Whether a file is text whose heading names four electrodes and a voltage or resistance."""
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
     try:
@@ -94,11 +94,12 @@ def recognises(path: Path) -> bool:
 def read(
     path: Path, description: str | Path | None = None, like: Measurement | None = None, key: str | None = None
 ) -> Measurement:
-    """Read all frames. A description, given or beside the file, states the body; its `[electrodes]` may leave out
-        positions that the file has. `[protocol]` states the current if the file does not.
+    """Read all frames of a file of four-electrode measurements. A `description`, or a description beside the file,
+    states the body; its section `[electrodes]` may leave out positions that the file contains. The section `[protocol]`
+    states the current if the file does not.
 
-    Raises `ValueError`, with the line, for lines that are not as the heading says, and for a `key`, because there are
-    no arrays.
+    Raises `ValueError`, with the line, for lines that do not match the heading, and if a `key` is given, because the
+    file contains no arrays.
     """
     if key is not None:
         raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
@@ -128,12 +129,14 @@ def read(
 
 
 def electrode_positions(path: Path) -> Float[np.ndarray, "L d"] | None:
-    """Positions of the electrodes (L, d), metres, that a file states; or None. Raises `ValueError` as `read`."""
+    """Positions (electrodes, dimensions) of the electrodes in metres, from a file of four-electrode measurements; None
+    if the file states none. Raises `ValueError` for lines that do not match the heading."""
     return _read_table(path).positions
 
 
 def _heading(lines: Sequence[str]) -> tuple[int, list[str], list[float]] | None:
-    """Index of the line that names the columns, names and scales of these; None if there is none."""
+    """Index of the line that names the columns, names of the columns, and their units in SI units; None if there is no
+    such line."""
     for line_index, line in enumerate(lines[:_MAX_HEADING_LINES]):
         cells = _split_cells(re.sub(r"\s+([(\[])", r"\1", line.lstrip("#% \t")))
         if not 5 <= len(cells) <= 60:
@@ -154,7 +157,7 @@ def _split_cells(line: str) -> list[str]:
 
 
 def _parse_column_name(cell: str) -> tuple[str, float]:
-    """The letters and digits of a column's name, and the value of its unit in SI units."""
+    """The letters and digits of a column's name, and the value of the column's unit in SI units."""
     unit_match = _UNIT_PATTERN.match(cell)
     unit = "" if unit_match is None else (unit_match[2] or unit_match[3]).lower()
     text = (unit_match[1] if unit_match is not None and unit in _UNIT_VALUES else cell).lower()
@@ -164,7 +167,7 @@ def _parse_column_name(cell: str) -> tuple[str, float]:
 
 
 def _electrode_columns(names: Sequence[str]) -> list[int] | None:
-    """Indices of the columns with the four electrodes, or None."""
+    """Indices of the columns with the four electrodes of each measurement, or None."""
     return next(
         (
             [names.index(name) for name in electrode_names]
@@ -176,7 +179,8 @@ def _electrode_columns(names: Sequence[str]) -> list[int] | None:
 
 
 def _read_table(path: Path) -> _QuadrupoleTable:
-    """The numbers of a file. Raises `ValueError`, with the line, for a line that is not as the heading says."""
+    """Read the columns, electrode positions and notes of a file. Raises `ValueError`, with the line, for a line that
+    does not match the heading."""
     try:
         text = content_of(path).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
@@ -225,7 +229,7 @@ def _read_table(path: Path) -> _QuadrupoleTable:
 
 
 def _header_positions(path: Path, preceding_lines: Sequence[tuple[int, list[str]]]) -> tuple[np.ndarray, int]:
-    """Coordinates of the electrodes, and the number of measurements, that precede the names of the columns."""
+    """Coordinates of the electrodes, and number of measurements, from the lines before the names of the columns."""
     num_electrodes, num_stated = int(preceding_lines[0][1][0]), int(preceding_lines[-1][1][0])
     try:
         positions = np.array([[float(cell) for cell in cells] for _, cells in preceding_lines[1:-1]])
@@ -241,8 +245,8 @@ def _header_positions(path: Path, preceding_lines: Sequence[tuple[int, list[str]
 
 
 def _describe_body(path: Path, description: str | Path | None, positions: np.ndarray | None) -> Description:
-    """Return the given description, else the one beside the file, else an empty one. If it states no positions of
-    electrodes, they are those in the file."""
+    """Return the `description`, else the description beside the file, else an empty description. If it states no
+    positions of electrodes, the `positions` from the file are added."""
     description_source = find_description(path) if description is None else description
     if description_source is None:
         return parse_description({}, path.name)
@@ -261,7 +265,7 @@ def _describe_body(path: Path, description: str | Path | None, positions: np.nda
 def _electrode_indices(
     path: Path, table: _QuadrupoleTable, num_described: int | None
 ) -> tuple[Int[np.ndarray, "R 4"], tuple[str, ...]]:
-    """Return the electrodes of each line, counted from 0, and notes. Raises `ValueError` for invalid electrode
+    """Return the four electrodes of each line, counted from 0, and notes. Raises `ValueError` for invalid electrode
     numbers."""
     numbers = table.rows[:, _electrode_columns(table.names) or []]
     if not (np.isfinite(numbers).all() and (numbers == numbers.round()).all() and np.abs(numbers).max() < 1e6):
@@ -298,7 +302,7 @@ def _measurement_name(row: int | np.integer) -> str:
 def _current_amplitude(
     path: Path, sensor_description: Description, table: _QuadrupoleTable, like: Measurement | None
 ) -> tuple[float, tuple[str, ...]]:
-    """Amplitude of the current, amperes, and a note if it is assumed."""
+    """Amplitude of the drive current in amperes, and a note if the amplitude is assumed."""
     if like is not None:
         return float(np.abs(np.asarray(like.protocol.drive)).max()), ()
     protocol = sensor_description.protocol(path)
@@ -314,7 +318,7 @@ def _current_amplitude(
 
 
 def _channel_voltages(table: _QuadrupoleTable, amplitude: float) -> Inexact[np.ndarray, " R"]:
-    """Voltages of the lines at one amplitude of the current; NaN where a current is zero."""
+    """Voltage of each line of the table, scaled to the current `amplitude`; NaN for a line whose current is zero."""
     resistances, currents, apparent_resistivities, geometric_factors = (
         table.column(name) for name in ("r", "i", "rhoa", "k")
     )
@@ -343,7 +347,8 @@ def _arrange_frames(
     values: Inexact[np.ndarray, " R"],
     like: Measurement | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...]]:
-    """Electrodes (M, 4) of the channels, frames (F, M), their times, and notes. NaN where a frame has no line."""
+    """Arrange the values of lines in frames: electrodes (channels, 4), voltages (frames, channels), times of the
+    frames, and notes. Voltages are NaN for channels that have no line in a frame."""
     channels, channel_of_line = np.unique(electrodes, axis=0, return_inverse=True)
     channel_of_line, notes = channel_of_line.ravel(), ()
     frame_of_line, frame_notes = _frame_of_lines(path, table.column("frame"), channel_of_line, len(channels))
@@ -381,7 +386,8 @@ def _arrange_frames(
 def _frame_of_lines(
     path: Path, stated_frames: np.ndarray | None, channel_of_line: Int[np.ndarray, " R"], num_channels: int
 ) -> tuple[Int[np.ndarray, " R"], tuple[str, ...]]:
-    """Return the frame number of each line, from 0, and notes. Raises `ValueError` if frames cannot be separated."""
+    """Return the index of the frame to which each line belongs, and notes. Raises `ValueError` if frames cannot be
+    separated."""
     if stated_frames is not None and np.isfinite(stated_frames).all():
         return np.unique(stated_frames, return_inverse=True)[1].ravel(), ()
     rows = np.arange(len(channel_of_line))
@@ -398,6 +404,6 @@ def _frame_of_lines(
 
 
 def _pairs(pairs: Int[np.ndarray, "n 2"], num_electrodes: int) -> Float[np.ndarray, "n L"]:
-    """Patterns of +1 and -1 at two electrodes."""
+    """Patterns (pairs, electrodes) with +1 and -1 at the two electrodes of each pair."""
     identity = np.eye(num_electrodes)
     return identity[pairs[:, 0]] - identity[pairs[:, 1]]

@@ -1,8 +1,8 @@
 """Conversion of the content of an instrument's file to a measurement, with a description of the body if there is one.
 
-The systems of Göttingen, Dräger and Carefusion share one frame of 16 electrodes: 208 adjacent voltages. Drive 1-2 is
-measured at 3-4, 4-5, … 15-16; drive 2-3 at 4-5, … 16-1; and so on. The sign of the voltages is chosen so that they are
-positive on every body, opposite to that of `jeit.protocol.adjacent`.
+The systems of Göttingen, Dräger and Carefusion measure the same frame of 208 voltages with 16 electrodes (adjacent
+protocol). Drive 1-2 is measured at 3-4, 4-5, … 15-16; drive 2-3 at 4-5, … 16-1; and so on. The voltages are positive on
+every body; their sign is opposite to that of `jeit.protocol.adjacent`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jeit.data.measurement import Measurement
 from jeit.files import check_memory
 from jeit.protocol import Protocol, adjacent
 
-# Maximum bytes of memory per byte of the file: two copies, with numbers twice as long as in the file.
+# Maximum bytes of memory per byte of the file: two copies of the numbers, each number twice as long as in the file.
 _MEMORY_FACTOR = 4
 
 
@@ -27,8 +27,8 @@ _MEMORY_FACTOR = 4
 class Recording:
     """Content of an instrument's file.
 
-    - `voltages`: (F, M), real or complex; `protocol`: protocol of the M channels; `usable`: (M,) mask, None if all
-      channels are usable.
+    - `voltages`: (F, M), real or complex, of F frames and M channels; `protocol`: protocol of the channels; `usable`:
+      (M,) mask, None if all channels are usable.
     - `times`: (F,) seconds, or None; `frame_names`: one name per frame, or empty; `notes`: properties that the format
       does not define.
     """
@@ -42,14 +42,14 @@ class Recording:
 
 
 def content_of(path: Path) -> bytes:
-    """Content of a file. Raises `TooLarge` if it would not fit in memory."""
+    """Content of a file. Raises `TooLarge` if the file exceeds the memory limit."""
     check_memory(path.name, _MEMORY_FACTOR * path.stat().st_size)
     return path.read_bytes()
 
 
 def description_of(path: Path, description: str | Path | None) -> Description:
-    """Return the given description, else the one beside the file, else an empty one. Raises `ValueError` if it is not
-    valid."""
+    """Return the given description, else the description beside the file, else an empty description. Raises
+    `ValueError` if the description is not valid."""
     description_source = find_description(path) if description is None else description
     return parse_description({}, path.name) if description_source is None else load_description(description_source)
 
@@ -58,7 +58,8 @@ def measurement_of(path: Path, recording: Recording, sensor_description: Descrip
     """Convert a recording to a measurement of the described body. Protocol, times and frame names of the description
     take precedence over those of the recording.
 
-    Raises `ValueError` if protocol and channels, or names and frames, do not match.
+    Raises `ValueError` if the number of channels differs from that of the protocol, or the number of names from that of
+    frames.
     """
     layout = sensor_description.layout
     notes = (*recording.notes, *component_notes(recording.voltages, layout))
@@ -82,7 +83,7 @@ def measurement_of(path: Path, recording: Recording, sensor_description: Descrip
 
 
 def count_frames(content: bytes, frames_start: int, frame_size: int, path: Path) -> tuple[int, int]:
-    """Number of complete frames of `frame_size` bytes after byte `frames_start`, and number of bytes left over.
+    """Number of complete frames of `frame_size` bytes after byte `frames_start`, and number of remaining bytes.
 
     Raises `ValueError` if there is no complete frame.
     """
@@ -100,7 +101,7 @@ def truncation_notes(num_bytes: int) -> tuple[str, ...]:
 
 
 CHANNELS = 208
-# Amperes: the maximum drive current stated for all of these systems.
+# Drive current in amperes: the maximum current that is stated for the systems of Göttingen, Dräger and Carefusion.
 _ASSUMED_CURRENT = 5e-3
 _CURRENT_NOTE = "a current of 5 mA is assumed; the file does not say it."
 
@@ -108,8 +109,8 @@ _CURRENT_NOTE = "a current of 5 mA is assumed; the file does not say it."
 def adjacent_recording(
     values: Float[np.ndarray, "F 208"], times: Float[np.ndarray, " F"] | None, notes: tuple[str, ...]
 ) -> Recording:
-    """Recording of positive adjacent voltages in the channel order of these systems. Channels that are zero in every
-    frame are marked as not measured."""
+    """Recording of 208 positive voltages in the channel order of the systems of Göttingen, Dräger and Carefusion.
+    Channels that are zero in every frame are marked as not measured."""
     usable = (values != 0).any(axis=0)
     if not usable.all() and usable.any():
         notes = (*notes, f"{int((~usable).sum())} of {CHANNELS} channels were not measured (zero in every frame).")

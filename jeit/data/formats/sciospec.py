@@ -2,10 +2,10 @@
 
 The first line states the number of header lines. The following lines give, one value per line: the version of the
 format (in headers of at least 11 lines), the name of the setup, date and time, the lowest and the highest frequency
-(hertz), their spacing (1: logarithmic, 0: linear), the number of frequencies, the current (amperes), and the frame
-rate. Later lines may list channels, as "MeasurementChannels: 1,2,3". After the header, every injection has a line with
-its two electrodes, and one line per frequency with the real and imaginary part of the potential at every channel. The
-file does not state whether currents are peak or root mean square values.
+(hertz), the spacing of frequencies (1: logarithmic, 0: linear), the number of frequencies, the current (amperes), and
+the frame rate. Later lines may list channels, as "MeasurementChannels: 1,2,3". After the header, every injection has a
+line with the two driven electrodes, and one line per frequency with the real and imaginary parts of the potentials at
+all channels. The file does not state whether currents are peak or root mean square values.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class _Header:
 
 
 def recognises(path: Path) -> bool:
-    """True for an .eit text file that begins with the number of its header lines."""
+    """Whether a file is an .eit text file that begins with the number of its header lines."""
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:
@@ -53,12 +53,13 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
-    """Read one file: one frame per frequency, named by the frequency, of potentials minus their mean.
+    """Read one Sciospec file: one frame per frequency, named by the frequency, of potentials minus their mean over the
+    electrodes.
 
     With `[protocol] kind = "measured"` in a description, its `measurement` selects another reading of the potentials,
     such as "adjacent" differences. Channels that the header does not list are left out.
 
-    Raises `ValueError` with the line at fault.
+    Raises `ValueError`, with the faulty line, for an invalid file.
     """
     try:
         lines = content_of(path).decode("utf-8-sig", "strict").splitlines()
@@ -74,10 +75,10 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
 
 
 def read_all(paths: Sequence[Path], description: str | Path | None = None) -> Measurement:
-    """Read several files of the same set-up and join their frames in the given order.
+    """Read several Sciospec files of the same set-up and join their frames in the given order.
 
-    If each file holds one frame, `[data] frame_rate` of a description sets the times; otherwise the dates in the files
-    do. Raises as `read` and `jeit.data.gesture_set.join`.
+    If each file contains one frame, `[data] frame_rate` of a description sets the times; otherwise the times are the
+    dates in the files. Raises `ValueError` as `read` and `jeit.data.gesture_set.join` do.
     """
     joined = join([read(path, description) for path in paths])
     rate = description_of(paths[0], description).layout.frame_rate
@@ -124,14 +125,14 @@ def _number(lines: list[str], line_index: int, path: Path, *, is_integer: bool =
 
 
 def _channel_list(line: str, name: str) -> list[int]:
-    """Channel numbers, counted from 1."""
+    """Channel numbers, counted from 1, in the header line that begins with `name`."""
     words = line.removeprefix(name).replace(",", " ").split()
     return [int(word) for word in words if word.isdecimal() and len(word) < 6]
 
 
 def _injections(lines: list[str], header: _Header, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Electrode pairs (S, 2), counted from 1, and complex potentials (S, frequencies, columns) as stored in the
-    file."""
+    """Driven electrode pairs (injections, 2), counted from 1, and complex potentials (injections, frequencies, columns)
+    as stored in the file."""
     pairs, rows, num_frequencies = [], [], len(header.frequencies)
     for line_index, line in _nonempty_lines(lines, header.num_lines):
         values = _values(line, line_index, path)
@@ -168,7 +169,7 @@ def _values(line: str, line_index: int, path: Path) -> np.ndarray:
 
 
 def _channels(header: _Header, num_columns: int, path: Path) -> tuple[list[int], list[int]]:
-    """Return the numbers of the electrodes, and the indices of the columns that hold their potentials."""
+    """Return the numbers of the electrodes, and the indices of the columns with the potentials of these electrodes."""
     all_channels, measured_channels = (header.channels.get(name, []) for name in _CHANNEL_LISTS)
     column_channels = next(
         (channels for channels in (measured_channels, all_channels) if len(channels) == num_columns),
@@ -202,7 +203,7 @@ def _recording(
         raise ValueError(f"{path.name}: its current is {header.current:g} A; it must be positive, and at most 1.")
     drive, drive_indices = np.zeros((len(index), len(electrode_numbers))), np.arange(len(index))
     drive[drive_indices, index[:, 0]], drive[drive_indices, index[:, 1]] = header.current, -header.current
-    # The sign of the power, which the body dissipates, shows at which electrode of a pair the current enters.
+    # The power that the body dissipates is positive; its sign shows at which electrode of a pair the current enters.
     notes: list[str] = [*_CURRENT_NOTES]
     if np.median(np.einsum("sl,sfl->sf", drive, np.nan_to_num(np.real(potentials)))) < 0:
         drive = -drive
@@ -223,7 +224,7 @@ def _recording(
 
 
 def _times(date: str) -> np.ndarray | None:
-    """Time of the measurement in seconds since 1970, taking the date as UTC; None if the date has another form."""
+    """Time of the measurement in seconds since 1970, if the date is in UTC; None if the date has an unknown form."""
     for date_format in ("%Y.%m.%d. %H:%M:%S.%f", "%Y.%m.%d. %H:%M:%S"):
         with suppress(ValueError):
             return np.array([datetime.strptime(date.strip(), date_format).replace(tzinfo=UTC).timestamp()])

@@ -1,10 +1,12 @@
-"""Reader of Swisstom BB2 and Pioneer recordings (.eit, format 4): 32 electrodes, pairs that skip four electrodes.
+"""Reader of Swisstom BB2 and Pioneer recordings (.eit, format 4) with 32 electrodes, and pairs that skip four
+electrodes.
 
 All numbers are little-endian. Bytes 0-3 are the number of the format, bytes 4-7 the offset of the first frame. A frame
-begins with its time in milliseconds (eight bytes), its kind and its length (four bytes each). Kind 0 continues with 15
-integers of four bytes, of which the fifth is a time in microseconds, 12 further bytes, 64 integers with impedances of
-the electrodes, and 2,048 integers with real and imaginary parts of 32 × 32 voltages, drive by drive. Other kinds are
-events. Formats 1 to 3 are not supported, as too little is known about them.
+begins with its time in milliseconds (eight bytes), its kind and its length (four bytes each). Frames of kind 0 are
+measurements: they continue with 15 integers of four bytes, of which the fifth is a time in microseconds, 12 further
+bytes, 64 integers with impedances of the electrodes, and 2,048 integers with real and imaginary parts of 32 × 32
+voltages, drive by drive. Frames of other kinds are events. Formats 1 to 3 are not supported, because too little is
+known about them.
 """
 
 from __future__ import annotations
@@ -19,10 +21,10 @@ from jeit.protocol import skip
 
 DESCRIPTION = "Swisstom BB2, Pioneer (.eit, format 4): 32 electrodes, skip 4, complex"
 _ELECTRODES, _SKIPPED, _FORMAT = 32, 4, 4
-# Bytes before the content of a frame, and in the content before the voltages; number of integers of the voltages;
-# offset of the time in the content.
+# Number of bytes before the content of a frame, and in the content before the voltages; number of integers of the
+# voltages; offset of the time in the content.
 _HEADER_BYTES, _VOLTAGE_OFFSET, _NUM_INTEGERS, _TIME_OFFSET = 16, 60 + 12 + 256, 2 * _ELECTRODES**2, 16
-# Range of the four-byte counter of microseconds.
+# Range of the four-byte counter of microseconds, after which it restarts at 0.
 _COUNTER_PERIOD = 2**32
 # Volts per unit of the stored numbers: an estimate by users of these files.
 _SCALE = 2.048 / (2**20 * 360 * 1000)
@@ -34,7 +36,7 @@ _SCALE_NOTES = (
 
 
 def recognises(path: Path) -> bool:
-    """True for an .eit file that begins with the number of a Swisstom format."""
+    """Whether a file is an .eit file that begins with the number of a Swisstom format."""
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:
@@ -43,8 +45,8 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
-    """Read all frames. Raises `ValueError` for other formats, for a file without a complete frame, and for damaged
-    frames."""
+    """Read all frames of a Swisstom recording. Raises `ValueError` for formats other than 4, for a file without a
+    complete frame, and for damaged frames."""
     content = content_of(path)
     if content[:4] != bytes([_FORMAT, 0, 0, 0]):
         raise ValueError(f"{path.name} is of a Swisstom format that is not known; format 4 is. Export it as a table.")
@@ -67,7 +69,7 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
 
 
 def _frames(content: bytes, frames_start: int, path: Path) -> tuple[list[np.ndarray], np.ndarray, int]:
-    """Stored numbers and times (microseconds) of every complete frame, and number of bytes left over by a truncated
+    """Stored numbers and times (microseconds) of every complete frame, and number of remaining bytes of a truncated
     last frame."""
     values, times, offset = [], [], frames_start
     while offset + _HEADER_BYTES <= len(content):

@@ -34,7 +34,7 @@ _TEXT_ARRAYS = ("mask", "protocol_name", "frame_names", "notes", "times")
 
 AXES = ("electrodes", "patterns", "frames")
 """Names of the axes of an array of voltages, in their default order; a description can state another order."""
-# Maximum mean of the potentials of a pattern that counts as removed, relative to the largest potential.
+# Maximum mean of the potentials of a current pattern, relative to the largest potential, that counts as zero.
 _MAX_RESIDUAL_MEAN = 0.01
 
 
@@ -44,10 +44,11 @@ def recognises(path: Path) -> bool:
 
 
 def find_description(path: Path) -> str | Path | None:
-    """The description that belongs to a file: a TOML file of the same name, else `description.toml` in the same folder.
+    """The description that belongs to a data file: a TOML file of the same name, else `description.toml` in the same
+    folder.
 
-    A CSV table named like the files of the 6 cm tank, with current and frequency (`…_55uA_1000Hz.csv`), is described by
-    the bundled "tank6cm" if neither exists. None if there is no description.
+    If neither file exists, the bundled description "tank6cm" is used for a CSV table named like the files of the 6 cm
+    tank, with current and frequency (`…_55uA_1000Hz.csv`). None if there is no description.
     """
     for candidate in (path.with_suffix(".toml"), path.parent / "description.toml"):
         if candidate.is_file():
@@ -60,12 +61,13 @@ def find_description(path: Path) -> str | Path | None:
 def read(
     path: Path, description: str | Path | None = None, like: Measurement | None = None, key: str | None = None
 ) -> Measurement:
-    """Read a table with the given `description` (path or bundled name), else with the one found beside it, else with
-    that of `like`. `key`: name of the array of voltages in an NPZ file.
+    """Read a measurement from a table, with the `description` (a path or the name of a bundled description), else with
+    the description beside the table, else with the description of `like`. `key`: name of the array of voltages in an
+    NPZ file.
 
-    `like`: a measurement of the same sensor. For a table without a description, its protocol, electrodes and outline
-    are used, and, if it was read from a table, the units and columns in its description. Raises `ValueError` if there
-    is no description, or if file and description disagree.
+    `like`: a measurement of the same sensor. For a table without a description, the protocol, electrodes and body of
+    `like` are used, and, if `like` was read from a table, the units and columns in the description of that table.
+    Raises `ValueError` if there is no description, or if file and description disagree.
     """
     description_source = find_description(path) if description is None else description
     if description_source is not None:
@@ -73,7 +75,7 @@ def read(
     elif like is not None:
         sensor_description = description_like(like)
     else:
-        # A damaged file is named as such: no description helps it.
+        # A damaged file raises its own error here, because a description would not help.
         _ = _from_numpy(path, ()) if path.suffix.lower() in (".npz", ".npy") else read_text(path)
         raise ValueError(
             f"description: {path.name} is a table of numbers, and nothing says what they mean. Put a description "
@@ -111,7 +113,7 @@ Protocols = Sequence[tuple[Protocol, str]]
 
 
 def channel_counts(protocols: Protocols) -> list[int]:
-    """Numbers of channels of the protocols, the described one's first."""
+    """Numbers of channels of the candidate protocols; the first is that of the described protocol."""
     return [*dict.fromkeys(protocol.num_measurements for protocol, _ in protocols)]
 
 
@@ -123,8 +125,8 @@ def measurement_in(
     mask: np.ndarray | None = None,
     like: Measurement | None = None,
 ) -> Measurement:
-    """Create the measurement from frames found in a file, with notes on detected properties; arguments as for
-    `measurement_from` and `read`."""
+    """Create a measurement from the frames of a file, with notes on detected properties; see `measurement_from` and
+    `read` for the arguments."""
     layout = replace(sensor_description.layout, frames_in="rows")
     frames = frames_from(file_frames.table, layout, path.name)
     notes = (*sensor_description.notes, *file_frames.notes, *component_notes(file_frames.table, layout))
@@ -148,7 +150,8 @@ def measurement_in(
 
 
 def _without_gains(frames: np.ndarray, protocol: Protocol, sensor_description: Description) -> np.ndarray:
-    """Frames divided by the gains of their measurement patterns. Raises `ValueError` for another number of these."""
+    """Frames divided by the described gains of their measurement patterns. Raises `ValueError` unless there is one gain
+    for each measurement pattern."""
     gains, num_patterns = np.array(sensor_description.layout.gains), len(protocol.measurement)
     if gains.size not in (0, num_patterns):
         raise ValueError(
@@ -161,8 +164,8 @@ def _without_gains(frames: np.ndarray, protocol: Protocol, sensor_description: D
 
 
 def description_like(like: Measurement) -> Description:
-    """Description that consists of the properties of another measurement of the same sensor, without its protocol and
-    frame names."""
+    """Description that consists of the properties of `like`, a measurement of the same sensor, without the protocol and
+    the frame names."""
     source = Path(like.source)
     description_path = (
         find_description(source) if like.source and (recognises(source) or source.suffix == ".mat") else None
@@ -187,11 +190,11 @@ def description_like(like: Measurement) -> Description:
 def measurement_from(
     path: Path, sensor_description: Description, frames: np.ndarray, protocol: Protocol | None, mask: np.ndarray | None
 ) -> Measurement:
-    """Screen frames (F, M), in the unit of the file, and scale them as the description states. `protocol`: the one
-    stored in the file, or None.
+    """Scale frames (frames, channels) in the unit of the file to volts as the description states, and mask unusable
+    voltages. `protocol`: the protocol stored in the file, or None.
 
-    Raises `ValueError` if there is no protocol, if the number of frame names differs from that of the frames, and as
-    `screen`.
+    Raises `ValueError` if there is no protocol, if the number of frame names differs from that of the frames, and if
+    `screen` does.
     """
     protocol = protocol or sensor_description.protocol(path)
     if protocol is None:
@@ -232,10 +235,10 @@ def measurement_from(
 
 
 def numbers(path: Path, layout: TableLayout) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The numbers of a text or NPY file, arranged as in the file, and the names of its columns in the last line of a
-    heading, if it has one. A last line that is cut off is left out.
+    """The numbers of a text or NPY file, arranged as in the file, and the names of its columns from the last line of
+    the heading, if there is a heading. A last line that is cut off is left out.
 
-    Raises `ValueError` if it holds anything but numbers.
+    Raises `ValueError` if the file contains anything but numbers.
     """
     if path.suffix.lower() == ".npy":
         return _voltages(_from_numpy(path, ()), layout, path), ()
@@ -244,8 +247,8 @@ def numbers(path: Path, layout: TableLayout) -> tuple[np.ndarray, tuple[str, ...
 
 
 def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray:
-    """Frames (F, M), in the unit of the file, of a table laid out as described. Raises `ValueError` for an odd number
-    of rows in complex pairs."""
+    """Frames (frames, channels), in the unit of the file, of a table with the arrangement `layout`. Raises `ValueError`
+    if rows are pairs of real and imaginary parts and their number is odd."""
     frames = table.T if table.ndim == 2 and layout.frames_in == "columns" else np.atleast_2d(table)
     if layout.complex_pairs:
         if len(frames) % 2:
@@ -259,20 +262,21 @@ def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray
     if layout.component == "imaginary":
         return np.imag(frames)
     if layout.component == "magnitude":
-        # With the sign of the real part, because a magnitude alone has no direction.
+        # The magnitude takes the sign of the real part, because a magnitude alone has no sign.
         return np.abs(frames) * np.where(np.real(frames) < 0, -1.0, 1.0)
     return frames if layout.component == "complex" else np.real(frames)
 
 
 def component_notes(values: np.ndarray, layout: TableLayout) -> tuple[str, ...]:
-    """A note that states which part of complex voltages is read."""
+    """A note that states which part (such as the real part) of complex voltages is read."""
     if not np.iscomplexobj(values) or layout.component == "complex":
         return ()
     return (f"of complex voltages this is the {layout.component} part; see [data] component.",)
 
 
 def _from_numpy(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """The needed arrays of an NPZ file by name, or the array of an NPY file as "voltages"."""
+    """The arrays `keys` and the arrays that `write_table` stores of an NPZ file, by name, or the array of an NPY file
+    as "voltages"."""
     try:
         if path.suffix.lower() == ".npy":
             return {"voltages": npy_array(path)}
@@ -312,7 +316,7 @@ def _with_stored_texts(description: Description, arrays: dict[str, np.ndarray]) 
 
 
 def _times(arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
-    """Times from a file written by `write_table`, or None."""
+    """Times of the frames from a file written by `write_table`, or None."""
     times = arrays.get("times")
     if times is not None and times.dtype.kind not in "iuf":
         raise ValueError(f"{name}: 'times' holds {times.dtype}; give seconds.")
@@ -324,14 +328,14 @@ def _texts(arrays: dict[str, np.ndarray], name: str) -> tuple[str, ...]:
 
 
 def frames_of(values: np.ndarray, axes: tuple[str, ...], name: str) -> Inexact[np.ndarray, "F M"]:
-    """Frames (F, M) of voltages with the given axes, channels ordered drive by drive; an array of two axes is one
-    frame.
+    """Frames (frames, channels) from an array of voltages with the given `axes`, with channels ordered drive by drive;
+    an array of two axes is one frame.
 
-    Raises `ValueError` for another number of axes.
+    Raises `ValueError` for an array with another number of axes.
     """
     axis_names = tuple(axes or AXES)
     if values.ndim == len(axis_names) - 1:
-        values = np.expand_dims(values, axis_names.index("frames"))  # MATLAB drops a last axis of length one
+        values = np.expand_dims(values, axis_names.index("frames"))  # MATLAB omits a last axis of length one
     if values.ndim != len(axis_names):
         raise ValueError(
             f"{name}: the voltages have shape {values.shape}; {', '.join(axis_names)} are {len(axis_names)} axes."
@@ -341,9 +345,9 @@ def frames_of(values: np.ndarray, axes: tuple[str, ...], name: str) -> Inexact[n
 
 
 def subtract_mean(frames: Inexact[np.ndarray, "F M"], num_electrodes: int) -> tuple[Inexact[np.ndarray, "F M"], float]:
-    """Subtract from the potentials of `num_electrodes` electrodes the mean of each pattern, if any mean exceeds noise:
-    the potentials were then measured against ground or an electrode. Returns the frames and the largest mean, 0 if
-    nothing is subtracted. Patterns with NaN are not changed."""
+    """Subtract from the potentials of each current pattern their mean over `num_electrodes` electrodes, if any mean
+    exceeds noise, i.e. if potentials were measured against ground or against an electrode. Returns the frames and the
+    largest mean, or 0 if nothing is subtracted. Patterns with NaN are not changed."""
     potentials = frames.reshape(len(frames), -1, num_electrodes)
     means = potentials.mean(axis=2, keepdims=True)
     means = np.where(np.isfinite(means), means, 0)

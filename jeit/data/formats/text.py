@@ -1,10 +1,11 @@
-"""Reading of numbers from text files, with detection of separators, headings and words before each line; and of frames
-from tables, with detection of their arrangement: rows or columns, a column of times, frames wrapped over lines.
+"""Reading of numbers from text files, with detection of separators, headings and words before the numbers of a line;
+and reading of frames from tables, with detection of the arrangement: rows or columns, a column of times, frames wrapped
+over lines.
 
-Accepted are cells separated by commas, semicolons, tabs or spaces, also several of these at once; decimal commas;
-complex numbers ("1+2j", "(1-2j)"); brackets around lines, as Python and NumPy print lists and arrays; comments (# or
-%), headings, and lines like those of the heading between frames; a word before the numbers of each line ("magnitudes :
-1.2, 3.4"); separators at the end of lines; and lines of unequal length, of frames that are wrapped over several lines.
+The readers accept cells separated by commas, semicolons, tabs or spaces, also by several of these at once; decimal
+commas; complex numbers ("1+2j", "(1-2j)"); brackets around lines, as Python and NumPy print lists and arrays; comments
+(# or %), headings, and repeated heading lines between frames; a word before the numbers of each line ("magnitudes :
+1.2, 3.4"); separators at the end of lines; and lines of unequal length if frames are wrapped over several lines.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from jeit.arguments import counted
 from jeit.data.description import TableLayout
 from jeit.files import check_memory
 
-# Bytes of memory per byte of text: a number may take two characters, and is stored twice.
+# Bytes of memory per byte of text: a number may consist of two characters, and is stored twice in eight bytes.
 _MEMORY_FACTOR = 8
 # Number of lines from which separators are detected, and maximum number of lines of a heading.
 _NUM_SAMPLE_LINES, _MAX_HEADING_LINES = 40, 100
@@ -32,20 +33,20 @@ _LABEL = re.compile(r"\s{0,40}([A-Za-z_][\w ()/\[\].-]{0,60})[:=]\s{0,40}(?=[-+.
 _CUT_NUMBER = re.compile(r"[-+]?(\d*[.,]?\d*([eE][-+]?)?|na?)")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 _COMPLEX = re.compile(r"\(?[-+]?[\d.]+(?:[eE][-+]?\d+)?[-+]{1,2}[\d.]+(?:[eE][-+]?\d+)?[ijIJ]\)?")
-# Minimum number of columns for which a first line that numbers the columns is not taken as a frame.
+# Minimum number of columns for which a first line 0, 1, 2, … counts as column numbers instead of a frame.
 _MIN_NUMBERED_COLUMNS = 8
 _COMMENT_MARKS = ("#", "%", "//")
 _DELIMITER_HINT = (
     "Set [data] delimiter and skip_rows in the description, if it is a heading or cells are separated otherwise."
 )
 
-# Integer times that rise by at least this step may be milliseconds as well as seconds.
+# Integer times that increase by at least this step may be milliseconds as well as seconds.
 _MIN_MILLISECOND_STEP = 5
 
 
 class Text(NamedTuple):
-    """**Fields**: `values`: all numbers; `lengths`: number of values in each line; `heading`: cells of the last line of
-    a heading; `notes`: detected properties."""
+    """The numbers of a text file. **Fields**: `values`: all numbers; `lengths`: number of values in each line;
+    `heading`: cells of the last line of the heading; `notes`: detected properties."""
 
     values: Inexact[np.ndarray, " n"]
     lengths: np.ndarray
@@ -54,13 +55,14 @@ class Text(NamedTuple):
 
 
 class _NumberFormat(NamedTuple):
-    """Format of lines of numbers: `delimiter` (None: white space) and whether commas are decimal points."""
+    """Format of lines of numbers: the `delimiter` between numbers (None: white space) and whether commas are decimal
+    points."""
 
     delimiter: str | None
     decimal_comma: bool
 
     def cells(self, line: str) -> list[str]:
-        """Cells of a line, without a label before them and without a separator after them."""
+        """Cells of a line, without a word before the first cell and without a separator after the last cell."""
         line = _without_label(line)
         if self.decimal_comma:
             line = line.replace(",", ".")
@@ -72,7 +74,7 @@ class _NumberFormat(NamedTuple):
         return cells
 
     def numbers(self, line: str) -> list[complex] | None:
-        """The numbers of a line, or None if it holds anything else."""
+        """The numbers of a line, or None if the line contains anything else."""
         try:
             return [_number(cell) for cell in self.cells(line)]
         except ValueError:
@@ -91,14 +93,15 @@ _NUMBER_FORMATS = (
 
 
 class LineNumbers:
-    """Parser of successive lines of numbers. Separators are detected in one line, and used for later lines as long as
-    they fit."""
+    """Parser of successive lines of numbers. The separators are detected in the first line, and again in a later line
+    that they do not fit."""
 
     def __init__(self):
         self._format: _NumberFormat | None = None
 
     def __call__(self, line: str) -> list[float] | None:
-        """The numbers of a line, NaN for an empty cell between others; None if the line holds anything else."""
+        """The numbers of a line, with NaN for an empty cell between numbers; None if the line contains anything
+        else."""
         numbers = None if self._format is None else self._parse(self._format, line)
         if numbers is None:
             number_format = _detect_format([line])
@@ -115,10 +118,10 @@ class LineNumbers:
 
 
 def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = None) -> Text:
-    """Read the numbers of a text file. `delimiter` and `skip_rows`, the number of heading lines, are detected if they
-    are not given.
+    """Read the numbers of a text file. The `delimiter` between numbers and `skip_rows`, the number of heading lines,
+    are detected if they are not given.
 
-    Raises `ValueError`, with the line, for a file that holds anything but numbers or was cut off.
+    Raises `ValueError`, with the line, for a file that contains anything but numbers or that was cut off.
     """
     check_memory(path.name, _MEMORY_FACTOR * path.stat().st_size)
     num_skipped = skip_rows or 0
@@ -176,7 +179,7 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
 
 
 def rectangle(text: Text, name: str) -> Inexact[np.ndarray, "R C"]:
-    """The numbers as rows of equal length. Raises `ValueError` if a row has another length."""
+    """The numbers of a text file as a matrix. Raises `ValueError` if lines have different lengths."""
     length = int(text.lengths[0])
     if (unequal_rows := np.flatnonzero(text.lengths != length)).size:
         raise ValueError(
@@ -187,7 +190,7 @@ def rectangle(text: Text, name: str) -> Inexact[np.ndarray, "R C"]:
 
 
 def _line_pattern(line: str) -> str:
-    """Return a line with # in place of numbers, so that "Frame 1" and "Frame 2" have the same pattern."""
+    """A line with # in place of each number, so that "Frame 1" and "Frame 2" give the same pattern."""
     return re.sub(r"\d+", "#", line.strip())
 
 
@@ -202,7 +205,8 @@ def _delimiter_for_split(delimiter: str) -> str | None:
 
 
 def _detect_format(lines: Sequence[str]) -> _NumberFormat:
-    """Return the format in which most lines are numbers; among equals, the one that finds the most numbers."""
+    """Return the format in which the most lines are numbers; among equally good formats, the format that finds the most
+    numbers."""
 
     def count_numbers(number_format: _NumberFormat) -> tuple[int, int]:
         rows = [row for line in lines if (row := number_format.numbers(line))]
@@ -217,15 +221,16 @@ def _detect_format(lines: Sequence[str]) -> _NumberFormat:
 
 
 def _has_decimal_commas(number_format: _NumberFormat, lines: Sequence[str]) -> bool:
-    """Whether commas are decimal points: in most cells that contain a comma, it stands between two digits."""
+    """Whether commas are decimal points: in most cells that contain a comma, the comma stands between two digits."""
     cells = [cell for line in lines for cell in _without_label(line).split(number_format.delimiter) if "," in cell]
     decimal_cells = [cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell.strip(' \t\r\n"'))]
     return len(decimal_cells) > 0.9 * len(cells)
 
 
 def _heading_length(number_format: _NumberFormat, lines: Sequence[str]) -> int:
-    """Return the number of heading lines at the start. A line belongs to the heading if at least half of its cells are
-    words, if it has another length than the lines of numbers, or if it numbers the columns, as saved data frames do."""
+    """Return the number of heading lines at the start of a file. A line belongs to the heading if at least half of its
+    cells are words, if its length differs from that of the lines of numbers, or if it numbers the columns, as in saved
+    data frames."""
     row_lengths = {len(row) for line in lines if (row := number_format.numbers(line))}
     for line_index, line in enumerate(lines):
         cells = number_format.cells(line)
@@ -242,7 +247,8 @@ def _heading_length(number_format: _NumberFormat, lines: Sequence[str]) -> int:
 
 
 def _content_lines(path: Path, num_skipped: int) -> Iterator[tuple[int, str]]:
-    """Lines of a text file that are neither empty nor comments, with their numbers from 1, after those skipped."""
+    """Lines of a text file that are neither empty nor comments, after `num_skipped` lines, with their line numbers from
+    1."""
     with path.open("rb") as file:
         is_utf16 = file.read(2) in (b"\xff\xfe", b"\xfe\xff")  # as spreadsheets write "Unicode text"
     try:
@@ -269,7 +275,7 @@ def _not_a_number_message(cells: list[str], number_format: _NumberFormat, *, is_
 
 
 def _number(cell: str) -> complex:
-    """A number, real or complex. Raises `ValueError` for anything else."""
+    """The real or complex number in a cell. Raises `ValueError` for anything else."""
     try:
         return float(cell)
     except ValueError:
@@ -287,8 +293,8 @@ def _is_number(cell: str) -> bool:
 
 
 class Frames(NamedTuple):
-    """**Fields**: `table`: frames in rows; `times`: times of the rows in seconds, or None; `notes`: detected
-    properties."""
+    """Frames read from a table. **Fields**: `table`: one frame per row; `times`: times of the rows in seconds, or None;
+    `notes`: detected properties."""
 
     table: Inexact[np.ndarray, "F M"]
     times: Float[np.ndarray, " F"] | None = None
@@ -296,7 +302,8 @@ class Frames(NamedTuple):
 
 
 def frames_in_text(text: Text, counts: Sequence[int], layout: TableLayout, name: str) -> Frames:
-    """Frames of a text file. `counts`: numbers of channels that a frame may have, the described one first.
+    """Frames of a text file. `counts`: numbers of channels that a frame may have; the first is that of the described
+    protocol.
 
     A last line or frame that is cut off is left out. Raises `ValueError` for lines of unequal length that are not
     frames wrapped over several lines.
@@ -317,7 +324,8 @@ def frames_in_text(text: Text, counts: Sequence[int], layout: TableLayout, name:
 
 
 def without_cut_line(text: Text) -> Text:
-    """Return the text without its last line, and with a note, if that line is shorter than the first, i.e. cut off."""
+    """Return the text without its last line, and with a note, if the last line is shorter than the first line, i.e. cut
+    off."""
     if len(text.lengths) < 2 or text.lengths[-1] >= text.lengths[0]:
         return text
     num_cut = int(text.lengths[-1])
@@ -326,8 +334,8 @@ def without_cut_line(text: Text) -> Text:
 
 
 def _wrapped_frames(text: Text, counts: Sequence[int]) -> tuple[int, int] | None:
-    """Return the number of values in a frame that is wrapped over several lines, and how many are left over at the end;
-    None if lines or columns are frames."""
+    """For frames that are wrapped over several lines, return the number of values per frame, and the number of values
+    after the last complete frame; None if each line or each column is a frame."""
     line_ends = np.cumsum(text.lengths)
     if (text.lengths == text.lengths[0]).all():
         shape = len(text.lengths), int(text.lengths[0])
@@ -336,12 +344,13 @@ def _wrapped_frames(text: Text, counts: Sequence[int]) -> tuple[int, int] | None
     candidates = []
     for index, count in enumerate(counts):
         num_frames, num_left_over = divmod(int(line_ends[-1]), count)
-        # Numbers left over from frames of another length than the described one mean that a line is missing.
+        # With a number of channels that is not the described number, values after the last complete frame mean that a
+        # line is missing.
         if index and num_left_over:
             continue
         if num_frames and text.lengths[0] < count and np.isin(count * np.arange(1, num_frames + 1), line_ends).all():
             candidates.append((count, num_left_over))
-    # Prefer a number of channels that leaves no numbers over.
+    # Prefer a number of channels for which all frames are complete.
     return min(candidates, key=lambda candidate: candidate[1] > 0, default=None)
 
 
@@ -356,8 +365,8 @@ def frames_in_table(
     heading: Sequence[str] = (),
     default_axis: str = "rows",
 ) -> Frames:
-    """Frames of an array. `counts` as for `frames_in_text`; `heading`: names of the columns; `default_axis`: where
-    frames are if the numbers of channels do not decide, "rows" or "columns"."""
+    """Frames of a two-dimensional array. `counts`: see `frames_in_text`; `heading`: names of the columns;
+    `default_axis`: "rows" or "columns", whichever are frames if the numbers of channels do not decide."""
     stated_axis = layout.frames_in
     is_transposed = stated_axis == "columns" if stated_axis else _are_columns(table.shape, counts, default_axis)
     rows = table.T if is_transposed else table
@@ -374,7 +383,8 @@ def frames_in_table(
 
 
 def _are_columns(shape: tuple[int, int], counts: Sequence[int], default_axis: str) -> bool:
-    """Whether columns, not rows, are frames: the first number of channels that one of the two has decides."""
+    """Whether columns, not rows, are frames: the first of the `counts` that equals the length of a column or row
+    decides."""
     for num_extra in (0, 1):
         for count in counts:
             axis_fits = [shape[1] == count + num_extra, shape[0] == count + num_extra]
@@ -384,7 +394,8 @@ def _are_columns(shape: tuple[int, int], counts: Sequence[int], default_axis: st
 
 
 def _times(column: Float[np.ndarray, " F"], column_name: str) -> tuple[Float[np.ndarray, " F"] | None, str]:
-    """Times in seconds from the first number of each frame, and a note; no note if these do not rise."""
+    """Times in seconds from the first number of each frame, or None if these numbers are not times, and a note. The
+    note is empty if the numbers do not increase."""
     if not (np.isfinite(column).all() and (np.diff(column) > 0).all()):
         return None, ""
     if (column == column[0] + np.arange(len(column))).all():

@@ -1,4 +1,4 @@
-"""`jeit live`: image a device's frames while they come, on a page in the browser."""
+"""`jeit live`: image a device's frames as they arrive, on a page in the browser."""
 
 from __future__ import annotations
 
@@ -103,11 +103,11 @@ def live(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Image frames as they come, on a page in the browser; 'jeit live demo' needs no device.
+    """Image frames as they arrive, on a page in the browser; 'jeit live demo' needs no device.
 
-    What is shown follows from what is given: the change of conductivity, contacts (--contacts), a learnt skin, gestures
-    or depth (--model), or the loss map of microphones (--calibration). The page takes a new reference, records, marks
-    events, pauses and steps back. Ctrl-C ends it.
+    The options select what is shown: the change of conductivity (default), contacts (--contacts), a learnt skin,
+    gestures or depth (--model), or the loss map of microphones (--calibration). The page can take a new reference,
+    record frames, mark events, pause, and step back. Ctrl-C ends the session.
     """
     from jeit.arguments import counted
     from jeit.arguments.extras import need_extra
@@ -140,7 +140,7 @@ def live(
     _check_folder(output)
     with Steps(console, quiet=quiet) as step, naming_options(_ARGUMENT_OPTIONS):
         step("read")
-        # A reference for a model is plain frames, as `jeit touch predict` reads them.
+        # The reference of a model is a file of plain frames, as `jeit touch predict` reads it.
         reference_input = reference
         if reference is not None and model is None:
             reference_input = read_file("--reference", reference, format, description, key=reference_key)
@@ -185,7 +185,7 @@ def live(
 
 @contextmanager
 def _handle_sigterm() -> Iterator[list[int]]:
-    """Treat SIGTERM like Ctrl-C within the context. Yields the list of received signals."""
+    """Context in which the signal SIGTERM is treated like Ctrl-C; yields the list of received signals."""
     received_signals: list[int] = []
 
     def stop(signal_number: int, _) -> None:
@@ -202,7 +202,7 @@ def _handle_sigterm() -> Iterator[list[int]]:
         signal.signal(signal.SIGTERM, previous_handler)
 
 
-# Maximum number of reasons of refused frames that are printed.
+# Maximum number of printed reasons why frames were refused.
 _MAX_REASONS = 8
 _OPTION_NAMES = {"solver": "--method", "max_steps": "--steps"}
 _ARGUMENT_OPTIONS = {
@@ -217,15 +217,16 @@ _ARGUMENT_OPTIONS = {
 
 
 def _check_folder(output: Path) -> None:
-    """Raise `ValueError` if no folder can be made at `output`; none is made before a recording begins."""
+    """Raise `ValueError` if no folder can be created at `output`; the folder is created only when a recording
+    begins."""
     existing_path = next(path for path in (output.absolute(), *output.absolute().parents) if path.exists())
     if not (existing_path.is_dir() and os.access(existing_path, os.W_OK)):
         raise ValueError(f"--output: no folder '{output}' can be made or written to; '{existing_path}' is in the way.")
 
 
 def _check_use(options: dict, model: Path | None, calibration: Path | None, contacts: bool) -> None:
-    """Raise `ValueError` if options of images are given together with a model or microphones, which do not use
-    them."""
+    """Raise `ValueError` if options of conductivity images are given together with a model or microphones, which do not
+    use these options."""
     used_options = [_OPTION_NAMES.get(name, f"--{name.replace('_', '-')}") for name in options] + [
         "--contacts"
     ] * contacts
@@ -254,7 +255,7 @@ def _has_display() -> bool:
 
 
 def _print_counters(console, state: dict) -> None:
-    """Print the counters of a session."""
+    """Print the numbers of frames that a session received, imaged, refused and skipped."""
     from jeit.arguments import counted
 
     counts = [f"{state[name]} {name}" for name in ("imaged", "dropped", "refused") if state[name]]

@@ -1,3 +1,4 @@
-"""The page of a live session: what is sent to it, what it may ask for, who may open it, and the files in `static/`."""
+"""The page of a live session in the browser: messages to the page, commands from the page, access control, and the
+files in `static/`."""
 
 from __future__ import annotations

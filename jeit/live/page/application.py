@@ -1,4 +1,4 @@
-"""The web application of a live session: its files, and a WebSocket for pictures, state and commands."""
+"""The web application of a live session: the files of the page, and a WebSocket for pictures, state and commands."""
 
 from __future__ import annotations
 
@@ -35,13 +35,14 @@ _MEDIA_TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css",
 
 
 def page_files() -> dict[str, bytes]:
-    """Return the contents of the page's files by name. They are read once, so that no request accesses the disk."""
+    """Return the contents of the page's files by name. The files are read once, so that no request accesses the
+    disk."""
     folder = resources.files("jeit.live.page").joinpath("static")
     return {file.name: file.read_bytes() for file in folder.iterdir() if file.name.rpartition(".")[2] in _MEDIA_TYPES}
 
 
 def make_application(hub: Hub, *, host: str, token: str | None) -> Starlette:
-    """Return the application that shows a session's pictures; `host`, `token`: as in `Guard`."""
+    """Return the web application that shows a session's pictures; `host`, `token`: as in `Guard`."""
     files = page_files()
 
     def file(request: Request) -> Response:
@@ -69,7 +70,7 @@ def make_application(hub: Hub, *, host: str, token: str | None) -> Starlette:
 
 
 async def _serve_viewer(hub: Hub, websocket: WebSocket) -> None:
-    """Serve one page until it disconnects."""
+    """Send pictures and states to one open page, and execute its commands, until the page disconnects."""
     await websocket.accept()
     if len(hub.viewers) >= MAX_VIEWERS:
         await websocket.close(1013, f"{MAX_VIEWERS} pages are open already")
@@ -142,8 +143,8 @@ async def _execute_command(command: Command, hub: Hub, viewer: Viewer, websocket
 
 
 async def _execute_session_command(command: Command, hub: Hub) -> tuple[str, str | None]:
-    """Carry out a command that changes the session, in another thread, since it may write to disk. Returns the name of
-    the command, and the error message or None."""
+    """Execute a command of the page that changes the session, in another thread, because the command may write to disk.
+    Returns the name of the command, and the error message or None."""
     session = hub.session
     try:
         match command:

@@ -24,7 +24,7 @@ _HEADERS = {
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a name or address is a loopback address, which other machines cannot reach."""
+    """Whether a host name or address is a loopback address, which other machines cannot reach."""
     if host == "localhost":
         return True
     try:
@@ -46,7 +46,7 @@ def _is_unspecified(host: str) -> bool:
 
 
 def _host_name(host_header: str) -> str:
-    """Return the host in a header `host[:port]`, in lower case; "" if the header is invalid."""
+    """Return the host in a request's header `host[:port]`, in lower case; "" if the header is invalid."""
     try:
         return (urlsplit(f"//{host_header}").hostname or "").rstrip(".")
     except ValueError:
@@ -54,11 +54,11 @@ def _host_name(host_header: str) -> str:
 
 
 def host_allowed(header: str, listening: str) -> bool:
-    """Whether a request's host is a name or address of the server at `listening`.
+    """Whether the host that a request names in its `header` is a name or address of the server at `listening`.
 
     The domain name of another site can resolve to this machine, and the scripts of that site then reach this server
-    under that name (DNS rebinding). Such a name is neither an address nor the name of this machine. Any port is
-    allowed, so that a tunnel works.
+    under this domain name (DNS rebinding). The domain name is neither an address nor the name of this machine, so the
+    request is refused. Any port is allowed, so that a tunnel works.
     """
     name = _host_name(header)
     if is_loopback(name) or name == listening.lower():
@@ -81,7 +81,7 @@ class Guard:
         self._token = token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse a request, or pass it on to the application."""
+        """Refuse a request, or pass the request on to the application."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -109,8 +109,8 @@ class Guard:
 
     @staticmethod
     def _with_security_headers(send: Send, host: str) -> Send:
-        """Add headers by which a browser runs only the page's own files, and does not show the page in a frame of
-        another site."""
+        """Add headers to a response that make the browser run only the page's own files, and not show the page in a
+        frame of another site."""
         policy = (
             "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; media-src blob:; "
             f"connect-src 'self' ws://{host} wss://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"

@@ -1,5 +1,5 @@
-"""Distribution of the pictures of a live session to open pages. Each page is sent the newest picture, as fast as it
-draws."""
+"""Distribution of the pictures of a live session to open pages. Each page receives the newest picture, as fast as the
+page draws."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _LATENCY_SPAN = 10.0
 
 
 class Viewer:
-    """State of an open page: the pictures that were sent and are not yet drawn, and the latencies of its pictures.
+    """State of an open page: the pictures that were sent and are not yet drawn, and the latencies of drawn pictures.
 
-    A page that is slow or suspended reports no picture as drawn. It is sent no further pictures until it resumes, and
-    then the newest.
+    A page that is slow or suspended does not report pictures as drawn. Such a page receives no further pictures until
+    it resumes, and then receives the newest picture.
     """
 
     def __init__(self) -> None:
@@ -39,16 +39,18 @@ class Viewer:
         self._drawn: deque[tuple[float, float]] = deque(maxlen=2000)
 
     def ready_for(self, number: int) -> bool:
-        """Whether a picture may be sent now."""
+        """Whether the picture with the frame number `number` may be sent to the page now."""
         return self.following and number > self._last_sent and len(self._in_flight) < _MAX_IN_FLIGHT
 
     def note_sent(self, number: int, arrived: float) -> None:
-        """Record that a picture was sent."""
+        """Record that the picture with the frame number `number`, which arrived at the time `arrived`, was sent to the
+        page."""
         self._last_sent = number
         self._in_flight.append((number, arrived))
 
     def note_drawn(self, number: int, *, hidden: bool) -> None:
-        """Record that the page has drawn a picture, and has skipped those sent before."""
+        """Record that the page has drawn the picture with the frame number `number`, and has skipped pictures that were
+        sent before."""
         now = time.monotonic()
         while self._in_flight and self._in_flight[0][0] <= number:
             sent_number, arrived = self._in_flight.popleft()
@@ -57,19 +59,20 @@ class Viewer:
         self.wake_event.set()
 
     def wants_state(self) -> bool:
-        """Whether a state is to be sent now: it is due, and the page has read the last one."""
+        """Whether the state of the session is to be sent now: a new state is due, and the page has read the last
+        state."""
         if not (self.state_due and self._state_read):
             return False
         self.state_due = self._state_read = False
         return True
 
     def read_state(self) -> None:
-        """Record that the page has read the last state."""
+        """Record that the page has read the last state that was sent."""
         self._state_read = True
 
     def summary(self) -> dict[str, float | None]:
-        """Pictures drawn per second, and the latency from a frame's last byte until the page reports it drawn, in
-        seconds.
+        """Pictures drawn per second, and the latency in seconds from a frame's last byte until the page reports its
+        picture as drawn.
 
         The latency includes the transmission of the report, so that all times are from the same clock.
         """
@@ -99,18 +102,18 @@ class Hub:
         self._thread = threading.Thread(target=self._watch_session, name="jeit-live-pages", daemon=True)
 
     def start(self) -> None:
-        """Begin, in the event loop that serves the pages."""
+        """Start the thread; must be called in the event loop that serves the pages."""
         self._loop = asyncio.get_running_loop()
         self._state = self.session.state()
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread."""
+        """End the thread that waits for pictures."""
         self._closing.set()
         self._thread.join(5.0)
 
     def newest(self) -> tuple[Result, bytes] | None:
-        """Return the newest picture and its bytes, which are computed once for all pages."""
+        """Return the newest picture and its message to pages as bytes, which is computed once for all pages."""
         result = self._newest
         if result is None:
             return None
@@ -124,8 +127,8 @@ class Hub:
         return to_json("state", {**self._state, "drawn": viewer.summary(), "viewers": len(self.viewers)})
 
     def past_message(self, number: int, direction: int) -> bytes | None:
-        """Return the bytes of a picture of the last minute: that of a frame, or otherwise the nearest in a
-        direction."""
+        """Return the message with a past picture as bytes: the picture of the frame `number`, or else of the nearest
+        frame in the `direction` (-1: earlier, 1: later) that has a picture."""
         for candidate in range(number, max(-1, number + 600 * direction), direction):
             result = self.session.result(candidate)
             if result is not None and (result.frame.number - number) * direction >= 0:
@@ -151,13 +154,14 @@ class Hub:
                 self._closing.wait(0.1)
 
     def _wake_pages(self, *, state: bool = False) -> None:
-        """Wake the pages in the event loop. Several pictures that arrive meanwhile wake them only once."""
+        """Wake the pages in the event loop. Several pictures that arrive before the pages are awake wake them only
+        once."""
         if self._loop is None or (self._is_woken and not state):
             return
         self._is_woken = True
         try:
             self._loop.call_soon_threadsafe(self._notify_viewers, state)
-        except RuntimeError:  # the loop has been closed
+        except RuntimeError:  # the event loop has been closed
             self._closing.set()
 
     def _notify_viewers(self, state: bool) -> None:

@@ -24,14 +24,14 @@ _MAX_CURVE_POINTS = 2000
 
 
 class Command(BaseModel):
-    """Base class of the commands of a page. Keys that are not fields are refused."""
+    """Base class of the commands that a page sends. Keys that are not fields are refused."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 class Drawn(Command):
-    """The page has drawn a picture. `hidden`: whether the page was hidden meanwhile, so that the latency is not
-    meaningful."""
+    """Report that the page has drawn the picture of the frame `number`. `hidden`: whether the page was hidden while the
+    picture was sent, so that the latency is not meaningful."""
 
     do: Literal["drawn"]
     number: Annotated[int, Field(ge=0, lt=2**53)]
@@ -39,20 +39,21 @@ class Drawn(Command):
 
 
 class Seen(Command):
-    """The page has read the last state, so that the next can be sent."""
+    """Report that the page has read the last state of the session, so that the next state can be sent."""
 
     do: Literal["seen"]
 
 
 class Follow(Command):
-    """Send pictures as they come, or pause."""
+    """Command to send new pictures to the page (`on`), or to pause."""
 
     do: Literal["follow"]
     on: bool
 
 
 class Show(Command):
-    """Send a picture of the last minute, or its neighbour in a `direction` if that frame was not imaged."""
+    """Command to send the picture of a past frame `number`, or of the nearest imaged frame in the `direction` (-1:
+    earlier, 1: later)."""
 
     do: Literal["show"]
     number: Annotated[int, Field(ge=0, lt=2**53)]
@@ -60,7 +61,7 @@ class Show(Command):
 
 
 class Reference(Command):
-    """Take the mean of the next `count` frames as the reference."""
+    """Command to take the mean of the next `count` frames as the reference."""
 
     do: Literal["reference"]
     count: Annotated[int, Field(ge=1, le=10_000)]
@@ -74,14 +75,14 @@ def _to_one_line(text: str) -> str:
 
 
 class Mark(Command):
-    """Note an event now."""
+    """Command to mark an event with the text `label` at the present time."""
 
     do: Literal["mark"]
     label: Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_to_one_line)]
 
 
 class Record(Command):
-    """Begin a recording, or end it."""
+    """Command to begin a recording (`on`), or to end the recording in progress."""
 
     do: Literal["record"]
     on: bool
@@ -93,7 +94,7 @@ _COMMANDS: TypeAdapter[Any] = TypeAdapter(
 
 
 def read_command(text: str | bytes) -> Command:
-    """Return the command in a page's message; raises `ValueError` for anything else."""
+    """Return the command in a message from a page; raises `ValueError` for a message that is not a valid command."""
     if len(text) > MAX_COMMAND_LENGTH:
         raise ValueError(f"a message of {len(text)} characters: at most {MAX_COMMAND_LENGTH}")
     try:
@@ -118,18 +119,18 @@ def to_json_types(value: Any) -> Any:
 
 
 def to_json(kind: str, content: Mapping[str, Any]) -> str:
-    """Return a message of a kind as JSON text."""
+    """Return a message of the given `kind`, such as "state", as JSON text."""
     return json.dumps({"kind": kind, **to_json_types(content)}, allow_nan=False, separators=(",", ":"))
 
 
 def _curve_lists(curves: Sequence[np.ndarray]) -> list[list[list[float]]]:
-    """Convert curves to lists of at most 2,000 points each, rounded to tenths of a micrometre."""
+    """Convert curves to lists of at most 2,000 points each, with coordinates rounded to tenths of a micrometre."""
     thinned_curves = [np.asarray(curve, float)[:: 1 + len(curve) // _MAX_CURVE_POINTS] for curve in curves]
     return [np.round(curve, 7).tolist() for curve in thinned_curves]
 
 
 def scene_message(scene: Scene) -> str:
-    """Return the scene of a view, which is sent to a page once, as JSON text."""
+    """Return the scene of a view (outline, electrodes, names), which is sent to a page once, as JSON text."""
     content = {
         "title": scene.title,
         "quantity": scene.quantity,
@@ -147,7 +148,7 @@ def scene_message(scene: Scene) -> str:
 
 @dataclass(frozen=True)
 class _EncodedArray:
-    """An array as bytes, with the part of the header that describes it."""
+    """An array as bytes, with the part of the message header that describes the array."""
 
     header: dict[str, Any]
     body: bytes
@@ -161,8 +162,8 @@ def _encode_values(frame: LiveFrame) -> _EncodedArray:
 
 
 def _encode_pixels(picture: Picture) -> _EncodedArray:
-    """Encode pixels as 16-bit integers, in units of the largest magnitude divided by 32,767. This is finer than the
-    colours of the page."""
+    """Encode the pixels of a picture as 16-bit integers, in units of the largest magnitude divided by 32,767. This
+    resolution is finer than that of the page's colours."""
     if picture.pixels is None or picture.pixels.ndim != 2 or not picture.pixels.size:
         return _EncodedArray({"shape": None, "scale": 0.0}, b"")
     pixels = np.asarray(picture.pixels, np.float32)
@@ -175,7 +176,7 @@ def _encode_pixels(picture: Picture) -> _EncodedArray:
 
 
 def picture_message(frame: LiveFrame, picture: Picture, *, latency: float, past: bool = False) -> bytes:
-    """Return the bytes of one picture for the page. `past`: whether the page requested it as a past picture.
+    """Return the message with one picture for the page as bytes. `past`: whether the page requested a past picture.
 
     The message consists of the length of the header (4 bytes, little endian); the header, JSON padded with spaces to a
     multiple of four bytes; the channels, float32; and the pixels, row of the largest y first, int16, to be multiplied

@@ -1,3 +1,3 @@
-"""Kinds of view: what becomes of a frame, by what is known of the sensor."""
+"""Views for kinds of sensors and models: classes that compute pictures from frames."""
 
 from __future__ import annotations

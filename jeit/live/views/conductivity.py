@@ -19,20 +19,19 @@ from jeit.live.views.scene import PixelGrid, scene_of
 
 
 class ConductivityView(AbstractView):
-    """View of the change of conductivity from that of the undisturbed body: the images of `jeit.inverse.stream`.
+    """View of the change of conductivity from the undisturbed body: the images of `jeit.inverse.stream`.
 
-    Images are in S/m (2-D: S). A marker stands at the centroid of the strongest change, unless the frame differs from
-    an undisturbed one by noise only. `ConductivityView.prepare` makes the view from a measurement of the undisturbed
-    body.
+    Images are in S/m (2-D: S). A marker shows the centroid of the strongest change, unless the frame differs from the
+    reference by noise only. `ConductivityView.prepare` creates the view from a measurement of the undisturbed body.
 
     **Arguments:**
 
-    - `imager`: reconstructs images from frames, as from `jeit.imaging.prepare_imager`.
-    - `calibration`: calibrated model of the body, from the same function.
+    - `imager`: object that reconstructs images from frames, as returned by `jeit.imaging.prepare_imager`.
+    - `calibration`: calibrated model of the body, as returned by `jeit.imaging.prepare_imager`.
     - `title`: title of the page.
     - `notes`: remarks for the page.
 
-    Raises `ValueError` for objects of another type, and for a surface in space, which has no plane image.
+    Raises `ValueError` for arguments of a wrong type, and for a curved surface in space, which has no plane image.
 
     **Example:**
 
@@ -75,7 +74,7 @@ class ConductivityView(AbstractView):
     ) -> ConductivityView:
         """Prepare the view of a sensor from `reference`, a measurement of the undisturbed sensor.
 
-        Raises `ValueError` as `jeit.imaging.prepare_imager` does.
+        Raises `ValueError` if `jeit.imaging.prepare_imager` does.
         """
         imager, calibration = prepare_imager(reference, settings, progress=progress)
         return cls(imager, calibration, title=f"Conductivity change, {reference.name}", notes=reference.notes)
@@ -85,7 +84,7 @@ class ConductivityView(AbstractView):
         return self.image(frame)[1]
 
     def image(self, frame: LiveFrame) -> tuple[FrameImage, Picture]:
-        """Compute the image of a frame on the cells of the mesh, and its picture."""
+        """Compute the image of a frame on the cells of the mesh, and the picture for the page."""
         frame_image = self._state.image(frame.number, frame.values)
         if frame_image.conductivity is None:
             return frame_image, Picture(None, status=frame_image.status, reason=frame_image.reason)
@@ -98,15 +97,16 @@ class ConductivityView(AbstractView):
         return frame_image, Picture(self.grid(change), markers, frame_image.status, frame_image.reason)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
-        """Take the mean of frames (N, M) as the new reference. The memory of the images is reset."""
+        """Take the mean of `frames` (frames, channels) as the new reference, and reset the temporal smoothing of
+        images."""
         self.imager = self.imager.with_reference(mean_frame(frames))
         self._state = StreamState(self.imager)
 
 
 def mean_frame(frames: Float[np.ndarray, "N M"]) -> Float[np.ndarray, " M"]:
-    """Mean (M,) of the readings of each channel in frames (N, M); NaN for a channel without readings.
+    """Mean reading (channels,) of each channel over `frames` (frames, channels); NaN for a channel without readings.
 
-    Raises `ValueError` if there are no frames, or frames that are not (N, M).
+    Raises `ValueError` if there are no frames, or if `frames` is not two-dimensional.
     """
     values = np.asarray(frames, float)
     if values.ndim != 2 or not len(values):

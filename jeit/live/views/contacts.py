@@ -1,4 +1,4 @@
-"""Views of sheets that are touched: contacts with their paths, and gestures that are classified."""
+"""Views of touched sheets: contacts with their paths, and classified gestures."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from jeit.touch import (
 
 # Minimum number of frames of the reference from which the noise of images is estimated.
 _MIN_FRAMES = 10
-# Time in seconds by which a frame with the time of the previous one is delayed; time in seconds for which the name of a
-# gesture is shown on the image.
+# Time in seconds by which a frame is delayed if it has the same time as the previous frame; time in seconds for which
+# the name of a gesture is shown on the image.
 _MIN_TIME_STEP, _LABEL_TIME = 1e-6, 1.5
 
 Item = TypeVar("Item")
@@ -37,7 +37,8 @@ Output = TypeVar("Output")
 
 
 class StepwiseGenerator(Generic[Item, Output]):
-    """Callable that passes items one by one to a generator function: each call returns the result for its item."""
+    """Callable that passes items one by one to a generator function, and returns the generator's result for each
+    item."""
 
     def __init__(self, generate: Callable[[Iterable[Item]], Iterator[Output]]):
         self._items: list[Item] = []
@@ -53,18 +54,20 @@ class StepwiseGenerator(Generic[Item, Output]):
 
 
 class ContactsView(AbstractView):
-    """Contacts in images of change, with their paths: a marker for each, with the number of its touch.
+    """View of the contacts in images of the conductivity change: a marker for each contact, with the number of its
+    touch.
 
     Contacts are found by `jeit.touch.find_contacts`, and tracked by a `jeit.touch.ContactTracker`. The noise of images
     is estimated from the frames of the reference if there are ten or more, otherwise from each image.
 
     **Arguments:**
 
-    - `images`: view of the images, of a sheet.
-    - `still`: frames (N, M) of the untouched sheet, volts.
-    - `sign`: 1 if touched skin conducts better, -1 if worse; by default the sign of the strongest change of each image.
+    - `images`: view that computes the images of a sheet.
+    - `still`: frames (frames, channels) of the untouched sheet, volts.
+    - `sign`: 1 if touches increase the conductivity, -1 if they decrease it; by default the sign of the strongest
+      change of each image.
 
-    Raises `ValueError` for a solid, and for another sign.
+    Raises `ValueError` for a solid, and for a sign other than 1 and -1.
 
     **Example:**
 
@@ -85,7 +88,7 @@ class ContactsView(AbstractView):
         self._tracker = ContactTracker()
 
     def picture(self, frame: LiveFrame) -> Picture:
-        """Compute the image of a frame with its contacts; see `AbstractView.picture`."""
+        """Compute the image of a frame with markers for its contacts; see `AbstractView.picture`."""
         frame_image, picture = self.images.image(frame)
         if frame_image.conductivity is None:
             return picture
@@ -106,27 +109,28 @@ class ContactsView(AbstractView):
         return replace(picture, markers=markers)
 
     def contacts(self, change: Float[np.ndarray, " m"]) -> list[Contact]:
-        """Find the contacts in a change (m,) of conductivity in S, the strongest first."""
+        """Find the contacts in a conductivity change (cells,) in S, the strongest contact first."""
         strongest = 1 if change.max() >= -change.min() else -1
         finder = self._finders.get(strongest) or next(iter(self._finders.values()))
         return find_contacts(finder, change, self._noise)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
-        """Take the mean of frames (N, M) as the new reference, and estimate the noise of images from them if there are
-        ten or more."""
+        """Take the mean of `frames` (frames, channels) as the new reference, and estimate the noise of images from the
+        frames if there are ten or more."""
         self.images.set_reference(frames)
         self._noise = _estimate_noise(self.images, np.asarray(frames, float))
         self._tracker = ContactTracker()
 
     def _track_contacts(self, second: float, contacts: list[Contact]) -> None:
         tracker = self._tracker.follow(max(second, self._tracker.time + _MIN_TIME_STEP), contacts)
-        # Only the last frame of a touch is needed here. Keeping all frames would use ever more memory.
+        # Only the last observation of a touch is needed here. Keeping all observations would use ever more memory.
         open_touches = tuple(replace(touch, observations=touch.observations[-1:]) for touch in tracker.open)
         self._tracker = replace(tracker, open=open_touches, closed=())
 
 
 def _estimate_noise(images: ConductivityView, still: Float[np.ndarray, "N M"]) -> ImageNoise | None:
-    """Estimate the noise of images from frames (N, M) of the untouched sheet; None if there are too few."""
+    """Estimate the noise of images from frames (frames, channels) of the untouched sheet; None for fewer than ten
+    frames."""
     state = StreamState(images.imager)
     images_or_none = [state.image(number, frame).conductivity for number, frame in enumerate(still)]
     conductivities = np.array([image for image in images_or_none if image is not None])
@@ -142,12 +146,12 @@ class GestureView(AbstractView):
 
     - `description`: description of the skin.
     - `model`: the learnt gestures.
-    - `still`: frames (N, M) of the untouched skin, volts.
-    - `rate`: frames/s; by default that of the training data.
-    - `patience`: time after which a touch becomes part of the reference, seconds.
+    - `still`: frames (frames, channels) of the untouched skin, volts.
+    - `rate`: frames/s; by default the frame rate of the training data.
+    - `patience`: time in seconds after which a lasting touch becomes part of the reference.
     - `progress`: called with the name of each step when it begins.
 
-    Raises `ValueError` as `jeit.touch.TouchImages.prepare` and `jeit.touch.TouchWatch.create` do.
+    Raises `ValueError` if `jeit.touch.TouchImages.prepare` or `jeit.touch.TouchWatch.create` does.
 
     **Example:**
 
@@ -188,7 +192,7 @@ class GestureView(AbstractView):
         )
 
     def picture(self, frame: LiveFrame) -> Picture:
-        """Compute the image of a frame with its touch, and the gesture if one has ended; see
+        """Compute the image of a frame with a marker for the touch, and name the gesture of a touch that has ended; see
         `AbstractView.picture`."""
         self._second = max(frame.second, self._second)
         observation = self._watch_frame((self._second, frame.values))
@@ -214,7 +218,8 @@ class GestureView(AbstractView):
         return Picture(self.grid(change), markers, image.status, image.reason, events)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
-        """Take frames (N, M) of the untouched skin as the new reference. A touch in progress is discarded."""
+        """Take `frames` (frames, channels) of the untouched skin as the new reference. A touch in progress is
+        discarded."""
         reference_frames = np.asarray(frames, float)
         images = replace(
             self.watch.images, imager=self.watch.images.imager.with_reference(mean_frame(reference_frames))
@@ -228,8 +233,8 @@ class GestureView(AbstractView):
         self._gesture_label = Marker(0.0, 0.0), -np.inf
 
     def _classified_sentence(self, touch: NamedTouch | None) -> str:
-        """Return the sentence for a touch that has been classified, and show its name on the image for a while. Returns
-        an empty string if there is none."""
+        """Return a sentence about a touch that has been classified, and show the gesture's name on the image for a
+        while. Returns an empty string if `touch` is None."""
         if touch is None:
             return ""
         self._touch_number = touch.number
@@ -241,5 +246,5 @@ class GestureView(AbstractView):
 
 
 def _held_sentence(touch: NamedTouch) -> str:
-    """Return the sentence for a touch that became part of the reference; an empty string for other touches."""
+    """Return a sentence about a touch that became part of the reference; an empty string for other touches."""
     return f"a touch is held since {touch.touch.onset:.1f} s and counts as the skin at rest" if touch.held else ""

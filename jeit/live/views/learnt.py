@@ -21,25 +21,26 @@ from jeit.touch.networks.linear_channels import depth_centroids
 from jeit.touch.simulate.contact.indent_sets import pixel_places
 
 # Radius that contains 68 % of an isotropic normal distribution of standard deviation 1; number of nodes of a mesh that
-# is only drawn; number of frames for which a label or key must last before it is an event; half the side in metres of a
-# skin of unknown size.
+# is only drawn; number of frames for which a label or key must last to be reported as an event; half the side in metres
+# of a skin of unknown size.
 _RADIUS_68, _NUM_NODES, _MIN_STEADY_FRAMES, _HALF_SIZE = float(np.sqrt(-2 * np.log(1 - 0.68))), 400, 2, 0.05
 
 
 class LearntSkinView(AbstractView):
-    """Place and force of a touch, with their uncertainty, its label and keys, as `jeit.touch.LearntSkin.predict`
-    estimates them.
+    """View of the position and force of a touch with their uncertainty, and of its label and keys, all estimated by
+    `jeit.touch.LearntSkin.predict`.
 
     Positions are shown as markers. Changes of label and keys are events. There is no image.
 
     **Arguments:**
 
     - `skin`: the learnt skin.
-    - `still`: frames (N, M) of the untouched skin, in the unit of the training data; required if these had a reference.
-    - `description`: description of the skin, for its outline and electrodes.
+    - `still`: frames (frames, channels) of the untouched skin, in the unit of the training data; required if the
+      training data had a reference.
+    - `description`: description of the skin, from which the outline and the electrodes are drawn.
 
     Raises `ValueError` for a skin whose frames are standardised by session, which requires all frames of a session, and
-    as `jeit.touch.LearntSkin.predict` does for the reference.
+    for a reference that `jeit.touch.LearntSkin.predict` refuses.
 
     **Example:**
 
@@ -96,24 +97,24 @@ class LearntSkinView(AbstractView):
         )
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
-        """Take the mean of frames (N, M) as the new reference."""
+        """Take the mean of `frames` (frames, channels) as the new reference."""
         reference = mean_frame(frames)
-        self.skin.predict(reference, reference)  # raises ValueError if it is unlike the training data
+        self.skin.predict(reference, reference)  # raises ValueError if the reference is unlike the training data
         self.reference = reference
 
 
 class DepthView(AbstractView):
-    """Depth of indentation in millimetres, estimated by a network: the maps of `jeit.touch.stream_depths`.
+    """View of maps of the indentation depth in millimetres, estimated by a network (`jeit.touch.stream_depths`).
 
     A marker shows the centroid of the map if the maximum depth exceeds the noise.
 
     **Arguments:**
 
-    - `network`: the network of the skin, as from `jeit.touch.read_network`.
-    - `still`: frames (N, M) of the untouched skin, volts.
+    - `network`: the network of the skin, as returned by `jeit.touch.read_network`.
+    - `still`: frames (frames, channels) of the untouched skin, volts.
     - `title`: title of the page.
 
-    Raises `ValueError` for another number of channels.
+    Raises `ValueError` if the number of channels differs from that of the network.
 
     **Example:**
 
@@ -144,7 +145,7 @@ class DepthView(AbstractView):
         )
 
     def picture(self, frame: LiveFrame) -> Picture:
-        """Compute the map of a frame, the row of the largest y first; see `AbstractView.picture`."""
+        """Compute the depth map of a frame, with the row of the largest y first; see `AbstractView.picture`."""
         if isinstance(frame.values, str):
             return Picture(None, status=FrameStatus.REFUSED, reason="The frame is text, not numbers.")
         frame_depth = self._estimate_depth(frame.values)
@@ -158,26 +159,26 @@ class DepthView(AbstractView):
         return Picture(pixels, (Marker(x, y, f"{1e3 * max_depth:.2f} mm"),))
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
-        """Take the mean of frames (N, M) as the new reference."""
+        """Take the mean of `frames` (frames, channels) as the new reference."""
         reference_frames = np.atleast_2d(np.asarray(frames, float))
         mean_reference = resting_frame(reference_frames)
         self.network.changes(mean_reference, mean_reference)  # raises ValueError for another number of channels
         self._estimate_depth: StepwiseGenerator[np.ndarray, FrameDepth] = StepwiseGenerator(
             lambda frame_iterator: stream_depths(self.network, frame_iterator, mean_reference)
         )
-        self._estimate_depth(mean_reference)  # compiles
+        self._estimate_depth(mean_reference)  # compiles the network
 
 
 class _SteadyText:
-    """Text that is reported when it has been the same for some frames."""
+    """Filter for a text, such as a label, that reports the text when it has been the same for some frames."""
 
     def __init__(self, text: str):
         self._reported_text = self._last_text = text
         self._num_equal = 0
 
     def __call__(self, text: str) -> str:
-        """Return the text if it has just become steady and differs from the last reported one; otherwise an empty
-        string."""
+        """Return the text if it has now been the same for enough frames and differs from the last reported text;
+        otherwise an empty string."""
         self._num_equal = self._num_equal + 1 if text == self._last_text else 1
         self._last_text = text
         if self._num_equal < _MIN_STEADY_FRAMES or text == self._reported_text:
@@ -187,7 +188,7 @@ class _SteadyText:
 
 
 def _touch_markers(touches: Touches) -> tuple[Marker, ...]:
-    """Return the marker of a touch with its force and label; an empty tuple without a position."""
+    """Return the marker of a touch with its force and label; an empty tuple if no position is estimated."""
     position, deviation = np.asarray(touches.position)[0, :2], np.asarray(touches.position_std)[0, :2]
     if not np.isfinite(position).all():
         return ()
@@ -221,8 +222,8 @@ def _numbers_from_one(count: int) -> list[str]:
 
 
 def _skin_scene(skin: LearntSkin, description: Description | None) -> Scene:
-    """Create the scene of a learnt skin. Its outline is that of the description, or otherwise the bounding box of the
-    positions of the training data."""
+    """Create the scene of a learnt skin. The outline is taken from the description, or else is the bounding box of the
+    touch positions in the training data."""
     electrodes: Sequence[np.ndarray] = ()
     notes = []
     if description is not None and description.domain is not None and description.electrodes is not None:

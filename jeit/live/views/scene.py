@@ -15,15 +15,15 @@ from jeit.protocol import Protocol
 
 # Number of pixels along the longer side of an image, and number of vertices of a circle.
 _NUM_PIXELS, _NUM_VERTICES = 160, 36
-# Coefficient of a pattern, relative to the largest one, below which an electrode is considered unused.
+# Coefficient of a pattern, relative to its largest coefficient, below which an electrode is considered unused.
 _MIN_COEFFICIENT = 1e-9
 
 
 class PixelGrid:
-    """Raster of a plane mesh, or of a slice through a solid at half its height, for the images of a page.
+    """Pixel grid on a plane mesh, or on a slice through a solid at half its height, for the images of a page.
 
-    `extent`: x of the left and right edge, y of the lower and upper edge, metres. Raises `ValueError` for a surface in
-    space.
+    `extent`: x of the left and right edge, y of the lower and upper edge, metres. Raises `ValueError` for a curved
+    surface in space.
     """
 
     def __init__(self, mesh: Mesh, num_pixels: int = _NUM_PIXELS):
@@ -40,13 +40,13 @@ class PixelGrid:
 
     @property
     def inside(self) -> np.ndarray:
-        """Mask (H, W) of the pixels inside the body."""
+        """Mask (rows, columns) of the pixels inside the body."""
         mask = np.zeros(self._blank_image.size, bool)
         mask[self._inside_indices] = True
         return mask.reshape(self._blank_image.shape)
 
     def __call__(self, image: Float[np.ndarray, " m"]) -> Float[np.ndarray, "H W"]:
-        """Sample an image (m,) on the cells at the pixels (H, W), in single precision; NaN outside the body."""
+        """Sample an image (cells,) at the pixels (rows, columns), in single precision; NaN outside the body."""
         pixels = self._blank_image.copy()
         pixels.ravel()[self._inside_indices] = image[self._cell_indices]
         return pixels
@@ -82,8 +82,8 @@ def scene_of(
 
 
 def channel_names(protocol: Protocol) -> list[str]:
-    """Names of the channels of a protocol, such as "1-2 → 3-4": numbers, from 1, of the electrodes that drive and of
-    those that measure."""
+    """Names of the channels of a protocol, such as "1-2 → 3-4": numbers, from 1, of the driving electrodes and of the
+    measuring electrodes."""
     drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
     return [
         f"{_pattern_name(drive_row)} → {_pattern_name(measurement_row)}"
@@ -92,15 +92,16 @@ def channel_names(protocol: Protocol) -> list[str]:
 
 
 def electrode_curves(mesh: Mesh, electrodes: AbstractElectrodes) -> list[Float[np.ndarray, "n 2"]]:
-    """Curve (n, 2) of each electrode as seen from above, in metres; a single point for a point electrode."""
+    """Curve of n points (n, 2) around each electrode as seen from above, in metres; a single point for a point
+    electrode."""
     pen = _CurvePen()
     electrodes.draw(mesh, pen)
     return pen.curves
 
 
 def _pattern_name(row: np.ndarray) -> str:
-    """Name a pattern by its electrodes, those with positive before those with negative coefficients; for more than two
-    electrodes, by the first one and "…"."""
+    """Name of a pattern: its electrodes with positive coefficients, followed by those with negative coefficients; for
+    more than two electrodes, only the first electrode and "…"."""
     max_coefficient = np.abs(row).max()
     positive, negative = (np.flatnonzero(sign * row > _MIN_COEFFICIENT * max_coefficient) + 1 for sign in (1, -1))
     if len(positive) + len(negative) > 2:
@@ -109,14 +110,14 @@ def _pattern_name(row: np.ndarray) -> str:
 
 
 def closed_outline(mesh: Mesh) -> list[Float[np.ndarray, "n 2"]]:
-    """Closed curves (n, 2) along the boundary of a plane mesh, metres."""
+    """Closed curves of n points (n, 2) each along the boundary of a plane mesh, in metres."""
     facets, points = np.asarray(mesh.facets), np.asarray(mesh.points)
     starts = np.flatnonzero(np.append(True, facets[1:, 0] != facets[:-1, 1]))
     return [points[np.append(loop[:, 0], loop[0, 0])] for loop in np.split(facets, starts[1:])]
 
 
 def _slice_outline(grid: PixelGrid) -> list[np.ndarray]:
-    """Outline of a slice through a solid, from the mask of its pixels."""
+    """Outline of a slice through a solid, from the mask of the pixels inside the solid."""
     from contourpy import contour_generator
 
     inside = np.pad(grid.inside.astype(float), 1)
@@ -128,7 +129,7 @@ def _slice_outline(grid: PixelGrid) -> list[np.ndarray]:
 
 
 class _CurvePen:
-    """Collector of electrodes as curves; see `jeit.electrodes.electrodes.ElectrodePen`."""
+    """Pen that collects the electrodes it draws as curves; see `jeit.electrodes.electrodes.ElectrodePen`."""
 
     def __init__(self):
         self.curves: list[np.ndarray] = []

@@ -1,4 +1,5 @@
-"""View of an array of microphones: the loss map of a frame of intensities, and the position of the touch."""
+"""View of an array of microphones: the map of the localisation loss of a frame of intensities, and the position of the
+touch."""
 
 from __future__ import annotations
 
@@ -20,20 +21,22 @@ _LIKELIHOOD = "likelihood"
 
 
 class SoundView(AbstractView):
-    """Loss map and position of a touch, from frames with the intensity of each microphone.
+    """View of the loss map and the position of a touch, from frames with the intensity of each microphone.
 
-    Positions are those of `jeit.acoustic.locate` without changes of gains, since these are estimated from all touches
-    of a recording. With the method "likelihood", pixels are distances from the most likely position in standard
-    deviations, √(2 (loss − minimum loss)); with "consistency", they are the loss of Park et al. (2022).
+    Positions are estimated by `jeit.acoustic.locate` with fixed gains, because changes of gains are estimated from all
+    touches of a recording. With the method "likelihood", pixels are distances from the most likely position in standard
+    deviations, √(2 (loss − minimum loss)), where the loss is the negative log-likelihood; with "consistency", pixels
+    are the loss of Park et al. (2022).
 
     **Arguments:**
 
     - `calibration`: calibration of the array.
     - `method`: "likelihood" or "consistency".
-    - `floor`: noise power (M,) that was subtracted from the intensities.
+    - `floor`: noise power (microphones,) that was subtracted from the intensities.
     - `freedom`: degrees of freedom of the noise power, as in `jeit.acoustic.Intensities`.
 
-    Raises `ValueError` for another method, another number of microphones, or fewer than three that can be used.
+    Raises `ValueError` for another method, for a `floor` with another number of microphones, and for fewer than three
+    usable microphones.
 
     **Example:**
 
@@ -101,9 +104,11 @@ class SoundView(AbstractView):
         return Picture(loss.astype(np.float32), self._touch_markers(locations), reason=reason)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
-        """Take the mean of frames (N, M) without a touch as silence, which is subtracted from later frames.
+        """Take the mean of `frames` (frames, microphones) without a touch as the intensity of silence, which is
+        subtracted from later frames.
 
-        Raises `ValueError` for another number of microphones, and if a calibrated microphone has no reading.
+        Raises `ValueError` if the number of microphones differs from that of the calibration, and if a calibrated
+        microphone has no reading.
         """
         mean = mean_frame(frames)
         if mean.shape != self._silent_power.shape or not np.isfinite(mean[self.calibration.usable]).all():
