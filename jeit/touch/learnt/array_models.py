@@ -324,8 +324,10 @@ class SupportVectorMachine:
 
     def _boundary_distances(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n P"], Float[np.ndarray, "P C"]]:
         """Compute the signed distances (frames, pairs) of features from the decision boundaries of all pairs of
-        classes. Also returns the sign of the distance on each class's side of a boundary (pairs, classes), 0 for
-        classes that are not of the pair.
+        classes.
+
+        Also returns the sign of the distance on each class's side of a boundary (pairs, classes), 0 for classes that
+        are not of the pair.
         """
         num_classes = len(self.classes_)
         first, second = np.triu_indices(num_classes, 1)

@@ -116,9 +116,10 @@ class ImageFeatures:
         return apply_in_parts(features, changes, _CHUNK_SIZE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
-        """Return the unit by which each feature is divided. For the contact and the logarithm, the unit is a fraction
-        of the feature's standard deviation; for all cells of the image, the unit is the root mean square of their
-        standard deviations.
+        """Return the unit by which each feature is divided.
+
+        For the contact and the logarithm, the unit is a fraction of the feature's standard deviation; for all cells of
+        the image, the unit is the root mean square of their standard deviations.
         """
         num_other_features = values.shape[1] - len(self.imaged.sizes)
         deviations = values.std(axis=0)
