@@ -26,8 +26,7 @@ def changes_from_reference(frames: Float[np.ndarray, "n M"], reference: np.ndarr
 
 
 def standardise_sessions(changes: np.ndarray, group) -> np.ndarray:
-    """Standardise voltage changes: subtract each channel's median over the session, and divide by its standard
-    deviation.
+    """Standardise changes: subtract each channel's median over a session, and divide by the standard deviation.
 
     `group` (frames,): the session of each frame; None if all frames are of one session. Raises `ValueError` for
     sessions of fewer than 20 frames, and for a `group` that is not of shape (frames,).
