@@ -21,7 +21,7 @@ from jeit.files import need, npz_arrays, written_whole
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
 # Number of neurons from which the place of a frame is estimated, and regularisation of the neurons' shares, relative to
-# the mean square difference between the frame and their frames: first for the neurons nearest to the frame, then for
+# the mean square deviation of the neurons' frames from their mean: first for the neurons nearest to the frame, then for
 # the 5 by 5 neurons on the grid around the nearest neuron.
 _NUM_NEAREST, _REGULARISATION = 9, 0.05
 _NUM_ON_GRID, _REGULARISATION_ON_GRID = 25, 0.005
