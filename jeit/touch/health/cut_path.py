@@ -4,7 +4,7 @@ Across a cut, a sheet conducts as if it were longer by some added length, which 
 through; along the cut, the sheet conducts as before. The loss of conductivity is spread over a band about as wide as
 two edges of the mesh; the mesh is refined where images show a loss. The unknowns are the ends of the path, its bend,
 and the added length; the voltages are computed exactly in every step of the fit. A round spot, as a press makes, is
-fitted too: the better fit determines what caused the change.
+fitted too: the better fit determines whether a cut or a press caused the change.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _DERIVATIVE_STEP = 1e-5
 
 @dataclass(frozen=True)
 class FittedLoss:
-    """Fitted loss of conductivity along a path or in a round spot.
+    """Fitted loss of conductivity along the path of a cut or in a round spot.
 
     **Fields**: `path` (points, 2): points of the path of a cut, metres, or the centre of a spot; `misfit`: fraction of
     the weighted sum of squares of the voltage change that the loss does not explain; `conductivity` (cells,):

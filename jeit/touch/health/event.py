@@ -41,7 +41,7 @@ class EventKind(StrEnum):
 
 
 class EventStatus(StrEnum):
-    """How certain an event is. Each member equals its string value."""
+    """How certain an event in the state of a skin is. Each member equals its string value."""
 
     HELD = "held, or a void"
     """The change looks like a touch that is held: only time or the user can distinguish the two."""
@@ -57,12 +57,12 @@ class HealthEvent(Module):
     """An event in the state of a monitored skin, such as a cut or a failing electrode.
 
     **Fields**: `number`: position among events in order of detection; `kind`; `status`; `time`: time at which the event
-    began; `noticed`: time at which it was detected, both in seconds (in frames if frames have no times); `frame`:
-    number of the frame at which the event began; `channels`: whether each channel changed; `change`: change of each
-    channel, volts; `strength`: size of the change divided by the limit learnt from healthy frames; `electrode`: number
-    of the failing electrode, from 0, or None; `path` (points, 2): path of a cut, metres, or None; `deviation`: standard
-    deviation of the path's `length`, metres, estimated from the voltages; `through`: whether the whole depth of the
-    skin is cut, or None; `reason`: a sentence that explains the event.
+    began; `noticed`: time at which the event was detected, both in seconds (in frames if frames have no times);
+    `frame`: number of the frame at which the event began; `channels`: whether each channel changed; `change`: change of
+    each channel, volts; `strength`: size of the change divided by the limit learnt from healthy frames; `electrode`:
+    number of the failing electrode, from 0, or None; `path` (points, 2): path of a cut, metres, or None; `deviation`:
+    standard deviation of the path's `length`, metres, estimated from the voltages; `through`: whether the whole depth
+    of the skin is cut, or None; `reason`: a sentence that explains the event.
 
     **Example:**
 

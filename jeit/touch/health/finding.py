@@ -71,8 +71,8 @@ def kind_of_fault(
     noise: Float[np.ndarray, " M"],
     electrode_channels: Bool[np.ndarray, " M"],
 ) -> EventKind:
-    """Classify the fault of a failing electrode from the latest `frames`; `electrode_channels`: the channels that use
-    it."""
+    """Classify the fault of a failing electrode from the latest `frames`; `electrode_channels`: whether each channel
+    uses this electrode."""
     electrode_frames = frames[:, electrode_channels]
     medians = np.nanmedian(electrode_frames, axis=0)
     rms_reading = np.sqrt(np.mean(reference[electrode_channels] ** 2))

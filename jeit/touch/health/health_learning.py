@@ -27,12 +27,12 @@ def learn_health(
     patience: float | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> SkinHealth:
-    """Learn the healthy state of a skin to be monitored, from a recording of frames while it is healthy.
+    """Learn the healthy state of a skin to be monitored, from a recording of frames of the healthy skin.
 
     **Arguments:**
 
-    - `healthy`: the recording. Frames have the recording's times, or come at `rate`; otherwise, times are frame
-      numbers.
+    - `healthy`: the recording of the healthy skin. Frames have the recording's times, or come at `rate`; otherwise,
+      times are frame numbers.
     - `description`: description of the skin. If the description has a protocol, failing electrodes are identified. If
       the description also has geometry and electrodes, a model is calibrated on the untouched frames to locate cuts.
     - `sign`: as in `SkinHealth.fit`, -1 for skins that conduct worse where touched.
@@ -79,7 +79,7 @@ def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndar
     **Arguments:**
 
     - `health`: state of the monitored skin, as from `learn_health`.
-    - `healthy`: the recording from which it was learnt.
+    - `healthy`: the recording from which the healthy state was learnt.
     - `frames`: the monitored frames (frames, channels), volts.
 
     Raises `ValueError` if no frame has a reading in half of the healthy channels.

@@ -4,7 +4,7 @@ Frames are averaged to steps in time. Single channels that are noisy, jump, or a
 from step to step. Two measures of variation are computed for every channel in a window of steps: the mean of the
 smaller half of the magnitudes of these changes, which touches hardly affect, and the mean of all magnitudes, which
 responds to jumps. Both measures, in two consecutive windows, are compared with those of healthy windows and of the
-other channels. If many channels exceed their limits at once, the cause is a touch, not the channels.
+other channels. If many channels exceed the limits of their measures at once, the cause is a touch, not faulty channels.
 """
 
 from __future__ import annotations
@@ -214,8 +214,8 @@ class HealthyState:
         """Learn the healthy state from frames (frames, channels), with or without touches, `period` seconds apart.
 
         `longest`: length of a window, seconds, which must exceed the length of every touch; by default estimated from
-        the touches in the frames. Raises `ValueError` for fewer than 20 frames, and if all channels lack readings or
-        are constant.
+        the touches in the frames. Raises `ValueError` for fewer than 20 frames, and if every channel lacks readings or
+        is constant.
         """
         if len(frames) < _MIN_NUM_FRAMES:
             raise ValueError(

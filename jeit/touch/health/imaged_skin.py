@@ -107,8 +107,8 @@ class ImagedSkin:
     def fit_cut(
         self, change: Float[np.ndarray, " M"], usable: Bool[np.ndarray, " M"], noise: Float[np.ndarray, " M"]
     ) -> FittedLoss | None:
-        """Fit a cut to a voltage change, volts; returns None if no cut explains the change, or a press explains it as
-        well.
+        """Fit a cut to a voltage change, volts; returns None if no cut explains the change, or a press explains the
+        change as well.
 
         `usable`: channels that are used; `noise`: noise of each channel's change, volts.
         """

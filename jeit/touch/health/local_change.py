@@ -76,8 +76,8 @@ def finer_mesh(mesh: Mesh, centre: np.ndarray, radius: float, area: float) -> tu
 
 
 def _halve(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, is_large: Bool[np.ndarray, " m"]):
-    """Halve the cells that `is_large` marks, and others as needed to avoid hanging nodes. Returns the points, the
-    cells, and the index of each cell's original cell."""
+    """Halve the cells that `is_large` marks, and further cells as needed to avoid hanging nodes. Returns the points,
+    the cells, and the index of each cell's original cell."""
     node_pairs = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
     edges, edge_numbers = np.unique(node_pairs.reshape(-1, 2), axis=0, return_inverse=True)
     edge_numbers = edge_numbers.reshape(-1, 3)

@@ -213,7 +213,7 @@ class SkinHealth:
         return replace(state, reference=reference, trusted=state._trusted_channels(), skin=state._current_skin())
 
     def repaired(self, frames: ArrayLike) -> "SkinHealth":
-        """Return the state after the user has repaired the skin; all open events become mended.
+        """Return the state after the user has repaired the skin; the status of all open events becomes "mended".
 
         The median of the `frames` of the repaired, untouched skin, volts, is the new reference. Before the first frame
         of a later day, untouched frames of that day replace the reference likewise: changes since, such as of gains,
@@ -368,7 +368,8 @@ class SkinHealth:
         return replace(state, reference=healthy.reference)._add_events(change, findings, EventStatus.LASTING)
 
     def _update_pending(self, medians: np.ndarray) -> "SkinHealth":
-        """Return the state after checking whether the pending change has disappeared or has lasted."""
+        """Return the state after checking whether the pending change has disappeared or has lasted longer than a
+        touch."""
         pending = self._pending
         if pending is None:
             return self

@@ -41,14 +41,14 @@ class PlacedMap:
     **Fields**
 
     - `learnt`: the map.
-    - `places` (R, C, d): mean place of the presses whose frames are nearest to each neuron, metres; NaN without such
-      presses.
-    - `widening`: factor of the estimated spread that makes it the root mean square error of the places of held-out
-      presses.
+    - `places` (rows, columns, coordinates): mean place of the presses whose frames are nearest to each neuron, metres;
+      NaN without such presses.
+    - `widening`: root mean square error of the places of held-out presses, divided by that of the estimated spread.
     - `missed`: root mean square residual of a channel if the frames of presses are approximated by combinations of
       their nearest neurons, in the unit of frames.
-    - `fitted` (R, C, d): neurons' places by least squares over the presses, metres, used if a frame is located by
-      neighbours on the grid; None if a frame is located by the neurons with the nearest frames and their `places`.
+    - `fitted` (rows, columns, coordinates): neurons' places by least squares over the presses, metres, used if a frame
+      is located by neighbours on the grid; None if a frame is located by the neurons with the nearest frames and their
+      `places`.
 
     **Example:**
 
@@ -168,8 +168,8 @@ class PlacedMap:
     def _locating_neurons(self, frames: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the neurons from which frames are located, and their shares in the frames.
 
-        Returns the indices of the neurons among those with places and their shares, both (frames, neurons), and the
-        residuals of the frames (frames, channels).
+        Returns the indices of these neurons among the neurons with places, and their shares, both (frames, neurons),
+        and the residuals of the frames (frames, channels).
         """
         placed_neurons = self._placed_neurons
         if self.fitted is None:

@@ -1,4 +1,4 @@
-"""Quality of a self-organising map: quantisation and topographic errors, and how fast its weights converge."""
+"""Quality of a self-organising map: quantisation and topographic errors, and how fast the map's weights converge."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ def learning_curves(
     """Compute how the mean weight of self-organising maps changes in training, for several constant learning rates.
 
     Returns the mean of all weights after each training step (rates, steps), in the unit of frames. `frames`: (frames,
-    channels). Initial weights are small. The neighbourhood radius is constant, half the map's longer side. Raises
-    `ValueError` as `SelfOrganisingMap.fit` does.
+    channels). The initial weights of the maps are small. The neighbourhood radius is constant, half the map's longer
+    side. Raises `ValueError` as `SelfOrganisingMap.fit` does.
     """
     radius = max(shape) / 2
     schedules = [MapSchedule(steps, 0, (float(rate), float(rate)), (radius, radius)) for rate in rates]

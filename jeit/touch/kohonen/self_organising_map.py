@@ -83,7 +83,7 @@ class SelfOrganisingMap:
         """Compute the Euclidean distances (frames, rows, columns) of frames (frames, channels) from every neuron's
         frame.
 
-        Distances are in the unit of frames. Raises `ValueError` for frames with another number of channels than the
+        Distances are in the unit of the frames. Raises `ValueError` for frames with another number of channels than the
         map, and for NaN.
         """
         return np.sqrt(self._squared_distances(self.checked(frames))).reshape(-1, *self.shape)
@@ -153,8 +153,8 @@ def fit_maps(
 ) -> list[SelfOrganisingMap]:
     """Train several maps on the same frames at once, one for each pair of a key and a schedule.
 
-    The maps of the first key come first. All schedules must show the same number of frames. The other arguments, and
-    the errors raised, are as in `SelfOrganisingMap.fit`.
+    The maps of the first key come first in the list. All schedules must show the same number of frames. The other
+    arguments, and the errors raised, are as in `SelfOrganisingMap.fit`.
     """
     frames = checked_frames(frames)
     weights, _ = learn_weights(frames, keys, shape, schedules)

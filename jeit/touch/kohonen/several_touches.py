@@ -58,8 +58,8 @@ def touches_reported(
     """Detect the touches in a frame by a self-organising map: at most six, the strongest first.
 
     Neurons with a share in the frame (`neuron_shares`) are grouped into possible touches. Touches are added one after
-    another, as long as each reduces the residual sum of squares by the square of five standard deviations of the map's
-    own residual.
+    another, as long as each touch reduces the residual sum of squares by the square of five standard deviations of the
+    map's own residual.
 
     **Arguments:**
 

@@ -57,7 +57,7 @@ class MapSchedule(Module):
     radius: tuple[float, float] | None = None
 
     def __check_init__(self):
-        """Raises `ValueError` for invalid numbers of frames, rates and radii."""
+        """Raises `ValueError` for invalid numbers of frames, learning rates and radii."""
         for name in ("ordering", "tuning"):
             value = getattr(self, name)
             if not (is_number(value) and int(value) == value and value >= 0):

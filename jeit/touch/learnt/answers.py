@@ -108,8 +108,7 @@ def _assign_by_class(rank: np.ndarray, kinds: np.ndarray, num_folds: int) -> Int
 
 
 def _training_sets_cover(fold: np.ndarray, positions: np.ndarray | None, kinds: np.ndarray | None) -> bool:
-    """Whether the training set of each fold contains the places or classes of the presses that are held out in the
-    fold."""
+    """Whether the training set of each fold contains the classes of its held-out presses, or places near theirs."""
     if kinds is not None and kinds.ndim == 2:
         return all(_training_sets_cover(fold, None, column) for column in kinds.T)
     if kinds is not None:
@@ -155,7 +154,7 @@ class Standing:
     - `tried`: names of all methods that were tried, and their errors on held-out presses.
     - `held_out`: predictions of the chosen method for held-out presses.
     - `right`: the true values of the quantity for these presses.
-    - `std`: standard deviations of the predictions.
+    - `std`: estimated standard deviations of these predictions, or None.
 
     **Example:**
 

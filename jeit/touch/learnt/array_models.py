@@ -66,7 +66,7 @@ class Forest:
         return apply_in_parts(evaluate, features, _CHUNK_SIZE) + self.start
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
-        """Compute the score of each class (frames, classes): the sum of the trees' values. Only for classifiers."""
+        """Compute the score of each class (frames, classes) for a classifier: the sum of the trees' values."""
         return self.predict(features)
 
     @classmethod
@@ -103,7 +103,7 @@ class Forest:
 
     @classmethod
     def from_averaged_trees(cls, models: list[Any]) -> "Forest":
-        """Convert scikit-learn's regression trees to a forest that predicts their mean."""
+        """Convert scikit-learn's regression trees to a forest that predicts the mean of the trees' predictions."""
         trees = []
         for model in models:
             tree = model.tree_
@@ -117,7 +117,8 @@ class Forest:
     def from_classification_trees(
         cls, models: list[Any], weights: np.ndarray, classes: np.ndarray, *, votes: bool
     ) -> "Forest":
-        """Convert scikit-learn's classification trees to a forest that predicts the weighted sum of their class shares.
+        """Convert scikit-learn's classification trees to a forest that predicts the weighted sum of the trees' class
+        shares.
 
         If `votes`, each tree instead gives one weighted vote to the most frequent class of the leaf.
         """
@@ -280,7 +281,7 @@ class SupportVectorMachine:
         is_linear = machine.kernel == "linear"
         start = np.concatenate([[0], np.cumsum(machine.n_support_)])
         # In scikit-learn, a positive decision value means the second of two classes; with more than two classes, it
-        # means the first class of a pair.
+        # means the first class of the pair.
         sign = -1.0 if len(machine.classes_) == 2 else 1.0
         return cls(
             machine.support_vectors_,

@@ -78,7 +78,7 @@ _MAX_RANGE_EXCESS, _MAX_EXCEEDING_FRACTION = 2.0, 0.1
 _ROUNDING_ERROR = 1e-13
 # Candidate values added to the diagonal of the covariance of channels, which are scaled to variance 1.
 _DIAGONALS = np.logspace(-6, 0, 13)
-# Fraction of dead channels in a frame at which the search for more of them stops.
+# Fraction of dead channels in a frame at which the search for further dead channels stops.
 _MAX_DEAD_FRACTION = 0.34
 # Number of consecutive frames with a unique set of dead channels after which frames are processed one by one.
 _MAX_UNIQUE_FRAMES = 8
@@ -179,7 +179,7 @@ class Channels:
         )
 
     def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Replace changes of dead or missing channels by their prediction from the other channels.
+        """Replace the voltage changes of dead or missing channels by their prediction from the other channels.
 
         Returns the changes (frames, channels) of the used channels; whether each channel is alive in each frame
         (frames, channels); the novelty of each frame, 1 for a frame that is as far from the training set as the
@@ -329,7 +329,7 @@ def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"
     num_frames, num_channels = scaled.shape
     if num_channels <= num_frames:
         squares, directions = np.linalg.eigh(scaled.T @ scaled)
-    else:  # the matrix between frames is smaller than the one between channels
+    else:  # the Gram matrix of frames is smaller than that of channels
         squares, combinations = np.linalg.eigh(scaled @ scaled.T)
         directions = scaled.T @ combinations / np.sqrt(np.maximum(squares, 1e-300))
     significant_indices = np.flatnonzero(squares > _ROUNDING_ERROR * squares[-1])[::-1]
@@ -340,7 +340,7 @@ def _fit_patterns(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray,
     """Compute the patterns of channels (channels, patterns), and the standard deviations of each pattern's score and of
     each channel's noise.
 
-    The noise is the part of each channel that the patterns do not explain.
+    The noise is the part of each channel's readings that the patterns do not explain.
     """
     explained_fractions = np.cumsum(variance) / np.sum(variance)
     num_patterns = min(

@@ -1,4 +1,4 @@
-"""Limit the threads and the memory that learning uses."""
+"""Limit the number of threads and the memory that machine learning uses."""
 
 from __future__ import annotations
 

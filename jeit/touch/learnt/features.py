@@ -166,8 +166,9 @@ class Features:
 def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, ...]:
     """Compute features of a `form` from voltage changes (presses, channels), and their mean and standard deviation.
 
-    Returns the unit of each channel, which is its median absolute change; the features (presses, features); the mean of
-    each feature; and the standard deviation of each feature, infinite for a constant feature.
+    Returns the unit of each channel, which is its median absolute change, or the mean if the median is 0; the features
+    (presses, features); the mean of each feature; and the standard deviation of each feature, infinite for a constant
+    feature.
     """
     size = np.abs(changes)
     unit = np.median(size, axis=0)

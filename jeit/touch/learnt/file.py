@@ -106,7 +106,7 @@ _STORED_NAMES = {stored: name for name, stored in _STORED_CLASSES.items()}
 
 
 def write_skin(skin: LearntSkin, path: str | Path) -> None:
-    """Write a learnt skin to one file, without `standing`, its accuracy on held-out presses.
+    """Write a learnt skin to one file, without its field `standing` (accuracy on held-out presses).
 
     **Arguments:**
 
@@ -167,7 +167,7 @@ def write_plain(path: str | Path, kind: str, version: int, fields_by_name: dict[
 
 
 def read_plain(path: Path, kind: str, version: int, description: str, make: Callable[[dict[str, Any]], Any]) -> Any:
-    """Read a file that `write_plain` wrote, and return `make(fields)`, where `fields` are those written, by name.
+    """Read a file that `write_plain` wrote, and return `make(fields)`, where `fields` are the written fields, by name.
 
     Nothing in the file is executed. `description`: the expected content of the file, as error messages name it. Raises
     `ValueError` if the file is of another `kind` or contains anything but arrays, estimators and objects of jeit's
@@ -208,7 +208,7 @@ def _to_plain(value):
 
 
 def _from_plain(value):
-    """Convert the dictionaries that `_to_plain` made back to objects of jeit's classes."""
+    """Convert dictionaries of fields, as of `_to_plain`, back to objects of jeit's classes, recursively."""
     if isinstance(value, dict):
         restored_values = {_OLD_FIELDS.get(key, key): _from_plain(item) for key, item in value.items() if key != "jeit"}
         return _STORED_CLASSES[value["jeit"]](**restored_values) if "jeit" in value else restored_values

@@ -88,7 +88,7 @@ class ContactFeatures:
     imaged: ImageReconstruction
 
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n p"]:
-        """Compute the features (n, p) of changes (n, m)."""
+        """Compute the features (frames, features) of voltage changes (frames, channels)."""
         return apply_in_parts(lambda rows: self.imaged.contacts(rows @ self.imaged.matrix), changes, _CHUNK_SIZE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
@@ -106,7 +106,7 @@ class ImageFeatures:
     imaged: ImageReconstruction
 
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n p"]:
-        """Compute the features (n, p) of changes (n, m)."""
+        """Compute the features (frames, features) of voltage changes (frames, channels)."""
 
         def features(rows: np.ndarray) -> np.ndarray:
             image = rows @ self.imaged.matrix

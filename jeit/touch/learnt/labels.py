@@ -38,8 +38,8 @@ class LabelMethodResult:
 class LearntLabels:
     """A classifier that predicts the label of a touch from features of voltage changes.
 
-    `classes`: the labels; `sharpness`: factor by which log-odds are multiplied before they are converted to
-    probabilities; `notes`: remarks on the fit as text.
+    `classes`: the labels; `sharpness`: factor by which log-odds are multiplied for conversion to probabilities;
+    `notes`: remarks on the fit as text.
     """
 
     features: Features
@@ -125,8 +125,8 @@ def _hold_out(method, form, forms: Forms, changes, reference, true_classes, fold
 
 _INVERSE_PENALTIES = (1e-3, 1e-2, 1e-1, 1.0)
 _KEY_FORMS = ("differences", "compressed")
-# Number of channels that the discriminant and the trees use for a key, those that best separate presses of the key from
-# others; number of trees.
+# Number of channels that the discriminant and the trees use for a key, selected for the best separation of the key's
+# presses from other presses; number of trees.
 _NUM_SELECTED_CHANNELS, _NUM_TREES = 200, 150
 _TREE_OPTIONS: dict[str, Any] = {"max_features": 0.3, "min_samples_leaf": 2, "random_state": 0}
 
@@ -155,10 +155,9 @@ class StandardisedFeatures:
 
 @dataclass(frozen=True)
 class LearntKeys:
-    """Classifiers that predict for each key whether it is pressed.
+    """Classifiers that predict which keys of a keyboard are pressed.
 
-    `members`: for each key its features, its classifier, and the factor (sharpness) that converts log-odds to
-    calibrated ones.
+    `members`: features, classifier, and calibration factor of the log-odds (sharpness) for each key.
     """
 
     members: list[tuple[StandardisedFeatures, Any, float]]

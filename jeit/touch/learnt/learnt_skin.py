@@ -59,11 +59,11 @@ class LearntSkin:
     - `mean_reference` (channels,): mean reference frame of the training set.
     - `place`, `force`, `label`, `keys`: model that predicts each quantity of a touch.
     - `quiet`: root mean square of the changes, in standard deviations of the channels, below which a skin is untouched.
-    - `lag`: number of rows by which frames lagged behind their presses.
+    - `lag`: number of rows by which frames of the training set lagged behind their presses.
     - `per_session`: whether voltage changes are standardised separately for each session.
     - `name`: name of the training presses.
     - `notes`: corrections that were made to the training presses, as text.
-    - `standing`: accuracy of each model on held-out presses.
+    - `standing`: accuracy on held-out presses, by quantity.
 
     **Example:**
 
@@ -199,7 +199,7 @@ class LearntSkin:
         """Predict the learnt fields of `Touches`, by name, from the voltage changes of frames."""
         completed_changes, alive, novelty, excess = self.channels.complete(changes)
         is_touched = np.sqrt(np.mean((completed_changes / self.channels.scale) ** 2, axis=1)) > self.quiet
-        # A frame with small changes is of the untouched skin; one with too many missing channels is always unlike.
+        # Frames with small changes are of the untouched skin; frames with too many missing channels are always unlike.
         is_unlike = (novelty > _MAX_NOVELTY) & is_touched | (alive.mean(axis=1) < _MIN_ALIVE)
         predictions = {"novelty": novelty, "unlike": is_unlike, "alive": np.zeros(changes.shape, bool)}
         predictions["alive"][:, self.channels.used] = alive
@@ -282,7 +282,7 @@ class LearntSkin:
             )
         reference = check_reference(values, frames)
         is_read = np.isfinite(reference).any(axis=0) & self.channels.used
-        a, b = mean_reference(reference)[is_read], self.mean_reference[is_read]  # those of frames, of the training set
+        a, b = mean_reference(reference)[is_read], self.mean_reference[is_read]  # of frames, of training frames
         if not is_read.any():
             raise ValueError(
                 "reference has no finite reading in any channel that is used; give a frame of the untouched skin."

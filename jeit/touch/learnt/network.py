@@ -63,10 +63,11 @@ class Network:
 
 @functools.cache
 def _compiled_training(num_steps: int) -> Callable[..., Any]:
-    """Return a function that trains a network in `num_steps` steps, compiled once for each shape.
+    """Return a function that trains a network in `num_steps` steps of Adam, compiled once for each shape of its
+    arguments.
 
-    The arguments of the function are features, targets, the rows of each batch, and two random keys; it returns the
-    layers.
+    The arguments of the function are features, targets, the rows of each batch, and two random keys; the function
+    returns the layers.
     """
     import equinox as eqx
     import jax

@@ -166,7 +166,7 @@ def read_presses(path: str | Path) -> Presses:
 
     - `path`: path of the file.
 
-    Raises `FileNotFoundError` if the file does not exist, and `ValueError` if it is no NPZ file with valid presses.
+    Raises `FileNotFoundError` if `path` does not exist, and `ValueError` if the file is no NPZ file of valid presses.
 
     **Example:**
 
@@ -186,7 +186,7 @@ def read_frames(path: str | Path) -> dict[str, np.ndarray]:
 
     - `path`: path of the file.
 
-    Raises `FileNotFoundError` if the file does not exist, and `ValueError` if it is no NPZ file with `frames`.
+    Raises `FileNotFoundError` if `path` does not exist, and `ValueError` if the file is no NPZ file with `frames`.
 
     **Example:**
 
@@ -418,8 +418,8 @@ class Touches:
 
     - `position` (frames, 2) or (frames, 3), metres, with standard deviations `position_std`; `force`, newtons, with
       `force_std`; `label`, text, with its `probability`; `touched` (frames, keys), whether each key is pressed, with
-      `key_probability`. In frames unlike the training set, these numbers are NaN, labels "" and keys false. Where
-      nothing touches, positions are NaN, forces 0, labels "none" and keys false.
+      `key_probability`. In frames unlike the training set, these numbers are NaN, labels "" and keys false. In frames
+      of the untouched skin, positions are NaN, forces 0, labels "none" and keys false.
     - `unlike`: whether a frame is unlike the training set; `novelty`: distance of a frame from the training set, 1 for
       the farthest training frame.
     - `alive` (frames, channels): whether the reading was used, because the channel is alive.

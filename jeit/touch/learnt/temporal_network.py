@@ -106,10 +106,11 @@ def _neighbouring_steps(course, engine):
 
 @functools.cache
 def _compiled_training(num_steps: int, whole: int, values: int, num_classes: int) -> Callable[..., Any]:
-    """Return a function that trains networks in `num_steps` steps, compiled once for each shape.
+    """Return a function that trains networks in `num_steps` steps of AdamW, compiled once for each shape of its
+    arguments.
 
     The arguments of the function are features, class indices, the rows of each batch, and a random key for each
-    network; it returns the weights and biases, layer by layer.
+    network; the function returns the weights and biases, layer by layer.
     """
     import jax
     import jax.numpy as jnp

@@ -40,7 +40,7 @@ _MAX_BATCH_SIZE = 64
 # Thresholds for unreliable depth maps: fraction of the squared voltage change that the map does not explain; minimum
 # size of a change that is tested, as a multiple of the noise; depth, divided by the skin's thickness; outward bulge, as
 # a multiple of the noise floor. A large unexplained fraction alone is no evidence, since a network that has learnt
-# little misses many touches: the map must also bulge more than it is indented.
+# little misses many touches: the map must also bulge outwards more than it is indented.
 _MAX_UNEXPLAINED_FRACTION, _MIN_CHANGE_TO_NOISE, _MAX_RELATIVE_DEPTH, _MIN_BULGE_TO_FLOOR = 0.6, 3.0, 1.2, 3.0
 # Maximum fraction of channels without a reading with which a frame is still imaged.
 MAX_MISSING_FRACTION = 0.5
@@ -90,9 +90,9 @@ class ImageNetwork:
         """Estimate maps of indentation depth, metres, from one frame (channels,) or several (frames, channels), volts.
 
         `reference`: frame of the untouched skin, volts. Channels without a reading are NaN; the "unrolled" design
-        replaces them by their expected values given the other channels. The network returns a map for any input:
-        `doubts` states which maps are unreliable. Raises `ValueError` for another number of channels than in training,
-        and as `changes` does.
+        replaces missing channels by their expected values given the other channels. The network returns a map for any
+        input: `doubts` states which maps are unreliable. Raises `ValueError` for another number of channels than in
+        training, and as `changes` does.
         """
         change = self.changes(voltages, reference)
         maps = self.thickness * self.share(change)

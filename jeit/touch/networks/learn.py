@@ -50,7 +50,7 @@ _MAX_TOUCHES_IN_MEMORY = 12_000
 class SimulatedTouches(Protocol):
     """Simulated touches: voltage changes "change" (touches, channels), depth maps "depth" (touches, rows, columns).
 
-    Changes are relative, without noise. Depths are divided by the thickness of the skin.
+    Changes are relative, without noise. Depths are divided by the skin's thickness.
     """
 
     def rows(self, *names: str) -> Rows:
@@ -117,7 +117,7 @@ class StoredRows:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Number of touches of each chunk."""
+        """Number of simulated touches of each chunk."""
         return tuple(map(len, self._touches.spans))
 
     @property
@@ -409,7 +409,7 @@ def learn_images(
     - `design`: "unrolled", a network with the skin's forward model, or "three-stages", that of Park et al. 2022.
     - `touches`: number of simulated training touches, by default that of the preset, limited only by the disk.
     - `seed`: random seed.
-    - `client`: client of a dask cluster for the simulation.
+    - `client`: client of a dask cluster that simulates the touches, or None.
     - `progress`: called with a description of the progress.
 
     Raises `ValueError` for curved skins, unknown names, an invalid number of touches, and a folder with work on another

@@ -173,7 +173,7 @@ class LinearChannels(NamedTuple):
 def round_relative(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Round values to a millionth of their maximum, or finer, to remove effects of the order of summation.
 
-    The same random key then gives the same training wherever NumPy's arrays are in memory.
+    After rounding, the same random key gives the same training wherever NumPy's arrays are in memory.
     """
     unit = 2.0 ** (np.floor(np.log2(max(float(np.abs(values).max()), 1e-300))) - 20)
     return np.round(values / unit) * unit
@@ -186,8 +186,8 @@ def strength(depth):
 
     A patch of lower conductivity has a larger effect than in proportion to the change of conductivity, since current
     flows around the patch. In two dimensions, patches with e^s and e^−s times the conductivity change voltages
-    oppositely, to first order in their size (Keller's duality). The strength 2 sinh(s / 2), with log(1 − δ) = −s, has
-    this property.
+    oppositely, to first order in their size (Keller's duality). The strength 2 sinh(s / 2), with log(1 − δ) = −s,
+    changes its sign with s, as these changes do.
     """
     clipped_depth = jnp.clip(depth, 0.0, _MAX_DEPTH)
     return clipped_depth / jnp.sqrt(1 - clipped_depth) + (depth - clipped_depth)

@@ -30,7 +30,7 @@ class Dense(Module):
         self.bias = jnp.zeros(outputs, jnp.float32)
 
     def __call__(self, values: Float[Array, "b i"]) -> Float[Array, "b o"]:
-        """Apply the layer to a batch."""
+        """Apply the layer to a batch of inputs (rows, inputs)."""
         return values @ self.weight + self.bias
 
 
@@ -48,7 +48,7 @@ class Convolution(Module):
         self.stride = stride
 
     def __call__(self, image: Float[Array, "b r c i"]) -> Float[Array, "b p q o"]:
-        """Apply the layer to a batch."""
+        """Apply the layer to a batch of images (images, rows, columns, channels)."""
         layout = ("NHWC", "HWIO", "NHWC")
         strides = (self.stride, self.stride)
         return jax.lax.conv_general_dilated(image, self.weight, strides, "SAME", dimension_numbers=layout) + self.bias
@@ -161,7 +161,7 @@ class DepthEncoder(Module):
     last: Dense
 
     def __init__(self, shape: tuple[int, int], *, key: Array):
-        """Create an untrained network for maps of this shape; rows and columns are multiples of 8."""
+        """Create an untrained network for depth maps of this shape; rows and columns are multiples of 8."""
         *layer_keys, last_key = jax.random.split(key, len(_NUM_FILTERS) + 1)
         widths = (1, *_NUM_FILTERS)
         self.layers = tuple(
@@ -185,7 +185,7 @@ class DepthDecoder(Module):
     shape: tuple[int, int] = eqx.field(static=True)
 
     def __init__(self, shape: tuple[int, int], *, key: Array):
-        """Create an untrained network for maps of this shape; rows and columns are multiples of 8."""
+        """Create an untrained network for depth maps of this shape; rows and columns are multiples of 8."""
         first_key, *layer_keys = jax.random.split(key, len(_NUM_FILTERS) + 1)
         widths = (*_NUM_FILTERS[::-1], 1)
         self.shape = (shape[0] // 8, shape[1] // 8)
@@ -209,7 +209,7 @@ class DepthAutoencoder(Module):
     decoder: DepthDecoder
 
     def __init__(self, shape: tuple[int, int], *, key: Array):
-        """Create an untrained network for maps of this shape; rows and columns are multiples of 8."""
+        """Create an untrained network for depth maps of this shape; rows and columns are multiples of 8."""
         encoder_key, decoder_key = jax.random.split(key)
         self.encoder, self.decoder = DepthEncoder(shape, key=encoder_key), DepthDecoder(shape, key=decoder_key)
 

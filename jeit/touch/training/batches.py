@@ -22,7 +22,7 @@ class Rows(Protocol):
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Number of rows of each chunk."""
+        """Number of rows of each chunk of the data."""
         ...
 
     @property
@@ -82,7 +82,7 @@ class MappedRows:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Number of rows of each chunk."""
+        """Number of rows of each chunk of the data."""
         return self.rows.sizes
 
     @property
@@ -113,7 +113,7 @@ class BatchOrder:
     In every epoch, the chunks, and the rows within each chunk, are shuffled anew. Rows that remain when no full batch
     can be formed are left out of the epoch; the rows left out differ between epochs. `sizes`: number of rows of each
     chunk; `batch`: number of rows in a batch. The order depends only on `seed`, so that the index of a batch determines
-    its rows.
+    the rows of the batch.
     """
 
     def __init__(self, sizes: tuple[int, ...], batch: int, seed: list[int]):
@@ -123,7 +123,7 @@ class BatchOrder:
 
     @property
     def batches_per_epoch(self) -> int:
-        """Number of batches in an epoch."""
+        """Number of full batches in an epoch of training."""
         return sum(self.num_batches)
 
     def chunk_batches(self, first: int, last: int, max_batches: int) -> Iterator[ChunkBatches]:

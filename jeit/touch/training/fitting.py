@@ -30,8 +30,8 @@ class TrainingObjective(NamedTuple):
 
     **Fields**
 
-    - `loss`: function of a network, a batch of rows and a random key. It returns the loss of the batch, which is
-      minimised, and the network, in which leaves that are not trained, such as running means, may have changed.
+    - `loss`: function of a network, a batch of rows and a random key. The function returns the loss of the batch, which
+      is minimised, and the network, in which leaves that are not trained, such as running means, may have changed.
     - `held_out`: function of a network and a batch of held-out rows, which returns the loss of each row, (rows,).
     - `trained`: selects the leaves (arrays) of the network that are trained: a function of a leaf that returns true or
       false, or a tree of booleans like the network, as in `equinox.filter`.
@@ -122,7 +122,7 @@ def fit_network(
 
     **Arguments:**
 
-    - `network`: the network, any tree of arrays and functions.
+    - `network`: the untrained network, any tree of arrays and functions.
     - `objective`: functions that compute the network's losses.
     - `training`: training data: arrays (rows, …) in any tree, such as (inputs, targets), or `Rows` of many chunks.
     - `validation`: the held-out rows, in the same form as the training data, but in memory.
@@ -191,7 +191,8 @@ def fit_network(
 
 
 class _CompiledTraining:
-    """Compiled functions of one training, and methods that apply them to the state of the training."""
+    """Compiled functions of a network's training, and methods that apply these functions to the state of the
+    training."""
 
     def __init__(self, network, objective: TrainingObjective, plan: TrainingPlan, order: BatchOrder, key: Array):
         import optax

@@ -50,7 +50,7 @@ def read_head(path: str | Path, kind: str, version: int) -> dict[str, Any]:
     """Read the head of a file that `write_model` wrote, but not its arrays.
 
     Raises `FileNotFoundError` if the file does not exist, and `ValueError` if the file is of another kind or version,
-    or jeit did not write it.
+    or was not written by jeit.
     """
     with _open_file(Path(path), kind) as file:
         return _read_header(file, kind, version)
@@ -62,9 +62,9 @@ def read_model(
     """Read the head and the model of a file that `write_model` wrote.
 
     `make`: function that returns, for a head, a model of the same architecture; only the model's shapes are evaluated,
-    so that no head can make it use memory. Nothing in the file is executed: before an array is read, its shape and
-    dtype must be those of the architecture. Raises `FileNotFoundError` if the file does not exist, and `ValueError` if
-    the file is of another kind or version, is cut short or too long, or has arrays of another architecture.
+    so that no head can cause large use of memory. Nothing in the file is executed: before an array is read, its shape
+    and dtype must be those of the architecture. Raises `FileNotFoundError` if the file does not exist, and `ValueError`
+    if the file is of another kind or version, is cut short or too long, or has arrays of another architecture.
     """
     with _open_file(Path(path), kind) as file:
         head = _read_header(file, kind, version)
