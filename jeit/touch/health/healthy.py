@@ -431,7 +431,7 @@ def _touch_directions(frames: np.ndarray, noise: np.ndarray, window: int) -> tup
 
 
 def _principal_directions(frames: np.ndarray) -> np.ndarray:
-    """Principal directions (channels, directions) of frames, as many as explain 98 % of the frames' energy."""
+    """Leading principal directions (channels, directions) of frames, which explain up to 98 % of the frames' energy."""
     _, singular_values, rows = np.linalg.svd(frames, full_matrices=False)
     fractions = np.cumsum(singular_values**2) / max(np.sum(singular_values**2), 1e-300)
     num_directions = min(

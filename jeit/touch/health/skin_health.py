@@ -368,8 +368,7 @@ class SkinHealth:
         return replace(state, reference=healthy.reference)._add_events(change, findings, EventStatus.LASTING)
 
     def _update_pending(self, medians: np.ndarray) -> "SkinHealth":
-        """Return the state after checking whether the pending change has disappeared or has lasted longer than a
-        touch."""
+        """Return the state after checking whether the pending change has disappeared or outlasted a touch."""
         pending = self._pending
         if pending is None:
             return self
