@@ -1,4 +1,4 @@
-"""Monitor a skin for damage: detect cuts, failing electrodes and repair from frames, and with a model locate cuts."""
+"""Monitor a skin for damage: detect cuts, failing electrodes and repairs from frames, and locate cuts with a model."""
 
 from __future__ import annotations
 

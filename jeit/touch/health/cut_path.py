@@ -1,10 +1,10 @@
-"""Locate a cut: fit its path to the change of voltages by least squares on the forward model.
+"""Locate a cut in a skin: fit the cut's path to the change of voltages by least squares on the forward model.
 
-Across a cut, a sheet conducts as if it were longer there by some length, which is very long if it is cut through; along
-the cut, it conducts as before. This loss is spread over a band about as wide as two edges of the mesh, which is refined
-where images show a loss. The unknowns are the ends of the path, its bend, and the added length; the voltages are
-computed exactly in every step. A round spot, as a press makes, is fitted too: the better fit determines what caused the
-change.
+Across a cut, a sheet conducts as if it were longer by some added length, which is very large if the sheet is cut
+through; along the cut, the sheet conducts as before. The loss of conductivity is spread over a band about as wide as
+two edges of the mesh; the mesh is refined where images show a loss. The unknowns are the ends of the path, its bend,
+and the added length; the voltages are computed exactly in every step of the fit. A round spot, as a press makes, is
+fitted too: the better fit determines whether a cut or a press caused the change.
 """
 
 from __future__ import annotations
@@ -18,42 +18,43 @@ from jeit.forward import ForwardModel
 from jeit.mesh import centroids
 from jeit.touch.health.local_change import LocalChange, finer_model
 
-# Starting points of the fit: number of directions; lengths divided by the skin's side; number of starting points that
-# are optimised; maximum number of steps of each optimisation.
+# Starting points of the fit of a cut: number of directions; lengths divided by the skin's side; number of starting
+# points that are optimised; maximum number of steps of each optimisation.
 _NUM_DIRECTIONS, _RELATIVE_LENGTHS, _NUM_OPTIMISED_STARTS, _MAX_STEPS = 8, (0.08, 0.2), 2, 25
-# Added length across a cut, divided by the skin's side: maximum, for a cut that goes through; initial value of the fit
-# of a partial cut; minimum.
+# Added length across a cut, divided by the skin's side: maximum, for a cut through the whole depth; initial value in
+# the fit of a partial cut; minimum.
 _MAX_ADDED_LENGTH, _INITIAL_PARTIAL_LENGTH, _MIN_ADDED_LENGTH = 3.0, 0.02, 1e-4
-# Divided by the skin's side: radius of the refined region; length of the mesh edges in it.
+# Radius of the region of refined mesh, and length of the mesh edges in the region, divided by the skin's side.
 _REFINED_RADIUS, _EDGE_LENGTH = 0.22, 0.0125
-# Half the width of the band, in edges of the refined mesh; factor by which it is narrower beyond a path's ends.
+# Half the width of the band of lost conductivity, in edges of the refined mesh; factor by which the band is narrower
+# beyond the ends of a path.
 _BAND_HALF_WIDTH, _END_NARROWING = 1.5, 2.0
-# Spot: initial and maximum radius, divided by the skin's side; extent, in radii; initial and maximum depth, where depth
-# is minus the logarithm of the fraction of conductivity left at the centre.
+# Spot of changed conductivity: initial and maximum radius, divided by the skin's side; extent, in radii; initial and
+# maximum depth, where depth is minus the logarithm of the fraction of conductivity left at the centre.
 _INITIAL_SPOT_RADIUS, _MAX_SPOT_RADIUS, _SPOT_EXTENT, _SPOT_DEPTHS, _MAX_SPOT_DEPTH = 0.05, 0.1, 3.0, (0.5, -0.5), 6.0
 # Initial offset of a bend from the middle of a straight path, divided by the length of the path.
 _BEND_OFFSET = 0.2
-# Maximum ratio of misfits for accepting a bent path in place of a straight one, and a partial cut in place of one that
-# goes through.
+# Maximum ratio of misfits for accepting a bent path in place of a straight path, and a partial cut in place of a cut
+# through the whole depth.
 _MAX_BEND_RATIO, _MAX_PARTIAL_RATIO = 0.7, 0.4
-# Misfit below which a cut that goes through is certain; ratio of misfits from which the alternative is excluded;
-# maximum uncertainty of an end, in edges.
+# Misfit below which a cut through the whole depth is certain; ratio of misfits above which the other depth of the cut
+# is excluded; maximum standard deviation of an end of the path, in mesh edges.
 _CERTAIN_MISFIT, _DISTINCT_RATIO, _MAX_END_DEVIATION = 0.01, 4.0, 10.0
-# Model error, relative to a change and to the root mean square of all changes; standard deviation of a factor common to
-# all changes.
+# Model error, relative to a channel's change and to the root mean square of all changes; standard deviation of a
+# relative change common to all voltages.
 _MODEL_ERROR, _FACTOR_DEVIATION = 0.05, 0.1
-# Step of numerical derivatives, divided by the skin's side.
+# Step of numerical derivatives with respect to places, divided by the skin's side.
 _DERIVATIVE_STEP = 1e-5
 
 
 @dataclass(frozen=True)
 class FittedLoss:
-    """Fitted loss of conductivity along a path or in a round spot.
+    """Fitted loss of conductivity along the path of a cut or in a round spot.
 
-    **Fields**: `path` (k, 2): points of the path, metres, or the centre (1, 2) of a spot; `misfit`: fraction of the
-    change's energy that the loss does not explain; `conductivity` (m,): conductivity with the loss, S/m (2-D: S);
-    `through`: whether the cut goes through the whole depth, which is assumed unless the data require a partial cut;
-    `deviation`: standard deviation of the path's length, metres.
+    **Fields**: `path` (points, 2): points of the path of a cut, metres, or the centre of a spot; `misfit`: fraction of
+    the weighted sum of squares of the voltage change that the loss does not explain; `conductivity` (cells,):
+    conductivity with the loss, S/m (2-D: S); `through`: whether the cut goes through the whole depth of the skin, which
+    is assumed unless the data require a partial cut; `deviation`: standard deviation of the path's length, metres.
     """
 
     path: Float[np.ndarray, "k 2"]
@@ -70,14 +71,15 @@ class _FittedUnknowns:
 
 
 def _length(fit: _FittedUnknowns) -> float:
-    """Length of a fitted path, metres."""
+    """Length of the fitted path of a cut, metres."""
     return float(np.linalg.norm(np.diff(fit.unknowns[:-2].reshape(-1, 2), axis=0), axis=1).sum())
 
 
 class LossFit:
-    """Least-squares fit of a cut or a spot to a `change` (K,), volts, in the `channels` (K,) of a model.
+    """Least-squares fit of a cut, or of a round spot, to a `change` of voltages, volts, in some `channels` of a model.
 
-    The change is relative to the `conductivity` (m,), S/m (2-D: S); the mesh is refined around a `centre` (2,), metres.
+    The model's `conductivity` (cells,) is that before the change, S/m (2-D: S); the mesh is refined around a `centre`
+    (x, y), metres.
     """
 
     def __init__(
@@ -89,8 +91,8 @@ class LossFit:
         noise: Float[np.ndarray, " K"],
         centre: Float[np.ndarray, " 2"],
     ):
-        """Prepare the fit. `conductivity`: before the change, S/m (2-D: S); `noise` (K,): noise of the change,
-        volts."""
+        """Prepare the fit. `conductivity`: that before the change, S/m (2-D: S); `noise` (channels,): noise of the
+        change, volts."""
         cell_centres = np.asarray(centroids(model.mesh))[:, :2]
         self.lower_corner, self.upper_corner = cell_centres.min(axis=0), cell_centres.max(axis=0)
         self.skin_size = float((self.upper_corner - self.lower_corner).max())
@@ -118,13 +120,15 @@ class LossFit:
         rms_change = np.sqrt(np.mean(change**2))
         self.weights = 1 / np.hypot(noise, _MODEL_ERROR * np.hypot(change, rms_change))
         self.change = change
-        # Direction of a uniform change of the skin's conductivity, which is projected out of changes.
+        # Direction of the voltage change by a uniform change of conductivity, which is projected out of voltage
+        # changes.
         uniform_change = self.weights * self.rest_voltages
         self.drift_direction = uniform_change / np.linalg.norm(uniform_change)
         self.energy = float(np.sum(self._weight_residual(change) ** 2))
 
     def fit_line(self, starts: list[np.ndarray]) -> FittedLoss:
-        """Fit a straight cut near one of the places (x, y) in `starts`, or a bent cut if it fits much better."""
+        """Fit a straight cut near one of the places (x, y) in `starts`, metres, or a bent cut if the bent cut fits much
+        better."""
         angles = np.pi * np.arange(_NUM_DIRECTIONS) / _NUM_DIRECTIONS
         directions = np.column_stack([np.cos(angles), np.sin(angles)])
         starts_by_depth = []
@@ -146,7 +150,7 @@ class LossFit:
         is_through = not partial_cut.misfit < _MAX_PARTIAL_RATIO * complete_cut.misfit
         best_fit, other_fit = (complete_cut, partial_cut) if is_through else (partial_cut, complete_cut)
         path = best_fit.unknowns[:-2].reshape(-1, 2)
-        # A long partial cut and a short cut that goes through may fit about equally well.
+        # A long partial cut and a short cut through the whole depth may fit about equally well.
         is_certain = is_through and best_fit.misfit < _CERTAIN_MISFIT
         are_similar = not is_certain and other_fit.misfit < _DISTINCT_RATIO * best_fit.misfit
         length_difference = abs(_length(best_fit) - _length(other_fit)) if are_similar else 0.0
@@ -154,7 +158,7 @@ class LossFit:
         return FittedLoss(path, best_fit.misfit, self._conductivity_on_mesh(best_fit.unknowns), is_through, deviation)
 
     def fit_spot(self, start: np.ndarray) -> FittedLoss:
-        """Fit a round spot of lost or gained conductivity near a place (x, y)."""
+        """Fit a round spot of lost or gained conductivity near a place (x, y), metres."""
         candidate_starts = [np.array([*start, np.log(_INITIAL_SPOT_RADIUS), depth, 0.0]) for depth in _SPOT_DEPTHS]
         best_fit = min((self._fit(candidate) for candidate in candidate_starts), key=lambda fit: fit.misfit)
         return FittedLoss(best_fit.unknowns[None, :2], best_fit.misfit, self._conductivity_on_mesh(best_fit.unknowns))
@@ -172,8 +176,8 @@ class LossFit:
         return bent_fit if bent_fit.misfit < _MAX_BEND_RATIO * straight_fit.misfit else straight_fit
 
     def _fit(self, start: np.ndarray, *, fixed: bool = False) -> _FittedUnknowns:
-        """Minimise the misfit over the unknowns, beginning at `start`; if `fixed`, the added length across the cut is
-        not fitted."""
+        """Minimise the misfit over the unknowns of a cut or a spot, from `start`; if `fixed`, the added length across
+        the cut is not fitted."""
         from scipy.optimize import least_squares
 
         lower_bounds, upper_bounds, scales = self._bounds(len(start))
@@ -199,7 +203,7 @@ class LossFit:
         return _FittedUnknowns(all_unknowns(optimum.x), 2 * optimum.cost / self.energy)
 
     def _bounds(self, num_unknowns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Lower bounds, upper bounds and scales of the unknowns, each an array (num_unknowns,)."""
+        """Lower bounds, upper bounds and scales of the unknowns of a cut or a spot, each an array (num_unknowns,)."""
         if num_unknowns == 5:  # a spot
             lower_bounds, upper_bounds = (
                 [*self.lower_corner, np.log(self.band_half_width / self.skin_size), -_MAX_SPOT_DEPTH],
@@ -214,8 +218,8 @@ class LossFit:
         return np.array([*lower_bounds, -0.5]), np.array([*upper_bounds, 0.5]), np.array([*scales, _FACTOR_DEVIATION])
 
     def _deviation(self, fitted: _FittedUnknowns) -> float:
-        """Standard deviation of the length of a path, metres, from those of both ends, each combined with half an edge
-        of the mesh."""
+        """Standard deviation of the length of a cut, metres, from the standard deviations of both ends, each combined
+        with half an edge of the mesh."""
         min_energy = fitted.misfit * self.energy
         residual_variance = min_energy / max(len(self.change) - len(fitted.unknowns), 1)
         path = fitted.unknowns[:-2].reshape(-1, 2)
@@ -243,7 +247,7 @@ class LossFit:
         return float(np.sum(self._residual(unknowns) ** 2))
 
     def _channel_voltages(self, impedance: np.ndarray) -> np.ndarray:
-        """Voltages (K,) of the channels, computed from a transfer impedance (L, L)."""
+        """Voltages of the channels, computed from a transfer impedance matrix (electrodes, electrodes)."""
         return np.einsum("kl,kl->k", self.measurement_weights @ impedance, self.drive_currents)
 
     def _predicted_change(self, unknowns: np.ndarray) -> np.ndarray:
@@ -254,7 +258,7 @@ class LossFit:
         return np.append(self._weight_residual(unexplained_change), unknowns[-1] / _FACTOR_DEVIATION)
 
     def _jacobian(self, unknowns: np.ndarray) -> np.ndarray:
-        """Derivatives (K + 1, q) of the weighted residuals with respect to the q unknowns."""
+        """Derivatives (residuals, unknowns) of the weighted residuals of the fit with respect to the unknowns."""
         change = self._conductivity_change(unknowns)
         steps = np.full(len(unknowns) - 1, _DERIVATIVE_STEP)
         steps[: 2 if len(unknowns) == 5 else -1] *= self.skin_size
@@ -276,7 +280,8 @@ class LossFit:
         return np.concatenate([self._weight_residual(columns), last_row[None]])
 
     def _conductivity_change(self, unknowns: np.ndarray) -> np.ndarray:
-        """Change of the region's conductivity: scalars (c,) for a spot, tensors (c, d, d) for a path."""
+        """Change of conductivity in the cells of the region: scalars for a spot, tensors (cells, d, d) in d dimensions
+        for a cut."""
         if len(unknowns) == 5:
             return self.conductivity * np.expm1(self._log_spot(unknowns))
         fractions, normals = self._fraction_across_path(unknowns)
@@ -287,20 +292,21 @@ class LossFit:
         return change
 
     def _log_spot(self, unknowns: np.ndarray) -> np.ndarray:
-        """Logarithm (c,) of the fraction of conductivity that is left in a spot."""
+        """Logarithm of the fraction of conductivity that is left in each cell of the region with a spot."""
         squared_distances = (
             np.sum((self.centres - unknowns[:2]) ** 2, axis=1) / (np.exp(unknowns[2]) * self.skin_size) ** 2
         )
         return -unknowns[3] * np.where(squared_distances < _SPOT_EXTENT**2, np.exp(-squared_distances / 2), 0.0)
 
     def _fraction_across_path(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Fraction of conductivity (m,) left across the nearest part of a path, and the direction (m, 2) across it."""
+        """Fraction of each cell's conductivity that is left across the nearest segment of a path, and the direction
+        across the segment (cells, 2)."""
         path = unknowns[:-2].reshape(-1, 2)
         segment_starts, directions = path[:-1], np.diff(path, axis=0)
         lengths = np.maximum(np.linalg.norm(directions, axis=1), 1e-9)
         directions = directions / lengths[:, None]
         normals = np.column_stack([-directions[:, 1], directions[:, 0]])
-        offsets = self.centres[:, None] - segment_starts  # (m, s, 2)
+        offsets = self.centres[:, None] - segment_starts  # (cells, segments, 2)
         positions_along = np.sum(offsets * directions, axis=-1)
         # The band reaches beyond the ends of its centre line, which is shortened so that the band ends with the path.
         shortening = np.minimum(self.band_half_width / _END_NARROWING, 0.45 * lengths)
@@ -315,13 +321,13 @@ class LossFit:
         squared_distances = (
             squared_distances[np.arange(len(squared_distances)), nearest_segments] / self.band_half_width**2
         )
-        # Profile of the band across the path, with integral 1.
+        # Profile of the loss across the band, with integral 1.
         profile = np.where(squared_distances < 1, (1 - squared_distances) ** 2, 0.0) * 15 / (16 * self.band_half_width)
         return 1 / (1 + np.exp(unknowns[-2]) * self.skin_size * profile), normals[nearest_segments]
 
     def _conductivity_on_mesh(self, unknowns: np.ndarray) -> np.ndarray:
-        """Conductivity on the mesh of the model before refinement, one value for each cell."""
-        # Conductivity is lost across a path, not along it: the geometric mean of both directions is used.
+        """Conductivity with the fitted loss on the mesh of the model before refinement, one value for each cell."""
+        # Conductivity is lost across a path, not along the path: the geometric mean of both directions is used.
         log_fractions = (
             self._log_spot(unknowns) if len(unknowns) == 5 else 0.5 * np.log(self._fraction_across_path(unknowns)[0])
         )

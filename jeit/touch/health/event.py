@@ -1,9 +1,9 @@
-"""Events in the state of a skin, and detection of lasting steps in its frames.
+"""Events in the state of a monitored skin, and detection of lasting steps in the skin's frames.
 
-A lasting step is detected in frames with touches, noise and drift by comparing the medians of two windows. A touch is
-shorter than half a window, so that it hardly affects the window's median. Drift within a window is as large as drift
-between two windows, whereas a step occurs at one time. Steps are measured relative to the change between windows of
-healthy frames, channel by channel.
+A lasting step of the voltages is detected in frames with touches, noise and drift by comparing the medians of two
+consecutive windows of frames. A touch is shorter than half a window, so it hardly affects the window's median. Drift
+within a window is as large as drift between two windows, whereas a step occurs at one time. The size of a step is
+relative to the change between windows of healthy frames, channel by channel.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jeit_solvers.module import Module
 
 
 class EventKind(StrEnum):
-    """Kind of an event. Each member equals its string value."""
+    """Kind of an event in the state of a skin. Each member equals its string value."""
 
     CUT = "cut"
     """Conductivity is permanently lost along a path."""
@@ -41,7 +41,7 @@ class EventKind(StrEnum):
 
 
 class EventStatus(StrEnum):
-    """How certain an event is. Each member equals its string value."""
+    """How certain an event in the state of a skin is. Each member equals its string value."""
 
     HELD = "held, or a void"
     """The change looks like a touch that is held: only time or the user can distinguish the two."""
@@ -54,15 +54,15 @@ class EventStatus(StrEnum):
 
 
 class HealthEvent(Module):
-    """An event in the state of a skin.
+    """An event in the state of a monitored skin, such as a cut or a failing electrode.
 
-    **Fields**: `number`: position in order of detection; `kind`; `status`; `time`: when it began; `noticed`: when it
-    was detected, both in seconds (in frames if there are no times); `frame`: number of the frame at which it began;
-    `channels` (M,): whether each channel changed; `change` (M,): change of each channel, volts; `strength`: size of the
-    change divided by the limit learnt from healthy frames; `electrode`: number of the electrode, from 0, or None;
-    `path` (k, 2): path of a cut, metres, or None; `deviation`: standard deviation of the path's `length`, metres,
-    estimated from the voltages; `through`: whether the whole depth of the skin is cut, or None; `reason`: explanation,
-    a sentence.
+    **Fields**: `number`: position among events in order of detection; `kind`; `status`; `time`: time at which the event
+    began; `noticed`: time at which the event was detected, both in seconds (in frames if frames have no times);
+    `frame`: number of the frame at which the event began; `channels`: whether each channel changed; `change`: change of
+    each channel, volts; `strength`: size of the change divided by the limit learnt from healthy frames; `electrode`:
+    number of the failing electrode, from 0, or None; `path` (points, 2): path of a cut, metres, or None; `deviation`:
+    standard deviation of the path's `length`, metres, estimated from the voltages; `through`: whether the whole depth
+    of the skin is cut, or None; `reason`: a sentence that explains the event.
 
     **Example:**
 
@@ -89,24 +89,24 @@ class HealthEvent(Module):
 
     @property
     def length(self) -> float:
-        """Length of the path, metres; 0 without a path."""
+        """Length of the path of a cut, metres; 0 for an event without a path."""
         return 0.0 if self.path is None else float(np.linalg.norm(np.diff(self.path, axis=0), axis=1).sum())
 
     @property
     def open(self) -> bool:
-        """Whether the event still applies: it is neither denied nor mended, and is not a repair."""
+        """Whether the event still applies: the event is neither denied nor mended, and is not a repair."""
         is_closed = self.status in (EventStatus.DENIED, EventStatus.MENDED)
         return not is_closed and self.kind != EventKind.REPAIRED
 
 
-# Minimum fraction of a step that occurs between the quarters of a window directly before and after it; for a constant
-# slope, the fraction is a quarter.
+# Sharpness: minimum fraction of a step that occurs between the quarter of a window before the step and the quarter
+# after it; for a constant slope, the fraction is a quarter.
 _MIN_SHARPNESS = 0.55
-# Fraction of a step that the medians of all thirds of the frames after it must exceed; fraction that no third of the
-# frames before it may exceed.
+# Fraction of a step that the median of each third of the frames after the step must exceed; fraction that the median of
+# no third of the frames before the step may exceed.
 _MIN_FRACTION_AFTER, _MAX_FRACTION_BEFORE = 0.5, 0.5
-# Fraction of the step below which a frame counts as before the step; maximum fraction of frames on the wrong side of
-# the step, because of touches of the opposite sign.
+# Fraction of a step below which the level of a frame counts as that before the step; maximum fraction of frames with
+# the level of the wrong side, because of touches of the opposite sign.
 _BEFORE_LEVEL, _MAX_OUTLIER_FRACTION = 0.3, 0.1
 # Exponent of the power mean over channels, large enough to detect a change of a single channel among many.
 _POWER_MEAN_EXPONENT = 4
@@ -114,10 +114,10 @@ _POWER_MEAN_EXPONENT = 4
 
 @dataclass(frozen=True)
 class Step:
-    """A step between two windows.
+    """A step of the voltages between two consecutive windows of frames.
 
-    **Fields**: `change` (M,): change of each channel, volts; `size`: size of the change relative to healthy windows;
-    `first`: index, within both windows, of the first frame after the step.
+    **Fields**: `change`: change of each channel, volts; `size`: size of the change relative to changes between healthy
+    windows; `first`: index, among the frames of both windows, of the first frame after the step.
     """
 
     change: Float[np.ndarray, " M"]
@@ -126,13 +126,14 @@ class Step:
 
 
 def window_change(frames: Float[np.ndarray, "2w M"]) -> Float[np.ndarray, " M"]:
-    """Change from the median of the first half of frames to that of the second; NaN if a half has no reading."""
+    """Change of each channel from the median of the first half of frames to that of the second; NaN if a half has no
+    reading."""
     half = len(frames) // 2
     return channel_medians(frames[half:]) - channel_medians(frames[:half])
 
 
 def channel_medians(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]:
-    """Median of every channel over its readings; NaN for channels without readings."""
+    """Median of every channel over the frames with a reading; NaN for channels without readings."""
     if not np.isnan(frames).any():
         return np.median(frames, axis=0)
     has_readings = ~np.isnan(frames).all(axis=0)
@@ -142,7 +143,8 @@ def channel_medians(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]
 
 
 def change_size(scaled_changes: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "..."]:
-    """Size of changes (..., M) divided by their healthy scale: a power mean over the channels that have readings."""
+    """Size of voltage changes that are divided by the usual healthy change: a power mean over the channels with a
+    reading."""
     powers = np.minimum(np.abs(scaled_changes), 1e9) ** _POWER_MEAN_EXPONENT
     has_reading = np.isfinite(powers)
     mean_powers = np.sum(np.where(has_reading, powers, 0.0), axis=-1) / np.maximum(has_reading.sum(axis=-1), 1)
@@ -150,11 +152,11 @@ def change_size(scaled_changes: Float[np.ndarray, "... M"]) -> Float[np.ndarray,
 
 
 def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M"], limit: float) -> Step | None:
-    """Find a lasting step between two windows of frames (2w, M).
+    """Find a lasting step of the voltages between two windows: the first and the second half of frames (frames,
+    channels).
 
-    `scale` (M,): healthy change of each channel. The first w frames are the first window, the others the second.
-    Returns None unless the step from one to the other is larger than the `limit`, is sharp, and lasts for all of the
-    second window.
+    `scale`: usual healthy change of each channel. Returns None unless the step between the medians of the two windows
+    exceeds the `limit`, in units of `scale`, is sharp, and lasts to the end of the second window.
     """
     change = window_change(frames)
     size = float(change_size(change / scale))
@@ -164,7 +166,7 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
     half_length = len(frames) // 2
     initial_medians = np.where(np.isfinite(change), channel_medians(frames[:half_length]), 0.0)
     readings = np.where(np.isfinite(frames), frames, initial_medians)
-    # Component of the frames along the step: 0 before the step, 1 after it.
+    # Component of the frames along the step: 0 before the step, 1 after the step.
     projections = (readings - initial_medians) @ direction / max(np.nan_to_num(change) @ direction, 1e-300)
     first_frame = _best_split_index(np.clip(projections, -1.0, 2.0), half_length)
     quarter_length = max(2, half_length // 4)
@@ -187,9 +189,10 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
 
 
 def is_distinct(projections: Float[np.ndarray, " n"], first: int) -> bool:
-    """Whether frames are 0 before index `first` and 1 from it on, apart from noise and a few exceptions.
+    """Whether the levels of frames are 0 before index `first` and 1 from this index on, apart from noise and a few
+    exceptions.
 
-    Between two touches, in contrast, frames return to 0.
+    A lasting step is distinct from two touches, between which the level returns to 0.
     """
     noise = 1.4826 * np.median(np.abs(np.diff(projections))) / np.sqrt(2)
     max_fraction = max(_MAX_OUTLIER_FRACTION, 1.5 * float(ndtr((_BEFORE_LEVEL - 1) / max(noise, 1e-12))))
@@ -198,7 +201,7 @@ def is_distinct(projections: Float[np.ndarray, " n"], first: int) -> bool:
 
 
 def _best_split_index(projections: np.ndarray, half: int) -> int:
-    """Find the index at which splitting the frames into two constant parts fits best."""
+    """Find the index at which the levels of frames are best split into two constant parts by least squares."""
     num_frames = len(projections)
     total_sum, cumulative_sums = projections.sum(), np.cumsum(projections)[:-1]
     num_before = np.arange(1, num_frames)

@@ -12,31 +12,33 @@ from jeit.touch.health.event import EventKind
 from jeit.touch.health.healthy import HealthyState
 from jeit.touch.health.imaged_skin import ImagedSkin
 
-# Failing electrodes: maximum fraction of a change's energy that they may leave unexplained; minimum fraction of an
-# electrode's channels that have changed; minimum change of such a channel, divided by its reading; maximum fraction of
-# electrodes that may fail at once.
+# Maximum fraction of a change's energy (sum of squares over channels) that failing electrodes may leave unexplained;
+# minimum fraction of a failing electrode's channels that have changed; minimum change of a changed channel, divided by
+# its reading; maximum fraction of electrodes that may fail at once.
 _MAX_UNEXPLAINED, _MIN_CHANGED_FRACTION, _MIN_RELATIVE_CHANGE, _MAX_FAULTY_FRACTION = 0.1, 0.75, 0.12, 0.25
-# Maximum ratio of a reading to its reference for a torn wire; minimum ratio of the noise to its healthy value for a
-# loose contact.
+# Maximum ratio of readings to reference readings for a torn wire; minimum ratio of noise to healthy noise for a loose
+# contact.
 _TORN_RATIO, _LOOSE_NOISE_RATIO = 0.2, 5.0
-# Ratio of the standard deviation of a normal variable to the median magnitude of the difference of two.
+# Ratio of the standard deviation of a normal variable to the median magnitude of the difference of two independent
+# values.
 _DEVIATION_PER_MEDIAN_DIFFERENCE = 1.0484
-# Maximum of a change divided by the reading; larger ones are clipped.
+# Maximum of a voltage change divided by the reading; larger ratios are clipped.
 _MAX_RELATIVE_CHANGE = 10.0
 
 
 def faulty_electrodes(
     change: Float[np.ndarray, " M"], reference: Float[np.ndarray, " M"], uses_electrode: Bool[np.ndarray, "L M"]
 ) -> list[int]:
-    """Find the electrodes whose failure alone explains a change from the reference, volts.
+    """Find the electrodes whose failure alone explains a change of the channels from their `reference`, volts.
 
-    Returns the numbers of these electrodes, or an empty list if the skin must have changed too. `uses_electrode` (L,
-    M): whether each channel uses each electrode.
+    Returns the numbers of the failing electrodes, or an empty list if the skin must have changed too. `uses_electrode`
+    (electrodes, channels): whether each channel uses each electrode.
     """
     rms_reading = np.sqrt(np.mean(reference[np.isfinite(reference)] ** 2))
     relative_changes = np.abs(np.nan_to_num(change)) / np.maximum(np.abs(reference), 0.1 * rms_reading)
     relative_changes = np.minimum(relative_changes, _MAX_RELATIVE_CHANGE)
-    # The change of a channel with a weak reading is compared with the mean reading, not with its own.
+    # The change of a channel with a weak reading is relative to the root mean square reading, not to the channel's own
+    # reading.
     energies = np.minimum(np.abs(np.nan_to_num(change)) / rms_reading, relative_changes) ** 2
     total_energy, is_unexplained, electrodes = energies.sum(), np.ones(len(energies), bool), []
     while (
@@ -69,7 +71,8 @@ def kind_of_fault(
     noise: Float[np.ndarray, " M"],
     electrode_channels: Bool[np.ndarray, " M"],
 ) -> EventKind:
-    """Classify the fault of an electrode with channels `electrode_channels` (M,) from its latest `frames` (n, M)."""
+    """Classify the fault of a failing electrode from the latest `frames`; `electrode_channels`: whether each channel
+    uses this electrode."""
     electrode_frames = frames[:, electrode_channels]
     medians = np.nanmedian(electrode_frames, axis=0)
     rms_reading = np.sqrt(np.mean(reference[electrode_channels] ** 2))
@@ -80,7 +83,7 @@ def kind_of_fault(
     )
     if is_constant or np.median(np.abs(medians)) < _TORN_RATIO * np.median(np.abs(reference[electrode_channels])):
         return EventKind.TORN
-    # Touches hardly affect differences from frame to frame.
+    # Touches hardly affect the median difference from frame to frame.
     differences = np.diff(electrode_frames, axis=0)
     has_steps = np.isfinite(differences).any(axis=0)
     noise_ratios = np.zeros(len(medians))
@@ -96,17 +99,17 @@ def kind_of_fault(
     return EventKind.DEAD
 
 
-# Maximum fraction of the energy of a change in an electrode's channels that a cut beside the electrode leaves
-# unexplained; for a failing contact, the fraction is larger.
+# Maximum fraction of a change in an electrode's channels, as a sum of squares, that a fitted cut leaves unexplained if
+# the change is by a cut beside the electrode; for a failing contact, the fraction is larger.
 _MAX_CUT_MISFIT = 0.1
 
 
 @dataclass(frozen=True)
 class LastingChange:
-    """A lasting change.
+    """A lasting change of a skin's voltages.
 
-    **Fields**: `vector` (M,): change of each channel, volts; `size`: size relative to healthy changes; `time`, `frame`:
-    time and frame at which it began; `noticed`: time at which it was detected.
+    **Fields**: `vector`: change of each channel, volts; `size`: size of the change relative to healthy changes; `time`,
+    `frame`: time and frame number at which the change began; `noticed`: time at which the change was detected.
     """
 
     vector: Float[np.ndarray, " M"]
@@ -118,11 +121,11 @@ class LastingChange:
 
 @dataclass(frozen=True)
 class Finding:
-    """Classification of a lasting change.
+    """Classification of a lasting change of a skin: what caused the change.
 
-    **Fields**: `kind`: kind of event; `reason`: explanation; `is_certain`: False if a press may cause the same change;
-    `electrode`: number of the failing electrode, or None; `loss`: fitted cut, or None; `channels` (M,): channels that
-    are affected, None for all.
+    **Fields**: `kind`: kind of event; `reason`: a sentence that explains the kind; `is_certain`: False if a press may
+    cause the same change; `electrode`: number of the failing electrode, or None; `loss`: fitted cut, or None;
+    `channels`: whether each channel is affected, None if all are.
     """
 
     kind: EventKind
@@ -141,7 +144,7 @@ def classify_change(
     touching: Bool[np.ndarray, "L M"] | None,
     skin: ImagedSkin | None,
 ) -> list[Finding]:
-    """Classify a `change` (M,) from the `reference` (M,), with the `frames` (n, M) after it."""
+    """Classify a lasting change of the channels from their `reference`, volts, with the `frames` after the change."""
     usable = healthy.used & np.isfinite(change)
     electrodes = [] if touching is None else faulty_electrodes(change, reference, touching & healthy.used)
     faults = []
@@ -152,8 +155,8 @@ def classify_change(
             f"Nearly all of the change is in the {int(electrode_channels.sum())} channels of electrode {electrode + 1}."
         )
         faults.append(Finding(kind, fault_reason, True, electrode=electrode, channels=electrode_channels))
-    # A cut right beside an electrode also changes almost only that electrode's channels. But it does not fluctuate, and
-    # does not increase the current at the electrode.
+    # A cut right beside an electrode also changes almost only that electrode's channels. But readings beside a cut do
+    # not fluctuate, and a cut does not increase the current at the electrode.
     if faults and (skin is None or any(fault.kind != EventKind.DEAD for fault in faults)):
         return faults
     loss = None if skin is None else skin.fit_cut(change, usable, healthy.scale)
@@ -175,5 +178,5 @@ def classify_change(
 
 
 def _loss_is_opposite_to_touch(skin: ImagedSkin | None) -> bool:
-    """Whether touches raise the conductivity, so that a loss of conductivity cannot be a touch."""
+    """Whether touches raise the skin's conductivity, so that a loss of conductivity cannot be a touch."""
     return skin is not None and skin.sign > 0

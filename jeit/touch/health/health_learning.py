@@ -1,4 +1,4 @@
-"""Learn the healthy state of a skin from a recording of it, with or without a calibrated model."""
+"""Learn the healthy state of a skin from a recording of the skin, with or without a calibrated model."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jeit.touch.gestures.touch_images import TouchImages
 from jeit.touch.health import SkinHealth
 
 # Minimum fraction of a frame's channels that have a reading; number of healthy frames below which drift is poorly
-# known; ratio between the readings of two recordings that suggests different units.
+# known; ratio of the readings of two recordings above which different units are suspected.
 _MIN_READ_FRACTION, _MIN_NUM_FRAMES, _MAX_UNIT_RATIO = 0.5, 250, 20.0
 
 
@@ -27,17 +27,18 @@ def learn_health(
     patience: float | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> SkinHealth:
-    """Learn the healthy state of a skin to be monitored, from a recording of frames while it is healthy.
+    """Learn the healthy state of a skin to be monitored, from a recording of frames of the healthy skin.
 
     **Arguments:**
 
-    - `healthy`: the recording. Frames have its times, or come at `rate`; otherwise, times are numbers of frames.
-    - `description`: description of the skin. If it has a protocol, failing electrodes are identified. If it also has
-      geometry and electrodes, a model is calibrated on the untouched frames, with which cuts are located.
+    - `healthy`: the recording of the healthy skin. Frames have the recording's times, or come at `rate`; otherwise,
+      times are frame numbers.
+    - `description`: description of the skin. If the description has a protocol, failing electrodes are identified. If
+      the description also has geometry and electrodes, a model is calibrated on the untouched frames to locate cuts.
     - `sign`: as in `SkinHealth.fit`, -1 for skins that conduct worse where touched.
     - `rate`: frames/s of a recording without times.
-    - `patience`: time that no touch is held for, seconds.
-    - `progress`: called with each step as it begins.
+    - `patience`: time longer than any touch is held, seconds.
+    - `progress`: called with a description of each step as the step begins.
 
     Raises `ValueError` as `SkinHealth.fit` and `TouchImages.prepare` do.
 
@@ -65,20 +66,21 @@ def learn_health(
 
 
 def seconds_of(recording: FrameRecording, rate: float | None) -> Float[np.ndarray, " F"] | None:
-    """Times of frames, seconds: those of the recording, or computed from `rate`, frames/s; None if neither is known."""
+    """Times of a recording's frames, seconds: those recorded, or computed from `rate`, frames/s; None if neither is
+    known."""
     if recording.seconds is None:
         return None if rate is None else np.arange(len(recording.frames)) / rate
     return recording.seconds
 
 
 def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndarray, "F M"]) -> list[str]:
-    """List reasons to doubt the events that a monitored skin reports: a sentence for each reason.
+    """List reasons to doubt the detected events of a monitored skin, as sentences.
 
     **Arguments:**
 
-    - `health`: the monitored skin, as from `learn_health`.
-    - `healthy`: the recording from which it was learnt.
-    - `frames`: the monitored frames (F, M), volts.
+    - `health`: state of the monitored skin, as from `learn_health`.
+    - `healthy`: the recording from which the healthy state was learnt.
+    - `frames`: the monitored frames (frames, channels), volts.
 
     Raises `ValueError` if no frame has a reading in half of the healthy channels.
 

@@ -1,10 +1,10 @@
-"""The healthy state of a skin: directions of its touches, usual changes, and steadiness of its channels.
+"""The healthy state of a skin: principal directions of its touches, usual changes, and steadiness of its channels.
 
-Single channels that are noisy, jump, or are stuck are detected from their changes from step to step. Two measures are
-computed for every channel in a window: the mean of the smaller half of the magnitudes of these changes, which touches
-hardly affect, and the mean of all of them, which responds to jumps. Both are compared with those of healthy windows, in
-two consecutive windows, and with those of the other channels. If many channels exceed their limits at once, the cause
-is a touch, not the channels.
+Frames are averaged to steps in time. Single channels that are noisy, jump, or are stuck are detected from their changes
+from step to step. Two measures of variation are computed for every channel in a window of steps: the mean of the
+smaller half of the magnitudes of these changes, which touches hardly affect, and the mean of all magnitudes, which
+responds to jumps. Both measures, in two consecutive windows, are compared with those of healthy windows and of the
+other channels. If many channels exceed the limits of their measures at once, the cause is a touch, not faulty channels.
 """
 
 from __future__ import annotations
@@ -16,23 +16,25 @@ from jaxtyping import Bool, Float
 
 from jeit.touch.health.event import change_size, channel_medians, lasting_step, window_change
 
-# Fraction of a window's changes, the smallest ones, that measure noise; minimum fraction of changes with a reading.
+# Fraction of a window's changes, the smallest changes, that measure noise; minimum fraction of changes that have
+# readings.
 _SMALL_FRACTION, _MIN_READ_FRACTION = 0.5, 0.5
-# Minimum limit, as a multiple of the usual value; limit as a multiple of the maximum among healthy windows; increase of
-# the latter multiple, to be divided by the number of windows.
+# Limit of a variation measure: minimum, as a multiple of the usual value; multiple of the maximum among healthy
+# windows; increase of the second multiple, to be divided by the number of windows.
 _MIN_LIMIT_RATIO, _UNSTEADY_FACTOR, _UNSTEADY_INCREASE = 3.0, 2.0, 12.0
-# Minimum fraction of steps in which a healthy channel changes; otherwise, it never counts as stuck.
+# Minimum fraction of steps in which a healthy channel must change for the channel ever to count as stuck.
 _MIN_MOVING_FRACTION = 0.6
-# Maximum fraction of channels that may be unsteady at once.
+# Maximum fraction of channels that may be noisy or stuck at once.
 _MAX_UNSTEADY_FRACTION = 0.1
 
 
 @dataclass(frozen=True)
 class Steadiness:
-    """Usual variation of channels from step to step, and its limits.
+    """Usual variation of healthy channels from one averaged frame to the next, and limits of the variation.
 
-    **Fields**: `usual_values` (2, M): usual values of the two measures, volts; `limits` (2,): limits of the measures,
-    as multiples of the usual values; `can_be_stuck` (M,): whether a channel that does not change at all is stuck.
+    **Fields**: `usual_values` (2, channels): usual values of two measures of variation, the mean of the smaller half of
+    the magnitudes of changes and the mean of all magnitudes, volts; `limits` (2,): limits of the two measures, as
+    multiples of the usual values; `can_be_stuck`: whether a channel that does not change at all counts as stuck.
     """
 
     usual_values: Float[np.ndarray, "2 M"]
@@ -41,12 +43,12 @@ class Steadiness:
 
     @classmethod
     def learn(cls, steps: Float[np.ndarray, "n M"], window: int, noise: Float[np.ndarray, " M"]) -> "Steadiness":
-        """Learn from healthy steps (n, M) and the length of a window.
+        """Learn the usual variation from averaged healthy frames (`steps`), with the length of a window in steps.
 
-        `noise` (M,): noise of the channels, volts; infinite for channels without readings.
+        `noise`: noise of each channel, volts; infinite for channels without readings.
         """
         starts = range(0, max(1, len(steps) - window + 1), max(1, window // 2))
-        measures = np.array([_variation_measures(steps[start : start + window]) for start in starts])  # (n, 2, M)
+        measures = np.array([_variation_measures(steps[start : start + window]) for start in starts])  # (windows, 2, M)
         half, ratios = len(measures) // 2, [np.zeros((1, *measures.shape[1:]))]
         for training, test in ((measures[:half], measures[half:]), (measures[half:], measures[:half])):
             if len(training) and len(test):
@@ -65,10 +67,9 @@ class Steadiness:
     def noisy_channels(
         self, steps: Float[np.ndarray, "2w M"], trusted: Bool[np.ndarray, " M"]
     ) -> Bool[np.ndarray, " M"]:
-        """Whether each channel (M,) is noisy, or jumps, in both of two windows, far more than nearly all other
-        channels.
+        """Whether each channel is noisy, or jumps, in both of two windows, far more than nearly all other channels.
 
-        `steps` (2w, M): changes from step to step in both windows, volts; `trusted` (M,): channels that may be used.
+        `steps` (steps, channels): averaged frames of both windows, volts; `trusted`: whether each channel may be used.
         """
         half, exceeds_by_window = len(steps) // 2, []
         for window_steps in (steps[:half], steps[half:]):
@@ -79,7 +80,7 @@ class Steadiness:
     def stuck_channels(
         self, steps: Float[np.ndarray, "2w M"], trusted: Bool[np.ndarray, " M"]
     ) -> Bool[np.ndarray, " M"]:
-        """Whether each channel (M,) is constant in both of two windows while other channels change; arguments as for
+        """Whether each channel is constant in both of two windows while other channels change; arguments as for
         `noisy_channels`."""
         half = len(steps) // 2
         return self._exclude_common_changes(
@@ -93,8 +94,8 @@ class Steadiness:
     @staticmethod
     def _exclude_common_changes(exceeds_by_window: list[np.ndarray], trusted: np.ndarray) -> Bool[np.ndarray, " M"]:
         is_unsteady = exceeds_by_window[0] & exceeds_by_window[1] & trusted
-        # A channel that was steady in the first window is detected later; if too many channels are unsteady at once,
-        # none is.
+        # A channel that was steady in the first window is detected later; if too many channels are unsteady at once, no
+        # channel is detected.
         max_num_channels = max(1, _MAX_UNSTEADY_FRACTION * trusted.sum())
         return (
             is_unsteady
@@ -105,8 +106,8 @@ class Steadiness:
 
 
 def _relative_to_others(ratios: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "... M"]:
-    """Divide the `ratios` of the measures to their usual values by a high quantile of the ratios over the channels, if
-    that is above 1: a change common to nearly all channels is then not attributed to single ones."""
+    """Divide the ratios of variation measures to their usual values by a high quantile of the ratios over the channels,
+    if the quantile is above 1: a change of nearly all channels is then not attributed to single channels."""
     num_excluded = max(1, int(_MAX_UNSTEADY_FRACTION * ratios.shape[-1]))
     if num_excluded >= ratios.shape[-1]:
         return ratios
@@ -114,11 +115,11 @@ def _relative_to_others(ratios: Float[np.ndarray, "... M"]) -> Float[np.ndarray,
 
 
 def _variation_measures(window_steps: Float[np.ndarray, "w M"]) -> Float[np.ndarray, "2 M"]:
-    """Compute, for each channel, the two measures (2, M) of variation in a window from its changes `window_steps` (w,
-    M).
+    """Compute the two measures (2, channels) of each channel's variation in a window of averaged frames (steps,
+    channels).
 
-    They are the mean of the smaller half of the magnitudes of the changes, and the mean of all; NaN for channels with
-    too few readings.
+    The measures are the mean of the smaller half of the magnitudes of changes from step to step, and the mean of all
+    magnitudes; NaN for channels with too few readings.
     """
     magnitudes = np.sort(np.abs(np.diff(window_steps, axis=0)), axis=0)  # NaN last
     num_readings = np.isfinite(magnitudes).sum(axis=0)
@@ -130,43 +131,44 @@ def _variation_measures(window_steps: Float[np.ndarray, "w M"]) -> Float[np.ndar
 
 
 def _usual_variation(measures: Float[np.ndarray, "n 2 M"], noise: Float[np.ndarray, " M"]) -> Float[np.ndarray, "2 M"]:
-    """Mean (2, M) of the `measures` (n, 2, M) over n healthy windows, but at least a tenth of the `noise` (M,): a
-    coarse analogue-to-digital converter hides noise."""
+    """Mean of the variation measures (windows, 2, channels) over healthy windows, but at least a tenth of the `noise`:
+    a coarse analogue-to-digital converter hides noise."""
     usual_values = np.nan_to_num(measures).mean(axis=0)
     return np.where(
         np.isfinite(noise), np.maximum(usual_values, 0.1 * np.where(np.isfinite(noise), noise, 1.0)), np.inf
     )
 
 
-# Maximum number of steps of a window (with more frames, several are averaged to a step); minimum number; minimum number
-# of windows of a healthy recording.
+# Maximum number of steps of a window (with more frames, several frames are averaged to a step); minimum number of
+# steps; minimum number of windows of a healthy recording.
 _MAX_WINDOW_STEPS, _MIN_WINDOW_STEPS, _MIN_NUM_WINDOWS = 48, 5, 8
 # Minimum and maximum length of windows, in frames, for a healthy recording without a quiet interval.
 _MIN_WINDOW_FRAMES, _MAX_WINDOW_FRAMES = 12, 64
-# If no time is given: length of a window as a multiple of the longest touch; its minimum as a fraction of the
-# recording.
+# If the length of a window is not given: the length as a multiple of the longest touch; its minimum as a fraction of
+# the recording.
 _WINDOW_PER_TOUCH, _MIN_WINDOW_FRACTION = 3.0, 1 / 40
-# Limit of a change: multiple of the maximum among healthy windows; minimum, in standard deviations of healthy changes;
-# increase of the multiple, to be divided by the number of windows.
+# Limit of a change between windows: multiple of the maximum among healthy windows; minimum, in standard deviations of
+# healthy changes; increase of the multiple, to be divided by the number of windows.
 _CHANGE_FACTOR, _MIN_CHANGE_SIZE, _CHANGE_INCREASE = 2.0, 4.0, 20.0
-# Factor by which windows may be shorter than touches require; if they are even shorter, touches appear to last, and
-# limits are multiplied by the second factor.
+# Factor by which windows may be shorter than touches require; if windows are even shorter, touches appear to last, and
+# limits of changes are multiplied by the second factor.
 _SHORT_WINDOW_FACTOR, _BRIEF_LIMIT_FACTOR = 1.5, 2.0
-# Minimum fraction of a step that is left a window later if the step lasts.
+# Minimum fraction of a lasting step of the voltages that is left one window later.
 _MIN_REMAINING_FRACTION = 0.4
-# Limit of a change of level from the healthy recording to another one, as a multiple of the maximum among its windows.
+# Limit of the change of voltages from the healthy to another recording, as a multiple of the maximum between healthy
+# windows.
 _LEVEL_FACTOR = 3.0
-# Minimum ratio of the change in a touched frame to that in quiet frames; quantile of the changes of all frames that is
-# used as the change in quiet frames.
+# Minimum ratio of the change in a touched frame to the change in quiet frames; quantile of the changes of all frames
+# that estimates the change in quiet frames.
 _MIN_TOUCH_RATIO, _QUIET_QUANTILE = 3.0, 0.3
-# Maximum number of directions of touches; fraction of the touches' energy that the directions explain.
+# Maximum number of principal directions of touches; fraction of the touches' energy that the directions explain.
 _MAX_NUM_DIRECTIONS, _EXPLAINED_FRACTION = 40, 0.98
-# Quantile, among healthy touches, of the energy outside of these directions, above which a change is unlike touches;
-# minimum energy of these touches, relative to that of a strong touch.
+# A change is unlike touches if its fraction of energy outside of the directions of touches exceeds this quantile over
+# healthy touches; minimum energy of the healthy touches, relative to that of a strong touch.
 _OUTSIDE_QUANTILE, _MIN_STRONG_ENERGY = 0.99, 0.2
 _MIN_NUM_FRAMES = 20
-# Fraction of the changes from frame to frame, the smallest ones, that touches do not affect; mean magnitude of the same
-# fraction of a standard normal variable.
+# Fraction of the changes from frame to frame, the smallest changes, that touches do not affect; mean magnitude of the
+# same fraction of a standard normal variable.
 _UNTOUCHED_FRACTION, _NORMAL_MEAN_MAGNITUDE = 0.8, 0.5586
 # Ratio of the standard deviation of a normal variable to its mean magnitude.
 _DEVIATION_PER_MEAN_MAGNITUDE = float(np.sqrt(np.pi / 2))
@@ -174,17 +176,18 @@ _DEVIATION_PER_MEAN_MAGNITUDE = float(np.sqrt(np.pi / 2))
 
 @dataclass(frozen=True)
 class HealthyState:
-    """Healthy state of a skin with M channels, and its variation.
+    """Healthy state of a skin and its usual variation, learnt from a recording.
 
-    **Fields**: `reference` (M,): voltages of the untouched skin, volts; `used` (M,): whether channels have readings;
-    `noise` (M,): noise from frame to frame, volts; `span` (2, M): minimum and maximum change in the recording, volts;
-    `stride`: number of frames averaged to a step; `window`: number of steps of a window; `scale` (M,): change between
-    consecutive windows, volts; `limit`: limit of `change_size` for a step that lasts; `sudden_limit`: its limit for a
-    step that may be a touch; `level_scale` (M,): change between any two windows, volts; `level_limit`: limit of
-    `change_size` for a change of level; `touch_directions` (M, k): directions of touches, orthonormal in units of
-    noise; `max_fraction_outside`: maximum fraction of the energy of touches outside of these directions; `steadiness`:
-    steadiness of single channels; `period`: seconds between frames, or 1; `is_brief`: whether the recording was too
-    short for its touches, so that limits are twice as high.
+    **Fields**, of each channel where not said otherwise: `reference`: voltage of the untouched skin, volts; `used`:
+    whether the channel has readings; `noise`: noise from frame to frame, volts; `span` (2, channels): minimum and
+    maximum change in the recording, volts; `stride`: number of frames averaged to a step in time; `window`: number of
+    steps of a window; `scale`: usual change between consecutive windows, volts; `limit`: limit of the change between
+    windows (`change_size`) for a change that lasts; `sudden_limit`: limit for a change that may be a touch;
+    `level_scale`: usual change between any two windows, volts; `level_limit`: limit for a change from the healthy to
+    another recording; `touch_directions` (channels, directions): principal directions of touches, orthonormal in units
+    of noise; `max_fraction_outside`: maximum fraction of the energy of touches outside of these directions;
+    `steadiness`: steadiness of single channels; `period`: seconds between frames, or 1; `is_brief`: whether the
+    recording was too short for its touches, so that limits are twice as high.
     """
 
     reference: Float[np.ndarray, " M"]
@@ -208,11 +211,11 @@ class HealthyState:
     def learn(
         cls, frames: Float[np.ndarray, "F M"], period: float = 1.0, longest: float | None = None
     ) -> "HealthyState":
-        """Learn from healthy frames (F, M), with or without touches, `period` seconds apart.
+        """Learn the healthy state from frames (frames, channels), with or without touches, `period` seconds apart.
 
-        `longest`: length of a window, seconds, which must exceed that of every touch; by default estimated from the
-        touches in the frames. Raises `ValueError` for fewer than 20 frames, and if all channels lack readings or are
-        constant.
+        `longest`: length of a window, seconds, which must exceed the length of every touch; by default estimated from
+        the touches in the frames. Raises `ValueError` for fewer than 20 frames, and if every channel lacks readings or
+        is constant.
         """
         if len(frames) < _MIN_NUM_FRAMES:
             raise ValueError(
@@ -264,12 +267,13 @@ class HealthyState:
         )
 
     def fraction_outside(self, change: Float[np.ndarray, " M"]) -> float:
-        """Fraction of a change's energy, in units of noise, that is outside of the directions of touches."""
+        """Fraction of a voltage change's sum of squares, in units of noise, that is outside of the directions of
+        touches."""
         return float(_fraction_outside((np.nan_to_num(change) / self.noise)[None], self.touch_directions)[0])
 
 
 def average_frames(frames: Float[np.ndarray, "F M"], stride: int) -> Float[np.ndarray, "n M"]:
-    """Average every `stride` frames, for each channel over its readings."""
+    """Average every `stride` consecutive frames; the mean of each channel is over the frames with a reading."""
     if stride == 1:
         return frames
     groups = frames[: len(frames) // stride * stride].reshape(-1, stride, frames.shape[1])
@@ -281,7 +285,7 @@ def average_frames(frames: Float[np.ndarray, "F M"], stride: int) -> Float[np.nd
 
 
 def _estimate_noise(frames: np.ndarray) -> np.ndarray:
-    """Noise of every channel from frame to frame: its standard deviation, estimated from the smaller changes."""
+    """Standard deviation of every channel's noise from frame to frame, estimated from the smaller changes."""
     steps = np.diff(frames, axis=0)
     has_steps = np.isfinite(steps).any(axis=0)
     deviations, trimmed_deviations, total_deviations = np.zeros((3, frames.shape[1]))
@@ -289,7 +293,8 @@ def _estimate_noise(frames: np.ndarray) -> np.ndarray:
     num_readings = np.isfinite(magnitudes).sum(axis=0)
     deviations[has_steps] = 1.4826 * np.nanmedian(magnitudes, axis=0) / np.sqrt(2)
     total_deviations[has_steps] = np.nanstd(steps[:, has_steps], axis=0) / np.sqrt(2)
-    # With a coarse converter, the median change is zero or one step of the converter; the mean is more informative.
+    # With a coarse analogue-to-digital converter, the median change is zero or one step of the converter; the mean
+    # change is more informative.
     num_small = np.maximum((_UNTOUCHED_FRACTION * num_readings).astype(int), 1)
     trimmed_deviations[has_steps] = (
         np.cumsum(np.nan_to_num(magnitudes), axis=0)[num_small - 1, np.arange(len(num_small))]
@@ -304,7 +309,7 @@ def _estimate_noise(frames: np.ndarray) -> np.ndarray:
 
 
 def _window_length(frames: np.ndarray, noise: np.ndarray, period: float, longest: float | None) -> tuple[int, float]:
-    """Number of frames of a window, and the number that a sufficiently long recording would allow."""
+    """Length of a window in frames, and the length that a sufficiently long recording would allow."""
     max_length = max(_MIN_WINDOW_STEPS, len(frames) // _MIN_NUM_WINDOWS)
     if longest is not None:
         return int(np.clip(np.ceil(longest / period), _MIN_WINDOW_STEPS, max_length)), longest / period
@@ -321,27 +326,31 @@ def _window_length(frames: np.ndarray, noise: np.ndarray, period: float, longest
 
 
 def _median_noise(noise: np.ndarray, num_frames: int) -> np.ndarray:
-    """Minimum difference between the medians of two windows of `num_frames` frames that contain only noise."""
+    """Standard deviation of each channel's difference between the medians of two windows of frames that contain only
+    noise."""
     return noise * np.sqrt(np.pi / max(num_frames, 2))
 
 
 def _window_triples(steps: np.ndarray, window: int) -> np.ndarray:
-    """Triples (n, 3w, M) of consecutive windows of `window` = w steps each, throughout a recording."""
+    """Triples of consecutive windows throughout a recording (triples, 3 `window`, channels), `window` steps in each
+    window."""
     starts = range(0, max(1, len(steps) - 3 * window + 1), max(1, window // 4))
     return np.array([steps[start : start + 3 * window] for start in starts])
 
 
 def _window_levels(steps: np.ndarray, window: int) -> np.ndarray:
-    """Differences (n, M) of the medians of windows from the median of all steps."""
+    """Differences (windows, channels) of the medians of windows from the median of the whole recording."""
     starts = range(0, max(1, len(steps) - window + 1), max(1, window // 2))
     return np.array([channel_medians(steps[start : start + window]) for start in starts]) - channel_medians(steps)
 
 
 def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Estimate the scale (M,) of changes between windows, and the limits of steps relative to that scale.
+    """Estimate the scale of each channel's change between windows, and two limits of voltage steps relative to this
+    scale.
 
-    The first limit is for steps that are still present a window later; the second is for all steps, including touches.
-    The steps of each half of the recording are scaled by the other half, which is independent of them.
+    The first limit is for voltage steps that are still present one window later; the second limit is for all steps,
+    including touches. The steps in each half of the recording are relative to the scale of the other half, which is
+    independent of them.
     """
     pairs = triples[:, : 2 * window]
     changes = np.nan_to_num(np.array([window_change(pair) for pair in pairs]))
@@ -356,7 +365,7 @@ def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[n
             sizes.append(step.size)
             direction = np.nan_to_num(step.change / scale**2)
             medians_after = channel_medians(triple[2 * window :])
-            # A step back to the voltages at rest is the end of a touch.
+            # A step back to the voltages of the untouched skin is the end of a touch.
             if change_size((medians_after - rest_medians) / scale) < _MIN_REMAINING_FRACTION * step.size:
                 continue
             remaining_change = np.nan_to_num(medians_after - channel_medians(pair[:window]))
@@ -369,8 +378,8 @@ def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[n
 
 
 def _level_limit(changes: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, float]:
-    """Estimate the scale (M,) and the limit of the windows' differences from the median; each half is scaled by the
-    other."""
+    """Estimate the scale of each channel and the limit of the differences between windows and the whole recording; the
+    differences in each half are relative to the scale of the other half."""
     changes = np.nan_to_num(changes)
     half_index = len(changes) // 2
     sizes = [
@@ -384,18 +393,18 @@ def _level_limit(changes: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, fl
 
 
 def _deviation_of_changes(changes: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """Standard deviation of changes (n, M), estimated from their mean magnitude as for a normal variable."""
+    """Standard deviation of each channel's changes, estimated from their mean magnitude as for a normal variable."""
     deviations = (
         _DEVIATION_PER_MEAN_MAGNITUDE * np.mean(np.abs(changes), axis=0) if len(changes) else np.zeros(changes.shape[1])
     )
-    # A channel that hardly changed while others did may have done so by chance.
+    # A channel may have hardly changed by chance while others did change.
     typical_ratio = np.median(deviations[np.isfinite(floor)] / floor[np.isfinite(floor)])
     return np.maximum(deviations, np.maximum(1.0, 0.5 * typical_ratio) * floor)
 
 
 def _touch_directions(frames: np.ndarray, noise: np.ndarray, window: int) -> tuple[np.ndarray, float]:
-    """Directions (M, k) of healthy changes, in units of noise, and 99 % quantile of the fraction of energy outside of
-    them."""
+    """Principal directions (channels, directions) of healthy touches, in units of noise, and the 99 % quantile of the
+    fraction of energy outside of these directions."""
     readings = np.where(np.isfinite(frames), frames, channel_medians(frames))
     centres = np.concatenate(
         [
@@ -422,7 +431,7 @@ def _touch_directions(frames: np.ndarray, noise: np.ndarray, window: int) -> tup
 
 
 def _principal_directions(frames: np.ndarray) -> np.ndarray:
-    """Principal directions (M, k) of frames."""
+    """Leading principal directions (channels, directions) of frames, which explain up to 98 % of the frames' energy."""
     _, singular_values, rows = np.linalg.svd(frames, full_matrices=False)
     fractions = np.cumsum(singular_values**2) / max(np.sum(singular_values**2), 1e-300)
     num_directions = min(
@@ -432,7 +441,7 @@ def _principal_directions(frames: np.ndarray) -> np.ndarray:
 
 
 def _fraction_outside(scaled_changes: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Fraction of the energy of changes (n, M) that is outside of the directions."""
+    """Fraction of the energy (sum of squares) of each voltage change that is outside of the `directions`."""
     energies = np.sum(scaled_changes**2, axis=1)
     energies_outside = energies - np.sum((scaled_changes @ directions) ** 2, axis=1)
     return np.clip(energies_outside / np.maximum(energies, 1e-300), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""`ImagedSkin`: a calibrated model of a skin that computes images from the remaining channels and fits cuts."""
+"""`ImagedSkin`: a calibrated model of a monitored skin that computes images from the working channels and fits cuts."""
 
 from __future__ import annotations
 
@@ -16,25 +16,28 @@ from jeit.mesh import centroids, measures
 from jeit.touch.health.cut_path import FittedLoss, LossFit
 from jeit_solvers.engines import as_array
 
-# Maximum factor between the gain of a channel and that of all channels; if it is larger, the latter is used.
+# Maximum factor between the gain of a channel and the common gain of all channels; if the factor is larger, the common
+# gain is used.
 _MAX_GAIN_FACTOR = 3.0
-# Maximum factor between readings and the model that model errors explain; a larger one is due to units or polarity.
+# Maximum factor between readings and modelled voltages that model errors explain; a larger factor is due to units or
+# polarity.
 _MAX_MODEL_FACTOR = 10.0
-# Fraction of an image's peak above which cells count for the starting point of the fit, their centroid.
+# Fraction of an image's peak; the centroid of the cells above this level is the starting point of the fit of a cut.
 _PEAK_FRACTION = 0.5
-# Thresholds for accepting a line as a cut: maximum misfit, and maximum ratio of its misfit to that of a spot.
+# Thresholds for accepting a fitted line as a cut: maximum misfit, and maximum ratio of the misfits of line and spot.
 _MAX_MISFIT, _MAX_MISFIT_RATIO = 0.4, 0.6
-# Minimum distance of a second starting point from the first, divided by the skin's side.
+# Minimum distance of the fit's second starting point from the first, divided by the skin's side.
 _MIN_START_DISTANCE = 0.05
 
 
 @dataclass(frozen=True)
 class ImagedSkin:
-    """A calibrated model of a skin.
+    """A calibrated model of a monitored skin, with its cuts.
 
-    **Fields**: `model`: forward model; `conductivity` (m,): current conductivity with all cuts, S/m (2-D: S); `healthy`
-    (m,): conductivity of the healthy skin, S/m (2-D: S); `gain` (M,): ratio of readings to the model's voltages;
-    `noise` (M,): noise of readings, volts; `sign`: 1 if touched skin conducts better, -1 if it conducts worse.
+    **Fields**: `model`: forward model; `conductivity` (cells,): present conductivity with all cuts, S/m (2-D: S);
+    `healthy` (cells,): conductivity of the healthy skin, S/m (2-D: S); `gain`: ratio of each channel's reading to the
+    model's voltage; `noise`: noise of each channel's readings, volts; `sign`: 1 if touched skin conducts better, -1 if
+    touched skin conducts worse.
     """
 
     model: ForwardModel
@@ -48,9 +51,10 @@ class ImagedSkin:
     def create(
         cls, model: ForwardModel, conductivity: ArrayLike, reference: np.ndarray, noise: np.ndarray, sign: int
     ) -> "ImagedSkin":
-        """Calibrate a model on the `reference` (M,), volts, of a healthy skin.
+        """Calibrate a forward model on the `reference` voltages of a healthy, untouched skin, volts.
 
-        Raises `ValueError` for an invalid conductivity, a reference of another skin, and a sign other than 1 and -1.
+        Raises `ValueError` for an invalid conductivity, a reference unlike the model's voltages, and a sign other than
+        1 and -1.
         """
         if sign not in (1, -1):
             raise ValueError(f"sign must be 1, where touched skin conducts better, or -1, where worse; it is {sign!r}.")
@@ -79,15 +83,16 @@ class ImagedSkin:
         return cls(model, values, values, gain, noise, int(sign))
 
     def linear_reconstruction(self, usable: Bool[np.ndarray, " M"]) -> LinearReconstruction:
-        """One-step reconstruction from the model's voltages of the `usable` channels (M,), about the current
-        conductivity."""
+        """One-step reconstruction from voltages of the `usable` channels, linearised at the present conductivity of the
+        skin."""
         noise = np.where(np.isfinite(self.noise), self.noise / np.abs(self.gain), 1.0)
         return one_step(self.model, self.conductivity, noise=as_array(noise), mask=as_array(usable))
 
     def images(self, changes: Float[np.ndarray, "F M"], usable: Bool[np.ndarray, " M"]) -> Float[np.ndarray, "F m"]:
-        """Reconstruct changes of conductivity (F, m), S/m (2-D: S), from changes of voltage (F, M), volts.
+        """Reconstruct conductivity changes (frames, cells), S/m (2-D: S), from voltage changes (frames, channels),
+        volts.
 
-        Channels without a reading are NaN; a frame without any reading gives NaN.
+        Missing readings are NaN; the image of a frame without any reading is NaN. `usable`: channels that are used.
         """
         has_reading = np.isfinite(changes) & usable
         volts = np.where(has_reading, changes / self.gain, 0.0)
@@ -102,9 +107,10 @@ class ImagedSkin:
     def fit_cut(
         self, change: Float[np.ndarray, " M"], usable: Bool[np.ndarray, " M"], noise: Float[np.ndarray, " M"]
     ) -> FittedLoss | None:
-        """Fit a cut to a change (M,), volts; returns None if no cut explains it, or a press explains it as well.
+        """Fit a cut to a voltage change, volts; returns None if no cut explains the change, or a press explains the
+        change as well.
 
-        `usable` (M,): channels to use; `noise` (M,): noise of the change, volts.
+        `usable`: channels that are used; `noise`: noise of each channel's change, volts.
         """
         is_used = usable & np.isfinite(change)
         volts = np.where(is_used, change / self.gain, 0.0)
@@ -128,9 +134,9 @@ class ImagedSkin:
         return line_fit
 
     def with_cut(self, loss: FittedLoss) -> "ImagedSkin":
-        """Return the skin with a cut added."""
+        """Return the skin model with the conductivity after a fitted cut."""
         return replace(self, conductivity=loss.conductivity)
 
     def without_cuts(self) -> "ImagedSkin":
-        """Return the skin without any cuts."""
+        """Return the skin model with the conductivity of the healthy skin, without cuts."""
         return replace(self, conductivity=self.healthy)

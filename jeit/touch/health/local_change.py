@@ -1,14 +1,14 @@
-"""Local change of conductivity: cells near a line that lose conductivity, on a mesh that is finer there.
+"""Voltages after a local change of conductivity, computed by low-rank updates on a locally refined mesh.
 
 To refine a flat mesh locally, triangles are halved across their longest edge. Rivara's closure: a triangle with any
-halved edge has its longest edge halved too, so that no triangle becomes thinner than half of what it was, and there are
-no hanging nodes.
+halved edge has its longest edge halved too, so that no triangle becomes thinner than half of the original triangle, and
+there are no hanging nodes.
 
-If the conductivity changes in one region only, voltages are computed by dense low-rank updates of one solution. With
-the grounded matrix A of stiffness and contact mass, the loads B (`jeit.forward.transfer`) and a change D of the
-stiffness between a few nodes t, the Woodbury identity gives Bᵀ(A + D)⁻¹B = BᵀX − X_tᵀ (1 + D G)⁻¹ D X_t, where X =
-A⁻¹B, and G is A⁻¹ between the nodes t. G is computed once for all nodes of the region. The
-voltages for any change then follow from a dense system with one unknown for each node t that the change touches.
+If the conductivity changes in one region only, voltages are computed by dense low-rank updates of the solution before
+the change. With the grounded matrix A of stiffness and contact mass, the loads B (`jeit.forward.transfer`) and a change
+D of the stiffness between a few nodes t, the Woodbury identity gives Bᵀ(A + D)⁻¹B = BᵀX − X_tᵀ (1 + D G)⁻¹ D X_t, where
+X = A⁻¹B, and G is A⁻¹ between the nodes t. G is computed once for all nodes of the region. The voltages for any change
+then follow from a dense system with one unknown for each node t of the changed cells.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from jeit.mesh import Mesh, centroids, check_flat, measures
 from jeit.mesh.checks import size_checked
 from jeit_solvers.engines import on_host
 
-# Maximum number of times that a cell is halved.
+# Maximum number of times that a cell of the mesh is halved.
 _MAX_ROUNDS = 12
-# Electrodes that remain valid if the mesh of the skin gets more nodes.
+# Classes of electrodes that remain valid if the mesh of the skin is refined.
 _MESH_INDEPENDENT = (BoundaryElectrodes, SheetDiscs, PointElectrodes, NodeElectrodes)
 
 
 def finer_model(
     model: ForwardModel, centre: np.ndarray, radius: float, edge: float
 ) -> tuple[ForwardModel, Int[np.ndarray, " m"], float]:
-    """Refine a model's mesh to edges of `edge` metres within `radius` metres of a `centre` (2,).
+    """Refine a model's mesh to edges of `edge` metres within `radius` metres of a `centre` (x, y).
 
-    Returns the model; the number of the original cell that contains each of its cells (m,); and the length of the edges
-    in the refined region, metres. Three-dimensional meshes, and meshes whose facets form the electrodes, are not
+    Returns the refined model; the index of the original cell that contains each refined cell; and the length of the
+    edges in the refined region, metres. Three-dimensional meshes, and meshes whose facets form the electrodes, are not
     refined.
     """
     mesh = model.mesh
@@ -59,9 +59,9 @@ def finer_model(
 
 @size_checked()
 def finer_mesh(mesh: Mesh, centre: np.ndarray, radius: float, area: float) -> tuple[Mesh, Int[np.ndarray, " m"]]:
-    """Refine a flat mesh so that cells within `radius` metres of a `centre` (2,) are no larger than `area`, m².
+    """Refine a flat mesh so that cells within `radius` metres of a `centre` (x, y) are no larger than `area`, m².
 
-    Returns the mesh, and the number of the original cell that contains each of its cells (m,).
+    Returns the refined mesh, and the index of the original cell that contains each refined cell.
     """
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     parent = np.arange(len(cells))
@@ -76,13 +76,13 @@ def finer_mesh(mesh: Mesh, centre: np.ndarray, radius: float, area: float) -> tu
 
 
 def _halve(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, is_large: Bool[np.ndarray, " m"]):
-    """Halve the cells that `is_large` (m,) marks, and others as needed to avoid hanging nodes. Returns points, cells
-    and parents."""
+    """Halve the cells that `is_large` marks, and further cells as needed to avoid hanging nodes. Returns the points,
+    the cells, and the index of each cell's original cell."""
     node_pairs = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
     edges, edge_numbers = np.unique(node_pairs.reshape(-1, 2), axis=0, return_inverse=True)
     edge_numbers = edge_numbers.reshape(-1, 3)
     lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
-    # If two edges of a cell are equally long, both neighbours must choose the same one.
+    # If two edges of a cell are equally long, all cells must choose the same edge as the longest.
     lengths = lengths * (1 + 1e-9 * np.arange(len(lengths)) / len(lengths))
     longest_edges = edge_numbers[np.arange(len(cells)), lengths[edge_numbers].argmax(axis=1)]
     is_split = np.zeros(len(edges), bool)
@@ -108,8 +108,8 @@ def _halve(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, is_large: 
     new_cells, new_parents = [rotated_cells[is_unchanged]], [parent[is_unchanged]]
     halves = ((second_node, third_node, new_nodes[:, 1]), (third_node, first_node, new_nodes[:, 2]))
     for corner, opposite, edge_midpoint in halves:
-        # A half is the triangle (corner, opposite, midpoint of the longest edge); its edge from corner to opposite may
-        # be halved too.
+        # Half of a cell is the triangle (corner, opposite, midpoint of the longest edge); its edge from corner to
+        # opposite may be halved too.
         is_halved = edge_midpoint >= 0
         longest_midpoint = new_nodes[:, 0]
         new_cells += [
@@ -121,17 +121,17 @@ def _halve(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, is_large: 
     return points, np.concatenate(new_cells), np.concatenate(new_parents)
 
 
-# Maximum number of nodes of a region.
+# Maximum number of mesh nodes of a region of changed conductivity.
 _MAX_NUM_NODES = 2500
 # Factor by which the radius of a region with too many nodes is reduced.
 _SHRINKAGE_FACTOR = 0.85
 
 
 class LocalChange:
-    """Voltages of a `model` whose conductivity changes only within about `radius` metres of a `centre` (2,).
+    """Voltages of a `model` whose conductivity changes only within about `radius` metres of a `centre` (x, y).
 
-    `conductivity` (m,): before the change, S/m (2-D: S). The attribute `cells` (c,) holds the numbers of the cells in
-    the region, whose conductivity may change.
+    `conductivity` (cells,): conductivity before the change, S/m (2-D: S). The attribute `cells` holds the indices of
+    the cells in the region, whose conductivity may change.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class LocalChange:
         region_numbers = np.full(mesh.num_points, -1)
         region_numbers[nodes] = np.arange(len(nodes))
         self.corners = region_numbers[corners[self.cells]]
-        self.gradients = np.asarray(gradients(mesh))[self.cells]  # (c, k, d)
+        self.gradients = np.asarray(gradients(mesh))[self.cells]  # (cells, nodes of a cell, coordinates)
         self.measures = np.asarray(measures(mesh))[self.cells]
         self.centres = np.asarray(centroids(mesh))[self.cells][:, :2]
         solved: SolvedSystem = on_host(evaluate(model, solved_system_of, conductivity))
@@ -158,14 +158,15 @@ class LocalChange:
         self.inverse = _inverse_between(matrix, nodes)
 
     def impedance(self, change: Float[np.ndarray, "c ..."]) -> Float[np.ndarray, "L L"]:
-        """Transfer impedance (L, L), ohms, after a change of conductivity: scalars (c,) or tensors (c, d, d)."""
+        """Transfer impedance matrix (electrodes, electrodes), ohms, after a `change` of the conductivity in the
+        region's cells: scalars (cells,) or tensors (cells, d, d) in d dimensions."""
         return self._impedance(self._solve_change(change)[1])
 
     def derivatives(
         self, change: Float[np.ndarray, "c ..."], directions: list[Float[np.ndarray, "c ..."]]
     ) -> tuple[Float[np.ndarray, "L L"], list[Float[np.ndarray, "L L"]]]:
-        """Transfer impedance (L, L), ohms, after a `change` of conductivity, and its derivatives (L, L) in the
-        directions `directions`."""
+        """Transfer impedance matrix (electrodes, electrodes), ohms, after a `change` of conductivity in the region, and
+        its derivatives along the changes in `directions`."""
         cells, product, solution = self._solve_change(change)
         fields: Any = unit_fields(solution, product, self.resistance)[0]  # pyright: ignore[reportArgumentType]
         node_fields = np.zeros((self.solution.shape[0], fields.shape[1]))
@@ -187,8 +188,8 @@ class LocalChange:
         return self._impedance(product), impedance_derivatives
 
     def _solve_change(self, change: np.ndarray):
-        """Solve for a change; returns the changed cells, Bᵀ(A + D)⁻¹B, and (A + D)⁻¹B at the nodes of these cells, in
-        order."""
+        """Solve the forward problem after a change of conductivity; returns the indices of the changed cells, Bᵀ(A +
+        D)⁻¹B, and (A + D)⁻¹B at the nodes of these cells, with the grounded matrix A, its change D and the loads B."""
         magnitudes = np.abs(change).reshape(len(change), -1).max(axis=1)
         cells = np.flatnonzero(magnitudes > 0)
         if not len(cells):
@@ -217,7 +218,8 @@ class LocalChange:
 
 
 def _inverse_between(matrix, nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t t"]:
-    """Inverse of a sparse symmetric matrix between some nodes: inverse of the Schur complement without the others."""
+    """Inverse of a sparse symmetric matrix, restricted to some nodes: inverse of the Schur complement without the other
+    nodes."""
     others = np.setdiff1d(np.arange(matrix.shape[0]), nodes)
     schur_complement = matrix[nodes][:, nodes].toarray()
     if len(others):

@@ -1,4 +1,4 @@
-"""`SkinHealth`: monitor a skin from frame to frame, to detect damage."""
+"""`SkinHealth`: monitor a skin from frame to frame, to detect damage and repairs."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from jeit.touch.health.finding import Finding, LastingChange, classify_change
 from jeit.touch.health.healthy import HealthyState, average_frames
 from jeit.touch.health.imaged_skin import ImagedSkin
 
-# Time that no touch is held for: seconds; number of windows if frames have no times.
+# Time longer than any touch is held (patience): seconds; number of windows if frames have no times.
 PATIENCE, _PATIENCE_WINDOWS = 30.0, 3
-# Ratio of the patience to the length of a window.
+# Ratio of the patience to the length of a window of frames.
 _PATIENCE_PER_WINDOW = 3.0
-# Weight of the latest window when the reference is updated, every quarter of a window.
+# Weight of the latest window in the update of the reference, every quarter of a window.
 _REFERENCE_WEIGHT = 0.1
-# Fraction of a change that must have disappeared for it to count as gone; minimum fraction of channels with a reading,
-# otherwise a frame is refused.
+# Fraction of a change that must have disappeared for the change to count as gone; minimum fraction of channels with a
+# reading, below which a frame is refused.
 _MIN_DISAPPEARED_FRACTION, _MIN_READ_FRACTION = 0.6, 0.5
-# Multiple of the span of healthy changes beyond which a channel does not measure the skin; maximum fraction of channels
-# that may be beyond it at once.
+# Multiple of the span of healthy changes beyond which a channel is faulty; maximum fraction of channels that may be
+# beyond this multiple at once.
 _SPAN_FACTOR, _MAX_OUTLIER_FRACTION = 3.0, 0.34
 
-# Appended to the reason of an event that the first window shows.
+# Appended to the reason of an event that is detected in the first window of frames.
 _FIRST_WINDOW_NOTE = (
     "The change is present from the first frame on: gains or contacts that changed since the healthy "
     "recording have the same effect."
@@ -51,7 +51,7 @@ _CHANNEL_KINDS = (EventKind.NOISY, EventKind.STUCK)
 
 
 class WatchStatus(StrEnum):
-    """How a frame was processed. Each member equals its string value."""
+    """How a frame of a monitored skin was processed. Each member equals its string value."""
 
     WATCHED = "watched"
     PARTIAL = "partial"
@@ -62,7 +62,7 @@ class WatchStatus(StrEnum):
 
 @dataclass(frozen=True)
 class _PendingChange:
-    """A change that looks like a touch, which is pending until it disappears or has lasted."""
+    """A change that looks like a touch; the change is pending until it disappears or has lasted."""
 
     change: LastingChange
     finding: Finding
@@ -72,19 +72,19 @@ class _PendingChange:
 class SkinHealth:
     """State of a monitored skin.
 
-    `health.follow(time, frame)` returns the state after the next frame; this one is not changed. Every quarter of a
-    window, the medians of two windows are compared. A step between them is a change of the skin if it is larger than
-    any step in the healthy frames, sharp, and lasting. A change unlike any healthy touch is reported at once. A change
-    that touches can make too may be a press that is held, and is reported when it has lasted for `patience` seconds.
-    The reference follows drift.
+    `health.follow(time, frame)` returns the state after the next frame; `health` is not changed. Every quarter of a
+    window of frames, the medians of the last two windows are compared. A step of the voltages between the windows is a
+    change of the skin if the step is larger than any in the healthy frames, sharp, and lasting. A change unlike any
+    healthy touch is reported at once. A change that touches can make too may be a held press, and is reported when it
+    has lasted for `patience` seconds. The reference voltages follow drift.
 
-    **Fields**: `healthy`: healthy state; `reference` (M,): voltages of the skin as it is now, untouched, volts;
-    `trusted` (M,): whether channels may be used; `patience`: time that no touch is held for, seconds; `skin`: model of
-    the skin, or None; `touching` (L, M): whether each channel uses each electrode, or None; `events`: events so far;
-    `time`: time of the last frame; `frames`: number of frames given; `status`: status of the last frame; `usable` (M,):
-    whether its channels are usable; `reason`: reason for the status, a sentence.
+    **Fields**: `healthy`: healthy state; `reference`: present voltages of the untouched skin, volts; `trusted`: whether
+    each channel may be used; `patience`: time longer than any touch is held, seconds; `skin`: model of the skin, or
+    None; `touching` (electrodes, channels): whether each channel uses each electrode, or None; `events`: events so far;
+    `time`: time of the last frame; `frames`: number of frames given; `status`: status of the last frame; `usable`:
+    whether each channel is usable in this frame; `reason`: a sentence that explains the status.
 
-    Create it with `SkinHealth.fit`.
+    Create a state with `SkinHealth.fit`.
 
     **Example:**
 
@@ -124,14 +124,13 @@ class SkinHealth:
         conductivity: ArrayLike | None = None,
         sign: int = 1,
     ) -> "SkinHealth":
-        """Learn the healthy state from a recording (F, M), volts or differences of volts, preferably with touches.
+        """Learn the healthy state from frames (frames, channels) of voltages or voltage changes, best with touches.
 
-        `times` (F,): seconds; without them, frames are counted. `patience`: time that no touch is held for, seconds
-        (frames), by default 30 s, or three windows. `protocol`: protocol of the channels, with which failing electrodes
-        are identified. `model`, `conductivity`, `sign`: forward model of the skin, its conductivity, S/m (2-D: S), and
-        1 if touched skin conducts better, -1 if it conducts worse; with these, cuts are located. Raises `ValueError`
-        for frames that are no recording of this skin, fewer than 20 frames, times that do not rise, and a patience that
-        is not positive.
+        `times`: times of the frames, seconds; if None, frames are counted. `patience`: time longer than any touch is
+        held, seconds (frames), by default 30 s, or three windows. `protocol`: measurement protocol, to identify failing
+        electrodes. `model`, `conductivity`, `sign`: forward model of the skin, its conductivity, S/m (2-D: S), and 1 if
+        touched skin conducts better, -1 if worse; with these, cuts are located. Raises `ValueError` for frames of
+        another skin, fewer than 20 frames, times that do not rise, and a patience that is not positive.
         """
         frames = _check_frames("healthy", healthy)
         period = 1.0
@@ -169,10 +168,10 @@ class SkinHealth:
         return cls(state, state.reference, state.used, wanted_patience, skin, touching)
 
     def follow(self, time: float, frame: ArrayLike) -> "SkinHealth":
-        """Return the state after a frame (M,) at `time`, seconds. NaN marks a channel without a reading.
+        """Return the state after a frame (channels,) at `time`, seconds; NaN marks a channel without a reading.
 
-        A frame is refused if it is not later than the last one, or if fewer than half of its channels have a reading;
-        then `status` and `reason` say so. Raises `ValueError` for an invalid time, and for another number of channels.
+        A frame is refused if its time is not after that of the last frame, or if fewer than half of its channels have a
+        reading; then `status` and `reason` say so. Raises `ValueError` for an invalid time or number of channels.
         """
         if not is_number(time):
             raise ValueError(f"time must be seconds; it is {describe(time)}.")
@@ -192,7 +191,7 @@ class SkinHealth:
         return replace(self, frames=self.frames + 1, status=WatchStatus.REFUSED, reason=reason, usable=no_channels)
 
     def confirm(self, event: HealthEvent) -> "SkinHealth":
-        """Return the state after the user has confirmed an event, which may be the one in `held`.
+        """Return the state after the user has confirmed an event; the event may be the pending event `held`.
 
         Raises `ValueError` for an event of another skin.
         """
@@ -203,9 +202,9 @@ class SkinHealth:
         return self._with_status(event, EventStatus.CONFIRMED)
 
     def deny(self, event: HealthEvent) -> "SkinHealth":
-        """Return the state after the user has denied an event, which was a press that is held, not damage.
+        """Return the state after the user has denied an event because it was a held press, not damage.
 
-        The reference is reset to what it was before the event. Raises `ValueError` for an event of another skin.
+        The reference voltages are reset to those before the event. Raises `ValueError` for an event of another skin.
         """
         if self._pending is not None and self.held is not None and event.number == self.held.number:
             return replace(self, _pending=None)
@@ -214,12 +213,11 @@ class SkinHealth:
         return replace(state, reference=reference, trusted=state._trusted_channels(), skin=state._current_skin())
 
     def repaired(self, frames: ArrayLike) -> "SkinHealth":
-        """Return the state after the user has repaired the skin; all open events become mended.
+        """Return the state after the user has repaired the skin; the status of all open events becomes "mended".
 
-        The median of the frames (n, M), volts, of the repaired, untouched skin is the new reference. Before the first
-        frame of a later day, untouched frames of that day replace the healthy reference likewise: what has changed
-        since, such as gains, is then no event. Raises `ValueError` for frames with another number of channels, or
-        without a reading in half of them.
+        The median of the `frames` of the repaired, untouched skin, volts, is the new reference. Before the first frame
+        of a later day, untouched frames of that day replace the reference likewise: changes since, such as of gains,
+        are then no event. Raises `ValueError` for another number of channels, or readings in fewer than half of them.
         """
         checked_frames = _check_frames("frames", np.atleast_2d(real_array("frames", frames, "(n, M) volts")))
         if checked_frames.shape[1] != self.reference.size:
@@ -258,10 +256,10 @@ class SkinHealth:
         )
 
     def images(self, frames: ArrayLike) -> Float[np.ndarray, "F m"]:
-        """Reconstruct changes of conductivity (F, m), S/m (2-D: S), from the skin as it is now, with all cuts.
+        """Reconstruct conductivity changes (frames, cells), S/m (2-D: S), relative to the present skin with its cuts.
 
-        Only trusted channels are used; a frame without a reading gives NaN. Raises `ValueError` without a model, and
-        for another number of channels.
+        Only trusted channels are used; the image of a frame without a reading is NaN. Raises `ValueError` without a
+        forward model, and for frames with another number of channels.
         """
         if self.skin is None:
             raise ValueError("images need a forward model: give model and conductivity to SkinHealth.fit.")
@@ -272,15 +270,14 @@ class SkinHealth:
 
     @property
     def held(self) -> HealthEvent | None:
-        """Pending event that may be a touch that is held, or damage, until time or the user decides; None without
-        one."""
+        """Pending event that may be a held touch or damage, until time or the user decides, or None."""
         if self._pending is None:
             return None
         return self._create_event(self._pending.change, self._pending.finding, EventStatus.HELD, len(self.events))
 
     @property
     def open_events(self) -> list[HealthEvent]:
-        """The events that still apply."""
+        """The events that still apply: neither denied nor mended, and no repairs."""
         return [event for event in self.events if event.open]
 
     def _process(self, time: float, values: np.ndarray, has_reading: np.ndarray) -> "SkinHealth":
@@ -290,7 +287,7 @@ class SkinHealth:
             healthy.used, healthy.noise, 0.0
         )
         is_outlier = has_reading & ((values < lower_limits - margins) | (values > upper_limits + margins))
-        # If many channels are beyond their span, the skin has changed; the channels are not faulty.
+        # If many channels are beyond their healthy span, the skin has changed; the channels are not faulty.
         is_outlier &= is_outlier.sum() <= _MAX_OUTLIER_FRACTION * healthy.used.sum()
         usable = has_reading & self.trusted & ~is_outlier
         num_lost = int((healthy.used & ~usable).sum())
@@ -313,7 +310,7 @@ class SkinHealth:
         return next_state._compare_windows() if next_state._steps % max(1, healthy.window // 4) == 0 else next_state
 
     def _compare_windows(self) -> "SkinHealth":
-        """Return the state after comparing the two windows."""
+        """Return the state after comparing the medians of the last two windows of frames."""
         healthy, num_steps = self.healthy, len(self._window)
         if num_steps < healthy.window:
             return self
@@ -323,7 +320,7 @@ class SkinHealth:
             return self._process_first_window(medians)
         next_state = self._update_pending(medians)
         if num_steps == 2 * healthy.window:
-            # Changes in channels that are not trusted belong to known events.
+            # Changes in untrusted channels belong to known events and are ignored.
             step = lasting_step(frames, np.where(next_state.trusted, healthy.scale, np.inf), healthy.limit)
             if step is not None:
                 return next_state._process_step(step, frames)
@@ -337,7 +334,7 @@ class SkinHealth:
         return next_state
 
     def _process_first_window(self, medians: np.ndarray) -> "SkinHealth":
-        """Return the state after the first window, which is compared with the healthy frames."""
+        """Return the state after comparing the first window of frames with the healthy frames."""
         healthy = self.healthy
         change = np.where(np.isfinite(medians), medians - healthy.reference, 0.0)
         # A uniform drift of conductivity, which scales all channels alike, is removed if it is small.
@@ -371,7 +368,7 @@ class SkinHealth:
         return replace(state, reference=healthy.reference)._add_events(change, findings, EventStatus.LASTING)
 
     def _update_pending(self, medians: np.ndarray) -> "SkinHealth":
-        """Return the state after checking whether the pending change has disappeared or has lasted."""
+        """Return the state after checking whether the pending change has disappeared or outlasted a touch."""
         pending = self._pending
         if pending is None:
             return self
@@ -389,13 +386,13 @@ class SkinHealth:
         )
 
     def _process_step(self, step: Step, frames: np.ndarray) -> "SkinHealth":
-        """Return the state after a lasting step."""
+        """Return the state after a lasting step of the voltages was found."""
         time, frame, _ = self._window[step.first]
         change = LastingChange(step.change, step.size, time, frame, self.time)
         next_state = replace(self, _window=self._window[step.first :])
         deviations = np.where(np.isfinite(step.change), channel_medians(frames[step.first :]) - self.reference, 0.0)
         scale = np.where(self.trusted, self.healthy.scale, np.inf)
-        if change_size(deviations / scale) <= self.healthy.limit:  # the skin is as it was before a touch
+        if change_size(deviations / scale) <= self.healthy.limit:  # the skin is as before a touch
             return next_state
         reversed_state = next_state._reverse_change(change)
         if reversed_state is not None:
@@ -430,7 +427,7 @@ class SkinHealth:
         return next_state if next_state is self else replace(next_state, trusted=next_state._trusted_channels())
 
     def _reverse_change(self, change: LastingChange) -> "SkinHealth | None":
-        """Return the state after a step that reverses an earlier change; None if it reverses none."""
+        """Return the state after a change that reverses the change of an earlier event; None without such an event."""
         for earlier_event in self.open_events:
             is_used = np.isfinite(earlier_event.change) & np.isfinite(change.vector) & self.trusted
             earlier_change = (earlier_event.change[is_used] / self.healthy.scale[is_used]).clip(-1e9, 1e9)
@@ -454,12 +451,12 @@ class SkinHealth:
         return None
 
     def _add_events(self, change: LastingChange, findings: list[Finding], status: EventStatus) -> "SkinHealth":
-        """Return the state with events added; from now on, the reference contains their change."""
+        """Return the state with events added, and with their change added to the reference voltages."""
         events = [
             self._create_event(change, finding, status, len(self.events) + index)
             for index, finding in enumerate(findings)
         ]
-        # If electrodes fail, the reference changes only in their channels: the skin may be touched at the time.
+        # If electrodes fail, the reference changes only in their channels, since the skin may be touched meanwhile.
         is_affected = np.logical_or.reduce(
             [np.ones_like(self.trusted) if finding.channels is None else finding.channels for finding in findings]
         )
@@ -494,7 +491,7 @@ class SkinHealth:
         )
 
     def _with_status(self, event: HealthEvent, status: EventStatus) -> "SkinHealth":
-        """Return the state with another status of an event. Raises `ValueError` for an event of another skin."""
+        """Return the state after setting the status of an event. Raises `ValueError` for an event of another skin."""
         check_kind("event", event, HealthEvent, "one of health.events, or health.held")
         if not event.number < len(self.events):
             raise ValueError(f"event {event.number} does not belong to this skin, which has {len(self.events)} events.")
@@ -505,12 +502,13 @@ class SkinHealth:
         return replace(self, events=tuple(events))
 
     def _current_skin(self) -> ImagedSkin | None:
-        """Return the model, without cuts if no open event is a cut."""
+        """Return the model of the skin, without cuts if no open event is a cut."""
         has_cut = any(event.path is not None for event in self.open_events)
         return self.skin if self.skin is None or has_cut else self.skin.without_cuts()
 
     def _trusted_channels(self) -> Bool[np.ndarray, " M"]:
-        """Whether each channel (M,) is trusted: it has readings, and no open event excludes it or its electrodes."""
+        """Whether each channel is trusted: the channel has readings, and no open event excludes it or its
+        electrodes."""
         trusted = self.healthy.used.copy()
         for event in self.open_events:
             if event.electrode is not None and self.touching is not None:
@@ -521,15 +519,15 @@ class SkinHealth:
 
 
 def watch(health: SkinHealth, frames: ArrayLike, times: ArrayLike | None = None) -> SkinHealth:
-    """Process a recording frame by frame, and return the state of the skin after it.
+    """Process a recording of a monitored skin frame by frame, and return the state of the skin after the last frame.
 
     **Arguments:**
 
-    - `health`: the monitored skin.
-    - `frames`: frames (F, M), volts.
-    - `times`: times (F,), seconds; by default, frames are counted.
+    - `health`: state of the monitored skin before the recording.
+    - `frames`: frames (frames, channels), volts.
+    - `times`: times of the frames, seconds; by default, frames are counted.
 
-    Raises `ValueError` as `SkinHealth.follow` does, and for a different number of times.
+    Raises `ValueError` as `SkinHealth.follow` does, and if the number of times is not that of frames.
 
     **Example:**
 

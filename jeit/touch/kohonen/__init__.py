@@ -1,6 +1,6 @@
-"""Kohonen's self-organising map: learnt from a skin's frames without a physical model, it estimates places of touches.
+"""Estimate places of touches by Kohonen's self-organising map, learnt from a skin's frames without a physical model.
 
-`jeit.touch.learnt` offers it as the method "som" of `jeit touch fit`.
+`jeit.touch.learnt` offers the map as the method "som" of `jeit touch fit`.
 """
 
 from __future__ import annotations

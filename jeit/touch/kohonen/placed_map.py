@@ -1,5 +1,5 @@
-"""A self-organising map whose neurons have places on a skin, or other values; a map's drawing as a graph; and files of
-maps, which contain only arrays."""
+"""A self-organising map whose neurons have places on a skin or other target values; the drawing of a map as a graph;
+and files of maps, which contain only arrays."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from jeit.arguments.extras import optional
 from jeit.files import need, npz_arrays, written_whole
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
-# Number of neurons from which a place is estimated, and regularisation of their shares, relative to the mean square of
-# the differences of their frames: first for the neurons nearest to the frame, then for the 5 by 5 neurons on the grid
-# around the nearest one.
+# Number of neurons from which the place of a frame is estimated, and regularisation of the neurons' shares, relative to
+# the mean square deviation of the neurons' frames from their mean: first for the neurons nearest to the frame, then for
+# the 5 by 5 neurons on the grid around the nearest neuron.
 _NUM_NEAREST, _REGULARISATION = 9, 0.05
 _NUM_ON_GRID, _REGULARISATION_ON_GRID = 25, 0.005
-# Weight of the mean place of a neuron's presses in the fit of its place, relative to that of one press.
+# Weight of the mean place of a neuron's presses in the least-squares fit of the neuron's place, relative to one press.
 _MEAN_WEIGHT = 0.3
 _MIN_PRESSES = 10
-# Fields of a `PlacedMap` that a file contains, besides its map.
+# Fields of a `PlacedMap` that its file contains in addition to the map.
 _PLACE_FIELDS = "places", "widening", "missed", "fitted"
 # Number of frames that are located at once.
 _CHUNK_SIZE = 512
@@ -36,17 +36,19 @@ _CHUNK_SIZE = 512
 
 @dataclass(frozen=True)
 class PlacedMap:
-    """A self-organising map whose neurons have places, created by `PlacedMap.learn`.
+    """A self-organising map whose neurons have places on a skin, created by `PlacedMap.learn`.
 
     **Fields**
 
     - `learnt`: the map.
-    - `places` (R, C, d): mean place of the presses that each neuron won, metres, NaN if it won none.
-    - `widening`: root mean square error of held-out presses, divided by the estimated spread.
-    - `missed`: root mean square residual of a channel if presses are approximated by the neurons nearest to them, in
-      the unit of frames.
-    - `fitted` (R, C, d): places that fit the presses best, metres, if neighbours on the grid locate a frame; None if
-      the neurons nearest to the frame locate it, by `places`.
+    - `places` (rows, columns, coordinates): mean place of the presses whose frames are nearest to each neuron, metres;
+      NaN without such presses.
+    - `widening`: root mean square error of the places of held-out presses, divided by that of the estimated spread.
+    - `missed`: root mean square residual of a channel if the frames of presses are approximated by combinations of
+      their nearest neurons, in the unit of frames.
+    - `fitted` (rows, columns, coordinates): neurons' places by least squares over the presses, metres, used if a frame
+      is located by neighbours on the grid; None if a frame is located by the neurons with the nearest frames and their
+      `places`.
 
     **Example:**
 
@@ -64,12 +66,13 @@ class PlacedMap:
 
     @classmethod
     def learn(cls, learnt: SelfOrganisingMap, frames: ArrayLike, positions: ArrayLike) -> "PlacedMap":
-        """Learn places of a map's neurons from presses: frames (N, M) and their `positions` (N, d), metres.
+        """Learn places of a map's neurons from the frames of presses (presses, channels) and their `positions`, metres.
 
         The frames may be those that the map was learnt from, or others. With few presses, a frame is located best by
-        the neurons nearest to it; with many, by neighbours on the grid, whose places are fitted by least squares. The
-        choice is the one with less error on held-out presses. Raises `ValueError` if `learnt` is no map, for fewer than
-        ten presses, and for positions that are not finite, not one for each frame, or all the same.
+        the neurons with the nearest frames; with many presses, by neighbours of the nearest neuron on the grid, whose
+        places are fitted by least squares. The method with the smaller error on held-out presses is chosen. Raises
+        `ValueError` if `learnt` is no map, for fewer than ten presses, and for positions that are not finite, not one
+        for each frame, or all the same.
         """
         check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")
         frames = learnt.checked(frames)
@@ -108,9 +111,9 @@ class PlacedMap:
 
     @classmethod
     def _from_presses(cls, learnt, frames, positions, winners, is_fitted: bool) -> "PlacedMap":
-        """Create a map with places from presses and their winners (N,).
+        """Create a map with places from the frames, positions and nearest neurons (`winners`) of presses.
 
-        Its standard deviations are not yet calibrated.
+        The standard deviations of the map's estimates are not yet calibrated.
         """
         num_neurons = learnt.shape[0] * learnt.shape[1]
         win_counts = np.bincount(winners, minlength=num_neurons)[:, None]
@@ -135,18 +138,19 @@ class PlacedMap:
 
     @property
     def placed(self) -> Bool[np.ndarray, "R C"]:
-        """Whether each neuron has a place (R, C)."""
+        """Whether each neuron of the grid (rows, columns) has a place on the skin."""
         return np.isfinite(self.places[..., 0])
 
     def locate(self, frames: ArrayLike) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-        """Estimate the places (n, d) of frames (n, M), or one frame (M,), and their standard deviations (n, d), metres.
+        """Estimate the places of touches from frames (frames, channels), and the standard deviations of the places,
+        metres.
 
         A frame is approximated by a combination of the frames of several neurons, with shares of sum 1 by least squares
-        (Roweis and Saul 2000). The place is the combination of the neurons' places with the same shares. The neurons
-        are those whose frames are nearest to the given frame; or, if there are `fitted` places, the nearest neuron and
-        those around it on the grid. The place is limited to the distance of the farthest of the neurons' places from
-        their mean, or, on the grid, from the place of the nearest neuron. Raises `ValueError` for
-        frames with another number of channels, and NaN.
+        (Roweis and Saul 2000). The touch's place is the combination of the neurons' places with the same shares. The
+        neurons are those whose frames are nearest to the given frame; or, if there are `fitted` places, the nearest
+        neuron and its neighbours on the grid. The place's distance from the mean of the neurons' places, or, on the
+        grid, from the place of the nearest neuron, is limited to that of the farthest neuron's place. Raises
+        `ValueError` for frames with another number of channels than the map, and for NaN.
         """
         placed = self._estimate_places(self.learnt.checked(frames))
         return placed.places, self.widening * placed.spread
@@ -162,10 +166,10 @@ class PlacedMap:
         return _Estimate(places, np.sqrt(np.mean((neuron_places - places[:, None]) ** 2, axis=1)), residuals)
 
     def _locating_neurons(self, frames: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the neurons that locate frames.
+        """Find the neurons from which frames are located, and their shares in the frames.
 
-        Returns their indices (n, q) among the neurons with places, their shares (n, q), and the residuals of the frames
-        (n, M).
+        Returns the indices of these neurons among the neurons with places, and their shares, both (frames, neurons),
+        and the residuals of the frames (frames, channels).
         """
         placed_neurons = self._placed_neurons
         if self.fitted is None:
@@ -187,23 +191,24 @@ class PlacedMap:
         return neurons, shares, residuals
 
     def predict(self, features: ArrayLike) -> Float[np.ndarray, "n d"]:
-        """Predict only the places (n, d) of `locate`, in the interface of scikit-learn's estimators."""
+        """Estimate the places of touches as `locate` does, without standard deviations, in the interface of
+        scikit-learn."""
         return self.locate(features)[0]
 
     @cached_property
     def _placed_neurons(self) -> "_PlacedNeurons":
         neurons = SelfOrganisingMap(self.learnt.weights[self.placed][None], self.learnt.scale)
         places, grid = (self.places if self.fitted is None else self.fitted)[self.placed], np.argwhere(self.placed)
-        # Sorted by the larger of the distances in rows and columns: the first is the neuron itself.
+        # Neighbours are sorted by the larger of the distances in rows and columns; the first is the neuron itself.
         grid_neighbours = KDTree(grid).query(grid, min(_NUM_ON_GRID, len(grid)), p=np.inf)[1].reshape(len(grid), -1)
         return _PlacedNeurons(neurons, places, grid_neighbours)
 
 
 class _PlacedNeurons(NamedTuple):
-    """The neurons that have a place, as a map of one row.
+    """The neurons of a map that have a place, as a map of one row.
 
-    `places` (k, d): the places that estimates use; `grid_neighbours` (k, q): indices of the neurons around each on the
-    grid.
+    `places` (neurons, coordinates): the neurons' places for estimates, metres; `grid_neighbours` (neurons, neighbours):
+    indices of the neurons around each neuron on the grid.
     """
 
     neurons: SelfOrganisingMap
@@ -212,10 +217,10 @@ class _PlacedNeurons(NamedTuple):
 
 
 class _Estimate(NamedTuple):
-    """Estimated places (n, d), metres.
+    """Estimated places of touches (frames, coordinates), metres.
 
-    `spread` (n, d): standard deviations of the neurons' places around them; `residuals` (n, M): residuals of the
-    frames.
+    `spread` (frames, coordinates): standard deviations of the neurons' places around an estimated place; `residuals`
+    (frames, channels): residuals of the frames.
     """
 
     places: Float[np.ndarray, "n d"]
@@ -226,15 +231,16 @@ class _Estimate(NamedTuple):
 def _fit_combination_shares(
     neuron_frames: Float[np.ndarray, "n q M"], frames: Float[np.ndarray, "n M"], regularisation: float
 ):
-    """Compute shares (n, q) of sum 1 whose combinations of the neurons' frames are nearest to the given frames.
+    """Compute the shares of neurons (frames, neurons), of sum 1, by which their frames combine to approximate given
+    frames.
 
-    Also returns the residuals (n, M).
+    Also returns the residuals of the given frames (frames, channels).
     """
     num_neurons = neuron_frames.shape[1]
     mean_frames = neuron_frames.mean(axis=1, keepdims=True)
     deviations = neuron_frames - mean_frames
     gram = deviations @ np.swapaxes(deviations, 1, 2)
-    diagonal = np.einsum("nqq->nq", gram)  # a view of `gram`
+    diagonal = np.einsum("nqq->nq", gram)  # a view of the diagonal of `gram`
     diagonal += regularisation * diagonal.mean(axis=1, keepdims=True) + 1e-300
     change = frames - mean_frames[:, 0]
     shares = np.linalg.solve(gram, deviations @ change[..., None])
@@ -242,16 +248,18 @@ def _fit_combination_shares(
     return shares[..., 0] + (1 - shares.sum(axis=1)) / num_neurons, residuals
 
 
-# Number of iterations; minimum distance of neighbours' frames, relative to the median, for the strength of a spring.
+# Number of iterations of the spring layout; minimum distance between the frames of neighbours, relative to the median,
+# in the strength of a spring.
 _NUM_ITERATIONS, _MIN_RELATIVE_DISTANCE = 60, 1e-2
 
 
 def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2"]:
-    """Draw a map as a graph: places (R, C, 2) of its neurons, from -1 to 1, by springs (Fruchterman and Reingold 1991).
+    """Compute a drawing of a map as a graph by a spring layout (Fruchterman and Reingold 1991).
 
-    Each neuron is tied to its four neighbours on the grid, more strongly if their frames are more similar; all neurons
-    repel each other. The initial places are those on the grid, shifted slightly at random by `key`; the orientation of
-    the drawing has no meaning. Raises `ValueError` if `learnt` is no map, and for an invalid key.
+    Returns places (rows, columns, 2) of the neurons in the drawing, from -1 to 1. Each neuron is tied to its four
+    neighbours on the grid, more strongly if their frames are more similar; all neurons repel each other. The initial
+    places are those on the grid, shifted slightly at random by `key`; the orientation of the drawing has no meaning.
+    Raises `ValueError` if `learnt` is no map, and for an invalid key.
     """
     networkx = optional("networkx", "a map drawn as a graph")
     import jax
@@ -275,14 +283,14 @@ def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2
 
 
 def neighbours(shape: tuple[int, int]) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " e"]]:
-    """Return the indices of the neurons at both ends of every edge of a grid of this shape, counted row by row."""
+    """Return the indices, counted row by row, of the neurons at both ends of every edge of a grid of this shape."""
     indices = np.arange(shape[0] * shape[1]).reshape(shape)
     first_ends = np.concatenate([indices[:-1].ravel(), indices[:, :-1].ravel()])
     return first_ends, np.concatenate([indices[1:].ravel(), indices[:, 1:].ravel()])
 
 
 def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
-    """Write a map to an NPZ file: its `weights` and `scale`, and the places of a `PlacedMap`.
+    """Write a self-organising map to an NPZ file: its `weights` and `scale`, and the places of a `PlacedMap`.
 
     **Arguments:**
 
@@ -310,13 +318,13 @@ def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
 
 
 def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:
-    """Read a map from a file that `write_map` wrote.
+    """Read a self-organising map from a file that `write_map` wrote.
 
     **Arguments:**
 
     - `path`: path of the file.
 
-    Raises `FileNotFoundError` if there is no such file, and `ValueError` for a file that holds no map.
+    Raises `FileNotFoundError` if the file does not exist, and `ValueError` if the file contains no map.
 
     **Example:**
 

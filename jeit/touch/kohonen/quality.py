@@ -1,4 +1,4 @@
-"""Quality of a self-organising map: quantisation and topographic errors, and how fast its weights converge."""
+"""Quality of a self-organising map: quantisation and topographic errors, and how fast the map's weights converge."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from jeit.arguments.extras import optional
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap, checked_frames, learn_weights
 from jeit.touch.kohonen.training import MapSchedule
 
-# Maximum number of frames of which all pairs are compared; number of neighbours of each frame.
+# For trustworthiness: maximum number of frames of which all pairs are compared; number of neighbours of each frame.
 _MAX_COMPARED_FRAMES, _NUM_NEIGHBOURS = 2000, 12
 
 
 @dataclass(frozen=True)
 class MapQuality:
-    """Measures of how well a map preserves the order of frames.
+    """Measures of how well a self-organising map preserves the neighbourhoods of frames.
 
-    `quantisation_error`: mean distance of frames from their winners, in the unit of frames; `topographic_error`: share
-    of the frames whose two nearest neurons are not neighbours on the grid, where each neuron has eight neighbours
-    (Kiviluoto 1996); `trustworthiness`: 1 if all neighbours on the map are neighbours among the frames
-    (Venna and Kaski 2001).
+    `quantisation_error`: mean distance of frames from their nearest neurons, in the unit of frames;
+    `topographic_error`: share of the frames whose two nearest neurons are not neighbours on the grid, where each neuron
+    has eight neighbours (Kiviluoto 1996); `trustworthiness`: 1 if all frames that are neighbours on the map are
+    neighbours by the distance between frames (Venna and Kaski 2001).
     """
 
     quantisation_error: float
@@ -34,16 +34,17 @@ class MapQuality:
 
 
 def map_quality(learnt: SelfOrganisingMap, frames: ArrayLike) -> MapQuality:
-    """Compute the quality of a self-organising map.
+    """Compute the quantisation error, the topographic error and the trustworthiness of a self-organising map.
 
-    Trustworthiness is computed for at most 2,000 evenly spaced frames, with 12 neighbours of each.
+    Trustworthiness is computed for at most 2,000 evenly spaced frames, with 12 neighbours of each frame.
 
     **Arguments:**
 
-    - `learnt`: the map.
-    - `frames`: frames (n, M), those it was learnt from or others, in their unit.
+    - `learnt`: the self-organising map.
+    - `frames`: frames (frames, channels), those that the map was learnt from, or others in the same unit.
 
-    Raises `ValueError` if `learnt` is no map, and for fewer than 25 frames, another number of channels, and NaN.
+    Raises `ValueError` if `learnt` is no map, and for fewer than 25 frames, frames with another number of channels than
+    the map, and NaN.
 
     **Example:**
 
@@ -75,10 +76,10 @@ def learning_curves(
     steps: int = 10_000,
     shape: tuple[int, int] = (32, 32),
 ) -> Float[np.ndarray, "r T"]:
-    """Compute the mean of all weights after each of T `steps`, for each of the `rates` ε: (r, T), in the unit of
-    frames.
+    """Compute how the mean weight of self-organising maps changes in training, for several constant learning rates.
 
-    `frames`: (N, M). Initial weights are small. The rates are constant, and so is the radius, half the map's longer
+    Returns the mean of all weights after each training step (rates, steps), in the unit of frames. `frames`: (frames,
+    channels). The initial weights of the maps are small. The neighbourhood radius is constant, half the map's longer
     side. Raises `ValueError` as `SelfOrganisingMap.fit` does.
     """
     radius = max(shape) / 2
@@ -87,10 +88,10 @@ def learning_curves(
 
 
 def time_constant(curve: ArrayLike) -> float:
-    """Number of steps after which a curve (T,) has risen from zero to 1 − 1/e of its final value.
+    """Number of steps after which a learning curve (steps,) has risen from zero to 1 − 1/e of its final value.
 
-    The final value is the mean of the last tenth. Raises `ValueError` for a curve that is not (T,), not finite, or
-    shorter than ten steps.
+    The final value is the mean of the last tenth of the curve. Raises `ValueError` for a curve that is not
+    one-dimensional, not finite, or shorter than ten steps.
     """
     values = real_array("curve", curve, "the means (T,) of a map's weights")
     if values.ndim != 1 or len(values) < 10 or not np.isfinite(values).all():

@@ -1,4 +1,5 @@
-"""`SelfOrganisingMap`: neurons on a grid, each with its own frame, such that neighbours have similar frames."""
+"""`SelfOrganisingMap`: neurons on a grid, each with its own frame of voltages, such that neighbours have similar
+frames."""
 
 from __future__ import annotations
 
@@ -15,11 +16,11 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_key, check_kind, counted, describe, is_number, real_array
 from jeit.touch.kohonen.training import MapSchedule, train
 
-# Minimum number of frames: fewer define no order.
+# Minimum number of frames from which a map is learnt: fewer frames define no order.
 _MIN_FRAMES = 3
-# Standard deviation of the initial weights, relative to the frames' root mean square.
+# Standard deviation of a map's initial weights, relative to the frames' root mean square.
 _INITIAL_DEVIATION = 1e-3
-# Radius, in grid steps, at which only the winner moves: for its neighbours, exp(−1/2ρ²) underflows.
+# Neighbourhood radius ρ, in grid steps, at which only the winner moves: for its neighbours, exp(−1/2ρ²) underflows.
 _WINNER_ONLY_RADIUS = 0.01
 # Number of frames whose distances to all neurons are computed at once.
 _CHUNK_SIZE = 1024
@@ -27,10 +28,10 @@ _CHUNK_SIZE = 1024
 
 @dataclass(frozen=True)
 class SelfOrganisingMap:
-    """Kohonen's map of frames with M channels, created by `SelfOrganisingMap.fit`.
+    """Kohonen's self-organising map of frames, created by `SelfOrganisingMap.fit`.
 
-    **Fields**: `weights` (R, C, M): the frame of every neuron on a grid of R rows and C columns, in the unit of frames;
-    `scale`: distance between a frame and a neuron at which the neuron's activity is 1/2, in the same unit.
+    **Fields**: `weights` (rows, columns, channels): the frame of every neuron on a grid, in the unit of frames;
+    `scale`: distance between a frame and a neuron's frame at which the neuron's activity is 1/2, in the same unit.
 
     **Example:**
 
@@ -44,8 +45,8 @@ class SelfOrganisingMap:
     scale: float
 
     def __post_init__(self):
-        """Raises `ValueError` for weights that are not finite or not (R, C, M), and for a scale that is not
-        positive."""
+        """Raises `ValueError` for weights that are not finite or not (rows, columns, channels), and for a scale that is
+        not positive."""
         weights = real_array("weights", self.weights, "an array (R, C, M), a frame for every neuron")
         if weights.ndim != 3 or not weights.size or not np.isfinite(weights).all():
             raise ValueError(f"weights must be finite, (R, C, M), a frame for every neuron; they are {weights.shape}.")
@@ -62,49 +63,51 @@ class SelfOrganisingMap:
         schedule: MapSchedule | None = None,
         scale: float | None = None,
     ) -> "SelfOrganisingMap":
-        """Train a map on frames (N, M): voltages or changes of voltage, all in one unit.
+        """Train a map on frames (frames, channels) of voltages or voltage changes, all in one unit.
 
         `key` (`jax.random.key`): determines the initial weights, which are small and random, and the order of the
-        frames: all are shown once, then again in another order, until the `schedule` ends. `shape`: rows and columns.
-        `scale`: by default the median distance of the frames from their winners. Raises `ValueError` for frames that
-        are not numbers, contain NaN, are fewer than three or all the same, and for an invalid key, shape, schedule or
-        scale.
+        frames: all frames are shown once, then again in another order, until the `schedule` ends. `shape`: rows and
+        columns of the grid. `scale`: see the field of this name; by default the median distance of the frames from
+        their nearest neurons. Raises `ValueError` for frames that are not numbers, contain NaN, are fewer than three or
+        all the same, and for an invalid key, shape, schedule or scale.
         """
         schedule = MapSchedule() if schedule is None else schedule
         return fit_maps(frames, [key], shape=shape, schedules=[schedule], scale=scale)[0]
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Numbers of rows and columns of the grid of neurons."""
         return self.weights.shape[0], self.weights.shape[1]
 
     def distances(self, frames: ArrayLike) -> Float[np.ndarray, "n R C"]:
-        """Compute the Euclidean distances (n, R, C) of frames (n, M), or one frame (M,), from every neuron.
+        """Compute the Euclidean distances (frames, rows, columns) of frames (frames, channels) from every neuron's
+        frame.
 
-        Distances are in the unit of frames. Raises `ValueError` for frames with another number of channels, and NaN.
+        Distances are in the unit of the frames. Raises `ValueError` for frames with another number of channels than the
+        map, and for NaN.
         """
         return np.sqrt(self._squared_distances(self.checked(frames))).reshape(-1, *self.shape)
 
     def activity(self, frames: ArrayLike) -> Float[np.ndarray, "n R C"]:
-        """Compute the activity (n, R, C) of every neuron for frames (n, M), or one frame (M,).
+        """Compute the activity (frames, rows, columns) of every neuron for frames (frames, channels).
 
-        The activity is 1 / (1 + distance / scale), which is 1 if the frame is the neuron's own. Raises as `distances`
-        does.
+        The activity is 1 / (1 + distance / scale), which is 1 if the given frame is the neuron's own frame. Raises
+        `ValueError` as `distances` does.
         """
         return 1 / (1 + self.distances(frames) / self.scale)
 
     def winners(self, frames: ArrayLike) -> Int[np.ndarray, "n 2"]:
-        """Find the row and the column (n, 2) of the neuron nearest to each of the frames (n, M), or to one frame (M,).
+        """Find the row and the column on the grid of the neuron nearest to each frame (frames, channels), its winner.
 
-        Raises as `distances` does.
+        Raises `ValueError` as `distances` does.
         """
         nearest = self._squared_distances(self.checked(frames)).argmin(axis=1)
         return np.stack(np.unravel_index(nearest, self.shape), axis=1)
 
     def nearest(self, frames: Float[np.ndarray, "n M"], count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Find the `count` neurons nearest to each of the frames (n, M), which must be checked, the nearest first.
+        """Find the `count` neurons nearest to each frame, the nearest first; frames must be checked before.
 
-        Returns their indices (n, count), counted row by row of the grid, and their distances (n, count).
+        Returns the indices of the neurons, counted row by row of the grid, and their distances, both (frames, count).
         """
         squared_distances = self._squared_distances(frames)
         candidates = np.argpartition(squared_distances, count - 1, axis=1)[:, :count]
@@ -115,12 +118,13 @@ class SelfOrganisingMap:
         )
 
     def checked(self, frames: ArrayLike) -> Float[np.ndarray, "n M"]:
-        """Convert frames to an array (n, M). Raises `ValueError` for other shapes, and NaN."""
+        """Convert frames to an array (frames, channels). Raises `ValueError` for frames of another shape, and for
+        NaN."""
         return checked_frames(frames, self.weights.shape[2])
 
     def _squared_distances(self, frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n k"]:
-        """Compute squared distances (n, k) as |w − m|² − 2 (w − m)·(x − m) + |x − m|², with m the mean of the
-        weights."""
+        """Compute squared distances of frames x from weights w as |w − m|² − 2 (w − m)·(x − m) + |x − m|², with the
+        mean weights m."""
         mean_weights, weights, squares = self._centred_weights
         distances = np.empty((len(frames), len(weights)))
         for start in range(0, len(frames), _CHUNK_SIZE):
@@ -149,8 +153,8 @@ def fit_maps(
 ) -> list[SelfOrganisingMap]:
     """Train several maps on the same frames at once, one for each pair of a key and a schedule.
 
-    The maps of the first key come first. All schedules must show the same number of frames. The other arguments, and
-    what is raised, are as in `SelfOrganisingMap.fit`.
+    The maps of the first key come first in the list. All schedules must show the same number of frames. The other
+    arguments, and the errors raised, are as in `SelfOrganisingMap.fit`.
     """
     frames = checked_frames(frames)
     weights, _ = learn_weights(frames, keys, shape, schedules)
@@ -163,7 +167,8 @@ def learn_weights(
     shape: tuple[int, int],
     schedules: Sequence[MapSchedule],
 ) -> tuple[Float[np.ndarray, "k R C M"], Float[np.ndarray, "k T"]]:
-    """Train the weights of the maps of `fit_maps`; also returns the mean of their weights after each frame.
+    """Train the weights of several maps, as for `fit_maps`; also returns the mean of each map's weights after each
+    frame.
 
     Raises `ValueError` as `fit_maps` does.
     """
@@ -189,9 +194,9 @@ def learn_weights(
 
 
 def checked_frames(values, num_channels: int | None = None) -> Float[np.ndarray, "n M"]:
-    """Convert frames (n, M), or one frame (M,), to an array (n, M).
+    """Convert frames, or one frame (channels,), to an array (frames, channels).
 
-    Raises `ValueError` for other shapes, for another number of channels than `num_channels`, and for NaN.
+    Raises `ValueError` for frames of another shape, for another number of channels than `num_channels`, and for NaN.
     """
     frames = real_array("frames", values, "numbers (n, channels)")
     frames = frames[None] if frames.ndim == 1 else frames
@@ -209,9 +214,9 @@ def checked_frames(values, num_channels: int | None = None) -> Float[np.ndarray,
 
 
 def _extend_radii(radii: Float[np.ndarray, " O"], max_ordering: int) -> Float[np.ndarray, " L"]:
-    """Extend radii to the length of the longest ordering phase of several schedules.
+    """Extend the radii of a map's ordering phase to the longest ordering phase of several schedules.
 
-    The added radii, which belong to the tuning phase, are almost 0.
+    The added radii, which belong to the map's tuning phase, are almost 0.
     """
     return np.concatenate([radii, np.full(max_ordering - len(radii), _WINNER_ONLY_RADIUS)])
 
@@ -221,7 +226,8 @@ def _train_single_map(initial_weights, frames, orders, rates, radii):
 
 
 def _create_map(weights: np.ndarray, frames: np.ndarray, scale: float | None) -> SelfOrganisingMap:
-    """Create a map; without a `scale`, it is the median distance of the frames from their winners."""
+    """Create a map from weights; if `scale` is None, the scale is the median distance of the frames from their nearest
+    neurons."""
     fitted_map = SelfOrganisingMap(weights, 1.0 if scale is None else scale)
     if scale is not None:
         return fitted_map
@@ -230,13 +236,13 @@ def _create_map(weights: np.ndarray, frames: np.ndarray, scale: float | None) ->
 
 
 def _draw_initial_weights(frames: np.ndarray, key: Array, shape: tuple[int, int]) -> Float[np.ndarray, "R C M"]:
-    """Draw the initial weights, which are small and random."""
+    """Draw small random numbers as the initial weights of a map."""
     deviation = _INITIAL_DEVIATION * float(np.sqrt(np.mean(frames**2)))
     return deviation * np.asarray(jax.random.normal(key, (*shape, frames.shape[1])))
 
 
 def _draw_order(key: Array, num_frames: int, num_steps: int) -> Int[np.ndarray, " T"]:
-    """Draw the order of `num_frames` frames for `num_steps` steps: a new permutation each time that all have been
+    """Draw the order in which frames are shown in training: a new permutation each time that all frames have been
     shown."""
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     permutations = [random.permutation(num_frames) for _ in range(-(-num_steps // num_frames))]

@@ -1,4 +1,4 @@
-"""Detect several simultaneous touches with a map that was learnt from single touches."""
+"""Detect several simultaneous touches with a self-organising map that was learnt from single touches."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, describe, is_number, real_array
 from jeit.touch.kohonen.placed_map import PlacedMap
 
-# Minimum strength of a touch, relative to the strongest; minimum distance between touches, relative to the extent of
-# the map's places.
+# Minimum strength of a touch, relative to the strongest touch; minimum distance between touches, relative to the extent
+# of the places of a map's neurons.
 _MIN_STRENGTH, _RELATIVE_SEPARATION = 0.08, 0.1
-# Minimum decrease of the residual sum of squares for each further touch, in residual variances; maximum number of
-# touches.
+# Minimum decrease of the residual sum of squares by each further touch, in variances of the map's residual; maximum
+# number of touches in a frame.
 _MIN_RESIDUAL_DECREASE, _MAX_TOUCHES = 25.0, 6
 
 
 @dataclass(frozen=True)
 class MapTouch:
-    """One of several simultaneous touches.
+    """One of several simultaneous touches, as detected by a self-organising map.
 
-    `place` (d,), metres; `spread`: root mean square distance of its neurons from the place, metres; `strength`: 1 for a
-    touch like those in the training set.
+    `place`: coordinates, metres; `spread`: root mean square distance of the touch's neurons from the place, metres;
+    `strength`: sum of the neurons' shares, 1 for a touch like those in the training set.
     """
 
     place: Float[np.ndarray, " d"]
@@ -33,12 +33,13 @@ class MapTouch:
 
 
 def neuron_shares(placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "R C"]:
-    """Explain a frame (M,) as a sum of touches: the share of each neuron's touch (R, C), by non-negative least squares.
+    """Compute the share (rows, columns) of each neuron of a map in a frame by non-negative least squares.
 
-    The changes of the neurons from the `reference` (M,), the frame of the untouched skin, times their shares,
-    approximate the change of the frame; neurons without a place have share 0. Changes of small touches add up, and
-    touches have one sign, so few of the non-negative shares are needed (Lawson and Hanson 1974). Raises `ValueError` if
-    `placed` is no map with places, and for more than one frame, another number of channels, and NaN.
+    The frame's change from the `reference`, the frame of the untouched skin, is approximated by the sum of the changes
+    of the neurons' frames from the reference, times their shares; neurons without a place have share 0. Changes of
+    small touches add up, and touches have one sign, so few of the non-negative shares differ from 0 (Lawson and Hanson
+    1974). Raises `ValueError` if `placed` is no map with places, and for more than one frame, another number of
+    channels than the map, and NaN.
     """
     touch_sum = _TouchSum.from_frame(placed, frame, reference)
     shares = np.zeros(placed.learnt.shape)
@@ -57,15 +58,18 @@ def touches_reported(
     """Detect the touches in a frame by a self-organising map: at most six, the strongest first.
 
     Neurons with a share in the frame (`neuron_shares`) are grouped into possible touches. Touches are added one after
-    another, as long as the unexplained change decreases by five standard deviations of the map's own residual.
+    another, as long as each touch reduces the residual sum of squares by the square of five standard deviations of the
+    map's own residual.
 
     **Arguments:**
 
-    - `placed`: the map, with places.
-    - `frame`: the frame (M,), in the unit of the frames it was learnt from.
-    - `reference`: frame (M,) of the untouched skin, in the same unit.
-    - `least`: touches weaker than this fraction of the strongest touch, or of a touch in the training set, are omitted.
-    - `apart`: distance that separates groups, metres; by default a tenth of the extent of all places.
+    - `placed`: the self-organising map, with places.
+    - `frame`: the frame (channels,), in the unit of the frames that the map was learnt from.
+    - `reference`: frame (channels,) of the untouched skin, in the unit of the `frame`.
+    - `least`: touches weaker than this fraction of the strongest touch, or of a touch in the training set, are left
+      out.
+    - `apart`: minimum distance between groups of neurons, metres; by default a tenth of the extent of the neurons'
+      places.
 
     Raises `ValueError` as `neuron_shares` does, and for an invalid `least` or `apart`.
 
@@ -101,10 +105,10 @@ def touches_reported(
 
 @dataclass(frozen=True)
 class _TouchSum:
-    """Model of the `change` (M,) of a frame as a sum of the `changes` (k, M) of neurons at `places` (k, d).
+    """Model of the voltage `change` of a frame as a weighted sum of the `changes` of neurons at `places`.
 
-    Changes are divided by the root mean square of the neurons' changes; `variance`: residual variance of a channel, in
-    the square of this unit.
+    `change` (channels,) and `changes` (neurons, channels) are divided by the root mean square of the neurons' changes;
+    `variance`: residual variance of a channel, in the square of the same unit; `places` in metres.
     """
 
     change: Float[np.ndarray, " M"]
@@ -126,7 +130,7 @@ class _TouchSum:
         )
 
     def fit_shares(self, neurons: Bool[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], float]:
-        """Fit the shares (k,) of the neurons `neurons`; also returns the residual sum of squares."""
+        """Fit the shares of the selected `neurons` in the frame; also returns the residual sum of squares."""
         from scipy.optimize import nnls
 
         shares = np.zeros(len(neurons))
@@ -134,9 +138,9 @@ class _TouchSum:
         return shares, float(residual_norm) ** 2
 
     def group_neurons(self, shares: Float[np.ndarray, " k"], apart: float) -> list[Bool[np.ndarray, " k"]]:
-        """Group the neurons with shares into clusters of nearby places.
+        """Group the neurons that have a share in the frame into clusters of nearby places.
 
-        Returns the neurons (k,) near each of the clusters that change the frame most.
+        Returns, for each of the clusters that change the frame most, whether each neuron is near the cluster.
         """
         from scipy.cluster.hierarchy import fcluster, linkage
 
@@ -153,7 +157,7 @@ class _TouchSum:
 
 
 def _select_groups(model: _TouchSum, groups: list[np.ndarray], variance: float) -> list[Bool[np.ndarray, " k"]]:
-    """Select the groups of neurons that are needed to explain the frame, the most informative first."""
+    """Select groups of neurons by forward selection until no further group reduces the residual of the frame enough."""
     selected_groups: list[np.ndarray] = []
     residual = float(model.change @ model.change)
     remaining_groups = list(groups)
@@ -168,7 +172,7 @@ def _select_groups(model: _TouchSum, groups: list[np.ndarray], variance: float) 
 
 
 def _create_touch(places: Float[np.ndarray, "k d"], shares: Float[np.ndarray, " k"]) -> MapTouch:
-    """Create the touch of a group of neurons from their places and shares."""
+    """Create a touch from the places and shares of a group of neurons."""
     centroid = shares @ places / shares.sum()
     spread = np.sqrt(shares @ np.sum((places - centroid) ** 2, axis=1) / shares.sum())
     return MapTouch(centroid, float(spread), float(shares.sum()))

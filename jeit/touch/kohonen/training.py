@@ -1,19 +1,22 @@
-"""Kohonen's learning rule in two phases, compiled: a map learns the order of its inputs, then their detail.
+"""Training of a self-organising map by Kohonen's rule, compiled, in two phases: ordering of the neurons, then fine
+tuning.
 
-For each frame x, the winner c is the neuron whose weights are nearest, and every neuron n moves by
+For each frame x, the winner c is the neuron whose weights are nearest to x, and the weights w_n of every neuron n move
+by
 
     w_n ← w_n + ε h_cn (x − w_n),    h_cn = exp(−|r_c − r_n|² / 2ρ²)
 
-where r_n is its place on the grid (Kohonen, Self-Organizing Maps, 2001, chapter 3). In the ordering phase, the radius ρ
-decreases; in the tuning phase, ρ is almost zero, so only the winner moves. The rate ε decreases throughout.
+where r_n is the neuron's place on the grid (Kohonen, Self-Organizing Maps, 2001, chapter 3). In the ordering phase, the
+neighbourhood radius ρ decreases; in the tuning phase, ρ is almost zero, so only the winner moves. The learning rate ε
+decreases throughout.
 
-The mean of the frames is subtracted first, since frames differ little from it. When weights w move by the share s = ε h
-of the way to x, the squared distance of the new weights w′ from any frame y is
+The mean of the frames is subtracted first, since frames differ little from their mean. When weights w move by the share
+s = ε h of the way to x, the squared distance of the new weights w′ from any frame y is
 
     |w′ − y|² = (1 − s) |w − y|² + s |x − y|² − s (1 − s) |w − x|²
 
 (Stewart's theorem). So the weights are multiplied with several frames at once, and moved once after these frames; in
-between, only the distances are updated, and in the tuning phase only those of the winner.
+between, only the squared distances are updated, in the tuning phase only those of the winner.
 """
 
 from __future__ import annotations
@@ -26,19 +29,19 @@ from jaxtyping import Array, Float, Int
 from jeit.arguments import describe, is_number, real_array
 from jeit_solvers.module import Module
 
-# Number of frames after which the weights are moved, in the ordering and in the tuning phase.
+# Number of frames after which the weights of a map are moved, in the ordering and in the tuning phase.
 _ORDERING_FRAMES, _TUNING_FRAMES = 16, 64
-# Mode of indexing in JAX: all indices are within bounds, since they are numbers of neurons. In other modes, JAX copies
-# all distances.
+# Mode of indexing arrays in JAX: all indices are within bounds, since they are indices of neurons. In other modes, JAX
+# copies all distances.
 _IN_BOUNDS = "promise_in_bounds"
 
 
 class MapSchedule(Module):
-    """Schedule of a map's training.
+    """Schedule of a self-organising map's training: number of frames, learning rate and neighbourhood radius.
 
-    **Fields**: `ordering` and `tuning`: number of frames shown in each phase; `rate`: the rate ε at the first and the
-    last frame, with exponential decay between them; `radius`: ρ at the first and the last frame of the ordering phase,
-    in grid steps, also with exponential decay; if None, from half the map's longer side to 1.
+    **Fields**: `ordering` and `tuning`: number of frames shown in each phase; `rate`: learning rate at the first and
+    the last frame, with exponential decay between them; `radius`: neighbourhood radius at the first and the last frame
+    of the ordering phase, in grid steps, also with exponential decay; if None, from half the map's longer side to 1.
 
     **Example:**
 
@@ -54,7 +57,7 @@ class MapSchedule(Module):
     radius: tuple[float, float] | None = None
 
     def __check_init__(self):
-        """Raises `ValueError` for invalid numbers of frames, rates and radii."""
+        """Raises `ValueError` for invalid numbers of frames, learning rates and radii."""
         for name in ("ordering", "tuning"):
             value = getattr(self, name)
             if not (is_number(value) and int(value) == value and value >= 0):
@@ -67,15 +70,16 @@ class MapSchedule(Module):
 
     @property
     def steps(self) -> int:
-        """Total number of frames shown."""
+        """Total number of frames shown in the training of a map."""
         return self.ordering + self.tuning
 
     def rates(self) -> Float[np.ndarray, " T"]:
-        """Compute the rate ε for every frame (T,)."""
+        """Compute the learning rate for every frame shown in training."""
         return np.geomspace(*self.rate, self.steps)
 
     def radii(self, shape: tuple[int, int]) -> Float[np.ndarray, " O"]:
-        """Compute ρ for every frame of the ordering phase (O,), in grid steps, for a map of this `shape`."""
+        """Compute the neighbourhood radius for every frame of the ordering phase, in grid steps, for a map of this
+        `shape`."""
         first, last = (max(max(shape) / 2, 1.0), 1.0) if self.radius is None else self.radius
         return np.geomspace(first, last, self.ordering)
 
@@ -88,17 +92,18 @@ def train(
     rates: Float[Array, " T"],
     radii: Float[Array, " O"],
 ) -> tuple[Float[Array, "R C M"], Float[Array, " T"]]:
-    """Train a map; return its weights (R, C, M), and the mean of all weights after each frame shown (T,).
+    """Train a map; returns its weights (rows, columns, channels), and the mean of all weights after each frame shown.
 
-    `weights`: initial weights; `order` (T,): indices of the `frames` (N, M) in the order in which they are shown;
-    `rates` (T,): rate ε for each. The first O frames shown are the ordering phase, with `radii` (O,) in grid steps; the
-    others are the tuning phase. The function may be mapped by `jax.vmap` over weights, orders, rates and radii.
+    `weights`: initial weights; `order`: indices of the `frames` (frames, channels) in the order in which they are
+    shown; `rates`: learning rate for each frame shown; `radii`: neighbourhood radius for each frame of the ordering
+    phase, in grid steps. The frames after these are shown in the tuning phase. The function may be mapped by `jax.vmap`
+    over weights, orders, rates and radii.
     """
     shape, mean_frame, num_ordering = weights.shape[:2], frames.mean(axis=0), len(radii)
 
     def train_phase(phase, weight_rows, block_size, order, rates, *radii):
         num_padding = -len(order) % block_size
-        # Frames are added to fill the last part; at a rate of 0, they change nothing.
+        # Frames are added to fill the last part; with a learning rate of 0, they change no weights.
         order_rates = [jnp.pad(values, (0, num_padding)) for values in (order, rates)]
         blocks = *order_rates, *(jnp.pad(values, (0, num_padding), "edge") for values in radii)
 
@@ -126,9 +131,9 @@ def train(
 
 
 def _ordering_phase(shape, weights, frames, rates, radii):
-    """Show frames (n, M) to a map of this shape in the ordering phase, in which all neurons move.
+    """Show frames (frames, channels) to a map in the ordering phase, in which all neurons move.
 
-    Returns the weights (k, M) after these frames, and their mean after each frame (n,).
+    Returns the weights (neurons, channels) after these frames, and the mean of all weights after each frame.
     """
     row, column = jnp.arange(shape[0])[:, None], jnp.arange(shape[1])
 
@@ -152,15 +157,15 @@ def _ordering_phase(shape, weights, frames, rates, radii):
 
 
 def _tuning_phase(shape, weights, frames, rates):
-    """Show frames in the tuning phase, in which only the winner moves.
+    """Show frames (frames, channels) to a map in the tuning phase, in which only the winner moves.
 
-    Returns the weights (k, M) after these frames, and their mean after each frame (n,)."""
+    Returns the weights (neurons, channels) after these frames, and the mean of all weights after each frame."""
 
     def show_frame(state, step):
         distances, weight_means, (winner, winner_distances) = state
         index, rate, to_other_frames, frame_mean = step
-        # The distances of the previous frame's winner are written before any are read, which avoids a copy of the
-        # array.
+        # The distances of the previous frame's winner are written before any distances are read, which avoids a copy of
+        # the array.
         distances = distances.at[:, winner].set(winner_distances, mode=_IN_BOUNDS)
         row, column = _find_winner(distances[index], shape)
         winner = row * shape[1] + column
@@ -178,14 +183,14 @@ def _tuning_phase(shape, weights, frames, rates):
 
 
 def _squared_distances(frames, weights):
-    """Compute squared distances (n, k) of frames (n, M) from weights (k, M)."""
+    """Compute the squared Euclidean distances (frames, neurons) of frames from the weights of neurons."""
     return jnp.sum(frames**2, axis=1)[:, None] + jnp.sum(weights**2, axis=1) - 2 * frames @ weights.T
 
 
 def _find_winner(distances, shape):
-    """Find the row and the column of the neuron with the smallest of the distances (k,).
+    """Find the row and the column of the neuron with the smallest of the `distances` (neurons,).
 
-    The minimum of each column is found first, since this is done for many columns at once.
+    The minimum of each column of the grid is found first, for many columns at once.
     """
     distance_grid = distances.reshape(shape)
     column = jnp.argmin(distance_grid.min(axis=0))
@@ -193,7 +198,8 @@ def _find_winner(distances, shape):
 
 
 def _move_weights(weights, shares, frames):
-    """Move weights (k, M) towards frames (n, M), one after another, by `shares` (n, k) of the remaining way."""
+    """Move the weights of neurons towards frames, one frame after another, by `shares` (frames, neurons) of the
+    remaining way."""
 
     def remaining_and_added(remaining, share):
         return remaining * (1 - share), remaining * share

@@ -1,4 +1,4 @@
-"""Learn the quantities of recorded presses: folds of held-out presses, and the comparison of methods on them."""
+"""Learn places, forces, labels and keys from recorded presses, and compare methods by cross-validation."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from jeit.touch.learnt.numbers import LearntNumbers, learn_numbers
 from jeit.touch.learnt.presses import Presses
 
 NUM_FOLDS = 5
-# Maximum distance of held-out presses from the nearest other press, relative to the same distance for random folds.
+# Maximum mean distance of the held-out presses of a fold from the nearest press of another fold, relative to the same
+# distance for random folds.
 _MAX_DISTANCE_RATIO = 2.0
 # Places count as repeated if the number of different places, divided by the number of presses, is lower than this.
 _MAX_UNIQUE_SHARE = 0.7
@@ -32,14 +33,16 @@ def time_folds(
     kinds: np.ndarray | None = None,
     num_folds: int = NUM_FOLDS,
 ) -> tuple[Int[np.ndarray, " N"], tuple[str, ...]]:
-    """Assign each press to the fold (N,) in which it is held out; returns folds and notes.
+    """Assign presses to folds for cross-validation; returns the fold of each press, and notes on the assignment as
+    text.
 
-    Presses, in order of `time` or as recorded, are cut into `num_folds` intervals, one for each fold. If a training set
-    would lack places (`positions`, (N, d)) or classes (`kinds`, (N,) or (N, K)), because these were pressed one after
-    the other, presses are cut into more and shorter intervals, which are assigned to the folds in turn. Each `group`
-    stays in one fold; groups are ordered by their mean time. Presses with the same frame stay in one fold, and if
-    places (d > 1) are repeated, so do presses at the same place: otherwise the training set would contain copies of
-    held-out presses.
+    The presses, ordered by `time` or else as recorded, are cut into `num_folds` intervals of time, one for each fold.
+    If the training set of a fold would lack places (`positions`) or classes (`kinds`: one class for each press, or true
+    and false for each key), because places or classes were pressed one after the other, the presses are cut into more
+    and shorter intervals, which are assigned to the folds in turn. All presses of a `group` are in one fold; groups are
+    ordered by their mean time. Presses with the same frame are in one fold, and so are presses at the same place if
+    places of two or three coordinates are repeated: otherwise the training set would contain copies of held-out
+    presses.
     """
     num_presses = len(frames)
     order = np.arange(num_presses) if time is None else np.argsort(time, kind="stable")
@@ -83,7 +86,8 @@ def time_folds(
 
 
 def _assign_to_folds(unit: np.ndarray, rank: np.ndarray, num_folds: int, num_intervals: int) -> Int[np.ndarray, " N"]:
-    """Assign units of presses to folds: their order is cut into intervals, which are assigned to the folds in turn."""
+    """Assign presses to folds: the presses in order of their `rank` in time are cut into `num_intervals` intervals,
+    which are assigned to the folds in turn; presses with the same `unit` are in one fold."""
     sizes = np.bincount(unit)
     unit_order = np.argsort(np.bincount(unit, rank) / sizes, kind="stable")
     middle_ranks = np.cumsum(sizes[unit_order]) - sizes[unit_order] / 2
@@ -95,7 +99,7 @@ def _assign_to_folds(unit: np.ndarray, rank: np.ndarray, num_folds: int, num_int
 
 
 def _assign_by_class(rank: np.ndarray, kinds: np.ndarray, num_folds: int) -> Int[np.ndarray, " N"]:
-    """Assign the presses of each class to the folds in turn, for data in which some classes are rare."""
+    """Assign the presses of each class in `kinds` to the folds in turn, for data in which some classes are rare."""
     fold = np.empty(len(kinds), int)
     for kind in np.unique(kinds):
         class_rows = np.flatnonzero(kinds == kind)
@@ -104,7 +108,7 @@ def _assign_by_class(rank: np.ndarray, kinds: np.ndarray, num_folds: int) -> Int
 
 
 def _training_sets_cover(fold: np.ndarray, positions: np.ndarray | None, kinds: np.ndarray | None) -> bool:
-    """Whether the training set of each fold contains places and classes like those of the held-out presses."""
+    """Whether the training set of each fold contains the classes of its held-out presses, or places near theirs."""
     if kinds is not None and kinds.ndim == 2:
         return all(_training_sets_cover(fold, None, column) for column in kinds.T)
     if kinds is not None:
@@ -116,7 +120,8 @@ def _training_sets_cover(fold: np.ndarray, positions: np.ndarray | None, kinds: 
 
 
 def _largest_distance(positions: np.ndarray, fold: np.ndarray) -> float:
-    """Compute the mean distance of held-out presses from the nearest other press, in the fold where it is largest."""
+    """Compute the mean distance of the presses of a fold from the nearest press of another fold; returns the maximum
+    over the folds."""
     unit = positions.std(axis=0).max() or 1.0
     return max(
         KDTree(positions[fold != fold_index]).query(positions[fold == fold_index])[0].mean() + 1e-3 * unit
@@ -125,8 +130,8 @@ def _largest_distance(positions: np.ndarray, fold: np.ndarray) -> float:
 
 
 def _connected_sets(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Number the connected sets of n elements; elements with equal `first` (n,) or equal `second` (n,) are
-    connected."""
+    """Number the connected sets of elements; two elements are connected if they have the same number in `first` or in
+    `second`."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -141,15 +146,15 @@ METHODS = tuple(dict.fromkeys((*number_methods.METHODS, *label_methods.METHODS))
 
 @dataclass(frozen=True)
 class Standing:
-    """Accuracy with which a quantity was learnt, in the units of the quantity.
+    """Accuracy with which a quantity of presses was learnt, in the unit of the quantity.
 
     **Fields**
 
-    - `method`: the chosen method.
-    - `tried`: all methods that were tried, and their errors on held-out presses.
+    - `method`: name of the chosen learning method.
+    - `tried`: names of all methods that were tried, and their errors on held-out presses.
     - `held_out`: predictions of the chosen method for held-out presses.
-    - `right`: the true values.
-    - `std`: standard deviations of the predictions.
+    - `right`: the true values of the quantity for these presses.
+    - `std`: estimated standard deviations of these predictions, or None.
 
     **Example:**
 
@@ -174,9 +179,11 @@ def learn_quantities(
     imaged: ImageReconstruction | None,
     progress,
 ) -> tuple[dict[str, Any], dict[str, Standing], list[str]]:
-    """Learn models of `place`, `force`, `label` and `keys`, each None if the presses lack its quantity.
+    """Learn models that predict the `place`, `force`, `label` and `keys` of presses; a model is None if the presses
+    lack its quantity.
 
-    Returns the models of these quantities, their accuracies for held-out presses, and notes for the user.
+    Returns the models and the accuracies for held-out presses, both by the names of the quantities, and notes on the
+    data for the user.
     """
     notes, standing = [], {}
     models: dict[str, Any] = dict.fromkeys(("place", "force", "label", "keys"))
@@ -224,7 +231,8 @@ def learn_quantities(
 
 
 def places_and_folds(presses: Presses) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return the rows of the presses that have a place, their cross-validation folds, and notes."""
+    """Return the indices of the presses that have a place, their cross-validation folds, and notes on the folds as
+    text."""
     positions = np.asarray(presses.positions)
     rows = np.flatnonzero(~np.isnan(positions).any(axis=1))
     folds, remarks = time_folds(presses.frames[rows], *_groups_and_times(presses, rows), positions=positions[rows])
@@ -234,7 +242,7 @@ def places_and_folds(presses: Presses) -> tuple[np.ndarray, np.ndarray, tuple[st
 def _learn_targets(
     changes, reference, targets, rows, folds, method, imaged, progress
 ) -> tuple[LearntNumbers, Standing]:
-    """Learn targets (n, d) from the changes of the given rows; returns the model and its accuracy."""
+    """Learn places or forces, the targets, from the voltage changes of presses; returns the model and its accuracy."""
     selected_reference, number_method = (
         None if reference is None else reference[rows],
         _method_or_auto(method, number_methods),

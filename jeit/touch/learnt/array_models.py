@@ -1,7 +1,8 @@
-"""Decision trees, nearest neighbours and support vector machines as arrays, evaluated within microseconds per frame.
+"""Decision trees, nearest neighbours and support vector machines stored as arrays, evaluated in microseconds per frame.
 
-Support vector machines have one decision boundary for each pair of classes. Their sums are computed class by class:
-with thousands of pairs, scikit-learn would take a hundredth of a second for one frame.
+Support vector machines have one decision boundary for each pair of classes. The sums over the support vectors are
+computed class by class: with thousands of pairs of classes, scikit-learn would take a hundredth of a second for one
+frame.
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ _CHUNK_SIZE = 128
 
 @dataclass(frozen=True)
 class Forest:
-    """T decision trees with up to n nodes.
+    """An ensemble of decision trees, stored as arrays.
 
-    `feature` and `threshold` (T, n): the test at each node; `left` and `right` (T, n): index of the next node if the
-    feature is at most the threshold, and if it is greater; leaves have their own index. `value` (T, n, d): values of
-    the leaves; the prediction is their sum over the trees plus `start` (d,). `depth`: number of steps to the leaves.
-    `classes_` (d,): the classes, for classifiers.
+    `feature` and `threshold` (trees, nodes): index of the feature that each node tests, and the threshold with which
+    the feature is compared; `left` and `right` (trees, nodes): index of the next node if the feature is at most the
+    threshold, and if it is greater; for leaves, the leaf's own index. `value` (trees, nodes, targets): values of the
+    leaves; a prediction is the sum of one leaf of each tree plus `start` (targets,). `depth`: maximum number of steps
+    to a leaf. `classes_`: for classifiers, the class of each target.
     """
 
     feature: Int[np.ndarray, "T n"]
@@ -39,15 +41,15 @@ class Forest:
     classes_: np.ndarray
 
     def __post_init__(self):
-        """Raises `ValueError` for a depth that is negative or exceeds the number of nodes."""
+        """Raises `ValueError` if the depth of the trees is negative or exceeds the number of nodes."""
         if not 0 <= self.depth <= self.value.shape[1]:
             raise ValueError(f"depth is {self.depth}, of trees of {self.value.shape[1]} nodes.")
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
-        """Compute the sum (n, d) of the trees' values."""
+        """Predict targets (frames, targets): the sum of the trees' values and the constant `start`."""
         num_trees, num_nodes, num_targets = self.value.shape
         first_node = num_nodes * np.arange(num_trees)
-        # Nodes are numbered through all trees, and arrays are flat: `take` is faster than indexing two axes.
+        # Nodes are numbered consecutively over all trees, and arrays are flat: `take` is faster than indexing two axes.
         feature, threshold = self.feature.ravel(), self.threshold.ravel()
         left_children, right_children = ((child + first_node[:, None]).ravel() for child in (self.left, self.right))
         value = self.value.reshape(-1, num_targets)
@@ -64,12 +66,12 @@ class Forest:
         return apply_in_parts(evaluate, features, _CHUNK_SIZE) + self.start
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
-        """Compute the score of each class (n, d), for classifiers: the sum of the trees' values."""
+        """Compute the score of each class (frames, classes) for a classifier: the sum of the trees' values."""
         return self.predict(features)
 
     @classmethod
     def from_boosted_regressors(cls, models: list[Any]) -> "Forest":
-        """Convert scikit-learn's histogram gradient boosting regressors, one for each of d targets."""
+        """Convert scikit-learn's histogram gradient boosting regressors, one for each target, to one forest."""
         trees = []
         for target, model in enumerate(models):
             for (regressor_tree,) in model._predictors:
@@ -85,7 +87,7 @@ class Forest:
     def from_boosted_classifier(cls, model: Any) -> "Forest":
         """Convert scikit-learn's histogram gradient boosting classifier to a forest that predicts log-odds.
 
-        With two classes, the second has half of the model's log-odds, and the first the same with opposite sign.
+        With two classes, the score of the second is half of the model's log-odds, and that of the first its negative.
         """
         trees, num_classes = [], len(model.classes_)
         for round_trees in model._predictors:
@@ -101,7 +103,7 @@ class Forest:
 
     @classmethod
     def from_averaged_trees(cls, models: list[Any]) -> "Forest":
-        """Convert scikit-learn's regression trees to a forest that predicts their mean."""
+        """Convert scikit-learn's regression trees to a forest that predicts the mean of the trees' predictions."""
         trees = []
         for model in models:
             tree = model.tree_
@@ -115,9 +117,10 @@ class Forest:
     def from_classification_trees(
         cls, models: list[Any], weights: np.ndarray, classes: np.ndarray, *, votes: bool
     ) -> "Forest":
-        """Convert scikit-learn's classification trees to a forest that predicts the weighted sum of their class shares.
+        """Convert scikit-learn's classification trees to a forest that predicts the weighted sum of the trees' class
+        shares.
 
-        If `votes`, each tree has one vote for its most frequent class instead.
+        If `votes`, each tree instead gives one weighted vote to the most frequent class of the leaf.
         """
         trees = []
         for model, weight in zip(models, weights, strict=True):
@@ -159,8 +162,8 @@ class Forest:
 
     @classmethod
     def _pack_trees(cls, trees: list[tuple], start: np.ndarray, classes: np.ndarray) -> "Forest":
-        """Create a forest from trees, each a tuple of arrays: tested features, thresholds, left and right children,
-        whether a node is a leaf, and the values of the nodes."""
+        """Create a forest from trees, each a tuple of arrays over its nodes: tested features, thresholds, left and
+        right children, whether the node is a leaf, and values."""
         max_nodes, depth = max(len(tree[0]) for tree in trees), 1
         feature, left, right = (np.zeros((len(trees), max_nodes), np.int32) for _ in range(3))
         threshold = np.zeros((len(trees), max_nodes))
@@ -179,17 +182,19 @@ class Forest:
         return cls(feature, threshold, left, right, value, depth, start, classes)
 
 
-# Number of frames whose distances from all presses are computed at once.
+# Number of frames whose distances from all presses of the training set are computed at once.
 _NEIGHBOUR_CHUNK_SIZE = 128
 _CANDIDATE_COUNTS = (3, 5, 8, 12)
 
 
 @dataclass(frozen=True)
 class NearestNeighbours:
-    """Nearest neighbours: the mean over the `count` nearest presses, weighted by inverse distance.
+    """Nearest-neighbour prediction: the mean target of the `count` nearest presses of the training set, weighted by
+    inverse distance between features.
 
-    `features` (N, k): features of the presses; `known` (N, d): their targets, or for classes 1 in the column of each
-    press's class and 0 elsewhere; `classes_` (d,): the classes.
+    `features` (presses, features): features of the training presses; `known` (presses, targets): the targets of these
+    presses, or for a classifier 1 in the column of each press's class and 0 elsewhere; `classes_`: the class of each
+    column.
     """
 
     features: Float[np.ndarray, "N k"]
@@ -199,7 +204,8 @@ class NearestNeighbours:
 
     @classmethod
     def fit_regressor(cls, features, targets) -> "NearestNeighbours":
-        """Create a regressor of targets (N, d), with the `count` that has the lowest leave-one-out error."""
+        """Create a regressor of targets (presses, targets), with the number of neighbours that has the lowest
+        leave-one-out error."""
         count = min(max(_CANDIDATE_COUNTS), len(features) - 1)
         all_neighbours = cls(features, targets, count + 1, np.arange(targets.shape[1]))
         distances, indices = (array[:, 1:] for array in all_neighbours._nearest_presses(features))
@@ -211,28 +217,29 @@ class NearestNeighbours:
 
     @classmethod
     def fit_classifier(cls, features, label) -> "NearestNeighbours":
-        """Create a classifier, which predicts the class of the single nearest press."""
+        """Create a classifier that predicts the class of the single nearest press."""
         classes = np.unique(label)
         return cls(features, (np.asarray(label)[:, None] == classes).astype(float), 1, classes)
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
-        """Predict targets (n, d)."""
+        """Predict targets (frames, targets) from features (frames, features)."""
         distances, indices = self._nearest_presses(features)
         weights = 1 / np.maximum(distances, 1e-12)
         return np.einsum("nc,ncd->nd", weights / weights.sum(axis=1, keepdims=True), self.known[indices])
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Predict the share of each class (n, C) among the nearest presses."""
+        """Predict the weighted share of each class (frames, classes) among the nearest presses."""
         return self.predict(features)
 
     def _nearest_presses(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n c"], Int[np.ndarray, "n c"]]:
-        """Find the nearest presses: their distances (n, c), the nearest first, and their indices (n, c)."""
+        """Find the nearest training presses of each frame; returns their distances and their indices, both (frames,
+        neighbours), the nearest first."""
 
         def find_nearest(rows: np.ndarray) -> np.ndarray:
             shifted_squares = (-2 * rows) @ self.features.T
             shifted_squares += (
                 self._squared_norms
-            )  # without the frame's squared norm, which is the same for all presses
+            )  # omits the frame's squared norm, which is the same for all presses
             indices = np.argpartition(shifted_squares, self.count - 1, axis=1)[:, : self.count]
             distances = np.linalg.norm(self.features[indices] - rows[:, None], axis=2)
             order = np.argsort(distances, axis=1, kind="stable")
@@ -243,7 +250,7 @@ class NearestNeighbours:
 
     @cached_property
     def _squared_norms(self) -> Float[np.ndarray, " N"]:
-        """Squared norm of each press's features."""
+        """Squared Euclidean norm of the features of each training press."""
         return np.sum(self.features**2, axis=1)
 
 
@@ -251,10 +258,11 @@ class NearestNeighbours:
 class SupportVectorMachine:
     """A support vector machine with one decision boundary for each pair of classes.
 
-    `support` (S, k): support vectors, sorted by class; those of class c are the rows from `start[c]` to `start[c + 1]`;
-    `weights` (C - 1, S): their weights for the boundaries with each other class; `intercepts` (P,): one for each of the
-    pairs (0, 1), (0, 2), …. The kernel is (gain x·y + offset)^degree. A linear machine uses the normals of the
-    boundaries instead, `slopes` (P, k).
+    `support` (vectors, features): support vectors, sorted by class; those of class c are the rows from `start[c]` to
+    `start[c + 1]`; `weights` (classes - 1, vectors): weight of each support vector for the boundary with each other
+    class; `intercepts`: one for each pair of classes (0, 1), (0, 2), …. The kernel of features x and y is (gain x·y +
+    offset)^degree. A linear machine uses the normals of the boundaries instead of the kernel: `slopes` (pairs,
+    features).
     """
 
     support: Float[np.ndarray, "S k"]
@@ -272,8 +280,8 @@ class SupportVectorMachine:
         """Convert scikit-learn's support vector classifier with a linear or a polynomial kernel."""
         is_linear = machine.kernel == "linear"
         start = np.concatenate([[0], np.cumsum(machine.n_support_)])
-        # In scikit-learn, a positive value means the second of two classes, but the first class of a pair if there are
-        # more.
+        # In scikit-learn, a positive decision value means the second of two classes; with more than two classes, it
+        # means the first class of the pair.
         sign = -1.0 if len(machine.classes_) == 2 else 1.0
         return cls(
             machine.support_vectors_,
@@ -288,9 +296,10 @@ class SupportVectorMachine:
         )
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Count the pairwise decisions won by each class (n, C).
+        """Count the pairwise decisions that each class wins (frames, classes).
 
-        A term below 1/2 from the distances to the boundaries is added, which orders classes with equal counts.
+        A term below 1/2, computed from the distances to the decision boundaries, is added and orders classes with equal
+        counts.
         """
         distances, side_signs = self._boundary_distances(features)
         votes = (distances > 0) @ (side_signs > 0).astype(float) + (distances <= 0) @ (side_signs < 0).astype(float)
@@ -298,10 +307,12 @@ class SupportVectorMachine:
         return votes + confidences / (3 * (np.abs(confidences) + 1))
 
     def pair_odds(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Compute, for each class, the sum of its log-probabilities relative to every other class (n, C).
+        """Compute the score of each class (frames, classes): the sum of its log-probabilities relative to every other
+        class.
 
-        Relative to one other class, the probability is 1 / (1 + exp(-2 d)) at a distance d from the boundary between
-        the two, in units of its margin. Unlike numbers of won decisions, the sums measure confidence.
+        The probability of one class relative to another is 1 / (1 + exp(-2 d)) at a distance d from the boundary
+        between the two classes, in units of its margin. Unlike the numbers of won decisions, these sums measure
+        confidence.
         """
         distances, side_signs = self._boundary_distances(features)
         log_probabilities_won, log_probabilities_lost = (
@@ -313,9 +324,11 @@ class SupportVectorMachine:
         ).astype(float)
 
     def _boundary_distances(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n P"], Float[np.ndarray, "P C"]]:
-        """Compute signed distances (n, P) from the boundaries of all pairs of classes.
+        """Compute the signed distances (frames, pairs) of features from the decision boundaries of all pairs of
+        classes.
 
-        Also returns the sign of the distance on the side of each class (P, C), 0 for classes that are not of the pair.
+        Also returns the sign of the distance on each class's side of a boundary (pairs, classes), 0 for classes that
+        are not of the pair.
         """
         num_classes = len(self.classes_)
         first, second = np.triu_indices(num_classes, 1)

@@ -1,13 +1,16 @@
-"""Joint model of a learnt skin's channels: it detects dead channels, replaces their readings, and rates novel frames.
+"""Joint model of the measurement channels of a skin: detects dead channels, predicts their readings, and rates how
+unlike the training set a frame is.
 
-Changes of a skin's M channels are modelled as d = s (V z + n), with scales s, a few patterns V, their scores z, and
-noise n; z and n are normal. The scores of a frame with missing channels are the most likely ones. A channel is dead if
-its residual, the deviation from the prediction by the others, exceeds a multiple of the residuals of training presses.
-Its reading is predicted from the covariance of all channels, which contains more than the patterns do: for example,
-that reciprocal channels read the same.
+The voltage changes d of a skin's channels are modelled as d = s (V z + n), with the scale s of each channel, a few
+patterns V (principal directions of the channels), the scores z of the patterns, and noise n; z and n are normally
+distributed. For a frame with missing channels, the most likely scores are computed. A channel is dead if its residual,
+the deviation from the prediction by the other channels, exceeds a multiple of the residuals of training presses. The
+reading of a dead channel is predicted from the covariance of all channels, which contains more than the patterns do:
+for example, that reciprocal channels have the same reading.
 
-The novelty of a frame includes its distance from all presses of the training set: two simultaneous touches, or a touch
-of the opposite sign, consist of the same patterns as recorded presses, but are unlike any of them.
+The novelty of a frame includes its distance from all presses of the training set: the frame of two simultaneous
+touches, or of a touch of the opposite sign, consists of the same patterns as the recorded presses, but is unlike any of
+them.
 """
 
 from __future__ import annotations
@@ -19,19 +22,20 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-# Number of scores used; maximum number of presses stored; fraction of the usual norm of scores that is added to a
-# frame's norm, by which distances are divided.
+# Number of pattern scores compared; maximum number of presses stored. Distances are divided by the norm of the frame's
+# scores plus this fraction of the presses' median norm.
 _NUM_SCORES, _MAX_STORED_PRESSES, _NORM_OFFSET_FRACTION = 8, 4000, 0.5
 _USUAL_QUANTILE = 0.99
 
 
 @dataclass(frozen=True)
 class Neighbourhood:
-    """Distances of frames from the nearest press of the training set, by their leading scores.
+    """Distances of frames from the nearest press of the training set, computed from the scores of the leading channel
+    patterns.
 
-    `scores` (N, k): leading scores of presses; `size`: their median norm; `usual`: distance from the nearest other
-    press that 99 % of the presses do not exceed. Distances are divided by the norm of the frame's scores plus a
-    fraction of `size`.
+    `scores` (presses, patterns): scores of the presses for the leading patterns; `size`: median norm of these scores;
+    `usual`: the 99 % quantile of the distance of a press from the nearest other press. Distances are divided by the
+    norm of the frame's scores plus a fraction of `size`.
     """
 
     scores: Float[np.ndarray, "N k"]
@@ -40,7 +44,7 @@ class Neighbourhood:
 
     @classmethod
     def learn(cls, scores: Float[np.ndarray, "N K"]) -> "Neighbourhood":
-        """Fit to the scores of presses (N, K)."""
+        """Fit the distances to the scores (presses, patterns) of the training presses."""
         stored_scores = scores[:: -(-len(scores) // _MAX_STORED_PRESSES), :_NUM_SCORES]
         size = float(np.median(np.linalg.norm(stored_scores, axis=1))) or 1.0
         unscaled_neighbourhood = cls(stored_scores, size, 1.0)
@@ -48,7 +52,8 @@ class Neighbourhood:
         return cls(stored_scores, size, max(float(np.quantile(distances, _USUAL_QUANTILE)), 1e-6))
 
     def __call__(self, scores: Float[np.ndarray, "n K"]) -> Float[np.ndarray, " n"]:
-        """Compute the distances (n,) of frames with these scores from the nearest press, divided by `usual`."""
+        """Compute the distance of each frame from the nearest training press, from pattern scores (frames, patterns),
+        relative to the usual distance between presses."""
         return self._relative_distances(scores[:, :_NUM_SCORES]) / self.usual
 
     def _relative_distances(self, scores: np.ndarray, *, skip_first: bool = False) -> np.ndarray:
@@ -60,23 +65,25 @@ class Neighbourhood:
         return KDTree(self.scores)
 
 
-# Fraction of the variance that is left to noise; maximum number of patterns; number of presses required for each
-# pattern.
+# Fraction of the variance of the channels that patterns leave to noise; maximum number of patterns; number of presses
+# required for each pattern.
 _NOISE_VARIANCE_FRACTION, _MAX_PATTERNS, _PRESSES_PER_PATTERN = 1e-3, 60, 4
-# A channel is dead if its residual exceeds this multiple of this quantile of the residuals of training presses.
+# A channel is dead if its residual exceeds this factor times this quantile of the residuals of training presses.
 _RESIDUAL_FACTOR, _RESIDUAL_QUANTILE = 2.0, 0.999
-# Maximum distance of a working channel's reading from its training range, relative to the width of that range; maximum
-# fraction of channels that may exceed it, above which the frame counts as unusual and the channels as alive.
+# Maximum distance of a working channel's reading from the range of its training readings, relative to the width of the
+# range; if more than this fraction of channels exceed the maximum, the frame counts as unusual and the channels as
+# alive.
 _MAX_RANGE_EXCESS, _MAX_EXCEEDING_FRACTION = 2.0, 0.1
-# Variation below this fraction of the largest change is rounding error.
+# Variation of a channel below this fraction of the largest change counts as rounding error.
 _ROUNDING_ERROR = 1e-13
 # Candidate values added to the diagonal of the covariance of channels, which are scaled to variance 1.
 _DIAGONALS = np.logspace(-6, 0, 13)
-# Maximum fraction of dead channels, at which the search for dead channels stops.
+# Fraction of dead channels in a frame at which the search for further dead channels stops.
 _MAX_DEAD_FRACTION = 0.34
-# Number of consecutive frames with a unique set of missing channels after which frames are processed one by one.
+# Number of consecutive frames with a unique set of dead channels after which frames are processed one by one.
 _MAX_UNIQUE_FRAMES = 8
-# Number of standard deviations, those of the mean square of normal residuals, by which a frame's must exceed 1.
+# A frame has excess errors if the mean square of its residuals exceeds 1 by this number of standard deviations of the
+# mean square of normal residuals.
 _EXCESS_STANDARD_DEVIATIONS = 2.0
 # Novelty of a frame whose distance from the nearest press is the usual distance between presses.
 _NOVELTY_AT_USUAL_DISTANCE = 2 / 1.75
@@ -84,15 +91,16 @@ _NOVELTY_AT_USUAL_DISTANCE = 2 / 1.75
 
 @dataclass(frozen=True)
 class Channels:
-    """Joint model of M channels.
+    """Joint model of the readings of a skin's measurement channels.
 
-    `used` (M,): whether a channel has readings that are not constant. All other fields are for the m channels used. In
-    units of `scale` (m,), the standard deviation of the changes: `range` (2, m): limits of the readings of a working
-    channel; `patterns` (m, k), the `spread` (k,) of their scores, and the `noise` (m,). `farthest` (m,): maximum
-    residual of a working channel, relative to its noise. `directions` (m, r): principal directions of the changes;
-    `weight` (r,): variance along each, divided by the same variance plus a constant; `unpredicted` (m,): variance of a
-    channel that the others do not predict. `usual`: novelty that 99 % of the presses do not exceed; `neighbourhood`:
-    distances between presses.
+    `used`: whether a channel has readings that are not constant; all other fields are for the used channels. `scale`:
+    standard deviation of the changes of each channel, the unit of the next four fields. `range` (2, channels): limits
+    of the readings of a working channel; `patterns` (channels, patterns): correlated changes of the channels; `spread`:
+    standard deviation of the score of each pattern; `noise`: standard deviation of the part of each channel that the
+    patterns do not explain. `farthest`: maximum residual of a working channel, relative to its noise. `directions`
+    (channels, directions): principal directions of the changes; `weight`: variance along each direction, divided by the
+    same variance plus a constant; `unpredicted`: variance of each channel that the others do not predict. `usual`: 99 %
+    quantile of the novelty of the presses; `neighbourhood`: distances of frames from presses.
     """
 
     used: Bool[np.ndarray, " M"]
@@ -110,9 +118,9 @@ class Channels:
 
     @classmethod
     def learn(cls, changes: Float[np.ndarray, "N M"]) -> "Channels":
-        """Fit the model to changes (N, M), NaN where a reading is missing.
+        """Fit the channel model to voltage changes (presses, channels), NaN where a reading is missing.
 
-        Raises `ValueError` if no channel changes.
+        Raises `ValueError` if all channels have constant readings.
         """
         missing = np.isnan(changes)
         used = missing.mean(axis=0) < 0.5
@@ -126,7 +134,7 @@ class Channels:
         scaled = np.where(missing[:, used], 0.0, changes[:, used]) / scale
         has_reading, half = ~missing[:, used], len(scaled) // 2
         # Residuals are larger for frames outside the training set than in it, so each half of the frames is evaluated
-        # with the patterns of the other half.
+        # with the patterns that were fitted to the other half.
         residuals, novelties, leave_one_out_errors = [], [], np.zeros((2, len(_DIAGONALS), int(used.sum())))
         for training_rows, test_rows in (
             (slice(None, half), slice(half, None)),
@@ -171,11 +179,12 @@ class Channels:
         )
 
     def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Replace changes of dead or missing channels by their prediction from the other channels.
+        """Replace the voltage changes of dead or missing channels by their prediction from the other channels.
 
-        Returns the changes (n, m) of the channels used; whether each is alive (n, m); the novelty (n,) of the frames, 1
-        for a frame that is as far from the training set as the farthest frame in it; and the standard deviation (n, m)
-        of errors of the readings that residuals show beyond those of the training set, in the unit of changes.
+        Returns the changes (frames, channels) of the used channels; whether each channel is alive in each frame
+        (frames, channels); the novelty of each frame, 1 for a frame that is as far from the training set as the
+        farthest training press; and the standard deviation of the reading errors (frames, channels), in the unit of the
+        changes, as far as a frame's residuals exceed those of the training set.
         """
         completed_changes = changes[:, self.used] / self.scale
         has_reading, out_of_range = (
@@ -193,7 +202,8 @@ class Channels:
             0,
         )
         while remaining_frames.size:
-            # Most frames have the same dead channels, so the set found for one frame is tried on all remaining frames.
+            # Most frames have the same dead channels, so the dead channels found for one frame are tried on all
+            # remaining frames.
             is_working = self._working_channels(
                 completed_changes[remaining_frames[0]], has_reading[remaining_frames[0]]
             )
@@ -217,10 +227,10 @@ class Channels:
         return completed_changes * self.scale, alive, novelty, self._excess(residual, alive)
 
     def _working_channels(self, frame: np.ndarray, has_reading: np.ndarray) -> np.ndarray:
-        """Determine which channels of a frame agree with the prediction from the others.
+        """Determine which channels of a frame agree with the prediction from the other channels.
 
-        The channels with the largest deviations are removed repeatedly; then channels that agree with the remaining
-        ones are restored.
+        The channels with the largest deviations are removed repeatedly; then removed channels that agree with the
+        remaining channels are restored.
         """
         alive, min_alive, is_restored = has_reading.copy(), (1 - _MAX_DEAD_FRACTION) * len(frame), False
         while alive.sum() > min_alive:
@@ -235,10 +245,11 @@ class Channels:
         return alive
 
     def _deviations(self, changes, has_reading, alive) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute the deviations of channels in frames (n, m) from the prediction by the channels `alive` (m,).
+        """Compute the deviations (frames, channels) of readings from their prediction by the channels that are `alive`.
 
-        They are divided by the maximum deviation of a working channel, and infinite for readings that are not
-        `has_reading` (n, m). Also returns the frames' scores (n, k) and residuals (n, m).
+        Deviations are divided by the maximum deviation of a working channel, and infinite for readings that are missing
+        (not `has_reading`). Also returns the pattern scores of the frames (frames, patterns) and their residuals
+        (frames, channels).
         """
         weighted_patterns = self.patterns * (alive / self.noise**2)[:, None]
         gain = weighted_patterns @ np.linalg.inv(weighted_patterns.T @ self.patterns + np.diag(1 / self.spread**2))
@@ -246,7 +257,7 @@ class Channels:
         residual = (changes - scores @ self.patterns.T) / self.noise
         variance_factor = 1 - np.einsum(
             "ij,ij->i", self.patterns, gain
-        )  # variance of a residual, relative to the noise; the channel's weight in its own prediction reduces it
+        )  # variance of a residual relative to the noise, reduced by the channel's weight in its own prediction
         relative_deviations = np.where(
             has_reading, np.abs(residual) / np.sqrt(np.maximum(variance_factor, 1e-6)) / self.farthest, np.inf
         )
@@ -255,7 +266,7 @@ class Channels:
     def _predict_others(
         self, alive_readings: Float[np.ndarray, "n a"], alive: np.ndarray
     ) -> Float[np.ndarray, "n m-a"]:
-        """Predict the most likely readings of the channels that are not `alive` (m,) from those that are."""
+        """Predict the most likely readings of the dead channels from those of the channels that are `alive`."""
         dead_directions = self.directions[~alive] * self.weight
         right_sides = dead_directions @ (alive_readings @ self.directions[alive]).T
         return np.linalg.solve(
@@ -263,9 +274,10 @@ class Channels:
         ).T
 
     def prediction_errors(self, alive: Bool[np.ndarray, "n m"], max_errors: int) -> Float[np.ndarray, "q n m"]:
-        """Compute the errors of readings that are predicted for frames with some channels `alive`.
+        """Compute the errors of the readings that are predicted for the dead channels of frames.
 
-        Returns the q ≤ `max_errors` largest independent errors, each of one standard deviation, in the unit of changes.
+        `alive` (frames, channels): the channels that are not dead. Returns the largest independent errors (errors,
+        frames, channels), at most `max_errors`, each of one standard deviation, in the unit of the changes.
         """
         errors = np.zeros((min(max_errors, int((~alive).sum(axis=1).max(initial=0))), *alive.shape))
         patterns, pattern_indices = np.unique(alive, axis=0, return_inverse=True)
@@ -282,11 +294,12 @@ class Channels:
         return errors
 
     def _excess(self, residual: np.ndarray, alive: np.ndarray) -> Float[np.ndarray, "n m"]:
-        """Estimate the standard deviation (n, m) of errors of readings that frames show beyond those of the presses.
+        """Estimate the standard deviation of reading errors (frames, channels) in excess of the errors of the training
+        presses.
 
-        The mean square of a frame's residuals, relative to the noise, is about 1 for the presses; what exceeds it
-        significantly, as after a drift, is attributed to independent errors of all channels `alive`. The k patterns
-        explain a fraction k/m of such errors.
+        The mean square of a frame's residuals, relative to the noise, is about 1 for the training presses. A
+        significant excess over 1, for example after a drift, is attributed to independent errors of all channels that
+        are `alive`. Of such errors, k patterns of m channels explain a fraction k/m.
         """
         num_alive = np.maximum(alive.sum(axis=1), 1)
         degrees_of_freedom = np.maximum(num_alive - self.patterns.shape[1], 1)
@@ -299,23 +312,24 @@ class Channels:
         )
 
     def _scores_and_residuals(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute scores and residuals of frames (n, m) whose channels are all alive."""
+        """Compute the pattern scores of frames whose channels are all alive, and the residuals relative to the
+        noise."""
         scores = changes @ self._score_matrix
         return scores, (changes - scores @ self.patterns.T) / self.noise
 
     @cached_property
     def _score_matrix(self) -> Float[np.ndarray, "m k"]:
-        """Matrix that maps the readings of all channels to scores, if all channels are alive."""
+        """Matrix (channels, patterns) that maps readings to pattern scores if all channels are alive."""
         weighted_patterns = self.patterns / self.noise[:, None] ** 2
         return np.linalg.solve(weighted_patterns.T @ self.patterns + np.diag(1 / self.spread**2), weighted_patterns.T).T
 
 
 def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "m r"]]:
-    """Compute the variance along each principal direction of the frames, in decreasing order, and the directions."""
+    """Compute the principal directions of frames, and the variance along each direction, in decreasing order."""
     num_frames, num_channels = scaled.shape
     if num_channels <= num_frames:
         squares, directions = np.linalg.eigh(scaled.T @ scaled)
-    else:  # the smaller of the two matrices
+    else:  # the Gram matrix of frames is smaller than that of channels
         squares, combinations = np.linalg.eigh(scaled @ scaled.T)
         directions = scaled.T @ combinations / np.sqrt(np.maximum(squares, 1e-300))
     significant_indices = np.flatnonzero(squares > _ROUNDING_ERROR * squares[-1])[::-1]
@@ -323,9 +337,10 @@ def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"
 
 
 def _fit_patterns(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the patterns (m, k), and the standard deviations of their scores (k,) and of the noise (m,).
+    """Compute the patterns of channels (channels, patterns), and the standard deviations of each pattern's score and of
+    each channel's noise.
 
-    The noise is the part of each channel that the patterns do not explain.
+    The noise is the part of each channel's readings that the patterns do not explain.
     """
     explained_fractions = np.cumsum(variance) / np.sum(variance)
     num_patterns = min(
@@ -341,10 +356,12 @@ def _fit_patterns(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray,
 
 
 def _leave_one_out_errors(scaled, variance, directions) -> Float[np.ndarray, "2 D m"]:
-    """Compute mean squared prediction errors of channels, for covariances with each of the diagonals.
+    """Compute mean squared prediction errors of channels for each candidate value that is added to the diagonal of
+    their covariance.
 
-    Returns two arrays (D, m): the error of each channel as predicted by the others, and this error times
-    `residual_factor`, one minus the weight of the channel in its own prediction; `prediction_errors` uses the second.
+    Returns two arrays (diagonal values, channels): the error of the prediction of each channel by the others, and this
+    error times `residual_factor`, one minus the weight of the channel in its own prediction; `prediction_errors` uses
+    the second array.
     """
     scores, errors = scaled @ directions, []
     for diagonal in _DIAGONALS:
@@ -356,9 +373,10 @@ def _leave_one_out_errors(scaled, variance, directions) -> Float[np.ndarray, "2 
 
 
 def _most_likely_scores(changes, alive, patterns, spread, noise) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the most likely scores (n, k) of frames (n, m), and the residuals divided by the noise.
+    """Compute the most likely pattern scores of frames (frames, patterns), and the residuals of their readings divided
+    by the noise.
 
-    Residuals are 0 for channels that are not `alive` (n, m).
+    Residuals are 0 for readings that are not `alive` (frames, channels).
     """
     weighted_patterns = patterns / noise[:, None] ** 2
     prior = np.diag(1 / spread**2)
@@ -370,9 +388,8 @@ def _most_likely_scores(changes, alive, patterns, spread, noise) -> tuple[np.nda
 
 
 def _novelty(scores, residual, alive, spread) -> np.ndarray:
-    """Compute the larger of two root mean squares for each frame (n,): of its residuals, and of its scores.
-
-    Residuals are relative to the noise, and scores relative to their spread.
+    """Compute the novelty of each frame: the larger of the root mean squares of its residuals, relative to the noise,
+    and of its pattern scores, relative to their standard deviations.
     """
     residual_size = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(alive.sum(axis=1), 1))
     return np.maximum(residual_size, np.sqrt(np.mean((scores / spread) ** 2, axis=1)))
@@ -381,10 +398,12 @@ def _novelty(scores, residual, alive, spread) -> np.ndarray:
 def choose_channels(
     scaled: Float[np.ndarray, "N m"], targets: Float[np.ndarray, "N q"], num_channels: int
 ) -> Int[np.ndarray, " n"]:
-    """Select channels by simultaneous orthogonal matching pursuit (Tropp et al. 2006), the most informative first.
+    """Select channels by simultaneous orthogonal matching pursuit (Tropp et al. 2006), in decreasing order of
+    information.
 
-    Each channel explains, by least squares, most of the part of the `targets` that the previous channels leave
-    unexplained. Products of the targets are explained too, since places are not linear in voltages.
+    Each selected channel explains, by least squares, more than any other channel of the part of the `targets` that the
+    previously selected channels leave unexplained. Products of the targets are explained too, since places are not
+    linear functions of voltages.
     """
     products = [targets[:, i] * targets[:, j] for i in range(targets.shape[1]) for j in range(i + 1)]
     unexplained_targets = np.column_stack([targets, *(product - product.mean() for product in products[:20])])

@@ -1,4 +1,4 @@
-"""Limit the threads and the memory that learning uses."""
+"""Limit the number of threads and the memory that machine learning uses."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from jeit_solvers import number_of_cores
 
 
 def one_thread() -> AbstractContextManager:
-    """Return a context manager within which libraries use one thread.
+    """Return a context manager within which numerical libraries use one thread.
 
-    With thousands of presses, several threads spend more time waiting for each other than computing.
+    In learning from thousands of presses, several threads spend more time waiting for each other than computing.
     """
     from threadpoolctl import threadpool_limits
 
@@ -26,16 +26,16 @@ def one_thread() -> AbstractContextManager:
 
 
 def apply_in_parts(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, at_once: int) -> np.ndarray:
-    """Apply `function` to `at_once` rows at a time, which limits memory, and concatenate the results."""
+    """Apply `function` to `at_once` rows of an array at a time, which limits memory, and concatenate the results."""
     return np.concatenate([function(rows[chunk]) for chunk in _slices(len(rows), at_once)])
 
 
 def apply_over_threads(
     function: Callable[..., dict[str, np.ndarray]], *arrays: np.ndarray, at_once: int
 ) -> dict[str, np.ndarray]:
-    """Apply `function` to `at_once` rows of the `arrays` at a time, and concatenate the arrays that it returns.
+    """Apply `function` to `at_once` rows of the `arrays` at a time, and concatenate the arrays that `function` returns.
 
-    Many parts are computed in parallel.
+    If there are many parts of `at_once` rows, they are computed in parallel.
     """
     chunks = _slices(len(arrays[0]), at_once)
     if len(chunks) < 4:
@@ -47,9 +47,11 @@ def apply_over_threads(
 
 
 def apply_over_folds(function: Callable[[int], Any], num_folds: int) -> list[Any]:
-    """Apply `function` to 0 … `num_folds` - 1 in parallel, each call with one thread.
+    """Apply `function` to the index of each cross-validation fold, 0 … `num_folds` - 1, in parallel, with one thread
+    for each call.
 
-    The limit is set in every call, since OpenMP keeps a separate number of threads for each calling thread.
+    The limit of one thread is set in every call, since OpenMP keeps a separate number of threads for each calling
+    thread.
     """
 
     def apply_with_one_thread(fold: int) -> Any:

@@ -1,4 +1,5 @@
-"""Features of frames: several forms of the changes, standardised, and their principal components."""
+"""Features of frames for learning: several forms of the voltage changes, standardised, and their principal
+components."""
 
 from __future__ import annotations
 
@@ -10,21 +11,22 @@ from jaxtyping import Float
 
 from jeit.touch.learnt.imaged import ContactFeatures, ImageFeatures, ImageReconstruction
 
-# Minimum number of frames with the same targets as another frame, from which the noise of frames is estimated.
+# Minimum number of repeated frames (frames with the same targets as another frame) for estimating the noise of frames.
 _MIN_REPEATED_FRAMES = 20
 
 
 @dataclass(frozen=True)
 class WhitenedChanges:
-    """Features: changes times `root` (m, m). The variation between repeated frames then has unit covariance."""
+    """Whitened features: voltage changes times the matrix `root`, such that the variation between frames with the same
+    target has unit covariance."""
 
     root: Float[np.ndarray, "m m"]
 
     @classmethod
     def learn(cls, changes: Float[np.ndarray, "N m"], answers: Float[np.ndarray, "N d"]) -> "WhitenedChanges":
-        """Fit the whitening to frames, of which some have the same `answers`.
+        """Fit the whitening matrix to frames, of which some have the same `answers` (targets).
 
-        The covariance of the variation between frames with the same answers is shrunk as in Ledoit and Wolf (2004).
+        The covariance between frames with the same targets is shrunk as in Ledoit and Wolf (2004).
         """
         from sklearn.covariance import ledoit_wolf
 
@@ -43,62 +45,64 @@ class WhitenedChanges:
         return cls((vectors / np.sqrt(values)) @ vectors.T / scale[:, None])
 
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
-        """Compute the features (n, m) of changes (n, m)."""
+        """Compute the whitened features of voltage changes, both (frames, channels)."""
         return changes @ self.root
 
     def deviation(self, values: Float[np.ndarray, "N m"]) -> Float[np.ndarray, " m"]:
-        """Return the unit of the features, the same for all: the root mean square of their standard deviations."""
+        """Return the unit of each feature, the same for all: the root mean square of the features' standard
+        deviations."""
         return np.full(values.shape[1], np.sqrt(np.mean(values.var(axis=0))))
 
 
 def are_repeated(answers: Float[np.ndarray, "N d"]) -> bool:
-    """Whether enough frames have the same answers as another frame to estimate their noise."""
+    """Whether enough frames have the same `answers` (targets) as another frame to estimate the noise of frames."""
     return int(np.sum(_group_equal_rows(answers)[1] - 1)) >= _MIN_REPEATED_FRAMES
 
 
 def _group_equal_rows(targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number the frames (N,) such that frames with equal `targets` have the same number; also return the number of
-    frames with each number."""
+    """Number the groups of frames with equal `targets`; returns the group of each frame and the size of each group."""
     group, count = np.unique(targets, axis=0, return_inverse=True, return_counts=True)[1:]
     return group.ravel(), count
 
 
-# Maximum number of principal components; number of presses required for each.
+# Maximum number of principal components; number of presses required for each component.
 _MAX_COMPONENTS, _PRESSES_PER_COMPONENT = 60, 3
 
 
 def _divide_by_unit(changes, reference, unit):
-    """Compute features (n, m): changes divided by the `unit` of each channel."""
+    """Compute features (frames, channels): voltage changes divided by the `unit` of each channel."""
     return changes / unit
 
 
 def _divide_by_reference(changes, reference, unit):
-    """Compute features (n, m): changes relative to the reference."""
+    """Compute features (frames, channels): voltage changes relative to the reference voltages."""
     size = np.maximum(np.abs(reference), 1e-3 * np.sqrt(np.mean(reference**2, axis=1, keepdims=True)))
     return changes / np.where(size > 0, size, 1.0)
 
 
 def _compress_changes(changes, reference, unit):
-    """Compute features (n, m): changes, divided by `unit`, on a scale that compresses large ones."""
+    """Compute features (frames, channels): sign(u) log(1 + |u|) of the voltage changes u in the `unit` of each
+    channel."""
     return np.sign(changes) * np.log1p(np.abs(changes) / unit)
 
 
 def _normalise_scaled_changes(changes, reference, unit):
-    """Compute features (n, m + 1): changes divided by `unit` and by the frame's root mean square, and its logarithm."""
+    """Compute features: voltage changes in the `unit` of each channel, divided by their root mean square in the frame,
+    and the logarithm of this root mean square."""
     size = np.sqrt(np.mean((changes / unit) ** 2, axis=1, keepdims=True))
     size = np.where(size > 0, size, 1.0)
     return np.hstack([changes / unit / size, np.log(size)])
 
 
 def _normalise_changes(changes, reference, unit):
-    """Compute features (n, m + 1): changes divided by the frame's root mean square, and its logarithm, without
-    `unit`."""
+    """Compute features: voltage changes divided by their root mean square in the frame, and the logarithm of this root
+    mean square, without `unit`."""
     size = np.sqrt(np.mean(changes**2, axis=1, keepdims=True))
     size = np.where(size > 0, size, 1.0)
     return np.hstack([changes / size, np.log(size)])
 
 
-# Forms of features: functions of changes (n, m), the reference (n, m), and a unit (m,) for each channel.
+# Forms of features: functions of changes and reference, both (frames, channels), and of the unit of each channel.
 FORMS = {
     "differences": _divide_by_unit,
     "ratios": _divide_by_reference,
@@ -106,17 +110,17 @@ FORMS = {
     "normalised": _normalise_scaled_changes,
     "shapes": _normalise_changes,
 }
-# Functions that fit a learnt form of features to changes (N, m) and targets (N, d).
+# Functions that fit a learnt form of features to changes (presses, channels) and targets (presses, targets).
 Maker = Callable[[np.ndarray, np.ndarray], WhitenedChanges | ContactFeatures | ImageFeatures]
 
 
 @dataclass(frozen=True)
 class Features:
-    """Features of one `form`, standardised, and optionally reduced to principal components.
+    """Features of voltage changes in one `form`, standardised, and optionally reduced to principal components.
 
-    `mean` and `deviation` (p,) standardise the features; `components` (p, k): the principal components, or None.
-    `made`: computes the features if the form is learnt, None otherwise; `unit` (m,): unit of each channel for the other
-    forms.
+    `mean` and `deviation` standardise each feature; `components` (features, components): the principal components, or
+    None. `made`: computes the features of a learnt form, None for other forms; `unit`: unit of each channel for the
+    forms that are not learnt.
     """
 
     form: str
@@ -136,9 +140,10 @@ class Features:
         made: WhitenedChanges | ContactFeatures | ImageFeatures | None = None,
         rotated: bool = True,
     ) -> "Features":
-        """Fit the features to changes of voltage and their reference.
+        """Fit the scaling and the principal components of features to voltage changes and reference voltages.
 
-        If `rotated`, features are reduced to principal components, except the few features of a contact.
+        If `rotated`, features are reduced to principal components, except for the few features of a contact in an
+        image.
         """
         if made is None:
             unit, values, mean, deviation = standardisation(form, changes, reference)
@@ -152,17 +157,18 @@ class Features:
         return cls(form, unit, mean, deviation, components, made)
 
     def __call__(self, changes: np.ndarray, reference: np.ndarray) -> Float[np.ndarray, "n k"]:
-        """Compute the features (n, k) of changes (n, m)."""
+        """Compute the features (frames, features) of changes and reference voltages (frames, channels)."""
         values = FORMS[self.form](changes, reference, self.unit) if self.made is None else self.made(changes)
         standardised_values = (values - self.mean) / self.deviation
         return standardised_values if self.components is None else standardised_values @ self.components
 
 
 def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Compute the standardisation of features of a `form` from changes (N, m).
+    """Compute features of a `form` from voltage changes (presses, channels), and their mean and standard deviation.
 
-    Returns the unit of each channel (m,), its usual absolute change; the features (N, p); and their mean and standard
-    deviation (p,), which is infinite for a feature that never changes.
+    Returns the unit of each channel, which is its median absolute change, or the mean if the median is 0; the features
+    (presses, features); the mean of each feature; and the standard deviation of each feature, infinite for a constant
+    feature.
     """
     size = np.abs(changes)
     unit = np.median(size, axis=0)
@@ -172,16 +178,17 @@ def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tu
 
 
 def _replace_zeros_by_infinity(deviation: np.ndarray) -> np.ndarray:
-    """Replace standard deviations that are negligible compared with the largest one by infinity."""
+    """Replace standard deviations of features by infinity if they are negligible compared with the largest."""
     is_nonzero = deviation > 1e-9 * max(deviation.max(), 1e-300)
     return np.where(is_nonzero, deviation, np.inf)
 
 
 @dataclass(frozen=True)
 class Forms:
-    """The forms of features that are available.
+    """The forms of features that can be computed from a set of presses.
 
-    `names`: names of all forms; `makers`: functions that fit the learnt forms, which need repeated frames or images.
+    `names`: names of all forms; `makers`: by name, the functions that fit learnt forms, which need repeated frames or
+    images.
     """
 
     names: tuple[str, ...]
@@ -191,7 +198,8 @@ class Forms:
     def available(
         cls, answers: Float[np.ndarray, "N d"], imaged: ImageReconstruction | None, *, has_reference: bool
     ) -> "Forms":
-        """Return the forms that can be computed from the data."""
+        """Return the forms of features that can be computed with or without reference voltages, repeated targets and
+        images."""
         makers: dict[str, Maker] = {"whitened": WhitenedChanges.learn} if are_repeated(answers) else {}
         if imaged is not None:
             makers |= {"contacts": lambda changes, answers: ContactFeatures(imaged)}
@@ -200,6 +208,6 @@ class Forms:
         return cls((*unlearnt_forms, *makers), makers)
 
     def learn(self, form: str, changes, reference, answers, *, rotated: bool = True) -> Features:
-        """Fit features of one form, as `Features.learn` does."""
+        """Fit features of one form to voltage changes, as `Features.learn` does."""
         made = self.makers[form](changes, answers) if form in self.makers else None
         return Features.learn(form, changes, reference, made=made, rotated=rotated)

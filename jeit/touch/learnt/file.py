@@ -1,8 +1,9 @@
-"""Read and write learnt skins as files in the format of skops: arrays and estimators of scikit-learn, never a pickle.
+"""Read and write learnt skins as files in the format of skops, with arrays and estimators of scikit-learn, never a
+pickle.
 
-Files are ZIP archives with the same bytes for the same content: skops numbers objects by their address in memory and
+A file is a ZIP archive with the same bytes for the same content: skops numbers objects by their address in memory and
 stores the time of writing, whereas here objects are numbered in order of appearance, without dates. A checksum, the
-seal, detects files that were changed after jeit wrote them. It contains no secret, so it is no signature.
+seal, detects files that were changed after jeit wrote them. The seal contains no secret, so it is no signature.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ from jeit.touch.learnt.numbers import DeviationModel, LearntNumbers
 from jeit.touch.learnt.temporal_network import TemporalNetwork
 
 _SCHEMA_FILE = "schema.json"
-# Matches the number of an object in the schema, also where the number is part of a file name.
+# Matches the number of an object in the schema of a skops file, also where the number is part of a file name.
 _OBJECT_NUMBER = re.compile(r'("__id__": |"file": ")(\d+)')
 
 
 def write_sealed(content: Any, file: BinaryIO) -> None:
-    """Write `content` to a sealed archive: arrays and estimators, or lists and dictionaries of them."""
+    """Write arrays and estimators, or lists and dictionaries of them, to a ZIP archive with a checksum, the seal."""
     from skops.io import dumps
 
     with zipfile.ZipFile(io.BytesIO(dumps(content))) as archive:
@@ -58,7 +59,7 @@ def write_sealed(content: Any, file: BinaryIO) -> None:
 
 
 def check_seal(path: Path) -> None:
-    """Check the seal of an archive. Raises `ValueError` if the archive was changed after it was written."""
+    """Check the checksum (seal) of an archive. Raises `ValueError` if the archive was changed after it was written."""
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
         if archive.comment != _seal(members):
@@ -66,7 +67,7 @@ def check_seal(path: Path) -> None:
 
 
 def _seal(members: dict[str, bytes]) -> bytes:
-    """Compute a checksum of the names and contents of an archive's members."""
+    """Compute the checksum of the names and contents of the files in an archive."""
     digest = hashlib.sha256()
     for name in sorted(members):
         digest.update(f"{name} {len(members[name])}\n".encode() + members[name])
@@ -74,9 +75,9 @@ def _seal(members: dict[str, bytes]) -> bytes:
 
 
 _FILE_KIND, _FILE_VERSION = "a jeit learnt skin", 2
-# Names of fields in files of version 0.2, and their present names.
+# Names of fields in files that jeit 0.2 wrote, and the present names of these fields.
 _OLD_FIELDS = {"unforetold": "unpredicted"}
-# Classes of stored objects, by the names that files have for them.
+# Classes of the objects that a file can store, by their names in the file.
 _STORED_CLASSES: dict[str, type] = {
     "Channels": Channels,
     "Contacts": ContactFeatures,
@@ -105,14 +106,14 @@ _STORED_NAMES = {stored: name for name, stored in _STORED_CLASSES.items()}
 
 
 def write_skin(skin: LearntSkin, path: str | Path) -> None:
-    """Write a learnt skin to one file, without its `standing`.
+    """Write a learnt skin to one file, without its field `standing` (accuracy on held-out presses).
 
     **Arguments:**
 
     - `skin`: the learnt skin.
     - `path`: path of the file.
 
-    Raises `ValueError` for a folder.
+    Raises `ValueError` if `path` is a folder.
 
     **Example:**
 
@@ -128,13 +129,14 @@ def write_skin(skin: LearntSkin, path: str | Path) -> None:
 def read_skin(path: str | Path) -> LearntSkin:
     """Read a learnt skin from a file, or from the folder that `jeit touch fit` made.
 
-    Nothing in the file is executed: it may contain only numbers and estimators of scikit-learn.
+    Nothing in the file is executed: the file may contain only numbers and estimators of scikit-learn.
 
     **Arguments:**
 
     - `path`: path of the file or folder.
 
-    Raises `FileNotFoundError`, and `ValueError` for files of another kind or with any other content.
+    Raises `FileNotFoundError` if the path does not exist, and `ValueError` if the file is not that of a learnt skin or
+    contains other objects than numbers and estimators.
 
     **Example:**
 
@@ -152,11 +154,10 @@ def read_skin(path: str | Path) -> LearntSkin:
 
 
 def write_plain(path: str | Path, kind: str, version: int, fields_by_name: dict[str, Any], example: str) -> None:
-    """Write the fields `fields_by_name` of an object, by name, to one file: arrays, estimators, and objects of jeit's
-    classes.
+    """Write the fields of an object to one file; the fields may be arrays, estimators, and objects of jeit's classes.
 
-    `kind` and `version` identify the type of file; `example`: a file name that the error message suggests.
-    Raises `ValueError` if `path` is a folder.
+    `fields_by_name`: the fields, by name; `kind` and `version` identify the type of file; `example`: a file name that
+    the error message suggests. Raises `ValueError` if `path` is a folder.
     """
     need_extra("learn", "a file of a learnt skin")
     if Path(path).is_dir():
@@ -166,11 +167,11 @@ def write_plain(path: str | Path, kind: str, version: int, fields_by_name: dict[
 
 
 def read_plain(path: Path, kind: str, version: int, description: str, make: Callable[[dict[str, Any]], Any]) -> Any:
-    """Read a file that `write_plain` wrote, and return `make(fields)`, where `fields` are those written, by name.
+    """Read a file that `write_plain` wrote, and return `make(fields)`, where `fields` are the written fields, by name.
 
-    Nothing in the file is executed. `description`: what the file should contain, as error messages name it.
-    Raises `ValueError` for files of another kind, and if the file contains anything but arrays, estimators and objects
-    of jeit's classes.
+    Nothing in the file is executed. `description`: the expected content of the file, as error messages name it. Raises
+    `ValueError` if the file is of another `kind` or contains anything but arrays, estimators and objects of jeit's
+    classes.
     """
     need_extra("learn", "a file of a learnt skin")
     from skops.io import get_untrusted_types, load
@@ -193,7 +194,7 @@ def read_plain(path: Path, kind: str, version: int, description: str, make: Call
 
 
 def _to_plain(value):
-    """Convert objects of jeit's classes (`_STORED_CLASSES`) to dictionaries of their fields, recursively."""
+    """Convert objects of jeit's classes (those in `_STORED_CLASSES`) to dictionaries of their fields, recursively."""
     if type(value) in _STORED_NAMES:
         return {
             "jeit": _STORED_NAMES[type(value)],
@@ -207,7 +208,7 @@ def _to_plain(value):
 
 
 def _from_plain(value):
-    """Convert the dictionaries that `_to_plain` made back to objects of jeit's classes."""
+    """Convert dictionaries of fields, as of `_to_plain`, back to objects of jeit's classes, recursively."""
     if isinstance(value, dict):
         restored_values = {_OLD_FIELDS.get(key, key): _from_plain(item) for key, item in value.items() if key != "jeit"}
         return _STORED_CLASSES[value["jeit"]](**restored_values) if "jeit" in value else restored_values

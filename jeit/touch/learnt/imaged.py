@@ -1,4 +1,5 @@
-"""Linear images of changes of voltage, computed with a model of the skin, and the strongest contact in each."""
+"""Images computed from voltage changes by linear reconstruction with a model of the skin, and the strongest contact in
+each image."""
 
 from __future__ import annotations
 
@@ -15,20 +16,21 @@ from jeit.mesh import centroids, measures
 from jeit.touch.learnt.extras import apply_in_parts
 from jeit_solvers.engines import as_array
 
-# A contact is the region above this fraction of its peak, among the cells nearest to the peak; the number of these
-# cells, as a fraction of all.
+# A contact is the region of an image above this fraction of its peak, among the cells nearest to the peak; fraction of
+# all cells that count as nearest.
 _CONTACT_LEVEL, _NEIGHBOUR_FRACTION = 0.7, 0.2
-# Weight of each feature of the contact, where each cell of the image has weight 1.
+# Weight of each feature of the contact among image features, relative to one cell of the image.
 _CONTACT_WEIGHT = 3.0
 _CHUNK_SIZE = 128
 
 
 @dataclass(frozen=True)
 class ImageReconstruction:
-    """Linear reconstruction of images with c cells from changes of m channels; touches are positive.
+    """Linear reconstruction of images from voltage changes; touches are positive in the images.
 
-    `matrix` (m, c): an image is changes times this matrix; `centres` (c, d): centroids of the cells, metres; `sizes`
-    (c,): areas or volumes of the cells; `around` (c, k): indices of the cells nearest to each cell.
+    `matrix` (channels, cells): voltage changes times this matrix give an image; `centres` (cells, coordinates):
+    centroids of the image cells, metres; `sizes`: areas or volumes of the cells; `around` (cells, neighbours): indices
+    of the cells nearest to each cell.
     """
 
     matrix: Float[np.ndarray, "m c"]
@@ -40,16 +42,16 @@ class ImageReconstruction:
     def create(
         cls, model: ForwardModel, changes: Float[np.ndarray, "N m"], used: Bool[np.ndarray, " M"], reference
     ) -> tuple["ImageReconstruction", list[str]]:
-        """Create a one-step reconstruction from the channels `used`.
+        """Create a one-step linear reconstruction from the channels that are `used`.
 
-        If a `reference` (M,) is given, the model is calibrated on it. The sign of touches is determined from the
-        changes of presses. Also returns notes.
+        If a `reference` frame is given, the forward model is calibrated on this frame. The sign of touches in images is
+        determined from the voltage `changes` of presses. Also returns notes on the calibration as text.
         """
         notes, conductivity, mask = [], 1.0, as_array(used)
         if reference is not None and np.abs(reference[used]).max() > 0:
             polarity = np.sign(
                 np.where(used, model.voltages(1.0), 0.0) @ reference
-            )  # -1 where the polarity is reversed
+            )  # -1 where the polarity of a channel is reversed
             calibration = calibrate(model, as_array(polarity * reference), mask=mask, contact="fixed")
             if np.isfinite(calibration.misfit):
                 model, conductivity = calibration.model, calibration.conductivity
@@ -62,8 +64,8 @@ class ImageReconstruction:
         return cls(sign * matrix, centres, sizes, np.reshape(around, (len(centres), -1))), notes
 
     def contacts(self, images: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n d+3"]:
-        """Describe the strongest contact of each image: its centroid (d,), and the logarithms of its peak, integral and
-        size."""
+        """Compute features of the strongest contact of each image: the centroid, and the logarithms of the peak, the
+        integral and the area or volume."""
         row_indices = np.arange(len(images))[:, None]
         cells = self.around[images.argmax(axis=1)]
         neighbour_values, sizes = images[row_indices, cells], self.sizes[cells]
@@ -80,30 +82,31 @@ class ImageReconstruction:
 
 @dataclass(frozen=True)
 class ContactFeatures:
-    """Features of changes: the strongest contact in their image."""
+    """Features of voltage changes: centroid, peak, integral and size of the strongest contact in the reconstructed
+    image."""
 
     imaged: ImageReconstruction
 
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n p"]:
-        """Compute the features (n, p) of changes (n, m)."""
+        """Compute the features (frames, features) of voltage changes (frames, channels)."""
         return apply_in_parts(lambda rows: self.imaged.contacts(rows @ self.imaged.matrix), changes, _CHUNK_SIZE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
-        """Return the unit of each feature, its standard deviation."""
+        """Return the unit by which each feature is divided: its standard deviation over the presses."""
         return values.std(axis=0)
 
 
 @dataclass(frozen=True)
 class ImageFeatures:
-    """Features of changes: the strongest contact in their image, and the image itself.
+    """Features of voltage changes: the strongest contact in the reconstructed image, and the values of the image.
 
-    The image is divided by its root mean square, whose logarithm is another feature.
+    The image is divided by its root mean square; the logarithm of the root mean square is another feature.
     """
 
     imaged: ImageReconstruction
 
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n p"]:
-        """Compute the features (n, p) of changes (n, m)."""
+        """Compute the features (frames, features) of voltage changes (frames, channels)."""
 
         def features(rows: np.ndarray) -> np.ndarray:
             image = rows @ self.imaged.matrix
@@ -113,10 +116,10 @@ class ImageFeatures:
         return apply_in_parts(features, changes, _CHUNK_SIZE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
-        """Return the unit of each feature.
+        """Return the unit by which each feature is divided.
 
-        For the contact and the logarithm, it is a fraction of the feature's standard deviation; for all cells of the
-        image, it is the root mean square of their standard deviations.
+        For the contact and the logarithm, the unit is a fraction of the feature's standard deviation; for all cells of
+        the image, the unit is the root mean square of their standard deviations.
         """
         num_other_features = values.shape[1] - len(self.imaged.sizes)
         deviations = values.std(axis=0)
@@ -129,7 +132,8 @@ class ImageFeatures:
 
 
 def check_imaged(model: ForwardModel, num_channels: int) -> None:
-    """Check the model of a skin. Raises `ValueError` if it is no model, or has another number of channels."""
+    """Check the forward model of a skin. Raises `ValueError` if `model` is no forward model, or its number of channels
+    is not `num_channels`."""
     check_kind("model", model, ForwardModel, "a ForwardModel(mesh, electrodes, protocol)")
     num_model_channels = model.protocol.num_measurements
     if num_model_channels != num_channels:

@@ -1,4 +1,4 @@
-"""Learn to classify touches by labels, and which keys are pressed."""
+"""Learn to predict the labels of touches, and which keys are pressed."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ _QUICK_METHOD = "linear-discriminant"
 
 @dataclass(frozen=True)
 class LabelMethodResult:
-    """Result of a `method` on a `form` of the features, for held-out presses.
+    """Cross-validation result of a classification `method` with one `form` of features.
 
-    `held_out` (N,): indices of the predicted labels; `odds` (N, C): log-odds of the classes; `error`: share of errors.
+    `held_out`: index of the predicted label of each press; `odds` (presses, classes): predicted log-odds of the
+    classes; `error`: share of wrong labels.
     """
 
     method: str
@@ -35,10 +36,10 @@ class LabelMethodResult:
 
 @dataclass(frozen=True)
 class LearntLabels:
-    """A classifier of features.
+    """A classifier that predicts the label of a touch from features of voltage changes.
 
-    `classes` (C,): the labels; `sharpness`: factor of the log-odds from which probabilities are computed; `notes`:
-    remarks on the fit.
+    `classes`: the labels; `sharpness`: factor by which log-odds are multiplied for conversion to probabilities;
+    `notes`: remarks on the fit as text.
     """
 
     features: Features
@@ -48,7 +49,7 @@ class LearntLabels:
     notes: list[str]
 
     def predict(self, changes, reference) -> tuple[np.ndarray, Float[np.ndarray, " n"]]:
-        """Predict labels (n,) and their probabilities (n,)."""
+        """Predict the label of each frame and its probability."""
         odds = log_odds(self.model, self.features(changes, reference))
         return self.classes[odds.argmax(axis=1)], probabilities(odds, self.sharpness).max(axis=1)
 
@@ -63,11 +64,12 @@ def learn_labels(
     imaged: ImageReconstruction | None = None,
     progress: Callable[[str], None] = lambda message: None,
 ) -> tuple[LearntLabels, list[LabelMethodResult]]:
-    """Learn labels (N,) from changes (N, m), their reference, and images of the changes if `imaged` is given.
+    """Learn a classifier of labels from voltage changes of presses (presses, channels).
 
-    `method`: one of the nine classifiers; "auto" chooses the one with the lowest error. Also returns the results of all
-    methods that were tried, in order of their errors in cross-validation on `folds` (N,). All use the form of the
-    features with which the linear discriminant has the lowest error.
+    `reference`: reference voltages of the changes; `imaged`: optional reconstruction of images, which are then used as
+    features too; `method`: one of the nine classifiers, or "auto" for the classifier with the lowest error. Also
+    returns the results of all methods that were tried, in order of their errors in cross-validation on `folds`. All
+    methods use the form of features with which the linear discriminant has the lowest error.
     """
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference
@@ -102,7 +104,7 @@ def _error_rate(result: LabelMethodResult) -> float:
 
 
 def _hold_out(method, form, forms: Forms, changes, reference, true_classes, folds) -> LabelMethodResult:
-    """Predict the classes of all presses by cross-validation of a method on one form of the features."""
+    """Predict the classes of all presses by cross-validation of one method with one form of features."""
     num_classes = true_classes.max() + 1
     odds = np.full((len(true_classes), num_classes), -1e3)
 
@@ -123,15 +125,15 @@ def _hold_out(method, form, forms: Forms, changes, reference, true_classes, fold
 
 _INVERSE_PENALTIES = (1e-3, 1e-2, 1e-1, 1.0)
 _KEY_FORMS = ("differences", "compressed")
-# Number of channels that the discriminant and the trees use, which are those that best separate a key; number of
-# trees.
+# Number of channels that the discriminant and the trees use for a key, selected for the best separation of the key's
+# presses from other presses; number of trees.
 _NUM_SELECTED_CHANNELS, _NUM_TREES = 200, 150
 _TREE_OPTIONS: dict[str, Any] = {"max_features": 0.3, "min_samples_leaf": 2, "random_state": 0}
 
 
 @dataclass(frozen=True)
 class StandardisedFeatures:
-    """Standardised features of one `form`: all features, or those with the indices `chosen`."""
+    """Standardised features of voltage changes in one `form`: all features, or only those with the indices `chosen`."""
 
     form: str
     unit: Float[np.ndarray, " m"]
@@ -141,27 +143,27 @@ class StandardisedFeatures:
 
     @classmethod
     def learn(cls, form: str, changes: np.ndarray, reference: np.ndarray) -> "StandardisedFeatures":
-        """Fit the standardisation to changes (N, m) and their reference."""
+        """Fit the standardisation of features to voltage changes (presses, channels) and reference voltages."""
         unit, _, mean, deviation = standardisation(form, changes, reference)
         return cls(form, unit, mean, deviation)
 
     def __call__(self, changes: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """Compute the features (n, p) of changes (n, m)."""
+        """Compute the features (frames, features) of voltage changes (frames, channels)."""
         values = (FORMS[self.form](changes, reference, self.unit) - self.mean) / self.deviation
         return values if self.chosen is None else values[:, self.chosen]
 
 
 @dataclass(frozen=True)
 class LearntKeys:
-    """Classifiers of K keys.
+    """Classifiers that predict which keys of a keyboard are pressed.
 
-    `members`: the features, the classifier, and the sharpness of the probability of each key.
+    `members`: features, classifier, and calibration factor of the log-odds (sharpness) for each key.
     """
 
     members: list[tuple[StandardisedFeatures, Any, float]]
 
     def predict(self, changes, reference) -> tuple[Bool[np.ndarray, "n K"], Float[np.ndarray, "n K"]]:
-        """Predict which keys are pressed, and the probability of each."""
+        """Predict which keys are pressed, and the probability that each key is pressed, both (frames, keys)."""
         odds = [log_odds(model, features(changes, reference)) for features, model, _ in self.members]
         key_probabilities = [
             probabilities(key_odds, sharpness)[:, 1]
@@ -173,9 +175,10 @@ class LearntKeys:
 
 @dataclass(frozen=True)
 class KeyMethodResults:
-    """Results of the chosen method of each key for held-out presses.
+    """Cross-validation results of the classification method that was chosen for each key.
 
-    `methods`: the chosen methods; `held_out` (N, K): predictions; `errors` (K,): shares of errors.
+    `methods`: name of each key's method; `held_out` (presses, keys): predictions for held-out presses; `errors`: share
+    of errors for each key.
     """
 
     methods: list[str]
@@ -191,10 +194,10 @@ def learn_keys(
     *,
     progress: Callable[[str], None] = lambda message: None,
 ) -> tuple[LearntKeys, KeyMethodResults]:
-    """Learn to predict which of K keys are pressed from changes (N, m).
+    """Learn to predict which keys are pressed from voltage changes (presses, channels).
 
-    Each key is classified by the method with the lowest loss in cross-validation on `folds`. Also returns the results
-    of these methods.
+    For each key, the classification method with the lowest loss in cross-validation on `folds` is chosen. Also returns
+    the cross-validation results of the chosen methods.
     """
     reference = np.zeros_like(changes) if reference is None else reference
     num_presses, num_keys = touched.shape
@@ -210,13 +213,13 @@ def learn_keys(
             )
             rotation = np.linalg.svd(training_features, full_matrices=False)[
                 2
-            ].T  # faster, and equivalent for linear methods
+            ].T  # principal axes: faster, and equivalent for linear methods
             rotated_features = training_features @ rotation, held_out_features @ rotation
             for key in range(num_keys):
                 training_answers = touched[~is_held_out, key].astype(int)
                 if (
                     training_answers.min() == training_answers.max()
-                ):  # all presses of the key, or all without it, are held out
+                ):  # the training set has no press of the key, or only presses of the key
                     for name in odds:
                         odds[name][is_held_out, key] = 2.0 * training_answers[0] - 1
                     continue
@@ -237,7 +240,7 @@ def learn_keys(
     members, methods, held_out = [], [], np.empty((num_presses, num_keys), bool)
     for key in range(num_keys):
         is_pressed = touched[:, key]
-        # Choose by the error rate and the likelihood, since many methods have the same number of errors.
+        # Choose the method by error rate and likelihood, since many methods have the same number of errors.
         name = min(odds, key=lambda name: _loss(odds[name][:, key], is_pressed))
         methods.append(name)
         held_out[:, key] = odds[name][:, key] > 0
@@ -247,7 +250,8 @@ def learn_keys(
 
 
 def _key_methods() -> dict[str, tuple[str, float]]:
-    """Return the candidate methods by name: the kind of classifier, and the constant C of logistic regression."""
+    """Return the candidate classification methods by name: kind of classifier, and inverse penalty C of logistic
+    regression."""
     candidates = {}
     for form in _KEY_FORMS:
         candidates |= {f"logistic, C = {strength:g} on {form}": ("linear", strength) for strength in _INVERSE_PENALTIES}
@@ -257,9 +261,11 @@ def _key_methods() -> dict[str, tuple[str, float]]:
 
 
 def _fit_key(name: str, changes, reference, answers, odds) -> tuple[StandardisedFeatures, Any, float]:
-    """Fit the method `name` to one key; returns its features, its classifier, and the sharpness of probabilities.
+    """Fit the classification method `name` to one key; returns features, classifier, and sharpness (factor of
+    log-odds).
 
-    `answers` (N,): 1 where the key is pressed; `odds` (N,): log-odds of held-out presses, for the sharpness.
+    `answers`: 1 for presses of the key, else 0; `odds`: log-odds of held-out presses, from which the sharpness is
+    fitted.
     """
     kind, strength = _key_methods()[name]
     features = StandardisedFeatures.learn(name.partition(" on ")[2], changes, reference)
@@ -275,7 +281,7 @@ def _fit_key(name: str, changes, reference, answers, odds) -> tuple[Standardised
 
 
 def _fit_rotated(values, answers, strength):
-    """Fit logistic regression to rotated features, and convert its coefficients to the original features."""
+    """Fit logistic regression to principal components of the features, and convert its coefficients to the features."""
     rotation = np.linalg.svd(values, full_matrices=False)[2].T
     model = _fit_logistic(values @ rotation, answers, strength)
     model.coef_ = model.coef_ @ rotation.T
@@ -290,7 +296,7 @@ def _fit_logistic(values, answers, strength):
 
 
 def _fit_discriminant(values, answers):
-    """Fit a linear discriminant to features (N, p), for answers (N,) that are true where the key is pressed."""
+    """Fit a linear discriminant to features (presses, features); `answers` are true for the presses of a key."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
     return LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(values, answers)
@@ -309,7 +315,8 @@ _CHANNEL_METHODS = {"discriminant": _fit_discriminant, "trees": _fit_trees}
 
 
 def _select_features(values: np.ndarray, is_pressed: np.ndarray) -> np.ndarray:
-    """Select the features whose means differ most between the two classes, relative to the spread within them."""
+    """Select the features whose means differ most between pressed and released, relative to the spread within each
+    class."""
     pressed_values, released_values = values[is_pressed == 1], values[is_pressed == 0]
     deviation = np.sqrt(
         (pressed_values.var(axis=0) * len(pressed_values) + released_values.var(axis=0) * len(released_values))
@@ -323,8 +330,8 @@ def _select_features(values: np.ndarray, is_pressed: np.ndarray) -> np.ndarray:
 
 
 def _loss(odds: np.ndarray, true_classes: np.ndarray) -> float:
-    """Compute the error rate plus 0.1 times the mean negative log-likelihood of the true answers, at the best
-    sharpness."""
+    """Compute the loss of a classifier: the error rate plus 0.1 times the mean negative log-likelihood of the true
+    classes, at the best sharpness (factor of the log-odds)."""
     columns = np.column_stack([np.zeros(len(odds)), odds])
     sharpness = fit_sharpness(columns, true_classes.astype(int))
     likelihoods = probabilities(columns, sharpness)[np.arange(len(true_classes)), true_classes.astype(int)]

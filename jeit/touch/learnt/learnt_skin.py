@@ -35,35 +35,35 @@ from jeit.touch.learnt.presses import (
     standardise_sessions,
 )
 
-# A frame is unlike the training set above this novelty, which is 1 for the farthest frame in it, or below this fraction
-# of channels that are alive.
+# A frame is unlike the training set above this novelty (1 for the farthest training frame), or below this fraction of
+# alive channels.
 _MAX_NOVELTY, _MIN_ALIVE = 2.0, 0.66
 _CHUNK_SIZE = 256
-# Number of principal directions of the error of predicted readings that are propagated to predictions; number of random
-# errors of all readings that are.
+# To propagate errors of readings to predictions: number of principal directions of the error of readings predicted for
+# dead channels; number of random draws of errors of all readings.
 _MAX_ERROR_DIRECTIONS, _NUM_DRAWS = 4, 4
 # Minimum number of touched frames for the detection of stuck channels.
 _MIN_TOUCHED_FRAMES = 20
-# Minimum cosine similarity of a reference to that of the training set; maximum ratio of their norms. Beyond these
-# limits, it is taken for the reference of another skin.
+# Minimum cosine similarity of a reference frame to that of the training set; maximum ratio of their norms. Beyond these
+# limits, the reference is taken for that of another skin.
 _MIN_COSINE_SIMILARITY, _MAX_NORM_RATIO = 0.8, 5.0
 
 
 @dataclass(frozen=True)
 class LearntSkin:
-    """Models learnt from presses by `LearntSkin.fit`; a model is None if the presses lack its quantity.
+    """Models learnt from presses by `LearntSkin.fit`; the model of a quantity is None if the presses lack the quantity.
 
     **Fields**
 
-    - `channels`: joint model of the channels.
-    - `mean_reference` (M,): mean reference of the training set.
-    - `place`, `force`, `label`, `keys`: model of each quantity.
-    - `quiet`: root mean square of the changes, in the channels' scales, below which the skin counts as untouched.
-    - `lag`: number of rows by which frames lagged behind their presses.
-    - `per_session`: whether changes are standardised by session.
-    - `name`: name of the presses.
-    - `notes`: corrections that were made.
-    - `standing`: accuracy of each model on held-out presses.
+    - `channels`: joint model of the readings of the measurement channels.
+    - `mean_reference` (channels,): mean reference frame of the training set.
+    - `place`, `force`, `label`, `keys`: model that predicts each quantity of a touch.
+    - `quiet`: root mean square of the changes, in standard deviations of the channels, below which a skin is untouched.
+    - `lag`: number of rows by which frames of the training set lagged behind their presses.
+    - `per_session`: whether voltage changes are standardised separately for each session.
+    - `name`: name of the training presses.
+    - `notes`: corrections that were made to the training presses, as text.
+    - `standing`: accuracy on held-out presses, by quantity.
 
     **Example:**
 
@@ -97,15 +97,15 @@ class LearntSkin:
         per_session: bool = False,
         progress: Callable[[str], None] | None = None,
     ) -> "LearntSkin":
-        """Fit models to recorded presses.
+        """Fit models of place, force, label and keys to recorded presses.
 
-        `method`: one of `METHODS`, which applies to the quantities it can learn; "auto" chooses the method with the
-        lowest error on presses held out in intervals of time. `model`: a forward model of the skin, if one is known,
-        with some hundred nodes; its images of the changes, and the contacts in them, are used as additional features.
-        `num_channels`: number of channels to use, the most informative; by default all. `per_session`: standardise the
-        changes of each `group` separately, against drift. `progress`: is called with a description of each step.
-        Raises `ValueError` for an unknown method, a method that can learn none of the presses' quantities, presses from
-        which nothing can be learnt, and a model with another number of channels.
+        `method`: one of `METHODS`, used for the quantities that the method can learn; "auto" chooses the method with
+        the lowest error on presses held out in intervals of time. `model`: optional forward model of the skin, with
+        some hundred nodes; images reconstructed with the model, and the contacts in the images, are additional
+        features. `num_channels`: number of channels to use, the most informative; by default all. `per_session`:
+        standardise the changes of each `group` separately, against drift. `progress`: is called with a description of
+        each step. Raises `ValueError` for an unknown method, a method that can learn no quantity of the presses,
+        presses from which nothing can be learnt, and a model with other channels than the frames.
         """
         _check_fit(presses, method, model, num_channels, per_session)
         with one_thread():
@@ -161,12 +161,12 @@ class LearntSkin:
         )
 
     def predict(self, frames: ArrayLike, reference: ArrayLike | None = None, group: ArrayLike | None = None) -> Touches:
-        """Predict the touches of frames (n, M).
+        """Predict place, force, label and keys of touches from frames (frames, channels).
 
-        `reference` (M,) or (n, M) is required if the training presses had a reference; `group` (n,) is the session of
-        each frame, if the skin was learnt `per_session`. Channels that no longer work are detected, and their readings
-        replaced; frames unlike the training set are marked, and have no other prediction. Raises `ValueError` for
-        frames with another number of channels, and for a reference that is missing, superfluous, or of another skin.
+        `reference`, one frame or one for each frame, is required if the training presses had a reference; `group` is
+        the session of each frame, if the skin was learnt `per_session`. Dead channels are detected, and their readings
+        replaced; frames unlike the training set are marked, and have no predicted touch. Raises `ValueError` if frames
+        have another number of channels than the skin, or the reference is missing, superfluous, or of another skin.
         """
         frames = self._check_frames(frames)
         reference = self._check_reference(frames, reference)
@@ -185,10 +185,9 @@ class LearntSkin:
         return Touches(**touch_fields, notes=self._prediction_notes(predictions["alive"], predictions["unlike"]))
 
     def _stuck_channels(self, frames: np.ndarray, changes: np.ndarray) -> np.ndarray:
-        """Detect stuck channels (M,), whose readings are the same in all frames although many frames are touched.
+        """Detect stuck channels, whose readings are the same in all frames although many frames are touched.
 
-        Only touched frames count, since a coarse converter may give the same readings of an untouched skin for a long
-        time.
+        Only touched frames count: a coarse A/D converter may give constant readings of an untouched skin.
         """
         is_constant = (frames == frames[0]).all(axis=0)
         if is_constant.all() or not is_constant.any() or len(frames) < _MIN_TOUCHED_FRAMES:
@@ -197,11 +196,10 @@ class LearntSkin:
         return is_constant & (np.count_nonzero(np.sqrt(np.mean(scaled**2, axis=1)) > self.quiet) >= _MIN_TOUCHED_FRAMES)
 
     def _predict(self, changes: Float[np.ndarray, "n M"], reference: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
-        """Predict the fields of `Touches` that were learnt, for frames with these changes."""
+        """Predict the learnt fields of `Touches`, by name, from the voltage changes of frames."""
         completed_changes, alive, novelty, excess = self.channels.complete(changes)
         is_touched = np.sqrt(np.mean((completed_changes / self.channels.scale) ** 2, axis=1)) > self.quiet
-        # Small changes mean that the skin is untouched, but frames with too many missing channels always count as
-        # unlike.
+        # Frames with small changes are of the untouched skin; frames with too many missing channels are always unlike.
         is_unlike = (novelty > _MAX_NOVELTY) & is_touched | (alive.mean(axis=1) < _MIN_ALIVE)
         predictions = {"novelty": novelty, "unlike": is_unlike, "alive": np.zeros(changes.shape, bool)}
         predictions["alive"][:, self.channels.used] = alive
@@ -235,15 +233,15 @@ class LearntSkin:
     def _predict_targets(
         self, model: LearntNumbers, changes, reference, alive, excess
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Predict targets (n, d) and their standard deviations.
+        """Predict places or forces (frames, targets) and their standard deviations.
 
-        The standard deviations include the uncertainty of the readings predicted for dead channels, and errors of all
-        readings, where these deviate more from the patterns of the training set than its presses do.
+        The standard deviations include the errors of readings predicted for dead channels, and errors of all readings
+        in frames that deviate more from the patterns of the training set than training presses do.
         """
         noisy_rows = np.flatnonzero(excess.any(axis=1))
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (_NUM_DRAWS, 1, changes.shape[1]))
         perturbed_changes = (changes[noisy_rows] + signs * excess[noisy_rows]).reshape(-1, changes.shape[1])
-        # All inputs are predicted in one call, since for few frames the overhead of a call exceeds its computation.
+        # Predict for all inputs in one call, since for few frames the overhead of a call exceeds the computing time.
         repeated_references = np.tile(reference[noisy_rows], (_NUM_DRAWS, 1))
         inputs = np.concatenate([changes, perturbed_changes]), np.concatenate([reference, repeated_references])
         predictions, errors = np.split(model.predict(*inputs), [len(changes)])
@@ -284,12 +282,12 @@ class LearntSkin:
             )
         reference = check_reference(values, frames)
         is_read = np.isfinite(reference).any(axis=0) & self.channels.used
-        a, b = mean_reference(reference)[is_read], self.mean_reference[is_read]  # of frames, of the training set
+        a, b = mean_reference(reference)[is_read], self.mean_reference[is_read]  # of frames, of training frames
         if not is_read.any():
             raise ValueError(
                 "reference has no finite reading in any channel that is used; give a frame of the untouched skin."
             )
-        if not b.any():  # the frames of the training set were changes already
+        if not b.any():  # the frames of the training set were voltage changes
             return reference
         cosine = float(a @ b / np.sqrt((a @ a) * (b @ b))) if a.any() else 0.0
         norm_ratio = np.sqrt((a @ a) / (b @ b))
@@ -350,7 +348,7 @@ def _check_fit(presses: Presses, method: str, model, num_channels: int | None, p
 def _usable_presses(presses: Presses) -> tuple[Presses, list[str]]:
     """Select the presses that have readings of at least two thirds of the channels.
 
-    Channels without a reading in any press do not count.
+    Channels that have no reading in any press are left out of the count.
     """
     changes = changes_from_reference(presses.frames, presses.reference)
     is_read = np.isfinite(changes)
@@ -385,7 +383,8 @@ def _reduce_channels(
 
 
 def _standardised_targets(presses: Presses) -> np.ndarray:
-    """Return all quantities of the presses as standardised columns (N, q); 0 where unknown."""
+    """Return all quantities of the presses as standardised columns (presses, columns); 0 where a quantity is
+    unknown."""
     columns = []
     if presses.positions is not None:
         columns.append(presses.positions)
@@ -401,9 +400,9 @@ def _standardised_targets(presses: Presses) -> np.ndarray:
 
 
 def _quiet_threshold(scaled: np.ndarray, presses: Presses) -> float:
-    """Compute the root mean square change that separates untouched from touched frames.
+    """Compute the threshold of the root mean square change that separates untouched from touched frames.
 
-    With fewer than five untouched frames, it is half of the 1 % quantile of the touched frames.
+    With fewer than five untouched frames, the threshold is half of the 1 % quantile over the touched frames.
     """
     is_untouched = np.zeros(len(scaled), bool)
     if presses.positions is not None:
@@ -416,7 +415,7 @@ def _quiet_threshold(scaled: np.ndarray, presses: Presses) -> float:
     if is_untouched.sum() < 5:
         return 0.5 * float(np.quantile(size[~is_untouched], 0.01))
     sizes = np.sort(size)
-    # Choose the threshold with the lowest sum of the error rates of untouched and of touched frames.
+    # Choose the threshold with the lowest sum of the error rates for untouched and for touched frames.
     error_sums = [
         np.mean(size[is_untouched] > threshold) + np.mean(size[~is_untouched] <= threshold) for threshold in sizes
     ]
@@ -424,9 +423,9 @@ def _quiet_threshold(scaled: np.ndarray, presses: Presses) -> float:
 
 
 def _align_frames(changes: np.ndarray, presses: Presses) -> tuple[np.ndarray, Presses, int, list[str]]:
-    """Align frames with their presses if the recording clearly has a lag.
+    """Align frames with their presses if the frames of the recording clearly lag behind the presses or precede them.
 
-    Returns changes, presses, the lag in rows, and notes.
+    Returns the aligned changes and presses, the lag in rows, and a note on the lag as text.
     """
     if presses.positions is None:
         return changes, presses, 0, []

@@ -1,7 +1,8 @@
-"""Methods of learnt skins: regressors of places and forces, and classifiers of labels.
+"""Machine learning methods for skins: regressors that predict places and forces, and classifiers that predict labels.
 
-A regressor is a function of features (N, k) and standardised targets (N, d) that returns an object with
-`predict(features)`. A classifier is a function of features and labels (N,); `log_odds` evaluates what it returns.
+A regressor here is a function of features (presses, features) and standardised targets (presses, targets) that returns
+a model with `predict(features)`. A classifier is a function of features and labels that returns a model, which
+`log_odds` evaluates.
 """
 
 from __future__ import annotations
@@ -24,19 +25,20 @@ from jeit.touch.learnt.extras import apply_in_parts
 from jeit.touch.learnt.network import Network
 from jeit_solvers import number_of_cores
 
-# Number of presses from which length and noise are estimated; maximum number of centres. If there are no more presses
-# than this, all are centres.
+# Number of presses from which kernel length and noise are estimated; maximum number of kernel centres. If there are no
+# more presses than this maximum, all presses are centres.
 _NUM_TUNING_PRESSES, _MAX_CENTRES = 400, 640
 _CHUNK_SIZE = 512
 
 
 @dataclass(frozen=True)
 class GaussianProcess:
-    """Gaussian process regression: the sum of kernels at `centres` (m, k) with `weights` (m, d).
+    """Gaussian process regression with a Matérn kernel.
 
-    The kernel is the Matérn kernel of order 3/2, (1 + √3 r) e^(−√3 r), of the distance r from a centre divided by
-    `length`. Length and noise maximise the marginal likelihood, Rasmussen and Williams (2006), eq. 5.8; if there are
-    fewer centres than presses, the method is the subset of regressors, section 8.3.1.
+    A prediction is the sum of kernels at `centres` (centres, features) with `weights` (centres, targets). The kernel is
+    the Matérn kernel of order 3/2, (1 + √3 r) e^(−√3 r), of the distance r from a centre divided by `length`. Kernel
+    length and noise maximise the marginal likelihood (Rasmussen and Williams 2006, eq. 5.8). If there are fewer centres
+    than presses, the method is the subset of regressors (section 8.3.1 there).
     """
 
     centres: Float[np.ndarray, "m k"]
@@ -45,7 +47,7 @@ class GaussianProcess:
 
     @classmethod
     def fit(cls, features, targets) -> "GaussianProcess":
-        """Fit standardised `targets` (N, d) to `features` (N, k)."""
+        """Fit a Gaussian process to features (presses, features) and standardised targets (presses, targets)."""
         order = np.random.default_rng(0).permutation(len(features))
         tuning_presses = order[:_NUM_TUNING_PRESSES]
         length, noise = _estimate_length_and_noise(features[tuning_presses], targets[tuning_presses])
@@ -61,7 +63,7 @@ class GaussianProcess:
         return cls(centres, cho_solve(cho_factor(matrix), right_side), length)
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
-        """Predict targets (n, d)."""
+        """Predict standardised targets (frames, targets) from features (frames, features)."""
         scaled_centres = self.centres / self.length
         squared_norms = np.sum(scaled_centres**2, axis=1)
 
@@ -74,15 +76,15 @@ class GaussianProcess:
 
 
 def _matern_kernel(distance: np.ndarray) -> np.ndarray:
-    """Evaluate the Matérn kernel of order 3/2 at distances divided by the length."""
+    """Evaluate the Matérn kernel of order 3/2 at distances divided by the kernel length."""
     scaled_distance = np.sqrt(3.0) * distance
     return (1 + scaled_distance) * np.exp(-scaled_distance)
 
 
 def _estimate_length_and_noise(features: np.ndarray, targets: np.ndarray) -> tuple[float, float]:
-    """Estimate the length, and the ratio of the variance of the noise to that of the function.
+    """Estimate the kernel length, and the ratio of the noise variance to the variance of the Gaussian process.
 
-    The variance of the function follows from these two in closed form.
+    The variance of the process follows from the length and the ratio in closed form.
     """
     distances = cdist(features, features)
     mean_distance = float(np.sqrt(np.mean(distances**2))) or 1.0
@@ -112,19 +114,19 @@ def _estimate_length_and_noise(features: np.ndarray, targets: np.ndarray) -> tup
 
 _ALPHAS = np.logspace(-2, 5, 15)
 _NUM_TREES = 100
-# Maximum number of times that each press is presented to a map, in each phase.
+# Maximum number of times that each press is presented to a self-organising map, in each phase of its training.
 _MAX_PRESENTATIONS = 50
 
 
 def fit_ridge(features, targets) -> Any:
-    """Fit ridge regression, with the penalty that generalised cross-validation chooses."""
+    """Fit ridge regression; generalised cross-validation chooses its penalty."""
     from sklearn.linear_model import RidgeCV
 
     return RidgeCV(_ALPHAS).fit(features, targets)
 
 
 def fit_gradient_boosting(features, targets) -> Any:
-    """Fit gradient-boosted regression trees, one model for each target."""
+    """Fit gradient-boosted regression trees, one ensemble of trees for each target."""
     from sklearn.ensemble import HistGradientBoostingRegressor
 
     options = {"max_iter": 100, "max_leaf_nodes": 15, "min_samples_leaf": 8, "l2_regularization": 1.0}
@@ -133,7 +135,7 @@ def fit_gradient_boosting(features, targets) -> Any:
 
 
 def fit_extra_trees(features, targets) -> Any:
-    """Fit trees with random splits, whose predictions are averaged (Geurts et al. 2006)."""
+    """Fit extremely randomised regression trees, whose predictions are averaged (Geurts et al. 2006)."""
     from sklearn.ensemble import ExtraTreesRegressor
 
     targets = targets[:, 0] if targets.shape[1] == 1 else targets
@@ -144,7 +146,8 @@ def fit_extra_trees(features, targets) -> Any:
 
 
 def fit_self_organising_map(features, targets) -> Any:
-    """Fit a self-organising map, which interpolates between the mean targets of the presses that each neuron won."""
+    """Fit a self-organising map, which interpolates between the neurons' targets; a neuron's target is the mean over
+    the presses nearest to the neuron."""
     import jax
 
     num_steps = min(MapSchedule().ordering, _MAX_PRESENTATIONS * len(features))
@@ -161,21 +164,23 @@ REGRESSORS: dict[str, Callable[..., Any]] = {
     "network": Network.train,
     "som": fit_self_organising_map,
 }
-# Methods that are quick enough to be tried on every form of the features.
+# Regression methods that are quick enough to be tried on every form of features.
 QUICK_METHODS = ("ridge", "neighbours")
-# Methods that select few informative channels: they use the channels instead of principal components.
+# Regression methods that select a few informative channels themselves, and so use channels instead of principal
+# components.
 CHANNEL_METHODS = ("forest",)
 
 
-# For the ensembles of Russo et al. (2017): number of members; number of leaves of a boosted tree.
+# For the ensembles of classifiers of Russo et al. (2017): number of members; maximum number of leaves of a boosted
+# tree.
 _NUM_MEMBERS, _MAX_LEAVES = 30, 21
-# Shrinkage of covariances if a class has fewer presses than twice the number of features; minimum variance of a class
-# along any axis, relative to the maximum.
+# Shrinkage of class covariances if a class has fewer presses than twice the number of features; minimum variance of a
+# class along a principal axis, relative to the maximum.
 _SHRINKAGE, _MIN_VARIANCE_RATIO = 0.1, 1e-4
 
 
 def fit_decision_tree(features, label) -> Any:
-    """Fit a decision tree."""
+    """Fit a decision tree that classifies presses by label."""
     from sklearn.tree import DecisionTreeClassifier
 
     fitted_tree = DecisionTreeClassifier(min_samples_leaf=2, random_state=0).fit(features, label)
@@ -183,7 +188,7 @@ def fit_decision_tree(features, label) -> Any:
 
 
 def fit_linear_discriminant(features, label) -> Any:
-    """Fit a linear discriminant: normal classes with a common covariance, with Ledoit-Wolf shrinkage."""
+    """Fit a linear discriminant: normally distributed classes with a common covariance and Ledoit-Wolf shrinkage."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
     try:
@@ -195,10 +200,11 @@ def fit_linear_discriminant(features, label) -> Any:
 
 @dataclass(frozen=True)
 class QuadraticDiscriminant:
-    """A quadratic discriminant: normal classes, each with its own `mean` (C, k) and covariance.
+    """A quadratic discriminant: normally distributed classes, each with its own mean and covariance.
 
-    `whiten` (C, k, k): factor of the inverse covariance; `offset` (C,): logarithm of the density at the mean times the
-    class's share of the presses, up to a constant (Russo et al. 2017, eq. 1).
+    `mean` (classes, features); `whiten` (classes, features, features): factor of each inverse covariance; `offset`:
+    logarithm of each class's density at its mean times its share of the presses, up to a constant (Russo et al. 2017,
+    eq. 1).
     """
 
     mean: Float[np.ndarray, "C k"]
@@ -208,9 +214,10 @@ class QuadraticDiscriminant:
 
     @classmethod
     def fit(cls, features, label) -> "QuadraticDiscriminant":
-        """Fit the classes.
+        """Fit the mean and the covariance of the features of each class.
 
-        If a class has too few presses for a covariance, all covariances are shrunk towards multiples of the identity.
+        If a class has too few presses to estimate a covariance, all covariances are shrunk towards multiples of the
+        identity.
         """
         classes, class_indices = np.unique(label, return_inverse=True)
         shrinkage, num_features = covariance_shrinkage(features, label), features.shape[1]
@@ -230,7 +237,8 @@ class QuadraticDiscriminant:
         return cls(np.array(means), np.array(whiten), np.array(offset), classes)
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Compute the logarithms (n, C) of each class's density times its share of the presses, up to a constant."""
+        """Compute the logarithm (frames, classes) of each class's density times its share of the presses, up to a
+        constant."""
         scores = np.empty((len(features), len(self.offset)))
         for class_index, (mean, whiten, offset) in enumerate(zip(self.mean, self.whiten, self.offset, strict=True)):
             scores[:, class_index] = offset - 0.5 * np.sum(((features - mean) @ whiten) ** 2, axis=1)
@@ -238,21 +246,21 @@ class QuadraticDiscriminant:
 
 
 def fit_linear_svm(features, label) -> Any:
-    """Fit a support vector machine with a linear kernel."""
+    """Fit a support vector classifier with a linear kernel."""
     from sklearn.svm import SVC
 
     return SupportVectorMachine.from_scikit_learn(SVC(kernel="linear").fit(features, label))
 
 
 def fit_quadratic_svm(features, label) -> Any:
-    """Fit a support vector machine with a quadratic kernel."""
+    """Fit a support vector classifier with a quadratic kernel."""
     from sklearn.svm import SVC
 
     return SupportVectorMachine.from_scikit_learn(SVC(kernel="poly", degree=2, coef0=1.0).fit(features, label))
 
 
 def fit_boosted_trees(features, label) -> Any:
-    """Fit decision trees by AdaBoost, in which each tree has one weighted vote."""
+    """Fit an ensemble of decision trees by AdaBoost, in which each tree has one weighted vote."""
     from sklearn.ensemble import AdaBoostClassifier
     from sklearn.tree import DecisionTreeClassifier
 
@@ -265,7 +273,7 @@ def fit_boosted_trees(features, label) -> Any:
 
 
 def fit_bagged_trees(features, label) -> Any:
-    """Fit decision trees, each independently to a bootstrap sample of the presses."""
+    """Fit an ensemble of decision trees, each to its own bootstrap sample of the presses."""
     from joblib import parallel_config
     from sklearn.ensemble import BaggingClassifier
     from sklearn.tree import DecisionTreeClassifier
@@ -295,9 +303,10 @@ def fit_subspace_discriminant(features, label) -> Any:
 
 @dataclass(frozen=True)
 class LinearEnsemble:
-    """An ensemble of T linear classifiers, whose probabilities are averaged.
+    """An ensemble of linear classifiers, whose probabilities are averaged.
 
-    `weights` (T, C, k) and `intercepts` (T, C) give the log-odds of the classes.
+    `weights` (members, classes, features) and `intercepts` (members, classes) give each member's log-odds of the
+    classes.
     """
 
     weights: Float[np.ndarray, "T C k"]
@@ -313,13 +322,13 @@ class LinearEnsemble:
         for member, feature_indices, weight, intercept in zip(
             members, bagged.estimators_features_, weights, intercepts, strict=True
         ):
-            is_binary = len(member.coef_) == 1  # two classes: only the log-odds of the second are given
+            is_binary = len(member.coef_) == 1  # with two classes, scikit-learn gives only the log-odds of the second
             weight[-1 if is_binary else slice(None), feature_indices] = member.coef_[0] if is_binary else member.coef_
             intercept[-1 if is_binary else slice(None)] = member.intercept_[0] if is_binary else member.intercept_
         return cls(weights, intercepts, bagged.classes_)
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Compute the probabilities (n, C) of the classes, averaged over the ensemble."""
+        """Compute the probabilities of the classes (frames, classes), averaged over the members of the ensemble."""
         summed_probabilities = np.zeros((len(features), len(self.classes_)))
         for weight, intercept in zip(self.weights, self.intercepts, strict=True):
             summed_probabilities += probabilities(features @ weight.T + intercept, 1.0)
@@ -327,7 +336,8 @@ class LinearEnsemble:
 
 
 def _number_classes(tree, ensemble=None):
-    """Replace the classes of a tree by their indices, among the classes of the `ensemble` if it is given."""
+    """Replace the classes of a tree by their indices among the classes of the `ensemble`, or else of the tree
+    itself."""
     tree.classes_ = (
         np.arange(len(tree.classes_)) if ensemble is None else np.searchsorted(ensemble.classes_, tree.classes_)
     )
@@ -348,17 +358,17 @@ CLASSIFIERS: dict[str, Callable[..., Any]] = {
 
 
 def covariance_shrinkage(features, label) -> float:
-    """Return the shrinkage of the covariances of classes; 0 if every class has at least twice as many presses as
+    """Return the shrinkage of the class covariances; 0 if every class has at least twice as many presses as
     features."""
     min_presses = np.unique(label, return_counts=True)[1].min()
     return _SHRINKAGE if min_presses < 2 * features.shape[1] else 0.0
 
 
 def log_odds(model, features) -> Float[np.ndarray, "n C"]:
-    """Compute a classifier's scores for each class (n, C).
+    """Compute a classifier's score for each class (frames, classes).
 
-    Depending on the classifier, they are logarithms of probabilities, sums of these over pairs of classes, votes, or
-    distances from decision boundaries.
+    Depending on the classifier, scores are log-probabilities, sums of log-probabilities over pairs of classes, votes,
+    or distances from decision boundaries.
     """
     if hasattr(model, "predict_proba"):
         return np.log(np.maximum(model.predict_proba(features), 1e-6))
@@ -369,14 +379,15 @@ def log_odds(model, features) -> Float[np.ndarray, "n C"]:
 
 
 def probabilities(odds: np.ndarray, sharpness: float) -> Float[np.ndarray, "n C"]:
-    """Compute the probability of each class (n, C) from its log-odds times the `sharpness`."""
+    """Compute the probability of each class (frames, classes) as the softmax of its log-odds times the `sharpness`."""
     scaled_odds = sharpness * odds
     exponentials = np.exp(scaled_odds - scaled_odds.max(axis=1, keepdims=True))
     return exponentials / exponentials.sum(axis=1, keepdims=True)
 
 
 def fit_sharpness(odds: np.ndarray, true_classes: np.ndarray) -> float:
-    """Choose the sharpness that maximises the likelihood of the `true_classes` (N,) of held-out presses."""
+    """Choose the factor of log-odds, the sharpness, that maximises the likelihood of the `true_classes` of held-out
+    presses."""
     candidates = np.geomspace(0.02, 50, 60)
     rows = np.arange(len(true_classes))
     log_likelihoods = [

@@ -1,4 +1,5 @@
-"""A small fully connected network, trained with equinox and optax, evaluated in NumPy within microseconds per frame."""
+"""A small fully connected neural network, trained with equinox and optax, and evaluated in NumPy in microseconds per
+frame."""
 
 from __future__ import annotations
 
@@ -17,9 +18,10 @@ _FEATURE_NOISE = 0.1
 
 @dataclass(frozen=True)
 class Network:
-    """A fully connected network: `weights` (out, in) and `biases` (out,) of each layer, with tanh between layers.
+    """A fully connected neural network with tanh between layers.
 
-    Features are divided by `scale` (k,) first.
+    `weights` (outputs, inputs) and `biases` (outputs,) of each layer; `scale`: number by which each feature is divided
+    before the first layer.
     """
 
     weights: list[Float[np.ndarray, "o i"]]
@@ -27,7 +29,7 @@ class Network:
     scale: Float[np.ndarray, " k"]
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
-        """Predict targets (n, d)."""
+        """Predict targets (frames, targets) from features (frames, features)."""
         values = features / self.scale
         for layer_index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             values = values @ weight.T + bias
@@ -36,7 +38,8 @@ class Network:
 
     @classmethod
     def train(cls, features, targets) -> "Network":
-        """Train by Adam with weight decay and a decreasing rate, with noise added to the features of each batch."""
+        """Train a network by Adam with weight decay and a decreasing learning rate, with noise added to the features of
+        each batch."""
         import jax
         import jax.numpy as jnp
 
@@ -45,8 +48,8 @@ class Network:
         num_steps = _NUM_EPOCHS * max(1, -(-len(features) // _BATCH_SIZE))
         rng = np.random.default_rng(0)
         order = np.concatenate([rng.permutation(len(features)) for _ in range(_NUM_EPOCHS)])
-        # The number of rows is padded to a multiple of the batch size, so that folds of about the same size share the
-        # compiled function; no batch uses the added rows.
+        # The number of presses is padded to a multiple of the batch size, so that cross-validation folds of about the
+        # same size share the compiled function; no batch uses the added rows.
         row_padding = ((0, -len(features) % _BATCH_SIZE), (0, 0))
         layers = _compiled_training(num_steps)(
             jnp.asarray(np.pad(features / scale, row_padding), jnp.float32),
@@ -60,9 +63,11 @@ class Network:
 
 @functools.cache
 def _compiled_training(num_steps: int) -> Callable[..., Any]:
-    """Return a function that trains a network in `num_steps` steps, compiled once for each shape.
+    """Return a function that trains a network in `num_steps` steps of Adam, compiled once for each shape of its
+    arguments.
 
-    The function returns the layers, from features, targets, the rows of each batch, and two keys.
+    The arguments of the function are features, targets, the rows of each batch, and two random keys; the function
+    returns the layers.
     """
     import equinox as eqx
     import jax

@@ -1,4 +1,4 @@
-"""Learn to predict places or forces, with calibrated standard deviations."""
+"""Learn to predict the places or forces of touches, with calibrated standard deviations."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from jeit.touch.learnt.imaged import ImageReconstruction
 from jeit.touch.learnt.methods import CHANNEL_METHODS, QUICK_METHODS, REGRESSORS
 
 _NUM_SIMILAR, _TARGET_COVERAGES = 40, ((1.0, 0.6827), (1.96, 0.95))
-# Number of similar presses from which a variance is estimated; pairs of a multiple of the standard deviation and the
-# share of normally distributed errors within it.
-# Weight of the size of the changes relative to the predicted values, in the distance between presses; fraction of a
-# variance that is the mean squared error of all presses, where the rest is that of similar presses.
+# Number of similar presses from which the variance of a prediction is estimated; pairs of a multiple of the standard
+# deviation and the share of normally distributed errors within this multiple. Weight of the logarithm of the size of
+# the changes, relative to the predicted values, in the distance between presses; weight of the mean squared error of
+# all presses in an estimated variance, where the rest is that of similar presses.
 _SIZE_WEIGHT, _GLOBAL_FRACTION = 0.3, 0.15
 # Minimum number of presses from which the coverage of standard deviations is estimated.
 _MIN_CALIBRATION_PRESSES = 30
-# Minimum standard deviation, relative to the spread of the predictions for the training set.
+# Minimum predicted standard deviation, relative to the standard deviation of the predictions for the training set.
 _MIN_RELATIVE_DEVIATION = 1e-4
 
 
 @dataclass(frozen=True)
 class DeviationModel:
-    """Model of the standard deviations of predictions, from the errors of similar held-out presses.
+    """Model that estimates the standard deviations of predictions from the errors of similar held-out presses.
 
-    `where` (N, d + 1): predicted values of the held-out presses and the logarithm of the size of their changes, minus
-    `low` (d + 1,) and divided by `unit` (d + 1,); `squares` (N, d): squared errors of these presses; `factor` (d,):
-    calibration factors of the standard deviations.
+    `where` (presses, targets + 1): predicted targets of the held-out presses, and the logarithm of the size of their
+    voltage changes, minus `low` and divided by `unit` (targets + 1,); `squares` (presses, targets): squared errors of
+    these predictions; `factor`: calibration factor of the standard deviation of each target.
     """
 
     where: Float[np.ndarray, "N e"]
@@ -47,10 +47,11 @@ class DeviationModel:
     def learn(
         cls, predictions: np.ndarray, changes: np.ndarray, errors: np.ndarray, last_presses: np.ndarray
     ) -> "DeviationModel":
-        """Fit to `predictions` (N, d) for held-out presses, their changes (N, m), and their errors (N, d).
+        """Fit to predictions for held-out presses, the voltage changes of these presses, and the errors of the
+        predictions.
 
-        `last_presses` (N,): presses recorded before or after all presses that their predictions were learnt from. If
-        there are enough of them, the standard deviations are calibrated on these alone, since future presses are
+        `last_presses`: whether a press was recorded before or after all presses that its prediction was learnt from.
+        Standard deviations are calibrated on these presses alone if there are enough, since future presses are
         predicted likewise.
         """
         where = np.column_stack([predictions, _log_size(changes)])
@@ -59,7 +60,7 @@ class DeviationModel:
         unit[-1] /= _SIZE_WEIGHT
         max_errors = np.quantile(
             np.abs(errors), 0.99, axis=0
-        )  # one large error is not representative of its neighbours
+        )  # a single large error is not representative of similar presses
         squares = np.minimum(np.abs(errors), max_errors) ** 2
         uncalibrated_model = cls((where - low) / unit, squares, low, unit, np.ones(errors.shape[1]))
         local_deviations = uncalibrated_model._local_deviations(uncalibrated_model.where, leave_one_out=True)
@@ -73,17 +74,18 @@ class DeviationModel:
         return cls(uncalibrated_model.where, squares, low, unit, np.array(factors))
 
     def __call__(self, predictions: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "n d"]:
-        """Compute the standard deviations (n, d) of `predictions` (n, d) for frames with these changes (n, m)."""
+        """Compute the standard deviations of predictions (frames, targets) from the voltage changes of the frames."""
         where = (np.column_stack([predictions, _log_size(changes)]) - self.low) / self.unit
         return self.factor * self._local_deviations(where)
 
     def held_out(self, predictions: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "N d"]:
-        """Compute the standard deviations (N, d) of the held-out presses, each without its own error."""
+        """Compute the standard deviations of the predictions for held-out presses, each without the press's own
+        error."""
         where = (np.column_stack([predictions, _log_size(changes)]) - self.low) / self.unit
         return self.factor * self._local_deviations(where, leave_one_out=True)
 
     def _local_deviations(self, where: np.ndarray, *, leave_one_out: bool = False) -> np.ndarray:
-        """Estimate standard deviations (n, d) from the errors of the held-out presses that are nearest to `where`."""
+        """Estimate standard deviations (frames, targets) from the errors of the held-out presses nearest to `where`."""
         num_neighbours = min(_NUM_SIMILAR, len(self.where) - 1)
         neighbours = np.asarray(self._search_tree.query(where, num_neighbours + leave_one_out)[1])[
             :, int(leave_one_out) :
@@ -107,8 +109,8 @@ def _log_size(changes: np.ndarray) -> np.ndarray:
 def _calibration_factor(ratios: np.ndarray) -> float:
     """Compute the calibration factor of standard deviations from the ratios of errors to standard deviations.
 
-    With this factor, the shares of errors within 1 and 1.96 standard deviations are nearest to those of a normal
-    distribution.
+    With the calibration factor, the shares of errors within 1 and 1.96 standard deviations are nearest to those of a
+    normal distribution.
     """
     candidates = np.geomspace(0.2, 5, 200)
     coverage_errors = [
@@ -120,15 +122,15 @@ def _calibration_factor(ratios: np.ndarray) -> float:
 
 BLEND = "blend"
 METHODS = ("auto", *REGRESSORS, BLEND)
-# Maximum number of methods in a blend; maximum error of a blend, relative to that of the best single method.
+# Maximum number of methods in a blend; maximum error of a chosen blend, relative to that of the best single method.
 _MAX_BLENDED_METHODS, _MAX_BLEND_ERROR_RATIO = 3, 0.98
 
 
 @dataclass(frozen=True)
 class MethodResult:
-    """Result of a `method` on a `form` of the features.
+    """Cross-validation result of a regression `method` with one `form` of features.
 
-    `held_out` (N, d): predictions for held-out presses; `error`: their mean error.
+    `held_out` (presses, targets): predictions for held-out presses; `error`: mean distance of predictions from targets.
     """
 
     method: str
@@ -138,16 +140,16 @@ class MethodResult:
 
     @property
     def name(self) -> str:
-        """Name of the method and the form; for a blend, the names of its members."""
+        """Name of the regression method and the form of features; for a blend, the names of its members."""
         return f"{self.method}: {self.form}" if self.method == BLEND else f"{self.method} on {self.form}"
 
 
 @dataclass(frozen=True)
 class LearntNumbers:
-    """The average of several regressors, with standard deviations of its predictions.
+    """The average of several regressors of places or forces, with standard deviations of the predictions.
 
     `members`: pairs of features and a regressor of standardised targets; a prediction is `mean` + `scale` × the average
-    of the members. `spread`: model of the standard deviations.
+    of the members' predictions. `spread`: model of the standard deviations of predictions.
     """
 
     members: list[tuple[Features, Any]]
@@ -158,7 +160,7 @@ class LearntNumbers:
     def predict(
         self, changes: Float[np.ndarray, "n m"], reference: Float[np.ndarray, "n m"]
     ) -> Float[np.ndarray, "n d"]:
-        """Predict targets (n, d) from changes (n, m) and their reference."""
+        """Predict targets (frames, targets) from voltage changes and reference voltages (frames, channels)."""
         summed_predictions = 0.0
         for features, model in self.members:
             summed_predictions = summed_predictions + np.asarray(model.predict(features(changes, reference))).reshape(
@@ -177,11 +179,13 @@ def learn_numbers(
     imaged: ImageReconstruction | None = None,
     progress: Callable[[str], None] = lambda message: None,
 ) -> tuple[LearntNumbers, list[MethodResult]]:
-    """Learn `targets` (N, d) from changes (N, m), their reference, and images of the changes if `imaged` is given.
+    """Learn to predict places or forces (presses, targets) from voltage changes (presses, channels).
 
-    `method`: one of `METHODS`; "auto" chooses the best method, or a blend if it is better. Also returns the results of
-    all methods that were tried, in order of their mean errors in cross-validation on `folds` (N,). Quick methods are
-    tried on all forms of the features, the others on the one or two forms with the lowest error of a quick method.
+    `reference`: reference voltages of the changes; `imaged`: optional reconstruction of images, which are then used as
+    features too; `method`: one of `METHODS`; "auto" chooses the best method, or a blend of methods if its error is
+    lower. Also returns the results of all methods that were tried, in order of their mean errors in cross-validation on
+    `folds`. Quick methods are tried with all forms of features, other methods with the one or two forms with the lowest
+    error of a quick method.
     """
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference
@@ -229,7 +233,8 @@ def learn_numbers(
 
 
 def _choose_methods(results: list[MethodResult], targets: np.ndarray, *, blend: bool) -> list[MethodResult]:
-    """Choose the best method alone, or a blend of several methods if it is better or `blend` requires it."""
+    """Choose the regression method with the lowest error, or a blend of methods if its error is lower or `blend` is
+    true."""
     best_of_each_method = list({result.method: result for result in reversed(results)}.values())
     best_of_each_method = sorted(best_of_each_method, key=_mean_error)[:_MAX_BLENDED_METHODS]
     blends = [best_of_each_method[:num_members] for num_members in range(2, len(best_of_each_method) + 1)]
@@ -252,12 +257,12 @@ def _mean_error(result: MethodResult) -> float:
 
 
 def _mean_distance(predictions: np.ndarray, targets: np.ndarray) -> float:
-    """Compute the mean distance of predictions from targets."""
+    """Compute the mean Euclidean distance of predictions from targets."""
     return float(np.linalg.norm(predictions - targets, axis=1).mean())
 
 
 class _CrossValidation:
-    """Cross-validation of methods, in which the features of each form and fold are computed once for all methods."""
+    """Cross-validation of regression methods; the features of each form and fold are computed once for all methods."""
 
     def __init__(self, changes, reference, targets, folds, forms: Forms):
         self.changes, self.reference, self.targets, self.folds = changes, reference, targets, folds

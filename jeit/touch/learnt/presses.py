@@ -1,4 +1,4 @@
-"""Recorded presses: frames with known places and forces, changes from the untouched skin, and the lag of the frames."""
+"""Recorded presses: frames with known places and forces, changes from the untouched skin, and the lag of frames."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from jeit.arguments import readings
 from jeit.files import need, npz_arrays
 from jeit.touch.learnt.features import Features
 
-# Minimum number of frames of a session, if sessions are standardised separately.
+# Minimum number of frames of a session whose voltage changes are standardised separately.
 _MIN_SESSION_FRAMES = 20
 
 
 def changes_from_reference(frames: Float[np.ndarray, "n M"], reference: np.ndarray | None) -> Float[np.ndarray, "n M"]:
-    """Subtract the reference from the frames; without a reference, return the frames."""
+    """Subtract the reference frames of the untouched skin from frames; without a reference, return the frames."""
     return frames if reference is None else frames - reference
 
 
 def standardise_sessions(changes: np.ndarray, group) -> np.ndarray:
-    """Standardise changes (n, M): subtract the median of their session, and divide by its standard deviation.
+    """Standardise changes: subtract each channel's median over a session, and divide by the standard deviation.
 
-    `group` (n,): the session of each frame; without it, all frames are of one session. Raises `ValueError` for sessions
-    of fewer than 20 frames, and for a `group` of another shape.
+    `group` (frames,): the session of each frame; None if all frames are of one session. Raises `ValueError` for
+    sessions of fewer than 20 frames, and for a `group` that is not of shape (frames,).
     """
     group = np.zeros(len(changes), int) if group is None else np.asarray(group)
     if group.shape != (len(changes),):
@@ -50,7 +50,7 @@ def standardise_sessions(changes: np.ndarray, group) -> np.ndarray:
 
 
 def mean_reference(reference: np.ndarray) -> np.ndarray:
-    """Compute the mean reference of each channel; 0 for channels without any reading."""
+    """Compute the mean of each channel over reference frames; 0 for channels without any reading."""
     is_finite = np.isfinite(reference)
     return np.where(is_finite, reference, 0.0).sum(axis=0) / np.maximum(is_finite.sum(axis=0), 1)
 
@@ -58,18 +58,18 @@ def mean_reference(reference: np.ndarray) -> np.ndarray:
 def reference_used(
     reference: np.ndarray | None, mean: np.ndarray | None, used: Bool[np.ndarray, " M"], num_frames: int
 ) -> Float[np.ndarray, "n m"]:
-    """Return the reference (n, m) of the channels `used`; zeros if there is no reference.
+    """Return reference frames (frames, channels) of the `used` channels; zeros if there is no reference.
 
-    Missing readings are replaced by the `mean` (M,) reference of the training set.
+    Missing readings are replaced by the `mean` reference frame of the training set.
     """
     if reference is None or mean is None:
         return np.zeros((num_frames, int(used.sum())))
     return np.where(np.isnan(reference), mean, reference)[:, used]
 
 
-# Maximum extent of the positions: larger ones must be in millimetres.
+# Maximum extent of the positions of presses: with a larger extent, positions must be in millimetres.
 _MAX_EXTENT = 5.0  # m
-# Maximum force of a press: larger ones must be in grams or millinewtons.
+# Maximum force of a press: larger forces must be in grams or millinewtons.
 _MAX_FORCE = 2000.0  # N
 _MIN_PRESSES, _MIN_PRESSES_PER_CLASS = 10, 4
 # Label of a frame of the untouched skin.
@@ -80,17 +80,17 @@ _OPTIONAL_FIELDS = ("positions", "force", "label", "touched", "group", "time")
 
 @dataclass(frozen=True)
 class Presses:
-    """N presses on a skin with M channels, created by `Presses.create`; quantities that were not recorded are None.
+    """Recorded presses on a skin, created by `Presses.create`; quantities that were not recorded are None.
 
     **Fields**
 
-    - `frames`: (N, M), in any unit; NaN where a reading is missing.
-    - `reference`: (N, M), the frame of the untouched skin that belongs to each frame; None if frames are already
-      changes.
-    - `positions`: (N, 2) or (N, 3), metres, NaN where nothing touched; `force`: (N,), newtons; `label`: (N,), text,
-      "none" where nothing touched; `touched`: (N, K), which of K keys were pressed.
-    - `group`: (N,), the session or person of each press, which cross-validation never splits; `time`: (N,), seconds.
-    - `name`: the name in errors and reports; `notes`: corrections that were made.
+    - `frames`: (presses, channels), readings in any unit; NaN where a reading is missing.
+    - `reference`: (presses, channels), the frame of the untouched skin for each frame; None if `frames` are changes.
+    - `positions`: (presses, 2) or (presses, 3), metres, NaN where nothing touched; `force`: newtons; `label`: text,
+      "none" where nothing touched; `touched`: (presses, keys), whether each key was pressed.
+    - `group`: session or person of each press; cross-validation never splits a group. `time`: time of each press,
+      seconds.
+    - `name`: name of the recording in errors and reports; `notes`: corrections made to the recording, as text.
 
     **Example:**
 
@@ -125,11 +125,11 @@ class Presses:
         time: ArrayLike | None = None,
         name: str = "presses",
     ) -> "Presses":
-        """Create presses from recorded arrays, and validate them.
+        """Create presses from recorded arrays, and validate the arrays.
 
-        Shapes and units are those of the fields; `reference` may also be one frame (M,) for all presses.
-        Raises `ValueError` for inconsistent shapes, fewer than ten presses, positions that seem to be in millimetres,
-        presses without any quantity to learn, and invalid values.
+        Shapes and units are those of the fields of `Presses`; `reference` may also be one frame for all presses. Raises
+        `ValueError` for inconsistent shapes, fewer than ten presses, positions that seem to be in millimetres, presses
+        without any quantity to learn, and invalid values.
         """
         frames = check_frames("frames", frames)
         if len(frames) < _MIN_PRESSES:
@@ -154,19 +154,19 @@ class Presses:
         return replace(cls(frames, reference, name=name), **optional_arrays)
 
     def rows(self, index: ArrayLike | slice) -> "Presses":
-        """Select presses by their indices, or by a slice."""
+        """Select presses by index or by slice."""
         arrays = {key: getattr(self, key) for key in ("frames", "reference", *_OPTIONAL_FIELDS)}
         return replace(self, **{key: None if values is None else values[index] for key, values in arrays.items()})
 
 
 def read_presses(path: str | Path) -> Presses:
-    """Read presses from an NPZ file with arrays named as the fields of `Presses`: `frames`, and optionally the others.
+    """Read recorded presses from an NPZ file with arrays named as the fields of `Presses`; only `frames` is required.
 
     **Arguments:**
 
     - `path`: path of the file.
 
-    Raises `FileNotFoundError`, and `ValueError` for any other file and as `Presses.create` does.
+    Raises `FileNotFoundError` if `path` does not exist, and `ValueError` if the file is no NPZ file of valid presses.
 
     **Example:**
 
@@ -186,7 +186,7 @@ def read_frames(path: str | Path) -> dict[str, np.ndarray]:
 
     - `path`: path of the file.
 
-    Raises `FileNotFoundError`, and `ValueError` for any other file.
+    Raises `FileNotFoundError` if `path` does not exist, and `ValueError` if the file is no NPZ file with `frames`.
 
     **Example:**
 
@@ -201,7 +201,7 @@ def read_frames(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def _read_arrays(path: str | Path, *keys: str) -> dict[str, np.ndarray]:
-    """Read the named arrays from a file: `frames`, which is required, and the others if the file contains them."""
+    """Read the arrays named `keys` from an NPZ file: `frames`, which is required, and the others if present."""
     if Path(path).is_dir():
         raise ValueError("it is a folder; give an NPZ file.")
     if not Path(path).is_file():
@@ -213,7 +213,7 @@ def _read_arrays(path: str | Path, *keys: str) -> dict[str, np.ndarray]:
 
 @contextmanager
 def _with_file_name(path: str | Path) -> Iterator[None]:
-    """Add the name of the file to any `ValueError` raised in this context."""
+    """Return a context manager that adds the name of the file to any `ValueError` raised within it."""
     try:
         yield
     except ValueError as error:
@@ -221,9 +221,9 @@ def _with_file_name(path: str | Path) -> Iterator[None]:
 
 
 def check_frames(name: str, values) -> Float[np.ndarray, "N M"]:
-    """Convert frames (N, M) to floating-point numbers; readings that are infinite or impossibly large become NaN.
+    """Convert frames (frames, channels) to floats; readings that are infinite or impossibly large become NaN.
 
-    Raises `ValueError` for anything but a two-dimensional array of real numbers.
+    Raises `ValueError` if frames are no two-dimensional array of real numbers.
     """
     try:
         frames = np.asarray(values)
@@ -238,9 +238,9 @@ def check_frames(name: str, values) -> Float[np.ndarray, "N M"]:
 
 
 def check_reference(values, frames) -> Float[np.ndarray, "N M"]:
-    """Return a reference (N, M) with a row for each of the `frames`; infinite readings become NaN.
+    """Return the reference with one row (channels,) for each of the `frames`; infinite readings become NaN.
 
-    Raises `ValueError` for other shapes and types.
+    Raises `ValueError` if the reference is not one frame, or one for each frame, of real numbers.
     """
     reference = np.asarray(values)
     if reference.dtype.kind not in "fiu" or reference.shape not in (frames.shape, frames.shape[1:]):
@@ -356,19 +356,19 @@ def _one_dimensional(name: str, values: ArrayLike) -> np.ndarray:
     return flat_values
 
 
-# Maximum lag in rows; number of similar frames whose places are averaged; number of principal components compared.
+# Maximum lag of frames, in rows; number of similar frames whose places are averaged; number of principal components by
+# which frames are compared.
 _MAX_LAG, _NUM_NEIGHBOURS, _NUM_COMPONENTS = 2, 8, 12
-# Conditions for a lag, by the mean errors of estimated places. Without a lag, the error is more than this fraction of
-# the error of guessing the mean place, and with the lag it is less. With any other lag, the error is larger by more
+# A lag is clear if the mean error of places estimated with the lag is below this fraction of the error of guessing the
+# mean place, the mean error without lag is above this fraction, and the mean error with any other lag is larger by more
 # than this number of standard errors.
 _MAX_GUESS_ERROR_RATIO, _MIN_STANDARD_ERRORS = 0.95, 4.0
 
 
 def estimate_lag(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) -> tuple[int, float, float]:
-    """Estimate by how many rows frames lag behind their presses; 0 without clear evidence of a lag.
+    """Estimate by how many rows of a recording frames lag behind their presses; 0 without clear evidence of a lag.
 
-    Also returns two mean errors, metres, of places estimated from the most similar frames: without the lag, and with
-    it.
+    Also returns the mean errors, metres, of places estimated from the most similar frames, without and with the lag.
     """
     features = Features.learn("normalised", changes, np.zeros_like(changes))
     scores = features(changes, np.zeros_like(changes))[:, :_NUM_COMPONENTS]
@@ -386,12 +386,13 @@ def estimate_lag(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) 
 
 
 def aligned_slices(num_rows: int, lag: int) -> tuple[slice, slice]:
-    """Return slices of frames and of the presses they belong to, for a recording of `num_rows` rows with this `lag`."""
+    """Return the slices of frames and of the corresponding presses, for a recording with a `lag` of frames in rows."""
     return slice(max(lag, 0), num_rows + min(lag, 0)), slice(max(-lag, 0), num_rows - max(lag, 0))
 
 
 def _place_errors(scores: np.ndarray, positions: np.ndarray, folds: np.ndarray, lag: int) -> np.ndarray:
-    """Compute the errors of places that are estimated from the frames with the most similar scores in other folds."""
+    """Compute errors of places that are estimated from the frames with the most similar scores in other folds,
+    metres."""
     frames, presses = aligned_slices(len(scores), lag)
     scores, positions, folds = scores[frames], positions[presses], folds[presses]
     errors = np.empty(len(scores))
@@ -411,18 +412,18 @@ def _place_errors(scores: np.ndarray, positions: np.ndarray, folds: np.ndarray, 
 
 @dataclass(frozen=True)
 class Touches:
-    """Predictions for n frames; quantities that were not learnt are None.
+    """Predicted touches of frames; quantities that were not learnt are None.
 
     **Fields**
 
-    - `position` (n, 2) or (n, 3), metres, with standard deviations `position_std`; `force` (n,), newtons, with
-      `force_std`; `label` (n,), text, with its `probability`; `touched` (n, K), which keys are pressed, with
-      `key_probability`. In frames unlike the training set, numbers are NaN, labels "" and keys false. Where nothing
-      touches, positions are NaN, forces 0, labels "none" and keys false.
-    - `unlike` (n,): whether a frame is unlike the training set; `novelty` (n,): its distance from the training set, 1
-      for the farthest frame in it.
-    - `alive` (n, M): whether a channel was used.
-    - `notes`: corrections that were made.
+    - `position` (frames, 2) or (frames, 3), metres, with standard deviations `position_std`; `force`, newtons, with
+      `force_std`; `label`, text, with its `probability`; `touched` (frames, keys), whether each key is pressed, with
+      `key_probability`. In frames unlike the training set, these numbers are NaN, labels "" and keys false. In frames
+      of the untouched skin, positions are NaN, forces 0, labels "none" and keys false.
+    - `unlike`: whether a frame is unlike the training set; `novelty`: distance of a frame from the training set, 1 for
+      the farthest training frame.
+    - `alive` (frames, channels): whether the reading was used, because the channel is alive.
+    - `notes`: corrections made to the frames, as text.
 
     **Example:**
 

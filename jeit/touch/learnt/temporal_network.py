@@ -1,7 +1,7 @@
-"""A small convolutional network that classifies touches from their course over time and features of the whole touch.
+"""A small convolutional network that classifies touches from time courses and from features of the whole touch.
 
 A few networks with different initial weights are trained at once with equinox and optax, and their probabilities are
-averaged. They are evaluated in NumPy, which takes a fraction of a millisecond per touch.
+averaged. The networks are evaluated in NumPy, in a fraction of a millisecond per touch.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from jaxtyping import Float
 
 _HIDDEN_SIZE, _DENSE_SIZE, _KERNEL_SIZE = 24, 32, 5
 _NUM_NETWORKS, _BATCH_SIZE, _NUM_EPOCHS, _LEARNING_RATE, _WEIGHT_DECAY = 2, 64, 45, 3e-3, 2e-2
-# Standard deviation of the noise added to features in each batch, relative to their scale; amount of label smoothing;
-# dropout rate of the values that enter the dense layer.
+# Standard deviation of the noise added to features in each batch, in the features' unit; amount of label smoothing;
+# dropout rate of the inputs of the dense layer.
 _FEATURE_NOISE, _LABEL_SMOOTHING, _DROPOUT_RATE = 0.15, 0.05, 0.2
 
 
 @dataclass(frozen=True)
 class TemporalNetwork:
-    """An ensemble of s networks that classify touches from their course over time.
+    """An ensemble of s convolutional networks that classify touches from time courses.
 
-    Each row of the features (n, k) contains `whole` features of the whole touch, then c values for each of T time
-    steps, step by step.
+    Each row of the features (touches, features) contains `whole` features of the whole touch, then c values for each
+    time step, step by step.
 
-    **Fields**: `first` (s, h, 5 c) and `second` (s, h, 5 h): weights of the convolutions; `dense` (s, d, whole + 2 h)
-    and `last` (s, C, d): weights of the fully connected layers; `..._bias`: the biases of each layer; `whole`: number
-    of features of the whole touch; `classes_` (C,): the classes.
+    **Fields**: `first` (s, h, 5 c) and `second` (s, h, 5 h): weights of the two convolutions over five time steps with
+    h outputs; `dense` (s, d, whole + 2 h) and `last` (s, classes, d): weights of the fully connected layers;
+    `..._bias`: the biases of each layer; `whole`: number of features of the whole touch; `classes_`: the classes.
     """
 
     first: Float[np.ndarray, "s h i"]
@@ -45,7 +45,7 @@ class TemporalNetwork:
     classes_: np.ndarray
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Compute the probabilities (n, C) of the classes, averaged over the networks."""
+        """Compute the probabilities of the classes (touches, classes), averaged over the networks."""
         course = features[:, self.whole :].reshape(len(features), -1, self.first.shape[2] // _KERNEL_SIZE)
         summed_probabilities = np.zeros((len(features), len(self.classes_)))
         for network_index in range(len(self.first)):
@@ -68,9 +68,9 @@ class TemporalNetwork:
     def fit(
         cls, features: Float[np.ndarray, "n k"], label: np.ndarray, *, whole: int, values: int
     ) -> "TemporalNetwork":
-        """Train networks on the classes `label` (n,) by AdamW, with noise added to the features of each batch.
+        """Train networks by AdamW to predict the `label` of touches, with noise added to the features of each batch.
 
-        `whole`: number of features of the whole touch; `values`: number of values at each time step, c.
+        `whole`: number of features of the whole touch; `values`: number of values at each time step.
         """
         import jax
         import jax.numpy as jnp
@@ -79,8 +79,8 @@ class TemporalNetwork:
         num_steps = _NUM_EPOCHS * max(1, -(-len(features) // _BATCH_SIZE))
         rng = np.random.default_rng(0)
         order = np.concatenate([rng.permutation(len(features)) for _ in range(_NUM_EPOCHS)])
-        # The number of rows is padded to a multiple of the batch size, so that folds of about the same size share the
-        # compiled function; no batch uses the added rows.
+        # The number of touches is padded to a multiple of the batch size, so that cross-validation folds of about the
+        # same size share the compiled function; no batch uses the added rows.
         num_padding_rows = -len(features) % _BATCH_SIZE
         parameters = _compiled_training(num_steps, whole, values, len(classes))(
             jnp.asarray(np.pad(features, ((0, num_padding_rows), (0, 0))), jnp.float32),
@@ -96,7 +96,7 @@ def _relu(values):
 
 
 def _neighbouring_steps(course, engine):
-    """Concatenate each time step with the two before and the two after it (n, T, 5 c); zeros beyond the ends."""
+    """Concatenate the values at each time step with those at the two steps before and after; zeros beyond the ends."""
     half_width, num_steps = _KERNEL_SIZE // 2, course.shape[-2]
     padded_course = engine.pad(course, ((0, 0), (half_width, half_width), (0, 0)))
     return engine.concatenate(
@@ -106,10 +106,11 @@ def _neighbouring_steps(course, engine):
 
 @functools.cache
 def _compiled_training(num_steps: int, whole: int, values: int, num_classes: int) -> Callable[..., Any]:
-    """Return a function that trains networks in `num_steps` steps, compiled once for each shape.
+    """Return a function that trains networks in `num_steps` steps of AdamW, compiled once for each shape of its
+    arguments.
 
-    The function returns weights and biases, layer by layer, from features, indices of the classes, the rows of each
-    batch, and a key for each network.
+    The arguments of the function are features, class indices, the rows of each batch, and a random key for each
+    network; the function returns the weights and biases, layer by layer.
     """
     import jax
     import jax.numpy as jnp

@@ -1,8 +1,8 @@
 """Neural networks that estimate a map of indentation depth from a skin's voltages, trained on simulated touches.
 
-`learn_images` simulates the touches of a described skin, trains a network, and stores it in a file; `read_network`
-reads it, and `ImageNetwork.depth` images frames. There are two designs: "three-stages", that of Park et al. 2022, and
-"unrolled", which is trained with the skin's forward model.
+`learn_images` simulates touches of a described skin, trains a network on them, and stores the network in a file;
+`read_network` reads the network, and `ImageNetwork.depth` computes depth maps of frames. There are two network designs:
+"three-stages", that of Park et al. 2022, and "unrolled", which is trained with the skin's forward model.
 """
 
 from __future__ import annotations

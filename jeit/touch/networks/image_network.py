@@ -1,5 +1,5 @@
-"""`ImageNetwork`: a trained network that estimates maps of indentation depth from a skin's voltages; its file
-format."""
+"""`ImageNetwork`: a trained network that estimates maps of indentation depth from a skin's voltages; files of
+networks."""
 
 from __future__ import annotations
 
@@ -31,31 +31,31 @@ from jeit.touch.training import check_same, read_model, write_model
 
 DESIGNS = ("unrolled", "three-stages")
 _FILE_KIND, _FILE_VERSION = "a jeit image network", 1
-# Maximum number of steps of an unrolled network.
+# Maximum number of refinement steps of an unrolled network.
 _MAX_STEPS = 100
 NETWORK_FILE = "network.jeit"
 # Maximum number of frames that are imaged at once; larger batches would exceed the processor's cache. JAX compiles a
 # program for each power of two up to this number.
 _MAX_BATCH_SIZE = 64
-# Thresholds for unreliable maps: fraction of the squared change that the map does not explain; size of the change that
-# is tested, as a multiple of the noise; depth, divided by the skin's thickness; outward bulge, as a multiple of the
-# noise floor. An unexplained fraction alone is no evidence, since a network that has learnt little misses many touches:
-# the map must bulge more than it is indented as well.
+# Thresholds for unreliable depth maps: fraction of the squared voltage change that the map does not explain; minimum
+# size of a change that is tested, as a multiple of the noise; depth, divided by the skin's thickness; outward bulge, as
+# a multiple of the noise floor. A large unexplained fraction alone is no evidence, since a network that has learnt
+# little misses many touches: the map must also bulge outwards more than it is indented.
 _MAX_UNEXPLAINED_FRACTION, _MIN_CHANGE_TO_NOISE, _MAX_RELATIVE_DEPTH, _MIN_BULGE_TO_FLOOR = 0.6, 3.0, 1.2, 3.0
-# Maximum fraction of missing channels with which a frame is still used.
+# Maximum fraction of channels without a reading with which a frame is still imaged.
 MAX_MISSING_FRACTION = 0.5
-# Maximum relative change; larger ones are not caused by touch.
+# Maximum relative change of a voltage; larger changes are not caused by touch.
 _MAX_RELATIVE_CHANGE = 100.0
 
 
 @dataclass(frozen=True)
 class ImageNetwork:
-    """A network that images touches of one skin.
+    """A trained network that estimates depth maps of touches from the voltages of one skin.
 
-    **Fields**: `network`: the network; `design`: its design, one of `DESIGNS`; `thickness`: thickness of the skin,
-    metres; `shape`: (rows, columns) of its maps; `extent`: (x_min, x_max, y_min, y_max) of its maps, metres, with row 0
-    at y_min; `noise`: relative noise of a channel in training; `made_for`: description of the skin, electrodes and
-    protocol that it can be used for, as plain values.
+    **Fields**: `network`: the neural network; `design`: design of the network, one of `DESIGNS`; `thickness`: thickness
+    of the skin, metres; `shape`: (rows, columns) of the depth maps; `extent`: (x_min, x_max, y_min, y_max) of the maps,
+    metres, with row 0 at y_min; `noise`: relative noise of a channel in training; `made_for`: description of the skin,
+    electrodes and protocol that the network was trained for, as plain values.
 
     **Example:**
 
@@ -75,7 +75,7 @@ class ImageNetwork:
 
     @classmethod
     def from_skin(cls, network: ThreeStages | Unrolled, skin: Skin, noise: float, shape: tuple[int, int]):
-        """Create an `ImageNetwork` from a network that was trained for this skin."""
+        """Create an `ImageNetwork` from a neural network that was trained for the given skin."""
         design = "unrolled" if isinstance(network, Unrolled) else "three-stages"
         low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
         extent = low_x, high_x, low_y, high_y
@@ -83,26 +83,26 @@ class ImageNetwork:
         return cls(network, design, float(skin.thickness), shape, extent, float(noise), made_for)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the fields without the compiled programs, which are not pickled but compiled again."""
+        """Return the fields to pickle; compiled programs are left out and compiled again later."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def depth(self, voltages: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "*n rows columns"]:
-        """Estimate the indentation depth, metres, from frames (M,) or (n, M), volts.
+        """Estimate maps of indentation depth, metres, from one frame (channels,) or several (frames, channels), volts.
 
-        `reference` (M,): frame of the untouched skin, volts. Channels without a reading are NaN; the "unrolled" design
-        replaces them by their expected values given the other channels. The network returns a map for any input:
-        `doubts` states which maps are unreliable. Raises `ValueError` for other numbers of channels, and as `changes`
-        does.
+        `reference`: frame of the untouched skin, volts. Channels without a reading are NaN; the "unrolled" design
+        replaces missing channels by their expected values given the other channels. The network returns a map for any
+        input: `doubts` states which maps are unreliable. Raises `ValueError` for another number of channels than in
+        training, and as `changes` does.
         """
         change = self.changes(voltages, reference)
         maps = self.thickness * self.share(change)
         return maps if np.ndim(voltages) == 2 else maps[0]
 
     def changes(self, voltages: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "n M"]:
-        """Compute relative changes (n, M) of frames from a reference, with missing channels filled in.
+        """Compute relative voltage changes (frames, channels) from a reference frame, with missing channels filled in.
 
         Raises `ValueError` if voltages are infinite or change by more than 100 times the reference, and if too many
-        channels are missing: more than half of them, or any for the design "three-stages".
+        channels are missing: more than half of the channels, or any channel for the design "three-stages".
         """
         num_channels = self.made_for["channels"]
         frames = real_array("voltages", voltages, f"frames ({num_channels},) or (n, {num_channels}), volts")
@@ -133,11 +133,12 @@ class ImageNetwork:
         return fill_missing(change, self._covariance, self.noise) if is_missing.any() else change
 
     def doubts(self, change: Float[np.ndarray, "n M"], share: Float[np.ndarray, "n rows columns"]) -> list[str]:
-        """State why each map of `share(change)` is unreliable; an empty string if there is no evidence against the map.
+        """State why each depth map is unreliable; an empty string if there is no evidence against the map.
 
-        A map is unreliable if it is much deeper than the skin is thick. It is also unreliable if it bulges outwards
-        more than it is indented, and its indentation does not explain the change by the forward model, which only the
-        design "unrolled" has.
+        `change`: relative voltage changes; `share`: relative depth maps, as of `share(change)`. A map is unreliable if
+        it is much deeper than the skin is thick. A map is also unreliable if it bulges outwards more than it is
+        indented, and its indentation does not explain the voltage change by the forward model, which only the design
+        "unrolled" has.
         """
         reasons = ["" for _ in share]
         change_norms = np.linalg.norm(change, axis=1)
@@ -166,8 +167,8 @@ class ImageNetwork:
 
     @functools.cached_property
     def floor(self) -> float:
-        """Noise floor of depth, metres: the maximum depth in 64 simulated maps of an untouched skin, whose channels
-        have the noise of the training."""
+        """Noise floor of depth, metres: the maximum depth in 64 maps of an untouched skin, simulated with the channel
+        noise of the training."""
         random = np.random.default_rng(0)
         return self.thickness * float(
             self.share(self.noise * random.normal(size=(64, self.made_for["channels"]))).max()
@@ -175,21 +176,21 @@ class ImageNetwork:
 
     @functools.cached_property
     def _covariance(self) -> Float[np.ndarray, "M M"]:
-        """Covariance of the relative changes of the channels that touches cause."""
+        """Covariance (channels, channels) of the relative voltage changes that touches cause."""
         assert isinstance(self.network, Unrolled)
         return self.network.covariance(pixel_places(self.extent, self.shape))
 
     @functools.cached_property
     def _predict_changes(self) -> Callable[..., Any]:
-        """Compiled function from relative depth maps to the changes of the channels, by the forward model."""
+        """Compiled function that predicts relative voltage changes from relative depth maps by the forward model."""
         network = self.network
         assert isinstance(network, Unrolled)
         return jax.jit(lambda maps: network.predicted_changes(jnp.asarray(maps, jnp.float32)))
 
     def share(self, change: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n rows columns"]:
-        """Compute depths divided by the skin's thickness, from relative changes (n, M).
+        """Compute depth maps, divided by the skin's thickness, from relative voltage changes (frames, channels).
 
-        `change` is relative to a reference, as computed by `jeit.touch.simulate.relative_changes`.
+        `change` is relative to a reference frame, as computed by `jeit.touch.simulate.relative_changes`.
         """
         num_frames = len(change)
         if not num_frames:
@@ -200,7 +201,8 @@ class ImageNetwork:
         if len(padded_changes) == batch_size:
             return np.asarray(self._compiled(padded_changes))[:num_frames]
         starts, compiled = range(0, len(padded_changes), batch_size), self._compiled
-        # A program leaves cores idle between its convolutions: running two at once takes three quarters of the time.
+        # A compiled program leaves cores idle between its convolutions: running two programs at once takes three
+        # quarters of the time.
         with ThreadPoolExecutor(min(len(starts), os.cpu_count() or 1)) as pool:
             parts = list(
                 pool.map(lambda start: np.asarray(compiled(padded_changes[start : start + batch_size])), starts)
@@ -209,22 +211,22 @@ class ImageNetwork:
 
     @functools.cached_property
     def _compiled(self) -> Callable[..., Any]:
-        """Compiled function from relative changes to relative depth maps."""
+        """Compiled function that computes relative depth maps from relative voltage changes."""
         arrays, static_part = eqx.partition(self.network, eqx.is_array)
         run_network = jax.jit(lambda arrays, change: eqx.combine(arrays, static_part)(change))
         return lambda change: run_network(arrays, jnp.asarray(change))
 
     def check_protocol(self, protocol: Protocol, name: str = "the data") -> None:
-        """Raise `ValueError`, with the difference, if the network was trained for another protocol; currents may
-        differ."""
+        """Raise `ValueError`, which states the difference, if the network was trained for another protocol than the
+        given; currents may differ."""
         check_same(name, self.made_for, _describe_protocol(protocol))
 
 
 def describe_skin(protocol: Protocol, centres: ArrayLike, extent: tuple[float, ...]) -> dict[str, Any]:
-    """Describe the skin that a network is made for, as plain values that JSON can store.
+    """Describe the skin that a network is trained for, as plain values that JSON can store.
 
-    `protocol`: its protocol; `centres` (L, 2): centres of its electrodes, metres; `extent`: (x_min, x_max, y_min,
-    y_max) of its bounding box, metres.
+    `protocol`: measurement protocol of the skin; `centres` (electrodes, 2): centres of the electrodes, metres;
+    `extent`: (x_min, x_max, y_min, y_max) of the skin's bounding box, metres.
     """
     centres_mm = np.round(1e3 * np.asarray(centres), 3).tolist()
     extent_mm = np.round(1e3 * np.asarray(extent), 3).tolist()
@@ -232,14 +234,14 @@ def describe_skin(protocol: Protocol, centres: ArrayLike, extent: tuple[float, .
 
 
 def write_network(network: ImageNetwork, path: str | Path) -> None:
-    """Write a network to one file: arrays with a JSON header.
+    """Write a trained image network to one file: arrays with a JSON header.
 
     **Arguments:**
 
     - `network`: the network.
     - `path`: path of the file.
 
-    Raises `ValueError` for anything but an `ImageNetwork`, and if `path` is a folder; `OSError` if it cannot be
+    Raises `ValueError` if `network` is no `ImageNetwork` or `path` is a folder, and `OSError` if the file cannot be
     written.
 
     **Example:**
@@ -264,17 +266,17 @@ def write_network(network: ImageNetwork, path: str | Path) -> None:
 
 
 def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
-    """Read a network from a file that `write_network` wrote, or from the folder of `learn_images`.
+    """Read a trained image network from a file that `write_network` wrote, or from the folder of `learn_images`.
 
     Nothing in the file is executed.
 
     **Arguments:**
 
     - `path`: path of the file or folder.
-    - `skin`: the skin that it is to be used for, which is then compared with that it was trained for.
+    - `skin`: the skin to be imaged, which is compared with the skin that the network was trained for.
 
-    Raises `FileNotFoundError`, and `ValueError` for a file of another kind, and, with the difference, if the network
-    was trained for another skin.
+    Raises `FileNotFoundError` if the path does not exist, and `ValueError` if the file is not that of a network or the
+    network was trained for another skin.
 
     **Example:**
 
@@ -305,7 +307,7 @@ def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
 
 
 def _untrained_network(head: dict[str, Any]) -> ThreeStages | Unrolled:
-    """Create an untrained network of the architecture that the header `head` of a file describes."""
+    """Create an untrained network of the architecture that the header `head` of a network's file describes."""
     check_name("design", head["design"], DESIGNS)
     rows, columns = head["shape"]
     channels, key = head["made_for"]["channels"], jax.random.key(0)
@@ -323,8 +325,8 @@ def _untrained_network(head: dict[str, Any]) -> ThreeStages | Unrolled:
 
 
 def _describe_protocol(protocol: Protocol) -> dict[str, Any]:
-    """Return the numbers of channels and electrodes of a protocol, and a hash of its drive and measurement patterns,
-    for any current."""
+    """Return the numbers of channels and electrodes of a protocol, and a hash of its drive and measurement patterns
+    that does not depend on the current."""
     drive_patterns, measurement_patterns = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
     patterns = (
         np.round(
@@ -348,10 +350,11 @@ def _describe_protocol(protocol: Protocol) -> dict[str, Any]:
 def fill_missing(
     changes: Float[np.ndarray, "n M"], covariance: Float[np.ndarray, "M M"], noise: float
 ) -> Float[np.ndarray, "n M"]:
-    """Replace missing channels, NaN, by their expected values given the others, C₂₁ (C₁₁ + noise² 1)⁻¹ y₁.
+    """Replace missing channels, NaN, by their expected values given the other channels, C₂₁ (C₁₁ + noise² 1)⁻¹ y₁.
 
-    C is the `covariance` of the changes that touches cause; index 1 stands for known channels, 2 for missing ones; y₁
-    are the known changes. `noise`: standard deviation of the Gaussian noise of each channel.
+    C is the `covariance` of the relative changes that touches cause; index 1 stands for known channels, 2 for missing
+    channels; y₁ are the changes of the known channels. `noise`: standard deviation of the Gaussian noise of each
+    channel.
     """
     completed_changes = np.array(changes, float)
     is_known = np.isfinite(completed_changes)

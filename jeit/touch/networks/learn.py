@@ -1,4 +1,4 @@
-"""Learn an image network in three steps: simulation of touches, training, evaluation."""
+"""Learn a network that images touches in three steps: simulation of touches, training, evaluation."""
 
 from __future__ import annotations
 
@@ -43,45 +43,45 @@ from jeit.touch.training import (
     fit_network,
 )
 
-# Maximum number of touches that are in memory, and shuffled, at once: 120 MB for 94 channels and 48 × 48 maps.
+# Maximum number of simulated touches in memory, and shuffled, at once: 120 MB for 94 channels and 48 × 48 maps.
 _MAX_TOUCHES_IN_MEMORY = 12_000
 
 
 class SimulatedTouches(Protocol):
-    """Simulated touches: relative changes "change" (n, M) without noise, and depth maps "depth" (n, rows, columns).
+    """Simulated touches: voltage changes "change" (touches, channels), depth maps "depth" (touches, rows, columns).
 
-    Depths are divided by the thickness of the skin.
+    Changes are relative, without noise. Depths are divided by the skin's thickness.
     """
 
     def rows(self, *names: str) -> Rows:
-        """Return the arrays of these names, float32, in this order; for a single name, the array itself."""
+        """Return the float32 arrays "change" or "depth" in the order of `names`; the array itself for one name."""
         ...
 
 
 class TouchExamples(NamedTuple):
-    """Touches in memory.
+    """Simulated touches in memory.
 
-    **Fields**: `change` (n, M): relative changes without noise; `depth` (n, rows, columns): depth maps, divided by the
-    thickness of the skin.
+    **Fields**: `change` (touches, channels): relative voltage changes without noise; `depth` (touches, rows, columns):
+    depth maps, divided by the thickness of the skin.
     """
 
     change: Float[np.ndarray, "n M"]
     depth: Float[np.ndarray, "n r c"]
 
     def rows(self, *names: str) -> ArrayRows:
-        """See `Touches.rows`."""
+        """Return the arrays of these names, as `SimulatedTouches.rows` does."""
         arrays = tuple(np.asarray(getattr(self, name), np.float32) for name in names)
         return ArrayRows(arrays[0] if len(arrays) == 1 else arrays)
 
 
 class StoredTouches:
-    """Touches of a finished set of `simulate_presses`, read from its store on access.
+    """Simulated touches of a finished set of `simulate_presses`, read from the set's store on access.
 
     Chunks of the store are read together in larger chunks of about `max_chunk_size` touches, or fewer.
     """
 
     def __init__(self, indents: IndentSet, path: str | Path, max_chunk_size: int = _MAX_TOUCHES_IN_MEMORY):
-        """Open the store. Raises `ValueError` if it is not finished, and as `Store` does."""
+        """Open the store of touches. Raises `ValueError` if the set is not finished, and as `Store` does."""
         store, chunks = Store(indents.contents(), path, create=False), indents.chunks
         checksums = store.finished()
         if len(checksums) < len(chunks):
@@ -90,34 +90,34 @@ class StoredTouches:
             )
         self.fingerprint = hashlib.sha256(repr(sorted(checksums.items())).encode()).hexdigest()
         self._arrays = store.open_dataset()
-        # The chunks are of similar size, so that none is smaller than a batch.
+        # The chunks are of similar size, so that no chunk is smaller than a batch.
         num_chunks = min(-(-indents.number // max_chunk_size), len(chunks))
         chunk_groups = np.array_split(np.arange(len(chunks)), num_chunks)
         self.spans = [range(chunks[chunk_group[0]].start, chunks[chunk_group[-1]].stop) for chunk_group in chunk_groups]
 
     def rows(self, *names: str) -> "StoredRows":
-        """Return the arrays of these names, which are read chunk by chunk; see `SimulatedTouches`."""
+        """Return the arrays of these names, to be read chunk by chunk; see `SimulatedTouches`."""
         return StoredRows(self, names)
 
     def in_memory(self) -> TouchExamples:
-        """Read all touches into memory."""
+        """Read all touches of the set into memory."""
         return TouchExamples(self._arrays["change"].to_numpy(), self._arrays["depth"].to_numpy())
 
     def read(self, name: str, chunk: int) -> Float[np.ndarray, "n *shape"]:
-        """Read the array `name` of one chunk, float32."""
+        """Read the array `name` of one chunk of touches, float32."""
         span = self.spans[chunk]
         return self._arrays[name][span.start : span.stop].to_numpy().astype(np.float32, copy=False)
 
 
 class StoredRows:
-    """Arrays of `StoredTouches` with these names, with the interface of `Rows`."""
+    """The named arrays of `StoredTouches`, with the interface of `Rows`."""
 
     def __init__(self, touches: StoredTouches, names: tuple[str, ...]):
         self._touches, self._names = touches, names
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Number of touches of each chunk."""
+        """Number of simulated touches of each chunk."""
         return tuple(map(len, self._touches.spans))
 
     @property
@@ -126,23 +126,23 @@ class StoredRows:
         return f"{self._touches.fingerprint} {' '.join(self._names)} {self.sizes}"
 
     def chunk(self, index: int):
-        """Read the arrays of one chunk; for a single name, the array itself."""
+        """Read the arrays of one chunk of touches; for a single name, returns the array itself."""
         arrays = tuple(self._touches.read(name, index) for name in self._names)
         return arrays[0] if len(arrays) == 1 else arrays
 
 
-# Training of the unrolled network: weight of the maps of all steps but the last; weight of the voltage misfit; both are
-# relative to the weight of the last map. Model error, relative to the changes; maximum standard deviation of the drift
-# of log contact impedances; maximum noise, as a multiple of the given noise.
+# Training of the unrolled network. Weights in the loss, relative to that of the last step's map: maps of the other
+# steps; voltage misfit. Model error, relative to the voltage changes; maximum standard deviation of the drift of log
+# contact impedances; maximum noise, as a multiple of the given noise.
 _EARLY_MAP_WEIGHT, _MISFIT_WEIGHT, _MODEL_ERROR, _MAX_CONTACT_DRIFT, _MAX_NOISE_FACTOR = 0.3, 0.05, 0.1, 0.1, 6.0
-# Scale of squared depths, chosen so that losses are about one before training.
+# Squared depths are divided by this scale, so that losses are about one before training.
 _LOSS_SCALE = 0.002
 
 
 class TrainedNetwork(NamedTuple):
-    """A trained network.
+    """A trained neural network and the results of its trainings.
 
-    **Fields**: `network`: the network; `courses`: results of its trainings, with their histories, by name.
+    **Fields**: `network`: the network; `courses`: results of its trainings, with the histories of losses, by name.
     """
 
     network: ThreeStages | Unrolled
@@ -150,9 +150,9 @@ class TrainedNetwork(NamedTuple):
 
 
 class TrainingRuns(NamedTuple):
-    """Settings of consecutive trainings.
+    """Settings of consecutive trainings of a network's parts.
 
-    **Fields**: `plan`: plan of every training; `key`: random key; `folder`: folder of the checkpoints, or None;
+    **Fields**: `plan`: settings of every training; `key`: random key; `folder`: folder of the checkpoints, or None;
     `progress`: function that is called with a description of the progress, or None.
     """
 
@@ -162,7 +162,7 @@ class TrainingRuns(NamedTuple):
     progress: Callable[[str], None] | None = None
 
     def run(self, name: str, network, objective: TrainingObjective, training, validation) -> TrainingResult:
-        """Run one training, with a random key that depends on its name."""
+        """Run one training, with a random key that depends on the training's name."""
         key = jax.random.fold_in(self.key, int.from_bytes(name.encode()[:4], "little"))
         checkpoint = None if self.folder is None else self.folder / f"{name}.training"
         report = self.progress
@@ -175,7 +175,7 @@ class TrainingRuns(NamedTuple):
 def train_three_stages(
     training: SimulatedTouches, validation: TouchExamples, noise: float, runs: TrainingRuns
 ) -> TrainedNetwork:
-    """Train the design of Park et al. 2022: autoencoders of the changes and of the maps, and a projection between them.
+    """Train the design of Park et al. 2022: autoencoders of voltage changes and depth maps, a projection between them.
 
     Both autoencoders are fixed while the projection is trained. `noise`: standard deviation of relative changes.
     """
@@ -246,18 +246,17 @@ def train_unrolled(
     noise: float,
     runs: TrainingRuns,
 ) -> TrainedNetwork:
-    """Train the network `untrained`, which is already adapted to a skin, on the errors of its maps and of their
-    voltages.
+    """Train an unrolled network, already adapted to a skin, to minimise errors of its depth maps and of their voltages.
 
-    The voltages of maps are computed by the skin's forward model. Changes are trained with the relative `noise` and
-    with drifting contact impedances.
+    The voltages of maps are computed by the skin's forward model. In training, voltage changes have the relative
+    `noise` and drifting contact impedances.
     """
     contacts = jnp.asarray(channels.contacts, jnp.float32)
 
     def loss(network, batch, key):
         change, depth = batch
         keys = jax.random.split(key, 4)
-        # The amounts of drift and noise are squares of uniform random numbers, so that most are near the usual amounts.
+        # Drift and log noise are linear in the square of a uniform random number, so that most amounts are low.
         drift_size, noise_size = (
             jax.random.uniform(size_key, (len(change), 1), change.dtype) ** 2 for size_key in keys[2:]
         )
@@ -280,7 +279,7 @@ def train_unrolled(
 
 
 def shuffle_pairs(examples: TouchExamples, seed: int = 0) -> TouchExamples:
-    """Pair the changes and maps at random: only the distribution of maps can be learnt from the result."""
+    """Pair voltage changes and depth maps at random: only the distribution of maps can be learnt from such pairs."""
     order = np.random.default_rng(seed).permutation(len(examples.change))
     return examples._replace(depth=examples.depth[order])
 
@@ -291,12 +290,12 @@ def _map_errors(network, batch):
 
 
 def mean_and_deviation(rows: Rows) -> tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]]:
-    """Compute the mean and standard deviation of each column of rows that are arrays (n, M), over all their chunks."""
+    """Compute the mean and the standard deviation of each column of the `rows` over all their chunks."""
     num_rows, mean, squares = 0, np.zeros(()), np.zeros(())
     for chunk_index, size in enumerate(rows.sizes):
         values = np.asarray(rows.chunk(chunk_index), float)
         chunk_mean = values.mean(axis=0)
-        # Sum of squares about the mean of both parts together (Chan, Golub and LeVeque 1983).
+        # Sum of squares about the mean of earlier chunks and this chunk together (Chan, Golub and LeVeque 1983).
         difference, num_rows = chunk_mean - mean, num_rows + size
         squares = (
             squares + ((values - chunk_mean) ** 2).sum(axis=0) + difference**2 * (num_rows - size) * size / num_rows
@@ -306,26 +305,25 @@ def mean_and_deviation(rows: Rows) -> tuple[Float[np.ndarray, " M"], Float[np.nd
 
 
 def _add_noise(examples: TouchExamples, noise: float) -> tuple[Float[np.ndarray, "n M"], Float[np.ndarray, "n r c"]]:
-    """Return changes with noise, and maps; the noise is fixed, so that held-out data are the same in every
-    evaluation."""
+    """Return voltage changes with noise, and depth maps; the noise is fixed, so that held-out data never differ."""
     random = np.random.default_rng(0).normal(size=examples.change.shape)
     return np.asarray(examples.change + noise * random, np.float32), examples.depth
 
 
 SHAPE = (48, 48)
-# Number of touches of a chunk; seeds of the training set, the held-out set, and the test set, on which no choice
-# depends.
+# Number of simulated touches of a chunk; seed offsets of the training, held-out and test sets. No choice depends on the
+# test set.
 _CHUNK_SIZE, _SEED_OFFSETS = 250, (0, 1, 2)
-# Evaluation: diameter of a ball, metres; its depth, divided by the skin's thickness; number of places along a side.
+# Evaluation with a ball: diameter, metres; depth, divided by the skin's thickness; number of places along a side.
 _BALL_DIAMETER, _BALL_DEPTH, _PLACES_PER_SIDE = 0.015, 0.75, 15
 
 
 @dataclass(frozen=True)
 class NetworkPreset:
-    """Size of a training.
+    """Numbers of simulated touches and training plans for learning an image network.
 
     **Fields**: `number`: number of training touches; `held_out`: number of held-out touches, and of test touches;
-    `plan`: plan of every training; `three_stages`: plan for the design "three-stages" if it is another, otherwise None.
+    `plan`: settings of every training; `three_stages`: those for the design "three-stages" if they differ, else None.
 
     **Example:**
 
@@ -341,7 +339,7 @@ class NetworkPreset:
     three_stages: TrainingPlan | None = None
 
     def plan_of(self, design: str) -> TrainingPlan:
-        """Return the training plan for a design."""
+        """Return the training settings for a network design."""
         return self.three_stages if design == "three-stages" and self.three_stages is not None else self.plan
 
 
@@ -358,12 +356,12 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class ImageStanding:
-    """Accuracy of a network on the touches of a test set.
+    """Accuracy of an image network on the touches of a test set.
 
-    **Fields**: `explained`: fraction of the squared depth that its maps explain, at most 1; `place`: mean, standard
-    deviation (sd) and root mean square (rms) of the error of a ball's centroid over a grid of places, metres;
-    `deepest`: median ratio of the ball's estimated depth to its true depth; `right`, `estimated` (k, rows, columns):
-    true and estimated maps of some touches, divided by the thickness of the skin.
+    **Fields**: `explained`: fraction of the squared depth that the estimated maps explain, at most 1; `place`: mean,
+    standard deviation (sd) and root mean square (rms) of the error of a ball's centroid over a grid of places, metres;
+    `deepest`: median ratio of the ball's estimated depth to its true depth; `right`, `estimated` (touches, rows,
+    columns): true and estimated maps of some touches, divided by the thickness of the skin.
     """
 
     explained: float
@@ -377,8 +375,8 @@ class ImageStanding:
 class LearntImages:
     """A trained image network and its accuracy.
 
-    **Fields**: `network`: the network; `courses`: results of its trainings, with their histories, by name; `standing`:
-    its accuracy; `seconds`: duration of each part of the work, seconds.
+    **Fields**: `network`: the network; `courses`: results of its trainings, with the histories of losses, by name;
+    `standing`: accuracy of the network; `seconds`: duration of each part of the work, seconds.
     """
 
     network: ImageNetwork
@@ -398,20 +396,20 @@ def learn_images(
     client: Any = None,
     progress: Callable[[str], None] | None = None,
 ) -> LearntImages:
-    """Simulate touches of a skin, train a network on them, and write it to a folder, as `network.jeit`.
+    """Simulate touches of a skin, train an image network on the touches, and write the network to a folder.
 
-    If it is interrupted, the same call resumes: touches are stored in chunks in the folder `work`, and trainings in
-    checkpoints.
+    The network's file is `network.jeit`. After an interruption, the same call resumes: touches are stored in chunks in
+    the folder `work`, and trainings in checkpoints.
 
     **Arguments:**
 
-    - `skin`: the skin, which is flat.
-    - `folder`: the folder, which is created if needed.
-    - `preset`: "quick", under two minutes, "full", or a `NetworkPreset`.
+    - `skin`: the skin, which must be flat.
+    - `folder`: the folder of the results, which is created if needed.
+    - `preset`: size of the training: "quick", under two minutes, "full", or a `NetworkPreset`.
     - `design`: "unrolled", a network with the skin's forward model, or "three-stages", that of Park et al. 2022.
-    - `touches`: number of training touches, by default that of the preset, limited only by the disk.
+    - `touches`: number of simulated training touches, by default that of the preset, limited only by the disk.
     - `seed`: random seed.
-    - `client`: client of a dask cluster for the simulation.
+    - `client`: client of a dask cluster that simulates the touches, or None.
     - `progress`: called with a description of the progress.
 
     Raises `ValueError` for curved skins, unknown names, an invalid number of touches, and a folder with work on another
@@ -492,7 +490,7 @@ def learn_images(
 
 
 def evaluate_network(network: ImageNetwork, skin: Skin, examples: TouchExamples, seed: int = 0) -> ImageStanding:
-    """Evaluate a network on touches, with the noise of its training."""
+    """Evaluate an image network on simulated touches, with the noise of its training."""
     random = np.random.default_rng(seed)
 
     def estimate_maps(change):

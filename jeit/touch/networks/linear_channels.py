@@ -1,4 +1,4 @@
-"""Linear model of a skin's channels, random touches for training networks, and positions in depth maps."""
+"""Linear model of a skin's channels, random touches for training networks, and positions of touches in depth maps."""
 
 from __future__ import annotations
 
@@ -34,19 +34,20 @@ _TOUCH_FRACTION = 0.5
 
 
 def deepest_positions(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
-    """Return the positions (n, 2) of the deepest pixels of maps, metres; `places` (r, c, 2): positions of the pixels,
-    metres."""
+    """Return the positions (maps, 2) of the deepest pixels of depth maps, metres; `places` (rows, columns, 2):
+    positions of the pixels, metres."""
     deepest = maps.reshape(len(maps), -1).argmax(axis=1)
     return places.reshape(-1, 2)[deepest]
 
 
 def depth_centroids(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
-    """Compute the centroid (n, 2) of the indentation in each of n maps, metres: the mean position of the pixels deeper
-    than half of the map's maximum depth, weighted by depth. `places` (r, c, 2): positions of the pixels, metres."""
+    """Compute the centroid (maps, 2) of the indentation in each depth map, metres: the mean position, weighted by
+    depth, of the pixels deeper than half of the map's maximum depth. `places` (rows, columns, 2): positions of the
+    pixels, metres."""
     flat_maps = maps.reshape(len(maps), -1)
     max_depths = flat_maps.max(axis=1, keepdims=True)
     weights = np.where(flat_maps > _TOUCH_FRACTION * max_depths, np.maximum(flat_maps, 0), 0)
-    # A map without any depth gives the middle of the skin.
+    # The centroid of a map without any depth is the middle of the skin.
     weights = np.where(max_depths > 0, weights, 1.0)
     return weights @ places.reshape(-1, 2) / weights.sum(axis=1, keepdims=True)
 
@@ -60,25 +61,25 @@ def error_statistics(
     return {"mean": float(distances.mean()), "sd": float(distances.std()), "rms": float(np.sqrt(np.mean(distances**2)))}
 
 
-# Minimum and maximum depth of a touch, divided by the skin's thickness; in Park et al., 1 and 8 mm of 10 mm.
+# Minimum and maximum depth of a simulated touch, divided by the skin's thickness; in Park et al., 1 and 8 mm of 10 mm.
 DEPTHS = (0.1, 0.8)
-# Maximum number of bodies that touch at once.
+# Maximum number of bodies that touch the skin at once.
 _MAX_BODIES = 3
-# Limit of detection of Park et al., newtons, for a ball of 15 mm diameter; the change at this limit, in standard
-# deviations of the noise; number of places along a side at which the change is computed.
+# Limit of detection of Park et al., newtons, for a ball of 15 mm diameter; the voltage change at this limit, in
+# standard deviations of the noise; number of places along a side at which the change is computed.
 _DETECTION_LIMIT, _DETECTION_DEVIATIONS, _PLACES_PER_SIDE = 0.7, 3.0, 15
 # Minimum distance of a touch's centre from the skin's edge, divided by the skin's shorter side.
 _EDGE_MARGIN = 0.04
 
 
 def wrench() -> JoinedIndenters:
-    """Create an open-ended wrench laid flat, 100 mm long."""
+    """Create the shape of an open-ended wrench laid flat, 100 mm long."""
     jaw = PlacedIndenter(RingIndenter(0.030, 0.014), (0.040, 0.0))
     return JoinedIndenters(PlacedIndenter(BarIndenter(0.070, 0.010), (-0.010, 0.0)), jaw)
 
 
 def touching_bodies() -> list[AbstractIndenter]:
-    """Create the bodies that touch the skin: bells, balls, discs, bars, and a wrench."""
+    """Create the bodies that touch the skin in simulations: bells, balls, discs, bars, and a wrench."""
     return [
         *(RevolvedIndenter(Bell(0.02, deviation)) for deviation in (5e-3, 7.5e-3, 10e-3)),
         *(ball_indenter(diameter) for diameter in (0.015, 0.020, 0.030)),
@@ -89,7 +90,8 @@ def touching_bodies() -> list[AbstractIndenter]:
 
 
 def touch_draws(skin: Skin) -> IndentDraws:
-    """Create random touches by one to three of the `touching_bodies`, anywhere on a skin and turned by any angle."""
+    """Create a generator of random touches by one to three of the `touching_bodies`, anywhere on a skin and at any
+    angle."""
     thickness = float(skin.thickness)
     low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
     depth = (DEPTHS[0] * thickness, DEPTHS[1] * thickness)
@@ -101,30 +103,30 @@ def detection_noise(skin: Skin, limit: float = _DETECTION_LIMIT) -> float:
     """Compute the relative noise of a channel at which a ball of 15 mm diameter, pressed with `limit` newtons, is just
     detected.
 
-    The ball is pressed at places all over the skin. At each, the maximum relative change over all channels is computed;
-    the noise is a third of the median of these maxima. Park et al. 2022 detect 0.7 N; this load indents a hydrogel of
-    100 kPa by 1.7 mm.
+    The ball is pressed at places all over the skin. At each place, the maximum relative voltage change over all
+    channels is computed; the noise is a third of the median of these maxima. Park et al. 2022 detect 0.7 N; this load
+    indents a hydrogel of 100 kPa by 1.7 mm.
     """
     tip = ball_indenter(0.015)
     depth = material("hydrogel").support.pressure(tip, limit).approach
     grid = touches_away_from_the_edge(skin.flat_outline, 0.0075, _PLACES_PER_SIDE, _PLACES_PER_SIDE)
     change = relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places])
-    # Rounded to four digits, which do not depend on the order of summation.
+    # The noise is rounded to four digits, which do not depend on the order of summation.
     return float(f"{np.median(np.abs(change).max(axis=1)) / _DETECTION_DEVIATIONS:.4g}")
 
 
-# Number of points along a side of each cell; there are several, since pixels are smaller than cells.
+# Number of points along a side of each mesh cell that assign the cell to pixels, which are smaller than cells.
 _POINTS_PER_SIDE = 6
-# Maximum depth for the nonlinear formula; larger depths continue it linearly.
+# Maximum relative depth for the nonlinear formula of strength, which is continued linearly for larger depths.
 _MAX_DEPTH = 0.9
 
 
 class LinearChannels(NamedTuple):
-    """Linear model of a skin's channels.
+    """Linear model of the relative voltage changes of a skin's channels.
 
-    **Fields**: `operator` (M, P): relative changes of the channels per unit of `strength` of each of P pixels;
-    `contacts` (L, M): relative changes per unit of the logarithm of each electrode's contact impedance; `shape`: (rows,
-    columns) of the pixels.
+    **Fields**: `operator` (channels, pixels): relative changes of the channels per unit of the `strength` of each
+    pixel's indentation; `contacts` (electrodes, channels): relative changes per unit of the logarithm of each
+    electrode's contact impedance; `shape`: (rows, columns) of the pixels.
     """
 
     operator: Float[np.ndarray, "M P"]
@@ -133,7 +135,7 @@ class LinearChannels(NamedTuple):
 
     @classmethod
     def from_skin(cls, skin: Skin, shape: tuple[int, int] = (48, 48)) -> "LinearChannels":
-        """Compute the model of a skin, with its pixels on a grid of this shape over its bounding box."""
+        """Compute the linear model of a skin, with pixels on a grid of the given shape over the skin's bounding box."""
         rows, columns = shape
         model, conductivity = skin.model, np.asarray(skin.model_conductivity)
         rest_voltages, jacobian = (np.asarray(array) for array in model.voltages_and_jacobian(conductivity))
@@ -144,8 +146,8 @@ class LinearChannels(NamedTuple):
         tree = KDTree(image_places(skin, columns, rows).reshape(-1, 2))
         pixel_indices = np.asarray(tree.query(points[..., :2].reshape(-1, 2))[1])
         # A point at depth b, divided by the skin's thickness, loses all conductivity under indentations δ > b. The line
-        # through 0 that fits this best, for depths drawn uniformly in log δ, is δ ∫ [δ' > b] dδ' / ∫ δ' dδ'. In a
-        # sheet, which has no depth b, every point loses δ.
+        # through 0 that fits this loss best, for depths drawn uniformly in log δ, is δ ∫ [δ' > b] dδ' / ∫ δ' dδ'. In a
+        # sheet, which has no depth b, every point loses the fraction δ.
         point_shares = np.ones(points.shape[:2])
         if skin.num_layers:
             depths = (points[..., 2].max() - points[..., 2]) / float(skin.thickness)
@@ -161,8 +163,8 @@ class LinearChannels(NamedTuple):
         )
 
     def coarser_operator(self) -> Float[np.ndarray, "M p"]:
-        """Compute the operator (M, P / 4) for pixels twice as wide and high: the sum over the four pixels that each of
-        them covers."""
+        """Compute the operator for pixels twice as wide and high: the sum over the four pixels that each larger pixel
+        covers."""
         rows, columns = self.shape
         pixel_blocks = self.operator.reshape(len(self.operator), rows // 2, 2, columns // 2, 2)
         return pixel_blocks.sum(axis=(2, 4)).reshape(len(pixel_blocks), -1)
@@ -171,36 +173,36 @@ class LinearChannels(NamedTuple):
 def round_relative(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Round values to a millionth of their maximum, or finer, to remove effects of the order of summation.
 
-    The same random key then gives the same training wherever NumPy's arrays are in memory.
+    After rounding, the same random key gives the same training wherever NumPy's arrays are in memory.
     """
     unit = 2.0 ** (np.floor(np.log2(max(float(np.abs(values).max()), 1e-300))) - 20)
     return np.round(values / unit) * unit
 
 
 def strength(depth):
-    """Compute the strength δ / √(1 − δ), to which changes of voltages are proportional, of an indentation of relative
-    depth δ.
+    """Compute the strength δ / √(1 − δ) of an indentation, to which changes of voltages are proportional.
 
-    δ is the depth divided by the skin's thickness.
+    The relative `depth` δ is the depth divided by the skin's thickness.
 
-    A patch of lower conductivity has a larger effect than in proportion to its change, since current flows around it.
-    In two dimensions, patches with e^s and e^−s times the conductivity change voltages oppositely, to first order in
-    their size (Keller's duality). The strength 2 sinh(s / 2), with log(1 − δ) = −s, has this property.
+    A patch of lower conductivity has a larger effect than in proportion to the change of conductivity, since current
+    flows around the patch. In two dimensions, patches with e^s and e^−s times the conductivity change voltages
+    oppositely, to first order in their size (Keller's duality). The strength 2 sinh(s / 2), with log(1 − δ) = −s,
+    changes its sign with s, as these changes do.
     """
     clipped_depth = jnp.clip(depth, 0.0, _MAX_DEPTH)
     return clipped_depth / jnp.sqrt(1 - clipped_depth) + (depth - clipped_depth)
 
 
 def depth_from_strength(strength):
-    """Compute the relative depths δ with the given strengths: the inverse of `strength`. Negative strengths give
-    negative depths."""
+    """Compute the relative depths of indentations from their strengths: the inverse of `strength`. Negative strengths
+    give negative depths."""
     positive_strength = jnp.maximum(strength, 0.0)
     return (jnp.sqrt(positive_strength**2 + 4) - positive_strength) * positive_strength / 2 + jnp.minimum(strength, 0.0)
 
 
 def _contact_changes(skin: Skin, rest_voltages, conductivity) -> Float[np.ndarray, "L M"]:
-    """Compute the relative changes of the M channels per unit of the logarithm of each of the L contact impedances;
-    `rest_voltages` (M,): voltages of the untouched skin."""
+    """Compute the relative changes of the channels per unit of the logarithm of each electrode's contact impedance;
+    `rest_voltages`: voltages of the untouched skin."""
     model = skin.model
     fields, impedance = (np.asarray(array) for array in model.fields(conductivity))
     derivatives = ContactSensitivity(model.mesh, model.electrodes)(

@@ -1,4 +1,4 @@
-"""Image measured frames by a network, each as soon as it arrives."""
+"""Estimate depth maps of measured frames by a network, each map as soon as its frame arrives."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from jeit.arguments import check_kind
 from jeit.data import Measurement
 from jeit.touch.networks.image_network import MAX_MISSING_FRACTION, ImageNetwork
 
-# Maximum difference, metres, of electrode positions and of the skin's size from those that a network was trained for.
+# Maximum difference, metres, of electrode positions and skin size between a measurement and a network's training.
 _POSITION_TOLERANCE = 1e-3
 
 
 class FrameDepth(NamedTuple):
-    """Depth map of one frame of a stream.
+    """Indentation depth map of one frame of a stream.
 
-    **Fields**: `number`: number of the frame, from 0; `depth` (rows, columns): map of depth, metres, None if the frame
-    is refused; `reason`: reason for refusing it, otherwise an empty string; `latency`: time from the frame to the map,
-    seconds.
+    **Fields**: `number`: number of the frame, from 0; `depth` (rows, columns): depth map, metres, None if the frame is
+    refused; `reason`: reason for refusing the frame, otherwise an empty string; `latency`: time from the frame's
+    arrival to the map, seconds.
     """
 
     number: int
@@ -32,11 +32,11 @@ class FrameDepth(NamedTuple):
 
 
 def resting_frame(frames: Float[np.ndarray, "r M"], name: str = "reference") -> Float[np.ndarray, " M"]:
-    """Compute the mean (M,) of frames of the untouched skin, volts; NaN for channels without a reading.
+    """Compute the mean frame (channels,) of an untouched skin, volts; NaN for channels without a reading.
 
     **Arguments:**
 
-    - `frames`: the frames (r, M), volts.
+    - `frames`: frames of the untouched skin (frames, channels), volts.
     - `name`: name of the frames in error messages.
 
     Raises `ValueError` if more than half of the channels have no reading.
@@ -60,8 +60,8 @@ def resting_frame(frames: Float[np.ndarray, "r M"], name: str = "reference") -> 
 def check_measured(network: ImageNetwork, measurement: Measurement) -> None:
     """Check that a measurement is of the skin that a network was trained for.
 
-    Raises `ValueError` for anything but a measurement, for complex voltages, and for another protocol, other positions
-    of electrodes, or another size of the skin.
+    Raises `ValueError` if `measurement` is no measurement, has complex voltages, or differs from the network's training
+    in protocol, positions of electrodes, or size of the skin.
     """
     check_kind("measurement", measurement, Measurement, "a Measurement, as of jeit.data.read")
     network.check_protocol(measurement.protocol, measurement.name)
@@ -81,8 +81,7 @@ def check_measured(network: ImageNetwork, measurement: Measurement) -> None:
 
 
 def _check_extent(network: ImageNetwork, measurement: Measurement) -> None:
-    """Raise `ValueError` if the skin of a measurement differs in size from that of the network by more than a
-    millimetre."""
+    """Raise `ValueError` if the sizes of a measurement's and a network's skin differ by more than a millimetre."""
     domain = measurement.domain
     measured_extent = getattr(domain, "extent", None)
     if measured_extent is None or np.shape(measured_extent) != (4,):
@@ -98,17 +97,17 @@ def _check_extent(network: ImageNetwork, measurement: Measurement) -> None:
 
 
 def stream_depths(network: ImageNetwork, frames: Iterable, rest: Float[np.ndarray, " M"]) -> Iterator[FrameDepth]:
-    """Reconstruct an image of each frame in turn, relative to a frame of the untouched skin.
+    """Estimate the depth map of each frame in turn, relative to a frame of the untouched skin, by a network.
 
     The network is compiled before the first frame is requested. A frame is refused, and the stream continues, if it has
-    another number of channels, if too many of its channels are missing, or if its map is unreliable (see
-    `ImageNetwork.doubts`).
+    another number of channels than the network, if too many of its channels are missing, or if its map is unreliable
+    (see `ImageNetwork.doubts`).
 
     **Arguments:**
 
-    - `network`: the network.
-    - `frames`: frames (M,), volts.
-    - `rest`: frame (M,) of the untouched skin, volts, as from `resting_frame`.
+    - `network`: the trained image network.
+    - `frames`: an iterable of frames (channels,), volts.
+    - `rest`: frame (channels,) of the untouched skin, volts, as from `resting_frame`.
 
     Raises `ValueError` if `frames` is not iterable.
 

@@ -1,9 +1,9 @@
-"""An unrolled network with the skin's forward model: linear images of the residual, refined by convolutions.
+"""An unrolled network with the skin's forward model: linear images of residual voltages, refined by convolutions.
 
-Every step computes linear images of the residual changes by matrices of the forward model: one Gauss-Newton step with a
-Gaussian prior. One image allows for noise alone, another also for drift of the contact impedances. A small
-convolutional network, the same all over the skin, then computes a correction of the map. Training includes the misfit
-of the voltages that the forward model predicts for the maps.
+Every step of the network computes linear images of the residual voltage changes by matrices of the forward model: one
+Gauss-Newton step with a Gaussian prior. One image allows for noise alone, another image also for drift of the contact
+impedances. A small convolutional network, the same all over the skin, then computes a correction of the depth map from
+the images. The training loss includes the misfit of the voltages that the forward model predicts for the maps.
 """
 
 from __future__ import annotations
@@ -18,24 +18,23 @@ from jeit.touch.networks.linear_channels import LinearChannels, depth_from_stren
 from jeit.touch.networks.three_stages import Convolution, channels_to_pixels, repeat_pixels
 from jeit_solvers.module import Module
 
-# Numbers of channels of the network's inner layers and of its outer ones.
+# Numbers of channels of the inner and of the outer layers of the refinement network.
 _INNER_CHANNELS, _OUTER_CHANNELS = 24, 16
-# Prior: standard deviation of a pixel's strength; its correlation length, divided by the skin's longer side. Linear
-# images: multiples of the noise for the images without drift, of which the first is the initial map; standard deviation
-# of the drift of log contact impedances, for one more image.
+# Prior: standard deviation of the strength of a pixel's indentation; correlation length of the strengths, divided by
+# the skin's longer side. Linear images: multiples of the noise for the images without drift, of which the first image
+# is the initial map; standard deviation of the drift of log contact impedances, for one more image.
 _STRENGTH_DEVIATION, _CORRELATION_LENGTH, _NOISE_MULTIPLES, _CONTACT_DRIFT = 0.15, 0.04, (8.0, 1.5), 0.05
 
 
 class Refinement(Module):
-    """Convolutional U-net that computes, from images (b, rows, columns, i), corrections of maps with twice the rows and
-    columns."""
+    """Convolutional U-net that computes corrections of depth maps from images with half the maps' rows and columns."""
 
     inwards: tuple[Convolution, ...]
     outwards: tuple[Convolution, ...]
     last: Convolution
 
     def __init__(self, num_channels: int, *, key: Array):
-        """Create an untrained network for images with `num_channels` channels."""
+        """Create an untrained U-net for images with `num_channels` channels."""
         keys = jax.random.split(key, 9)
         self.inwards = (
             Convolution(num_channels, _OUTER_CHANNELS, key=keys[0]),
@@ -50,11 +49,12 @@ class Refinement(Module):
             Convolution(_OUTER_CHANNELS, _OUTER_CHANNELS, key=keys[7]),
         )
         last_layer = Convolution(_OUTER_CHANNELS, 4, key=keys[8])
-        # The initial weights are small, so that an untrained network hardly changes the linear images.
+        # The initial weights of the last layer are small, so that an untrained network hardly changes the linear
+        # images.
         self.last = eqx.tree_at(lambda layer: layer.weight, last_layer, 0.01 * last_layer.weight)
 
     def __call__(self, images: Float[Array, "b r c i"]) -> Float[Array, "b s d"]:
-        """Apply the network to a batch."""
+        """Compute corrections of depth maps from a batch of images (maps, rows, columns, channels)."""
         elu = jax.nn.elu
         full_features = elu(self.inwards[0](images))
         half_features = elu(self.inwards[2](elu(self.inwards[1](full_features))))
@@ -65,12 +65,12 @@ class Refinement(Module):
 
 
 class Unrolled(Module):
-    """Network from relative changes (b, M) to depth maps (b, rows, columns), divided by the skin's thickness.
+    """Network that computes depth maps, divided by the skin's thickness, from relative voltage changes.
 
-    **Fields**: `operator` (M, P): response of the channels to the pixels; `imagers` (M, p, k): transposed matrices of
-    the linear images, on pixels twice as wide; `constant_images` (rows / 2, columns / 2, s): constant images that
-    describe the skin; `steps`: networks that correct the map; `shape`: (rows, columns) of the maps. Only `steps` are
-    trained; the others depend on the skin.
+    **Fields**: `operator` (channels, pixels): response of the channels to indentation of each pixel; `imagers`
+    (channels, pixels, images): transposed matrices of the linear images, on pixels twice as wide; `constant_images`
+    (rows / 2, columns / 2, images): constant images that describe the skin; `steps`: networks that correct the depth
+    map; `shape`: (rows, columns) of the maps. Only `steps` are trained; the other fields depend on the skin.
     """
 
     operator: Float[Array, "M P"]
@@ -80,7 +80,8 @@ class Unrolled(Module):
     shape: tuple[int, int] = eqx.field(static=True)
 
     def __init__(self, num_channels: int, shape: tuple[int, int], num_steps: int = 1, *, key: Array):
-        """Create an untrained network for `num_channels` channels and maps of this shape, not yet adapted to a skin."""
+        """Create an untrained network for `num_channels` channels and maps of the given shape, not yet adapted to a
+        skin."""
         rows, columns = shape[0] // 2, shape[1] // 2
         num_images = len(_NOISE_MULTIPLES) + 1
         self.operator = jnp.zeros((num_channels, shape[0] * shape[1]), jnp.float32)
@@ -96,10 +97,11 @@ class Unrolled(Module):
     def adapted_to_skin(
         self, channels: LinearChannels, pixel_positions: Float[np.ndarray, "r c 2"], electrode_positions, noise: float
     ) -> "Unrolled":
-        """Return the network adapted to a skin.
+        """Return the network with the matrices and constant images of a skin.
 
-        `channels`: linear model of the skin's channels; `pixel_positions` (r, c, 2): positions of its pixels, metres;
-        `electrode_positions` (L, 2): positions of its electrodes, metres; `noise`: relative noise of its channels.
+        `channels`: linear model of the skin's channels; `pixel_positions` (rows, columns, 2): positions of the map's
+        pixels, metres; `electrode_positions` (electrodes, 2): positions of the electrodes, metres; `noise`: relative
+        noise of the channels.
         """
         operator = channels.coarser_operator()
         covariance = _covariance(pixel_positions[::2, ::2].reshape(-1, 2))
@@ -131,24 +133,26 @@ class Unrolled(Module):
 
     @property
     def trained(self) -> "Unrolled":
-        """Tree of booleans like the network: true for the arrays that are trained."""
+        """Tree of booleans with the structure of the network: true for the arrays that are trained."""
         all_false = jax.tree.map(lambda _: False, self)
         return eqx.tree_at(lambda network: network.steps, all_false, jax.tree.map(eqx.is_inexact_array, self.steps))
 
     def covariance(self, pixel_positions: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "M M"]:
-        """Compute the covariance (M, M) of the changes of channels for strengths of the prior, with pixels at
-        `pixel_positions` (r, c, 2), metres."""
+        """Compute the covariance (channels, channels) of the relative voltage changes due to touches that are
+        distributed as the prior; `pixel_positions` (rows, columns, 2): positions of the pixels, metres."""
         rows, columns = self.shape[0] // 2, self.shape[1] // 2
         operator = np.asarray(self.operator, float).reshape(-1, rows, 2, columns, 2).sum(axis=(2, 4))
         operator = operator.reshape(len(operator), -1)
         return operator @ _covariance(pixel_positions[::2, ::2].reshape(-1, 2)) @ operator.T
 
     def predicted_changes(self, maps: Float[Array, "b r c"]) -> Float[Array, "b M"]:
-        """Compute the relative changes (b, M) that the forward model predicts for maps."""
+        """Compute the relative voltage changes (maps, channels) that the linear forward model predicts for relative
+        depth maps."""
         return strength(maps).reshape(len(maps), -1) @ self.operator.T
 
     def maps_after_steps(self, changes: Float[Array, "b M"]) -> list[Float[Array, "b r c"]]:
-        """Compute the depth maps (b, rows, columns) after each step of the network."""
+        """Compute the relative depth maps after each step of the network from relative voltage changes (frames,
+        channels)."""
         num_frames, (rows, columns) = len(changes), (self.shape[0] // 2, self.shape[1] // 2)
         constant_images = jnp.broadcast_to(self.constant_images, (num_frames, *self.constant_images.shape))
         maps_of_steps = []
@@ -166,12 +170,13 @@ class Unrolled(Module):
         return maps_of_steps
 
     def __call__(self, changes: Float[Array, "b M"]) -> Float[Array, "b r c"]:
-        """Compute the depth maps (b, rows, columns) after the last step."""
+        """Compute the relative depth maps after the last step of the network from relative voltage changes (frames,
+        channels)."""
         return self.maps_after_steps(changes)[-1]
 
 
 def _covariance(pixel_positions: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p p"]:
-    """Compute the Gaussian covariance of the strengths of pixels at `pixel_positions`, as a function of their
+    """Compute the prior covariance of the indentation strengths of pixels, a Gaussian function of the pixels'
     distance."""
     length = _CORRELATION_LENGTH * np.ptp(pixel_positions, axis=0).max()
     squared_distances = ((pixel_positions[:, None] - pixel_positions) ** 2).sum(axis=-1)

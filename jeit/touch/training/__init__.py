@@ -1,4 +1,4 @@
-"""Train networks on arrays, and store them as files.
+"""Train neural networks on arrays, and store trained networks as files.
 
 `fit_network` trains any equinox network by Adam with early stopping, and resumes after an interruption; `write_model`
 and `read_model` store networks as arrays of numbers with a JSON header, never a pickle. Training needs the extra

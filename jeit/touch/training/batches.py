@@ -1,4 +1,4 @@
-"""Rows of training data, in memory or chunk by chunk, and their order in batches."""
+"""Rows of training data, in memory or read chunk by chunk, and the order of rows in batches."""
 
 from __future__ import annotations
 
@@ -14,38 +14,39 @@ from jeit.arguments import describe
 
 
 class Rows(Protocol):
-    """Rows of training data in chunks; data sets larger than memory implement a class with this interface.
+    """Interface of training data whose rows are in chunks, for example for data sets larger than memory.
 
-    `sizes`: number of rows of each chunk; `chunk`: returns the rows of one chunk; `fingerprint`: a text that changes
-    with any of the rows.
+    `sizes`: number of rows of each chunk; `chunk`: method that returns the rows of one chunk; `fingerprint`: a text
+    that changes if any row changes.
     """
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Number of rows of each chunk."""
+        """Number of rows of each chunk of the data."""
         ...
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of the content of all rows, the same in every process."""
+        """Fingerprint of the content of all rows: a text, the same in every process."""
         ...
 
     def chunk(self, index: int) -> Any:
-        """Return the arrays (rows, …) of a chunk, in tuples, dictionaries or modules.
+        """Return the arrays (rows, …) of one chunk of the data, in tuples, dictionaries or modules.
 
-        All chunks have the same arrays; only their number of rows may differ.
+        All chunks have the same arrays; only the number of rows may differ between chunks.
         """
         ...
 
 
 class ArrayRows:
-    """Rows in memory, as one chunk.
+    """Training data in memory, as one chunk of rows.
 
-    `arrays`: any tree of arrays, each (n, …).
+    `arrays`: any tree of arrays, each (rows, …).
     """
 
     def __init__(self, arrays: Any, name: str = "training"):
-        """Raises `ValueError`, about the argument `name`, if there are no arrays, or their numbers of rows differ."""
+        """Raises `ValueError`, with the `name` of the data, if there are no arrays, or the arrays differ in number of
+        rows."""
         lengths = {len(leaf) if np.ndim(leaf) else -1 for leaf in jax.tree.leaves(arrays)}
         if len(lengths) != 1 or min(lengths) < 1:
             raise ValueError(
@@ -57,7 +58,7 @@ class ArrayRows:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of the arrays."""
+        """Fingerprint of the rows: SHA-256 of the arrays."""
         digest = hashlib.sha256()
         for leaf in jax.tree.leaves(self.arrays):
             values = np.ascontiguousarray(leaf)
@@ -66,14 +67,14 @@ class ArrayRows:
         return digest.hexdigest()
 
     def chunk(self, index: int) -> Any:
-        """Return all rows."""
+        """Return all rows of the arrays, which are a single chunk."""
         return self.arrays
 
 
 class MappedRows:
-    """Rows computed from other rows by a `function` of each chunk, which must keep the number of rows.
+    """Training data computed from other `rows` by a `function` of each chunk, which must keep the number of rows.
 
-    `name` describes the function, and everything that it depends on except the rows.
+    `name`: description of the function and of everything that the function depends on, except the rows.
     """
 
     def __init__(self, rows: Rows, function: Callable[[Any], Any], name: str):
@@ -81,24 +82,24 @@ class MappedRows:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Number of rows of each chunk."""
+        """Number of rows of each chunk of the data."""
         return self.rows.sizes
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of the other rows, followed by the name."""
+        """Fingerprint of the rows that the function is applied to, followed by the name of the function."""
         return f"{self.rows.fingerprint}, {self.name}"
 
     def chunk(self, index: int) -> Any:
-        """Apply the function to a chunk of the other rows."""
+        """Return the rows of a chunk after applying the function to them."""
         return self.function(self.rows.chunk(index))
 
 
 class ChunkBatches(NamedTuple):
-    """Consecutive batches of one chunk.
+    """Consecutive training batches of rows of one chunk.
 
-    `chunk`: index of the chunk; `rows` (b, batch): indices of the rows of each batch; `first`: index of the first of
-    these batches in the whole training.
+    `chunk`: index of the chunk; `rows` (batches, batch size): indices of the rows of each batch; `first`: index of the
+    first of these batches in the whole training.
     """
 
     chunk: int
@@ -107,11 +108,12 @@ class ChunkBatches(NamedTuple):
 
 
 class BatchOrder:
-    """The order of rows in batches.
+    """The random order in which rows of training data are put into batches.
 
     In every epoch, the chunks, and the rows within each chunk, are shuffled anew. Rows that remain when no full batch
-    can be formed are left out; they differ between epochs. `sizes`: number of rows of each chunk; `batch`: number of
-    rows in a batch. The order depends only on `seed`, so that the index of a batch determines its rows.
+    can be formed are left out of the epoch; the rows left out differ between epochs. `sizes`: number of rows of each
+    chunk; `batch`: number of rows in a batch. The order depends only on `seed`, so that the index of a batch determines
+    the rows of the batch.
     """
 
     def __init__(self, sizes: tuple[int, ...], batch: int, seed: list[int]):
@@ -121,13 +123,13 @@ class BatchOrder:
 
     @property
     def batches_per_epoch(self) -> int:
-        """Number of batches in an epoch."""
+        """Number of full batches in an epoch of training."""
         return sum(self.num_batches)
 
     def chunk_batches(self, first: int, last: int, max_batches: int) -> Iterator[ChunkBatches]:
-        """Yield the batches from `first` to `last`, exclusive, grouped by chunk.
+        """Yield the training batches with indices from `first` to `last`, exclusive, grouped by chunk.
 
-        `max_batches`: maximum number of batches in a group.
+        `max_batches`: maximum number of batches in a group of one chunk.
         """
         while first < last:
             epoch, batch_in_epoch = divmod(first, self.batches_per_epoch)
@@ -144,6 +146,6 @@ class BatchOrder:
             first += group_size
 
     def _permutation(self, count: int, *location: int) -> np.ndarray:
-        """Draw a random permutation of 0 … `count` - 1, determined by the seed and by `location`: the epoch, or epoch
-        and chunk."""
+        """Draw a random permutation of 0 … `count` - 1, determined by the seed and by `location`: the epoch, or the
+        epoch and the chunk."""
         return np.random.default_rng([*self.seed, *location]).permutation(count)

@@ -1,4 +1,5 @@
-"""`fit_network`: train a network by Adam with early stopping on held-out rows, with checkpoints to resume from."""
+"""`fit_network`: train a neural network by Adam with early stopping on held-out rows, and checkpoints to resume
+from."""
 
 from __future__ import annotations
 
@@ -20,18 +21,18 @@ from jeit.arguments.extras import need_extra
 from jeit.touch.training.batches import ArrayRows, BatchOrder
 from jeit.touch.training.model_file import Checkpoint, Course, State
 
-# Number of batches after which a checkpoint may be written; maximum number of held-out rows evaluated at once.
+# Number of training batches after which a checkpoint may be written; maximum number of held-out rows evaluated at once.
 _CHECKPOINT_BATCHES, _MAX_BATCH_SIZE = 32, 256
 
 
 class TrainingObjective(NamedTuple):
-    """The objective of a training; its functions are compiled.
+    """The objective of a network's training; its functions are compiled.
 
     **Fields**
 
-    - `loss`: function of a network, a batch of rows and a random key, which returns the loss of the batch, which is
-      minimised, and the network, in which leaves that are not trained, such as running means, may have changed.
-    - `held_out`: function of a network and a batch of rows, which returns the loss (b,) of each held-out row.
+    - `loss`: function of a network, a batch of rows and a random key. The function returns the loss of the batch, which
+      is minimised, and the network, in which leaves that are not trained, such as running means, may have changed.
+    - `held_out`: function of a network and a batch of held-out rows, which returns the loss of each row, (rows,).
     - `trained`: selects the leaves (arrays) of the network that are trained: a function of a leaf that returns true or
       false, or a tree of booleans like the network, as in `equinox.filter`.
 
@@ -52,7 +53,7 @@ class TrainingObjective(NamedTuple):
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """Settings of a training.
+    """Settings of a network's training.
 
     **Fields**: `rate`: learning rate of Adam, which is multiplied by `decay` after every `decay_epochs` epochs;
     `batch`: number of rows in a batch; `epochs`: maximum number of epochs; `look_every`: number of batches between
@@ -78,7 +79,7 @@ class TrainingPlan:
     seconds: float = 10.0
 
     def __post_init__(self):
-        """Raises `ValueError` for settings that are not valid numbers."""
+        """Raises `ValueError` for training settings that are not valid numbers."""
         for name in ("rate", "decay"):
             value = getattr(self, name)
             if not (is_number(value) and value > 0):
@@ -93,10 +94,10 @@ class TrainingPlan:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """Result of a training.
+    """Result of a network's training.
 
-    `network`: the trained network, with the lowest loss on held-out rows; `course`: the training history; `reason`: why
-    the training ended.
+    `network`: the trained network at the evaluation with the lowest loss of held-out rows; `course`: history of the
+    losses; `reason`: why the training ended.
     """
 
     network: Any
@@ -115,24 +116,24 @@ def fit_network(
     checkpoint: str | Path | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> TrainingResult:
-    """Train a network by Adam with early stopping on held-out rows.
+    """Train a neural network by Adam with early stopping on held-out rows.
 
-    The same `key` gives identical results on the same machine.
+    The same random `key` gives identical results on the same machine.
 
     **Arguments:**
 
-    - `network`: the network, any tree of arrays and functions.
-    - `objective`: its losses.
-    - `training`: arrays (n, …) in any tree, such as (inputs, targets), or `Rows` of many chunks.
-    - `validation`: the held-out rows, in the same form, but in memory.
+    - `network`: the untrained network, any tree of arrays and functions.
+    - `objective`: functions that compute the network's losses.
+    - `training`: training data: arrays (rows, …) in any tree, such as (inputs, targets), or `Rows` of many chunks.
+    - `validation`: the held-out rows, in the same form as the training data, but in memory.
     - `plan`: settings of the training, by default `TrainingPlan()`.
     - `key`: random key.
-    - `checkpoint`: a file; if the training is killed at any moment, the same call resumes from it, with results
-      identical to those of an uninterrupted training; the file remains after the training.
+    - `checkpoint`: path of a file; if the training is killed at any moment, the same call resumes from this file, with
+      results identical to those of an uninterrupted training; the file remains after the training.
     - `progress`: called with a description of the progress after every evaluation of the held-out rows.
 
-    Raises `ValueError` for arguments that do not fit together, a checkpoint of another training, and losses that are
-    not finite from the first evaluation on; `ImportError` without the extra `learn`.
+    Raises `ValueError` for arguments that do not fit together, a checkpoint of another training, and losses of held-out
+    rows that are not finite from the first evaluation on; `ImportError` without the extra `learn`.
 
     **Example:**
 
@@ -168,7 +169,7 @@ def fit_network(
         next_evaluation = min(last_batch, (state.step // look_every + 1) * look_every)
         for batches in order.chunk_batches(state.step, next_evaluation, _CHECKPOINT_BATCHES):
             if loaded_chunk[0] != batches.chunk:
-                loaded_chunk = -1, None  # so that two chunks are never in memory
+                loaded_chunk = -1, None  # drops the chunk, so that two chunks are never in memory
                 loaded_chunk = batches.chunk, jax.tree.map(jnp.asarray, rows.chunk(batches.chunk))
             state = run.train_batches(state, loaded_chunk[1], batches.rows)
             if (
@@ -190,7 +191,8 @@ def fit_network(
 
 
 class _CompiledTraining:
-    """Compiled functions of one training, and methods that apply them to the state of the training."""
+    """Compiled functions of a network's training, and methods that apply these functions to the state of the
+    training."""
 
     def __init__(self, network, objective: TrainingObjective, plan: TrainingPlan, order: BatchOrder, key: Array):
         import optax
@@ -213,7 +215,7 @@ class _CompiledTraining:
             trained_part = eqx.apply_updates(trained_part, updates)
             return eqx.combine(eqx.filter(trained_part, eqx.is_array), updated_fixed_part), state, loss_value
 
-        # Each step is one call: on CPUs, XLA's convolutions take a hundred times as long within compiled loops.
+        # Each batch is one call: on CPUs, XLA's convolutions take a hundred times as long within compiled loops.
         def train_batch(arrays, state, total_loss, data, rows, batch_index):
             batch = jax.tree.map(lambda array: array[rows], data)
             arrays, state, loss_value = update(arrays, state, batch, jax.random.fold_in(key, batch_index))
@@ -226,15 +228,16 @@ class _CompiledTraining:
         self.optimiser = adam.init(eqx.filter(eqx.partition(network, trained)[0], eqx.is_inexact_array))
 
     def combine(self, arrays) -> Any:
-        """Combine the network's fixed parts with these arrays."""
+        """Return the network with its fixed parts and the given arrays."""
         return eqx.combine(arrays, self.fixed)
 
     def initial_state(self) -> State:
-        """Return the state before the first batch."""
+        """Return the state of the training before the first batch."""
         return State(0, Course([], [], []), self.arrays, self.optimiser, self.arrays, jnp.zeros(()))
 
     def train_batches(self, state: State, data, rows: Int[np.ndarray, "b batch"]) -> State:
-        """Train on batches of these rows; returns the new state."""
+        """Train the network on batches of `data` with the indices `rows` (batches, batch size); returns the new
+        state."""
         arrays, optimiser, total_loss = state.arrays, state.optimiser, state.total
         for offset, batch in enumerate(rows):
             arrays, optimiser, total_loss = self._train_batch(
@@ -243,9 +246,10 @@ class _CompiledTraining:
         return State(state.step + len(rows), state.course, arrays, optimiser, state.best, total_loss)
 
     def evaluate(self, state: State, data, num_batches: int) -> State:
-        """Evaluate the held-out rows, `num_batches` batches after the last evaluation; returns the new state.
+        """Evaluate the loss of the held-out rows, `num_batches` batches after the last evaluation; returns the new
+        state.
 
-        Raises `ValueError` if neither this loss nor any before was finite.
+        Raises `ValueError` if neither this loss nor any earlier loss of held-out rows is finite.
         """
         num_rows = len(jax.tree.leaves(data)[0])
         batch_size = min(num_rows, _MAX_BATCH_SIZE)
@@ -272,7 +276,7 @@ class _CompiledTraining:
 
 
 def _end_reason(state: State, plan: TrainingPlan, last_batch: int) -> str | None:
-    """Return the reason why the training has ended, or None if it has not."""
+    """Return the reason why the training has ended, or None if the training has not ended."""
     num_evaluations = len(state.course.validation)
     if num_evaluations and num_evaluations - 1 - state.course.best >= plan.patience:
         return f"no better at {plan.patience} looks in a row"
@@ -288,10 +292,10 @@ def _describe_progress(state: State, plan: TrainingPlan, batches_per_epoch: int)
 
 
 def _are_rows(value: Any) -> bool:
-    """Whether an argument has the interface of `Rows`."""
+    """Whether an argument has the interface of `Rows`, training data in chunks."""
     return all(hasattr(value, name) for name in ("sizes", "fingerprint", "chunk"))
 
 
 def _is_typed_key(key: Array) -> bool:
-    """Whether a random key is of `jax.random.key`, not of the older `jax.random.PRNGKey`."""
+    """Whether a random key was created by `jax.random.key`, not by the older `jax.random.PRNGKey`."""
     return jnp.issubdtype(key.dtype, jax.dtypes.prng_key)

@@ -1,4 +1,4 @@
-"""Read and write files of trained networks, and checkpoints of a training."""
+"""Read and write files of trained networks, and checkpoint files of a network's training."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ import numpy as np
 from jeit.arguments import describe
 from jeit.files import reason, written_whole
 
-# First bytes of a file; maximum size of the header, and of all arrays together, bytes.
+# First bytes of a model file; maximum size of its header, and of all its arrays together, bytes.
 _MAGIC, _MAX_HEADER_SIZE, _MAX_ARRAY_SIZE = b"jeit model\n", 2**20, 2**31
 
 
 def write_model(path: str | Path, kind: str, version: int, head: dict[str, Any], model: Any) -> None:
-    """Write the arrays of a `model`, any tree of arrays, to a file, which is replaced only when all is written.
+    """Write the arrays of a `model`, any tree of arrays, to a file; an earlier file is replaced only when all is
+    written.
 
     `kind` and `version`: type of the file, such as "a jeit network of images", which `read_model` checks; `head`: all
-    other data that are needed to create the model again and to know its purpose, as JSON values. Raises `ValueError` if
-    `path` is a folder, or the head or the model is too large; `OSError` if the file cannot be written.
+    other data that are needed to create the model again and to know the model's purpose, as JSON values. Raises
+    `ValueError` if `path` is a folder, or the head or the model is too large; `OSError` if the file cannot be written.
     """
     path = Path(path)
     if path.is_dir():
@@ -48,8 +49,8 @@ def write_model(path: str | Path, kind: str, version: int, head: dict[str, Any],
 def read_head(path: str | Path, kind: str, version: int) -> dict[str, Any]:
     """Read the head of a file that `write_model` wrote, but not its arrays.
 
-    Raises `FileNotFoundError`, and `ValueError` for files of another kind or version, and files that jeit did not
-    write.
+    Raises `FileNotFoundError` if the file does not exist, and `ValueError` if the file is of another kind or version,
+    or was not written by jeit.
     """
     with _open_file(Path(path), kind) as file:
         return _read_header(file, kind, version)
@@ -60,10 +61,10 @@ def read_model(
 ) -> tuple[dict[str, Any], Any]:
     """Read the head and the model of a file that `write_model` wrote.
 
-    `make(head)`: returns a model of the same architecture; only its shapes are evaluated, so that no head can make it
-    use memory. Nothing in the file is executed: before an array is read, its shape and dtype must be those of the
-    architecture. Raises `FileNotFoundError`, and `ValueError` for files of another kind or version, that are cut short
-    or too long, or with arrays of another architecture.
+    `make`: function that returns, for a head, a model of the same architecture; only the model's shapes are evaluated,
+    so that no head can cause large use of memory. Nothing in the file is executed: before an array is read, its shape
+    and dtype must be those of the architecture. Raises `FileNotFoundError` if the file does not exist, and `ValueError`
+    if the file is of another kind or version, is cut short or too long, or has arrays of another architecture.
     """
     with _open_file(Path(path), kind) as file:
         head = _read_header(file, kind, version)
@@ -87,10 +88,10 @@ def read_model(
 
 
 def check_same(path: str | Path, made_for: dict[str, Any], expected: dict[str, Any]) -> None:
-    """Check that a model is used for what it was trained for.
+    """Check that a model is used for what the model was trained for, such as the same skin and protocol.
 
-    `made_for`, `expected`: descriptions, such as of a skin and its protocol, as dictionaries of JSON values, in which
-    numbers may differ by a millionth. Raises `ValueError`, which states the first difference.
+    `made_for`, `expected`: descriptions of what the model was trained for and of its use, as dictionaries of JSON
+    values, in which numbers may differ by a millionth. Raises `ValueError`, which states the first difference.
     """
     for name in expected:
         if not _are_equal(made_for.get(name), expected[name]):
@@ -102,7 +103,7 @@ def check_same(path: str | Path, made_for: dict[str, Any], expected: dict[str, A
 
 @contextmanager
 def _open_file(path: Path, kind: str) -> Iterator[BinaryIO]:
-    """Open a file for reading; any error is raised as `ValueError` with the name of the file."""
+    """Open a model file for reading; any error is raised as `ValueError` with the name of the file."""
     if path.is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, {kind}.")
     if not path.is_file():
@@ -110,12 +111,12 @@ def _open_file(path: Path, kind: str) -> Iterator[BinaryIO]:
     try:
         with path.open("rb") as file:
             yield file
-    except Exception as error:  # any exception: what the header describes is created before it can be checked
+    except Exception as error:  # any exception: the model of the header is created before it can be checked
         raise ValueError(f"'{path}' is not {kind} that can be read: {reason(error)}.") from None
 
 
 def _read_header(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:
-    """Read the header of a file. Raises `ValueError` if the file is of another kind or version."""
+    """Read the header of a model file. Raises `ValueError` if the file is of another kind or version."""
     if file.read(len(_MAGIC)) != _MAGIC:
         raise ValueError("it is a file of another kind")
     line = file.readline(_MAX_HEADER_SIZE + 1)
@@ -138,7 +139,7 @@ def _num_bytes(arrays) -> int:
 
 
 def _read_array(file: BinaryIO, leaf: Any) -> Any:
-    """Read an array with the shape and dtype of `leaf`; leaves that are no arrays are returned unchanged."""
+    """Read an array with the shape and dtype of a model's `leaf`; a leaf that is no array is returned unchanged."""
     if not isinstance(leaf, jax.ShapeDtypeStruct):
         return leaf
     version = np.lib.format.read_magic(file)
@@ -175,10 +176,10 @@ _CHECKPOINT_KIND, _CHECKPOINT_VERSION = "a jeit training under way", 1
 
 
 class Course(NamedTuple):
-    """History of a training: losses at each evaluation.
+    """History of a network's training: losses at each evaluation of the held-out rows.
 
-    `steps`: number of batches processed; `training`: mean loss of the batches since the last evaluation; `validation`:
-    loss of the held-out rows.
+    `steps`: number of batches processed until each evaluation; `training`: mean loss of the batches since the last
+    evaluation; `validation`: loss of the held-out rows.
     """
 
     steps: list[int]
@@ -187,16 +188,16 @@ class Course(NamedTuple):
 
     @property
     def best(self) -> int:
-        """Index of the evaluation with the lowest loss of the held-out rows; 0 if there was none."""
+        """Index of the evaluation with the lowest loss of the held-out rows; 0 if there was no evaluation."""
         return min(range(len(self.validation)), key=self.validation.__getitem__, default=0)
 
 
 class State(NamedTuple):
-    """The whole state of a training.
+    """The whole state of a network's training, from which the training can be resumed.
 
-    `step`: number of batches processed; `course`: the training history; `arrays`: current arrays of the network,
-    trained or not; `optimiser`: state of the optimiser; `best`: arrays of the best network so far; `total`: sum of the
-    losses since the last evaluation.
+    `step`: number of batches processed; `course`: history of the losses; `arrays`: current arrays of the network,
+    trained or not; `optimiser`: state of the optimiser; `best`: arrays of the network with the lowest loss of held-out
+    rows so far; `total`: sum of the batch losses since the last evaluation.
     """
 
     step: int
@@ -208,20 +209,20 @@ class State(NamedTuple):
 
 
 class Checkpoint:
-    """A checkpoint file of one training, identified by its `fingerprint`."""
+    """A checkpoint file of one training, which is identified by its `fingerprint`."""
 
     def __init__(self, path: str | Path, fingerprint: dict[str, Any]):
         self.path, self.fingerprint = Path(path), fingerprint
 
     def write(self, state: State) -> None:
-        """Write the state; the file is replaced only when all is written."""
+        """Write the state of the training; an earlier file is replaced only when all is written."""
         head = {"training": self.fingerprint, "step": state.step, "course": list(state.course)}
         write_model(self.path, _CHECKPOINT_KIND, _CHECKPOINT_VERSION, head, state[2:])
 
     def read(self, initial_state: State) -> State:
-        """Read the state; if there is no file, return `initial_state`, the state before the first batch.
+        """Read the state of the training; without a file, return `initial_state`, the state before the first batch.
 
-        Raises `ValueError`, which states the first difference, for a file of another training.
+        Raises `ValueError`, which states the first difference, if the file is of another training.
         """
         if not self.path.exists():
             return initial_state
