@@ -427,6 +427,7 @@ def test_python_error_for_a_frame_that_is_too_noisy(tank):
 def test_module_prints_one_line_and_returns_a_status(tmp_path, monkeypatch, capsys):
     """Call what `python -m jeit` runs; the slow tests run it in a process of its own."""
     monkeypatch.setattr("sys.argv", ["jeit", "reconstruct", "absent.mat", "--output", str(tmp_path / "out")])
+    monkeypatch.delitem(sys.modules, "jeit.__main__", raising=False)  # another test may have imported it
     with pytest.raises(SystemExit) as left:
         runpy.run_module("jeit", run_name="__main__")
     assert left.value.code == 1
