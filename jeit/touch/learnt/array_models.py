@@ -237,9 +237,7 @@ class NearestNeighbours:
 
         def find_nearest(rows: np.ndarray) -> np.ndarray:
             shifted_squares = (-2 * rows) @ self.features.T
-            shifted_squares += (
-                self._squared_norms
-            )  # omits the frame's squared norm, which is the same for all presses
+            shifted_squares += self._squared_norms  # omits the frame's squared norm, which is the same for all presses
             indices = np.argpartition(shifted_squares, self.count - 1, axis=1)[:, : self.count]
             distances = np.linalg.norm(self.features[indices] - rows[:, None], axis=2)
             order = np.argsort(distances, axis=1, kind="stable")
