@@ -24,8 +24,8 @@ class WatchedFolder(AbstractSource):
     left out, unless a `rate` in frames/s is given.
 
     A file is read when its size is the same in two successive listings of the folder. `description`, `reference`: as
-    `description` and `like` of `jeit.data.read`. For a file that cannot be read, the source delivers a frame whose
-    values are the error message, which views refuse.
+    `description` and `like` of `jeit.data.read`. A file that cannot be read becomes a frame that holds the
+    error message in place of values; views refuse such frames.
     """
 
     def __init__(

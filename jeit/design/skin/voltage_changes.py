@@ -8,9 +8,9 @@ the Sherman-Morrison-Woodbury formula, the transfer impedance changes by
 
 The system for Y is solved by conjugate gradients with G as the preconditioner, which requires products with G and D
 only, not with G⁻¹. Few steps are needed, since a touch changes the energy of any field by a bounded factor. Nodes that
-a touch disconnects make G⁻¹ + D singular, but no current flows at these nodes. If Y has the residual R, then (D F)ᵀ Y +
-Yᵀ R differs from the exact value by Rᵀ (G⁻¹ + D)⁻¹ R, of which the main part Rᵀ G R is added. G is needed only between
-nodes of the same touch, which are close to each other.
+a touch disconnects make G⁻¹ + D singular, but no current flows at these nodes. An approximate Y leaves the residual R =
+D F − (G⁻¹ + D) Y. Then (D F)ᵀ Y + Yᵀ R differs from the exact (D F)ᵀ Y by Rᵀ (G⁻¹ + D)⁻¹ R. The main part of this
+difference, Rᵀ G R, is added. G is needed only between nodes of the same touch, which are close to each other.
 """
 
 from __future__ import annotations

@@ -200,8 +200,8 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
 
 
 def _describe_unread(failures: list[tuple[str, str]]) -> str:
-    """Describe how many files could not be read, and for which reasons. One reason for each format of file comes
-    first."""
+    """Describe how many files could not be read, and for which reasons. The reasons begin with one file of each
+    format."""
     num_previous: dict[str, int] = {}
     entries = []
     for index, (suffix, reason) in enumerate(failures):
