@@ -137,7 +137,7 @@ class Oscillation:
       phase is meaningless where the amplitude is only noise.
     - `noise`: (…), standard deviation of the amplitude, computed from the residual of the fit. The residual includes
       oscillations at other frequencies.
-    - `resolution`: smallest difference in hertz at which two frequencies can be distinguished.
+    - `resolution`: hertz, smallest difference of two distinguishable frequencies.
 
     **Example:**
 
@@ -249,7 +249,7 @@ def amplitude_spectrum(
 
 
 def _check_band(frequency) -> tuple[float, float]:
-    """Return the lowest and the highest frequency of a band in hertz; they are equal if `frequency` is a number."""
+    """The lowest and the highest frequency in hertz, which are equal if `frequency` is a number."""
     band = (frequency, frequency) if is_number(frequency) else frequency
     if not (
         isinstance(band, tuple | list) and len(band) == 2 and all(is_number(limit) and limit > 0 for limit in band)
@@ -261,7 +261,7 @@ def _check_band(frequency) -> tuple[float, float]:
 
 
 def _finite_rows(values, times) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frames (rows) of `values` without NaN as real numbers, and the times of these frames."""
+    """Frames (rows) without NaN as real numbers, and their times."""
     rows, row_times = np.asarray(values), np.asarray(times, float)
     if rows.ndim < 1 or rows.dtype.kind not in "iuf" or row_times.shape != rows.shape[:1]:
         raise ValueError(
@@ -276,8 +276,7 @@ def _finite_rows(values, times) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _window_weights(times: np.ndarray, window: Window) -> np.ndarray:
-    """Weight of each frame under a window. Hann's window is shifted so that the weights of the first and last frames
-    are not zero."""
+    """Weight of each frame. Hann's window is shifted so that the first and last frames have nonzero weights."""
     if window == "none":
         return np.ones(len(times))
     step = (times[-1] - times[0]) / (len(times) - 1)
@@ -285,8 +284,8 @@ def _window_weights(times: np.ndarray, window: Window) -> np.ndarray:
 
 
 def _fit_sinusoid(values: np.ndarray, times: np.ndarray, weight: np.ndarray, frequency: float):
-    """Fit a mean, a drift, a cosine and a sine to n series of values. Returns the coefficients (4, n), the residual
-    variances (n,), and the variance of each coefficient (4,) for noise of unit variance."""
+    """Fit mean, drift, cosine and sine to n series. Returns coefficients (4, n), residual variances (n,), and the
+    variance of each coefficient (4,) for noise of unit variance."""
     angle = 2 * np.pi * frequency * times
     centred_times = times - times.mean()
     design = np.stack([np.ones(len(times)), centred_times / centred_times[-1], np.cos(angle), np.sin(angle)], axis=1)

@@ -67,7 +67,7 @@ class SolidForm(Module):
 
 
 # Minimum area of an inclusion as a fraction of a sheet (a disc of a fourteenth of its width), and minimum volume as a
-# fraction of a solid (a ball of an eighth of its width), whose images have a coarser resolution.
+# fraction of a solid (a ball of an eighth of its width). Images of solids have a coarser resolution.
 _LEAST_AREA = {2: 0.004, 3: 0.001}
 
 

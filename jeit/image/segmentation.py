@@ -38,12 +38,12 @@ def ball_region(mesh: Mesh, centre: ArrayLike, radius: float) -> Bool[np.ndarray
 
 
 def box_region(mesh: Mesh, lower: ArrayLike, upper: ArrayLike) -> Bool[np.ndarray, " m"]:
-    """Mask (m,) of the cells whose centroid lies in a box with edges along the axes, given by two opposite corners.
+    """Mask (m,) of the cells whose centroid lies in an axis-parallel box between two corners.
 
     **Arguments:**
 
     - `mesh`: the mesh.
-    - `lower`, `upper` (d,): corners of the box with the smallest and the largest coordinates, metres.
+    - `lower`, `upper` (d,): corners of the box, metres.
 
     Raises `ValueError` for corners with another number of coordinates, for a corner `upper` that is not larger than
     `lower`, and for an empty region.
@@ -89,8 +89,8 @@ def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None
 
 
 def _centroids_from(mesh: Mesh, point: ArrayLike, name: str) -> Float[np.ndarray, "m d"]:
-    """Vectors (m, d) from a `point` to the centroids of the cells, metres. Raises `ValueError` for a point with another
-    number of coordinates than the mesh."""
+    """Vectors (m, d) from a `point` to the centroids of the cells. Raises `ValueError` for a point with another number
+    of coordinates."""
     coordinates = np.asarray(point, float)
     if coordinates.shape != (mesh.dimension,) or not np.isfinite(coordinates).all():
         raise ValueError(f"{name} must be {mesh.dimension} finite numbers in metres; it has shape {coordinates.shape}.")
@@ -131,7 +131,7 @@ def basins(
 
     `change`: (m,) value of every cell; `shared`: (m, k) indices of the facets (`shared_facets`) or nodes that cells
     share, -1 for none. Where two basins meet, the basin with the lower peak is merged into the other basin, unless the
-    lower peak exceeds the value at the meeting point by at least `least_prominence` times the height of this peak.
+    lower peak exceeds the meeting point by at least `least_prominence` times this peak's height.
     """
     peak = np.full(len(change), -1)
     label_of_place: dict[int, int] = {}
@@ -173,8 +173,7 @@ def segment(
     - `level`: value at the edge of a labelled region, as a share of the peak of the same sign (one half is the middle
       of a blurred edge).
     - `least_peak`: minimum height of the peak of either sign, as a share of the higher peak of both signs.
-    - `least_area`: minimum area of a connected region, as a fraction of the body; smaller regions are taken for
-      artefacts.
+    - `least_area`: minimum area of a connected region, as a fraction of the body; smaller regions are artefacts.
 
     Raises `ValueError` for an image that is not two-dimensional, or has no pixel inside the body.
 
