@@ -31,9 +31,8 @@ _CELLS_AT_ONCE = 256
 
 
 class ConductivityChange(NamedTuple):
-    """Change of conductivity that is linear in q coefficients. **Fields**: `cells`: (k,) indices of the cells that
-    change, or None for all cells; `slope`: (k, q) change of conductivity of each cell per unit coefficient, in S/m
-    (2-D: S)."""
+    """Change of conductivity that is linear in q coefficients. **Fields**: `cells`: (k,) the cells that change, or None
+    for all cells; `slope`: (k, q) change of conductivity of each cell per unit coefficient, in S/m (2-D: S)."""
 
     cells: Any
     slope: Float[np.ndarray, "k q"]
@@ -144,7 +143,7 @@ class ContactSensitivity:
         self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"], contact_impedance
     ) -> Float[np.ndarray, "L L L"]:
         """Derivatives ∂Z/∂ log z_l of the transfer impedance, (L, L, L) in ohms, from the `fields` F and `impedance` Z
-        at the given `contact_impedance` (L,)."""
+        at this `contact_impedance` (L,)."""
         return (
             np.stack([self._energy(electrode, fields, impedance) for electrode in range(len(impedance))])
             / (np.asarray(contact_impedance)[:, None, None])

@@ -86,7 +86,7 @@ def _check_values(conductivity: Any, normal: Any) -> None:
         if not np.allclose(conductivity, np.swapaxes(conductivity, 1, 2), rtol=1e-12, atol=0):
             raise ValueError("conductivity tensors must be symmetric.")
         real = conductivity.real
-        if normal is not None:  # tensors need to be positive only within the surface: a large value along the normal is added
+        if normal is not None:  # tensors must be positive only within the surface: add a large value along its normal
             normal_projection = normal[:, :, None] * normal[:, None]
             projection = np.eye(3) - normal_projection
             real = projection @ real @ projection + np.abs(real).max() * normal_projection
