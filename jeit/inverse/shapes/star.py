@@ -113,12 +113,12 @@ class Star(Module):
 
     @property
     def area(self) -> float:
-        """Area, m²."""
+        """Area inside the outline, m²."""
         return float(abs(self._moments()[0]))
 
     @property
     def measure(self) -> float:
-        """Area, m²."""
+        """Area inside the outline, m²."""
         return self.area
 
     @property

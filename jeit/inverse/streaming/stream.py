@@ -91,8 +91,7 @@ class FrameCheck:
         return values, usable, status, reason
 
     def _reason_unchanged(self, values, usable) -> str:
-        """Sentence that says that a frame differs from an undisturbed frame by noise only; empty if the frame differs
-        by more."""
+        """Sentence that says that a frame differs from an undisturbed frame by noise only; empty otherwise."""
         change = np.where(usable, values - self.expected, 0)
         if np.linalg.norm(change) <= _EQUAL_TOLERANCE * self.expected_norm:
             return "It equals an undisturbed frame."
