@@ -39,8 +39,8 @@ class ConductivityChange(NamedTuple):
 
 
 class SolvedFields(NamedTuple):
-    """Solution of a forward model, in NumPy. **Fields**: `mesh`, `protocol`: mesh and protocol of the model; `fields`:
-    F (n, L) of `ForwardModel.fields` in ohms; `impedance`: impedance of the electrodes in ohms."""
+    """Solution of a forward model, in NumPy. **Fields**: `mesh`, `protocol`: those of the model; `fields`: F (n, L) of
+    `ForwardModel.fields` in ohms; `impedance`: impedance of the electrodes in ohms."""
 
     mesh: Mesh
     protocol: Protocol

@@ -163,8 +163,8 @@ def oscillation(
 
     - `values` (F, …): values in each of F frames, in any unit.
     - `times` (F,): times of the frames in seconds, which need not be evenly spaced.
-    - `frequency`: in hertz, or a band (lowest, highest) in hertz in which the frequency with the largest power over all
-      values is sought. Frequencies with less than one period in the measured time are not considered.
+    - `frequency`: hertz, or a band (lowest, highest) in which the frequency with the largest power over all values is
+      sought. Frequencies with less than one period in the measured time are not considered.
     - `window`: "hann", Hann's window, which separates different frequencies better; or "none", with which a single
       oscillation is resolved twice as finely.
 
