@@ -95,8 +95,8 @@ class NodalTotalVariation(AbstractPenalty):
 
     @property
     def tolerance(self) -> float:
-        """Relative change of the objective that ends a descent. Larger than for other penalties, because lagged
-        diffusivity converges linearly and its last steps do not change the image visibly."""
+        """Relative change of the objective that ends a descent. The tolerance is larger than for other penalties,
+        because lagged diffusivity converges linearly and its last steps do not change the image visibly."""
         return 1e-4
 
     def cost(self, coefficients):
@@ -311,8 +311,8 @@ class TotalVariationPenalty(AbstractPenalty):
 
     @property
     def tolerance(self) -> float:
-        """Relative change of the objective that ends a descent. Larger than for other penalties, because lagged
-        diffusivity converges linearly and its last steps do not change the image visibly."""
+        """Relative change of the objective that ends a descent. The tolerance is larger than for other penalties,
+        because lagged diffusivity converges linearly and its last steps do not change the image visibly."""
         return 1e-4
 
     def cost(self, coefficients):
