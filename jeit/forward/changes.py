@@ -54,7 +54,7 @@ class SolvedFields(NamedTuple):
 
     def derivatives(self, changes: Sequence[ConductivityChange]) -> Float[np.ndarray, "M n"]:
         """Derivatives of the voltages with respect to the coefficients of all `changes`: -∫ dσ ∇u_drive · ∇u_measure.
-        They are computed from values for pairs of electrodes."""
+        Computed from integrals for pairs of electrodes."""
         energies = np.concatenate([self._energy(*change) for change in changes])
         return np.stack([-select_channels(self.protocol, impedance_change) for impedance_change in energies], axis=1)  # pyright: ignore
 

@@ -167,7 +167,7 @@ class ForwardModel(Module):
     def voltages(self, conductivity: ArrayLike) -> Inexact[Array, " M"]:
         """Voltages (M,) of the protocol's channels, in volts.
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for an invalid conductivity.
         """
         return evaluate(self, voltages_of, check_conductivity(self.mesh, conductivity))
 
@@ -175,7 +175,7 @@ class ForwardModel(Module):
     def transfer_impedance(self, conductivity: ArrayLike) -> Inexact[Array, "L L"]:
         """Transfer impedance Z (L, L) in ohms: electrode potentials are U = Z I for currents I that sum to zero.
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for an invalid conductivity.
         """
         return evaluate(self, transfer_impedance_of, check_conductivity(self.mesh, conductivity))
 
@@ -184,7 +184,7 @@ class ForwardModel(Module):
         """Potentials F (n, L) of the nodes, in ohms, for a unit current into each electrode that leaves through all
         electrodes in equal parts; and the transfer impedance Z (L, L).
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for an invalid conductivity.
         """
         return evaluate(self, fields_of, check_conductivity(self.mesh, conductivity))
 
@@ -192,7 +192,7 @@ class ForwardModel(Module):
     def potentials(self, conductivity: ArrayLike) -> Inexact[Array, "S n"]:
         """Potentials (S, n) at the nodes for every drive pattern, in volts; the mean over the electrodes is zero.
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for an invalid conductivity.
         """
         return evaluate(self, potentials_of, check_conductivity(self.mesh, conductivity))
 
@@ -210,7 +210,7 @@ class ForwardModel(Module):
         """Voltages and Jacobian, as from `voltages` and `jacobian`, with a single factorisation and one solve per
         electrode.
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid, and for tensors.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for an invalid conductivity, and for tensors.
         """
         conductivity = check_conductivity(self.mesh, conductivity)
         if conductivity.ndim == 3:

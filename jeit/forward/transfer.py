@@ -199,8 +199,8 @@ def electrode_impedance(product: Inexact[Array, "c c"], resistance: Inexact[Arra
 
 
 def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
-    """Potentials of the electrodes and of the ground for a unit current into each of them that leaves through a
-    reference terminal.
+    """Impedance matrix of the terminals (electrodes and ground): potentials of all terminals for a unit current into
+    each terminal that leaves through a reference terminal.
 
     Eliminating the nodes from the system leaves (D - BᵀA⁻¹B) U = I. The columns of the matrix D - BᵀA⁻¹B sum to zero,
     so its diagonal is computed as the sum of the other entries, which avoids the cancellation in D - BᵀA⁻¹B at small
@@ -227,7 +227,7 @@ def _mean_current_correction(
 
     The current between two terminals is computed from the difference of their potentials, so that, whatever the
     rounding, the current that leaves one terminal enters the other. The residual is `current` minus all these currents.
-    It therefore keeps the digits that couple a short-circuited pair to the other terminals.
+    The residual therefore keeps the digits that couple a short-circuited pair to the other terminals.
     """
     xp = namespace(others)
     if xp is np:

@@ -147,7 +147,8 @@ def find_inclusions(
     - `image` (m,): change of conductivity in every cell of the mesh.
     - `level`: change at the edge of an inclusion, as a share of its peak.
     - `least_peak`: minimum height of a peak, as a share of the strongest change of either sign.
-    - `least_prominence`: minimum height of a peak above the saddle towards a higher peak, as a share of its own height.
+    - `least_prominence`: minimum height of a peak above the saddle towards a higher peak, as a share of the height of
+      the lower peak.
     - `least_area`: minimum area (volume) of a region, as a fraction of the mesh; default 0.004 for a sheet and 0.001
       for a solid (0.004 of a solid would be a ball of a fifth of its width).
     - `noise` (m,): standard deviation of the image in every cell, in the unit of the image.

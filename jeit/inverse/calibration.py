@@ -356,7 +356,8 @@ class _CalibrationProblem:
 
     @property
     def num_parameters(self) -> int:
-        """Number of parameters: one for the conductivity, or two if it is complex, plus the contact impedances."""
+        """Number of parameters: one for the conductivity, or two if the conductivity is complex, plus the contact
+        impedances."""
         return (
             self.first_contact
             + {"fixed": 0, "common": 1, "each": self.initial_model.electrodes.num_electrodes}[self.contact]

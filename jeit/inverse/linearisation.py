@@ -102,7 +102,7 @@ class Linearisation(Module):
         mask: Bool[Array, " M"] | None = None,
     ) -> "Linearisation":
         """Linearise the problem at `conductivity`, S/m (2-D: S); arguments as in `one_step`. Raises `ValueError` for
-        arguments that do not fit together."""
+        invalid or inconsistent arguments."""
         prior = PRIOR if prior is None else prior
         check_model(model)
         check_prior(prior)

@@ -3,7 +3,7 @@
 XLA spreads a product of large matrices over all cores, but runs gathers, sums and small products of a compiled loop on
 one core; two loops, each on its own thread, keep two cores busy. NumPy likewise runs on one core, except for products,
 which its BLAS spreads over all cores. While several threads work in NumPy, the BLAS is limited to one thread, because
-the threads of BLAS would compete with the others.
+the threads of BLAS would compete with these threads.
 """
 
 from __future__ import annotations

@@ -295,9 +295,9 @@ def sleeve_sheet_impedance(
     """Potential (V) at each of L points of a sleeve (an open cylinder) for one ampere into each point; (L, L), up to
     terms that cancel for currents with sum zero.
 
-    `radius` and `height` of the sleeve in metres; `angles` (L,) of the points around it in radians, and their `heights`
-    (L,) above its lower end in metres; sheet `conductivity` in siemens. The diagonal is set to zero, where the
-    potential is infinite.
+    `radius` and `height` of the sleeve in metres; `angles` (L,) of the points around the sleeve in radians, and
+    `heights` (L,) of the points above the sleeve's lower end in metres; sheet `conductivity` in siemens. The diagonal
+    is set to zero, where the potential is infinite.
     """
     angle_difference = angles[:, None] - angles
     z, source = heights[:, None], heights

@@ -13,7 +13,7 @@ modes in the same way. Ratios of Bessel functions are computed from recurrences 
 for I_n, upwards for K_n.
 
 An electrode whose contact impedance z is large compared with its size divided by σ carries a uniform current density.
-It measures the mean potential beneath it plus the voltage z I / area across its contact.
+Such an electrode measures the mean potential beneath it plus the voltage z I / area across its contact.
 
 **A solid or hollow ball** is fed through caps of its surface, with a current that is uniform over each cap (the gap
 model). With an insulated inner surface at R₁, potentials are sums of F(r) P_n(cos γ), F = r^n + n/(n+1) R₁^{2n+1}

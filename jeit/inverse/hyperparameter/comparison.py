@@ -35,7 +35,7 @@ def choose_hyperparameter(
       such as `functools.partial(noise_figure, target=0.5)`.
     - `prior`, `difference`, `noise`, `mask`: as in `one_step`.
 
-    Raises `ValueError` for arguments that do not fit together.
+    Raises `ValueError` for invalid or inconsistent arguments.
 
     **Example:**
 
@@ -73,7 +73,7 @@ def compare_rules(
     - `rules`: rules to compare, by name; default `jeit.inverse.RULES`.
     - `progress`: function that is called with the name of each step or rule when it begins.
 
-    Raises `ValueError` for arguments that do not fit together.
+    Raises `ValueError` for invalid or inconsistent arguments.
 
     **Example:**
 

@@ -77,7 +77,7 @@ def greit(
     - `mask` (M,): True for the channels to use.
     - `num_targets`: number of targets, approximately.
 
-    Raises `ValueError` for arguments that do not fit together, and for a noise figure that no λ reaches.
+    Raises `ValueError` for invalid or inconsistent arguments, and for a noise figure that no λ reaches.
 
     **Example:**
 

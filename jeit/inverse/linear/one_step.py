@@ -255,7 +255,7 @@ def one_step(
       other).
     - `mask` (M,): True for the channels to use.
 
-    Raises `ValueError` for arguments that do not fit together.
+    Raises `ValueError` for invalid or inconsistent arguments.
 
     **Example:**
 

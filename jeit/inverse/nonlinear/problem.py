@@ -1,8 +1,8 @@
 """The nonlinear least squares problem of `reconstruct`, checks of its arguments, its reduction to informed shapes, and
 derivatives of its minimum.
 
-Informed shapes are the few dozen combinations of a prior's shapes that the data resolve. They are right singular
-vectors of the whitened Jacobian at the background. They are stored in single precision, which changes an image by a
+Informed shapes are the few dozen combinations of a prior's shapes that the data resolve. Informed shapes are right
+singular vectors of the whitened Jacobian at the background, stored in single precision, which changes an image by a
 relative 1e-6.
 
 Derivatives of the minimum are implicit: at a minimum the gradient of the objective, Jᵀ G r + penalty'(c), is zero. With

@@ -154,7 +154,7 @@ def reconstruct(
     - `parametrisation`: the quantities estimated: link, bounds, regions of one value, further unknowns.
     - `start`: an earlier reconstruction of the same kind, from which the iteration starts.
 
-    Raises `ValueError` for arguments that do not fit together; a failure of the solver is reported in the result's
+    Raises `ValueError` for invalid or inconsistent arguments; a failure of the solver is reported in the result's
     `status`.
 
     **Example:**
@@ -262,7 +262,7 @@ def pose(
     """Set up the least squares problem for a `model` of independent channels and their `data`, and choose λ.
 
     `per_cell`: whether every coefficient must be the value of a cell, as bounds require. Raises `ValueError` for
-    arguments that do not fit together.
+    invalid or inconsistent arguments.
     """
     mesh, link = model.mesh, parametrisation.link
     reference, regions = link.estimate(background), parametrisation.regions_of(mesh)

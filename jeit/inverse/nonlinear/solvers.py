@@ -313,7 +313,7 @@ def as_solver(
 
 
 def counted_iterations(iterations: int, shortened: int = 0) -> str:
-    """Numbers of iterations and of shortened steps, in words."""
+    """Text that states the numbers of iterations and of shortened steps of a solver."""
     iteration_count = counted(iterations, "iteration")
     if not shortened:
         return iteration_count
@@ -438,7 +438,7 @@ def minimise_between(
 @eqx.filter_jit
 def _is_within_rounding(inversion: Inversion, coefficients):
     """Whether a Gauss-Newton step would lower the objective by no more than its rounding error. Solvers that accept
-    steps by the decrease of the objective stall there, before they reach very small tolerances."""
+    steps by the decrease of the objective then stall before they reach very small tolerances."""
     cost, step = inversion.quadratic_model(coefficients)
     _, slope, curvature = step(0.0)
     return abs(slope + 0.5 * curvature) <= _ROUNDING_FACTOR * jnp.finfo(cost.dtype).eps * cost

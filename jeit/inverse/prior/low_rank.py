@@ -51,8 +51,8 @@ def traced_pivoted_cholesky(scaled: Float[Array, "m d"], *, tolerance: float, ma
     """Low-rank factor, as from `pivoted_cholesky`, of Γ = exp(-|x_i - x_j|²) for traced points x = `scaled`. Returns k
     = min(m, max_rank) columns; columns that are not needed are zero.
 
-    The derivative is that of Γ[:, P] L⁻ᵀ with Γ[P, P] = L Lᵀ for fixed pivots P. It is exact except where the pivots
-    change.
+    The derivative is that of Γ[:, P] L⁻ᵀ with Γ[P, P] = L Lᵀ for fixed pivots P. This derivative is exact except where
+    the pivots change.
     """
     num_columns = min(max_rank, len(scaled))
     pivots, rank = _pivots(jax.lax.stop_gradient(scaled), tolerance, num_columns)

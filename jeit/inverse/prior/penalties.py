@@ -60,8 +60,8 @@ class AbstractPenalty(Module):
     @abc.abstractmethod
     def inverse_hessian(self, coefficients: Float[Array, " n"], free, columns: Float[Array, "n k"]) -> Array:
         """Approximate inverse of the penalty's Hessian at c, restricted to the coefficients marked in `free` (n,),
-        times `columns` that are zero for all other coefficients. It preconditions the computation of a minimum's
-        derivatives."""
+        times `columns` that are zero for all other coefficients. This inverse preconditions the computation of a
+        minimum's derivatives."""
 
     def normal(self, coefficients: Float[Array, " n"]) -> AbstractNormal | None:
         """Normal distribution that corresponds to the penalty near c; None if the posterior is not nearly Gaussian."""

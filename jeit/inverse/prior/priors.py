@@ -104,7 +104,7 @@ class AbstractPrior(Module):
 
         `jacobian`: Jacobian of the whitened data with respect to the link's variable. `regions`: regions of cells that
         share a value. `per_cell`: whether every coefficient must be the value of a cell, as bounds require. Raises
-        `ValueError` for arguments that do not fit together.
+        `ValueError` for invalid or inconsistent arguments.
         """
         assert jacobian is not None  # a quadratic prior may depend on it
         if not per_cell:

@@ -131,12 +131,12 @@ def reconstruct_shapes(
 ) -> ShapeReconstruction:
     """Estimate the bodies (star shapes in a sheet, ellipsoids in a solid) that explain measured voltages.
 
-    All bodies are first fitted together, as strong disks or balls. Then each body in turn is left out and the others
-    are fitted again; the body whose absence raises the objective least is removed, as long as the rise is small. This
-    removes ghosts (false bodies) due to model errors and missing electrodes, because other bodies can take their place.
-    Remaining bodies are split in two, or changed to the other kind (a weak star, or a column from floor to lid), if the
-    evidence favours it (`ShapeProblem.surprise`). The search is run twice, once starting with a split and once with a
-    change of kind, and the better result is kept.
+    All bodies are first fitted together, as strong disks or balls. Then each body in turn is left out and all other
+    bodies are fitted again; the body whose absence raises the objective least is removed, as long as the rise is small.
+    This removes ghosts (false bodies) due to model errors and missing electrodes, because other bodies can take their
+    place. Remaining bodies are split in two, or changed to the other kind (a weak star, or a column from floor to lid),
+    if the evidence (`ShapeProblem.surprise`) favours this change. The search is run twice, once starting with a split
+    and once with a change of kind, and the better result is kept.
 
     **Arguments:**
 
@@ -157,8 +157,8 @@ def reconstruct_shapes(
       quantities.
     - `progress`: function called with the name of each stage as it begins. Stages take up to a minute in a solid.
 
-    Raises `ValueError` for arguments that do not fit together, and if `smooth` is not an image of the same channels
-    with a smooth prior.
+    Raises `ValueError` for invalid or inconsistent arguments, and if `smooth` is not an image of the same channels with
+    a smooth prior.
 
     Kolehmainen, Arridge, Lionheart, Vauhkonen and Kaipio, Inverse Problems 15 (1999) 1375, boundaries by Fourier
     coefficients; the choice of bodies by evidence is jeit's own.

@@ -144,7 +144,7 @@ class Imager(Module):
           steady-state Kalman filter for coefficients with covariance exp(-|t - t'| / memory) in time), which reduces
           noise and delays changes by a part of the memory. With 0, every frame is imaged independently.
 
-        Other arguments are as in `reconstruct`. Raises `ValueError` for arguments that do not fit together.
+        Other arguments are as in `reconstruct`. Raises `ValueError` for invalid or inconsistent arguments.
 
         Kaipio, Karjalainen, Somersalo and Vauhkonen, Ann. N. Y. Acad. Sci. 873 (1999) 430-439.
         """

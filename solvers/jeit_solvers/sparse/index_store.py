@@ -39,7 +39,7 @@ class IndexStore:
         self._total = 0
 
     def add(self, array: np.ndarray) -> Slot:
-        """Store an integer array; returns the slot from which it is read later."""
+        """Store an integer array, and return the `Slot` from which the array is read later."""
         slot = Slot(self._total, tuple(array.shape))
         self._arrays.append(array.astype(np.int32).ravel())
         self._total += array.size
