@@ -1,8 +1,8 @@
 """Derivatives of voltages with respect to conductivity changes in a few cells, and to contact impedances.
 
-At fixed fields F the energy in the contact of electrode l is E_l(F, F) = (1/z_l) ∫_l (F - Z_l)². As F is stationary
-(`jeit.forward.transfer`), the derivative of the transfer impedance with respect to the contact impedance needs no
-further solve:
+At fixed fields F (`ForwardModel.fields`) the energy in the contact of electrode l, with contact impedance z_l, is
+E_l(F, F) = (1/z_l) ∫_l (F - Z_l)², where Z is the transfer impedance. As F is stationary (`jeit.forward.transfer`), the
+derivative of the transfer impedance with respect to the contact impedance needs no further solve:
 
     ∂Z / ∂ log z_l = E_l(F, F).
 """
@@ -31,16 +31,16 @@ _CELLS_AT_ONCE = 256
 
 
 class ConductivityChange(NamedTuple):
-    """Linear change of conductivity by q coefficients. **Fields**: `cells`: (k,) the cells that change, or None for all
-    cells; `slope`: (k, q) change of each cell per unit coefficient, in S/m (2-D: S)."""
+    """Change of conductivity that is linear in q coefficients. **Fields**: `cells`: (k,) the cells that change, or None
+    for all cells; `slope`: (k, q) change of conductivity of each cell per unit coefficient, in S/m (2-D: S)."""
 
     cells: Any
     slope: Float[np.ndarray, "k q"]
 
 
 class SolvedFields(NamedTuple):
-    """Fields of a model, in NumPy. **Fields**: `mesh`, `protocol`: those of the model; `fields`: F (n, L) in ohms;
-    `impedance`: impedance of the electrodes in ohms."""
+    """Solution of a forward model, in NumPy. **Fields**: `mesh`, `protocol`: those of the model; `fields`: F (n, L) of
+    `ForwardModel.fields` in ohms; `impedance`: impedance of the electrodes in ohms."""
 
     mesh: Mesh
     protocol: Protocol
@@ -53,14 +53,14 @@ class SolvedFields(NamedTuple):
         return channel_voltages(self.protocol, self.impedance)  # pyright: ignore[reportReturnType]
 
     def derivatives(self, changes: Sequence[ConductivityChange]) -> Float[np.ndarray, "M n"]:
-        """Derivatives of the voltages with respect to the coefficients of all `changes`: -∫ dσ ∇u_drive · ∇u_measure,
-        computed from the values for pairs of electrodes."""
+        """Derivatives of the voltages with respect to the coefficients of all `changes`: -∫ dσ ∇u_drive · ∇u_measure.
+        Computed from integrals for pairs of electrodes."""
         energies = np.concatenate([self._energy(*change) for change in changes])
         return np.stack([-select_channels(self.protocol, impedance_change) for impedance_change in energies], axis=1)  # pyright: ignore
 
     def _energy(self, cells, slope) -> Float[np.ndarray, "q L L"]:
-        """∫ dσ ∇F_k · ∇F_l for every coefficient: from the stiffness matrix if all cells change, else from the
-        gradients in the cells that change."""
+        """Integrals ∫ dσ ∇F_k · ∇F_l for pairs of electrodes k, l and every coefficient of a change dσ: from the
+        stiffness matrix if all cells change, else from the gradients in the cells that change."""
         fields: Any = self.fields
         if cells is None:
             return np.stack([self._energy_everywhere(cell_change) for cell_change in slope.T])
@@ -88,7 +88,7 @@ def solved_fields(model: ForwardModel, conductivity: Float[np.ndarray, " m"]) ->
 
 
 def _field_energies(gradient, slope) -> Float[np.ndarray, "q L L"]:
-    """Matrices ∫ dσ ∇F_k · ∇F_l (q, L, L), one per coefficient."""
+    """Integrals ∫ dσ ∇F_k · ∇F_l as matrices (q, L, L) over pairs of L electrodes, one for each of q coefficients."""
     num_fields = gradient.shape[-1]
     energy = np.zeros((slope.shape[1], num_fields**2), np.result_type(gradient, slope))
     for start in range(0, len(slope), _CELLS_AT_ONCE):
@@ -98,7 +98,7 @@ def _field_energies(gradient, slope) -> Float[np.ndarray, "q L L"]:
     return energy.reshape(-1, num_fields, num_fields)
 
 
-# Contact impedance in ohm·m² beyond which an electrode carries no current, compared with one of unit impedance.
+# Contact impedance in ohm·m² above which an electrode carries no current, compared with one of unit impedance.
 _OPEN_CONTACT = 1e30
 
 
@@ -108,7 +108,7 @@ class _ContactMass(NamedTuple):
 
 
 def _contact_masses_of(mesh: Mesh, electrodes: AbstractElectrodes, electrode: int) -> list[_ContactMass]:
-    """Contact mass of one electrode, for unit contact impedance, where electrodes share facets or cells."""
+    """Contact mass matrices of one electrode, for unit contact impedance, where electrodes share facets or cells."""
     contact_impedance = np.where(np.arange(electrodes.num_electrodes) == electrode, 1.0, _OPEN_CONTACT)
     contact = on_host(electrodes.with_contact_impedance(contact_impedance)).contact(mesh)
     pieces = []
@@ -119,8 +119,8 @@ def _contact_masses_of(mesh: Mesh, electrodes: AbstractElectrodes, electrode: in
 
 
 class ContactSensitivity:
-    """Derivative ∂Z/∂ log z of the transfer impedance with respect to each contact impedance, on one mesh.
-    `electrodes`: electrodes of the complete model; their positions and sizes are fixed."""
+    """Derivative ∂Z/∂ log z of the transfer impedance Z with respect to each contact impedance z, on one mesh.
+    `electrodes`: electrodes of the complete electrode model, at fixed positions and with fixed sizes."""
 
     def __init__(self, mesh: Mesh, electrodes: AbstractElectrodes):
         mesh, num_electrodes = on_host(mesh), electrodes.num_electrodes
@@ -142,7 +142,8 @@ class ContactSensitivity:
     def __call__(
         self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"], contact_impedance
     ) -> Float[np.ndarray, "L L L"]:
-        """∂Z/∂ log z_l (l, L, L) in ohms, from F and Z at the contact impedances (L,) given."""
+        """Derivatives ∂Z/∂ log z_l of the transfer impedance, (L, L, L) in ohms, from the `fields` F and `impedance` Z
+        at this `contact_impedance` (L,)."""
         return (
             np.stack([self._energy(electrode, fields, impedance) for electrode in range(len(impedance))])
             / (np.asarray(contact_impedance)[:, None, None])
@@ -158,14 +159,14 @@ class ContactSensitivity:
         return energy
 
 
-# Fraction of the mesh's width by which electrodes are shifted for derivatives.
+# Fraction of the mesh's width by which electrodes are shifted for finite differences.
 _DIFFERENCE_SHIFT = 1e-4
 
 
 class PlacementSensitivity:
     """Derivatives of the transfer impedance Z with respect to shifts of the electrodes, along the directions in which
-    they can move, and to the logarithm of each contact impedance z. They are computed by central differences of the
-    contact energy at fixed fields. `electrodes` must be movable."""
+    they can move, and to the logarithm of each contact impedance z. Computed by central differences of the contact
+    energy at fixed fields. `electrodes` must be movable."""
 
     def __init__(self, mesh: Mesh, electrodes: AbstractMovableElectrodes):
         mesh = on_host(mesh)
@@ -185,8 +186,9 @@ class PlacementSensitivity:
             )
 
     def __call__(self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"]):
-        """Derivatives (p, L, L) of Z: for the L · a shifts, electrode by electrode, in ohms per metre, then for the L
-        values log z, in ohms. `fields`: F (n, L), and `impedance`: Z (L, L), both in ohms, with these electrodes."""
+        """Derivatives (p, L, L) of the transfer impedance Z: first for the L · a shifts, electrode by electrode, in
+        ohms per metre, then for the L values log z, in ohms. `fields`: F (n, L), and `impedance`: Z (L, L), both in
+        ohms, for these electrodes."""
         contact = self._contact_impedance
         shift_derivatives = []
         for forward, backward in self._shifted_sensitivities:
@@ -199,7 +201,7 @@ class PlacementSensitivity:
 def shift_electrodes(
     electrodes: AbstractMovableElectrodes, directions: Float[np.ndarray, "L a d"], shift: Float[np.ndarray, "L a"]
 ) -> AbstractMovableElectrodes:
-    """Copy electrodes, with each position displaced by `shift` (L, a), metres, along its unit vectors `directions` (L,
-    a, d)."""
+    """Copy electrodes, with the position of each electrode displaced by `shift` (L, a), metres, along the electrode's
+    unit vectors `directions` (L, a, d)."""
     position = np.asarray(electrodes.position) + np.einsum("la,lad->ld", shift, directions)
     return eqx.tree_at(lambda moved_electrodes: moved_electrodes.position, electrodes, as_array(position))

@@ -38,15 +38,15 @@ from jeit_solvers.module import Module
 
 # Maximum number of entries of a block of the Jacobian, so that the block fits in the cache of a core.
 _BLOCK_ENTRIES = 250_000
-# Number of blocks from which they are distributed over the cores.
+# Minimum number of blocks that are distributed over the cores.
 _MIN_PARALLEL_BLOCKS = 20
 # Number of cells processed at a time, so that their fields fit in the cache of a core.
 _CELLS_AT_ONCE = 4000
 
 
 class _BoundMethod(Module):
-    """Bound method of a model that `jax.jit` accepts. JAX needs a hash of the function that it compiles; arrays have
-    none, so the hash is that of the identity of the model."""
+    """Bound method of a model that `jax.jit` accepts. JAX needs a hash of the function that it compiles. Arrays cannot
+    be hashed, so the hash is computed from the identity of the model."""
 
     __func__: Callable[..., Any] = eqx.field(static=True)
     __self__: eqx.Module
@@ -55,7 +55,7 @@ class _BoundMethod(Module):
         return self.__func__(self.__self__, *arguments, **keywords)
 
     @property
-    def __wrapped__(self) -> Any:  # what `help` and signatures show
+    def __wrapped__(self) -> Any:  # the function that `help` and signatures show
         return types.MethodType(self.__func__, self.__self__)
 
     def __hash__(self) -> int:
@@ -84,21 +84,23 @@ def compilable(function: Function) -> Function:
 
 
 class ForwardModel(Module):
-    """Electrode voltages of a body of given conductivity: ∇·(σ∇u) = 0 with the complete (or point) electrode model.
+    """Electrode voltages of a body of given conductivity σ: solves ∇·(σ∇u) = 0 with the complete (or point) electrode
+    model.
 
-    Every method takes a conductivity: a scalar, one value per cell (m,), one per node (n,), or symmetric tensors (m, d,
-    d), in siemens per metre (2-D: sheet conductivity in siemens); complex values are admittivities. A conductivity of
-    another shape, or one that is not positive or not finite, raises `ValueError`. A method called directly runs at
-    once, in NumPy. Inside `jax.jit`, as in `jax.jit(model.voltages)`, `jax.vmap` or a derivative it is compiled once,
-    and is two to four times as fast afterwards. All methods are differentiable with respect to the conductivity and
-    every field of the model (`model.electrodes.position`, `.contact_impedance`, `model.mesh.points`, …).
+    Every method takes a conductivity: a scalar, one value per cell (m,), one value per node (n,), or a symmetric tensor
+    per cell (m, d, d), in siemens per metre (2-D: sheet conductivity in siemens); complex values are admittivities. A
+    conductivity of another shape, or one that is not positive or not finite, raises `ValueError`. A method that is
+    called directly runs in NumPy. Inside `jax.jit`, as in `jax.jit(model.voltages)`, `jax.vmap` or a derivative, the
+    method is compiled once, and is two to four times as fast afterwards. All methods are differentiable with respect to
+    the conductivity and every field of the model (`model.electrodes.position`, `.contact_impedance`,
+    `model.mesh.points`, …).
 
     **Arguments:**
 
     - `mesh`, `electrodes`, `protocol`: the body, its electrodes, and what is driven and measured.
     - `solver`: "auto" (chosen by size; `model.system.solver` states which solver and why), "cholesky", "cg", or any
-      lineax solver. With "auto", `jeit_solvers.Multigrid` or `jeit_solvers.Pardiso`, methods run in NumPy where they
-      can; with other values they are always compiled.
+      lineax solver. With "auto", `jeit_solvers.Multigrid` or `jeit_solvers.Pardiso`, methods run in NumPy where
+      possible; with other solvers they are always compiled.
 
     **Fields**: `mesh`, `electrodes`, `protocol`; `system`: sparsity pattern and linear solver; `at_once`: whether
     methods run in NumPy where possible.
@@ -125,7 +127,8 @@ class ForwardModel(Module):
         *,
         solver: str | lx.AbstractLinearSolver = "auto",
     ):
-        """Arguments as for the class. Raises `ValueError` if electrodes, mesh and protocol do not fit together."""
+        """Arguments as for the class. Raises `ValueError` if electrodes do not lie on the mesh or differ in number from
+        those of the protocol."""
         _check_model_parts(mesh, electrodes, protocol)
         self.mesh = mesh
         self.electrodes = electrodes
@@ -144,8 +147,8 @@ class ForwardModel(Module):
         )
 
     def with_electrodes(self, electrodes: AbstractElectrodes) -> "ForwardModel":
-        """The same model with other electrodes of the same kind and number; works under jit. Raises `ValueError` for
-        electrodes of another kind or number, and for electrodes that do not fit the mesh."""
+        """Copy of the model with other electrodes of the same kind and number; works under `jax.jit`. Raises
+        `ValueError` for electrodes of another kind or number, and for electrodes that do not fit the mesh."""
         if type(electrodes) is not type(self.electrodes):
             raise ValueError(
                 f"with_electrodes needs {type(self.electrodes).__name__}, not {type(electrodes).__name__}; make a new "
@@ -155,7 +158,8 @@ class ForwardModel(Module):
         return eqx.tree_at(lambda model: model.electrodes, self, electrodes)
 
     def with_protocol(self, protocol: Protocol) -> "ForwardModel":
-        """The same model with another protocol. Raises `ValueError` unless it has the same number of electrodes."""
+        """Copy of the model with another protocol. Raises `ValueError` unless the protocol has the same number of
+        electrodes."""
         _check_model_parts(self.mesh, self.electrodes, protocol)
         return eqx.tree_at(lambda model: model.protocol, self, protocol)
 
@@ -163,7 +167,7 @@ class ForwardModel(Module):
     def voltages(self, conductivity: ArrayLike) -> Inexact[Array, " M"]:
         """Voltages (M,) of the protocol's channels, in volts.
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for an invalid conductivity.
         """
         return evaluate(self, voltages_of, check_conductivity(self.mesh, conductivity))
 
@@ -171,7 +175,7 @@ class ForwardModel(Module):
     def transfer_impedance(self, conductivity: ArrayLike) -> Inexact[Array, "L L"]:
         """Transfer impedance Z (L, L) in ohms: electrode potentials are U = Z I for currents I that sum to zero.
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for an invalid conductivity.
         """
         return evaluate(self, transfer_impedance_of, check_conductivity(self.mesh, conductivity))
 
@@ -180,7 +184,7 @@ class ForwardModel(Module):
         """Potentials F (n, L) of the nodes, in ohms, for a unit current into each electrode that leaves through all
         electrodes in equal parts; and the transfer impedance Z (L, L).
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for an invalid conductivity.
         """
         return evaluate(self, fields_of, check_conductivity(self.mesh, conductivity))
 
@@ -188,7 +192,7 @@ class ForwardModel(Module):
     def potentials(self, conductivity: ArrayLike) -> Inexact[Array, "S n"]:
         """Potentials (S, n) at the nodes for every drive pattern, in volts; the mean over the electrodes is zero.
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for an invalid conductivity.
         """
         return evaluate(self, potentials_of, check_conductivity(self.mesh, conductivity))
 
@@ -203,9 +207,10 @@ class ForwardModel(Module):
 
     @compilable
     def voltages_and_jacobian(self, conductivity: ArrayLike) -> tuple[Inexact[Array, " M"], Inexact[Array, "M m"]]:
-        """The results of `voltages` and `jacobian` from a single factorisation and one solve per electrode.
+        """Voltages and Jacobian, as from `voltages` and `jacobian`, with a single factorisation and one solve per
+        electrode.
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid, and for tensors.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for an invalid conductivity, and for tensors.
         """
         conductivity = check_conductivity(self.mesh, conductivity)
         if conductivity.ndim == 3:
@@ -217,9 +222,11 @@ class ForwardModel(Module):
 
 
 def evaluate(model: ForwardModel, quantity: Callable[..., Any], conductivity) -> Any:
-    """Evaluate a `quantity` of a model: in NumPy if all values are known, in a compiled program if any array is traced.
+    """Evaluate a `quantity` of a model, such as `voltages_of`: in NumPy if all values are known, in a compiled program
+    if any array is traced.
 
-    `conductivity`: an array in S/m (2-D: S). It is not checked: values that are not positive or not finite yield NaN.
+    `conductivity`: an array in S/m (2-D: S). Its values are not checked: values that are not positive or not finite
+    yield NaN.
     """
     if not has_values(model):
         return _COMPILED_QUANTITIES[quantity](model, conductivity)
@@ -258,8 +265,8 @@ def _check_model_parts(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Pro
 
 
 def select_channels(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
-    """Voltages of the channels: entries of measurement · Z · driveᵀ. The full matrix is computed only where that is
-    less work than computing the entries one by one."""
+    """Voltages of the channels (M,) for a transfer impedance Z: entries of the matrix measurement · Z · driveᵀ. The
+    full matrix is computed only where this takes less work than computing the entries one by one."""
     measured, driven = protocol.measurement, protocol.drive
     num_direct_products, num_matrix_products = (
         protocol.num_measurements * len(impedance),
@@ -273,8 +280,8 @@ def select_channels(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
 
 
 def channel_voltages(protocol: Protocol, impedance: ElectrodeImpedance) -> Inexact[Array, " M"]:
-    """Voltages of the channels. The contribution of a contact is added only to channels that measure an electrode
-    carrying current."""
+    """Voltages (M,) of the channels of a protocol for given impedances of the electrodes. The contribution of a contact
+    impedance is added only to channels that measure an electrode carrying current."""
     contact_voltages = select_channels(protocol, namespace(impedance.contact).diag(impedance.contact))
     return select_channels(protocol, impedance.body) + contact_voltages
 
@@ -291,25 +298,27 @@ def voltages_of(model: ForwardModel | IntegratedModel, conductivity):
 
 
 def fields_of(model: ForwardModel | IntegratedModel, conductivity):
-    """Fields F (n, L) and transfer impedance Z (L, L) in ohms, for a `conductivity` in S/m (2-D: S); a quantity for
-    `evaluate`."""
+    """Fields F (n, L) and transfer impedance Z (L, L) as defined in `ForwardModel.fields`, in ohms, for a
+    `conductivity` in S/m (2-D: S); a quantity for `evaluate`."""
     return electrode_fields(model.mesh, conductivity, model.electrodes, model.system)
 
 
 def fields_and_impedance_of(model: ForwardModel | IntegratedModel, conductivity):
-    """Fields F (n, L) in ohms, relative to a reference near the body, and the `ElectrodeImpedance`, for a
-    `conductivity` in S/m (2-D: S); a quantity for `evaluate`."""
+    """Fields F (n, L) of `ForwardModel.fields` in ohms, relative to a reference potential near the body, and the
+    `ElectrodeImpedance`, for a `conductivity` in S/m (2-D: S); a quantity for `evaluate`."""
     solved = solved_system_of(model, conductivity)
     return solved.fields()[0], solved.impedance()
 
 
 def solved_system_of(model: ForwardModel | IntegratedModel, conductivity):
-    """The system solved for the electrodes' loads, for a `conductivity` in S/m (2-D: S); a quantity for `evaluate`."""
+    """The `SolvedSystem` for unit currents into the electrodes, for a `conductivity` in S/m (2-D: S); a quantity for
+    `evaluate`."""
     return solved_system(model.mesh, conductivity, model.electrodes, model.system)
 
 
 def potentials_of(model: ForwardModel | IntegratedModel, conductivity):
-    """Potentials (S, n) in volts, for a `conductivity` in S/m (2-D: S); a quantity for `evaluate`."""
+    """Potentials (S, n) of the nodes for every drive pattern, in volts, for a `conductivity` in S/m (2-D: S); a
+    quantity for `evaluate`."""
     return model.protocol.drive @ fields_of(model, conductivity)[0].T
 
 
@@ -354,18 +363,18 @@ def _blocks_of_cells(mesh: Mesh, protocol: Protocol) -> list[slice]:
 def jacobian_blocks(
     mesh: Mesh, protocol: Protocol, fields: Inexact[Array, "n L"]
 ) -> Iterator[tuple[slice, Inexact[Array, "M b"]]]:
-    """Jacobian of the channels with respect to the conductivity of cells, in V m/S (2-D: V/S), as blocks of consecutive
-    cells, because the whole Jacobian of a solid does not fit in memory. Computed in NumPy; `fields` from `fields_of`,
-    in ohms."""
+    """Jacobian of the channels with respect to the conductivity of cells, in V m/S (2-D: V/S), as blocks (M, b) of
+    consecutive cells, because the whole Jacobian of a solid does not fit in memory. Computed in NumPy from the `fields`
+    (n, L) of `fields_of`, in ohms."""
     gradient = field_gradients(mesh, fields)
     for cells in _blocks_of_cells(mesh, protocol):
         yield cells, _jacobian_of_cells(protocol, gradient[:, cells])
 
 
 def field_products(mesh: Mesh, fields: Inexact[Array, "n L"]) -> Iterator[tuple[slice, Inexact[np.ndarray, "f b"]]]:
-    """Integrals ∫_e ∇u_a · ∇u_b of the electrodes' fields for a ≤ b, rows in the order of `np.triu_indices`, as blocks
-    of consecutive cells. The Jacobian of any channel is a sum of them. Computed in NumPy; `fields` from `fields_of`,
-    in ohms."""
+    """Integrals ∫_e ∇u_a · ∇u_b over each cell e of the fields u_a, u_b of electrodes a ≤ b, with rows in the order of
+    `np.triu_indices`, as blocks of consecutive cells. The Jacobian of any channel is a weighted sum of these integrals.
+    Computed in NumPy from the `fields` (n, L) of `fields_of`, in ohms."""
     gradient: Any = field_gradients(mesh, fields)
     count = gradient.shape[-1]
     starts = np.cumsum([0, *range(count, 0, -1)])
@@ -381,9 +390,10 @@ def field_products(mesh: Mesh, fields: Inexact[Array, "n L"]) -> Iterator[tuple[
 
 
 def _jacobian_of_cells(protocol: Protocol, gradient: Inexact[Array, "d b L"]) -> Inexact[Array, "M b"]:
-    """Jacobian ∂v/∂σ_e = -∫_e ∇u_drive · ∇u_measure, summed axis by axis from the gradients of the fields in cells."""
+    """Jacobian ∂v/∂σ_e = -∫_e ∇u_drive · ∇u_measure of the channels for b cells e, summed axis by axis from the
+    gradients of the electrodes' fields in the cells."""
     xp, jacobian = namespace(gradient), host.zeros(())
-    # A single product for all patterns and axes also keeps XLA from recomputing the gradients for every channel.
+    # With a single product for all patterns and axes, XLA does not recompute the gradients for every channel.
     patterns = xp.concatenate([-protocol.drive, protocol.measurement])
     rows = patterns @ gradient.reshape(-1, gradient.shape[-1]).T
     for component in xp.split(rows, len(gradient), axis=1):
@@ -405,7 +415,8 @@ _COMPILED_QUANTITIES = {
 
 
 class IntegratedModel(NamedTuple):
-    """Parts of a forward model, with the integrals over the electrodes in place of the electrodes."""
+    """Parts of a forward model, with integrals of the basis functions over the electrodes in place of the
+    electrodes."""
 
     mesh: Mesh
     electrodes: IntegratedElectrodes

@@ -37,11 +37,11 @@ from jeit_solvers.module import Module
 
 
 def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
-    """Conductivity per cell, (m,) or tensors (m, d, d), from values per cell, values per node, or tensors, in S/m (2-D:
-    S).
+    """Conductivity per cell, (m,) or tensors (m, d, d), computed from values per cell, values per node, or tensors, in
+    S/m (2-D: S).
 
-    A conductivity given per node is linear in each cell. Because gradients of P1 functions are constant there, its mean
-    over the nodes of the cell is exact.
+    A conductivity given per node is linear in each cell. Because gradients of P1 functions are constant in a cell,
+    replacing the conductivity by its mean over the cell's nodes is exact.
     """
     if conductivity.ndim == 1 and conductivity.shape[0] != mesh.num_cells:
         return gather(conductivity, mesh.cells).mean(axis=1)
@@ -49,7 +49,7 @@ def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
 
 
 def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
-    """Convert `conductivity` to an array, and raise `ValueError` if it has the wrong shape or is not positive.
+    """Convert `conductivity` to an array, and raise `ValueError` if the array has the wrong shape or is not positive.
 
     Accepts a scalar (converted to shape (m,)), values per cell (m,) or per node (n,), or symmetric tensors (m, s, s),
     where s is the dimension of space; in siemens per metre (in a 2-D sheet, siemens). For tensors (m, 3, 3) on a
@@ -57,7 +57,7 @@ def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
     part. Values of traced arrays are not checked.
     """
     conductivity = np.asarray(conductivity) if has_values(conductivity) else jnp.asarray(conductivity)
-    # A single type and shape for all equivalent inputs, because JAX compiles again for Python's "weakly typed" numbers.
+    # All equivalent inputs get the same type and shape, because JAX compiles again for Python's "weakly typed" numbers.
     conductivity = namespace(conductivity).asarray(conductivity, dtype=_floating_type(conductivity.dtype))
     m, n, d = mesh.num_cells, mesh.num_points, mesh.space_dimension
     if conductivity.shape not in [(), (m,), (n,), (m, d, d)]:
@@ -86,7 +86,7 @@ def _check_values(conductivity: Any, normal: Any) -> None:
         if not np.allclose(conductivity, np.swapaxes(conductivity, 1, 2), rtol=1e-12, atol=0):
             raise ValueError("conductivity tensors must be symmetric.")
         real = conductivity.real
-        if normal is not None:  # tensors need to be positive only across the normal: add a large value along it
+        if normal is not None:  # tensors must be positive only within the surface: add a large value along its normal
             normal_projection = normal[:, :, None] * normal[:, None]
             projection = np.eye(3) - normal_projection
             real = projection @ real @ projection + np.abs(real).max() * normal_projection
@@ -101,8 +101,8 @@ def _check_values(conductivity: Any, normal: Any) -> None:
 
 
 def _cached_geometry(mesh: Mesh) -> tuple[Inexact[Array, "m k s"], Inexact[Array, " m"]]:
-    """Gradients (m, d + 1, s) of the basis functions, and measures (m,) of the cells. In NumPy, those of the mesh that
-    was used last are kept."""
+    """Gradients (m, d + 1, s) of the basis functions in m cells of dimension d in s-dimensional space, and measures
+    (m,) of the cells. In NumPy, the results for the last mesh are kept."""
     return _last_geometry(mesh) if namespace(mesh) is np else _gradients_and_measures(mesh)
 
 
@@ -114,8 +114,8 @@ _last_geometry = Recent(_gradients_and_measures, 1)
 
 
 def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Array, "p m"]:
-    """Element stiffness ∫ ∇φ_i·σ∇φ_j for a conductivity per cell in S/m (2-D: S): lower triangles (p, m) in siemens, p
-    = (d+1)(d+2)/2."""
+    """Element stiffness matrices ∫ ∇φ_i·σ∇φ_j of the basis functions φ, for a conductivity σ per cell in S/m (2-D: S).
+    Returns lower triangles (p, m) in siemens, with p = (d+1)(d+2)/2 entries for each of m cells."""
     xp = namespace(mesh, conductivity)
     gradient, measure = _cached_geometry(mesh)
     flux = gradient if conductivity.ndim == 1 else xp.einsum("mij,mkj->mki", conductivity, gradient)
@@ -130,10 +130,10 @@ def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Arra
 
 
 def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array, "d m p"]:
-    """Gradients (d, m, p) of nodal fields in every cell, one layer per axis, multiplied by the square root of the
+    """Gradients (d, m, p) of p nodal fields in every cell, one layer per axis, multiplied by the square root of the
     cell's measure.
 
-    With this weight the product of two gradients is the integral ∫_e ∇u·∇w.
+    With this weight the product of the gradients of two fields u, w is the integral ∫_e ∇u·∇w over the cell e.
     """
     xp = namespace(mesh, fields)
     gradient, measure = _cached_geometry(mesh)
@@ -150,11 +150,11 @@ def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array,
 class System(Module):
     """Sparsity pattern of the system matrix, and the solvers of systems with this pattern.
 
-    Made once for a mesh and a kind of electrode (`System.create`). It holds no physical quantities, so one system
+    A system is made once for a mesh and a kind of electrode (`System.create`). It holds no physical quantities, so it
     serves every conductivity, contact impedance, electrode position and size.
 
-    **Fields**: `pattern`; `solver`: lineax solver, of compiled programs; `fronts`: by which matrices with known values
-    are factorised in NumPy, None if only `solver` is to be used.
+    **Fields**: `pattern`: sparsity pattern; `solver`: lineax solver used in compiled programs; `fronts`: plan by which
+    matrices with known values are factorised in NumPy, None if only `solver` is used.
     """
 
     pattern: SparsityPattern
@@ -168,10 +168,10 @@ class System(Module):
 
     @classmethod
     def create(cls, mesh: Mesh, electrodes: AbstractElectrodes, solver: str | lx.AbstractLinearSolver = "auto"):
-        """Make the system for a mesh and electrodes. `solver`: "auto" (by predicted memory and time), "cholesky",
-        "cg", or any lineax solver.
+        """Make the system for a mesh and electrodes. `solver`: "auto" (chosen by predicted memory and time),
+        "cholesky", "cg", or any lineax solver.
 
-        Raises `ValueError` for another name.
+        Raises `ValueError` for another name of a solver.
         """
         groups = [np.asarray(nodes) for nodes in (mesh.cells, *electrodes.contact_nodes(mesh))]
         pattern = SparsityPattern.from_elements(groups, size=mesh.num_points)
@@ -191,8 +191,9 @@ class System(Module):
     def grounded(
         self, mesh: Mesh, conductivity, electrodes: AbstractElectrodes, contact: Contact
     ) -> tuple[SparseSymmetric, Inexact[Array, "n c"]]:
-        """The symmetric positive-definite matrix A, (n, n) in siemens, of stiffness, contact mass and ground; and the
-        loads of the electrodes, (n, L) for point electrodes, otherwise (n, L + 1) with the load of the ground.
+        """The symmetric positive-definite system matrix A, (n, n) in siemens, the sum of stiffness, contact mass and
+        ground; and the loads (right-hand sides) of L electrodes, (n, L) for point electrodes, otherwise (n, L + 1) with
+        the load of the ground.
 
         `conductivity` per cell, in S/m (2-D: S).
         """
@@ -207,18 +208,18 @@ class System(Module):
         return SparseSymmetric(values, self.pattern), load
 
     def solve(self, operator: SparseSymmetric, load: Inexact[Array, "n c"]) -> Inexact[Array, "n c"]:
-        """Solution A⁻¹ load, one column per load. Differentiable by implicit differentiation, whichever solver is
-        used."""
+        """Solution A⁻¹ load for the matrix A of `operator`, one column per load. Differentiable by implicit
+        differentiation, whichever solver is used."""
         load = load.astype(operator.values.dtype)
         if self.fronts is not None and isinstance(load, np.ndarray):
             solution: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).solve(load)
             return solution.astype(load.dtype)
         if isinstance(self.solver, NumpySolver) and isinstance(load, np.ndarray):
             return self.solver.solve_columns(operator, load)
-        constant = jax.lax.stop_gradient(operator)  # derivatives come from A X = B, not through the factor
+        constant = jax.lax.stop_gradient(operator)  # derivatives come from A X = B, not from the factor of A
         state: Any = self.solver.init(constant, {})
         solver = self.solver
-        if isinstance(solver, ColumnSolver):  # all columns at once; lineax solves one by one
+        if isinstance(solver, ColumnSolver):  # all columns at once; other lineax solvers take one column at a time
 
             def solve_columns(_, columns):
                 return solver.solve_columns(state, columns)
@@ -234,7 +235,8 @@ class System(Module):
         return jax.vmap(column, in_axes=1, out_axes=1)(load)
 
     def quadratic_form(self, operator: SparseSymmetric, load: Inexact[Array, "n c"]) -> Inexact[Array, "c c"]:
-        """The product loadᵀ A⁻¹ load; with a direct solver it takes half the work of `solve`."""
+        """The product loadᵀ A⁻¹ load for the matrix A of `operator`. With a direct solver the product takes half the
+        work of `solve`."""
         load = load.astype(operator.values.dtype)
         if self.fronts is not None and isinstance(load, np.ndarray):
             product: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).quadratic_form(load)
@@ -245,12 +247,13 @@ class System(Module):
 
 
 def ground_conductance(stiffness: Inexact[Array, " n"], load: Inexact[Array, "n L"]) -> Inexact[Array, " n"]:
-    """A conductance (n,) to ground at one node under an electrode, of the order of the `stiffness` (n,) there.
+    """Conductances (n,) from the nodes to ground: zero except at one node under an electrode, there of the order of the
+    `stiffness` (n,).
 
-    No current flows through it if the currents sum to zero, so it does not change the solution. It fixes the constant
-    part of the potential, which point electrodes leave undetermined, and complete electrodes with a very large contact
-    impedance nearly so. `load` (n, L): the right-hand sides, nonzero at the nodes under electrodes. It is not
-    differentiated.
+    If the electrode currents sum to zero, no current flows to ground, so the ground does not change the solution. The
+    ground fixes the constant part of the potential, which is undetermined with point electrodes, and nearly so with
+    complete electrodes of very large contact impedance. `load` (n, L): right-hand sides, nonzero under electrodes. The
+    conductance is not differentiated.
     """
     xp = namespace(stiffness, load)
     stiffness = undifferentiated(abs(stiffness))
@@ -259,5 +262,5 @@ def ground_conductance(stiffness: Inexact[Array, " n"], load: Inexact[Array, "n 
 
 
 def with_ground(load: Inexact[Array, "n L"], ground: Inexact[Array, " n"]) -> Inexact[Array, "n c"]:
-    """Loads (n, L + 1): those of the electrodes, and last that of the `ground` (n,)."""
+    """Loads (n, L + 1): the loads of the electrodes, followed by the load of the `ground` (n,)."""
     return namespace(load, ground).concatenate([load, ground[:, None]], axis=1)

@@ -1,14 +1,14 @@
 """Transfer impedance of the electrodes as a function of the conductivity, with its derivative rule.
 
-Let a_θ(u, w) be the energy form of the electrode model, where θ stands for everything it depends on (conductivity,
+Let a_θ(u, w) be the energy form of the electrode model, where θ stands for all parameters of the form (conductivity,
 contact impedance, electrode positions, mesh points), and F_l the potential for a unit current into electrode l that
 leaves through all electrodes in equal parts. Then Z_lk = a_θ(F_l, F_k), and, as F is stationary,
 
     dZ = -∂_θ a_θ(F, F) dθ      at fixed F,
 
-so a first derivative in any direction is a product of known fields and needs no further solve. (For point electrodes
-the load depends on their position, and 2 ∂_θ⟨load, F⟩ dθ is added.) Cheney, Isaacson and Newell, SIAM Review 41 (1999)
-85-101; Polydorides and Lionheart, Meas. Sci. Technol. 13 (2002) 1871-1883.
+so a first derivative in any direction is computed from products of known fields, without a further solve. (For point
+electrodes the load depends on their position, and 2 ∂_θ⟨load, F⟩ dθ is added.) Cheney, Isaacson and Newell, SIAM Review
+41 (1999) 85-101; Polydorides and Lionheart, Meas. Sci. Technol. 13 (2002) 1871-1883.
 """
 
 from __future__ import annotations
@@ -30,11 +30,13 @@ from jeit_solvers.engines import namespace, undifferentiated
 
 
 class ElectrodeImpedance(NamedTuple):
-    """Transfer impedance of the electrodes, up to terms that cancel for currents that sum to zero, in two parts: the
-    resistance of a nearly open contact is so large that the sum would lose the digits of the body's part.
+    """Transfer impedance of the electrodes in two parts, up to terms that cancel for currents that sum to zero. The
+    parts are kept separate because the resistance of a nearly open contact is so large that the sum would lose the
+    digits of the body's part.
 
-    **Fields**: `body`: (L, L) mean potentials under the electrodes for unit currents; `contact`: (L,) what each contact
-    adds to the potential of its electrode, z / |e|, zero for point electrodes; both in ohms.
+    **Fields**: `body`: (L, L) mean potentials under the electrodes for unit currents; `contact`: (L,) voltage drop at
+    each contact per unit current, z / |e| with the contact impedance z and the electrode's area |e|, zero for point
+    electrodes; both in ohms.
     """
 
     body: Inexact[Array, "L L"]
@@ -42,7 +44,7 @@ class ElectrodeImpedance(NamedTuple):
 
     @property
     def transfer(self) -> Inexact[Array, "L L"]:
-        """Z (L, L), where the mean of every row and column is zero."""
+        """Transfer impedance Z (L, L) in ohms, in which every row and column has zero mean."""
         return centred(self.body + namespace(self.body).diag(self.contact))
 
 
@@ -55,7 +57,7 @@ def transfer_impedance(mesh: Mesh, conductivity: ArrayLike, electrodes: Abstract
     **Arguments:**
 
     - `mesh`: the mesh.
-    - `conductivity` (m,), (n,) or (m, d, d): in S/m (2-D: S).
+    - `conductivity`: per cell (m,), per node (n,) or tensors per cell (m, d, d), in S/m (2-D: S).
     - `electrodes`: the electrodes on the mesh.
     - `system`: sparsity pattern and linear solver, such as `ForwardModel.system`.
 
@@ -70,7 +72,8 @@ def transfer_impedance(mesh: Mesh, conductivity: ArrayLike, electrodes: Abstract
 
 
 def impedance_parts(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System) -> ElectrodeImpedance:
-    """The transfer impedance as an `ElectrodeImpedance`, in two parts; `conductivity` in S/m (2-D: S)."""
+    """The transfer impedance in two parts, body and contacts, as an `ElectrodeImpedance`; `conductivity` in S/m (2-D:
+    S)."""
     formula = _impedance_by_quadratic_form if namespace(mesh, conductivity, electrodes) is np else _differentiable
     return formula(mesh, conductivity, electrodes, system)
 
@@ -101,11 +104,11 @@ def _impedance_parts_jvp(primals, tangents):
 
 
 def electrode_fields(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
-    """Potentials F (n, L) for a unit current into each electrode that leaves through all electrodes in equal parts; and
-    Z (L, L).
+    """Potentials F (n, L) of the nodes for a unit current into each electrode that leaves through all electrodes in
+    equal parts; and the transfer impedance Z (L, L).
 
-    In volts per ampere; `conductivity` in S/m (2-D: S). Differentiable by implicit differentiation of the linear
-    system, with one more solve per direction.
+    Both are in volts per ampere; `conductivity` in S/m (2-D: S). Both are differentiable by implicit differentiation of
+    the linear system, with one more solve per direction.
     """
     solved = solved_system(mesh, conductivity, electrodes, system)
     fields, potentials = solved.fields()
@@ -133,16 +136,16 @@ class SolvedSystem(NamedTuple):
 
     def fields(self) -> tuple[Inexact[Array, "n L"], Inexact[Array, "L L"]]:
         """Potentials F (n, L) of the nodes and U (L, L) of the electrodes for a unit current into each electrode that
-        leaves through all electrodes in equal parts. All are relative to the same reference near the body, whatever the
-        contact impedances."""
+        leaves through all electrodes in equal parts. All potentials are relative to the same reference potential near
+        the body, whatever the contact impedances."""
         return unit_fields(self.solution, self.product, self.resistance)
 
 
 def unit_fields(
     solution: Inexact[Array, "k c"], product: Inexact[Array, "c c"], resistance: Inexact[Array, " L"] | None
 ) -> tuple[Inexact[Array, "k L"], Inexact[Array, "L L"]]:
-    """F at some nodes and U as defined in `SolvedSystem.fields`, from the rows of X at these nodes and the product
-    loadᵀ X."""
+    """Potentials F at some nodes and U of the electrodes as defined in `SolvedSystem.fields`, computed from the rows of
+    the solution X at these nodes and the product loadᵀ X."""
     potentials = product
     if resistance is not None:
         terminals = terminal_impedance(product)[:, :-1]
@@ -151,7 +154,7 @@ def unit_fields(
 
 
 def solved_system(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System) -> SolvedSystem:
-    """Solve the system for the loads of the electrodes; `conductivity` in S/m (2-D: S)."""
+    """Solve the finite-element system for the loads of the electrodes; `conductivity` in S/m (2-D: S)."""
     contact = electrodes.contact(mesh)
     operator, load = system.grounded(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
     return SolvedSystem(operator, load, system.solve(operator, load), contact_resistance(electrodes, contact))
@@ -161,11 +164,12 @@ def solved_system(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, syst
 def fields_and_inverse(
     solved: SolvedSystem, strips: Strips, max_distance: int
 ) -> tuple[Inexact[Array, "p L"], NearInverse]:
-    """F at the places of strips of the nodes, and K⁻¹ between places up to `max_distance` strips apart, in ohms.
+    """Potentials F (`SolvedSystem.fields`) of the nodes in the order of `strips`, and the entries of K⁻¹ between nodes
+    up to `max_distance` strips apart, in ohms.
 
-    K is the matrix of the electrode model with the ground and all electrodes but one floating; K⁻¹ is the potential at
-    one node for a unit current into another. The choice of the electrode that is not floating does not affect the
-    derivatives with respect to conductivity.
+    K is the matrix of the electrode model with the ground and all electrodes but one floating. An entry of K⁻¹ is the
+    potential of one node for a unit current into another node. The choice of the electrode that is not floating does
+    not affect the derivatives with respect to conductivity.
     """
     fields, solution = strips.spread(solved.fields()[0]), strips.spread(solved.solution)
     inverse = near_inverse(strips, solved.operator, max_distance)
@@ -184,9 +188,9 @@ def electrode_impedance(product: Inexact[Array, "c c"], resistance: Inexact[Arra
     """Impedance of the electrodes from the product loadᵀ A⁻¹ load, with A and the loads of `System.grounded`, and from
     the resistances of the contacts.
 
-    With the electrodes' loads B and the contacts' resistances D⁻¹, the mean potentials under complete electrodes are
-    D⁻¹ Bᵀ u = D⁻¹ BᵀA⁻¹B U. The remainder of U, D⁻¹ I, is kept separate, so no digits are lost at large contact
-    impedance.
+    With the electrodes' loads B, the contacts' resistances D⁻¹, nodal potentials u, electrode potentials U and currents
+    I, the mean potentials under complete electrodes are D⁻¹ Bᵀ u = D⁻¹ BᵀA⁻¹B U. The remainder of U, the voltage drop
+    D⁻¹ I at the contacts, is kept separate, so no digits are lost at large contact impedance.
     """
     if resistance is None:
         return ElectrodeImpedance((product + product.T) / 2, namespace(product).zeros_like(product[0]))
@@ -195,13 +199,13 @@ def electrode_impedance(product: Inexact[Array, "c c"], resistance: Inexact[Arra
 
 
 def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
-    """Potentials of the electrodes and of the ground for a unit current into each of them that leaves through a
-    reference terminal.
+    """Impedance matrix of the terminals (electrodes and ground): potentials of all terminals for a unit current into
+    each terminal that leaves through a reference terminal.
 
-    Eliminating the nodes leaves (D - BᵀA⁻¹B) U = I. The columns of this matrix sum to zero, so its diagonal is computed
-    as the sum of the other entries, which avoids the cancellation in D - BᵀA⁻¹B at small contact impedance. The
-    reference is the terminal that is best connected to the others. Rows and columns are scaled by their diagonals,
-    because the contact impedances may differ by orders of magnitude.
+    Eliminating the nodes from the system leaves (D - BᵀA⁻¹B) U = I. The columns of the matrix D - BᵀA⁻¹B sum to zero,
+    so its diagonal is computed as the sum of the other entries, which avoids the cancellation in D - BᵀA⁻¹B at small
+    contact impedance. The reference terminal is the terminal that is best connected to the others. Rows and columns are
+    scaled by their diagonals, because the contact impedances may differ by orders of magnitude.
     """
     xp = namespace(product)
     coupling = (product + product.T) / 2 * (1 - np.eye(len(product)))
@@ -222,8 +226,8 @@ def _mean_current_correction(
     short-circuit each other.
 
     The current between two terminals is computed from the difference of their potentials, so that, whatever the
-    rounding, the current that leaves one enters the other. The residual, `current` minus all these currents, therefore
-    keeps the digits that couple such a pair to the other terminals.
+    rounding, the current that leaves one terminal enters the other. The residual is `current` minus all these currents.
+    The residual therefore keeps the digits that couple a short-circuited pair to the other terminals.
     """
     xp = namespace(others)
     if xp is np:
@@ -242,7 +246,8 @@ def centred(matrix: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:
 
 
 def _stationary_form(mesh, conductivity, electrodes, fields, impedance):
-    """2⟨load, F⟩ - a(F, F) as a matrix (L, L), whose derivative at fixed F and Z equals the derivative of Z."""
+    """The form 2⟨load, F⟩ - a(F, F) of the module's docstring as a matrix (L, L). Its derivative at fixed F and Z
+    equals the derivative of the transfer impedance Z."""
     conductivity = cell_conductivity(mesh, conductivity)
     contact = electrodes.contact(mesh)
     gradient = field_gradients(mesh, fields)
@@ -257,7 +262,8 @@ def _stationary_form(mesh, conductivity, electrodes, fields, impedance):
 
 
 def _contact_energy(contact: Contact, fields, impedance):
-    """Σ_l (1/z_l) ∫_l (u - U_l)(w - W_l) for all pairs of fields, as a matrix (L, L)."""
+    """Energy Σ_l (1/z_l) ∫_l (u - U_l)(w - W_l) in the contacts for all pairs of fields u, w with electrode potentials
+    U, W, as a matrix (L, L)."""
     body_term = 0
     for nodes, mass in zip(contact.nodes, contact.mass, strict=True):
         local = fields.at[nodes].get(mode="promise_in_bounds")  # (q, k, L)

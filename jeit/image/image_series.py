@@ -1,13 +1,15 @@
-"""Series of images, and their oscillations such as breathing: spectra, and amplitude and phase at a frequency.
+"""Series of images over time, and oscillations of their values (such as breathing): spectra, and amplitude and phase at
+a frequency.
 
 At a frequency f, the values x are fitted by weighted least squares, with weights w (a window over the measured time),
 to
 
     x(t) ≈ a + b t + A cos(2πf t + φ).
 
-For evenly spaced times and an integer number of periods this is the discrete Fourier transform at f. For other times it
-avoids the leakage of the mean, of the drift and of -f. Frequencies can be distinguished if they differ by at least the
-resolution: 1 / T without a window and 2 / T with Hann's window, where T is the measured time.
+For evenly spaced times and an integer number of periods, the fit equals the discrete Fourier transform at f. For other
+times the fit avoids the leakage of the mean, of the drift and of the frequency -f into the result. Frequencies can be
+distinguished if they differ by at least the resolution, which is 1 / T without a window and 2 / T with Hann's window,
+where T is the measured time.
 """
 
 from __future__ import annotations
@@ -26,13 +28,13 @@ from jeit.mesh import Mesh, measures
 
 @dataclass(frozen=True)
 class ImageSeries:
-    """Changes of conductivity over time.
+    """Images of the change of conductivity over time: F frames on a mesh of m cells.
 
-    **Fields**: `mesh`; `changes`: (F, m) in S/m (2-D: S), a row of NaN for a frame without an image; `times`: (F,)
-    increasing times in seconds; `background`: the conductivity to which the changes are relative, in S/m (2-D: S);
-    `timed`: False if `times` are the numbers of the frames instead.
+    **Fields**: `mesh`; `changes`: (F, m) change of every cell in every frame, in S/m (2-D: S), NaN in a frame without
+    an image; `times`: (F,) increasing times of the frames in seconds; `background`: the conductivity from which the
+    changes are measured, in S/m (2-D: S); `timed`: False if `times` are frame numbers instead of seconds.
 
-    Raises `ValueError` if shapes disagree, if times do not increase, and if no frame has an image.
+    Raises `ValueError` if shapes of the fields disagree, if times do not increase, and if no frame has an image.
 
     **Example:**
 
@@ -76,35 +78,37 @@ class ImageSeries:
 
     @property
     def imaged(self) -> Bool[np.ndarray, " F"]:
-        """(F,) True for frames that have an image."""
+        """Mask (F,) of the frames that have an image."""
         return np.isfinite(self.changes[:, 0]) & np.isfinite(self.changes[:, -1])
 
     @property
     def frame_rate(self) -> float | None:
-        """Mean frame rate in frames per second; None for a single frame, and if times are not known."""
+        """Mean frame rate in frames per second; None for a single frame, and if the times of the frames are not
+        known."""
         if len(self.times) < 2 or not self.timed:
             return None
         return float((len(self.times) - 1) / (self.times[-1] - self.times[0]))
 
     @property
     def titles(self) -> list[str]:
-        """The time of each frame, or its number, as text."""
+        """Title of each frame: the time of the frame, or the frame number if times are not known."""
         return [f"{time:.2f} s" if self.timed else f"frame {time:.0f}" for time in self.times]
 
     @property
     def unit(self) -> str:
-        """Unit of the changes."""
+        """Unit of the changes of conductivity."""
         return "S" if self.mesh.dimension == 2 else "S/m"
 
     def functional(self) -> Float[np.ndarray, " m"]:
-        """Functional image (m,): the standard deviation of every cell over time."""
+        """Functional image (m,): the standard deviation over time of the change in every cell."""
         return self.changes[self.imaged].std(axis=0, dtype=float)
 
     def mean_change(self, region: ArrayLike) -> Float[np.ndarray, " F"]:
-        """Mean change (F,) in a region, weighted by the size of its cells; NaN for frames without an image.
+        """Mean change of conductivity (F,) in a region of the mesh, weighted by cell size; NaN for frames without an
+        image.
 
-        `region`: (m,) True for the cells of the region (`ball_region`, `box_region`, `half_region`). Raises
-        `ValueError` for another shape, and for an empty region.
+        `region`: mask (m,) of the cells of the region, for example from `ball_region`, `box_region` or `half_region`.
+        Raises `ValueError` for a mask of another shape, and for an empty region.
         """
         is_in_region = np.asarray(region)
         if is_in_region.dtype != bool or is_in_region.shape != (self.mesh.num_cells,) or not is_in_region.any():
@@ -123,17 +127,17 @@ _MIN_PERIODS = 1.0
 
 @dataclass(frozen=True)
 class Oscillation:
-    """The component of values (F, …) that oscillates at one frequency, the result of `oscillation`.
+    """The component of values (frames, …) that oscillates at one frequency, the result of `oscillation`.
 
     **Fields**
 
-    - `frequency`: hertz.
+    - `frequency`: frequency of the oscillation in hertz.
     - `amplitude`: (…), in the unit of the values: half of the difference between maximum and minimum.
-    - `phase`: (…), radians from -π to π: the values vary as cos(2πf t + phase), with the times t that were given. The
+    - `phase`: (…), radians from -π to π: the values vary as cos(2πf t + phase), with the given times t in seconds. The
       phase is meaningless where the amplitude is only noise.
-    - `noise`: (…), standard deviation of the amplitude, from the residual of the fit, which includes other
-      oscillations.
-    - `resolution`: hertz.
+    - `noise`: (…), standard deviation of the amplitude, computed from the residual of the fit. The residual includes
+      oscillations at other frequencies.
+    - `resolution`: hertz, smallest difference of two distinguishable frequencies.
 
     **Example:**
 
@@ -153,19 +157,19 @@ class Oscillation:
 def oscillation(
     values: ArrayLike, times: ArrayLike, frequency: float | tuple[float, float], *, window: Window = "hann"
 ) -> Oscillation:
-    """Amplitude and phase with which values oscillate over time. Rows of NaN are left out.
+    """Amplitude and phase with which values oscillate over time at one frequency. Frames with NaN are left out.
 
     **Arguments:**
 
-    - `values` (F, …): in any unit.
-    - `times` (F,): in seconds, which need not be evenly spaced.
-    - `frequency`: hertz; or a band (lowest, highest), in which the frequency with the largest power over all values is
-      found. Frequencies with less than one period in the measured time are not considered.
-    - `window`: "hann", which separates different frequencies better, or "none", which has twice the resolution for a
-      single oscillation.
+    - `values` (F, …): values in each of F frames, in any unit.
+    - `times` (F,): times of the frames in seconds, which need not be evenly spaced.
+    - `frequency`: hertz, or a band (lowest, highest) in which the frequency with the largest power over all values is
+      sought. Frequencies with less than one period in the measured time are not considered.
+    - `window`: "hann", Hann's window, which separates different frequencies better; or "none", with which a single
+      oscillation is resolved twice as finely.
 
-    Raises `ValueError` for fewer than five frames, less than one period, a frequency at or above half the frame rate,
-    and invalid options.
+    Raises `ValueError` for fewer than five frames, less than one period in the measured time, a frequency at or above
+    half the frame rate, and invalid options.
 
     **Example:**
 
@@ -214,11 +218,11 @@ def oscillation(
 def amplitude_spectrum(
     values: ArrayLike, times: ArrayLike, *, window: Window = "hann"
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K ..."]]:
-    """Amplitude of values at every frequency, from one period in the measured time to half the frame rate in steps of
-    half the resolution. Returns the frequencies (K,) in hertz, and the amplitudes (K, …) in the unit of the values.
-    A single oscillation has a peak of the height of its amplitude.
+    """Amplitude spectrum of values. Returns K frequencies in hertz, from one period in the measured time to half the
+    frame rate in steps of half the resolution, and the amplitudes (K, …) in the unit of the values. A single
+    oscillation appears as a peak as high as its amplitude.
 
-    The mean is subtracted first. Rows of NaN are left out.
+    The mean of the values over time is subtracted first. Frames with NaN are left out.
 
     **Arguments:**
 
@@ -245,7 +249,7 @@ def amplitude_spectrum(
 
 
 def _check_band(frequency) -> tuple[float, float]:
-    """The lowest and the highest frequency, equal if a single frequency is given."""
+    """The lowest and the highest frequency in hertz, which are equal if `frequency` is a number."""
     band = (frequency, frequency) if is_number(frequency) else frequency
     if not (
         isinstance(band, tuple | list) and len(band) == 2 and all(is_number(limit) and limit > 0 for limit in band)
@@ -257,7 +261,7 @@ def _check_band(frequency) -> tuple[float, float]:
 
 
 def _finite_rows(values, times) -> tuple[np.ndarray, np.ndarray]:
-    """Rows without NaN as real numbers, and their times."""
+    """Frames (rows) without NaN as real numbers, and their times."""
     rows, row_times = np.asarray(values), np.asarray(times, float)
     if rows.ndim < 1 or rows.dtype.kind not in "iuf" or row_times.shape != rows.shape[:1]:
         raise ValueError(
@@ -272,7 +276,7 @@ def _finite_rows(values, times) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _window_weights(times: np.ndarray, window: Window) -> np.ndarray:
-    """Weight of each time; Hann's window is shifted so that it is not zero at the first and last frames."""
+    """Weight of each frame. Hann's window is shifted so that the first and last frames have nonzero weights."""
     if window == "none":
         return np.ones(len(times))
     step = (times[-1] - times[0]) / (len(times) - 1)
@@ -280,8 +284,8 @@ def _window_weights(times: np.ndarray, window: Window) -> np.ndarray:
 
 
 def _fit_sinusoid(values: np.ndarray, times: np.ndarray, weight: np.ndarray, frequency: float):
-    """Coefficients (4, n), residual variance (n,), and the variance of each coefficient (4,) for noise of unit
-    variance."""
+    """Fit mean, drift, cosine and sine to n series. Returns coefficients (4, n), residual variances (n,), and the
+    variance of each coefficient (4,) for noise of unit variance."""
     angle = 2 * np.pi * frequency * times
     centred_times = times - times.mean()
     design = np.stack([np.ones(len(times)), centred_times / centred_times[-1], np.cos(angle), np.sin(angle)], axis=1)
@@ -296,7 +300,7 @@ def _strongest_frequency(
 ) -> float:
     """The frequency in a band (lowest, highest, resolution) at which the power summed over all values is largest."""
     min_frequency, max_frequency, resolution = band
-    # The first eight principal components, in place of all values.
+    # The first eight principal components of the values represent all values.
     centred = values - values.mean(axis=0)
     left_vectors, singular_values, _ = np.linalg.svd(
         centred @ centred.T if centred.shape[1] > len(centred) else centred, full_matrices=False

@@ -1,4 +1,4 @@
-"""Inclusions: connected regions of an image above a level, with their areas, centroids and shapes."""
+"""Inclusions: connected regions where an image exceeds a level, with their areas, centroids and shapes."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
     from jeit.image.plane import TriangleSurface
 
 _SURFACE_COLUMNS, _SURFACE_ROWS = 48, 24
-# Edge of the strongest region, as a share of its peak.
+# Level of the image at the edge of the strongest region, as a share of the region's peak.
 _REGION_LEVEL = 0.5
 
 
 class SolidForm(Module):
     """An ellipsoid, or an upright elliptic column.
 
-    **Fields**: `centre` in metres; `axes`: three semi-axes as rows, in metres; the last one of a column points to its
-    upper end; `column`: whether the shape is a column.
+    **Fields**: `centre`: (3,) in metres; `axes`: three semi-axes as rows, in metres; the last semi-axis of a column
+    points to the upper end; `column`: whether the shape is a column.
 
     **Example:**
 
@@ -40,7 +40,7 @@ class SolidForm(Module):
     column: bool
 
     def surface(self) -> TriangleSurface:
-        """Closed surface of the shape, as triangles."""
+        """Closed surface of the ellipsoid or column, as triangles."""
         from jeit.image.plane import TriangleSurface
 
         polar_angle = np.linspace(0, np.pi, _SURFACE_ROWS + 1)
@@ -53,7 +53,7 @@ class SolidForm(Module):
             [circles, np.broadcast_to(height[:, None, None], (len(height), _SURFACE_COLUMNS, 1))], axis=2
         )
         axes = np.array(self.axes)
-        axes[0] *= np.sign(np.linalg.det(axes))  # so that all normals point outward
+        axes[0] *= np.sign(np.linalg.det(axes))  # a right-handed system, so that all normals point outward
         lower_nodes = _SURFACE_COLUMNS * np.arange(len(height) - 1)[:, None] + np.arange(_SURFACE_COLUMNS)
         next_lower_nodes = np.roll(lower_nodes, -1, axis=1)
         upper_nodes, next_upper_nodes = lower_nodes + _SURFACE_COLUMNS, next_lower_nodes + _SURFACE_COLUMNS
@@ -67,22 +67,22 @@ class SolidForm(Module):
 
 
 # Minimum area of an inclusion as a fraction of a sheet (a disc of a fourteenth of its width), and minimum volume as a
-# fraction of a solid (a ball of an eighth of its width), whose images have a coarser resolution.
+# fraction of a solid (a ball of an eighth of its width). Images of solids have a coarser resolution.
 _LEAST_AREA = {2: 0.004, 3: 0.001}
 
 
 class Inclusion(Module):
-    """A region of raised or lowered conductivity.
+    """A region of an image where the conductivity is raised or lowered.
 
-    **Fields**: `sign`: +1 for conductive, -1 for resistive; `centroid` in metres, weighted by the change; `area` in m²
-    (in solids: volume in m³); `peak`: the strongest change in the region, for a body fitted with intervals the
-    posterior median of its change, in the unit of the image; `on_surface`:
-    whether the region lies on a surface in space, so that it has an area although its centroid has three coordinates;
-    `form`: shape of an inclusion that was fitted to data as a body in a solid, else None. Where they were estimated:
-    `contrast_interval`: 68 % interval of the change relative to the background; `area_interval`: of the area, m²,
-    or volume, m³; `strength` and `strength_interval`: see `jeit.inverse.shapes.Quantities`; `centroid_radius`: radius,
-    metres, of the circle (in a solid, of the ball) about `centroid` that holds the true centroid with a probability of
-    68 %.
+    **Fields**: `sign`: +1 for conductive, -1 for resistive; `centroid`: in metres, weighted by the change of
+    conductivity; `area`: in m² (in solids: volume in m³); `peak`: the strongest change in the region, in the unit of
+    the image, or the posterior median of the change if the inclusion was fitted as a body with intervals; `on_surface`:
+    whether the region lies on a surface in space, so that the region has an area although its centroid has three
+    coordinates; `form`: shape of an inclusion that was fitted to data as a body in a solid, else None. None if not
+    estimated: `contrast_interval`: 68 % interval of the change relative to the background; `area_interval`: 68 %
+    interval of the area, m², or volume, m³; `strength` and `strength_interval`: see `jeit.inverse.shapes.Quantities`;
+    `centroid_radius`: radius, metres, of the circle (in a solid, of the ball) about `centroid` that holds the true
+    centroid with a probability of 68 %.
 
     **Example:**
 
@@ -106,12 +106,12 @@ class Inclusion(Module):
 
     @property
     def is_solid(self) -> bool:
-        """Whether `area` is a volume."""
+        """Whether the inclusion lies in a solid, so that its `area` is a volume in m³."""
         return len(self.centroid) == 3 and not self.on_surface
 
     @property
     def kind(self) -> str:
-        """Either 'conductive' or 'resistive'."""
+        """Kind of the inclusion: 'conductive' or 'resistive'."""
         return "conductive" if self.sign > 0 else "resistive"
 
     @property
@@ -121,7 +121,7 @@ class Inclusion(Module):
 
     @property
     def radius(self) -> float:
-        """Radius in metres of the disk of the same area, or in 3-D of the ball of the same volume."""
+        """Radius in metres of the disk of the same area as the inclusion, or in 3-D of the ball of the same volume."""
         if self.is_solid:
             return float(np.cbrt(3 * self.area / (4 * np.pi)))
         return float(np.sqrt(self.area / np.pi))
@@ -138,20 +138,21 @@ def find_inclusions(
     noise: Float[Array, " m"] | None = None,
     least_significance: float = 5.5,
 ) -> list[Inclusion]:
-    """Find the peaks of an image, each with the surrounding region where the change exceeds `level` times the peak. The
-    strongest inclusion comes first; peaks that do not satisfy the limits below are artefacts.
+    """Find inclusions: the peaks of an image, each with the surrounding region where the change exceeds `level` times
+    the peak. The strongest inclusion comes first. Peaks below the minimum values given are taken for artefacts.
 
     **Arguments:**
 
     - `mesh`: the mesh.
-    - `image` (m,): change of conductivity in every cell.
-    - `level`: edge of an inclusion, as a share of its peak.
+    - `image` (m,): change of conductivity in every cell of the mesh.
+    - `level`: change at the edge of an inclusion, as a share of its peak.
     - `least_peak`: minimum height of a peak, as a share of the strongest change of either sign.
-    - `least_prominence`: minimum height of a peak above the saddle towards a higher peak, as a share of its own height.
+    - `least_prominence`: minimum height of a peak above the saddle towards a higher peak, as a share of the height of
+      the lower peak.
     - `least_area`: minimum area (volume) of a region, as a fraction of the mesh; default 0.004 for a sheet and 0.001
       for a solid (0.004 of a solid would be a ball of a fifth of its width).
-    - `noise` (m,): standard deviation of the image, in its unit.
-    - `least_significance`: minimum height of a peak relative to the noise, if that is given.
+    - `noise` (m,): standard deviation of the image in every cell, in the unit of the image.
+    - `least_significance`: minimum height of a peak, as a multiple of the `noise` if `noise` is given.
 
     Raises `ValueError` for an image of another size or with NaN.
 
@@ -176,11 +177,11 @@ def find_inclusions(
 
 
 class StrongestRegion:
-    """Computes where an image is strongest: the centroid of the connected region around its peak in which the change
+    """Computes where an image is strongest: the centroid of the connected region around the peak in which the change
     exceeds half of the peak, weighted by area (volume) and change.
 
-    The peak itself is drawn to electrodes, where voltages are most sensitive; the centroid is less so. What depends
-    on the `mesh` alone is computed in advance.
+    The position of the peak itself is biased towards electrodes, where voltages are most sensitive; the centroid is
+    less biased. Quantities that depend on the `mesh` alone are computed in advance.
     """
 
     def __init__(self, mesh: Mesh):
@@ -192,7 +193,7 @@ class StrongestRegion:
         self._measures, self._centroids = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
 
     def __call__(self, change: Float[np.ndarray, " m"]) -> tuple[Float[np.ndarray, " d"], float]:
-        """Return the centroid, in metres, and the peak, with its sign, of a change (m,)."""
+        """Return the centroid of the strongest region, in metres, and the signed peak of a `change` (m,) per cell."""
         peak = int(np.abs(change).argmax())
         relative = change / change[peak] if change[peak] else np.zeros_like(change)
         candidates = relative >= _REGION_LEVEL
@@ -218,8 +219,8 @@ def inclusion_regions(
     noise: Float[Array, " m"] | None = None,
     least_significance: float = 5.5,
 ) -> list[tuple[Inclusion, Bool[np.ndarray, " m"]]]:
-    """The inclusions of `find_inclusions`, each with a mask (m,) of its cells. Raises `ValueError` as `find_inclusions`
-    does."""
+    """Return the inclusions of `find_inclusions`, each with a mask (m,) of the cells of its region. Raises `ValueError`
+    as `find_inclusions` does."""
     values = np.asarray(image)
     if values.shape != (mesh.num_cells,):
         raise ValueError(f"image has shape {values.shape}; give one value for each of the {mesh.num_cells} cells.")

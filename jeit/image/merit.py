@@ -17,34 +17,35 @@ from jeit.arguments import brief, page, picture
 from jeit_solvers.engines import has_values
 from jeit_solvers.module import Module
 
-# Pixels above this fraction of the maximum belong to the target.
+# Pixels above this fraction of the image's maximum belong to the target.
 _TARGET_LEVEL = 0.25
 
 
 class FiguresOfMerit(Module):
-    """GREIT figures of merit of images x of one target each; every field has one value per target.
+    """GREIT figures of merit of images, each of one target; every field has one value per target.
 
-    The quarter-amplitude set Q consists of the pixels with x ≥ max(x) / 4, where x is positive for a change of the
-    target's sign. C is the disc centred at the centre of gravity of Q with the area of Q.
+    Let x be an image, positive for a change of the target's sign. The quarter-amplitude set Q consists of the pixels
+    with x ≥ max(x) / 4. C is the disc centred at the centre of gravity of Q with the area of Q.
 
     **Fields**
 
-    - `amplitude_response`: AR = ∫x / (area of the target · its change), dimensionless. It is 1 if the image contains as
-      much change as the target, and should be the same at all positions.
+    - `amplitude_response`: AR = ∫x / (area of the target · change of the target), dimensionless. AR is 1 if the image
+      contains as much change as the target, and should be the same at all positions.
     - `position_error`: PE = r_t - r_q, metres, where r_t and r_q are the distances of the target and of the centre of
       gravity of Q from the centre of the body. **Positive if the target is imaged too near to the centre.** Ideally
-      zero. A displacement around the centre does not affect it.
+      zero. A displacement of the image around the centre does not affect PE.
     - `resolution`: RES = √(area of Q / area of the body), dimensionless: the radius of a disc with the area of Q,
-      divided by `body_radius`. Ideally small, and the same at all positions.
+      divided by `body_radius`. RES is ideally small, and the same at all positions.
     - `shape_deformation`: SD = (area of Q outside C) / (area of Q), dimensionless, 0 for a round image.
     - `ringing`: RNG = -(∫x over the pixels outside C where x < 0) / (∫x over C), dimensionless and not negative: change
       of the wrong sign around the target, relative to the change in the target. Ideally zero.
-    - `distance`: r_t, metres.
-    - `body_radius`: radius in metres of the disc with the area of the body; lengths divided by it can be compared
-      between bodies.
+    - `distance`: r_t, distance of the target from the centre of the body, metres.
+    - `body_radius`: radius in metres of the disc with the area of the body; lengths divided by this radius can be
+      compared between bodies.
 
     All fields except `amplitude_response`, `distance` and `body_radius` are NaN for an image without a pixel of the
-    target's sign, because Q is empty. The ringing is infinite if the net change in C does not have the target's sign.
+    target's sign, because Q is then empty. The ringing is infinite if the net change in C does not have the target's
+    sign.
 
     **Example:**
 
@@ -92,19 +93,19 @@ def figures_of_merit(
     """GREIT figures of merit of one image or of several images, each of one target. The centre of the body is the
     centre of gravity of its pixels.
 
-    Works under jit and vmap.
+    The function works under `jax.jit` and `jax.vmap`.
 
     **Arguments:**
 
-    - `raster` (rows, columns) or (T, rows, columns): change of conductivity on pixels, NaN outside the body, as
-      returned by `Raster.sample`, row 0 at the top.
-    - `extent`: (x_min, x_max, y_min, y_max) of the raster in metres.
+    - `raster` (rows, columns) or (T, rows, columns) for T targets: change of conductivity on pixels, NaN outside the
+      body, as returned by `Raster.sample`, row 0 at the top.
+    - `extent`: (x_min, x_max, y_min, y_max), edges of the raster in metres.
     - `position` (2,) or (T, 2): centre of each target in metres.
     - `area`: area of each target in m², a number or (T,).
     - `change`: change of conductivity of each target, negative for a resistive one, in the unit of the raster; a number
       or (T,).
 
-    Raises `ValueError` for arguments whose shapes or values do not fit.
+    Raises `ValueError` for arguments whose shapes do not match or whose values are invalid.
 
     **Example:**
 
@@ -155,7 +156,7 @@ def _figures_of_one_image(raster, extent, position, area, change):
 
 
 def _centre_of_gravity(inside, x, y):
-    """Centre of gravity of a set of pixels; NaN for an empty set."""
+    """Centre of gravity of the pixels in the mask `inside`; NaN for an empty mask."""
     size = jnp.sum(inside)
     return jnp.stack([jnp.sum(jnp.where(inside, x, 0)), jnp.sum(jnp.where(inside, y, 0))]) / size
 
@@ -204,13 +205,13 @@ RESISTIVE, CONDUCTIVE = 1, 2
 
 
 def challenge_score(labels: Int[np.ndarray, "256 256"], truth: Int[np.ndarray, "256 256"]) -> float:
-    """Score of the challenge: structural similarity to the true mask, averaged over the conductive and the resistive
-    class; 1 is perfect.
+    """Score of the Kuopio Tomography Challenge 2023: structural similarity (SSIM) of `labels` to the `truth`, averaged
+    over the conductive and the resistive class; 1 is perfect.
 
-    `labels`, `truth`: 0 background, 1 resistive, 2 conductive; 256 × 256 pixels, as in the challenge. Means, variances
-    and covariance are taken in Gaussian windows with a standard deviation of 80 pixels, cut off at ±160 pixels and
-    normalised at the border; the constants of the structural similarity are c1 = 1e-4 and c2 = 9e-4; its mean over all
-    pixels is the score. A class absent from both images scores 1.
+    `labels`, `truth`: 256 × 256 pixels with the labels 0 background, 1 resistive and 2 conductive. The means, variances
+    and covariance in the SSIM are taken in Gaussian windows with a standard deviation of 80 pixels, cut off at ±160
+    pixels and normalised at the border. The constants that stabilise the quotients of the SSIM are c1 = 1e-4 and c2 =
+    9e-4. The score of a class is the mean of the SSIM over all pixels, or 1 if the class is absent from both images.
     Raises `ValueError` for images of another shape or with other labels. Räsänen et al., KTC2023, doi
     10.5281/zenodo.8252370.
     """
@@ -225,7 +226,7 @@ def challenge_score(labels: Int[np.ndarray, "256 256"], truth: Int[np.ndarray, "
 
 
 def _structural_similarity(first: np.ndarray, second: np.ndarray) -> float:
-    """Structural similarity of two masks, averaged over the pixels. Wang et al., IEEE Trans. Image Process. 13
+    """Structural similarity (SSIM) of two masks, averaged over the pixels. Wang et al., IEEE Trans. Image Process. 13
     (2004)."""
     window = _gaussian_window(first.shape[0])
     # A mask equals its own square.
@@ -237,8 +238,8 @@ def _structural_similarity(first: np.ndarray, second: np.ndarray) -> float:
 
 @functools.cache
 def _gaussian_window(size: int) -> np.ndarray:
-    """Matrix of normalised Gaussian weights along one axis, one row per pixel; the two-dimensional window is the
-    product of two of them."""
+    """Matrix (size, size) of normalised Gaussian weights along one image axis, one row per pixel. The two-dimensional
+    window is the product of two such matrices."""
     distance = np.arange(size)[:, None] - np.arange(size)
     weight = np.where(np.abs(distance) <= _WINDOW_HALF_WIDTH, np.exp(-(distance**2) / (2 * _WINDOW_DEVIATION**2)), 0)
     return weight / weight.sum(axis=1, keepdims=True)

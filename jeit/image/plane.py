@@ -1,9 +1,9 @@
 """Sections of solids by planes, and isosurfaces of fields on tetrahedra, by marching simplices.
 
-A field is given by values at the nodes and is linear in every cell. The part of a simplex where it equals a level, or
-of a triangle where it exceeds the level, is a triangle or a quadrilateral; it is stored as four corners, with the last
-corner repeated for a triangle. Doi and Koide, IEICE Trans. E74 (1991) 214-224, for tetrahedra; all cells are processed
-at once, without a loop.
+A field is given by values at the nodes and is linear in every cell. The part of a tetrahedron where the field equals a
+level, or of a triangle where the field exceeds the level, is a triangle or a quadrilateral. Each part is stored as four
+corners, with the last corner repeated for a triangle. Doi and Koide, IEICE Trans. E74 (1991) 214-224, for tetrahedra.
+All cells are processed at once, without a loop.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ _CROSSED_SIDES = [[0, 1], [0, 2]]
 
 
 class CutPieces(NamedTuple):
-    """Pieces cut out of simplices, at most one per simplex.
+    """p pieces with c corners each, cut out of simplices (triangles or tetrahedra), at most one piece per simplex.
 
-    **Fields**: `ends`: (p, c, 2) nodes between which each corner lies; `share`: (p, c) position of the corner between
-    them, from 0 at the first node to 1 at the second; `cell`: (p,) simplex of each piece.
+    **Fields**: `ends`: (p, c, 2) nodes of the edge on which each corner lies; `share`: (p, c) position of the corner on
+    the edge, from 0 at the first node to 1 at the second; `cell`: (p,) index of the simplex of each piece.
     """
 
     ends: Int[np.ndarray, "p c 2"]
@@ -47,25 +47,28 @@ class CutPieces(NamedTuple):
     cell: Int[np.ndarray, " p"]
 
     def at_corners(self, values: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "p c ..."]:
-        """Values at the corners of a quantity that is linear between nodes, such as positions (n, d)."""
+        """Values at the corners of the pieces, interpolated linearly from `values` at the nodes, such as positions (n,
+        d)."""
         share = self.share.reshape(*self.share.shape, *[1] * (values.ndim - 1))
         return (1 - share) * values[self.ends[..., 0]] + share * values[self.ends[..., 1]]
 
 
 def crossed_cells(cells: Int[np.ndarray, "m 4"], values: Float[np.ndarray, " n"], level: float = 0.0) -> CutPieces:
-    """The surface in tetrahedra where `values` (n,) at the nodes equal `level`: polygons with four corners, in order
-    around each polygon. A node at the level counts as above it, so a facet in the surface is not found from both of its
-    cells."""
+    """The surface in tetrahedra on which the field with the `values` (n,) at the nodes equals `level`: polygons with
+    four corners, in order around each polygon. A node at the level counts as above the level, so a facet of the mesh
+    that lies in the surface is found from one of its two cells only."""
     return _cut_cells(cells, values, level, _CROSSED_EDGES)
 
 
 def part_above(triangles: Int[np.ndarray, "b 3"], values: Float[np.ndarray, " n"], level: float = 0.0) -> CutPieces:
-    """The part of a surface of triangles where `values` (n,) at the nodes are at or above `level`."""
+    """The part of a surface of triangles on which the field with the `values` (n,) at the nodes is at or above
+    `level`."""
     return _cut_cells(triangles, values, level, _CORNERS_ABOVE)
 
 
 def crossed_edges(triangles: Int[np.ndarray, "b 3"], values: Float[np.ndarray, " n"], level: float = 0.0) -> CutPieces:
-    """The lines on a surface of triangles where `values` (n,) at the nodes equal `level`: pieces of two corners."""
+    """The lines on a surface of triangles along which the field with the `values` (n,) at the nodes equals `level`:
+    pieces with two corners."""
     return _cut_cells(triangles, values, level, {1: _CROSSED_SIDES, 2: [[0, 2], [1, 2]]})
 
 
@@ -85,8 +88,8 @@ def _cut_cells(cells, values, level: float, cases: dict[int, list[list[int]]]) -
 
 @dataclass(frozen=True)
 class TriangleSurface:
-    """A surface of triangles in space. **Fields**: `points`: (n, 3) metres; `triangles`: (m, 3) indices of points,
-    ordered so that normals point outward.
+    """A surface of triangles in space. **Fields**: `points`: (n, 3) corners of the triangles in metres; `triangles`:
+    (m, 3) indices of points, ordered so that normals point outward.
 
     **Example:**
 
@@ -101,7 +104,7 @@ class TriangleSurface:
 
     @property
     def enclosed(self) -> float:
-        """Volume enclosed by a closed surface, in m³."""
+        """Volume in m³ that the surface encloses; the surface must be closed."""
         a, b, c = (
             np.swapaxes(self.points[self.triangles] - self.points.mean(axis=0), 0, 1)
             if len(self.points)
@@ -111,15 +114,15 @@ class TriangleSurface:
 
 
 def node_values(mesh: Mesh, image: Float[np.ndarray, "..."]) -> Float[np.ndarray, " n"]:
-    """Values (n,) of an image at the nodes.
+    """Values (n,) of an image at the nodes of its mesh.
 
     **Arguments:**
 
     - `mesh`: the mesh.
-    - `image`: values per cell (m,), which are averaged over the cells around each node, weighted by their measure; or
+    - `image`: values per cell (m,), which are averaged over the cells around each node, weighted by area or volume; or
       values per node (n,), which are returned unchanged.
 
-    Raises `ValueError` for another shape, complex values and NaN.
+    Raises `ValueError` for an image of another shape, complex values and NaN.
 
     **Example:**
 
@@ -146,7 +149,7 @@ def node_values(mesh: Mesh, image: Float[np.ndarray, "..."]) -> Float[np.ndarray
 
 
 def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) -> TriangleSurface:
-    """The closed surface of the region where an image exceeds `level`, or, for a negative level, falls below it.
+    """The closed surface of the region where an image exceeds `level`, or, for a negative `level`, is below `level`.
 
     Where the region reaches the wall of the body, the wall closes the surface. The surface has no triangles if no value
     reaches the level.
@@ -154,10 +157,11 @@ def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) ->
     **Arguments:**
 
     - `mesh`: the mesh of a solid.
-    - `values`: (m,) per cell, which are averaged to the nodes first, or (n,) per node; linear in between.
-    - `level`: in the unit of the values.
+    - `values`: the image, per cell (m,) or per node (n,); values per cell are first averaged to the nodes. The image is
+      linear between nodes.
+    - `level`: value of the image on the surface, in the unit of the image.
 
-    Raises `ValueError` for a level that is zero or not a number, and as `node_values`.
+    Raises `ValueError` for a level that is zero or not a number, and as `node_values` does.
 
     **Example:**
 
@@ -183,7 +187,7 @@ def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) ->
     _, first, number = np.unique(key, return_index=True, return_inverse=True)
     ends, share, number = ends.reshape(-1, 2)[first], share.reshape(-1)[first], number.reshape(-1, 4)
     places = (1 - share)[:, None] * points[ends[:, 0]] + share[:, None] * points[ends[:, 1]]
-    # Normals point from values above the level to values below it; facets of the wall have outward normals already.
+    # Normals point from values above the level to values below; facets of the wall have outward normals already.
     inside = points[inner.ends[..., 1]].sum(axis=1) - points[inner.ends[..., 0]].sum(axis=1)
     outward = np.concatenate([inside, _normals(points[np.asarray(mesh.facets)[wall.cell]])])
     triangles = np.concatenate([number[:, [0, 1, 2]], number[:, [0, 2, 3]]])
@@ -194,12 +198,12 @@ def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) ->
 
 
 def _normals(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3"]:
-    """Normals of triangles, with a length of twice the area."""
+    """Normals of triangles with the given corners; each normal is as long as twice the triangle's area."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 AXES = ("x", "y", "z")
-# Tolerance for treating a point as lying in a plane: its distance from the plane divided by the size of the body.
+# Distance from a plane, divided by the size of the body, below which a point counts as lying in the plane.
 _IN_PLANE_TOLERANCE = 1e-9
 
 
@@ -207,10 +211,10 @@ _IN_PLANE_TOLERANCE = 1e-9
 class Plane:
     """A plane in space, with the orientation in which it is viewed.
 
-    **Fields**: `point`: (3,) metres; `toward`, `right`, `up`: (3,) perpendicular unit vectors towards the viewer, to
-    the right and upwards on the page; `name`: name for figures, such as "z = 10 mm".
+    **Fields**: `point`: (3,) point in the plane, metres; `toward`, `right`, `up`: (3,) perpendicular unit vectors
+    towards the viewer, to the right and upwards on the page; `name`: name of the plane in figures, such as "z = 10 mm".
 
-    The z axis points up on the page; in horizontal planes the y axis does. Make a plane with `Plane.at` or
+    The z axis points up on the page; in horizontal planes the y axis points up. Make a plane with `Plane.at` or
     `Plane.through`.
 
     **Example:**
@@ -229,9 +233,9 @@ class Plane:
 
     @classmethod
     def at(cls, axis: str, value: float) -> "Plane":
-        """The plane where the coordinate `axis`, "x", "y" or "z", equals `value` metres. It is viewed from the right,
-        the front or above, so that the two other axes point to the right and up. Raises `ValueError` for another axis
-        or a value that is not a number."""
+        """The plane where the coordinate `axis`, "x", "y" or "z", equals `value` metres. The plane is viewed from the
+        right, the front or above, so that the two other axes point to the right and up. Raises `ValueError` for another
+        axis or a value that is not a number."""
         if axis not in AXES:
             raise ValueError(f"axis must be 'x', 'y' or 'z'; it is {describe(axis)}.")
         if not is_number(value):
@@ -265,18 +269,18 @@ class Plane:
         return (points - self.point) @ self.toward
 
     def on_page(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-        """Coordinates (…, 2) of points to the right and up on the page, in metres. In a plane made with `Plane.at` they
-        are measured along the coordinate axes of the body."""
+        """Coordinates (…, 2) of points to the right and up on the page, in metres. In a plane made with `Plane.at` the
+        coordinates are measured along the coordinate axes of the body."""
         return np.stack([points @ self.right, points @ self.up], axis=-1)
 
 
 @dataclass(frozen=True)
 class Cut:
-    """Section of a solid by a plane.
+    """Section of a solid by a plane: p polygons and an outline of s line segments.
 
     **Fields**: `polygons`: (p, 4, 2) corners in metres on the page of the plane, with the last corner repeated in
-    triangles; `cell`: (p,) cell of each polygon; `outline`: (s, 2, 2) line segments where the plane meets the surface
-    of the body.
+    triangles; `cell`: (p,) index of the cell cut by each polygon; `outline`: (s, 2, 2) line segments where the plane
+    meets the surface of the body.
 
     **Example:**
 
@@ -299,16 +303,16 @@ class Cut:
 
 
 def cut_by_plane(mesh: Mesh, plane: Plane) -> Cut:
-    """Exact section of a solid by a plane: the cells as polygons, and the outline of the section.
+    """Exact section of a solid by a plane: the polygon cut out of each cell, and the outline of the section.
 
-    A plane that contains facets of the mesh cuts the cells behind it, or those in front of it if there are none behind.
+    A plane that contains facets of the mesh cuts the cells behind the plane, or the cells in front if none are behind.
 
     **Arguments:**
 
     - `mesh`: the mesh of the solid.
     - `plane`: the plane.
 
-    Raises `ValueError` for a mesh that is not a solid, and for a plane that misses it.
+    Raises `ValueError` for a mesh that is not a solid, and for a plane that does not meet the solid.
 
     **Example:**
 
@@ -351,6 +355,6 @@ def _page_axes(toward) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _millimetres(value: float) -> str:
-    # Rounded to a tenth of a millimetre, or for small values to three digits.
+    # The value is rounded to a tenth of a millimetre, or for small values to three digits.
     text = f"{1e3 * value:.1f}".removesuffix(".0") if abs(value) >= 0.0095 else f"{1e3 * value:.3g}"
     return text.replace("-", "−") if abs(value) > 5e-10 else "0"

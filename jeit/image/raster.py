@@ -1,4 +1,4 @@
-"""Rasters: images on the cells of a mesh, sampled on a grid of pixels."""
+"""Rasters: grids of pixels on which images on the cells of a mesh are sampled."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from jeit_solvers.module import Module
 
 
 class Raster(Module):
-    """Grid of pixels with the cell that contains each pixel; made once for a mesh and used for every image on it.
+    """Grid of pixels, with the cell of a mesh that contains each pixel; made once for a mesh and used for every image
+    on this mesh.
 
-    **Fields**: `cell`: (rows, columns) index of the cell that contains the centre of the pixel, or -1 outside the mesh;
-    row 0 is at the top (largest y), column 0 at the left; `extent`: (x_min, x_max, y_min, y_max) in metres, the outer
-    edges of the outermost pixels.
+    **Fields**: `cell`: (rows, columns) index of the cell that contains the centre of each pixel, or -1 outside the
+    mesh; row 0 is at the top (largest y), column 0 at the left; `extent`: (x_min, x_max, y_min, y_max) in metres, the
+    outer edges of the outermost pixels.
 
     **Example:**
 
@@ -39,9 +40,9 @@ class Raster(Module):
         extent: tuple[float, float, float, float] | None = None,
         height: float | None = None,
     ) -> "Raster":
-        """Make a raster of a mesh. `shape`: (rows, columns). `extent`: in metres; by default the smallest square around
-        the mesh. `height`: z in metres of the slice through a 3-D mesh, by default half of its height. Raises
-        `ValueError` for an empty extent, and for a surface in space."""
+        """Make a raster of a mesh. `shape`: (rows, columns). `extent`: (x_min, x_max, y_min, y_max) in metres; by
+        default the smallest square around the mesh. `height`: z in metres of the slice through a 3-D mesh, by default
+        half of its height. Raises `ValueError` for an empty extent, and for a surface in space."""
         check_flat(mesh, "rasters")
         points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
         low, high = points.min(axis=0), points.max(axis=0)
@@ -76,7 +77,7 @@ class Raster(Module):
         return np.stack(np.meshgrid(x, y), axis=-1)
 
     def sample(self, image: Inexact[Array, "*frames m"]) -> Float[Array, "*frames rows columns"]:
-        """Values at the pixels of one image (m,) or several images (F, m); NaN outside the mesh."""
+        """Values at the pixels of one image (m,) or several images (frames, m) on m cells; NaN outside the mesh."""
         return _sample(self.cell, image)
 
 
@@ -87,10 +88,11 @@ def _sample(cell, image):
 
 
 def find_cells(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Index of the cell that contains each position (q, d), -1 for positions outside all cells.
+    """Index of the cell that contains each of the `positions` (q, d), -1 for positions outside all cells.
 
-    Tests the cells with the nearest centroids first, and widens the search for the remaining positions. Only cells in
-    the bounding box of the positions are considered, for a slice those that it cuts.
+    For each position the cells with the nearest centroids are tested first, then more cells for the positions that are
+    not yet found. Only cells that reach into the bounding box of the positions are considered; if the positions lie in
+    a slice, these are the cells that the slice cuts.
     """
     corners = points[cells]
     tolerance = 1e-9 * np.ptp(points, axis=0).max()

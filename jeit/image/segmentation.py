@@ -1,4 +1,4 @@
-"""Segmentation of images: regions by geometry, by thresholds and by watersheds."""
+"""Segmentation of images: regions defined by geometry, by thresholds and by watersheds."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from jeit.mesh.geometry import interior_facets
 
 
 def ball_region(mesh: Mesh, centre: ArrayLike, radius: float) -> Bool[np.ndarray, " m"]:
-    """Cells whose centroid lies within a ball, or a disk in a sheet: (m,) True.
+    """Mask (m,) of the cells whose centroid lies within a ball, or in a sheet within a disk.
 
     **Arguments:**
 
     - `mesh`: the mesh.
-    - `centre` (d,): in metres.
-    - `radius`: in metres.
+    - `centre` (d,): centre of the ball in metres.
+    - `radius`: radius of the ball in metres.
 
     Raises `ValueError` for a centre with another number of coordinates, a radius that is not positive, and an empty
     region.
@@ -38,12 +38,12 @@ def ball_region(mesh: Mesh, centre: ArrayLike, radius: float) -> Bool[np.ndarray
 
 
 def box_region(mesh: Mesh, lower: ArrayLike, upper: ArrayLike) -> Bool[np.ndarray, " m"]:
-    """Cells whose centroid lies between two corners: (m,) True.
+    """Mask (m,) of the cells whose centroid lies in an axis-parallel box between two corners.
 
     **Arguments:**
 
     - `mesh`: the mesh.
-    - `lower`, `upper` (d,): corners, metres.
+    - `lower`, `upper` (d,): corners of the box, metres.
 
     Raises `ValueError` for corners with another number of coordinates, for a corner `upper` that is not larger than
     `lower`, and for an empty region.
@@ -62,13 +62,13 @@ def box_region(mesh: Mesh, lower: ArrayLike, upper: ArrayLike) -> Bool[np.ndarra
 
 
 def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None) -> Bool[np.ndarray, " m"]:
-    """Cells whose centroid lies on one side of a point: (m,) True.
+    """Mask (m,) of the cells whose centroid lies on one side of the plane (2-D: line) through a point.
 
     **Arguments:**
 
     - `mesh`: the mesh.
-    - `direction` (d,): direction of the cells from the point; (1, 0) selects the right half.
-    - `point` (d,): in metres, by default the centroid of the body.
+    - `direction` (d,): normal of the plane, which points to the selected side; (1, 0) selects the right half.
+    - `point` (d,): point in the plane in metres, by default the centroid of the body.
 
     Raises `ValueError` for a direction of length zero, and for an empty region.
 
@@ -89,8 +89,8 @@ def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None
 
 
 def _centroids_from(mesh: Mesh, point: ArrayLike, name: str) -> Float[np.ndarray, "m d"]:
-    """Centroids of the cells relative to a place. Raises `ValueError` for a place with another number of
-    coordinates."""
+    """Vectors (m, d) from a `point` to the centroids of the cells. Raises `ValueError` for a point with another number
+    of coordinates."""
     coordinates = np.asarray(point, float)
     if coordinates.shape != (mesh.dimension,) or not np.isfinite(coordinates).all():
         raise ValueError(f"{name} must be {mesh.dimension} finite numbers in metres; it has shape {coordinates.shape}.")
@@ -109,7 +109,7 @@ def _check_not_empty(mesh: Mesh, region, message: str) -> Bool[np.ndarray, " m"]
 
 
 def shared_facets(mesh: Mesh) -> Int[np.ndarray, "m k"]:
-    """Indices (m, k) of the facets that each cell shares with another cell, -1 for facets on the boundary."""
+    """Indices (m, k) of the k facets of each cell that are shared with another cell, -1 for facets on the boundary."""
     pairs, _ = interior_facets(mesh)
     cell, facet = pairs.T.ravel(), np.tile(np.arange(len(pairs)), 2)
     order = np.argsort(cell, kind="stable")
@@ -126,12 +126,12 @@ def basins(
     floor: float,
     least_prominence: float,
 ) -> Int[np.ndarray, " m"]:
-    """Watershed from the top down: for every cell above `floor` the index of the cell at the peak that it belongs to,
-    -1 for cells below.
+    """Segment an image by a watershed from the peaks down. Returns, for every cell above `floor`, the index of the cell
+    at the peak of its basin, and -1 for cells below `floor`.
 
     `change`: (m,) value of every cell; `shared`: (m, k) indices of the facets (`shared_facets`) or nodes that cells
-    share, -1 for none. Where two basins meet, the lower one is merged into the higher one, unless its peak exceeds the
-    meeting point by at least `least_prominence` times its height.
+    share, -1 for none. Where two basins meet, the basin with the lower peak is merged into the other basin, unless the
+    lower peak exceeds the meeting point by at least `least_prominence` times this peak's height.
     """
     peak = np.full(len(change), -1)
     label_of_place: dict[int, int] = {}
@@ -163,15 +163,17 @@ def segment(
     least_peak: float = 0.3,
     least_area: float = 0.004,
 ) -> UInt8[np.ndarray, "rows columns"]:
-    """Labels of the pixels: 0 background, 1 resistive, 2 conductive; 0 outside the body.
+    """Segment an image into labels of the pixels: 0 background or outside the body, 1 resistive, 2 conductive.
 
     **Arguments:**
 
     - `image` (rows, columns): deviation from the background, negative where resistive, NaN outside the body. For
-      absolute images give the logarithm of conductivity divided by background, which weights both signs equally.
-    - `level`: edge of a label, as a share of the peak of its sign (one half is the middle of a blurred edge).
-    - `least_peak`: minimum peak of a sign, as a share of the strongest peak of both signs.
-    - `least_area`: minimum area of an island, as a fraction of the body; smaller ones are artefacts.
+      absolute images give the logarithm of the conductivity divided by the background conductivity, which weights both
+      signs equally.
+    - `level`: value at the edge of a labelled region, as a share of the peak of the same sign (one half is the middle
+      of a blurred edge).
+    - `least_peak`: minimum height of the peak of either sign, as a share of the higher peak of both signs.
+    - `least_area`: minimum area of a connected region, as a fraction of the body; smaller regions are artefacts.
 
     Raises `ValueError` for an image that is not two-dimensional, or has no pixel inside the body.
 

@@ -23,9 +23,10 @@ from jeit_solvers import Status, as_minimum, ended_number, symmetric_inverse
 from jeit_solvers.engines import as_array, has_values, on_device, on_host, undifferentiated
 from jeit_solvers.module import Module
 
-# Logarithm of the ratio of a contact impedance to the model's, beyond which it no longer changes the voltages.
+# Logarithm of the ratio of a contact impedance to the model's, beyond which the impedance no longer changes the
+# voltages.
 FARTHEST = 50.0
-# Tolerance of the parameters and the misfit of a fit inside jax.jit, jax.grad or jax.vmap: as small as double precision
+# Tolerance of the parameters and the misfit in a fit inside jax.jit, jax.grad or jax.vmap: as small as double precision
 # allows.
 _TRACED_TOLERANCE = 1e-12
 
@@ -44,8 +45,8 @@ class TracedFit(NamedTuple):
 
 @eqx.filter_jit
 def traced_fit(model: ForwardModel, measured: Float[Array, " M"], used, contact: str, max_steps: int) -> TracedFit:
-    """Fit log σ and log (z·σ / model's z) to the channels `used` by least squares, inside a JAX transformation; see
-    `calibrate`."""
+    """Fit the logarithms of the conductivity σ and of z·σ / (model's contact impedance z) to the channels `used` by
+    least squares, inside a JAX transformation; see `calibrate`."""
     problem = on_device((model, measured, used))
     unit_voltages = jnp.where(used, model.voltages(1.0), 0)
     num_parameters = {"fixed": 1, "common": 2, "each": 1 + model.electrodes.num_electrodes}[contact]
@@ -83,7 +84,7 @@ def _fitted_model(contact: str, parameters, model: ForwardModel) -> tuple[Forwar
 
 
 def _relative_residual(contact: str, parameters, problem):
-    """Residual (predicted - measured) / ‖measured‖ of the channels in use, zero for the others."""
+    """Residual (predicted - measured) / ‖measured‖ (M,) of the channels in use, zero for the other channels."""
     model, measured, used = problem
     fitted_model, conductivity = _fitted_model(contact, parameters, model)
     predicted = fitted_model.voltages(conductivity)
@@ -91,20 +92,20 @@ def _relative_residual(contact: str, parameters, problem):
 
 
 def _gradient(contact: str, parameters, problem):
-    """Gradient of half the sum of squared residuals."""
+    """Gradient (p,) of half the sum of squared residuals with respect to the parameters."""
     return jax.grad(
         lambda trial_parameters: 0.5 * jnp.sum(_relative_residual(contact, trial_parameters, problem) ** 2)
     )(parameters)
 
 
 def _normal_matrix(contact: str, parameters, problem):
-    """Normal matrix JᵀJ (p, p) of the residual."""
+    """Normal matrix JᵀJ (p, p) of the fit, with the Jacobian J of the residual."""
     jacobian = jax.jacfwd(lambda trial_parameters: _relative_residual(contact, trial_parameters, problem))(parameters)
     return jacobian.T @ jacobian
 
 
 def _inverse_normal_product(contact: str, parameters, problem):
-    """Function that multiplies a vector with the inverse of JᵀJ."""
+    """Function that multiplies a vector by the inverse of the normal matrix JᵀJ."""
     inverse = symmetric_inverse(_normal_matrix(contact, parameters, problem))
     return lambda vector: inverse @ vector
 
@@ -116,11 +117,11 @@ _REASONS = {
 _TRACED_REASON = "It was fitted inside a transformation of JAX; the status says how that ended."
 
 # Relative misfit above which `Calibration.note` doubts the model. The misfit is 1 % for the KIT4 tanks and 8 % for the
-# Kuopio challenge, whose geometry is known.
+# tank of the Kuopio challenge, whose geometries are known.
 _LARGE_MISFIT = 0.12
-# The largest voltage of a frame must lie between this number and its reciprocal, in volts.
+# The largest voltage of a frame, in volts, must lie between this number and its reciprocal.
 _MIN_VOLTAGE = 1e-30
-# Relative change of the misfit or the parameters that ends a fit: on small meshes, and on large ones.
+# Relative change of the misfit or the parameters that ends a fit: on small meshes, and on large meshes.
 _TOLERANCE, _TOLERANCE_LARGE_MESH = 1e-8, 1e-4
 # Number of cells above which a mesh counts as large. A step of the fit then takes seconds.
 _LARGE_MESH_CELLS = 30_000
@@ -132,10 +133,11 @@ class Calibration(Module):
     **Fields**: `model`: the model with fitted contact impedance; `conductivity`: uniform background (S/m; 2-D: S),
     complex if the voltages are; `voltages` (M,): voltages predicted by the fitted model; `misfit`: ‖predicted -
     measured‖ / ‖measured‖ over the channels used; `contact_deviation` (k,): standard deviations of the logarithms of
-    the k fitted contact impedances, estimated from the residuals; `iterations`: number of iterations; `outcome`:
-    `Status.number` of how the fit ended; `reason`: a sentence on why it did not converge, empty if it did; `shift`
-    (L, a): displacements of electrodes whose positions were estimated (`jeit.inverse.placement`), metres, else None;
-    `model_error`: the `ModelError` of positions and contact impedances, if it was estimated.
+    the k fitted contact impedances, estimated from the residuals; `iterations`: number of iterations; `outcome`: number
+    of the `Status` with which the fit ended; `reason`: a sentence on why the fit did not converge, empty if it
+    converged; `shift` (L, a): displacements of the electrodes along a directions each, metres, if their positions were
+    estimated (`jeit.inverse.placement`), else None; `model_error`: the `ModelError` of positions and contact
+    impedances, if estimated, else None.
 
     **Example:**
 
@@ -175,12 +177,12 @@ class Calibration(Module):
 
     @property
     def distinguishes_contacts(self) -> bool:
-        """Whether the fit converged and every fitted contact impedance is known to within a factor of three."""
+        """Whether the fit converged and determines every fitted contact impedance to within a factor of three."""
         return bool(self.status == Status.CONVERGED and (self.contact_deviation < 1).all())
 
     @property
     def note(self) -> str:
-        """Sentence on estimated electrode positions, or else on a large misfit; empty if there is neither."""
+        """Sentence on estimated electrode positions, or else on a large misfit; empty if neither applies."""
         if self.shift is not None:
             distances = 1e3 * np.linalg.norm(np.asarray(self.shift), axis=1)
             return (
@@ -219,16 +221,16 @@ def calibrate(
     1/σ at fixed z·σ). For complex voltages the background σ + iωε is complex, with the two parts of its logarithm as
     parameters; contact impedances stay real.
 
-    Works inside `jax.grad`, `jax.vmap` and `jax.jit`, with respect to the voltages and all fields of the model.
-    Derivatives of the minimum follow from the implicit function theorem with the full Hessian.
+    The function works inside `jax.grad`, `jax.vmap` and `jax.jit`, with respect to the voltages and all fields of the
+    model. Derivatives of the minimum follow from the implicit function theorem with the full Hessian.
 
     **Arguments:**
 
     - `model`: the forward model.
-    - `voltages` (M,): of the body without changes, such as the empty tank, volts.
+    - `voltages` (M,): voltages of the undisturbed body, such as the empty tank, volts.
     - `mask` (M,): True for the channels to use.
-    - `contact`: "common" fits one factor of the model's contact impedance for all electrodes; "each" fits one per
-      electrode; "fixed" keeps the model's contact impedance.
+    - `contact`: "common" fits one factor of the model's contact impedance for all electrodes; "each" fits one factor
+      per electrode; "fixed" keeps the model's contact impedance.
     - `max_steps`: maximum number of steps.
 
     Raises `ValueError` for a frame of another shape or without signal.
@@ -329,8 +331,8 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
 
 
 def _standard_deviations(solution: "scipy.optimize.OptimizeResult") -> Float[np.ndarray, " p"]:
-    """Standard deviations of the fitted parameters, estimated from the Jacobian and the residuals as if these were
-    independent errors of equal variance."""
+    """Standard deviations of the fitted parameters, estimated from the Jacobian and the residuals as if the residuals
+    were independent errors of equal variance."""
     _, singular_values, right_vectors = np.linalg.svd(solution.jac, full_matrices=False)
     degrees_of_freedom = max(np.count_nonzero(solution.fun) - len(solution.x), 1)
     return np.linalg.norm(right_vectors / singular_values[:, None], axis=0) * np.sqrt(
@@ -339,7 +341,8 @@ def _standard_deviations(solution: "scipy.optimize.OptimizeResult") -> Float[np.
 
 
 class _CalibrationProblem:
-    """Voltages as a function of log σ and of log (z·σ / model's z), which is one number or one per electrode.
+    """Voltages as a function of two kinds of parameters: log σ, and log (z·σ / model's z), which is one number or one
+    number per electrode, for the conductivity σ and the contact impedance z.
 
     Voltages are proportional to 1/σ at fixed z·σ, so these parameters are nearly uncorrelated. For a complex
     admittivity γ, the first two parameters are log |γ| and the phase.
@@ -353,7 +356,8 @@ class _CalibrationProblem:
 
     @property
     def num_parameters(self) -> int:
-        """Number of parameters: one for the conductivity, or two if it is complex, plus the contact impedances."""
+        """Number of parameters: one for the conductivity, or two if the conductivity is complex, plus the contact
+        impedances."""
         return (
             self.first_contact
             + {"fixed": 0, "common": 1, "each": self.initial_model.electrodes.num_electrodes}[self.contact]
@@ -399,8 +403,8 @@ class _CalibrationProblem:
         )
 
     def _with_phase(self, magnitude_derivative, derivative_at_fixed_contact):
-        """Column of derivatives with respect to log |γ| and, for a complex γ, to its phase at fixed contact
-        impedance."""
+        """Columns of the Jacobian: derivatives of the voltages with respect to log |γ| and, for a complex admittivity
+        γ, with respect to its phase at fixed contact impedance."""
         return (
             np.concatenate([magnitude_derivative, 1j * derivative_at_fixed_contact], axis=1)
             if self.is_complex
@@ -408,7 +412,7 @@ class _CalibrationProblem:
         )
 
     def _fields(self, parameters):
-        """Model, fields and transfer impedance for these parameters; the latest result is cached."""
+        """Model, fields and transfer impedance for these parameters; the last result is cached."""
         parameter_bytes = parameters.tobytes()
         if self.cached_fields is None or self.cached_fields[0] != parameter_bytes:
             model, conductivity = self.model(parameters)

@@ -1,15 +1,15 @@
 """Independent channels of a protocol, and the noise of channels.
 
 The transfer impedance Z (L, L) of a body is symmetric with rows that sum to zero, so it has L (L - 1) / 2 independent
-values. A protocol often has more channels, which repeat or combine these: 208 adjacent channels have 104 independent
-values, 2356 channels of a tank have 376. All channels v are combinations of r independent ones, v = T v[index] with T
-(M, r). For data y with weights W = 1 / noise², the weighted estimates ŷ of the independent channels hold the same
-information,
+values. A protocol often has more channels, which repeat or combine these values: 208 adjacent channels have 104
+independent values, 2356 channels of a tank have 376. The voltages v of all M channels are combinations of the voltages
+of r independent channels, v = T v[index] with T (M, r). For measured voltages y with weights W = 1 / noise², the
+weighted least-squares estimates ŷ of the independent voltages hold the same information as y,
 
     ‖W^½ (T u - y)‖² = (u - ŷ)ᵀ G (u - ŷ) + c,   G = TᵀWT,   ŷ = G⁻¹TᵀWy,
 
-where c does not depend on u, and least squares with ŷ is much cheaper, because the work grows with the square of the
-number of channels.
+where u are predicted independent voltages and c does not depend on u. Least squares with ŷ is much cheaper, because the
+work grows with the square of the number of channels.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _RANK_TOLERANCE = 1e-9
 
 
 class Data(Module):
-    """Voltages of independent channels and their noise.
+    """Voltages of r independent channels and their noise.
 
-    **Fields**: `voltages` (r,): ŷ, volts; `weight` (r,): 1 / volts; `covariance`, `precision` (r, r): covariance of
-    weight · ŷ and its inverse, which has a unit diagonal; `rest`: the constant c above, the sum of squared
-    residuals that no conductivity can explain.
+    ***Fields**: `voltages` (r,): estimated voltages ŷ, volts; `weight` (r,): weights of the voltages, 1 / volts;
+    `covariance`, `precision` (r, r): covariance of weight · ŷ, and its inverse, which has a unit diagonal; `rest`: the
+    constant c of `jeit.inverse.channels`, the sum of squared residuals that no conductivity can explain.
     """
 
     voltages: Float[Array, " r"]
@@ -49,15 +49,16 @@ class Data(Module):
 
 
 class IndependentChannels(Module):
-    """Channels that determine all others: v = `combination` (M, r) · v[`index` (r,)] for every body."""
+    """Independent channels of a protocol, which determine all other channels: the voltages of any body satisfy v =
+    `combination` (M, r) · v[`index` (r,)]."""
 
     index: Int[Array, " r"]
     combination: Float[Array, "M r"]
 
     @classmethod
     def create(cls, protocol: Protocol) -> "IndependentChannels":
-        """Choose channels by a pivoted QR factorisation of the linear forms that map Z to the channels. If the protocol
-        is traced, all channels are used."""
+        """Choose independent channels by a pivoted QR factorisation of the linear map from the transfer impedance Z to
+        the voltages of the channels. If the protocol is traced, all channels are used."""
         if not has_values(protocol):
             num_channels = protocol.num_measurements
             return cls(as_array(np.arange(num_channels)), as_array(np.eye(num_channels)))
@@ -78,12 +79,12 @@ class IndependentChannels(Module):
         return cls(as_array(order[:rank][ascending_order]), as_array(combination[:, ascending_order]))
 
     def weigh(self, noise: Float[Array, " M"]) -> "Weighing":
-        """Compute the map from voltages with noise of this standard deviation, (M,) volts, to `Data`."""
+        """Compute the map from voltages to `Data`; `noise` (M,): standard deviation of the voltages, volts."""
         return _compute_weighing(self.combination, noise)
 
 
 class Weighing(Module):
-    """Map from voltages to `Data`, which is the same for all frames of equal noise.
+    """Map from voltages (M,) to `Data`, which is the same for all frames of equal noise.
 
     **Fields**: `noise` (M,): standard deviations, volts; `estimator` (r, M): matrix with ŷ = estimator · y; `weight`,
     `covariance`, `precision`: as in `Data`.
@@ -96,7 +97,7 @@ class Weighing(Module):
     precision: Float[Array, "r r"]
 
     def combine(self, voltages: Float[Array, " M"]) -> Data:
-        """Combine voltages (M,) into the data ŷ."""
+        """Combine voltages (M,) into the estimates ŷ of the independent channels."""
         return _combine_voltages(self, voltages)
 
 
@@ -129,14 +130,14 @@ def relative_noise(
     """Standard deviation of channels whose errors grow with their voltages: relative · √(v² + (floor · median|v|)²).
 
     In real tanks most errors of difference data are proportional to the voltage, because the model does not describe
-    gains, electrode shapes and depth exactly; they are largest where driven electrodes are read.
+    gains, electrode shapes and depth exactly. The errors are largest for channels that read driven electrodes.
 
     **Arguments:**
 
     - `voltages` (M,): reference frame, volts.
-    - `mask` (M,): True for usable channels; others are left out of the median and get 1.
+    - `mask` (M,): True for usable channels; other channels are left out of the median and get the value 1.
     - `relative`: error as a fraction of the voltage.
-    - `floor`: voltage, as a fraction of the median, below which errors do not fall further.
+    - `floor`: voltage, as a fraction of the median voltage, below which errors do not decrease further.
 
     **Example:**
 
@@ -154,11 +155,11 @@ def relative_noise(
 def electrode_misfits(
     protocol: Protocol, residual: Float[Array, " M"], noise: Float[Array, " M"], mask: Bool[Array, " M"]
 ) -> Float[np.ndarray, " L"]:
-    """Misfit (L,) of the channels that read each electrode, divided by the median over all electrodes.
+    """Misfit of the channels that read each of L electrodes, (L,), divided by the median misfit over all electrodes.
 
-    `residual` (M,): predicted - measured, volts; `noise` (M,): volts, see `relative_noise`; `mask`: True for usable
-    channels. Electrodes that no usable channel reads get 1. A value far above 1 indicates an electrode whose gain,
-    offset or position differs from the model's.
+    `residual` (M,): predicted - measured voltages, volts; `noise` (M,): standard deviation of the channels in volts,
+    see `relative_noise`; `mask`: True for usable channels. Electrodes that no usable channel reads get 1. A misfit far
+    above 1 indicates an electrode whose gain, offset or position differs from the model's.
     """
     used = np.asarray(mask)
     reads_electrode = (np.asarray(protocol.channel_measurement) != 0) & used[:, None]
@@ -178,15 +179,15 @@ def repeated_noise(
     """Standard deviation (M,) of the channels of a single frame, in volts, estimated from repeated frames of an
     unchanged body.
 
-    Estimates from few frames are uncertain, so variances are shrunk towards their median over channels.
+    Estimates from few frames are uncertain, so the variances of the channels are shrunk towards their median.
 
     **Arguments:**
 
-    - `frames` (F, M): volts, F at least 2.
+    - `frames` (F, M): voltages of F frames in volts, F at least 2.
     - `mask` (F, M) or (M,): True for usable voltages; a channel with fewer than two usable voltages gets 1.
-    - `prior_frames`: weight of the median, in frames.
+    - `prior_frames`: weight of the median, as a number of frames.
 
-    Raises `ValueError` for other shapes, for identical frames, and for NaN in usable voltages.
+    Raises `ValueError` for arrays of other shapes, for identical frames, and for NaN in usable voltages.
 
     **Example:**
 

@@ -1,8 +1,8 @@
 """Linearised problem of difference imaging: checks of its arguments, whitening and decomposition.
 
 Without derivatives the problem is solved with the eigendecomposition of `jeit.inverse.spectrum`. For traced arguments
-it is solved for one hyperparameter without an eigendecomposition (`DirectProblem`), because eigenvectors of equal
-eigenvalues, which occur for symmetric bodies, have no derivatives although the images have. In the notation of
+the problem is solved for one hyperparameter without an eigendecomposition (`DirectProblem`), because eigenvectors of
+equal eigenvalues, which occur for symmetric bodies, have no derivatives although the images have. In the notation of
 `jeit.inverse.spectrum`,
 
     R_λ = ΓJᵀK⁻¹(I - BGᵀ) + NGᵀ,   G = K⁻¹B(BᵀK⁻¹B)⁻¹,   K = JΓJᵀ + λ²I,   B = JN.
@@ -33,7 +33,8 @@ from jeit_solvers.module import Module
 
 
 class DirectProblem(Module):
-    """Whitened linear problem without an eigendecomposition; it has the methods of a `Spectrum` that compute images.
+    """Whitened linear problem without an eigendecomposition. The class has those methods of a `Spectrum` that compute
+    images.
 
     **Fields**: `directions` (M, r): orthonormal combinations of the channels; `jacobian` (r, m): Jacobian J of the
     combinations; `product` (m, r): ΓJᵀ; `null_space` (m, p): basis N of the prior's null space.
@@ -70,17 +71,18 @@ class DirectProblem(Module):
         return matrix @ self.directions.T
 
 
-# Singular values below this fraction of the largest are rounding errors.
+# Singular values below this fraction of the largest singular value are rounding errors.
 _RANK_TOLERANCE = 1e-12
 
 
 class Linearisation(Module):
-    """Linear problem v = J x at a background conductivity for the channels in use, with rows divided by their noise.
+    """Linearised problem v = J x at a background conductivity, for the K channels in use, with rows divided by the
+    noise of their channels.
 
-    **Fields**: `spectrum`: the `Spectrum` of the problem, or a `DirectProblem` if it is traced (by a derivative,
-    `jax.jit` or `jax.vmap`), with which rules for λ do not work; `prior`; `channels` (K,): channels in use;
-    `root_weight` (K,): 1 / standard deviation of these, 1 / volts; `num_channels`: number of channels M of the
-    protocol.
+    **Fields**: `spectrum`: the `Spectrum` of the problem, or a `DirectProblem` if the problem is traced (by a
+    derivative, `jax.jit` or `jax.vmap`), with which rules for λ do not work; `prior`; `channels` (K,): indices of the
+    channels in use; `root_weight` (K,): 1 / standard deviation of the noise of these channels, 1 / volts;
+    `num_channels`: number of channels M of the protocol.
     """
 
     spectrum: Spectrum | DirectProblem
@@ -99,8 +101,8 @@ class Linearisation(Module):
         noise: Float[Array, " M"] | float = 1.0,
         mask: Bool[Array, " M"] | None = None,
     ) -> "Linearisation":
-        """Linearise at `conductivity`, S/m (2-D: S); arguments as in `one_step`. Raises `ValueError` for arguments that
-        do not fit together."""
+        """Linearise the problem at `conductivity`, S/m (2-D: S); arguments as in `one_step`. Raises `ValueError` for
+        invalid or inconsistent arguments."""
         prior = PRIOR if prior is None else prior
         check_model(model)
         check_prior(prior)
@@ -130,7 +132,8 @@ class Linearisation(Module):
         return cls(spectrum, prior, channels, root_weight, model.protocol.num_measurements)
 
     def whiten(self, difference: ArrayLike) -> Float[Array, " K"]:
-        """Change of voltages (M,) divided by the standard deviations, for the channels in use (K,).
+        """Change of voltages `difference` (M,) divided by the standard deviations of the channels, for the channels in
+        use (K,).
 
         Raises `ValueError` for another number of channels and, unless traced, for NaN or infinite values in channels in
         use.
@@ -147,7 +150,8 @@ class Linearisation(Module):
         return as_array(data)
 
     def matrix(self, hyperparameter) -> Float[Array, "m M"]:
-        """Reconstruction matrix: change of conductivity per volt, zero for channels not in use."""
+        """Reconstruction matrix (m, M) for hyperparameter λ: change of conductivity per volt, zero for channels not in
+        use."""
         if not has_values(self.spectrum, self.root_weight, hyperparameter):
             channel_matrix = jnp.asarray(self.spectrum.reconstruction(hyperparameter)) * self.root_weight
             return (
@@ -159,8 +163,8 @@ class Linearisation(Module):
         return as_array(images @ weights)
 
     def factors(self, hyperparameter) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "k M"]]:
-        """Factors of the reconstruction matrix: images (m, k), and their weights (k, M) in 1 / volts. Not available for
-        traced problems."""
+        """Factors of the reconstruction matrix: images (m, k), and weights of the images (k, M) in 1 / volts. Not
+        available for traced problems."""
         assert isinstance(self.spectrum, Spectrum)
         spectrum, host_hyperparameter = on_host((self.spectrum, hyperparameter))  # NumPy arrays are not copied
         images, whitened = (np.asarray(factor) for factor in spectrum.factors(host_hyperparameter))
@@ -172,8 +176,8 @@ class Linearisation(Module):
 def combined_blocks(
     model: ForwardModel, conductivity, channels: Int[np.ndarray, " K"], weights: Float[Any, "r K"]
 ) -> Iterator[tuple[slice, Any]]:
-    """Iterate over blocks of b cells, to limit memory, and yield the cells and the weighted sums (r, b) of the
-    channels' Jacobians there, in NumPy.
+    """Iterate over blocks of b cells, to limit memory. Yields the cells of the block and r weighted sums (r, b) of the
+    channels' Jacobians in these cells, in NumPy.
 
     `conductivity` in S/m (2-D: S). Raises `ValueError` for an invalid conductivity.
     """
@@ -181,7 +185,8 @@ def combined_blocks(
     mesh, protocol, fields = on_host((model.mesh, model.protocol.subset(channels), fields))
     num_electrodes = protocol.num_electrodes
     if num_electrodes * (num_electrodes + 1) // 2 < len(channels):
-        # Products of fields are fewer than channels, so they are computed: ∂v = -Σ_ab d_a m_b ∫ ∇u_a · ∇u_b.
+        # There are fewer products of fields than channels, so the products are computed: ∂v = -Σ_ab d_a m_b ∫ ∇u_a ·
+        # ∇u_b.
         weights, blocks = -weights @ _linear_forms(model.protocol, channels), field_products(mesh, fields)
     else:
         blocks = jacobian_blocks(mesh, protocol, fields)
@@ -192,7 +197,8 @@ def combined_blocks(
 def combined_jacobian(
     model: ForwardModel, conductivity, channels: Int[np.ndarray, " K"], weights: Float[Any, "r K"]
 ) -> Inexact[Any, "r m"]:
-    """Weighted sums (r, m) of the channels' Jacobians; `conductivity` in S/m (2-D: S)."""
+    """Weighted sums (r, m) of the Jacobians of `channels` (K,), with `weights` (r, K); `conductivity` in S/m (2-D:
+    S)."""
     number_type = complex if np.iscomplexobj(conductivity) else float
     jacobian = np.empty((len(weights), model.mesh.num_cells), number_type)
     for cells, block in combined_blocks(model, conductivity, channels, weights):
@@ -201,8 +207,8 @@ def combined_jacobian(
 
 
 def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, Float[Array, " K"]]:
-    """Indices (K,) of the channels in use, and the reciprocals (K,) of their noise, 1 / volts. Raises `ValueError` for
-    an invalid mask or noise."""
+    """Indices (K,) of the channels in use, and the reciprocals (K,) of the standard deviations of their noise, 1 /
+    volts. Raises `ValueError` for an invalid mask or noise."""
     check_mask(mask)
     num_channels = model.protocol.num_measurements
     used = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
@@ -226,8 +232,8 @@ def check_mask(mask) -> None:
 
 
 def data_directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarray, "K r"]:
-    """Orthonormal basis of the changes of whitened data that changes of conductivity can cause. Its dimension is at
-    most L(L - 1)/2 for L electrodes, because all channels are combinations of that many transfer impedances.
+    """Orthonormal basis (K, r) of the changes of whitened data that changes of conductivity can cause. The dimension r
+    is at most L(L - 1)/2 for L electrodes, because all channels are combinations of L(L - 1)/2 transfer impedances.
 
     For a drive d and a measurement m, which sum to zero, and a symmetric matrix G (the transfer impedance or its
     derivative), Σ_ab d_a m_b G_ab = Σ_a<b (d_a m_b + d_b m_a)(G_ab - (G_aa + G_bb)/2).
@@ -239,7 +245,8 @@ def data_directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarr
 
 
 def _traced_directions(protocol: Protocol, channels, root_weight) -> Float[Array, "K r"]:
-    """`data_directions`, differentiable with respect to the weights; the identity if the protocol is traced."""
+    """Basis of `data_directions`, differentiable with respect to the weights; the identity if the protocol is
+    traced."""
     if not has_values(protocol):
         return jnp.eye(len(channels))
     directions, singular_values, _ = np.linalg.svd(_pair_coefficients(protocol, channels), full_matrices=False)
@@ -249,7 +256,8 @@ def _traced_directions(protocol: Protocol, channels, root_weight) -> Float[Array
 
 
 def _pair_coefficients(protocol: Protocol, channels) -> Float[np.ndarray, "K e"]:
-    """Coefficients (K, e) of the channels for each of the e pairs of electrodes."""
+    """Coefficients (K, e) by which the voltages of K channels depend on the transfer impedances of e pairs of
+    electrodes."""
     rows, columns = np.triu_indices(protocol.num_electrodes)
     return _linear_forms(protocol, channels)[:, rows < columns]
 

@@ -1,14 +1,14 @@
-"""Electrode positions and contact impedances estimated from a reference frame.
+"""Estimation of electrode positions and contact impedances from a reference frame.
 
 Electrodes are rarely exactly where a description says, and their contact impedances differ. Both are estimated from a
-frame of the homogeneous body. With shifts t of the electrodes along the directions in which they can move, contact
+frame y of the homogeneous body. With shifts t of the electrodes along the directions in which they can move, contact
 impedances z = z₀ e^ζ and a conductivity σ, the estimate minimises
 
     ½ ‖(v(σ, t, z) - y) / κn‖² + ½ ‖t / s‖² + ½ ζᵀ Γ⁻¹ ζ,
 
-where n is the `relative_noise` of the channels, s the prior standard deviation of the positions, and Γ the prior
-covariance of the logarithms of the contact impedances, which have a common part. κ is estimated from the residual.
-Derivatives need no further solve: at fixed fields only the energy of electrode l depends on t_l
+where v are the predicted voltages, n is the `relative_noise` of the channels, s the prior standard deviation of the
+positions, and Γ the prior covariance of the logarithms ζ, which have a common part. The factor κ is estimated from the
+residual. Derivatives need no further solve: at fixed fields only the energy of electrode l depends on t_l
 (`jeit.forward.changes`).
 
 Kolehmainen, Vauhkonen, Karjalainen and Kaipio, Physiological Measurement 18 (1997) 289, errors of electrode positions;
@@ -44,19 +44,19 @@ _OWN_CONTACT_DEVIATION, _COMMON_CONTACT_DEVIATION, _CONDUCTIVITY_DEVIATION = 1.0
 _MAX_STEPS, _RTOL = {2: (40, 40), 3: (5, 3)}, {2: 1e-4, 3: 3e-3}
 # Default standard deviation of electrode positions, as a share of the width of the body: 2° of a disk.
 _DEFAULT_POSITION = 0.0175
-# Minimum of κ, which is in units of `relative_noise`: 0.1 means 0.1 % of a voltage.
+# Minimum of κ, the noise in units of `relative_noise`: 0.1 means 0.1 % of a voltage.
 _MIN_NOISE = 0.1
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Uncertainty of the description of a sensor, as standard deviations. All but the first are relative: 0.1 is 10 %.
+    """Uncertainty of the description of a sensor, as standard deviations. All but `position` are relative: 0.1 is 10 %.
 
-    **Fields**: `position`: of electrode positions, metres, in every direction in which they can move; default: 0.0175
-    of the width of the body, which is 2° on a disk. `drift`: of the logarithm of each contact impedance, from the
-    reference to the frame. `size`: of the lengths of the body, relative. `other`: of all other errors of the model, as
-    a share of the difference of the two frames; if the misfit of the reference is larger, it is used instead. Raises
-    `ValueError` for values that are negative or not finite, and for sizes and others above 1.
+    ***Fields**: `position`: standard deviation of electrode positions, metres, in every direction in which electrodes
+    can move; default: 0.0175 of the width of the body, which is 2° on a disk. `drift`: of the logarithm of each contact
+    impedance, between the reference and the frame. `size`: of the lengths of the body. `other`: of all other errors of
+    the model, as a share of the difference of the two frames; if the misfit of the reference is larger, the misfit is
+    used instead. Raises `ValueError` for values that are negative or not finite, and for `size` or `other` above 1.
 
     **Example:**
 
@@ -91,7 +91,7 @@ class Placement(NamedTuple):
 
     **Fields**: `model`: the model with the estimated electrodes; `conductivity`: estimated background, S/m (2-D: S);
     `shift` (L, a): displacements along the a directions in which each electrode can move, metres; `deviation` (L, a):
-    their posterior standard deviations, metres; `error`: the `ModelError` that remains.
+    posterior standard deviations of the displacements, metres; `error`: the remaining `ModelError`.
 
     **Example:**
 
@@ -109,12 +109,12 @@ class Placement(NamedTuple):
 
 
 class ModelError(NamedTuple):
-    """Error of the model, and so of a difference of two frames, because electrode positions and contact impedances are
-    known only as well as the reference frame determines them.
+    """Error of the model, and thereby of predicted differences of two frames, because electrode positions and contact
+    impedances are known only as well as the reference frame determines them.
 
-    **Fields**: `factor` (p, p): F with the posterior covariance F Fᵀ of the shifts, metres, and of the logarithms of
-    the contact impedances; `drift`: standard deviation of the logarithm of each contact impedance, from the reference
-    to the frame.
+    ***Fields**: `factor` (p, p): F with the posterior covariance F Fᵀ of the shifts, metres, and of the logarithms of
+    the contact impedances; `drift`: standard deviation of the change of the logarithm of each contact impedance between
+    the reference and the frame.
 
     Kaipio and Somersalo, Journal of Computational and Applied Mathematics 198 (2007) 493.
 
@@ -130,10 +130,11 @@ class ModelError(NamedTuple):
     drift: float = Uncertainty().drift
 
     def voltages(self, model: ForwardModel, conductivity: ArrayLike, background: ArrayLike) -> Float[np.ndarray, "M q"]:
-        """Errors (M, q) of the difference v(`conductivity`) - v(`background`), volts, for unit coefficients.
+        """Errors (M, q) of the voltage difference v(`conductivity`) - v(`background`), volts, each due to one standard
+        deviation of one of q independent errors.
 
-        `conductivity` and `background` per cell, S/m (2-D: S). The covariance of the difference is the product of the
-        errors with their transpose.
+        `conductivity` and `background` per cell, S/m (2-D: S). The covariance of the difference is the product of this
+        matrix with its transpose.
         """
         electrodes: Any = model.electrodes
         sensitivity, protocol = PlacementSensitivity(model.mesh, electrodes), on_host(model.protocol)
@@ -149,7 +150,8 @@ class ModelError(NamedTuple):
 
 
 class _LinearisedModel(NamedTuple):
-    """Model at a trial point, with its conductivity, fields F, impedance Z and predicted voltages (M,)."""
+    """Forward model with trial values of the electrode positions and contact impedances, with the conductivity, fields
+    F, transfer impedance Z and predicted voltages (M,)."""
 
     model: ForwardModel
     conductivity: float
@@ -165,18 +167,18 @@ def place_electrodes(
     deviation: float,
     mask: Bool[ArrayLike, " M"] | None = None,
 ) -> Placement:
-    """Estimate where the electrodes of a model are, and their contact impedances, from a frame of the homogeneous body.
+    """Estimate the positions and contact impedances of the electrodes of a model from a frame of the homogeneous body.
 
     **Arguments:**
 
     - `model`: the model with the electrodes as they are described.
-    - `voltages` (M,): of the homogeneous body, volts.
+    - `voltages` (M,): measured voltages of the homogeneous body, volts.
     - `deviation`: standard deviation of the described positions, metres, in every direction in which an electrode can
       move; 0 if they are exact.
     - `mask` (M,): True for the channels to use.
 
     Raises `ValueError` for electrodes that cannot move, invalid arguments, voltages that have the opposite sign of the
-    model's, and where nothing is found that explains them.
+    model's, and voltages that no positions are found to explain.
 
     **Example:**
 
@@ -214,7 +216,8 @@ def place_electrodes(
 
 
 class _PlacementProblem:
-    """Voltages and their derivatives with respect to coefficients of unit variance of log σ, the shifts and log zσ."""
+    """Voltages, and their derivatives with respect to coefficients of unit prior variance for log σ, the shifts and log
+    zσ, with the conductivity σ and the contact impedances z."""
 
     def __init__(self, model: ForwardModel, measured: np.ndarray, used: np.ndarray, deviation: float):
         self.described_model, self.mesh, self.protocol = model, on_host(model.mesh), on_host(model.protocol)
@@ -239,7 +242,8 @@ class _PlacementProblem:
         )
 
     def at(self, coefficients: Float[np.ndarray, " p"]) -> _LinearisedModel | None:
-        """The model at some coefficients; None where electrodes would overlap or leave the body."""
+        """The model with the parameters that `coefficients` give; None if electrodes would overlap or leave the
+        body."""
         num_electrodes, num_directions = self.directions.shape[:2]
         parameters = self.spread @ coefficients
         shifts, log_contact = (
@@ -260,7 +264,8 @@ class _PlacementProblem:
         return _LinearisedModel(model, conductivity, fields, transfer, predicted)
 
     def expand(self, coefficients, scale: float) -> QuadraticModel:
-        """Cost, and a step of Levenberg-Marquardt, at a `scale` κ of the noise."""
+        """Cost at the coefficients, and the function that computes a Levenberg-Marquardt step, for a `scale` κ of the
+        noise."""
         point = self.at(coefficients)
         if point is None:
             return np.inf, lambda damping: None  # pyright: ignore
@@ -275,15 +280,17 @@ class _PlacementProblem:
         return cost, step
 
     def noise_and_covariance(self, point: _LinearisedModel, scale: float) -> tuple[float, Float[np.ndarray, "p p"]]:
-        """κ estimated from the residual of a fit at `scale`, and the posterior covariance of the coefficients with it.
+        """Noise scale κ estimated from the residual of a fit at `scale`, and the posterior covariance of the
+        coefficients with this κ.
 
         Dependent channels count once: the number of degrees of freedom of the residual is the number of independent
-        channels minus the number that the fit has used.
+        channels minus the effective number of parameters of the fit.
         """
         residual, rows = self._residual(point), self._jacobian(point)
         num_independent = min(self.num_independent, len(residual))
         independent_share = num_independent / len(residual)
-        # With eigenvalues, the covariance stays definite where the Hessian's inverse loses its sign to rounding.
+        # Computed from eigenvalues, the covariance stays positive definite where rounding makes the Hessian's inverse
+        # indefinite.
         eigenvalues, eigenvectors = np.linalg.eigh(rows.T @ rows)
         eigenvalues = np.maximum(eigenvalues, 0)
         num_fitted = np.sum(eigenvalues / (eigenvalues + scale**2))
@@ -292,7 +299,8 @@ class _PlacementProblem:
         return scale, (eigenvectors / (1 + eigenvalues / scale**2)) @ eigenvectors.T
 
     def factor(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "q q"]:
-        """Factor of the covariance of shifts, metres, and of log z, from that of the coefficients."""
+        """Factor F of the covariance F Fᵀ of the shifts, metres, and of log z, from the `covariance` of the
+        coefficients."""
         parameter_root = self.spread.copy()
         parameter_root[1 + self.directions.shape[0] * self.directions.shape[1] :] -= self.spread[
             0
@@ -310,7 +318,7 @@ class _PlacementProblem:
         placement_derivatives = PlacementSensitivity(self.mesh, electrodes)(point.fields, point.impedance)
         impedance_derivatives = np.concatenate(
             [-point.impedance[None], placement_derivatives]
-        )  # the first with respect to log σ at fixed zσ
+        )  # the first column with respect to log σ at fixed zσ
         rows = np.stack(
             [np.asarray(select_channels(self.protocol, impedance)) for impedance in impedance_derivatives], axis=1
         )

@@ -1,4 +1,4 @@
-"""Eigendecomposition of the linear problem in data space, which makes images for any hyperparameter cheap.
+"""Eigendecomposition of the linear problem in data space, with which images for any hyperparameter are cheap.
 
 With the whitened Jacobian J (M, m), the prior covariance Γ and a basis N of the prior's null space, the reconstruction
 matrix is
@@ -6,7 +6,8 @@ matrix is
     R_λ = ΓJᵀP_λ + N(BᵀK⁻¹B)⁻¹BᵀK⁻¹,   K = JΓJᵀ + λ²I,   B = JN,   P_λ = Q(QᵀKQ)⁻¹Qᵀ,
 
 where Q is an orthonormal basis of the orthogonal complement of B (Q = I if N is empty). With the eigendecomposition
-QᵀJΓJᵀQ = UΛUᵀ, which does not depend on λ, the residual is v - JR_λv = λ²P_λv = QU diag(λ²/(Λ + λ²)) UᵀQᵀv, and
+QᵀJΓJᵀQ = UΛUᵀ, which does not depend on λ, the residual of data v is v - JR_λv = λ²P_λv = QU diag(λ²/(Λ + λ²)) UᵀQᵀv,
+and
 
     R_λ = (I - NB⁺J) ΓJᵀQU diag(1/(Λ + λ²)) UᵀQᵀ + NB⁺.
 
@@ -26,7 +27,7 @@ from jeit_solvers import symmetric_eigen
 from jeit_solvers.engines import adjoint, either_engine, has_values, host, namespace
 from jeit_solvers.module import Module
 
-# Approximate number of cells over which means over the image are taken.
+# Approximate number of cells over which the mean of an image is taken.
 _NUM_MEAN_CELLS = 10_000
 
 
@@ -34,8 +35,8 @@ class Spectrum(Module):
     """Eigendecomposition of the data-space system, in the notation of `jeit.inverse.spectrum`.
 
     **Fields**: `basis` (M, k): QU; `eigenvalues` (k,): Λ; `directions` (M, r): D; `reduced` (r, m): G; `images` (m, r):
-    ΓGᵀ; `null_space` (m, p): N; `seen` (M, p): B = JN; `outer` (M, M): JΓJᵀ; `repeated`: number of components that hold
-    no information because readings are repeated, see `Protocol.repeated_facts`.
+    ΓGᵀ; `null_space` (m, p): N; `seen` (M, p): B = JN; `outer` (M, M): JΓJᵀ; `repeated`: number of data components that
+    hold no information because readings are repeated, see `Protocol.repeated_facts`.
     """
 
     basis: Float[Array, "M k"]
@@ -57,8 +58,9 @@ class Spectrum(Module):
         directions: Float[Array, "M r"] | None = None,
         repeated: int = 0,
     ):
-        """Create from the whitened Jacobian of all channels, or of their orthonormal combinations `directions`, its
-        product with the prior covariance, and the prior's null space."""
+        """Create a spectrum from the whitened Jacobian of all channels, or of their orthonormal combinations
+        `directions`; the `product` of its transpose with the prior covariance; and a basis of the prior's null
+        space."""
         data_basis = host.asarray(np.eye(len(jacobian))) if directions is None else directions
         basis, eigenvalues, null_space_data, data_covariance = _decompose(jacobian, product, null_space, data_basis)
         return cls(
@@ -67,7 +69,7 @@ class Spectrum(Module):
 
     @property
     def freedom(self) -> int:
-        """Number of independent components of the data, without repeated readings."""
+        """Number of independent components of the data, not counting repeated readings."""
         return self.eigenvalues.shape[0] - self.repeated
 
     @property
@@ -77,7 +79,7 @@ class Spectrum(Module):
 
     @property
     def product(self) -> Float[Array, "m M"]:
-        """Product ΓJᵀ (m, M)."""
+        """Product ΓJᵀ (m, M) of the prior covariance with the transposed whitened Jacobian."""
         return self.images @ self.directions.T
 
     def reconstruction(self, hyperparameter) -> Float[Array, "m M"]:
@@ -95,7 +97,7 @@ class Spectrum(Module):
         return _spectrum_image(self, data, hyperparameter)
 
     def filter(self, hyperparameter) -> Float[Array, " r"]:
-        """Filter λ²/(Λ + λ²), the fraction of each data component that stays in the residual."""
+        """Filter λ²/(Λ + λ²): the fraction of each data component that remains in the residual."""
         return hyperparameter**2 / (self.eigenvalues + hyperparameter**2)
 
     def modes(self) -> Float[Array, "m k"]:
@@ -103,8 +105,8 @@ class Spectrum(Module):
         return _modes(self)
 
     def squared_modes(self) -> Float[np.ndarray, " k"]:
-        """Mean over cells of the squared absolute value of each of the `modes`; over a subset of about
-        `_NUM_MEAN_CELLS` cells on large meshes."""
+        """Squared absolute value of each of the `modes`, averaged over all cells, or on large meshes over a subset of
+        about `_NUM_MEAN_CELLS` cells."""
         images, weights = (np.asarray(factor) for factor in _mode_factors(self))
         sampled_images = images[:: max(1, len(images) // _NUM_MEAN_CELLS)]
         return np.mean(np.abs(sampled_images @ weights) ** 2, axis=0)
@@ -115,8 +117,8 @@ class Spectrum(Module):
         return max_singular_value * np.logspace(-6, 1, size)
 
     def curves(self, data: ArrayLike | None, candidates: Float[np.ndarray, " K"]) -> tuple[np.ndarray, np.ndarray]:
-        """Residual ‖v - JR_λv‖ and penalty √(xᵀQx), each (K,), for every candidate λ; empty arrays without data or if
-        they are traced."""
+        """Residual ‖v - JR_λv‖ and penalty √(xᵀQx), each (K,), for every candidate λ; empty arrays without data or for
+        traced data."""
         if data is None or not has_values(data):
             return np.zeros(0), np.zeros(0)
         eigenvalues = np.asarray(self.eigenvalues)

@@ -1,19 +1,20 @@
 """Uncertainty of an image: its posterior distribution by the Laplace approximation.
 
-The posterior is approximated by the Gaussian of the problem linearised at the minimum ĉ of ½ rᵀGr + penalty(c). Its
-covariance
+The posterior is approximated by the Gaussian of the problem linearised at the minimum ĉ of ½ rᵀGr + penalty(c), with
+the residual r of the data and its precision G. The covariance of the coefficients c,
 
     Σ = (Q + JᵀGJ)⁻¹ = Q⁻¹ - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹JQ⁻¹
 
-is computed in data space. For smooth priors Q = I, and Σ is exact if voltages are linear in c. Tarantola, Inverse
-Problem Theory (SIAM 2005), ch. 3; Kaipio and Somersalo, Statistical and Computational Inverse Problems (Springer 2005),
-ch. 3; MacKay, Neural Comput. 4 (1992) 415-447.
+is computed in data space, with the Jacobian J at ĉ, the data covariance C = G⁻¹ and the prior precision Q. For smooth
+priors Q = I, and Σ is exact if voltages are linear in c. Tarantola, Inverse Problem Theory (SIAM 2005), ch. 3; Kaipio
+and Somersalo, Statistical and Computational Inverse Problems (Springer 2005), ch. 3; MacKay, Neural Comput. 4 (1992)
+415-447.
 
 For total variation, Q is the quadratic form of lagged diffusivity, which touches the energy at ĉ from above (Vogel and
-Oman, SIAM J. Sci. Comput. 17 (1996) 227-238). A jump of height d between cells has a stiffness proportional to
-1 / √(d² + β²). Σ is therefore conditional on the edges found: it is the uncertainty if the positions of the edges, and
-roughly their heights, were known. At an edge the energy has a smaller curvature than Q, and an edge at another position
-may explain the data as well, so the true uncertainty is larger there.
+Oman, SIAM J. Sci. Comput. 17 (1996) 227-238). A jump of height d between cells has a stiffness proportional to 1 / √(d²
++ β²). Σ is therefore conditional on the edges found: it is the uncertainty if the positions of the edges, and roughly
+their heights, were known. At an edge the energy has a smaller curvature than Q, and an edge at another position may
+explain the data as well, so the true uncertainty is larger at an edge.
 """
 
 from __future__ import annotations
@@ -36,15 +37,15 @@ from jeit_solvers import Status
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_host
 from jeit_solvers.module import Module
 
-# Number of rows of the size of an image computed at a time.
+# Number of rows, each of the size of an image, that are computed at a time.
 _ROWS_AT_ONCE = 32
 
 
 class Posterior(Module):
-    """Posterior of an image: a Gaussian distribution of its coefficients with mean ĉ, created by `posterior`.
+    """Posterior of an image: a Gaussian distribution of the image's coefficients with mean ĉ, created by `posterior`.
 
-    **Fields**: `inversion`: the problem; `coefficients` (n,): ĉ; `jacobian` (r, n): J at ĉ; `root` (r, r): W with
-    WᵀW = (JQ⁻¹Jᵀ + C)⁻¹; `cross` (r, n): JQ⁻¹; `prior`: normal distribution of precision Q.
+    ***Fields**: `inversion`: the least squares problem; `coefficients` (n,): ĉ; `jacobian` (r, n): Jacobian J at ĉ;
+    `root` (r, r): W with WᵀW = (JQ⁻¹Jᵀ + C)⁻¹; `cross` (r, n): JQ⁻¹; `prior`: normal distribution of precision Q.
 
     **Example:**
 
@@ -67,8 +68,8 @@ class Posterior(Module):
         return self.inversion.link.slope(estimate) * deviation
 
     def credible_interval(self, probability: float = 0.95) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Lower and upper limits of every cell's conductivity, S/m (2-D: S), between which it lies with this
-        probability, for each cell separately.
+        """Lower and upper limits, S/m (2-D: S), between which the conductivity of a cell lies with this `probability`,
+        for each cell separately.
 
         The interval is computed on the link's scale, so positivity and bounds of the link hold. Raises `ValueError` if
         the probability is not between 0 and 1.
@@ -105,7 +106,7 @@ class Posterior(Module):
 
     def unknowns(self) -> dict[str, Float[Array, " k"]]:
         """Standard deviations of the unknowns estimated along with the conductivity, in the units of
-        `Reconstruction.unknowns`; linearised for quantities whose logarithm was estimated."""
+        `Reconstruction.unknowns`; obtained by linearisation for quantities whose logarithm was estimated."""
         model, values = self.inversion.model, self.inversion.values(self.coefficients)
         first_index = self.inversion.basis.num_coefficients
         deviation = jnp.sqrt(1 - jnp.sum((self.root @ self.cross) ** 2, axis=0))
@@ -133,12 +134,12 @@ class Posterior(Module):
 def posterior(reconstruction: Reconstruction) -> Posterior:
     """Posterior distribution of a reconstruction, by the Laplace approximation.
 
-    With a smooth prior, the standard deviations are as accurate as the noise, the prior and the forward model: with
-    λ = 1 and the correct prior variance, credible intervals have their nominal coverage; λ = 2 assumes that the image
-    varies half as much. With total variation, they are conditional on the edges found: they hold if the positions of
-    the edges, and roughly their heights, are known, and are too small at an edge that may lie elsewhere. Raises
-    `ValueError` for bounded solvers, whose posterior is not nearly Gaussian, for a failed reconstruction, and for any
-    other object.
+    With a smooth prior, the standard deviations are as accurate as the noise, the prior and the forward model: with λ =
+    1 and the correct prior variance, credible intervals have their nominal coverage; λ = 2 assumes that the image
+    varies half as much as the prior says. With total variation, the standard deviations are conditional on the edges
+    found: they hold if the positions of the edges, and roughly their heights, are known, and are too small at an edge
+    that may lie elsewhere. Raises `ValueError` for bounded solvers, whose posterior is not nearly Gaussian, for a
+    failed reconstruction, and for any other object.
 
     **Arguments:**
 
@@ -176,7 +177,7 @@ def _compute_posterior(inversion: Inversion, coefficients) -> Posterior:
 
 
 def _data_space_matrices(inversion: Inversion, coefficients):
-    """Matrices J, JQ⁻¹ and JQ⁻¹Jᵀ + C, and the normal distribution of precision Q."""
+    """Matrices J, JQ⁻¹ and JQ⁻¹Jᵀ + C of the posterior, and the prior normal distribution of precision Q."""
     normal = inversion.penalty.normal(coefficients)
     if normal is None:
         raise ValueError(
@@ -190,11 +191,11 @@ def _data_space_matrices(inversion: Inversion, coefficients):
 
 @either_engine
 def _sample_estimates(posterior: Posterior):
-    """Image x at the solution, including unknowns that change it, and its standard deviation, per cell, on the link's
-    scale.
+    """Posterior mean of the image x, including unknowns that change the image, and its standard deviation, per cell, on
+    the link's scale.
 
-    S holds the shapes and the contributions of the unknowns to the image. The variance is diag(S Q⁻¹ Sᵀ) -
-    diag(S Q⁻¹Jᵀ WᵀW JQ⁻¹ Sᵀ); the rows W JQ⁻¹ Sᵀ are computed in blocks.
+    The columns of S are the shapes and the contributions of the unknowns to the image. The variance of x is diag(S Q⁻¹
+    Sᵀ) - diag(S Q⁻¹Jᵀ WᵀW JQ⁻¹ Sᵀ); the rows W JQ⁻¹ Sᵀ are computed in blocks.
     """
     inversion, coefficients = posterior.inversion, posterior.coefficients
     basis, xp = inversion.basis, namespace(posterior)
@@ -215,7 +216,7 @@ def _sample_estimates(posterior: Posterior):
 
 @either_engine
 def _weighted_mean(posterior: Posterior, weight):
-    """Weighted sum of the cells' conductivities, and its standard deviation."""
+    """Sum of the cells' conductivities weighted with `weight` (m,), and the posterior standard deviation of the sum."""
     inversion, coefficients, xp = posterior.inversion, posterior.coefficients, namespace(posterior, weight)
     estimate, num_basis = inversion.estimate(coefficients), inversion.basis.num_coefficients
     slope = weight * inversion.link.slope(estimate)
@@ -231,8 +232,8 @@ def _weighted_mean(posterior: Posterior, weight):
 
 @either_engine
 def _draw_samples(posterior: Posterior, prior_draws, noise_draws):
-    """Sample conductivities with c = ĉ + z - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹(Jz + e), where z is drawn from the prior and e from
-    the noise."""
+    """Sample conductivities from the posterior: c = ĉ + z - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹(Jz + e), where z is drawn from the
+    prior and e from the noise."""
     inversion, root, xp = posterior.inversion, posterior.root, namespace(posterior, prior_draws)
     prior_samples = posterior.prior.drawn(prior_draws.T).T
     data_samples = prior_samples @ posterior.jacobian.T + noise_draws @ xp.linalg.cholesky(inversion.data.covariance).T
@@ -243,9 +244,10 @@ def _draw_samples(posterior: Posterior, prior_draws, noise_draws):
 def image_noise(reconstruction: Reconstruction) -> Float[np.ndarray, " m"]:
     """Standard deviation (m,) of an image in every cell due to the noise of the data alone, on the link's scale.
 
-    The coefficients at the solution satisfy c = K (Jc - r) with K = Jᵀ(JJᵀ + C)⁻¹, so noise of covariance C gives them
-    the covariance K C Kᵀ. If the image's misfit exceeds 1, the standard deviation is multiplied by it. Raises
-    `ValueError` for total variation and bounded solvers, to which this does not apply.
+    The coefficients at the solution satisfy c = K (Jc - r) with K = Jᵀ(JJᵀ + C)⁻¹, with the residual r and its Jacobian
+    J, so noise of covariance C gives the coefficients the covariance K C Kᵀ. If the image's misfit exceeds 1, the
+    standard deviation is multiplied by the misfit. Raises `ValueError` for total variation and bounded solvers, for
+    which this formula does not hold.
 
     **Arguments:**
 

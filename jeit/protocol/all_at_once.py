@@ -1,9 +1,9 @@
-"""Protocols with drive patterns that use all electrodes at once, from matrices or named families, and readings of the
-potentials of all electrodes.
+"""Protocols with drive patterns that use all electrodes at once, from matrices or named families, and measurement
+patterns for the potentials of all electrodes.
 
-Each of the named protocols can measure the potentials in any of the ways of `measurement_patterns`. Electrodes are
-numbered along a ring, or in any order on a solid. Any L - 1 independent drive patterns determine the transfer
-impedance, and with it the voltages of every other protocol (`jeit.data.driven_by`).
+Each of the named protocols can use any of the measurement patterns of `measurement_patterns`. Electrodes are numbered
+along a ring, or in any order on a solid. With L electrodes, any L - 1 independent drive patterns determine the transfer
+impedance, and thereby the voltages of every other protocol (`jeit.data.driven_by`).
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ READINGS = ("adjacent", "mean", "mean-removed", "against")
 
 
 def measurement_patterns(num_electrodes: int, measurement: Reading, reference: int | None = None) -> np.ndarray:
-    """Measurement patterns (K, L) for the potentials of all electrodes.
+    """Measurement patterns (K, L) that together measure the potentials of all L electrodes.
 
-    - "adjacent": each electrode against the next, K = L; their sum is zero for every body.
-    - "mean-removed": each potential minus the mean of all, K = L, as published for instruments that drive every
-      electrode; their sum is also zero, so only L - 1 of the L values are independent.
-    - "mean": each potential minus the mean of all others, K = L; L / (L - 1) times the "mean-removed" values.
+    - "adjacent": each electrode against the next, K = L; the L voltages sum to zero for every body.
+    - "mean-removed": each potential minus the mean of all potentials, K = L, as published for instruments that drive
+      every electrode; these voltages also sum to zero, so only L - 1 of the L values are independent.
+    - "mean": each potential minus the mean of all other potentials, K = L; L / (L - 1) times the "mean-removed" values.
     - "against": each electrode against electrode `reference` (0-based, by default the last), K = L - 1.
 
     **Arguments:**
 
     - `num_electrodes`: L.
-    - `measurement`: one of the names above.
-    - `reference`: electrode of "against".
+    - `measurement`: one of the four names above.
+    - `reference`: reference electrode of "against".
 
-    Raises `ValueError` for an invalid count or option, and for a `reference` that does not exist or is given for
-    another `measurement` than "against".
+    Raises `ValueError` for an invalid number of electrodes or option, for a `reference` that is not an electrode, and
+    for a `reference` with another `measurement` than "against".
 
     **Example:**
 
@@ -78,18 +78,19 @@ def from_matrices(
     name: str = "custom",
     large_currents: bool = False,
 ) -> Protocol:
-    """Combine every drive pattern with every measurement pattern, drive by drive. Channels are in the order of
-    `select.ravel()`: all measurements of the first drive, then of the second.
+    """Create a protocol that combines every drive pattern with every measurement pattern. Channels are in the order of
+    `select.ravel()`: all measurements of the first drive, then all of the second, and so on.
 
     **Arguments:**
 
     - `drive` (S, L): currents in amperes, one row per drive.
-    - `measurement` (K, L): weights, one row per measurement.
-    - `select` (S, K): True for the combinations that are measured; by default all.
+    - `measurement` (K, L): weights of the electrode potentials, one row per measurement pattern.
+    - `select` (S, K): True for the combinations of drive and measurement pattern that are measured; by default all.
     - `name`: name in reports.
     - `large_currents`: accept currents above 1 A, which are otherwise taken for an error of units.
 
-    Raises `ValueError` for patterns that `Protocol` rejects, currents above 1 A, and a `select` of another shape.
+    Raises `ValueError` for patterns that `Protocol` rejects, currents above 1 A (unless `large_currents`), and a
+    `select` of another shape than (S, K).
 
     **Example:**
 
@@ -127,13 +128,14 @@ def from_channels(
     **Arguments:**
 
     - `drive` (S, L): currents in amperes, one row per drive.
-    - `channel_measurement` (M, L): weights, one row per channel; equal rows are stored once.
+    - `channel_measurement` (M, L): weights of the electrode potentials, one row per channel; equal rows are stored
+      once.
     - `drive_index` (M,): 0-based index of the drive of each channel.
     - `name`: name in reports.
     - `large_currents`: accept currents above 1 A, which are otherwise taken for an error of units.
 
     Raises `ValueError` for patterns that `Protocol` rejects, currents above 1 A (unless `large_currents`), and a
-    `drive_index` of another length.
+    `drive_index` of another length than M.
 
     **Example:**
 
@@ -164,7 +166,7 @@ def from_channels(
 def _as_matrix(values: Any, pattern_kind: str) -> np.ndarray:
     if not has_values(values):
         return values
-    if hasattr(values, "toarray"):  # a scipy.sparse matrix, as loadmat returns EIDORS patterns
+    if hasattr(values, "toarray"):  # a scipy.sparse matrix, as loadmat returns for EIDORS patterns
         values = values.toarray()
     matrix = np.asarray(values)
     if matrix.ndim != 2 or matrix.dtype.kind not in "fiu":
@@ -191,11 +193,12 @@ def trigonometric(
     reference: int | None = None,
     current: Current = 1e-3,
 ) -> Protocol:
-    """Sinusoidal currents in all electrodes at once: L - 1 drives, L(L - 1) channels.
+    """Protocol that drives sinusoidal currents through all L electrodes at once: L - 1 drives, L(L - 1) channels.
 
-    The drives are cos(θ), sin(θ), cos(2θ), sin(2θ), ... with θ = 2πl/L: the patterns that best distinguish a centred
-    inclusion in a disk (Isaacson 1986; Gisser, Isaacson and Newell 1988). 16 electrodes give 240 channels. On a solid,
-    θ follows the electrodes' numbers: the drives are still complete, but no longer optimal.
+    The drives are cos(θ), sin(θ), cos(2θ), sin(2θ), ... with θ = 2πl/L at electrode l. These patterns best distinguish
+    a disk with a centred inclusion from a homogeneous disk (Isaacson 1986; Gisser, Isaacson and Newell 1988). 16
+    electrodes give 240 channels. On a solid, θ still follows the electrodes' numbers; the drives are then complete, but
+    not optimal.
 
     **Arguments:**
 
@@ -226,17 +229,19 @@ def haar(
     reference: int | None = None,
     current: Current = 1e-3,
 ) -> Protocol:
-    """Haar wavelets over the electrodes' numbers: L - 1 orthogonal drives, coarse to fine.
+    """Protocol whose drives are Haar wavelets over the numbers of the L electrodes: L - 1 orthogonal drives, from
+    coarse to fine.
 
-    The first drive sends current from the first half of the electrodes to the second, the next two drives do so within
-    each half, and so on (Haar 1910). If L is not a power of two, halves differ by one electrode, and each electrode of
-    the larger half carries less current, so that the sum is zero (unbalanced wavelets: Girardi and Sweldens 1997).
+    The first drive sends current from the first half of the electrodes to the second half, the next two drives send
+    current between the quarters of each half, and so on (Haar 1910). If L is not a power of two, halves differ by one
+    electrode, and each electrode of the larger half carries less current, so that the currents sum to zero (unbalanced
+    wavelets: Girardi and Sweldens 1997).
 
     **Arguments:**
 
     - `num_electrodes`: L, at least 2.
     - `measurement`, `reference`: as in `measurement_patterns`.
-    - `current`: maximum current of an electrode, amperes.
+    - `current`: maximum current of an electrode in each drive, amperes.
 
     Raises `ValueError` for an invalid count, current or option.
 
@@ -269,19 +274,21 @@ def optimal(
     reference: int | None = None,
     current: Current = 1e-3,
 ) -> Protocol:
-    """The currents that best distinguish two bodies, best first: at most L - 1 drives.
+    """Protocol of the drive patterns that best distinguish two bodies, the best pattern first: at most L - 1 drives.
 
     **Arguments:**
 
-    - `transfer`, `other` (L, L): transfer impedances of both bodies, ohm (`ForwardModel.transfer_impedance`, or
-      measured: `jeit.data.transfer_impedance`). Without `other`, the drives are the eigenvectors of `transfer`.
-    - `number`: maximum number of drives, by default all; a difference of low rank has fewer.
+    - `transfer`, `other` (L, L): transfer impedances Z₁ and Z₂ of the first and second body, ohm
+      (`ForwardModel.transfer_impedance`, or measured: `jeit.data.transfer_impedance`). Without `other`, the drives are
+      the eigenvectors of `transfer`.
+    - `number`: maximum number of drives, by default L - 1; if Z₁ - Z₂ has a lower rank, there are fewer drives.
     - `power`: if given, in watts, the drives I maximise ‖(Z₁ - Z₂) I‖ for fixed power Iᵀ Z₁ I (Cheney and Isaacson
-      1992), and each dissipates this power in the first body. It requires `other`, and `current` is not used.
+      1992), and each drive dissipates `power` in the first body. `power` requires `other`, and `current` is then not
+      used.
     - `measurement`, `reference`: as in `measurement_patterns`.
-    - `current`: unless `power` is given, the drives I maximise ‖(Z₁ - Z₂) I‖ for fixed ‖I‖: they are singular vectors
-      of the difference (Isaacson 1986; Gisser, Isaacson and Newell 1990), each scaled so that the maximum current of an
-      electrode is `current` amperes.
+    - `current`: unless `power` is given, the drives I maximise ‖(Z₁ - Z₂) I‖ for fixed ‖I‖. These drives are singular
+      vectors of Z₁ - Z₂ (Isaacson 1986; Gisser, Isaacson and Newell 1990), each scaled so that the maximum current of
+      an electrode is `current` amperes.
 
     Raises `ValueError` for matrices that are not square, real, finite, and symmetric to within a tenth; for equal
     matrices; if `power` is given and some currents dissipate no power in `transfer`; and for invalid options.
@@ -296,7 +303,7 @@ def optimal(
     count = len(first_transfer)
     check_current(current, "optimal")
     max_drives = count - 1 if number is None else check_count(number, "optimal: number", 1)
-    # Project to an orthonormal basis of the currents that sum to zero.
+    # Project the matrices to an orthonormal basis of the currents that sum to zero.
     basis = scipy.linalg.null_space(np.ones((1, count)))
     dissipated = basis.T @ first_transfer @ basis
     change = dissipated
@@ -327,7 +334,8 @@ def optimal(
 
 
 def _drives_for_power(dissipated, change, power: float, alone: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Drive directions for a given power and their squared distinguishabilities, best first."""
+    """Directions of the drives that maximise distinguishability for fixed power, and their squared
+    distinguishabilities, the largest first."""
     if alone:
         raise ValueError("power needs other: with one body alone the currents for a given power are those of no power.")
     if isinstance(power, bool) or not isinstance(power, int | float) or not 0 < power < np.inf:
@@ -340,7 +348,7 @@ def _drives_for_power(dissipated, change, power: float, alone: bool) -> tuple[np
 
 
 def _sort_descending(eigenpairs) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues and eigenvectors, sorted by eigenvalue with the largest first."""
+    """Sort eigenvalues and eigenvectors by eigenvalue, with the largest first."""
     values, vectors = eigenpairs
     return values[::-1], vectors[:, ::-1]
 
@@ -363,7 +371,7 @@ def _check_transfer(name: str, transfer: ArrayLike) -> np.ndarray:
 
 
 def _all_combinations(name: str, drive, measurement: Reading, reference: int | None, current: Current) -> Protocol:
-    """Protocol that combines every drive with every measurement pattern."""
+    """Protocol that combines every drive pattern with every measurement pattern of the kind `measurement`."""
     check_current(current, name)
     rows = measurement_patterns(drive.shape[1], measurement, reference)
     return from_matrices(current * drive, rows, name=f"{name}, {measurement} measurement, {drive.shape[1]} electrodes")

@@ -1,7 +1,7 @@
 """Protocols with drive and measurement patterns that are pairs of electrodes.
 
-Electrodes are counted from 0. For each pair, `+current` enters at the first electrode and leaves at the second, and
-voltages are the potential of the first electrode minus that of the second.
+Electrodes are counted from 0. For each drive pair, `+current` enters at the first electrode and leaves at the second.
+The voltage of each measurement pair is the potential of the first electrode minus that of the second.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ from jeit.protocol.reciprocity import reciprocal_channel_pairs
 
 Order = Literal["rotating", "fixed"]
 Reciprocal = Literal["all", "half"]
-# Current in amperes: a number, or an array, which may be traced to differentiate with respect to the current.
+# Current in amperes: a number or an array. The array may be traced, to differentiate with respect to the current.
 Current = float | Float[Array, ""]
 
 
 def pair_patterns(pairs: np.ndarray, num_electrodes: int) -> np.ndarray:
-    """Convert pairs (P, 2) to patterns (P, L): +1 at the first electrode, -1 at the second."""
+    """Convert electrode pairs (P, 2) to patterns (P, L) over L electrodes: +1 at the first electrode of the pair, -1 at
+    the second."""
     patterns = np.zeros((len(pairs), num_electrodes))
     rows = np.arange(len(pairs))
     patterns[rows, pairs[:, 0]] = 1.0
@@ -40,7 +41,8 @@ def pair_patterns(pairs: np.ndarray, num_electrodes: int) -> np.ndarray:
 
 
 def ring_pairs(num_electrodes: int, offset: int) -> np.ndarray:
-    """Pairs (L, 2) of every electrode of a ring with the electrode `offset` positions further."""
+    """Pairs (L, 2) of every electrode of a ring with the electrode that is `offset` positions further along the
+    ring."""
     start = np.arange(num_electrodes)
     return np.stack([start, (start + offset) % num_electrodes], axis=1)
 
@@ -68,10 +70,10 @@ class CrossedPairs:
         reciprocal: Reciprocal = "all",
         order: Order = "fixed",
     ) -> Protocol:
-        """Create the protocol, with the requested channels in the requested order; options as in
+        """Create the protocol of the pairs, with the requested channels in the requested order; options as in
         `jeit.protocol.adjacent`.
 
-        Raises `ValueError` for an invalid current or option, and if no channel is left.
+        Raises `ValueError` for an invalid current or option, and if the options leave no channel.
         """
         check_current(current, self.where)
         check_choice(reciprocal, ("all", "half"), self.where, "reciprocal")
@@ -82,7 +84,7 @@ class CrossedPairs:
         if order == "rotating":
             # Drive i begins with measurement pair i: the pairs are in ring order, one per electrode.
             measurement_index = (measurement_index + drive_index) % num_rows
-        # Channels are selected with NumPy at unit current, so that the current itself may be traced.
+        # Channels are selected with NumPy at unit current, so that the argument `current` may be traced.
         drive = pair_patterns(self.drive, self.num_electrodes)
         measurement = pair_patterns(self.measurement, self.num_electrodes)
         keep = np.ones(len(drive_index), dtype=bool)
@@ -113,19 +115,21 @@ def adjacent(
     reciprocal: Reciprocal = "all",
     order: Order = "rotating",
 ) -> Protocol:
-    """Adjacent drive and adjacent measurement: neighbouring electrodes drive and measure; L(L - 3) channels.
+    """Protocol of adjacent drive and adjacent measurement: neighbouring electrodes drive and measure; L(L - 3)
+    channels.
 
     16 electrodes give 208 voltages, or 104 with `reciprocal="half"`. Brown and Seagar 1987.
 
     **Arguments:**
 
-    - `num_electrodes`: L, at least 4.
+    - `num_electrodes`: number of electrodes L, at least 4.
     - `current`: amplitude in amperes.
-    - `driven_electrodes`: also measure on electrodes that carry current (L² channels).
-    - `reciprocal`: "half" keeps the first of every two channels that are equal by reciprocity, "all" keeps both.
-    - `order`: "rotating" starts the measurements of each drive at the driven pair, "fixed" always at electrode 0.
+    - `driven_electrodes`: whether to measure also on electrodes that carry current (L² channels).
+    - `reciprocal`: "half" keeps the first of every two channels that are equal by reciprocity, "all" keeps both
+      channels.
+    - `order`: "rotating" starts the measurements of each drive at the driven pair, "fixed" starts them at electrode 0.
 
-    Raises `ValueError` for an invalid count, current or option.
+    Raises `ValueError` for an invalid number of electrodes, current or option.
 
     **Example:**
 
@@ -154,15 +158,16 @@ def skip(
     reciprocal: Reciprocal = "all",
     order: Order = "rotating",
 ) -> Protocol:
-    """Drive pairs and measurement pairs that skip electrodes. Skip-0 is adjacent.
+    """Protocol whose drive pairs and measurement pairs skip electrodes. Skip-0 is the `adjacent` protocol.
 
     **Arguments:**
 
     - `skipped`: number of electrodes between the two driven ones.
-    - `measurement_skipped`: number of electrodes between the two measured ones, by default `skipped`.
+    - `measurement_skipped`: number of electrodes between the two measured electrodes, by default `skipped`.
     - `num_electrodes`, `current`, `driven_electrodes`, `reciprocal`, `order`: as in `adjacent`.
 
-    Raises `ValueError` for a skip that is negative or leads back to the same electrode, and as `adjacent` does.
+    Raises `ValueError` for a number of skipped electrodes that is negative or pairs an electrode with itself, and as
+    `adjacent` does.
 
     **Example:**
 
@@ -199,14 +204,14 @@ def opposite(
     driven_electrodes: bool = False,
     order: Order = "rotating",
 ) -> Protocol:
-    """Opposite drive and adjacent measurement: L(L - 4)/2 channels from the L/2 distinct drives. 16 electrodes give 96
-    voltages, 8 electrodes 16.
+    """Protocol of opposite drive and adjacent measurement on L electrodes: L(L - 4)/2 channels from the L/2 distinct
+    drives. 16 electrodes give 96 voltages, 8 electrodes 16 voltages.
 
     **Arguments:**
 
     - `num_electrodes`, `current`, `driven_electrodes`, `order`: as in `adjacent`.
-    - `drives`: "all" also drives each pair in the opposite direction, which doubles the number of voltages (192 and 32)
-      without adding information.
+    - `drives`: "distinct" drives each opposite pair once. "all" also drives each pair in the opposite direction, which
+      doubles the number of voltages (to 192 and 32) without adding information.
 
     Raises `ValueError` for an odd number of electrodes, and as `adjacent` does.
 
@@ -242,16 +247,16 @@ def all_against_one(
     driven_electrodes: bool | None = None,
     reciprocal: Reciprocal = "all",
 ) -> Protocol:
-    """Drive every electrode in turn against the electrode `common`: L - 1 drives.
+    """Protocol that drives every electrode in turn against the electrode `common`: L - 1 drives for L electrodes.
 
     **Arguments:**
 
     - `num_electrodes`, `current`, `reciprocal`: as in `adjacent`.
     - `common`: index of the electrode against which all others are driven.
-    - `measurement`: "common" also measures every electrode against `common` ((L - 1)² channels, all of which are on a
-      driven electrode); "adjacent" measures neighbouring pairs.
-    - `driven_electrodes`: measure on electrodes that carry current; by default only for `measurement="common"`, which
-      requires it.
+    - `measurement`: "common" also measures every electrode against `common` ((L - 1)² channels, all of which use a
+      driven electrode); "adjacent" measures pairs of neighbouring electrodes.
+    - `driven_electrodes`: whether to measure also on electrodes that carry current. Default True for
+      `measurement="common"`, which requires True, else False.
 
     Raises `ValueError` if `common` is not an electrode, for `measurement="common"` with `driven_electrodes=False`, and
     as `adjacent` does.
@@ -286,19 +291,20 @@ def reference_electrode(
     driven_electrodes: bool = False,
     order: Order = "rotating",
 ) -> Protocol:
-    """Drive pairs of boundary electrodes, and measure each boundary electrode against one reference electrode.
+    """Protocol that drives pairs of boundary electrodes, and measures each boundary electrode against one reference
+    electrode.
 
-    The protocol has `num_boundary + 1` electrodes. 16 boundary electrodes and a central one give 16 · 14 = 224 voltages
-    with adjacent drive (Silvera Tawil et al. 2011, "centre measurement pattern").
+    The protocol has `num_boundary + 1` electrodes. 16 boundary electrodes and a central reference electrode give 16 ·
+    14 = 224 voltages with adjacent drive (Silvera Tawil et al. 2011, "centre measurement pattern").
 
     **Arguments:**
 
     - `num_boundary`: number of boundary electrodes, at least 4.
     - `skipped`: number of electrodes between the two driven ones.
-    - `reference`: index of the reference electrode among the `num_boundary + 1`; by default the last.
+    - `reference`: index of the reference electrode among the `num_boundary + 1` electrodes; by default the last.
     - `current`, `driven_electrodes`, `order`: as in `adjacent`.
 
-    Raises `ValueError` for a `reference` that does not exist, and as `adjacent` does.
+    Raises `ValueError` for a `reference` that is not an electrode, and as `adjacent` does.
 
     **Example:**
 
@@ -331,8 +337,8 @@ def two_terminal(
     *,
     current: Current = 1e-3,
 ) -> Protocol:
-    """Drive and measure on the same two electrodes, pair by pair. Each voltage includes the voltage drop at the contact
-    impedances of both electrodes.
+    """Two-terminal protocol: drives and measures on the same pair of electrodes, pair by pair. Each voltage includes
+    the voltage drop at the contact impedances of both electrodes.
 
     **Arguments:**
 
@@ -374,13 +380,13 @@ def bipolar(
     reciprocal: Reciprocal = "all",
     name: str = "bipolar",
 ) -> Protocol:
-    """Combine any drive pairs with any measurement pairs, drive by drive.
+    """Protocol that combines any drive pairs of electrodes with any measurement pairs, drive by drive.
 
     **Arguments:**
 
     - `num_electrodes`, `current`, `driven_electrodes`, `reciprocal`: as in `adjacent`.
-    - `drive_pairs` (S, 2), `measurement_pairs` (K, 2): indices of electrodes from 0, positive first.
-    - `name`: name in reports.
+    - `drive_pairs` (S, 2), `measurement_pairs` (K, 2): indices of electrodes from 0, the positive electrode first.
+    - `name`: name of the protocol in reports.
 
     Raises `ValueError` if a pair contains an electrode twice, or one that does not exist.
 

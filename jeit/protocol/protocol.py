@@ -1,4 +1,4 @@
-"""`Protocol`: drive patterns, measurement patterns and channels; and checks of them."""
+"""`Protocol`: drive patterns, measurement patterns and channels; and checks of a protocol's arguments."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from jeit_solvers.module import Module
 
 
 def check_patterns(patterns, pattern_kind: str) -> None:
-    """Raise `ValueError` unless patterns (rows, L) are finite, no row is zero, and every row sums to zero."""
+    """Raise `ValueError` unless drive or measurement patterns (patterns, electrodes) are finite, no pattern is zero,
+    and every pattern sums to zero."""
     if patterns.ndim != 2 or patterns.shape[0] == 0 or patterns.shape[1] < 2:
         raise ValueError(
             f"Protocol: {pattern_kind} patterns have shape {tuple(patterns.shape)}. Give a matrix with one row per "
@@ -54,7 +55,7 @@ def check_patterns(patterns, pattern_kind: str) -> None:
 
 
 def check_indices(index, num_patterns: int, name: str, pattern_kind: str) -> None:
-    """Raise `ValueError` unless indices (M,) are 0-based integers into `num_patterns` patterns."""
+    """Raise `ValueError` unless `index` (M,) holds 0-based indices of patterns, as integers below `num_patterns`."""
     if index.ndim != 1 or index.shape[0] == 0:
         raise ValueError(
             f"Protocol: {name} has shape {tuple(index.shape)}; give one integer per channel, at least one."
@@ -70,8 +71,8 @@ def check_indices(index, num_patterns: int, name: str, pattern_kind: str) -> Non
 
 
 def check_current(current, function_name: str) -> None:
-    """Raise `ValueError` unless an amplitude in amperes is positive and at most 1 A, above which it is probably in
-    milliamperes."""
+    """Raise `ValueError` unless a current amplitude in amperes is positive and at most 1 A. A larger number is probably
+    in milliamperes."""
     if not has_values(current):
         return
     value = np.asarray(current)
@@ -81,7 +82,8 @@ def check_current(current, function_name: str) -> None:
 
 
 def check_amplitude(value: float, function_name: str) -> None:
-    """Raise `ValueError` for a current above one ampere, which is probably in milliamperes or microamperes."""
+    """Raise `ValueError` for a current amplitude above 1 A. Such a number is probably in milliamperes or
+    microamperes."""
     if value > 1.0 + 1e-9:
         raise ValueError(
             f"{function_name}: a current of {value:.6g} A is far above what a tank or a skin carries. Currents are "
@@ -91,7 +93,7 @@ def check_amplitude(value: float, function_name: str) -> None:
 
 
 def check_count(num_electrodes, function_name: str, minimum: int) -> int:
-    """Return the number of electrodes. Raises `ValueError` unless it is an integer of at least `minimum`."""
+    """Return the number of electrodes. Raises `ValueError` unless the number is an integer of at least `minimum`."""
     if (
         isinstance(num_electrodes, bool)
         or not isinstance(num_electrodes, (int, np.integer))
@@ -105,7 +107,7 @@ def check_count(num_electrodes, function_name: str, minimum: int) -> int:
 
 
 def electrode_indices(electrodes, num_electrodes: int) -> np.ndarray:
-    """Return 0-based electrode indices as an array. Raises `ValueError` for one that does not exist."""
+    """Return 0-based electrode indices as an array. Raises `ValueError` for an index that is not an electrode."""
     values = np.atleast_1d(np.asarray(electrodes))
     if values.size == 0:
         return np.zeros(0, dtype=int)
@@ -118,8 +120,8 @@ def electrode_indices(electrodes, num_electrodes: int) -> np.ndarray:
 
 
 def check_pairs(pairs, num_electrodes: int, argument_name: str) -> np.ndarray:
-    """Return electrode pairs (P, 2), 0-based. Raises `ValueError` for other arrays, electrodes that do not exist, and
-    an electrode paired with itself."""
+    """Return electrode pairs (P, 2) as 0-based indices. Raises `ValueError` for arrays of another shape or type,
+    electrodes that do not exist, and an electrode paired with itself."""
     values = np.asarray(pairs)
     if values.ndim != 2 or values.shape[1] != 2 or values.shape[0] == 0 or values.dtype.kind not in "iu":
         raise ValueError(
@@ -161,21 +163,21 @@ def _select_rows(patterns, index):
 
 
 class Protocol(Module):
-    """Drive patterns, measurement patterns, and channels that combine them.
+    """Drive patterns, measurement patterns, and channels, each of which combines a drive with a measurement pattern.
 
     Channel `k` measures `measurement[measurement_index[k]] @ U`, where `U` (L,) are the electrode potentials in volts
     while the currents `drive[drive_index[k]]` flow. Positive current enters the body.
 
-    Use the functions that create protocols (`adjacent`, `opposite`, `from_matrices`, ...) rather than this class,
-    unless all four arrays are known.
+    Protocols are best created by functions such as `adjacent`, `opposite` or `from_matrices`; use this class if all
+    four arrays are known.
 
     **Fields**
 
-    - `drive`: (S, L) amperes; each row sums to zero.
-    - `measurement`: (K, L) dimensionless weights, the distinct measurement patterns; each row sums to zero.
+    - `drive`: (S, L) currents into the electrodes for each of S drive patterns, amperes; each row sums to zero.
+    - `measurement`: (K, L) dimensionless weights of the K distinct measurement patterns; each row sums to zero.
     - `drive_index`: (M,) row of `drive` for each channel.
     - `measurement_index`: (M,) row of `measurement` for each channel.
-    - `name`: name in reports.
+    - `name`: name of the protocol in reports.
 
     **Raises** `ValueError` for patterns with NaN, with a zero row, with a row that does not sum to zero, or with
     different numbers of electrodes, and for indices out of range.
@@ -242,7 +244,7 @@ class Protocol(Module):
 
     @property
     def channel_measurement(self) -> Float[Array, "M L"]:
-        """Measurement weights (M, L) of each channel."""
+        """Weights (M, L) of the electrode potentials in the voltage of each channel, dimensionless."""
         return _select_rows(self.measurement, self.measurement_index)
 
     def channels_touching(self, electrodes: int | Sequence[int]) -> Bool[np.ndarray, " M"]:
@@ -300,12 +302,14 @@ class Protocol(Module):
         )
 
     def repeated_facts(self, channels: ArrayLike | None = None) -> int:
-        """Number of channels that are linear combinations of other channels of the same drive.
+        """Number of redundant channels: channels whose measurement patterns are linear combinations of those of other
+        channels of the same drive.
 
-        `channels` (K,): indices of the channels that are considered, by default all. If voltages are computed from the
-        potentials of many electrodes, for example by subtracting their mean, L of them contain L - 1 independent values
-        with L - 1 independent noises. If all measurements of a drive are differences of two electrodes, they are
-        assumed to be measured one by one with independent noise, even if the pairs form a ring, and are not counted.
+        `channels` (K,): indices of the channels that are considered, by default all. If L voltages are computed from
+        the potentials of many electrodes, for example by subtracting the mean potential, they contain L - 1 independent
+        values with L - 1 independent noises. If all measurements of a drive are differences of two electrodes, they are
+        assumed to be measured one by one with independent noise, even if the pairs form a ring, and no channel of this
+        drive is counted.
         """
         rows = np.asarray(self.measurement)
         used_channels = np.arange(self.num_measurements) if channels is None else np.asarray(channels)
@@ -332,8 +336,8 @@ class Protocol(Module):
 
         Returns `pairs` (P, 2) and `ratio` (P,) such that `v[pairs[:, 1]] = ratio * v[pairs[:, 0]]` for any body without
         magnetic bias. In each pair, the drive pattern of either channel is proportional to the measurement pattern of
-        the other. There are none for some protocols, for example opposite drive with adjacent measurement. See
-        `jeit.protocol.reciprocity` for combinations of channels.
+        the other. Some protocols have no such pairs, for example opposite drive with adjacent measurement. See
+        `jeit.protocol.reciprocity` for reciprocity between combinations of channels.
         """
         return reciprocal_channel_pairs(
             np.asarray(self.drive),
@@ -343,7 +347,7 @@ class Protocol(Module):
         )
 
     def same_patterns(self, other: "Protocol") -> bool:
-        """Whether both protocols have the same channels in the same order; names are ignored."""
+        """Whether `other` has the same channels in the same order; names of the protocols are ignored."""
         return (
             self.num_electrodes == other.num_electrodes
             and self.num_measurements == other.num_measurements
@@ -364,10 +368,11 @@ class Protocol(Module):
 
 
 def _pattern_rows(patterns, index) -> np.ndarray:
-    """Pattern of each channel, with NumPy, because JAX would compile the indexing."""
+    """Pattern of each channel: the rows `index` of `patterns`. NumPy is used, because JAX would compile the
+    indexing."""
     return np.asarray(patterns)[np.asarray(index)]
 
 
 def shares_electrode(drive: Float[np.ndarray, "S L"], measurement: Float[np.ndarray, "K L"]) -> Bool[np.ndarray, "S K"]:
-    """Whether each measurement pattern uses an electrode that each drive pattern drives, as booleans (S, K)."""
+    """Mask (S, K): whether measurement pattern k uses an electrode that drive pattern s drives."""
     return (drive != 0).astype(int) @ (measurement != 0).T.astype(int) > 0

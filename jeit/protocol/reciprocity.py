@@ -1,8 +1,8 @@
 """Reciprocity: driving at a and measuring at b gives the same voltage as driving at b and measuring at a.
 
-The transfer impedance S (L, L) of any body with (symmetric) conductivity is symmetric: `m @ S @ d = d @ S @ m`.
-Therefore two channels (d, m) and (d', m') with d' = a m and m' = b d have voltages v' = a b v. Geselowitz 1971, Lehr
-1972.
+The transfer impedance S (L, L) of any body with (symmetric) conductivity is symmetric: `m @ S @ d = d @ S @ m` for a
+drive pattern d and a measurement pattern m. Therefore, if two channels (d, m) and (d', m') satisfy d' = a m and m' = b
+d, their voltages satisfy v' = a b v. Geselowitz 1971, Lehr 1972.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Inexact, Int
 
 
 def _direction_keys(patterns: np.ndarray) -> tuple[list[bytes], np.ndarray]:
-    """A hashable key for each row, the same for proportional rows, and the scale of each row: row = scale * unit
-    row."""
+    """A hashable key of each pattern (row), the same for proportional patterns, and the scale of each pattern: pattern
+    = scale * unit pattern."""
     # The first entry that is not tiny determines scale and sign, so that proportional rows have the same unit row.
     size = np.max(np.abs(patterns), axis=1, keepdims=True)
     first = np.argmax(np.abs(patterns) > 1e-9 * size, axis=1)
@@ -25,10 +25,10 @@ def _direction_keys(patterns: np.ndarray) -> tuple[list[bytes], np.ndarray]:
 def reciprocal_channel_pairs(
     drive: np.ndarray, measurement: np.ndarray, drive_index: np.ndarray, measurement_index: np.ndarray
 ) -> tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]]:
-    """Channel pairs (P, 2), first < second, and ratios (P,) with `v[second] = ratio * v[first]`.
+    """Pairs (P, 2) of reciprocal channels, first < second, and the ratios (P,) of their voltages: `v[second] = ratio *
+    v[first]`.
 
-    The arguments are those of `Protocol`. Each channel is paired only with the last of the channels that are reciprocal
-    to it.
+    The arguments are those of `Protocol`. Each channel is paired only with the last of its reciprocal channels.
     """
     drive_key, drive_scale = _direction_keys(drive)
     measurement_key, measurement_scale = _direction_keys(measurement)
@@ -58,13 +58,15 @@ def transfer_between_drives(
     """Voltage that every drive pattern, used as a measurement pattern, would measure while each drive flows: a
     symmetric matrix for any body.
 
-    `voltages` (F, M): volts; `mask` (M,): usable channels; `deviation` (M,): standard deviation of the independent
-    noise of each channel, volts, by default one; the other arguments are those of `Protocol`. Returns
+    `voltages` (F, M): voltages of F frames and M channels, volts; `mask` (M,): True for usable channels; `deviation`
+    (M,): standard deviation of the independent noise of each channel, volts, by default one; the other arguments are
+    those of `Protocol`. Returns, for S drive patterns:
 
-    - `transfer` (F, S, S), watts: `drive[i] @ S @ drive[j]` in entry (i, j), combined from the channels measured while
-      drive j flows. For example, a skip-1 drive pattern measured by adjacent pairs is the sum of two of them.
-    - `is_known` (S, S): whether the measurement patterns of drive j span drive i.
-    - `noise` (S, S), watts: standard deviation of `transfer`.
+    - `transfer` (F, S, S), watts: `drive[i] @ Z @ drive[j]` in entry (i, j), combined from the channels measured while
+      drive j flows(Z: transfer impedance). For example, the voltage of a skip-1 pair is the sum of those of two
+      adjacent pairs.
+    - `is_known` (S, S): whether drive i is a linear combination of the measurement patterns of drive j.
+    - `noise` (S, S), watts: standard deviation of each entry of `transfer`.
     """
     num_drives = drive.shape[0]
     transfer = np.zeros((voltages.shape[0], num_drives, num_drives), dtype=voltages.dtype)

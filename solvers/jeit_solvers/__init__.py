@@ -1,4 +1,4 @@
-"""Numerical methods that do not depend on the physics, in JAX and NumPy.
+"""Numerical methods, independent of the physics, in JAX and NumPy.
 
 - `sparse`: symmetric sparse systems, solved directly (nested dissection, multifrontal Cholesky factorisation in batches
   of dense fronts) or by conjugate gradients, for `SparseSymmetric` operators and through `lineax.linear_solve`; and the

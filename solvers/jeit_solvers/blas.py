@@ -1,6 +1,6 @@
 """BLAS and LAPACK on parts of NumPy arrays, in place.
 
-SciPy exports its BLAS for other compiled code; here it is called through ctypes, which lets other threads run, and
+SciPy exports its BLAS for other compiled code. Here BLAS is called through ctypes, which lets other threads run and
 copies nothing: a matrix may be a part of the rows of a larger array. Arrays are in C order, in which a Fortran routine
 sees the transpose: a lower triangle of BLAS is the upper triangle of the array.
 """
@@ -30,7 +30,7 @@ def _routine(module: Any, name: str, num_arguments: int) -> Any:
 
 
 class _Routines(NamedTuple):
-    """BLAS routines and constants of a number type. **Fields**: `triangle`: triangular solve (trsm); `square`:
+    """BLAS routines and constants for one number type. **Fields**: `triangle`: triangular solve (trsm); `square`:
     symmetric product (syrk); `plus_one`, `minus_one`: arrays that hold the number 1 or -1."""
 
     triangle: Any
@@ -60,11 +60,12 @@ def _row_stride(matrix: np.ndarray) -> Any:
 
 
 def eliminate(panel: np.ndarray, schur: np.ndarray) -> bool:
-    """Eliminate the pivots of a front, in place. Returns False if the pivot block is not positive definite.
+    """Eliminate the pivots of a front (a dense matrix of p pivot rows and b border rows), in place. Returns False if
+    the pivot block is not positive definite.
 
-    `panel` (p, p + b): on entry the rows [A, B] of the pivots, of which the upper triangle of A and all of B are read,
-    on return [Lᵀ, L⁻¹ B] with A = L Lᵀ. `schur` (b, b): Bᵀ A⁻¹ B is subtracted from its upper triangle. Complex
-    matrices are symmetric, and transposes are not conjugated.
+    `panel` (p, p + b): on entry the rows [A, B] of the pivots, of which the upper triangle of A and all of B are read;
+    on return [Lᵀ, L⁻¹ B] with A = L Lᵀ. `schur` (b, b): Schur complement, from whose upper triangle Bᵀ A⁻¹ B is
+    subtracted. Complex matrices are symmetric, and transposes are not conjugated.
     """
     num_pivots, num_border = len(panel), panel.shape[1] - len(panel)
     routines, stride = _ROUTINES_OF_DTYPE[panel.dtype], _row_stride(panel)
@@ -112,8 +113,8 @@ def eliminate(panel: np.ndarray, schur: np.ndarray) -> bool:
 
 
 def solve_triangle(panel: np.ndarray, vectors: np.ndarray, *, transposed: bool) -> None:
-    """Overwrite the vectors V (p, k) with L⁻¹ V, or with L⁻ᵀ V if `transposed`. `panel`: [Lᵀ, …], as `eliminate`
-    returns it."""
+    """Overwrite the `vectors` V (p, k) with L⁻¹ V, or with L⁻ᵀ V if `transposed`. `panel`: [Lᵀ, …], as overwritten by
+    `eliminate`."""
     if not vectors.size:
         return
     routines, transposition = _ROUTINES_OF_DTYPE[panel.dtype], b"N" if transposed else b"T"

@@ -1,8 +1,8 @@
 """k-means clustering by matrix products.
 
-Lloyd's algorithm is run from several greedy k-means++ starts. An iteration costs a product of (k, d) with (d, n), less
-once clusters no longer move; everything else is small in comparison. Points are centred first, so that the distances
-‖x‖² - 2 x·c + ‖c‖² stay accurate however far the points lie from the origin.
+Lloyd's algorithm is run from several greedy k-means++ starts. With k clusters of n points in d dimensions, an iteration
+costs a product of (k, d) with (d, n), less once clusters no longer move; all other costs are small. Points are centred
+first, so that the distances ‖x‖² - 2 x·c + ‖c‖² stay accurate however far the points lie from the origin.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class KMeans(Module):
     """Result of k-means.
 
     **Fields**: `centres`: (k, d) means of the clusters; `labels`: (n,) cluster of each point; `inertia`: sum of the
-    squared distances of points to their centres; `steps`: number of iterations of the best restart; `converged`:
-    whether the best restart converged.
+    squared distances of the points from the centres of their clusters; `steps`: number of iterations of the best
+    restart; `converged`: whether the best restart converged.
 
     **Example:**
 
@@ -51,22 +51,23 @@ def kmeans(
     max_steps: int = 300,
     tolerance: float = 0.0,
 ) -> KMeans:
-    """Partition points into k clusters of minimum inertia: the best of several local minima.
+    """Partition points into k clusters of minimum inertia (sum of squared distances from the centres), by k-means: the
+    best of several local minima.
 
-    Lloyd's algorithm (IEEE Trans. Inf. Theory 28, 1982) from greedy k-means++ starts (Arthur and Vassilvitskii 2007).
-    Clusters that lose all points receive the points farthest from their centres; a cluster can remain empty only if
-    fewer than k points differ. Batches of point sets are supported through `jax.vmap`. Centres and inertia are
+    Lloyd's algorithm (IEEE Trans. Inf. Theory 28, 1982) is run from greedy k-means++ starts (Arthur and Vassilvitskii
+    2007). Clusters that lose all points receive the points farthest from their centres; a cluster can remain empty only
+    if fewer than k points differ. Batches of point sets are supported through `jax.vmap`. Centres and inertia are
     differentiable, with the labels held constant.
 
     **Arguments:**
 
     - `points` (n, d): the points.
     - `num_clusters`: k.
-    - `key`: from `jax.random.key`; the same key gives the same clusters.
+    - `key`: random key from `jax.random.key`; the same key gives the same clusters.
     - `restarts`: number of starts.
     - `max_steps`: maximum number of iterations of Lloyd's algorithm for each start.
-    - `tolerance`: stop when an iteration lowers the inertia by no more than this fraction of it; with 0, iterate until
-      no point changes its cluster.
+    - `tolerance`: stop when an iteration lowers the inertia by no more than this fraction of the inertia; with 0,
+      iterate until no point changes its cluster.
 
     Raises `ValueError` for invalid shapes, counts, tolerances, keys and points.
 
@@ -102,7 +103,7 @@ def _check_count(name: str, count: int) -> None:
 
 @partial(jax.jit, static_argnums=(3, 4))
 def _kmeans(points, key, stop: tuple[Any, Any], num_clusters: int, restarts: int) -> KMeans:
-    # Labels have no derivative. Means for constant labels have one, which needs no loop.
+    # Labels have no derivative. Means for constant labels have a derivative, which needs no loop.
     find_best = in_turn(partial(_best_restart, num_clusters, restarts))
     best_state = find_best(jax.lax.stop_gradient(points), key, stop)
     centres = _cluster_means(points, best_state.labels, best_state.centres)
@@ -131,9 +132,9 @@ def _best_restart(num_clusters: int, restarts: int, points, key, stop) -> _State
     mean = jnp.mean(points, axis=0)
     centred = points - mean
     squares = jnp.sum(centred**2, axis=1)
-    # All starts take the same number of steps, so they run side by side, and the points pass through memory once for
-    # all of them. The number of later iterations differs, so these run one after the other, and none waits for the
-    # slowest.
+    # Choosing centres takes the same number of steps for all starts, so the starts run side by side and share each read
+    # of the points. The number of Lloyd iterations differs, so these run one start after the other, and none waits for
+    # the slowest.
     draws = jax.random.uniform(key, (restarts, num_clusters, _num_candidates(num_clusters)), points.dtype)
     starts = jax.vmap(lambda draws: _kmeans_plus_plus(centred, squares, draws))(draws)
     descend = in_turn(_lloyd)
@@ -143,7 +144,7 @@ def _best_restart(num_clusters: int, restarts: int, points, key, stop) -> _State
 
 
 def _num_candidates(num_clusters: int) -> int:
-    """Number of points to draw for every centre of a start, as in scikit-learn."""
+    """Number of points drawn as candidates for every centre of a start, as in scikit-learn."""
     return 2 + int(np.log(num_clusters))
 
 
@@ -172,18 +173,19 @@ def _kmeans_plus_plus(points, squares, draws: Float[Array, "k trials"]) -> Float
 
 
 def _lloyd(start, points, squares, stop) -> _State:
-    """Alternate means of the clusters and assignment to the nearest means until nothing changes. `stop`: maximum number
-    of steps, and tolerance."""
+    """Alternate between computing the means of the clusters and assigning points to the nearest means, until nothing
+    changes. `stop`: maximum number of steps, and tolerance."""
     num_clusters = len(start)
     max_steps, tolerance = stop
     max_moved = -(-num_clusters // 3)
 
     def score(centres):
-        """Squared distances to the points, minus the squared norms of the points."""
+        """Squared distances between `centres` and points, minus the squared norms of the points."""
         return jnp.sum(centres**2, axis=1)[:, None] - 2 * centres @ points.T
 
     def score_moved(scores, centres, moved):
-        """Scores of the centres that moved; the others keep their scores, as most do after a few steps."""
+        """Update the scores of the centres that moved; all other centres keep their scores, as most do after a few
+        steps."""
 
         def score_some():
             index = jnp.nonzero(moved, size=max_moved, fill_value=num_clusters)[0]
@@ -192,8 +194,8 @@ def _lloyd(start, points, squares, stop) -> _State:
         return jax.lax.cond(jnp.sum(moved) <= max_moved, score_some, lambda: score(centres))
 
     def assign(scores):
-        """Labels, distances and inertia for the first of the nearest centres. A minimum is many times faster than
-        jnp.argmin on a CPU."""
+        """Labels, distances and inertia for the nearest centres, the first where several are equally near. Computed
+        with a minimum, which is many times faster than jnp.argmin on a CPU."""
         min_scores = jnp.min(scores, axis=0)
         rows = jnp.arange(num_clusters)[:, None]
         labels = jnp.min(jnp.where(scores == min_scores, rows, num_clusters - 1), axis=0)
@@ -245,7 +247,8 @@ def _cluster_means(points, labels, otherwise) -> Float[Array, "k d"]:
     def multiplied(points, labels):
         return jax.nn.one_hot(labels, num_clusters, dtype=points.dtype, axis=0) @ points
 
-    # On a CPU a sum by index costs a fifth of the product; on accelerators its order, and so its rounding, is random.
+    # On a CPU a sum by index costs a fifth of the product; on accelerators the order of such a sum, and so its
+    # rounding, is random.
     totals = jax.lax.platform_dependent(points, labels, cpu=scattered, default=multiplied)
     counts = _cluster_sizes(labels, num_clusters)[:, None]
     return jnp.where(counts > 0, totals / jnp.maximum(counts, 1), otherwise)

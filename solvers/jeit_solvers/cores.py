@@ -1,9 +1,9 @@
-"""Distribution of many equal parts of work over the cores of a machine.
+"""Distribution of many equal parts of a computation over the cores of a machine.
 
 XLA spreads a product of large matrices over all cores, but runs gathers, sums and small products of a compiled loop on
 one core; two loops, each on its own thread, keep two cores busy. NumPy likewise runs on one core, except for products,
 which its BLAS spreads over all cores. While several threads work in NumPy, the BLAS is limited to one thread, because
-its threads would compete with them.
+the threads of BLAS would compete with these threads.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ import numpy as np
 import threadpoolctl
 from jaxtyping import Array, Int
 
-# Maximum number of threads that work in NumPy at once: each needs its own memory, and all share the memory bandwidth.
+# Maximum number of threads that work in NumPy at once: each thread needs its own memory, and all share the memory
+# bandwidth.
 _MAX_THREADS = 4
 # Prefix of the names of the threads of `on_cores`, by which calls from inside a part are recognised.
 _THREAD_NAME = "jeit-core"
@@ -43,7 +44,7 @@ def number_of_cores() -> int:
 
 
 def memory_of_machine() -> float:
-    """Memory of the machine in bytes; 8 GB where the system does not state it."""
+    """Memory of the machine in bytes; 8 GB if the operating system does not state the memory."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, ValueError, OSError):
@@ -51,11 +52,12 @@ def memory_of_machine() -> float:
 
 
 def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], num_parts: int, group_size: int) -> Array:
-    """Compute a function for the parts 0 … `num_parts` - 1 on all cores, and concatenate the rows that it returns. If
-    `num_parts` is not divisible into equal groups, the rows of the last part are repeated at the end.
+    """Compute a function for the parts 0 … `num_parts` - 1 of a computation on all cores, and concatenate the rows that
+    the function returns. If `num_parts` is not divisible into equal groups, the rows of the last part are repeated at
+    the end.
 
     The function is compiled once, because every core processes the same number c of groups. The results of a group must
-    not depend on other groups; then they do not depend on the number of cores.
+    not depend on other groups; the results then do not depend on the number of cores.
 
     **Arguments:**
 
@@ -83,14 +85,14 @@ def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], num_parts: i
 def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
     """Apply `function` to each part, in NumPy, in parallel on several cores; the function stores its results itself.
 
-    A single part, a call from inside another part, and a call while another thread has the cores, are processed in the
-    calling thread: parts may wait for compiled programs, which call NumPy from threads of their own. Floating-point
-    warnings are suppressed, because NaN is reported elsewhere.
+    A single part, a call from inside another part, and a call while another thread uses the cores are processed in the
+    calling thread, because parts may wait for compiled programs, which call NumPy from threads of their own.
+    Floating-point warnings are suppressed, because NaN is reported elsewhere.
 
     **Arguments:**
 
     - `function`: function of a part.
-    - `parts`: one for each call.
+    - `parts`: arguments, one for each call of `function`.
 
     **Example:**
 
@@ -124,8 +126,8 @@ def parts_for_cores(number: int) -> list[slice]:
 
 @functools.cache
 def _thread_pool(process: int) -> ThreadPoolExecutor:
-    """Thread pool of a process (a forked process needs a new one). The pool is kept, because memory allocated and freed
-    by new threads, about a hundred megabytes, is not returned each time."""
+    """Thread pool of a process (a forked process needs a new pool). The pool is kept, because memory that new threads
+    allocate and free, about a hundred megabytes, is not returned to the system."""
     return ThreadPoolExecutor(min(number_of_cores(), _MAX_THREADS), _THREAD_NAME)
 
 
@@ -137,8 +139,8 @@ def _pool_lock(process: int) -> threading.Lock:
 
 @functools.cache
 def blas() -> threadpoolctl.ThreadpoolController:
-    """Controller of the two BLAS libraries that NumPy and SciPy bring along, one each."""
-    importlib.import_module("scipy.linalg.cython_blas")  # loads SciPy's
+    """Controller of the numbers of threads of two BLAS libraries, that of NumPy and that of SciPy."""
+    importlib.import_module("scipy.linalg.cython_blas")  # loads SciPy's BLAS
     return threadpoolctl.ThreadpoolController().select(user_api="blas")
 
 
@@ -148,7 +150,7 @@ _limits_lock = threading.Lock()
 
 @contextlib.contextmanager
 def one_thread_of_blas() -> Iterator[None]:
-    """Limit the BLAS to one thread while this context, or another one of this kind, is active. Takes a few
+    """Limit the BLAS to one thread while this context, or another context of this kind, is active. Entering takes a few
     microseconds.
 
     **Example:**

@@ -13,16 +13,17 @@ from jaxtyping import Array, Float, Inexact
 
 from jeit_solvers.engines import host, namespace
 
-# Sizes of the smallest blocks of the recursion, without and with LAPACK.
+# Sizes of the smallest blocks of recursive inversion, without and with LAPACK.
 _BLOCK, _LAPACK_BLOCK = 8, 128
 # Maximum size of compiled matrices that are inverted by recursion.
 _MAX_RECURSIVE_SIZE = 128
-# Batches of more matrices than this use unrolled code.
+# Number of matrices in a batch above which unrolled code is used.
 _MIN_UNROLLED_BATCH = 16
 
 
 def inverse_cholesky(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """W = L^-1 for the lower triangular L with A = L L^T, so that W A W^T = 1.
+    """Inverse Cholesky factor W = L^-1 of each matrix A, for the lower triangular L with A = L L^T, so that W A W^T =
+    1.
 
     Real matrices must be positive definite. Complex matrices must be symmetric (not Hermitian) with a positive definite
     real part, which makes elimination without pivoting stable (Higham, Math. Comp. 67, 1998). The result is NaN for
@@ -36,7 +37,7 @@ def inverse_cholesky(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "b
 
 
 def lower_cholesky(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
-    """Lower triangular L with A = L Lᵀ; NaN if there is no such matrix.
+    """Cholesky factor of a matrix A: the lower triangular L with A = L Lᵀ; NaN if A is not positive definite.
 
     **Arguments:**
 
@@ -57,7 +58,8 @@ def lower_cholesky(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
 
 
 def symmetric_eigen(matrix: Inexact[Array, "s s"]) -> tuple[Inexact[Array, " s"], Inexact[Array, "s s"]]:
-    """Eigenvalues in ascending order, and eigenvectors in columns; NaN if the matrix is not finite.
+    """Eigenvalues of a symmetric matrix in ascending order, and its eigenvectors in columns; NaN if the matrix is not
+    finite.
 
     **Arguments:**
 
@@ -77,11 +79,11 @@ def symmetric_eigen(matrix: Inexact[Array, "s s"]) -> tuple[Inexact[Array, " s"]
 
 
 def symmetric_inverse(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
-    """Inverse of a single symmetric matrix; NaN if it is singular or not finite.
+    """Inverse of a single symmetric matrix; NaN if the matrix is singular or not finite.
 
     **Arguments:**
 
-    - `matrix` (s, s): of the kind that `inverse_cholesky` accepts.
+    - `matrix` (s, s): a matrix of the kind that `inverse_cholesky` accepts.
 
     **Example:**
 
@@ -113,7 +115,7 @@ def _symmetric_inverse_jvp(primals, tangents):
 
 
 def _inverse_cholesky_lapack(matrices: Any) -> Any:
-    """`inverse_cholesky` for NumPy arrays, by LAPACK."""
+    """Inverse Cholesky factors, as from `inverse_cholesky`, of NumPy arrays, by LAPACK."""
     # Scale the diagonal to order one by powers of two: LAPACK's inverse is less accurate for rows of different orders
     # of magnitude.
     diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
@@ -140,9 +142,10 @@ def _inverse_square_root(pivot: Inexact[Array, "batch 1"]) -> Inexact[Array, "ba
 
 
 def _inverse_cholesky_recursive(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """`inverse_cholesky` by recursion on two by two blocks. Nearly all work is in matrix products, which are three to
-    four times faster than LAPACK's inverse of a triangle. The smallest blocks use unrolled code in large batches, and
-    in small batches a loop over short vectors, with larger blocks the fewer matrices there are."""
+    """Inverse Cholesky factors, as from `inverse_cholesky`, by recursion on two by two blocks. Nearly all work is in
+    matrix products, which are three to four times faster than LAPACK's inverse of a triangle. The smallest blocks use
+    unrolled code in large batches, and in small batches a loop over short vectors; blocks are larger for fewer
+    matrices."""
     batch, size, _ = matrices.shape
     is_numpy = isinstance(matrices, np.ndarray)
     uses_lapack = is_numpy and not np.iscomplexobj(matrices)
@@ -168,7 +171,7 @@ def _inverse_cholesky_recursive(matrices: Inexact[Array, "batch s s"]) -> Inexac
 
 
 def _inverse_cholesky_unrolled(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """Elimination of [A | 1] to [L^T | W], row by row, in unrolled code."""
+    """Inverse Cholesky factors by elimination of [A | 1] to [L^T | W], row by row, in unrolled code."""
     size, xp = matrices.shape[-1], namespace(matrices)
     identity = xp.broadcast_to(xp.eye(size, dtype=matrices.dtype), matrices.shape)
     augmented = xp.concatenate([matrices, identity], axis=-1)
@@ -182,8 +185,8 @@ def _inverse_cholesky_unrolled(matrices: Inexact[Array, "batch s s"]) -> Inexact
 
 
 def _inverse_cholesky_by_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """The elimination of `_inverse_cholesky_unrolled` in a loop, where each row is reduced by all previous rows in one
-    product."""
+    """Inverse Cholesky factors by the elimination of `_inverse_cholesky_unrolled` in a loop, in which each row is
+    reduced by all previous rows in one product."""
     size = matrices.shape[-1]
     identity = jnp.broadcast_to(jnp.eye(size, dtype=matrices.dtype), matrices.shape)
     augmented = jnp.concatenate([matrices, identity], axis=-1)
@@ -199,9 +202,9 @@ def _inverse_cholesky_by_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[
 
 
 def _inverse_cholesky_by_block_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """`inverse_cholesky` by a loop over blocks of rows of W. With G = A_k W^T, the new diagonal block satisfies A_kk -
-    G G^T = (W_kk^T W_kk)^-1, and the new rows are W_kk (E_k - G W). The compiled loop body does not depend on the
-    size."""
+    """Inverse Cholesky factor W, as from `inverse_cholesky`, by a loop over blocks of rows k of W. With G = A_k W^T,
+    the new diagonal block satisfies A_kk - G G^T = (W_kk^T W_kk)^-1, and the new rows are W_kk (E_k - G W). The
+    compiled loop body does not depend on the size."""
     size, dtype = matrices.shape[-1], matrices.dtype
     block = 32 if size <= 256 else 64
     padding = -size % block
@@ -223,8 +226,8 @@ def _inverse_cholesky_by_block_rows(matrices: Inexact[Array, "batch s s"]) -> In
     return inverse[:, :size, :size]
 
 
-# The cost at a point, and a function that returns, for a given damping, a step from that point with its slope and
-# curvature.
+# The cost at a point, and a function that returns, for a given damping, a step from this point with the slope and
+# curvature of the cost along the step.
 QuadraticModel = tuple[Float[Array, ""], Callable[[Any], tuple[Float[Array, " n"], Float[Array, ""], Float[Array, ""]]]]
 
 
@@ -235,15 +238,16 @@ def ridge_model(
     covariance: Float[Array, "M M"],
     precision: Float[Array, "M M"],
 ) -> QuadraticModel:
-    """The cost ½ rᵀ C⁻¹ r + ½ ‖c‖² at a point c, with the residual r, and its `step` function for `Descent`.
+    """Quadratic model for `Descent` of the cost ½ rᵀ C⁻¹ r + ½ ‖c‖² with the residual r: the cost at a point c, and the
+    function `step`.
 
     **Arguments:**
 
     - `residual` (M,): r at the point.
     - `jacobian` (M, n): derivative of r with respect to c.
     - `point` (n,): c.
-    - `covariance` (M, M): C, of the data.
-    - `precision` (M, M): its inverse.
+    - `covariance` (M, M): covariance C of the data.
+    - `precision` (M, M): C⁻¹.
 
     **Example:**
 
@@ -284,9 +288,9 @@ def ridge_step(
     - `jacobian` (M, n): J.
     - `residual` (M,): r.
     - `point` (n,): c.
-    - `covariance` (M, M): C, of the data.
-    - `precision` (M, M): its inverse.
-    - `ridge`: weight of the penalty.
+    - `covariance` (M, M): covariance C of the data.
+    - `precision` (M, M): C⁻¹.
+    - `ridge`: weight of the penalty ½ ‖c‖².
 
     **Example:**
 

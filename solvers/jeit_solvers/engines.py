@@ -50,10 +50,10 @@ def in_turn(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def differentiable_batches(function: Callable[..., Any], batch_rule: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` with `batch_rule` as its behaviour under vmap, and with its usual derivatives.
+    """Give `function` the behaviour `batch_rule` under `jax.vmap`, and keep its usual derivatives.
 
     `batch_rule(batchable, plain, axis_size, batched, *arguments)` returns outputs that all have the batch as leading
-    axis. `batchable` is the function with the rule, for nested batches; `plain` is the function without the rule.
+    axis. `batchable` is the function with the batch rule, for nested batches; `plain` is the function without the rule.
     """
 
     @custom_vmap
@@ -119,7 +119,7 @@ def one_by_one(
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _PROCESS = os.getpid()
-# Size of a complex step; its square is negligible in double precision.
+# Size of a complex step for derivatives; its square is negligible in double precision.
 _COMPLEX_STEP = 1e-100
 
 
@@ -138,12 +138,12 @@ def has_values(*trees: Any) -> bool:
 
 
 def is_forked() -> bool:
-    """Whether this process was forked from the one that imported this module; compiled code may hang in it."""
+    """Whether this process was forked from the process that imported this module; compiled code may hang in a fork."""
     return os.getpid() != _PROCESS
 
 
 def on_host(tree: Any) -> Any:
-    """The pytree with JAX's arrays converted to NumPy's, except traced ones; on a CPU both share their memory."""
+    """Convert the JAX arrays of a pytree, except traced arrays, to NumPy arrays; on a CPU both share their memory."""
     return jax.tree.map(_on_host, tree)
 
 
@@ -162,7 +162,7 @@ def _on_device(leaf: Any) -> Any:
     return jax.device_put(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
 
 
-# Size in bytes from which an array is allocated in memory that JAX can use without a copy (copying smaller ones is
+# Size in bytes from which an array is allocated in memory that JAX can use without a copy (copying smaller arrays is
 # faster), and alignment in bytes that JAX requires of such memory.
 _MIN_SHARED_BYTES, _JAX_ALIGNMENT = 1_000_000, 64
 
@@ -186,13 +186,13 @@ def product_for_jax(left: Inexact[np.ndarray, "*f k"], right: Inexact[np.ndarray
 
 @jax.jit
 def _to_jax(array) -> Any:
-    """Convert a NumPy array to a JAX array in a quarter of the time of `jax.device_put`. It cannot be used in forked
-    processes, where compiled functions do not run."""
+    """Convert a NumPy array to a JAX array in a quarter of the time of `jax.device_put`. This conversion cannot be used
+    in forked processes, where compiled functions do not run."""
     return array
 
 
 def as_array(values: Any, dtype: Any = None) -> Array:
-    """Copy values, known or traced, to an array of JAX's, so that later changes of the caller's array have no effect.
+    """Copy values, known or traced, to a JAX array, so that later changes of the caller's array have no effect.
 
     `jax.numpy.asarray`, in contrast, may share the memory, and compiles a program for every shape.
     """
@@ -203,16 +203,16 @@ def as_array(values: Any, dtype: Any = None) -> Array:
 
 
 def at_once(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Result of `function` for arrays with known values, computed in NumPy."""
+    """Return the result of `function` for arrays with known values, computed in NumPy."""
     arguments, named = on_host((arguments, named))
-    with np.errstate(all="ignore"):  # JAX does not warn of these errors either
+    with np.errstate(all="ignore"):  # JAX does not warn of floating-point errors either
         return function(*arguments, **named)
 
 
 def either_engine(function: _Function) -> _Function:
     """Make `function` of arrays run in NumPy if all values are known, and in a compiled program if any array is traced.
 
-    The results are JAX's arrays, unless all arguments are NumPy's.
+    The results are JAX arrays, unless all arguments are NumPy arrays.
     """
     compiled = jax.jit(function)
 
@@ -231,8 +231,8 @@ def values_at_once(function: _Function) -> _Function:
     """Make `function` of arrays run in NumPy if all values are known, and unchanged, not compiled, if any array is
     traced.
 
-    For functions that must read some values even if other arrays are traced, which `either_engine` does not allow. The
-    results are JAX's arrays, unless all arguments are NumPy's.
+    This suits functions that must read some values even if other arrays are traced, which `either_engine` does not
+    allow. The results are JAX arrays, unless all arguments are NumPy arrays.
     """
 
     @functools.wraps(function)
@@ -246,8 +246,8 @@ def values_at_once(function: _Function) -> _Function:
 
 
 class Recent:
-    """Cache of the last few results of a function of immutable pytrees, looked up by the identity of its arguments, or
-    of the arrays in them."""
+    """Cache of the last few results of a function of immutable pytrees. A result is found by the identity of the
+    arguments, or of the arrays in the arguments."""
 
     def __init__(self, make: Callable[..., Any], size: int = 4):
         self._make, self._size = make, size
@@ -273,22 +273,22 @@ def _identical(first: Sequence[Any], second: Sequence[Any]) -> bool:
 
 
 def undifferentiated(values: Any) -> Any:
-    """The same pytree of arrays, treated as constant in differentiation."""
+    """Return a pytree of arrays that differentiation treats as constant."""
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf, values)
 
 
 def kept(values: Any) -> Any:
-    """The same pytree of arrays, computed only once: otherwise XLA may compute them again wherever they are used."""
+    """Return a pytree of arrays that XLA computes only once, not again wherever the arrays are used."""
     return values if namespace(values) is np else jax.lax.optimization_barrier(values)
 
 
 def adjoint(matrix: Any) -> Any:
-    """The conjugate transpose of a matrix (m, n); for a real matrix the transpose, as a view."""
+    """Conjugate transpose of a matrix (m, n); for a real matrix the transpose, as a view."""
     return matrix.conj().T if np.iscomplexobj(matrix) else matrix.T
 
 
 def while_loop(condition: Callable[[Any], Any], body: Callable[[Any], Any], state: Any) -> Any:
-    """The state after repeating `body` while `condition` holds; `jax.lax.while_loop` for JAX's arrays."""
+    """Return the state after repeating `body` while `condition` holds; runs `jax.lax.while_loop` for JAX arrays."""
     if namespace(state) is jnp:
         return jax.lax.while_loop(condition, body, state)
     while condition(state):
@@ -297,8 +297,8 @@ def while_loop(condition: Callable[[Any], Any], body: Callable[[Any], Any], stat
 
 
 def scan(body: Callable[[Any, Any], tuple[Any, Any]], state: Any, elements: Any, *, reverse: bool = False) -> Any:
-    """The last state, and the stacked outputs, of `body(state, one)` applied along the first axis of `elements`.
-    `jax.lax.scan` for JAX's arrays; in NumPy at least one element is needed."""
+    """Apply `body(state, element)` along the first axis of `elements`; returns the last state and the stacked outputs.
+    Runs `jax.lax.scan` for JAX arrays; in NumPy at least one element is needed."""
     if namespace(state, elements) is jnp:
         return jax.lax.scan(body, state, elements, reverse=reverse)
     outputs: Any = [None] * len(jax.tree.leaves(elements)[0])
@@ -308,8 +308,8 @@ def scan(body: Callable[[Any, Any], tuple[Any, Any]], state: Any, elements: Any,
 
 
 def complex_slope(function: Callable[[Any], Any], x: Any, row_index: int) -> Any:
-    """Derivative of `function` with respect to one row of a NumPy array x (n, F), whose columns are independent. See
-    `slopes`."""
+    """Derivative of `function` with respect to one row of a NumPy array x (n, F), by a complex step. The columns of x
+    are independent arguments; see `slopes`."""
     return _complex_step(function, x, row_index)[1]
 
 
@@ -323,8 +323,8 @@ def _complex_step(function, x, row: int) -> tuple[Any, Any]:
 
 
 def slopes(function: Callable[[Any], Any], x: Any) -> tuple[Any, list[Any]]:
-    """Values of `function` at x (n, F), and its derivatives with respect to each of the n rows; columns are
-    independent.
+    """Values of `function` at x (n, F), and its derivatives with respect to each of the n rows of x; the columns are
+    independent arguments.
 
     NumPy uses complex steps (Squire and Trapp, SIAM Rev. 40, 1998, 110-112), which are exact to rounding if the
     function is analytic. JAX uses forward differentiation.
@@ -337,14 +337,14 @@ def slopes(function: Callable[[Any], Any], x: Any) -> tuple[Any, list[Any]]:
 
 
 def gather(values: Shaped[Array, "n *k"], index: Int[Array, "*i"]) -> Shaped[Array, "..."]:
-    """Rows of `values` at valid indices; the indices are not checked."""
+    """Rows of `values` at the indices `index`, which must be valid and are not checked."""
     if isinstance(values, np.ndarray):
         return values[np.asarray(index)]  # pyright: ignore[reportReturnType]
     return values.at[index].get(mode="promise_in_bounds")
 
 
 def gather_or_zero(values: Shaped[Array, "n *k"], index: Int[Array, "*i"]) -> Shaped[Array, "..."]:
-    """Rows of `values`, with zeros for the index n."""
+    """Rows of `values` (n, …) at the indices `index`, with a row of zeros for the index n."""
     if isinstance(values, np.ndarray):
         if not len(values):
             return host.zeros((*np.shape(index), *values.shape[1:]), values.dtype)
@@ -355,7 +355,7 @@ def gather_or_zero(values: Shaped[Array, "n *k"], index: Int[Array, "*i"]) -> Sh
 
 
 def replace_at(values: Shaped[Array, " n"], index: Any, value: Any) -> Shaped[Array, " n"]:
-    """`values` with `value` at an index; unchanged if the index lies beyond the end."""
+    """Copy of `values` with `value` at `index`; unchanged if the index lies beyond the end."""
     if isinstance(values, np.ndarray):
         return np.where(np.arange(values.size) == index, value, values)  # pyright: ignore[reportReturnType]
     return values.at[index].set(value, mode="drop")
@@ -367,7 +367,7 @@ def sum_into(shape: tuple[int, ...], index: Any, values: Inexact[Array, "*i"]) -
 
 
 def set_at(total: Shaped[Array, "*n"], index: Any, values: Any) -> Shaped[Array, "*n"]:
-    """`total` with the entries at `index` replaced by `values`; in JAX's arrays, indices beyond the end are ignored."""
+    """Copy of `total` with the entries at `index` replaced by `values`; JAX ignores indices beyond the end."""
     if isinstance(total, np.ndarray):
         replaced: Any = np.array(total)
         replaced[index] = values
@@ -376,12 +376,12 @@ def set_at(total: Shaped[Array, "*n"], index: Any, values: Any) -> Shaped[Array,
 
 
 def add_at(total: Inexact[Array, "*n"], index: Any, values: Inexact[Array, "*i"]) -> Inexact[Array, "*n"]:
-    """`total` with `values` added at `index`; repeated indices accumulate."""
+    """Copy of `total` with `values` added at `index`; repeated indices accumulate."""
     return add_into(host.array(total) if isinstance(total, np.ndarray) else total, index, values)
 
 
 def add_into(total: Inexact[Array, "*n"], index: Any, values: Inexact[Array, "*i"]) -> Inexact[Array, "*n"]:
-    """Like `add_at`, but a NumPy array `total` is changed in place."""
+    """Add `values` to `total` as `add_at` does, but change a NumPy array `total` in place."""
     if isinstance(total, np.ndarray):
         np.add.at(total, index, values)
         return host.asarray(total)
@@ -389,12 +389,12 @@ def add_into(total: Inexact[Array, "*n"], index: Any, values: Inexact[Array, "*i
 
 
 def call_numpy(function: Callable[..., Any], shape: jax.ShapeDtypeStruct, *arguments: Any) -> Any:
-    """The array that a `function` of NumPy arrays returns, for arguments whose values need not be known: a compiled
-    program calls it.
+    """Return the array that a `function` of NumPy arrays returns, also for traced arguments: the compiled program calls
+    NumPy.
 
     The function gets views of the program's memory. `jax.pure_callback` would copy the arguments into JAX arrays, which
     needs a free thread of XLA: if as many programs call at once as XLA has threads, all of them wait for ever. Under
-    `jax.vmap` the function is called for one element after the other. It is not differentiated.
+    `jax.vmap` the function is called for one element of the batch after the other. The function is not differentiated.
     """
     return _numpy_call.bind(*arguments, function=function, shape=tuple(shape.shape), kind=np.dtype(shape.dtype))
 

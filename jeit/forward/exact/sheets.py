@@ -29,14 +29,14 @@ integrated exactly:
 = 2/((m−n)(m+n+1)) for m + n odd, DLMF 14.17). All other integrands are smooth and are integrated by Gauss-Legendre
 quadrature.
 
-**Disc electrodes on a conducting sheet that is itself a disk with an insulated rim.** Under a disc of radius b the
-contact takes current from the sheet everywhere, σ Δu = (u − U)/z, so that with the transfer length λ = √(σz) the
-potential there is U + Σ_n A_n I_n(r/λ) cos n(φ − φ_n); outside the discs u is harmonic.
+**Disc electrodes on a conducting sheet that is itself a disk with an insulated rim.** Under a disc of radius b and
+contact impedance z the contact takes current from the sheet everywhere, σ Δu = (u − U)/z, so that with the transfer
+length λ = √(σz) the potential under the disc is U + Σ_n A_n I_n(r/λ) cos n(φ − φ_n); outside the discs u is harmonic.
 
-For a single disc in the middle and all current leaving through the rim only n = 0 occurs, which gives a closed form.
-For several discs at any places, the field about each disc is expanded in the multipoles (b/r)^n of the disc and in the
-regular harmonics (r/b)^n that the other discs and the mirror images in the rim produce there; continuity of potential
-and flux at r = b gives
+For a single disc in the middle and all current leaving through the rim, only n = 0 occurs, and the solution has a
+closed form. For several discs at any places, the field about each disc is expanded in the multipoles (b/r)^n of the
+disc and in the regular harmonics (r/b)^n that the other discs and the mirror images in the rim produce there;
+continuity of potential and flux at r = b gives
 
     multipole_n = regular_n (n − q_n)/(n + q_n),    q_n = (b/λ) I_n'(b/λ) / I_n(b/λ),
 
@@ -48,7 +48,7 @@ fed into a sphere of sheet conductivity σ at a point, and taken out uniformly o
 
     u = −1/(2πσ) log |chord|,
 
-because stereographic projection is conformal and maps it to the logarithm in the plane.
+because stereographic projection is conformal and maps this potential to the logarithm in the plane.
 
 On a sleeve of radius R, u is a Fourier series in n φ. On an infinite sleeve the terms n > 0 sum to, with s = |z −
 z'|/R,
@@ -69,8 +69,9 @@ from scipy.special import ive
 
 @dataclass(frozen=True)
 class ConductingDisk:
-    """A disk. **Fields**: `radius` in metres; `conductivity`: sheet conductivity in siemens; `inclusion_ratio`: radius
-    of a concentric inclusion divided by that of the disk, 0 for none; `inclusion_conductivity` in siemens."""
+    """A homogeneous disk, or a disk with a concentric inclusion. **Fields**: `radius` in metres; `conductivity`: sheet
+    conductivity in siemens; `inclusion_ratio`: radius of the inclusion divided by that of the disk, 0 for no inclusion;
+    `inclusion_conductivity`: sheet conductivity of the inclusion in siemens."""
 
     radius: float = 1.0
     conductivity: complex = 1.0
@@ -78,7 +79,8 @@ class ConductingDisk:
     inclusion_conductivity: complex = 1.0
 
     def inclusion_kernel(self, angle: np.ndarray) -> np.ndarray:
-        """Contribution of the inclusion to the kernel N at the angular distance `angle`, in ohm."""
+        """Contribution of the inclusion to the Neumann-to-Dirichlet kernel N at the angular distance `angle`, in
+        ohm."""
         angle = np.asarray(angle, dtype=float)
         if self.inclusion_ratio == 0.0:
             return np.zeros_like(angle)
@@ -91,16 +93,17 @@ class ConductingDisk:
         return series / (np.pi * self.conductivity)
 
     def kernel(self, angle: np.ndarray) -> np.ndarray:
-        """The kernel N, in ohm, at nonzero angular distances."""
+        """The Neumann-to-Dirichlet kernel N of the disk, in ohm, at nonzero angular distances."""
         logarithm = -np.log(np.abs(2.0 * np.sin(np.asarray(angle) / 2.0)))
         return logarithm / (np.pi * self.conductivity) + self.inclusion_kernel(angle)
 
 
 def point_transfer_impedance(disk: ConductingDisk, angles: np.ndarray) -> np.ndarray:
-    """Rim potential (V) at each of `angles` (L,) for one ampere into each point; (L, L), up to a constant.
+    """Potential (V) at L points on the rim of a disk, at the `angles` (L,), for one ampere into each point; (L, L), up
+    to a constant.
 
-    The potential at a point that feeds a current is infinite; the diagonal is set to zero, so use the matrix only where
-    the measured electrodes are not the driven ones.
+    The potential at a point that feeds a current is infinite, so the diagonal is set to zero. Use the matrix only for
+    channels that do not measure on driven electrodes.
     """
     distance = angles[:, None] - angles[None, :]
     off_diagonal = ~np.eye(len(angles), dtype=bool)
@@ -110,7 +113,8 @@ def point_transfer_impedance(disk: ConductingDisk, angles: np.ndarray) -> np.nda
 
 
 def point_inclusion_effect(disk: ConductingDisk, angles: np.ndarray) -> np.ndarray:
-    """Contribution (L, L) of the inclusion to `point_transfer_impedance`; finite on the diagonal too."""
+    """Contribution (L, L) of the inclusion of a disk to `point_transfer_impedance`, in ohm; finite on the diagonal
+    too."""
     return disk.inclusion_kernel(angles[:, None] - angles[None, :])
 
 
@@ -123,7 +127,8 @@ def point_potentials(disk: ConductingDisk, angles: np.ndarray, current: np.ndarr
 
 
 def logarithm_moments(order: int) -> np.ndarray:
-    """∫∫ P_m(x) P_n(y) log|x − y| over [−1, 1]², for m, n < `order`."""
+    """Integrals ∫∫ P_m(x) P_n(y) log|x − y| over [−1, 1]², for Legendre polynomials P_m, P_n of degrees m, n <
+    `order`."""
     m, n = np.meshgrid(np.arange(order), np.arange(order), indexing="ij")
     with np.errstate(divide="ignore"):
         moments = 8.0 / ((m + n) * (m + n + 2.0) * ((m - n) ** 2.0 - 1.0))
@@ -139,7 +144,8 @@ def arc_transfer_impedance(
     contact_impedance: np.ndarray,
     order: int = 48,
 ) -> np.ndarray:
-    """Electrode potentials (V) with sum zero, for one ampere into each electrode and −1/L into all electrodes; (L, L).
+    """Potentials (V) of L arc electrodes on the rim of a disk, with sum zero, for one ampere into each electrode and
+    −1/L into all electrodes; (L, L).
 
     `angles` (L,) are the centres of the arcs in radians, `widths` (L,) their lengths in metres along the circle,
     `contact_impedance` (L,) is in ohm·m. For drive patterns D and measurement patterns M with sum zero, the voltages
@@ -182,10 +188,11 @@ def arc_transfer_impedance(
 
 
 def disc_contact_resistance(conductivity: complex, radius: float, contact_impedance: complex) -> complex:
-    """U − u at the edge of the disc, in volts per ampere fed into the disc: λ I_0(b/λ) / (2πσb I_1(b/λ)).
+    """Contact resistance of a disc electrode: the electrode potential U minus the sheet's potential u at the edge of
+    the disc, in volts per ampere fed into the disc: λ I_0(b/λ) / (2πσb I_1(b/λ)) with the transfer length λ = √(σz).
 
-    Sheet `conductivity` σ in siemens, `radius` b in metres, `contact_impedance` z in ohm·m². For b/λ → 0 this is
-    z/(πb²), a uniformly fed contact; for b/λ → ∞ it is the resistance of a ring of width λ.
+    Sheet `conductivity` σ in siemens, `radius` b in metres, `contact_impedance` z in ohm·m². For b/λ → 0 the result
+    tends to z/(πb²), a uniformly fed contact; for b/λ → ∞ it tends to the resistance of a ring of width λ.
     """
     transfer_length = np.sqrt(conductivity * contact_impedance)
     argument = radius / transfer_length
@@ -195,7 +202,7 @@ def disc_contact_resistance(conductivity: complex, radius: float, contact_impeda
 def centre_to_rim_resistance(
     disk: ConductingDisk, radius: float, contact_impedance: complex, rim_contact_impedance: complex
 ) -> complex:
-    """Resistance (ohm) from a disc electrode in the middle to an electrode that covers the whole rim.
+    """Resistance (ohm) of a disk from a disc electrode in the middle to an electrode that covers the whole rim.
 
     `contact_impedance` of the disc is in ohm·m², `rim_contact_impedance` in ohm·m.
     """
@@ -211,7 +218,8 @@ def disc_transfer_impedance(
     contact_impedance: np.ndarray,
     num_multipoles: int = 24,
 ) -> np.ndarray:
-    """Electrode potentials (V) with sum zero, for one ampere into each disc and −1/L into all discs; (L, L).
+    """Potentials (V) of L disc electrodes on a disk, with sum zero, for one ampere into each disc and −1/L into all
+    discs; (L, L).
 
     `positions` (L, 2) and `radii` (L,) in metres, `contact_impedance` (L,) in ohm·m²; the disk has no inclusion.
     """
@@ -265,13 +273,13 @@ def disc_transfer_impedance(
     return centring @ potential
 
 
-# Distance in radii beyond which images are negligible in double precision.
+# Distance in radii of the sleeve beyond which mirror images are negligible in double precision.
 _IMAGE_CUTOFF = 45.0
 
 
 def sphere_sheet_impedance(positions: np.ndarray, conductivity: complex) -> np.ndarray:
-    """Potential (V) at each of `positions` (L, 3), in metres on a sphere, for one ampere into each point; (L, L), up to
-    a constant.
+    """Potential (V) of a closed sphere at `positions` (L, 3), metres, for one ampere into each of these points; (L, L),
+    up to a constant.
 
     Sheet `conductivity` in siemens. The potential at a point that feeds a current is infinite; the diagonal is set to
     zero.
@@ -284,12 +292,12 @@ def sphere_sheet_impedance(positions: np.ndarray, conductivity: complex) -> np.n
 def sleeve_sheet_impedance(
     radius: float, height: float, angles: np.ndarray, heights: np.ndarray, conductivity: complex
 ) -> np.ndarray:
-    """Potential (V) at each of L points of a sleeve for one ampere into each point; (L, L), up to terms that cancel for
-    currents with sum zero.
+    """Potential (V) at each of L points of a sleeve (an open cylinder) for one ampere into each point; (L, L), up to
+    terms that cancel for currents with sum zero.
 
-    `radius` and `height` of the sleeve in metres; `angles` (L,) of the points around it in radians, and their `heights`
-    (L,) above its lower end in metres; sheet `conductivity` in siemens. The diagonal is set to zero, where the
-    potential is infinite.
+    `radius` and `height` of the sleeve in metres; `angles` (L,) of the points around the sleeve in radians, and
+    `heights` (L,) of the points above the sleeve's lower end in metres; sheet `conductivity` in siemens. The diagonal
+    is set to zero, where the potential is infinite.
     """
     angle_difference = angles[:, None] - angles
     z, source = heights[:, None], heights

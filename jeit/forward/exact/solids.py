@@ -1,8 +1,8 @@
 """Exact voltages of homogeneous boxes, cylinders and spheres, as series.
 
-**A solid or hollow cylinder**, fed through patches of its wall, with a current that is uniform over each patch (the gap
-model). In 0 < z < H with insulated ends and R₁ < r < R₂, insulated at R₁, potentials are sums of F(r) cos nφ cos kz, k
-= mπ/H, with
+**A solid or hollow cylinder** is fed through patches of its wall, with a current that is uniform over each patch (the
+gap model). The cylinder fills 0 < z < H, with insulated ends, and R₁ < r < R₂, insulated at R₁. Potentials are sums of
+F(r) cos nφ cos kz, k = mπ/H, with
 
     F = I_n(kr) − I_n'(kR₁)/K_n'(kR₁) K_n(kr)   for m > 0,      F = (r/R₂)^n + (R₁²/rR₂)^n   for m = 0 < n,
 
@@ -13,9 +13,9 @@ modes in the same way. Ratios of Bessel functions are computed from recurrences 
 for I_n, upwards for K_n.
 
 An electrode whose contact impedance z is large compared with its size divided by σ carries a uniform current density.
-It measures the mean potential beneath it plus the voltage z I / area across its contact.
+Such an electrode measures the mean potential beneath it plus the voltage z I / area across its contact.
 
-**A solid or hollow ball**, fed through caps of its surface, with a current that is uniform over each cap (the gap
+**A solid or hollow ball** is fed through caps of its surface, with a current that is uniform over each cap (the gap
 model). With an insulated inner surface at R₁, potentials are sums of F(r) P_n(cos γ), F = r^n + n/(n+1) R₁^{2n+1}
 r^{−n−1}. A cap of half-angle α that carries one ampere has the density Σ (2n+1) w_n P_n(cos γ) / (4πR₂²), where γ is
 the angle from the centre of the cap, with
@@ -23,7 +23,7 @@ the angle from the centre of the cap, with
     w_n = (P_{n−1}(cos α) − P_{n+1}(cos α)) / ((2n+1)(1 − cos α)),
 
 the mean of P_n over the cap. By the addition theorem the mean of P_n(cos γ) over another cap is w_n P_n of the angle
-between the caps. Contact impedances act as described for the cylinder.
+between the caps. Contact impedances act as in the cylinder.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ from scipy.special import ive, kve
 
 
 def plate_resistance(length: float, area: float, conductivity: complex, contact_impedance: complex) -> complex:
-    """Resistance R = ℓ/(σA) + 2z/A in ohm: Ohm's law for the conductor and one contact layer at each plate.
+    """Resistance R = ℓ/(σA) + 2z/A in ohm between two plates: Ohm's law for the conductor of length ℓ and one contact
+    layer at each plate.
 
     In 3-D `area` is in m², `conductivity` in S/m and `contact_impedance` in ohm·m²; in 2-D `area` is the length of the
     plate in metres, `conductivity` is in siemens and `contact_impedance` in ohm·m.
@@ -54,8 +55,9 @@ def face_patch_impedance(
     with a uniform current density (the gap model). The result (L, L) is exact up to terms that cancel for currents that
     sum to zero.
 
-    `size`: (a, b, c) of the box, which fills 0 ≤ x ≤ a, 0 ≤ y ≤ b, 0 ≤ z ≤ c; `positions`: (L, 3) centres of the
-    patches, with z = 0 or c; `patch`: widths of the patches along x and y; all in metres. `conductivity` in S/m.
+    `size`: lengths (a, b, c) of the sides of the box, which fills 0 ≤ x ≤ a, 0 ≤ y ≤ b, 0 ≤ z ≤ c; `positions`: (L, 3)
+    centres of the patches, with z = 0 or c; `patch`: widths of the patches along x and y; all in metres. `conductivity`
+    in S/m.
 
     The mode cos(pπx/a) cos(qπy/b), of wave number κ, has the potential coth(κc)/κ on the face through which it is fed
     and 1/(κ sinh κc) on the opposite face. The mode p = q = 0 is that of a rod with a uniform sink, with a difference
@@ -86,8 +88,8 @@ def face_patch_impedance(
 
 @dataclass(frozen=True)
 class ConductingCylinder:
-    """An upright cylinder from z = 0 to its `height`. `radius` and `height` in metres, `conductivity` in S/m; a hollow
-    cylinder has an insulated `inner_radius`."""
+    """An upright cylinder from z = 0 to its `height`. `radius` and `height` in metres, `conductivity` in S/m;
+    `inner_radius` in metres: radius of the insulated inner wall of a hollow cylinder, 0 for a solid cylinder."""
 
     radius: float
     height: float
@@ -95,8 +97,8 @@ class ConductingCylinder:
     inner_radius: float = 0.0
 
     def response(self, num_around: int, num_along: int) -> np.ndarray:
-        """F(R₂) / F'(R₂), (n, m) in metres, of the modes n < `num_around` and m < `num_along`; 0 for the constant
-        mode."""
+        """Ratio F(R₂) / F'(R₂), (n, m) in metres, of the radial functions F of the modes n < `num_around` and m <
+        `num_along`; 0 for the constant mode."""
         order = np.arange(num_around)[:, None]
         ratio = self.inner_radius / self.radius
         response = np.zeros((num_around, num_along))
@@ -120,10 +122,11 @@ def wall_patch_impedance(
     size: tuple[float, float],
     num_modes: tuple[int, int] = (300, 300),
 ) -> np.ndarray:
-    """Mean potential (V) under each of L patches for one ampere into each patch; (L, L), up to a constant.
+    """Mean potential (V) under each of L patches on the wall of a cylinder, for one ampere into each patch; (L, L), up
+    to a constant.
 
-    The centres of the patches lie at `angles` (L,) in radians and `heights` (L,) in metres; all have the `size` (arc
-    length, height) in metres. `num_modes`: number of modes summed around and along the cylinder.
+    The centres of the patches lie at `angles` (L,) in radians and `heights` (L,) in metres; all patches have the `size`
+    (arc length, height) in metres. `num_modes`: number of modes summed around and along the cylinder.
     """
     n, m = np.arange(num_modes[0]), np.arange(num_modes[1])
     wave = m * np.pi / cylinder.height
@@ -138,8 +141,8 @@ def wall_patch_impedance(
 
 
 class _Bessel:
-    """Modified Bessel functions of orders n < `count` at x (m,), as arrays (n, m): their logarithms, the growth
-    I_n'/I_n and the decay −K_n'/K_n."""
+    """Modified Bessel functions I_n and K_n of orders n < `count` at x (m,), as arrays (n, m) of their logarithms, of
+    the growth I_n'/I_n and of the decay −K_n'/K_n."""
 
     def __init__(self, count: int, x: np.ndarray):
         order = np.arange(count)[:, None]
@@ -160,8 +163,8 @@ class _Bessel:
 
 @dataclass(frozen=True)
 class ConductingSphere:
-    """A ball around the origin. `radius` in metres, `conductivity` in S/m; a hollow ball has an insulated
-    `inner_radius`."""
+    """A ball around the origin. `radius` in metres, `conductivity` in S/m; `inner_radius` in metres: radius of the
+    insulated inner surface of a hollow ball, 0 for a solid ball."""
 
     radius: float
     conductivity: complex = 1.0
@@ -169,7 +172,8 @@ class ConductingSphere:
 
 
 def cap_impedance(sphere: ConductingSphere, directions: np.ndarray, radius: float, num_modes: int = 400) -> np.ndarray:
-    """Mean potential (V) under each of L caps for one ampere into each cap; (L, L), up to a constant.
+    """Mean potential (V) under each of L caps on the surface of a ball, for one ampere into each cap; (L, L), up to a
+    constant.
 
     `directions`: (L, 3) unit vectors to the centres of the caps; `radius`: radius of all caps in metres, measured in a
     straight line from centre to rim, as for `jeit.electrodes.FaceDiscs`. `num_modes`: number of modes summed.

@@ -1,4 +1,5 @@
-"""Rules that choose the hyperparameter λ, the curves they are based on, and their comparison on the same data."""
+"""Rules that choose the hyperparameter λ, the curves on which the rules are based, and a comparison of rules on the
+same data."""
 
 from __future__ import annotations
 

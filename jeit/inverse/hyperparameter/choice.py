@@ -1,6 +1,6 @@
 """Result of choosing a hyperparameter: λ, the rule, and the rule's curves; and the default values.
 
-GREIT and filtered back-projection scale λ differently and have their own defaults.
+GREIT and filtered back-projection scale λ differently and have default values of their own.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ EDGE_PRICE = 300.0
 class Choice(Module):
     """A hyperparameter λ that was chosen by a rule from a grid of candidates, or given.
 
-    **Fields**: `hyperparameter`: λ; `candidates` (K,): values of λ evaluated, ascending; `criterion` (K,): criterion of
-    the rule at every candidate (see the rules in `jeit.inverse.hyperparameter`); `residual` (K,): ‖w (v - Jx)‖ of the
-    image x at every candidate, in standard deviations; `penalty` (K,): √(xᵀQx) of the image, which together with the
-    residual forms the L-curve; `rule`: name of the rule, or "given"; `target`: value of the criterion that the rule
-    looks for, None if it takes the minimum or maximum; `edge`: "smallest" or "largest" if λ is the first or last
-    candidate, so that the rule's optimum may lie beyond the grid, else empty.
+    **Fields**: `hyperparameter`: λ; `candidates` (K,): values of λ evaluated, ascending; `criterion` (K,): value of the
+    rule's criterion for every candidate (see the rules in `jeit.inverse.hyperparameter`); `residual` (K,): norm ‖w (v -
+    Jx)‖ of the residual for the image x with every candidate, in standard deviations, with data v, Jacobian J and
+    weights w; `penalty` (K,): √(xᵀQx) of this image for the prior's precision Q, which together with the residual forms
+    the L-curve; `rule`: name of the rule, or "given"; `target`: value of the criterion that the rule seeks, None if the
+    rule seeks the minimum or maximum; `edge`: "smallest" or "largest" if λ is the first or last candidate, so that the
+    rule's optimum may lie beyond the grid, else empty.
 
-    For a given number, the number is the only candidate and the curves are empty, (0,). Without data, residual and
-    penalty are empty.
+    If λ was given, λ is the only candidate and the curves are empty, (0,). Without data, residual and penalty are
+    empty.
 
     **Example:**
 
@@ -56,7 +57,7 @@ class Choice(Module):
 
     @classmethod
     def given(cls, hyperparameter: ArrayLike) -> "Choice":
-        """Create from a given number."""
+        """Create a choice from a given value of λ."""
         value = as_array(hyperparameter, float)
         empty_curve = as_array(np.zeros(0))
         return cls(value, as_array(np.reshape(value, 1)), empty_curve, empty_curve, empty_curve, "given")
@@ -73,7 +74,8 @@ class Choice(Module):
         target: float | None = None,
         between: float | None = None,
     ) -> "Choice":
-        """Create from a rule's result: candidate number `index`, or `between`, a λ between that candidate and the next.
+        """Create a choice from the result of a `rule`: candidate number `index`, or `between`, a value of λ between
+        this candidate and the next.
 
         `curves`: residual and penalty at every candidate, or empty arrays.
         """
@@ -84,7 +86,7 @@ class Choice(Module):
 
     @property
     def note(self) -> str:
-        """Sentence that gives a reason to doubt the choice; empty if there is none."""
+        """Sentence that gives a reason to doubt the choice of λ; empty if there is no reason."""
         if not self.edge:
             return ""
         return (
@@ -93,7 +95,7 @@ class Choice(Module):
         )
 
     def read(self, curve: ArrayLike, hyperparameter: ArrayLike | None = None) -> float:
-        """Interpolate one of the curves (K,) at `hyperparameter`, by default the chosen λ.
+        """Interpolate a `curve` (K,), such as the residual, at `hyperparameter`, by default the chosen λ.
 
         Raises `ValueError` if the curve is empty.
         """

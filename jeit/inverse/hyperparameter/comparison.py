@@ -1,4 +1,4 @@
-"""Choice of the hyperparameter for given data by one rule, or by several rules for comparison."""
+"""Choice of the hyperparameter λ for given data by one rule, or by several rules for comparison."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def choose_hyperparameter(
 
     - `model`: the forward model.
     - `conductivity`: the background, S/m (2-D: S).
-    - `rule`: a name in `jeit.inverse.RULES`, or a function of (spectrum, data, mesh) that returns a `Choice`, such as
-      `functools.partial(noise_figure, target=0.5)`.
+    - `rule`: name of a rule in `jeit.inverse.RULES`, or a function of (spectrum, data, mesh) that returns a `Choice`,
+      such as `functools.partial(noise_figure, target=0.5)`.
     - `prior`, `difference`, `noise`, `mask`: as in `one_step`.
 
-    Raises `ValueError` for arguments that do not fit together.
+    Raises `ValueError` for invalid or inconsistent arguments.
 
     **Example:**
 
@@ -62,8 +62,8 @@ def compare_rules(
     rules: Mapping[str, Rule] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Choice]:
-    """Choose λ for the same data by several rules, and return the choices by name. The problem is decomposed once.
-    `jeit.plot.plot_choice` plots the result.
+    """Choose λ for the same data by several rules, and return the choices by the name of the rule. The problem is
+    decomposed once. `jeit.plot.plot_choice` plots the result.
 
     **Arguments:**
 
@@ -71,9 +71,9 @@ def compare_rules(
     - `conductivity`: the background, S/m (2-D: S).
     - `difference`, `prior`, `noise`, `mask`: as in `one_step`.
     - `rules`: rules to compare, by name; default `jeit.inverse.RULES`.
-    - `progress`: function that is called with the name of each step and rule as it begins.
+    - `progress`: function that is called with the name of each step or rule when it begins.
 
-    Raises `ValueError` for arguments that do not fit together.
+    Raises `ValueError` for invalid or inconsistent arguments.
 
     **Example:**
 

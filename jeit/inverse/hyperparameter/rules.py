@@ -1,8 +1,9 @@
 """Rules that choose the hyperparameter λ.
 
 A rule takes the `Spectrum` of the problem, the whitened data (or None) and the mesh, and returns a `Choice`. All rules
-use the eigendecomposition of the spectrum: with the data components c = UᵀQᵀv and the filter f = λ²/(Λ + λ²), the
-residual r has ‖r‖² = Σ f²c² and the image x has the penalty xᵀQx = Σ Λc²/(Λ + λ²)².
+use the eigendecomposition of the spectrum, in the notation of `jeit.inverse.spectrum`: with the data components c =
+UᵀQᵀv and the filter f = λ²/(Λ + λ²), the residual r has ‖r‖² = Σ f²c² and the image x has the penalty xᵀQx = Σ Λc²/(Λ +
+λ²)².
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ def best_resolution(
 ) -> Choice:
     """Choose the λ with the smallest blur radius, averaged over point targets spread through the body.
 
-    Without noise the smallest λ would always be sharpest, so the images of the targets are noisy. No measured data are
-    used, so λ depends on the system and not on the frame. Graham and Adler, Physiol. Meas. 27 (2006) S65-S79, calibrate
-    λ in this way with a small target in a tank. Criterion: mean `blur_radius` over the targets, relative to the size of
-    the body.
+    Without noise the smallest λ would always give the sharpest image, so noise is added to the images of the targets.
+    No measured data are used, so λ depends on the system and not on the frame. Graham and Adler, Physiol. Meas. 27
+    (2006) S65-S79, calibrate λ in this way with a small target in a tank. Criterion: mean `blur_radius` over the
+    targets, relative to the size of the body.
 
     **Arguments:**
 
@@ -87,11 +88,11 @@ def blur_radius(
     """Blur radius of the noisy image of every target cell for every candidate λ, relative to the size of the body.
 
     The blur radius is √(A/A₀) (3-D: the cube root), where A₀ is the area (volume) of the body and A that of the
-    half-amplitude set: the cells where the image is at least half its value *at the target*. (With half the image's
-    maximum, as in Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179, an image with a narrow peak elsewhere
-    would count as sharp.) A is the expected value for white noise of unit variance in the data: for a target of
-    strength s in cell t with image p = R_λJ_t and noise variance (RRᵀ)_ii, cell i belongs to the set with probability
-    Φ(s (p_i - p_t/2) / √(RRᵀ)_ii).
+    half-amplitude set: the cells where the image is at least half of the image's value *at the target*. (With half the
+    image's maximum, as in Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179, an image with a narrow peak
+    elsewhere would count as sharp.) A is the expected value for white noise of unit variance in the data: for a target
+    of strength s in cell t with image p = R_λJ_t and noise variance (RRᵀ)_ii, cell i belongs to the set with
+    probability Φ(s (p_i - p_t/2) / √(RRᵀ)_ii).
     """
     cell_areas = np.asarray(measures(mesh))
     eigenvalues, modes = np.asarray(spectrum.eigenvalues), np.asarray(spectrum.modes())
@@ -115,7 +116,8 @@ def blur_radius(
 
 
 def spread_cells(mesh: Mesh, num_cells: int) -> Int[np.ndarray, " T"]:
-    """About `num_cells` cells spread evenly through the body: the cells nearest to the points of a regular lattice."""
+    """Indices (T,) of about `num_cells` cells spread evenly through the body: the cells nearest to the points of a
+    regular lattice."""
     centres, cell_measures = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
     lower_corner, upper_corner = np.asarray(mesh.points).min(axis=0), np.asarray(mesh.points).max(axis=0)
     spacing = (cell_measures.sum() / num_cells) ** (1 / mesh.dimension)
@@ -126,21 +128,21 @@ def spread_cells(mesh: Mesh, num_cells: int) -> Int[np.ndarray, " T"]:
     ]
     lattice = np.stack(np.meshgrid(*coordinates, indexing="ij"), axis=-1).reshape(-1, mesh.space_dimension)
     distances, nearest = (np.asarray(result) for result in KDTree(centres).query(lattice))
-    # A surface in space passes between lattice points, so points up to half a spacing away count.
+    # A surface in space passes between lattice points, so lattice points up to half a spacing from the surface count.
     inside = distances <= (spacing / 2 if mesh.is_surface else cell_measures[nearest] ** (1 / mesh.dimension))
     return np.unique(nearest[inside] if inside.any() else nearest)
 
 
 def greit_noise_figure(target: float, eigenvalues, signal, data_ratio: float, image_modes, measure) -> float:
-    """Smallest λ at which GREIT's noise figure is `target`. Raises `ValueError` if there is none.
+    """Smallest λ at which GREIT's noise figure is `target`. Raises `ValueError` if no λ gives this noise figure.
 
-    The noise figure is the signal-to-noise ratio of the data divided by that of the image, for one target (Adler et
-    al., Physiol. Meas. 30, S35, 2009); in contrast, `noise_figure` draws signals from the prior.
+    The noise figure is the signal-to-noise ratio of the data divided by that of the image, for one target object (Adler
+    et al., Physiol. Meas. 30, S35, 2009); in contrast, `noise_figure` draws signals from the prior.
 
-    The columns of X are the desired images of training targets, those of Y their data, and λ is the hyperparameter.
-    With the eigendecomposition YYᵀ = VΛVᵀ, the image of data y is XYᵀV (Λ + λ²)⁻¹ Vᵀy. `signal`: Vᵀy; `image_modes`:
-    XYᵀV; `data_ratio`: signal-to-noise ratio of the data; `measure`: areas of the cells. White noise of unit variance
-    in the data gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².
+    The columns of X are the desired images of training targets, the columns of Y the data of the targets, and λ is the
+    hyperparameter. With the eigendecomposition YYᵀ = VΛVᵀ, the image of data y is XYᵀV (Λ + λ²)⁻¹ Vᵀy. `signal`: Vᵀy;
+    `image_modes`: XYᵀV; `data_ratio`: signal-to-noise ratio of the data; `measure`: areas of the cells. White noise of
+    unit variance in the data gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².
     """
     weight = measure / measure.sum()
     noise_gain = weight @ image_modes**2
@@ -167,10 +169,11 @@ Rule = Callable[[Spectrum, Float[Array, " M"] | None, Mesh | None], Choice]
 
 
 def generalised_cross_validation(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None) -> Choice:
-    """Choose λ by generalised cross-validation: it minimises M‖r‖²/(tr(I - H))², an estimate of the error of predicting
-    each of M channels from the others; H maps data to predicted data. Golub, Heath and Wahba 1979.
+    """Choose λ by generalised cross-validation: λ minimises M‖r‖²/(tr(I - H))², an estimate of the error of predicting
+    each of M channels from the other channels; r is the residual, and the matrix H maps data to predicted data. Golub,
+    Heath and Wahba 1979.
 
-    Criterion: this score, in units of the noise variance. Raises `ValueError` without data.
+    Criterion: M‖r‖²/(tr(I - H))², in units of the noise variance. Raises `ValueError` without data.
 
     **Arguments:**
 
@@ -184,7 +187,7 @@ def generalised_cross_validation(spectrum: Spectrum, data: ArrayLike | None, mes
     """
     candidates, data = spectrum.candidates(), _check_data(data, "gcv")
     residual, penalty = spectrum.curves(data, candidates)
-    # Repeated readings have filter 1 but leave no residual, so they are subtracted from both counts.
+    # Repeated readings have filter 1 but leave no residual, so their number is subtracted from both counts.
     num_independent = len(data) - spectrum.repeated
     score = num_independent * residual**2 / (_filters(spectrum, candidates).sum(axis=1) - spectrum.repeated) ** 2
     return Choice.among("gcv", candidates, int(np.argmin(score)), score, (residual, penalty))
@@ -199,7 +202,7 @@ def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = 
     **Arguments:**
 
     - `spectrum`: the problem, decomposed; `choose_hyperparameter` gives it to the rule.
-    - `data`: difference of frames in terms of the spectrum, whitened.
+    - `data`: whitened difference of frames (M,).
     - `mesh`: not used.
     - `noise`: standard deviation of the whitened data (of each part of complex data), 1 if the noise of the channels
       was specified correctly.
@@ -238,7 +241,8 @@ def l_curve(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None
     """Choose λ at the corner of the L-curve, where the curve of log √(xᵀQx) against log ‖r‖ has its maximum curvature.
     Hansen, SIAM Review 34 (1992) 561-580.
 
-    Criterion: this curvature, positive at a corner that points to the origin. Raises `ValueError` without data.
+    Criterion: the curvature of the L-curve, positive at a corner that points to the origin. Raises `ValueError` without
+    data.
 
     **Arguments:**
 
@@ -260,18 +264,18 @@ def l_curve(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None
 def noise_figure(
     spectrum: Spectrum, data: ArrayLike | None = None, mesh: Mesh | None = None, *, target: float = 1.25
 ) -> Choice:
-    """Choose the λ at which the noise figure, the signal-to-noise ratio of the data divided by that of the image, has a
-    given value. No measured data are used.
+    """Choose the λ at which the noise figure, the signal-to-noise ratio of the data divided by that of the image,
+    equals `target`. No measured data are used.
 
-    Signals are drawn from the prior and the noise is white: the ratio of the data is trΛ / n for n components, that of
-    the image tr(RJΓJᵀRᵀ) / tr(RRᵀ), in squared amplitudes. This follows Adler and Guardo 1996, who use one object at
-    the centre in place of the prior. Criterion: the noise figure.
+    Signals are drawn from the prior and the noise is white. In squared amplitudes, the signal-to-noise ratio of the
+    data is trΛ / n for n components, and that of the image is tr(RJΓJᵀRᵀ) / tr(RRᵀ). This follows Adler and Guardo
+    1996, who use one object at the centre in place of the prior. Criterion: the noise figure.
 
     **Arguments:**
 
     - `spectrum`: the problem, decomposed; `choose_hyperparameter` gives it to the rule.
     - `data`, `mesh`: not used.
-    - `target`: the noise figure.
+    - `target`: noise figure that λ shall give.
 
     **Example:**
 
@@ -307,7 +311,7 @@ RULES: dict[str, Rule] = {
 
 
 def choose(spectrum: Any, hyperparameter: float | str | Rule | Choice, data, mesh: Mesh | None = None) -> Choice:
-    """Choose λ from a number, the name of a rule, a rule, or an earlier choice.
+    """Choose λ from `hyperparameter`, which is a number, the name of a rule, a rule, or an earlier choice.
 
     `spectrum`: a `Spectrum`, used by rules only. Raises `ValueError` for an unknown name, for a rule if the problem is
     traced, and for a number that is not positive and finite.
@@ -329,7 +333,7 @@ def choose(spectrum: Any, hyperparameter: float | str | Rule | Choice, data, mes
 
 
 def _check_problem(problem, name: str) -> None:
-    """Raise `ValueError` for a traced problem, because a rule needs its values."""
+    """Raise `ValueError` for a traced problem, because a rule for λ needs numerical values."""
     advice = "give a number, such as the one that jeit.inverse.choose_hyperparameter finds outside"
     check_has_values("hyperparameter: the problem", problem, f"the rule '{name}' looks at", advice)
 
@@ -345,7 +349,7 @@ def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
     squared_components = abs(adjoint(np.asarray(spectrum.basis)) @ data) ** 2
     penalty_terms = (
         squared_components * eigenvalues / (eigenvalues + candidates[:, None] ** 2) ** 2
-    )  # its sum is the penalty
+    )  # the sum is the penalty
     residual_terms = squared_components * filters**2  # its sum is ‖r‖²
     # The derivatives with respect to t are 4 rest (1 - f) and -4 image f.
     residual_derivatives = _second_log_derivative(
@@ -359,8 +363,8 @@ def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
 
 
 def _second_log_derivative(terms, first_factors, second_factors):
-    """First and second derivative of ½ log Σ terms, where the derivatives of the terms are terms · once and
-    terms · twice."""
+    """First and second derivatives of ½ log Σ terms, where the first and second derivatives of the terms are the
+    products terms · first_factors and terms · second_factors."""
     total = terms.sum(axis=1)
     slope = (terms * first_factors).sum(axis=1) / total
     return slope / 2, ((terms * second_factors).sum(axis=1) / total - slope**2) / 2

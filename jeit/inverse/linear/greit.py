@@ -1,4 +1,5 @@
-"""GREIT: a reconstruction matrix trained on small targets, so that each is imaged as a smooth disc of the same size.
+"""GREIT: a reconstruction matrix trained on small targets, so that each target is imaged as a smooth disc of the same
+size.
 
 Adler et al., "GREIT: a unified approach to 2D linear EIT reconstruction of lung images", Physiol. Meas. 30 (2009)
 S35-S55. The paper treats a disk; here bodies of any outline are allowed, and targets in a solid body are balls.
@@ -24,7 +25,7 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.linearisation import combined_blocks, data_directions, used_channels
 from jeit.mesh import Mesh, centroids, check_flat, measures
 
-# Half width of the edge of a desired image, relative to its radius.
+# Half width of the smooth edge of a desired image, relative to the image's radius.
 _EDGE_HALF_WIDTH = 0.25
 # Sampling points along the radius of a target, by dimension: about 50 points in a disc, about 60 in a ball.
 _SAMPLES_PER_RADIUS = {2: 4.0, 3: 2.5}
@@ -33,9 +34,9 @@ _SAMPLES_PER_RADIUS = {2: 4.0, 3: 2.5}
 _SAMPLES_AT_ONCE, _SEARCH_RADII = 500_000, 1 + 1e-9
 # Minimum fraction of a training target that must lie in the body.
 _MIN_INSIDE_FRACTION = 0.9
-# Approximate number of cells over which means for the noise figure are taken.
+# Approximate number of cells over which the signal and noise in the noise figure are averaged.
 _NUM_MEAN_CELLS = 10_000
-# Minimum target radius: smaller targets give the same result in a linear model but need more sampling points.
+# Minimum radius of a target: smaller targets give the same result in a linear model but need more sampling points.
 _MIN_TARGET_RADIUS = 0.01
 
 
@@ -53,29 +54,30 @@ def greit(
 ) -> LinearReconstruction:
     """GREIT reconstruction matrix R = XYᵀ(YYᵀ + λ²W⁻¹)⁻¹ for a body of any shape, at a background conductivity.
 
-    The training targets are small discs (3-D: balls) on a hexagonal (3-D: cubic) grid over the body. Y holds their
-    responses to a unit change of conductivity (S/m; 2-D: S), computed **from the Jacobian**. They are exact for small
-    changes; as in any linear image, the contrast of large changes is underestimated. X holds the desired images: discs
-    of one radius with a smooth edge, cut off at the body's outline, each with the same integral as its target. X and Y
-    are divided by √(number of targets).
+    The training targets are small discs (3-D: balls) on a hexagonal (3-D: cubic) grid over the body. The columns of Y
+    are the voltage responses to a unit change of conductivity (S/m; 2-D: S) in each target, computed **from the
+    Jacobian**. These responses are exact for small changes; as in any linear image, the contrast of large changes is
+    underestimated. The columns of X are the desired images: discs of one radius with a smooth edge, cut off at the
+    body's outline, each with the same integral as its target. X and Y are divided by √(number of targets).
 
     **Arguments:**
 
     - `model`: the forward model.
     - `conductivity`: the background, S/m (2-D: S).
-    - `radius`, `target_radius`: radii of the desired images and of the targets, as fractions of the body's radius,
-      which is that of the disc of equal area (3-D: ball of equal volume). Default `radius` 1/√L, 0.25 for 16
-      electrodes; a smaller radius improves resolution but increases ringing and noise.
+    - `radius`, `target_radius`: radii of the desired images and of the targets, as fractions of the body's radius, i.e.
+      the radius of the disc of equal area (3-D: ball of equal volume). Default `radius` 1/√L, 0.25 for 16 electrodes; a
+      smaller radius improves resolution but increases ringing and noise.
     - `hyperparameter`: λ, or "noise-figure" for the λ at which the signal-to-noise ratio of the data is `noise_figure`
       times that of the image, for a target in the middle of the body.
-    - `noise_figure`: the default 0.5 is the value agreed on by GREIT's authors. The signal is the mean absolute value,
-      over channels in units of their noise or over the body; the noise is the root mean square standard deviation.
+    - `noise_figure`: the default 0.5 is the value agreed on by GREIT's authors. The signal of data or image is the mean
+      absolute value, over channels in units of their noise or over the body. The noise is the root mean square standard
+      deviation.
     - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
       other).
     - `mask` (M,): True for the channels to use.
     - `num_targets`: number of targets, approximately.
 
-    Raises `ValueError` for arguments that do not fit together, and for a noise figure that no λ reaches.
+    Raises `ValueError` for invalid or inconsistent arguments, and for a noise figure that no λ reaches.
 
     **Example:**
 
@@ -104,7 +106,8 @@ def greit(
     )
     positions, coverage = _place_targets(mesh, body_centre, target_radius * body_radius, num_targets)
     desired_images = _desired_images(mesh, positions, coverage.T @ cell_measures, radius * body_radius)
-    # Responses are computed for the directions in which a body can change the data; they are fewer than the channels.
+    # Responses are computed for the combinations of channels that a body can change, of which there are fewer than
+    # channels.
     directions = data_directions(model.protocol, channels, root_weight)
     weighted_directions = directions.T * np.asarray(root_weight)  # (r, K)
     responses, cell_coverage = np.zeros((len(weighted_directions), len(positions))), coverage.tocsr()
@@ -145,7 +148,8 @@ def _ball_measure(radius: float, dimension: int) -> float:
 
 
 def _place_targets(mesh: Mesh, middle, radius: float, num_targets: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
-    """Centres (K, d) of the targets that lie in the body, and the fraction (m, K) of every cell that each covers."""
+    """Centres (K, d) of the K training targets that lie in the body, and the fraction (m, K) of every cell that each
+    target covers."""
     cell_measures, points = np.asarray(measures(mesh)), np.asarray(mesh.points)
     lower_corner, upper_corner = points.min(axis=0), points.max(axis=0)
     if mesh.dimension == 2:
@@ -158,7 +162,7 @@ def _place_targets(mesh: Mesh, middle, radius: float, num_targets: int) -> tuple
     for samples, sample_cells, sample_shares in _sample_points(mesh, radius / _SAMPLES_PER_RADIUS[mesh.dimension]):
         if mesh.dimension == 3:
             offsets = (samples - middle) / spacing
-            offsets -= np.rint(offsets)  # offset from the nearest centre; only part of the points lie within a ball
+            offsets -= np.rint(offsets)  # offset from the nearest centre; not all points lie within a target
             near_indices = np.flatnonzero(
                 np.einsum("qi,qi->q", offsets, offsets) < (_SEARCH_RADII * radius / spacing) ** 2
             )
@@ -203,8 +207,8 @@ def _cubic_lattice(lower_corner, upper_corner, centre, spacing: float) -> np.nda
 
 
 def _sample_points(mesh: Mesh, spacing: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Iterate over groups of cells, and yield sampling points (q, d) spread evenly over each cell, their cells, and the
-    fraction of the cell that each point represents.
+    """Iterate over groups of cells. Yields q sampling points (q, d) spread evenly over each cell, the cells of the
+    points, and the fraction of the cell that each point represents.
 
     Points are about `spacing` apart. Each side of a triangle is divided into n parts, and the points are the centres
     of the upright small triangles, with barycentric coordinates (i + 1/3, j + 1/3, k + 1/3) / n, i + j + k = n - 1.
@@ -231,8 +235,8 @@ def _sample_points(mesh: Mesh, spacing: float) -> Iterator[tuple[np.ndarray, np.
 
 
 def _desired_images(mesh: Mesh, positions, integrals, radius: float) -> scipy.sparse.csc_array:
-    """Desired images X (m, K): a disc around each position, with half its height at `radius` and the integral
-    `integrals` (K,) over the body."""
+    """Desired images X (m, K) of K targets: a smooth disc around each position, which falls to half its height at
+    `radius`, with the integral `integrals` (K,) over the body."""
     cell_measures, cell_centres = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
     pairs = KDTree(cell_centres).sparse_distance_matrix(
         KDTree(positions), (1 + _EDGE_HALF_WIDTH) * radius, output_type="ndarray"

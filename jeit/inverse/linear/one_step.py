@@ -23,7 +23,7 @@ from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array, has_values, is_forked, on_device, on_host, product_for_jax
 
-# Approximate number of cells used to find which channels have proportional columns.
+# Approximate number of cells used to find the channels with proportional columns in the reconstruction matrix.
 _NUM_SAMPLED_CELLS = 4000
 
 
@@ -36,15 +36,16 @@ _NUM_SAMPLED_CELLS = 4000
 class LinearReconstruction:
     """A linear image reconstruction: change of conductivity = matrix · change of voltages.
 
-    Two reciprocal channels (v_b = r v_a) have proportional columns in the matrix, so they are added before the product,
-    which halves the arithmetic. If the matrix has a lower rank r than there are combined channels, these are first
-    reduced to r combinations.
+    Two reciprocal channels (v_b = ratio · v_a) have proportional columns in the matrix. The voltages of both channels
+    are added before the product, which halves the arithmetic. If the rank r of the matrix is lower than the number K of
+    combined channels, the combined channels are first reduced to r combinations.
 
     **Fields**: `mesh`; `first`, `second` (K,): channels added to form each combined channel; `ratio` (K,): weight of
-    the second; `weights` (K, m): S/m (2-D: S) per volt of combined channel, or (r, m) if there is a `mixing`; `mixing`
-    (K, r): matrix that reduces the combined channels, or None; `hyperparameter`: λ; `rule`: how λ was chosen;
-    `method`: name of the reconstruction; `choice`: curves used in choosing λ and a note on their reliability
-    (`choice.note`), or None if the method chooses λ differently; `num_measurements`: number of channels M.
+    the second channel; `weights` (K, m): change of conductivity in S/m (2-D: S) per volt of each combined channel, or
+    (r, m) if there is a `mixing`; `mixing` (K, r): matrix that reduces the combined channels, or None;
+    `hyperparameter`: λ; `rule`: how λ was chosen; `method`: name of the reconstruction; `choice`: curves from which λ
+    was chosen and a note on the reliability of the choice (`choice.note`), or None if the method chooses λ differently;
+    `num_measurements`: number of channels M.
 
     **Example:**
 
@@ -85,10 +86,10 @@ class LinearReconstruction:
         method: str,
         choice: Choice | None = None,
     ):
-        """Create from images (m, r) and weights (r, M), whose product is the reconstruction matrix. The product is
-        formed only if it is smaller than the factors."""
+        """Create a linear reconstruction from two `factors`, images (m, r) and weights (r, M), whose product is the
+        reconstruction matrix. The product is formed only if it is smaller than the factors."""
         images, weights = factors
-        # Channels are proportional in every cell or in none, so a sample of the cells suffices.
+        # Columns of two channels are proportional in every cell or in none, so a sample of the cells suffices.
         sampled_images = images[:: max(1, len(images) // _NUM_SAMPLED_CELLS)]
         first, second, ratio = _proportional_channels(model, sampled_images @ weights)
         combined_weights = (weights.T[first] + ratio[:, None] * weights.T[second]) / (1 + ratio**2)[:, None]
@@ -119,7 +120,7 @@ class LinearReconstruction:
         method: str,
         choice: Choice | None = None,
     ):
-        """Create from a full reconstruction matrix (m, M)."""
+        """Create a linear reconstruction from a full reconstruction matrix (m, M)."""
         if not has_values(model.protocol, matrix, hyperparameter):
             # It is unknown which columns of a traced matrix are proportional, so no channels are combined.
             all_channels, zero_ratios = jnp.arange(matrix.shape[1]), jnp.zeros(matrix.shape[1])
@@ -133,8 +134,8 @@ class LinearReconstruction:
             return cls(model.mesh, *traced_fields, matrix.shape[1], rule, method, choice)
         matrix = np.asarray(matrix)
         first, second, ratio = _proportional_channels(model, matrix)
-        # The weighted mean of two proportional columns is used: for small λ their rounding errors are large and
-        # opposite.
+        # Both columns of reciprocal channels are replaced by a weighted mean: for small λ their rounding errors are
+        # large and opposite.
         summed_columns = matrix.T[first] + ratio[:, None] * matrix.T[second]
         weights = summed_columns / (1 + ratio**2)[:, None]
         return cls(
@@ -159,7 +160,8 @@ class LinearReconstruction:
         return full.at[self.first].add(weights).T
 
     def image(self, difference: Inexact[Array | np.ndarray, "*frames M"]) -> Inexact[Array, "*frames m"]:
-        """Change of conductivity in every cell, for one difference of frames (M,) or several (F, M), in volts.
+        """Change of conductivity in every cell, (m,) or (F, m), for one difference of frames (M,) or several (F, M), in
+        volts.
 
         Raises `ValueError` for another number of channels, and for NaN or infinite voltages.
         """
@@ -182,7 +184,7 @@ class LinearReconstruction:
 
     @functools.cached_property
     def _product_arrays(self) -> tuple[Any, ...]:
-        """Arrays used by `image`, converted to NumPy once, because a conversion takes as long as the product."""
+        """Arrays used by `image`, converted to NumPy only once, because a conversion takes as long as the product."""
         arrays = (self.first, self.second, self.ratio, self.mixing, self.weights)
         return on_host(arrays) if has_values(arrays) else arrays
 
@@ -198,8 +200,9 @@ def _combine_channels(difference, first, second, ratio, mixing) -> Any:
 
 
 def _proportional_channels(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Channels `first` and `second` to add before the product, and the `ratio` of their columns: reciprocal pairs with
-    proportional columns, and all other channels alone, with ratio 0."""
+    """Channels `first` and `second` that are added before the product with the matrix, and the `ratio` of their
+    columns. The pairs are reciprocal channels with proportional columns; every other channel stands alone, with ratio
+    0."""
     column_norms = np.linalg.norm(matrix, axis=0)
     is_single = column_norms > 0
     pairs, _ = model.protocol.reciprocal_pairs()
@@ -230,28 +233,29 @@ def one_step(
 ) -> LinearReconstruction:
     """Reconstruction matrix of the linearised problem, R = (JᵀWJ + λ²Q)⁻¹JᵀW, at a background conductivity.
 
-    A complex `conductivity` is an admittivity σ + iωε; voltages and image are then complex. Both parts have the same
-    prior, and `noise` is the standard deviation of each part. With a real background, real and imaginary part of
-    complex voltages are imaged separately.
+    A complex `conductivity` is an admittivity σ + iωε; voltages and image are then complex. Real and imaginary part
+    have the same prior, and `noise` is the standard deviation of each part. With a real background, real and imaginary
+    part of complex voltages are imaged separately.
 
     If λ is a number, the function and the image are differentiable and work inside `jax.grad`, `jax.vmap` and
-    `jax.jit`. A rule for λ or a mask depends on values and must be evaluated outside.
+    `jax.jit`. A rule for λ or a mask depends on values and must be evaluated outside these transformations.
 
-    Computed in data space: R = ΓJᵀ(JΓJᵀ + λ²W⁻¹)⁻¹ with Γ = Q⁻¹; see `jeit.inverse.prior.priors` for a Q with a null
-    space. Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179.
+    The matrix is computed in data space: R = ΓJᵀ(JΓJᵀ + λ²W⁻¹)⁻¹ with the Jacobian J, the prior precision Q = Γ⁻¹ and
+    the weights W; see `jeit.inverse.prior.priors` for a Q with a null space. Adler and Guardo, IEEE Trans. Med. Imaging
+    15 (1996) 170-179.
 
     **Arguments:**
 
     - `model`: the forward model.
     - `conductivity`: the background, S/m (2-D: S).
     - `prior`: default `Noser()`.
-    - `hyperparameter`: λ, a rule in `jeit.inverse.RULES` that chooses it, or a `Choice`.
+    - `hyperparameter`: λ, a rule in `jeit.inverse.RULES` that chooses λ, or a `Choice`.
     - `difference` (M,): change of voltages to be imaged, volts, required by rules that use data.
     - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
       other).
     - `mask` (M,): True for the channels to use.
 
-    Raises `ValueError` for arguments that do not fit together.
+    Raises `ValueError` for invalid or inconsistent arguments.
 
     **Example:**
 
@@ -271,7 +275,7 @@ def one_step(
     result_fields = choice.hyperparameter, choice.rule, method, choice
     if isinstance(linear.spectrum, Spectrum) and has_values(choice.hyperparameter):
         factors = linear.factors(choice.hyperparameter)
-        del linear  # frees memory, which would not hold both for a large body
+        del linear  # frees memory, which cannot hold both for a large body
         return LinearReconstruction.of_factors(model, factors, *result_fields)
     return LinearReconstruction.create(model, linear.matrix(choice.hyperparameter), *result_fields)
 
@@ -284,13 +288,14 @@ def back_projection(
     hyperparameter: float = 0.05,
     mask: Bool[Array, " M"] | None = None,
 ) -> LinearReconstruction:
-    """Back-projection of voltage differences along the bands between equipotential lines of every drive.
+    """Reconstruction matrix of back-projection: voltage differences are projected along the bands between equipotential
+    lines of every drive.
 
     The relative change of a channel is assigned to the cells whose potential, under the channel's drive, lies between
     the potentials of its two measuring electrodes. The image of a cell is the mean over the channels that reach it
     (Barber and Brown, J. Phys. E 17 (1984) 723-733), scaled so that a uniform change of conductivity is imaged exactly.
-    A filtered image is sharper but noisier: its matrix is B F, where B is the matrix above and F minimises ‖JBFv - v‖²
-    + λ²‖JB‖²‖Fv‖², so that the Jacobian J maps the image to nearly the data.
+    A filtered image is sharper but noisier. Its matrix is B F, where B is the unfiltered matrix and F minimises ‖JBFv -
+    v‖² + λ²‖JB‖²‖Fv‖², so that the Jacobian J maps the image BFv approximately to the data v.
 
     **Arguments:**
 
@@ -300,7 +305,7 @@ def back_projection(
     - `hyperparameter`: λ of the filter.
     - `mask` (M,): True for the channels to use.
 
-    Raises `ValueError` for protocols whose measurements use more than two electrodes, where no band is defined.
+    Raises `ValueError` for protocols whose measurements use more than two electrodes, for which no band is defined.
 
     **Example:**
 

@@ -1,4 +1,4 @@
-"""Nonlinear least squares for the conductivity itself: parametrisations, links, further unknowns and solvers."""
+"""Absolute imaging by nonlinear least squares: parametrisations, links, further unknowns and solvers."""
 
 from __future__ import annotations
 

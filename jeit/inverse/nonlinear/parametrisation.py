@@ -1,8 +1,8 @@
 """Parametrisations of the nonlinear problem: the scale of the conductivity, and unknowns estimated along with it.
 
-Unknowns are further parameters that are not known exactly. Each has a normal prior of mean zero and a given standard
-deviation, and changes the forward model or the image. Its effect on the voltages is computed by automatic
-differentiation. Positive quantities are estimated through their logarithm.
+Unknowns are further parameters that are not known exactly. Each unknown has a normal prior of mean zero and a given
+standard deviation, and changes the forward model or the image. The derivatives of the voltages with respect to unknowns
+are computed by automatic differentiation. Positive quantities are estimated through their logarithm.
 """
 
 import abc
@@ -26,7 +26,7 @@ from jeit_solvers.module import Module
 
 
 class AbstractUnknown(Module):
-    """Base of all unknowns, which consist of `size` values with prior standard deviation `deviation`."""
+    """Base of all unknowns. An unknown consists of `size` values with the prior standard deviations `deviation`."""
 
     deviation: eqx.AbstractVar[Float[Array, " k"]]
 
@@ -43,8 +43,8 @@ class AbstractUnknown(Module):
     def apply(
         self, model: ForwardModel, estimate: Float[Array, " m"], values: Float[Array, " k"]
     ) -> tuple[ForwardModel, Float[Array, " m"]]:
-        """Return the model and the image `estimate`, on the link's scale, with the unknown's `values` added. Values of
-        zero leave both unchanged."""
+        """Return the model and the image `estimate`, on the link's scale, as changed by the unknown's `values`. Values
+        of zero leave both unchanged."""
 
     def quantity(self, model: ForwardModel, values: Float[Array, " k"]) -> Float[Array, " k"]:
         """Estimated quantities in their unit, computed from the values; by default the values themselves."""
@@ -52,7 +52,8 @@ class AbstractUnknown(Module):
 
 
 class ContactImpedance(AbstractUnknown):
-    """Contact impedance of every electrode; the values are logarithms of its ratio to the model's.
+    """Contact impedance z of every electrode as an unknown. The values are the logarithms of the ratios of the
+    estimated to the model's contact impedances.
 
     **Arguments:**
 
@@ -69,32 +70,32 @@ class ContactImpedance(AbstractUnknown):
     deviation: Float[Array, " L"]
 
     def __init__(self, model: ForwardModel, deviation: float = 0.5):
-        """`deviation`: standard deviation of the logarithm. Raises `ValueError` for point electrodes, which have no
-        contact impedance."""
+        """`deviation`: prior standard deviation of the logarithms. Raises `ValueError` for point electrodes, which have
+        no contact impedance."""
         if model.electrodes.is_point:
             raise ValueError("ContactImpedance: point electrodes have no contact impedance to estimate.")
         self.deviation = _check_deviation("ContactImpedance", deviation, model.electrodes.num_electrodes)
 
     def fits(self, model):
-        """Whether the model has the same number of electrodes, with contact impedance."""
+        """Whether the model has the same number of electrodes as the unknown, with contact impedance."""
         return not model.electrodes.is_point and self.size == model.electrodes.num_electrodes
 
     def apply(self, model, estimate, values):
-        """Model with contact impedances z exp(values), and the unchanged image."""
+        """Return the model with contact impedances z exp(values), and the unchanged image."""
         impedance = self.quantity(model, values)
         return model.with_electrodes(model.electrodes.with_contact_impedance(impedance)), estimate
 
     def quantity(self, model, values):
-        """Contact impedances z exp(values), ohm·m² (2-D: ohm·m)."""
+        """Estimated contact impedances z exp(values), ohm·m² (2-D: ohm·m)."""
         return model.electrodes.contact_impedance * jnp.exp(values)
 
 
 class ElectrodePosition(AbstractUnknown):
-    """Displacement of electrodes from their positions in the model, in metres.
+    """Displacement of electrodes from their positions in the model, in metres, as an unknown.
 
-    Electrodes on the boundary have one value each, along the boundary and positive counter-clockwise. Others have two:
-    x and y for discs in a sheet, horizontal and upward for discs and patches on a solid. The first values of all
-    electrodes come before the second values.
+    Electrodes on the boundary have one value each, along the boundary, positive counter-clockwise. All other electrodes
+    have two values: x and y for discs in a sheet, horizontal and upward for discs and patches on a solid. The first
+    values of all electrodes come before the second values.
 
     **Arguments:**
 
@@ -112,7 +113,7 @@ class ElectrodePosition(AbstractUnknown):
     direction: Float[Array, "L a d"]
 
     def __init__(self, model: ForwardModel, deviation: float):
-        """`deviation`: standard deviation in metres. Raises `ValueError` for electrodes that cannot be moved."""
+        """`deviation`: prior standard deviation in metres. Raises `ValueError` for electrodes that cannot be moved."""
         electrodes = model.electrodes
         if not isinstance(electrodes, AbstractMovableElectrodes):
             raise ValueError(
@@ -124,12 +125,12 @@ class ElectrodePosition(AbstractUnknown):
         self.deviation = _check_deviation("ElectrodePosition", deviation, direction.shape[0] * direction.shape[1])
 
     def fits(self, model):
-        """Whether the model has the same number of electrodes, of a kind that can be moved."""
+        """Whether the model has the same number of electrodes as the unknown, of a kind that can be moved."""
         movable = isinstance(model.electrodes, AbstractMovableElectrodes)
         return movable and self.direction.shape[0] == model.electrodes.num_electrodes
 
     def apply(self, model, estimate, values):
-        """Model with displaced electrodes, and the unchanged image."""
+        """Return the model with electrodes displaced by `values`, and the unchanged image."""
         displacements = jnp.einsum("al,lad->ld", values.reshape(self.direction.shape[1], -1), self.direction)
         electrodes: Any = model.electrodes
         moved_electrodes = eqx.tree_at(
@@ -139,7 +140,7 @@ class ElectrodePosition(AbstractUnknown):
 
 
 class Background(AbstractUnknown):
-    """Constant added to the image, on the link's scale (`Log`: the logarithm of a factor).
+    """Constant added to the image on the link's scale, as an unknown (with `Log`: the logarithm of a factor on σ).
 
     **Arguments:**
 
@@ -160,12 +161,13 @@ class Background(AbstractUnknown):
         self.deviation = _check_deviation("Background", deviation, 1)
 
     def apply(self, model, estimate, values):
-        """Unchanged model, and the image plus the constant."""
+        """Return the unchanged model, and the image plus the constant."""
         return model, estimate + values[0]
 
 
 class Scale(AbstractUnknown):
-    """Factor on all voltages, such as an unknown current or gain; the value is its logarithm.
+    """Factor on all voltages as an unknown, for example due to an unknown current or gain. The value is the logarithm
+    of the factor.
 
     **Arguments:**
 
@@ -187,12 +189,12 @@ class Scale(AbstractUnknown):
         self.deviation = _check_deviation("Scale", deviation, 1)
 
     def apply(self, model, estimate, values):
-        """Model with all currents multiplied by exp(value), and the unchanged image."""
+        """Return the model with all currents multiplied by exp(value), and the unchanged image."""
         drive = model.protocol.drive * self.quantity(model, values)[0]
         return eqx.tree_at(lambda scaled_model: scaled_model.protocol.drive, model, drive), estimate
 
     def quantity(self, model, values):
-        """Factor exp(value)."""
+        """Estimated factor exp(value) on the voltages."""
         return jnp.exp(values)
 
 
@@ -203,12 +205,13 @@ def _check_deviation(name: str, deviation, num_values: int) -> Float[Array, " k"
     return jnp.broadcast_to(jnp.asarray(values), (num_values,))
 
 
-# Minimum conductivity relative to the mean background, where no bound keeps it from zero.
+# Minimum conductivity relative to the mean background, where the lower bound is zero.
 _MIN_CONDUCTIVITY_RATIO = 1e-6
 
 
 class AbstractLink(Module):
-    """Base of all links σ(x) between the estimated quantity x and conductivity σ, which are increasing and smooth."""
+    """Base of all links: increasing, smooth functions σ(x) that give the conductivity σ for the estimated quantity
+    x."""
 
     @abc.abstractmethod
     def conductivity(self, estimate: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -216,21 +219,21 @@ class AbstractLink(Module):
 
     @abc.abstractmethod
     def slope(self, estimate: Float[Array, " m"]) -> Float[Array, " m"]:
-        """Derivative dσ/dx at x."""
+        """Derivative dσ/dx of the link at x = `estimate`."""
 
     @abc.abstractmethod
     def estimate(self, conductivity: Float[Array, " m"]) -> Float[Array, " m"]:
-        """Inverse x(σ) of `conductivity`, σ in S/m (2-D: S). Raises `ValueError` for conductivities outside the link's
-        range."""
+        """Estimated quantity x(σ) for the `conductivity` σ in S/m (2-D: S), the inverse of the link. Raises
+        `ValueError` for conductivities outside the link's range."""
 
     def ends(self, lower: float, upper: float, reference: Float[Array, " m"]) -> tuple[float, float]:
-        """Values of x for two bounds on σ, in an image with reference `reference`. Raises `ValueError` if the link does
-        not allow bounds."""
+        """Values of x for a `lower` and an `upper` bound on σ; `reference` (m,): x of the background. Raises
+        `ValueError` if the link does not allow bounds."""
         raise ValueError(f"bounds: link {type(self).__name__} takes none; take Log() or Linear().")
 
 
 class Linear(AbstractLink):
-    """Linear link σ = x. It does not keep the conductivity positive; a step that leads below zero is shortened.
+    """Linear link σ = x. σ may become negative; a step to a negative σ is shortened.
 
     **Example:**
 
@@ -241,11 +244,11 @@ class Linear(AbstractLink):
     """
 
     def conductivity(self, estimate):
-        """Conductivity x."""
+        """Conductivity σ = x, S/m (2-D: S)."""
         return estimate
 
     def slope(self, estimate):
-        """Ones."""
+        """Derivative dσ/dx = 1 in every cell."""
         return namespace(estimate).ones_like(estimate)
 
     def estimate(self, conductivity):
@@ -253,13 +256,14 @@ class Linear(AbstractLink):
         return conductivity
 
     def ends(self, lower, upper, reference):
-        """The bounds themselves, the lower at least a millionth of the mean background."""
+        """Values of x for two bounds on σ: the bounds themselves, the lower bound at least a millionth of the mean
+        background."""
         return namespace(lower, reference).maximum(lower, _MIN_CONDUCTIVITY_RATIO * reference.mean()), upper
 
 
 class Log(AbstractLink):
-    """Logarithmic link σ = exp(x): conductivity is positive, and the prior treats a ratio of conductivities and its
-    inverse alike.
+    """Logarithmic link σ = exp(x). The conductivity is positive, and the prior treats a ratio of conductivities and the
+    inverse ratio alike.
 
     **Example:**
 
@@ -269,20 +273,20 @@ class Log(AbstractLink):
     """
 
     def conductivity(self, estimate):
-        """Conductivity exp(x)."""
+        """Conductivity σ = exp(x), S/m (2-D: S)."""
         return namespace(estimate).exp(estimate)
 
     def slope(self, estimate):
-        """Derivative exp(x)."""
+        """Derivative dσ/dx = exp(x)."""
         return namespace(estimate).exp(estimate)
 
     def estimate(self, conductivity):
-        """Estimate log(σ), σ in S/m (2-D: S). Raises `ValueError` unless σ is positive."""
+        """Estimate x = log(σ), with σ in S/m (2-D: S). Raises `ValueError` unless σ is positive."""
         _check_inside(conductivity, 0, np.inf)
         return namespace(conductivity).log(conductivity)
 
     def ends(self, lower, upper, reference):
-        """Logarithms of the bounds; a lower bound of zero gives -∞, which is no bound."""
+        """Values of x for two bounds on σ: their logarithms. A lower bound of zero gives -∞, which is no bound."""
         with np.errstate(divide="ignore"):
             return namespace(lower).log(lower), namespace(upper).log(upper)
 
@@ -313,16 +317,16 @@ class Bounded(AbstractLink):
             raise ValueError(f"Bounded: give 0 ≤ lower < upper, finite; they are {self.lower} and {self.upper}.")
 
     def conductivity(self, estimate):
-        """Logistic function of x between the bounds."""
+        """Conductivity σ, a logistic function of x between the bounds of the link."""
         return self.lower + (self.upper - self.lower) * _logistic(estimate)
 
     def slope(self, estimate):
-        """Derivative of the logistic function, largest halfway between the bounds."""
+        """Derivative dσ/dx of the logistic function, which is largest halfway between the bounds."""
         fraction = _logistic(estimate)
         return (self.upper - self.lower) * fraction * (1 - fraction)
 
     def estimate(self, conductivity):
-        """Logit of (σ - lower) / (upper - lower). Raises `ValueError` for σ outside the bounds."""
+        """Estimate x, the logit of (σ - lower) / (upper - lower). Raises `ValueError` for σ outside the bounds."""
         _check_inside(conductivity, self.lower, self.upper)
         fraction = (conductivity - self.lower) / (self.upper - self.lower)
         xp = namespace(fraction)
@@ -372,14 +376,14 @@ class Parametrisation(Module):
     **Arguments:**
 
     - `link`: scale on which the prior acts, `Log()` by default.
-    - `bounds`: minimum and maximum conductivity, S/m (2-D: S), satisfied exactly. They require a solver that keeps
+    - `bounds`: minimum and maximum conductivity, S/m (2-D: S), satisfied exactly. Bounds require a solver that keeps
       bounds and a prior that has a precision matrix, or total variation.
     - `regions` (m,): integer label of each cell; cells of the same label share one value, and cells labelled -1 are
-      held at the background. See `pixels`.
+      held at the background. `pixels` creates labels.
     - `unknowns`: further parameters to estimate: `ContactImpedance`, `ElectrodePosition`, `Background`, `Scale`.
-    - `informative`: minimum signal, in standard deviations of the noise, of a combination of the prior's shapes with
-      prior amplitude of one standard deviation, linearised at the background. Images consist of the combinations above
-      it; 0 takes all shapes. None is 0 in `reconstruct` and 0.03 in an `Imager`.
+    - `informative`: minimum signal, in standard deviations of the noise, of a combination of the prior's shapes with an
+      amplitude of one prior standard deviation, linearised at the background. Images consist of the combinations with a
+      larger signal; 0 takes all. None means 0 in `reconstruct` and 0.03 in an `Imager`.
 
     Raises `ValueError` for invalid values.
 
@@ -421,11 +425,12 @@ class Parametrisation(Module):
                 raise ValueError(f"unknowns: this {name} was made for another model; make it with the one given here.")
 
     def regions_of(self, mesh: Mesh) -> Regions | None:
-        """Regions on this mesh, or None. Raises `ValueError` for labels that do not fit the mesh."""
+        """The `Regions` of a mesh with the labels `regions`, or None without labels. Raises `ValueError` for labels
+        that do not fit the mesh."""
         return None if self.regions is None else Regions.create(mesh, self.regions)
 
     def box(self, background: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """Lower and upper bounds (n,) on the coefficients of the cells, then infinite ones for the unknowns.
+        """Lower and upper bounds (n,) on the coefficients: bounds for the cells, then infinite bounds for the unknowns.
 
         Raises `ValueError` if the link does not allow bounds or the background lies outside them.
         """

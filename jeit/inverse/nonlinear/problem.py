@@ -1,13 +1,13 @@
-"""The nonlinear least squares problem, checks of its arguments, its reduction to informed shapes, and derivatives of
-its minimum.
+"""The nonlinear least squares problem of `reconstruct`, checks of its arguments, its reduction to informed shapes, and
+derivatives of its minimum.
 
-Informed shapes are the combinations of a prior's shapes, a few dozen, that the data resolve. They are right singular
-vectors of the whitened Jacobian at the background, stored in single precision, which changes an image by a relative
-1e-6.
+Informed shapes are the few dozen combinations of a prior's shapes that the data resolve. Informed shapes are right
+singular vectors of the whitened Jacobian at the background, stored in single precision, which changes an image by a
+relative 1e-6.
 
-Derivatives are implicit: at a minimum the gradient of the objective, Jᵀ G r + penalty'(c), is zero. With bounds, this
-holds for the free coefficients. A coefficient at an active bound, where the objective decreases outwards, follows the
-bound as long as the bound stays active. Where a bound is just reached, derivatives are one-sided.
+Derivatives of the minimum are implicit: at a minimum the gradient of the objective, Jᵀ G r + penalty'(c), is zero. With
+bounds, the gradient is zero for the free coefficients. A coefficient at an active bound, where the objective decreases
+outwards, follows the bound as long as the bound stays active. Where a bound is just reached, derivatives are one-sided.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ from jeit_solvers import QuadraticModel, as_minimum, symmetric_eigen, symmetric_
 from jeit_solvers.engines import either_engine, has_values, host, namespace, on_device, on_host
 from jeit_solvers.module import Module
 
-# Relative distance within which a coefficient counts as being at a bound; solvers scale coefficients and bounds, which
-# causes rounding errors.
+# Relative distance from a bound within which a coefficient counts as being at the bound; solvers scale coefficients and
+# bounds, which causes rounding errors.
 _BOUND_TOLERANCE = 1e-12
 
 
@@ -83,7 +83,8 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
 
 
 def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
-    """Background conductivity per cell; raises `ValueError` unless it is one positive number or one per cell."""
+    """Background conductivity per cell; raises `ValueError` unless `background` is one positive number or one positive
+    number per cell."""
     background = _as_float_array(background)
     if background.dtype.kind not in "biuf" or background.shape not in ((), (model.mesh.num_cells,)):
         raise ValueError(
@@ -118,19 +119,19 @@ def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[
 
 
 def _as_float_array(values):
-    """A NumPy copy, or a JAX array if it is traced."""
+    """Copy of `values` as a NumPy array of floats, or as a JAX array if traced."""
     return host.array(values) if has_values(values) else jnp.asarray(values)
 
 
 def check_steps(name: str, max_steps) -> int:
-    """`max_steps` as an integer. Raises `ValueError` unless it is a whole number from 1."""
+    """Return `max_steps` as an integer. Raises `ValueError` unless `max_steps` is a whole number of at least 1."""
     if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1:
         raise ValueError(f"{name} must be a whole number from 1; it is {max_steps!r}.")
     return int(max_steps)
 
 
 def check_tolerance(name: str, tolerance) -> float:
-    """`tolerance` as a float. Raises `ValueError` unless 0 ≤ tolerance < 1."""
+    """Return `tolerance` as a float. Raises `ValueError` unless 0 ≤ tolerance < 1."""
     if not isinstance(tolerance, (int, float, np.number)) or not 0 <= tolerance < 1:
         raise ValueError(f"{name} must be a number from 0 and less than 1; it is {tolerance!r}.")
     return float(tolerance)
@@ -144,7 +145,7 @@ def independent_data(
     *,
     at_once: bool,
 ) -> tuple[ForwardModel, Data]:
-    """Forward model of the independent channels among those used, and their voltages.
+    """Forward model of the independent channels among the channels used, and the data of these independent channels.
 
     `deviation` (M,): standard deviation of the noise, volts. `at_once`: whether to return NumPy arrays if the model
     supports it.
@@ -159,16 +160,16 @@ def independent_data(
     if at_once and (model.at_once or model.mesh.dimension == 3) and has_values(independent_model):
         independent_model, channels = on_host(
             (independent_model, channels)
-        )  # so that everything computed from them is in NumPy
+        )  # so that everything computed from these is in NumPy
     return independent_model, channels.weigh(deviation[used_indices]).combine(measured[used_indices])
 
 
 def keep_informed_shapes(inversion: Inversion, min_signal: float, persistence: float = 0.0) -> Inversion:
-    """Reduce a problem to the combinations of shapes that the data resolve; the penalty must be standard normal.
+    """Reduce a problem to the combinations of the prior's shapes that the data resolve. The penalty must be ½‖c‖².
 
-    `min_signal`: minimum signal of a shape of prior standard deviation, in standard deviations of the noise.
-    `persistence`: fraction of the last image that is expected in the next one; the variances of the shapes are those
-    before a frame in the steady state of the Kalman filter.
+    `min_signal`: minimum signal of a combination with an amplitude of one prior standard deviation, in standard
+    deviations of the noise. `persistence`: fraction of the last image that is expected in the next image; if it is not
+    0, the prior variances are those before a frame in the steady state of the Kalman filter.
     """
     squared_singular_values, scaled_right_vectors = (np.asarray(values) for values in _singular_values(inversion))
     is_informed = squared_singular_values > max(min_signal**2, 1e-12 * squared_singular_values[-1])
@@ -194,8 +195,8 @@ def _singular_values(inversion: Inversion):
 
 
 def _expected_variance(strength, persistence: float):
-    """Steady-state variance p of a coefficient before a frame, p = a² p / (1 + s p) + 1 - a², where a is the
-    persistence and s the `strength` of the data, the squared singular value."""
+    """Variance p of a coefficient before a frame in the steady state of the Kalman filter: p = a² p / (1 + s p) + 1 -
+    a², where a is the persistence and s the `strength` of the data, the squared singular value."""
     innovation_variance = 1 - persistence**2
     half_linear_term = innovation_variance * (1 - strength) / 2
     discriminant_root = np.sqrt(half_linear_term**2 + strength * innovation_variance)
@@ -207,11 +208,13 @@ def _expected_variance(strength, persistence: float):
 
 
 class Inversion(Module):
-    """Minimisation of ½ rᵀ G r + penalty(c) over c, with r = w (v(σ) - ŷ) and σ = link(x₀ + S c).
+    """Minimisation of ½ rᵀ G r + penalty(c) over the coefficients c, with the residual r = w (v(σ) - ŷ) and the
+    conductivity σ = link(x₀ + S c).
 
-    **Fields**: `model`: forward model of the independent channels; `data`: holds ŷ, w and G; `link`; `reference` (m,):
-    x₀, on the link's scale; `basis`: S, scaled with the hyperparameter; `penalty`; `unknowns`: parameters estimated
-    along with the conductivity, whose values are the last of the coefficients.
+    **Fields**: `model`: forward model of the independent channels, which predicts v; `data`: measured voltages ŷ,
+    weights w and precision G; `link`; `reference` (m,): x₀, on the link's scale; `basis`: S, scaled with the
+    hyperparameter; `penalty`; `unknowns`: parameters estimated along with the conductivity, whose values are the last
+    coefficients.
     """
 
     model: ForwardModel
@@ -242,13 +245,13 @@ class Inversion(Module):
         return self._model_and_image(*self._split_coefficients(coefficients))[1]
 
     def applied(self, model: ForwardModel, coefficients: Float[Array, " n"]) -> ForwardModel:
-        """`model` with the estimated unknowns, such as contact impedances or electrode positions."""
+        """Copy of `model` changed by the estimated unknowns, such as contact impedances or electrode positions."""
         for unknown, values in zip(self.unknowns, self.values(coefficients), strict=True):
             model, _ = unknown.apply(model, self.reference, values)
         return model
 
     def values(self, coefficients: Float[Array, " n"]) -> tuple[Float[Array, " k"], ...]:
-        """Estimated values of every unknown, as used by `AbstractUnknown.apply`."""
+        """Estimated values of every unknown, in the form that `AbstractUnknown.apply` takes."""
         return self._split_coefficients(coefficients)[1]
 
     def voltages(self, coefficients: Float[Array, " n"]) -> Float[Array, " r"]:
@@ -260,7 +263,7 @@ class Inversion(Module):
         return self.data.weight * (self.voltages(coefficients) - self.data.voltages)
 
     def linearise(self, coefficients: Float[Array, " n"]) -> tuple[Float[Array, " r"], Float[Array, "r n"]]:
-        """Residual, and its Jacobian with respect to the coefficients."""
+        """Residual (r,) of the data, and the Jacobian (r, n) of the residual with respect to the coefficients."""
         shapes, values = self._split_coefficients(coefficients)
         model, estimate = self._model_and_image(shapes, values)
         conductivity = self.link.conductivity(estimate)
@@ -291,12 +294,12 @@ class Inversion(Module):
         return 0.5 * residual @ self.data.precision @ residual + self.penalty.cost(coefficients)
 
     def quadratic_model(self, coefficients: Float[Array, " n"]) -> QuadraticModel:
-        """Objective and the function that computes a step, for `jeit_solvers.Descent`."""
+        """Objective at the coefficients, and the function that computes a step, for `jeit_solvers.Descent`."""
         residual, jacobian = self.linearise(coefficients)
         return self.penalty.model(residual, jacobian, coefficients, self.data)
 
     def _split_coefficients(self, coefficients):
-        """Coefficients of the image, and values of every unknown."""
+        """Split the coefficients into those of the image and the values of every unknown."""
         values, first_index = [], self.basis.num_coefficients
         for unknown in self.unknowns:
             values.append(unknown.deviation * coefficients[first_index : first_index + unknown.size])
@@ -304,7 +307,7 @@ class Inversion(Module):
         return coefficients[: self.basis.num_coefficients], tuple(values)
 
     def _model_and_image(self, shapes, values) -> tuple[ForwardModel, Float[Array, " m"]]:
-        """Model changed by the unknowns, and the image x."""
+        """Forward model changed by the values of the unknowns, and the image x on the link's scale."""
         model, estimate = self.model, self.reference + self.basis.expand(shapes)
         for unknown, value in zip(self.unknowns, values, strict=True):
             model, estimate = unknown.apply(model, estimate, value)
@@ -317,13 +320,13 @@ class Inversion(Module):
 
 @eqx.filter_jit
 def as_solution(coefficients: Float[Array, " n"], inversion: Inversion, box: Any = None) -> Float[Array, " n"]:
-    """Return `coefficients` (n,), the result of a solver, unchanged, but with the derivatives of the exact minimum:
-    with respect to all fields of the inversion and, if there are bounds, the lower and upper bounds `box`, (n,)
+    """Return `coefficients` (n,), the result of a solver, with unchanged values but with the derivatives of the exact
+    minimum with respect to all fields of the inversion and, if there are bounds, the lower and upper bounds `box`, (n,)
     each."""
     if box is None:
         return as_minimum(coefficients, (inversion, None, None), _free_gradient, _preconditioner)
     gradient = jax.grad(inversion.cost)(coefficients)
-    # -1 at the lower bound, 1 at the upper one, 0 where a coefficient is free.
+    # -1 for a coefficient at the lower bound, 1 at the upper bound, 0 for a free coefficient.
     tolerances = [_BOUND_TOLERANCE * jnp.maximum(1, jnp.abs(bound)) for bound in box]
     active_bounds = 1 * ((coefficients >= box[1] - tolerances[1]) & (gradient < 0)) - (
         (coefficients <= box[0] + tolerances[0]) & (gradient > 0)
@@ -335,21 +338,21 @@ def as_solution(coefficients: Float[Array, " n"], inversion: Inversion, box: Any
 
 
 def _with_bounds(point, box, active_bounds):
-    """Coefficients with free values from `point` and the others at their bounds."""
+    """Coefficients of which the free ones are taken from `point` and all others are at their bounds."""
     return point if box is None else jnp.where(active_bounds < 0, box[0], jnp.where(active_bounds > 0, box[1], point))
 
 
 def _free_gradient(point, problem):
-    """Gradient of the objective with respect to the free coefficients. The entries of the others equal `point`, so that
-    a zero of this function has zeros there; `_with_bounds` inserts their bounds."""
+    """Gradient of the objective with respect to the free coefficients. The entries of the other coefficients equal
+    `point`, so that a zero of this function is zero there; `_with_bounds` inserts their bounds."""
     inversion, box, active_bounds = problem
     gradient = jax.grad(inversion.cost)(_with_bounds(point, box, active_bounds))
     return gradient if box is None else jnp.where(active_bounds == 0, gradient, point)
 
 
 def _preconditioner(point, problem):
-    """Function that multiplies with the inverse of the Gauss-Newton matrix JᵀGJ + P of the free coefficients, where P
-    is the penalty's Hessian. Woodbury's identity gives P⁻¹ - P⁻¹Jᵀ(JP⁻¹Jᵀ + G⁻¹)⁻¹JP⁻¹."""
+    """Function that multiplies a vector by the inverse of the Gauss-Newton matrix JᵀGJ + P of the free coefficients,
+    where P is the penalty's Hessian. Woodbury's identity gives P⁻¹ - P⁻¹Jᵀ(JP⁻¹Jᵀ + G⁻¹)⁻¹JP⁻¹."""
     inversion, box, active_bounds = problem
     coefficients = _with_bounds(point, box, active_bounds)
     is_free = jnp.ones(point.shape, bool) if box is None else active_bounds == 0

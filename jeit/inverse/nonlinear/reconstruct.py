@@ -40,11 +40,11 @@ class Reconstruction(Module):
     """Result of `reconstruct`.
 
     **Fields**: `conductivity` (m,): S/m (2-D: S); `voltages` (M,): predicted voltages; `misfit`: root mean square of
-    predicted - measured over the channels used, in standard deviations (about 1 if only noise is left); `costs`:
-    objective at the start and at every accepted iterate (only at start and end if a solver keeps no record);
-    `iterations`: number of iterations; `outcome`: `Status.number` of how the solver ended; `reason`: the same in a
-    sentence; `choice`: choice of the hyperparameter λ; `inversion`, `coefficients`: the problem solved and its
-    solution, for warm starts and uncertainty; `model`: forward model with the estimated unknowns.
+    predicted - measured voltages over the channels used, in standard deviations (about 1 if only noise is left);
+    `costs`: objective at the start and at every accepted iterate (only at start and end if a solver keeps no record);
+    `iterations`: number of iterations; `outcome`: number of the `Status` with which the solver ended; `reason`: a
+    sentence on how the solver ended; `choice`: choice of the hyperparameter λ; `inversion`, `coefficients`: the problem
+    solved and its solution, for warm starts and uncertainty; `model`: forward model changed by the estimated unknowns.
 
     **Example:**
 
@@ -80,18 +80,19 @@ class Reconstruction(Module):
     def status(self) -> Status:
         """How the solver ended: "converged", "step limit", "stalled" or "failed".
 
-        Raises `ValueError` inside `jax.jit`, where the outcome is not known yet, and for a batch; see `converged`.
+        Raises `ValueError` inside `jax.jit`, where the outcome is not known yet, and for a batch of reconstructions;
+        use `converged` there.
         """
         return Status.of_number(self.outcome)
 
     @property
     def converged(self) -> Bool[Array, ""]:
-        """Whether the solver converged; also available inside `jax.jit` and for a batch."""
+        """Whether the solver converged; also available inside `jax.jit` and for a batch of reconstructions."""
         return jnp.asarray(self.outcome) == Status.CONVERGED.number
 
     @property
     def hyperparameter(self) -> Float[Array, ""]:
-        """Hyperparameter λ."""
+        """Hyperparameter λ, the weight of the prior."""
         return self.choice.hyperparameter
 
     @property
@@ -130,8 +131,8 @@ def reconstruct(
 
     If λ is a number, `reconstruct` works inside `jax.grad`, `jax.jacfwd`, `jax.vmap` and `jax.jit`, with respect to
     voltages, background, noise, λ, the prior's settings and all fields of the model. Derivatives are those of the
-    minimum by the implicit function theorem with the full Hessian, even if the solver stopped early. With bounds, they
-    are derivatives at fixed active bounds, so they are one-sided where a bound is just reached. See
+    minimum by the implicit function theorem with the full Hessian, even if the solver stopped early. With bounds,
+    derivatives are taken at fixed active bounds, so they are one-sided where a bound is just reached. See
     docs/explanation/derivatives.md.
 
     Tarantola, Inverse Problem Theory (SIAM 2005), ch. 3; Nocedal and Wright, Numerical Optimization (2006), ch. 10.
@@ -139,20 +140,21 @@ def reconstruct(
     **Arguments:**
 
     - `model`: the forward model.
-    - `voltages` (M,): measured, volts.
-    - `background`: prior mean and starting point, one number or (m,), S/m (2-D: S); see `calibrate`.
+    - `voltages` (M,): measured voltages, volts.
+    - `background`: conductivity of the prior mean and of the starting point, one number or (m,), S/m (2-D: S);
+      `calibrate` estimates it.
     - `prior`: `Noser()` by default; `TotalVariation()` for piecewise constant images.
-    - `hyperparameter`: weight λ of the prior, or a rule in `jeit.inverse.RULES`, which is applied to the problem
-      linearised at the background; default "noise-figure". Total variation takes a number, default 300.
+    - `hyperparameter`: weight λ of the prior, or a rule in `jeit.inverse.RULES` that chooses λ for the problem
+      linearised at the background; default "noise-figure". Total variation requires a number, default 300.
     - `noise`: standard deviation of the channels in volts, one number or (M,); default 1 % of the voltages, see
       `relative_noise`.
     - `mask` (M,): True for the channels to use.
     - `solver`: a solver such as `LevenbergMarquardt(max_steps=60)`, its name, or a least-squares solver of optimistix
       (not with total variation). Default `GaussNewton()`; with bounds `LBFGSB()`.
     - `parametrisation`: the quantities estimated: link, bounds, regions of one value, further unknowns.
-    - `start`: an earlier reconstruction of the same kind, to start from.
+    - `start`: an earlier reconstruction of the same kind, from which the iteration starts.
 
-    Raises `ValueError` for arguments that do not fit together; a failure of the solver is reported in the result's
+    Raises `ValueError` for invalid or inconsistent arguments; a failure of the solver is reported in the result's
     `status`.
 
     **Example:**
@@ -229,7 +231,8 @@ def _check_protocol(model: ForwardModel, used) -> None:
 
 
 def _solver_for(solver, prior: AbstractPrior, parametrisation: Parametrisation) -> AbstractSolver:
-    """The given solver, or the default for the problem. Raises `ValueError` if the solver does not suit the problem."""
+    """The given solver, or the default solver for prior and parametrisation. Raises `ValueError` if the solver cannot
+    solve a problem with these."""
     has_bounds = parametrisation.bounds is not None
     if solver is None:
         return LBFGSB() if has_bounds else GaussNewton()
@@ -256,10 +259,10 @@ def pose(
     *,
     per_cell: bool = False,
 ) -> tuple[Inversion, Choice]:
-    """Set up the problem for a `model` of independent channels and their `data`, and choose λ.
+    """Set up the least squares problem for a `model` of independent channels and their `data`, and choose λ.
 
     `per_cell`: whether every coefficient must be the value of a cell, as bounds require. Raises `ValueError` for
-    arguments that do not fit together.
+    invalid or inconsistent arguments.
     """
     mesh, link = model.mesh, parametrisation.link
     reference, regions = link.estimate(background), parametrisation.regions_of(mesh)
@@ -289,8 +292,8 @@ def pose(
 
 
 def _whitened_jacobian(model: ForwardModel, data: Data, background, slope):
-    """Voltages of the background, whitened Jacobian with respect to the link's variable there, and the data; as NumPy
-    arrays unless traced."""
+    """Voltages of the background, whitened Jacobian at the background with respect to the link's variable, and the
+    data; as NumPy arrays unless traced."""
     if not has_values(model, data, background, slope):
         voltages, jacobian = model.voltages_and_jacobian(background)
         return voltages, data.whiten(data.weight[:, None] * jacobian * slope), data
@@ -305,8 +308,8 @@ def _whitened_jacobian(model: ForwardModel, data: Data, background, slope):
 
 
 def _start_coefficients(start, inversion: Inversion, choice: Choice) -> Float[Array, " n"]:
-    """Coefficients of an earlier reconstruction, rescaled to this λ. Raises `ValueError` if its problem is of another
-    kind."""
+    """Coefficients of the earlier reconstruction `start`, rescaled to the λ of `choice`. Raises `ValueError` if the
+    problem of the earlier reconstruction is of another kind."""
     if not isinstance(start, Reconstruction):
         raise ValueError(f"start must be what reconstruct has returned, not {type(start).__name__}.")
     if start.coefficients.shape != (inversion.num_coefficients,) or not _have_same_unknowns(start.inversion, inversion):
@@ -320,7 +323,8 @@ def _start_coefficients(start, inversion: Inversion, choice: Choice) -> Float[Ar
 
 
 def _have_same_unknowns(first: Inversion, second: Inversion) -> bool:
-    """Whether the coefficients of two problems have the same meaning."""
+    """Whether two problems have the same types of link, basis, penalty and unknowns, so that their coefficients agree
+    in meaning."""
 
     def component_types(inversion):
         return [
@@ -331,7 +335,7 @@ def _have_same_unknowns(first: Inversion, second: Inversion) -> bool:
 
 
 def _mismatch_reason(model: ForwardModel, measured, background, used_indices) -> str:
-    """Hint at wrong units or polarity if measured voltages and those of the background differ in size or sign."""
+    """Sentence on wrong units or polarity if measured voltages and those of the background differ in size or sign."""
     background_voltages = model.voltages(background)[used_indices]
     ratio = float(jnp.vdot(measured, background_voltages) / jnp.vdot(background_voltages, background_voltages))
     if 0.1 < ratio < 10:

@@ -1,4 +1,4 @@
-"""Solvers of the nonlinear problem: objects that hold settings and declare which problems they can solve.
+"""Solvers of the nonlinear least squares problem: objects that hold settings and declare which problems they can solve.
 
 `SOLVERS` lists the solvers by name, and `as_solver` converts a name to an object.
 """
@@ -39,9 +39,9 @@ _TRACED_REASON = "It was solved inside a transformation of JAX; the status says 
 class Solution(NamedTuple):
     """Result of a solver.
 
-    **Fields**: `coefficients` (n,); `iterations`: number of iterations; `costs`: objective at the start and at every
-    accepted iterate, for a traced problem only at start and end; `status`: how the solver ended, for a traced problem
-    its number; `reason`: the same in a sentence.
+    **Fields**: `coefficients` (n,): coefficients of the image at the minimum; `iterations`: number of iterations;
+    `costs`: objective at the start and at every accepted iterate, for a traced problem only at start and end; `status`:
+    how the solver ended, for a traced problem the number of the `Status`; `reason`: a sentence on how the solver ended.
     """
 
     coefficients: Float[Array, " n"]
@@ -59,7 +59,7 @@ class AbstractSolver(Module):
 
     @property
     def keeps_bounds(self) -> bool:
-        """Whether the solver minimises between bounds, with one coefficient per cell."""
+        """Whether the solver minimises between bounds on the coefficients, with one coefficient per cell."""
         return False
 
     @property
@@ -69,7 +69,7 @@ class AbstractSolver(Module):
 
     @property
     def is_linear(self) -> bool:
-        """Whether the solver takes one step from the background, with the same matrix for every frame."""
+        """Whether the solver makes one step from the background, with the same matrix for every frame."""
         return False
 
     @abc.abstractmethod
@@ -78,15 +78,16 @@ class AbstractSolver(Module):
         `box`, (n,) each."""
 
     def for_frames(self, max_steps: int | None = None, rtol: float | None = None) -> "AbstractSolver":
-        """The solver for an `Imager`, with these settings as defaults for settings that are None. Raises `ValueError`
-        if it does not image a frame in a bounded time."""
+        """Copy of the solver for an `Imager`, in which `max_steps` and `rtol` replace settings that are None. Raises
+        `ValueError` if the solver does not image a frame in a bounded time."""
         raise ValueError(
             f"solver: {self.name} does not image frames in a bounded time; take one of {', '.join(frame_solvers())}."
         )
 
     def descent(self, max_steps: int, rtol: float) -> Descent:
-        """Descent method that optimistix runs, with the arguments as defaults for settings that are None. It records
-        the cost at the start and after each of `max_steps` steps. Raises `ValueError` if the solver works otherwise."""
+        """Descent method that optimistix runs, with the arguments in place of settings that are None. The descent
+        records the cost at the start and after each of `max_steps` steps. Raises `ValueError` if the solver does not
+        use a descent."""
         raise ValueError(f"solver: {self.name} does not descend along quadratic models.")
 
 
@@ -95,8 +96,8 @@ class GaussNewton(AbstractSolver):
 
     **Arguments:** `max_steps`: maximum number of steps, default 30, for an `Imager` 4; rejected steps and the shorter
     steps tried in their place both count. `rtol`: the iteration ends when the next step would change the objective by
-    less than rtol times the objective or rtol times ½, the misfit of one voltage that is wrong by a standard deviation;
-    default 1e-6, with total variation 1e-4, for an `Imager` 1e-3.
+    less than rtol times the objective, or by less than rtol times ½, which is the misfit of one voltage with an error
+    of one standard deviation; default 1e-6, with total variation 1e-4, for an `Imager` 1e-3.
 
     **Example:**
 
@@ -118,19 +119,19 @@ class GaussNewton(AbstractSolver):
         return _run_descent(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
 
     def for_frames(self, max_steps=None, rtol=None):
-        """The solver, with these settings as defaults."""
+        """Copy of the solver in which the arguments replace settings that are None."""
         return GaussNewton(_or_default(self.max_steps, max_steps), _or_default(self.rtol, rtol))
 
     def descent(self, max_steps, rtol):
-        """Descent without damping."""
+        """Descent method without damping, with the arguments in place of settings that are None."""
         return _descent_for(_or_default(self.max_steps, max_steps), _or_default(self.rtol, rtol))
 
 
 class LevenbergMarquardt(AbstractSolver):
     """Levenberg-Marquardt method: Gauss-Newton steps, whose damping is increased when a step is rejected.
 
-    **Arguments:** `max_steps`, `rtol`: as for `GaussNewton`. `damping`: damping of the first step, relative to the
-    prior. Raises `ValueError` for invalid settings.
+    **Arguments:** `max_steps`, `rtol`: as for `GaussNewton`. `damping`: damping of the first step, as a factor of the
+    prior's precision. Raises `ValueError` for invalid settings.
 
     **Example:**
 
@@ -154,11 +155,11 @@ class LevenbergMarquardt(AbstractSolver):
         return _run_descent(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
 
     def for_frames(self, max_steps=None, rtol=None):
-        """The solver, with these settings as defaults."""
+        """Copy of the solver in which the arguments replace settings that are None."""
         return LevenbergMarquardt(_or_default(self.max_steps, max_steps), _or_default(self.rtol, rtol), self.damping)
 
     def descent(self, max_steps, rtol):
-        """Descent with damping."""
+        """Descent method with damping, with the arguments in place of settings that are None."""
         return _descent_for(_or_default(self.max_steps, max_steps), _or_default(self.rtol, rtol), self.damping)
 
 
@@ -168,7 +169,8 @@ class LBFGSB(AbstractSolver):
     **Arguments:**
 
     - `max_steps`: maximum number of steps.
-    - `tolerance`: maximum change of a scaled coefficient in a step along the projected gradient at convergence.
+    - `tolerance`: the iteration has converged when a step along the projected gradient changes no scaled coefficient by
+      more than this number.
 
     **Example:**
 
@@ -187,7 +189,7 @@ class LBFGSB(AbstractSolver):
 
     @property
     def keeps_bounds(self):
-        """True."""
+        """True: the solver minimises between bounds on the coefficients."""
         return True
 
     def minimise(self, inversion, start, box):
@@ -218,7 +220,7 @@ class ProjectedGradient(AbstractSolver):
 
     @property
     def keeps_bounds(self):
-        """True."""
+        """True: the solver minimises between bounds on the coefficients."""
         return True
 
     def minimise(self, inversion, start, box):
@@ -227,7 +229,7 @@ class ProjectedGradient(AbstractSolver):
 
 
 class LeastSquares(AbstractSolver):
-    """A least-squares `solver` of optimistix, with its own tolerances; not for total variation."""
+    """A least-squares `solver` of optimistix, with the tolerances of this solver; not for total variation."""
 
     name: ClassVar[str] = "a solver of optimistix"
     solver: optx.AbstractLeastSquaresSolver
@@ -238,11 +240,11 @@ class LeastSquares(AbstractSolver):
 
     @property
     def needs_squares(self):
-        """True."""
+        """True: the objective must be a sum of squares."""
         return True
 
     def minimise(self, inversion, start, box):
-        """Minimise the residuals of data and prior together."""
+        """Minimise the sum of squares of the residuals of data and prior."""
         if not has_values(inversion, start):
             frozen_problem, frozen_start = undifferentiated((inversion, start))
             solution = _least_squares(frozen_problem, frozen_start, self.solver, self.max_steps, {})
@@ -270,15 +272,15 @@ class OneStep(AbstractSolver):
 
     @property
     def is_linear(self):
-        """True."""
+        """True: images are linear in the voltages."""
         return True
 
     def minimise(self, inversion, start, box):
-        """Not available. Raises `ValueError`."""
+        """Not available, because linear images require no minimisation. Raises `ValueError`."""
         raise ValueError("solver: linear images are those of one_step, or of an Imager; take another solver.")
 
     def for_frames(self, max_steps=None, rtol=None):
-        """The solver, with these settings as defaults."""
+        """Copy of the solver in which the arguments replace settings that are None."""
         return self
 
 
@@ -297,7 +299,7 @@ def as_solver(
     solver: "AbstractSolver | optx.AbstractLeastSquaresSolver | str", *, frames: bool = False
 ) -> AbstractSolver:
     """Convert a name in `SOLVERS` or a least-squares solver of optimistix to a solver; solvers are returned unchanged.
-    Raises `ValueError` for anything else, and lists the solvers for frames if `frames`, else for reconstructions."""
+    Raises `ValueError` for anything else; the message lists the solvers for `frames` or for `reconstruct`."""
     names = frame_solvers() if frames else tuple(name for name, kind in SOLVERS.items() if not kind().is_linear)
     if isinstance(solver, str):
         if solver not in SOLVERS:
@@ -311,7 +313,7 @@ def as_solver(
 
 
 def counted_iterations(iterations: int, shortened: int = 0) -> str:
-    """Numbers of iterations and of shortened steps, in words."""
+    """Text that states the numbers of iterations and of shortened steps of a solver."""
     iteration_count = counted(iterations, "iteration")
     if not shortened:
         return iteration_count
@@ -323,7 +325,8 @@ def _reason(status: Status, iterations: int, shortened: int = 0) -> str:
 
 
 def expand(coefficients: Float[Array, " n"], inversion: Inversion):
-    """Objective and step of a problem at these coefficients, for the option `expand` of `jeit_solvers.Descent`."""
+    """Objective and step of the problem `inversion` at these coefficients, for the option `expand` of
+    `jeit_solvers.Descent`."""
     return inversion.quadratic_model(coefficients)
 
 
@@ -349,8 +352,8 @@ def _least_squares(inversion: Inversion, start, solver, max_steps: int, options:
 
 
 def _descent_for(max_steps: int, rtol: float, damping: float = 0.0) -> Descent:
-    """Descent of `max_steps` steps, with a history that also holds the start. `atol` ends the iteration when the
-    objective tends to zero, as for an undisturbed frame, where no change is small relative to it."""
+    """Descent of at most `max_steps` steps, with a history that also holds the start. `atol` ends the iteration when
+    the objective tends to zero, as for an undisturbed frame, where no change is small relative to the objective."""
     return Descent(rtol=rtol, atol=0.5 * rtol, damping=damping, history=max_steps + 1)
 
 
@@ -411,10 +414,11 @@ def minimise_between(
     max_steps: int,
     tolerance: float,
 ) -> BoundedMinimum:
-    """Minimise the objective between bounds with `minimise`, which is `jeit_solvers.lbfgsb` or `projected_gradient`.
+    """Minimise the objective between `lower` and `upper` bounds with the function `minimise`, which is
+    `jeit_solvers.lbfgsb` or `projected_gradient`.
 
-    Coefficients are divided by a scale from the curvature of the objective. The iteration has converged when a step
-    along the projected gradient changes no scaled coefficient by more than `tolerance`.
+    Coefficients are divided by a scale computed from the curvature of the objective. The iteration has converged when a
+    step along the projected gradient changes no scaled coefficient by more than `tolerance`.
     """
     # Coefficients are scaled to similar curvature, because the number of steps depends on the conditioning.
     _, jacobian = inversion.linearise(start)
@@ -434,7 +438,7 @@ def minimise_between(
 @eqx.filter_jit
 def _is_within_rounding(inversion: Inversion, coefficients):
     """Whether a Gauss-Newton step would lower the objective by no more than its rounding error. Solvers that accept
-    steps by the decrease of the objective stall there, before they reach very small tolerances."""
+    steps by the decrease of the objective then stall before they reach very small tolerances."""
     cost, step = inversion.quadratic_model(coefficients)
     _, slope, curvature = step(0.0)
     return abs(slope + 0.5 * curvature) <= _ROUNDING_FACTOR * jnp.finfo(cost.dtype).eps * cost

@@ -23,7 +23,7 @@ from jeit_solvers.module import Module
 
 
 class AbstractBasis(Module):
-    """Base of all bases S (m, n)."""
+    """Base of all bases S (m, n) of images."""
 
     @property
     @abc.abstractmethod
@@ -32,14 +32,14 @@ class AbstractBasis(Module):
 
     @abc.abstractmethod
     def expand(self, coefficients: Float[Array, " n"]) -> Float[Array, " m"]:
-        """Product S c."""
+        """Image change S c (m,) for coefficients c."""
 
     @abc.abstractmethod
     def restrict(self, rows: Float[Array, "M m"]) -> Float[Array, "M n"]:
-        """Product of `rows` with S."""
+        """Product of `rows`, such as a Jacobian (M, m), with S."""
 
     def restrict_blocks(self, blocks: Iterable[tuple[slice, Any]]) -> Any:
-        """Product with S of rows (M, m) given as blocks of cells, in NumPy; a new array (M, n)."""
+        """Product of rows (M, m), given as blocks of consecutive cells, with S; a new NumPy array (M, n)."""
         cell_slices, column_blocks = zip(*blocks, strict=True)
         rows: Any = np.empty((len(column_blocks[0]), cell_slices[-1].stop), column_blocks[0].dtype)
         for block_cells, block in zip(cell_slices, column_blocks, strict=True):
@@ -52,11 +52,12 @@ class AbstractBasis(Module):
 
     @abc.abstractmethod
     def scaled(self, factor) -> "AbstractBasis":
-        """Basis whose S is multiplied by a number."""
+        """Basis in which S is multiplied by the number `factor`."""
 
     @abc.abstractmethod
     def pooled(self, regions: "Regions") -> "AbstractBasis":
-        """Basis whose rows are replaced by their mean over each region, and by zero where the image is held fixed."""
+        """Basis in which the rows of S are replaced by their mean over each region, and by zero where the image is held
+        fixed."""
 
 
 class DiagonalBasis(AbstractBasis):
@@ -70,15 +71,15 @@ class DiagonalBasis(AbstractBasis):
         return self.deviation.shape[0]
 
     def expand(self, coefficients):
-        """Each coefficient times its cell's deviation."""
+        """S c: each coefficient times the deviation of its cell."""
         return self.deviation * coefficients
 
     def restrict(self, rows):
-        """Columns multiplied by the deviations."""
+        """Rows times S: the columns multiplied by the deviations."""
         return rows * self.deviation
 
     def restrict_blocks(self, blocks):
-        """Columns multiplied by the deviations."""
+        """Rows times S: the columns multiplied by the deviations."""
         products: list[np.ndarray] = []
         for cells, block in blocks:
             if not products:
@@ -87,15 +88,15 @@ class DiagonalBasis(AbstractBasis):
         return products[0]
 
     def variance(self):
-        """Squares of the deviations."""
+        """Variance of the cells: squared deviations."""
         return self.deviation**2
 
     def scaled(self, factor):
-        """Basis with the deviations multiplied by a number."""
+        """Basis with the deviations multiplied by `factor`."""
         return DiagonalBasis(self.deviation * factor)
 
     def pooled(self, regions):
-        """Basis with one coefficient per region, whose variance is the mean over its cells."""
+        """Basis with one coefficient per region. Its variance is the mean over the cells of the region."""
         return RegionBasis(regions, namespace(regions).sqrt(regions.mean(self.deviation**2)))
 
 
@@ -107,7 +108,7 @@ class DenseBasis(AbstractBasis):
     **Arguments:**
 
     - `shapes`: (m, n), a shape in each column, in the unit of the image.
-    - `left_out`: (m,), prior variance of the cells that the shapes do not represent, or None.
+    - `left_out`: (m,), the part of each cell's prior variance that the shapes do not represent, or None.
 
     **Example:**
 
@@ -130,22 +131,22 @@ class DenseBasis(AbstractBasis):
         return (self.shapes @ coefficients.astype(self.shapes.dtype)).astype(coefficients.dtype)
 
     def restrict(self, rows):
-        """Product of `rows` with the matrix."""
+        """Product of `rows` with the shapes."""
         return (rows.astype(self.shapes.dtype) @ self.shapes).astype(rows.dtype)
 
     def restrict_blocks(self, blocks):
-        """Sum over the blocks of their products with the matrix."""
+        """Product of rows with the shapes, summed over blocks of cells."""
         total = sum(block.astype(self.shapes.dtype) @ self.shapes[cells] for cells, block in blocks)
         return np.asarray(total, float)
 
     def variance(self):
-        """Sum of the squared shapes, plus the variance left out."""
+        """Variance of the cells: sum of the squared shapes, plus the variance left out."""
         xp = namespace(self)
         shape_variance = xp.einsum("mn,mn->m", self.shapes, self.shapes)
         return shape_variance if self.left_out is None else shape_variance + self.left_out
 
     def scaled(self, factor):
-        """Basis with the matrix multiplied by a number."""
+        """Basis with the shapes multiplied by `factor`."""
         number_type = self.shapes.dtype
         left_out = None if self.left_out is None else self.left_out * factor**2
         return DenseBasis((self.shapes * factor).astype(number_type), left_out)
@@ -156,8 +157,8 @@ class DenseBasis(AbstractBasis):
 
 
 class NodalBasis(AbstractBasis):
-    """Basis with one coefficient per node; a cell has the mean of its nodes, which is the value at its centre of the
-    piecewise linear function with these nodal values.
+    """Basis with one coefficient per node; a cell has the mean of its nodal values, which is the value at the cell's
+    centre of the piecewise linear function with these nodal values.
 
     **Fields**: `cells` (m, k): nodes of the mesh's cells; `number`: number of nodes.
     """
@@ -175,14 +176,14 @@ class NodalBasis(AbstractBasis):
         return gather(coefficients, self.cells).mean(axis=1)
 
     def restrict(self, rows):
-        """Distribute each column in equal parts over the nodes of its cell."""
+        """Rows times S: each column is distributed in equal parts over the nodes of its cell."""
         corner_values = rows.T / self.cells.shape[1]
         shape = self.number, len(rows)
         corner_sums = [sum_into(shape, self.cells[:, corner], corner_values) for corner in range(self.cells.shape[1])]
         return functools.reduce(operator.add, corner_sums).T
 
     def restrict_blocks(self, blocks):
-        """Like `restrict`, for rows given as blocks of cells."""
+        """As `restrict`, for rows given as blocks of cells."""
         total: Any = np.zeros(0)
         nodes_per_cell = self.cells.shape[1]
         for cells, block in blocks:
@@ -197,15 +198,15 @@ class NodalBasis(AbstractBasis):
         return np.ascontiguousarray(total.T)
 
     def variance(self):
-        """Variance of the mean of independent nodes, for every cell."""
+        """Variance of the cells, each the mean of independent nodal values."""
         return namespace(self).full(len(self.cells), 1 / self.cells.shape[1])
 
     def scaled(self, factor):
-        """Not available: nodes have no scale of their own. Raises `ValueError`."""
+        """Not available for nodal bases. Raises `ValueError`."""
         raise ValueError("A basis of nodes has no scale; weigh the penalty.")
 
     def pooled(self, regions):
-        """Not available. Raises `ValueError`."""
+        """Not available for nodal bases. Raises `ValueError`."""
         raise ValueError("regions: images of nodes have none; leave them out.")
 
 
@@ -222,7 +223,7 @@ class Regions(Module):
 
     @classmethod
     def create(cls, mesh: Mesh, label) -> "Regions":
-        """Create regions of a mesh from labels.
+        """Create the regions of a mesh from labels of the cells.
 
         Raises `ValueError` unless `label` has one integer per cell, from -1, and uses all numbers from 0 to the
         largest.
@@ -256,14 +257,15 @@ class Regions(Module):
         return self.total(values * xp.expand_dims(weight, tuple(range(1, values.ndim))))
 
     def spread(self, values: Float[Array, "p *k"]) -> Float[Array, "m *k"]:
-        """Value of its region for each cell; zero where the image is held fixed."""
+        """Give each cell the value of its region; zero where the image is held fixed."""
         xp = namespace(self, values)
         is_fixed = xp.expand_dims(self.label < 0, tuple(range(1, values.ndim)))
         return xp.where(is_fixed, 0, values[xp.maximum(self.label, 0)])
 
 
 def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
-    """Labels for `Regions` that group cells into the pixels of a grid over the mesh; empty pixels are not numbered.
+    """Labels (m,) for `Regions` that group the cells of a mesh into the pixels of a grid; empty pixels are not
+    numbered.
 
     `shape`: numbers of rows and columns of the grid.
 
@@ -294,7 +296,8 @@ def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
 
 
 class RegionBasis(AbstractBasis):
-    """Basis with one coefficient per region; all cells of a region have its `deviation` (p,) times its coefficient."""
+    """Basis with one coefficient per region; all cells of a region have the value `deviation` (p,) times coefficient of
+    the region."""
 
     regions: Regions
     deviation: Float[Array, " p"]
@@ -305,19 +308,19 @@ class RegionBasis(AbstractBasis):
         return self.regions.number
 
     def expand(self, coefficients):
-        """Each region's value at its cells."""
+        """S c: each cell has the value of its region."""
         return self.regions.spread(self.deviation * coefficients)
 
     def restrict(self, rows):
-        """Columns summed over each region and multiplied by its deviation."""
+        """Rows times S: columns summed over each region and multiplied by its deviation."""
         return self.regions.total(rows.T).T * self.deviation
 
     def variance(self):
-        """Squared deviation of its region, for every cell."""
+        """Variance of the cells: squared deviation of the region."""
         return self.regions.spread(self.deviation**2)
 
     def scaled(self, factor):
-        """Basis with the deviations multiplied by a number."""
+        """Basis with the deviations multiplied by `factor`."""
         return RegionBasis(self.regions, self.deviation * factor)
 
     def pooled(self, regions):

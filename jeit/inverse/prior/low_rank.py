@@ -20,15 +20,16 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float
 
-# Diagonal entries of at least this fraction of the largest count as equal to it, as in symmetric meshes. The first of
-# them is the pivot, so that rounding errors do not decide.
+# Diagonal entries of at least this fraction of the largest entry count as equal to it, as occurs in symmetric meshes.
+# The first of these entries is the pivot, so that rounding errors do not decide.
 _EQUAL_DIAGONAL = 1 - 1e-4
 
 
 def pivoted_cholesky(
     diagonal: np.ndarray, column: Callable[[int], np.ndarray], *, tolerance: float, max_rank: int
 ) -> np.ndarray:
-    """S (m, n) with Γ ≈ S Sᵀ, for a covariance Γ given by its diagonal (m,) and a function that returns a column.
+    """Low-rank factor S (m, n) with Γ ≈ S Sᵀ, for a covariance Γ given by its `diagonal` (m,) and a function that
+    returns a `column` of Γ.
 
     `tolerance`: fraction of the trace of Γ that may be left out.
     """
@@ -47,10 +48,11 @@ def pivoted_cholesky(
 
 
 def traced_pivoted_cholesky(scaled: Float[Array, "m d"], *, tolerance: float, max_rank: int) -> Float[Array, "m k"]:
-    """`pivoted_cholesky` of Γ = exp(-|x_i - x_j|²) for traced points `scaled`. Returns k = min(m, max_rank) columns;
-    columns that are not needed are zero.
+    """Low-rank factor, as from `pivoted_cholesky`, of Γ = exp(-|x_i - x_j|²) for traced points x = `scaled`. Returns k
+    = min(m, max_rank) columns; columns that are not needed are zero.
 
-    The derivative is that of Γ[:, P] L⁻ᵀ with Γ[P, P] = L Lᵀ for fixed pivots P: exact except where the pivots change.
+    The derivative is that of Γ[:, P] L⁻ᵀ with Γ[P, P] = L Lᵀ for fixed pivots P. This derivative is exact except where
+    the pivots change.
     """
     num_columns = min(max_rank, len(scaled))
     pivots, rank = _pivots(jax.lax.stop_gradient(scaled), tolerance, num_columns)
@@ -69,7 +71,8 @@ def _squared_distances(points, other_points):
 
 
 def _pivots(scaled, tolerance: float, max_rank: int):
-    """Indices (size,) of the pivots, and how many of them are needed."""
+    """Indices (max_rank,) of the pivots of the Cholesky factorisation, and the number of pivots that reach the
+    tolerance."""
     allowed_residual = tolerance * len(scaled)
 
     def is_incomplete(state):
@@ -91,16 +94,17 @@ def _pivots(scaled, tolerance: float, max_rank: int):
 
 # Grid points per correlation length; number of grid points along an axis from which the cubic interpolates.
 _GRID_POINTS_PER_LENGTH, _CUBIC = 3, 4
-# Limits within which a grid is worthwhile: maximum number of grid points per point, and in total.
+# Maximum number of grid points, per point of the field and in total, up to which a grid saves time.
 _MAX_GRID_RATIO, _MAX_GRID_POINTS = 8, 500_000
-# Number of columns processed at a time, which limits the memory of the grid.
+# Number of columns processed at a time, which limits the memory for values on the grid.
 _COLUMNS_AT_ONCE = 64
 
 
 class GriddedGaussian:
     """Covariance Γ_ij = exp(-|x_i - x_j|² / 2 length²) between points `places` (m, d), approximated on a grid.
 
-    `places` and `length` in metres. `variance` (m,): diagonal of the approximation, one except for interpolation error.
+    `places` and `length` in metres. `variance` (m,): diagonal of the approximated covariance, 1 except for
+    interpolation errors.
     """
 
     def __init__(self, places: Float[np.ndarray, "m d"], length: float):
@@ -119,12 +123,12 @@ class GriddedGaussian:
 
     @staticmethod
     def suits(places: Float[np.ndarray, "m d"], length: float) -> bool:
-        """Whether the grid has few enough points to be worthwhile."""
+        """Whether the grid for points `places` has few enough points to save time."""
         extent = np.ptp(places, axis=0) / length * _GRID_POINTS_PER_LENGTH + 5
         return bool(np.prod(extent) < min(_MAX_GRID_RATIO * len(places), _MAX_GRID_POINTS))
 
     def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
-        """Γ times columns."""
+        """Product of the approximated covariance Γ with `columns`."""
         products = np.empty(columns.shape)
         for start in range(0, columns.shape[1], _COLUMNS_AT_ONCE):
             column_range = slice(start, start + _COLUMNS_AT_ONCE)
@@ -143,7 +147,8 @@ def _cubic_weights(place: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"
 
 
 def _cubic_interpolation(place: Float[np.ndarray, "m d"], shape: tuple[int, ...]) -> scipy.sparse.csr_array:
-    """Sparse matrix (m, grid points) that interpolates from the grid to points `place`, in units of the spacing."""
+    """Sparse matrix (m, grid points) that interpolates from a grid of the given `shape` to points `place` (m, d), in
+    units of the grid spacing."""
     first_nodes, nodes, axis_weights = np.floor(place).astype(int) - 1, np.arange(_CUBIC), _cubic_weights(place)
     weight, index = np.ones((len(place), 1)), np.zeros((len(place), 1), int)
     for axis, axis_size in enumerate(shape):

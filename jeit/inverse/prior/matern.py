@@ -4,11 +4,11 @@ In unbounded space, the solution of (κ² - Δ) x = white noise has the Matérn 
 
     d = 2:  κr K₁(κr),    d = 3:  exp(-κr).
 
-The covariance of the nodal values is A⁻¹ M A⁻¹ with A = κ²M + K, mass matrix M and stiffness matrix K. Products with it
-take sparse solves; the covariance itself would be a dense matrix over all pairs of cells. Lindgren, Rue and Lindström,
-J. R. Stat. Soc. B 73 (2011) 423-498. The domain's wall reflects the field and raises its variance there. The Robin
-condition ∂x/∂n = -κx / 1.42 removes most of this (Roininen, Huttunen and Lasanen, Inverse Probl. Imaging 8 (2014)
-561-586), and the nodes are scaled to unit variance to remove the rest.
+The covariance of the nodal values is A⁻¹ M A⁻¹ with A = κ²M + K, mass matrix M and stiffness matrix K. Products with
+this covariance take sparse solves; the covariance itself would be a dense matrix over all pairs of cells. Lindgren, Rue
+and Lindström, J. R. Stat. Soc. B 73 (2011) 423-498. The domain's wall reflects the field and raises the field's
+variance near the wall. The Robin condition ∂x/∂n = -κx / 1.42 removes most of this excess (Roininen, Huttunen and
+Lasanen, Inverse Probl. Imaging 8 (2014) 561-586), and the nodal values are scaled to unit variance to remove the rest.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from jeit.mesh import Mesh, gradients, measures
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, host, on_host
 
-# Length of the Robin condition at the wall, in units of 1/κ.
+# Length in the Robin condition at the wall, in units of 1/κ.
 _ROBIN_COEFFICIENT = 1.42
-# Number of nodes up to which variances are computed exactly; number of random fields from which they are estimated on
-# larger meshes.
+# Number of nodes up to which variances are computed exactly; number of random fields from which variances are estimated
+# on larger meshes.
 _MAX_EXACT_NODES, _NUM_SAMPLED_FIELDS = 3000, 400
-# Number of fields processed at a time.
+# Number of random fields processed at a time.
 _COLUMNS_AT_ONCE = 50
 
 
 class Matern(AbstractPrior):
     """Matérn prior: a smooth random field of unit variance.
 
-    The correlation falls to 0.14 at twice the length, as for `Gaussian(length)`, but decreases from distance zero on,
-    so images have sharper peaks. κ is 1 / length in a solid body, √2 / length in a sheet. The cells must not be much
-    larger than the length. Memory and time are roughly proportional to the number of nodes.
+    The correlation falls to 0.14 at twice the correlation length, as for `Gaussian(length)`, but it has a peak at
+    distance zero, so images have sharper peaks. κ is 1 / length in a solid body, √2 / length in a sheet. The cells must
+    not be much larger than the length. Memory and time are roughly proportional to the number of nodes.
 
     **Arguments:**
 
@@ -64,7 +64,7 @@ class Matern(AbstractPrior):
             raise ValueError(f"length must be positive, in metres; it is {self.length}.")
 
     def covariance_product(self, mesh, jacobian):
-        """Γ Jᵀ, computed by two sparse solves."""
+        """Product Γ Jᵀ, computed by two sparse solves."""
         field = self._field(mesh, jacobian)
         columns: Any = np.asarray(on_host(jacobian)).T
         if np.iscomplexobj(columns):
@@ -72,18 +72,18 @@ class Matern(AbstractPrior):
         return host.asarray(field.product(columns))
 
     def precision(self, mesh, jacobian):
-        """Not available for cells. Raises `ValueError`."""
+        """Not available for this prior. Raises `ValueError`."""
         raise ValueError(
             "prior: Matern is a field of the nodes and has no precision matrix of cells, which bounds need; take "
             "Noser, Tikhonov, Laplace or TotalVariation, or link=Bounded(lower, upper) in place of bounds."
         )
 
     def basis(self, mesh, jacobian):
-        """One shape for each node: the response of the cells to white noise at that node."""
+        """Basis with one shape for each node: the response of the cells to white noise at this node."""
         return DenseBasis(host.asarray(self._field(mesh, jacobian).shapes()))
 
     def informed_basis(self, mesh, jacobian):
-        """Informed shapes (`informed_shapes`) of this prior."""
+        """Basis of the shapes of this prior that the data resolve (`informed_shapes`)."""
         field = self._field(mesh, jacobian)
         return informed_shapes(np.asarray(jacobian), field.product, field.variance())
 
@@ -98,9 +98,9 @@ class Matern(AbstractPrior):
 class _MaternField(NamedTuple):
     """Matérn field on the nodes of a mesh.
 
-    **Fields**: `means` (m, n): matrix that averages nodal values over each cell; `solve`: solves systems with A; `mass`
-    (n,): lumped mass of the nodes; `scale` (n,): factors that give every node unit variance; `fields` (n, k): F, where
-    F Fᵀ approximates the covariance of the nodes.
+    ***Fields**: `means` (m, n): matrix that averages nodal values over each cell; `solve`: function that solves systems
+    with A = κ²M + K; `mass` (n,): lumped mass M of the nodes; `scale` (n,): factors that give every node unit variance;
+    `fields` (n, k): F, where F Fᵀ approximates the covariance of the nodal values.
     """
 
     means: scipy.sparse.csr_array
@@ -126,12 +126,12 @@ class _MaternField(NamedTuple):
         return cls(system.means, solve, mass, scale, scale[:, None] * fields)
 
     def variance(self) -> Float[np.ndarray, " m"]:
-        """Variance of the cells."""
+        """Variance of the field in every cell."""
         field_blocks = np.array_split(self.fields, max(1, self.fields.shape[1] // _COLUMNS_AT_ONCE), axis=1)
         return np.sum([((self.means @ fields) ** 2).sum(axis=1) for fields in field_blocks], axis=0)
 
     def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
-        """Γ times columns."""
+        """Covariance Γ of the cells times `columns`."""
 
         def multiply_block(column_slice: Any) -> Any:
             nodal_columns = self.scale[:, None] * (self.means.T @ column_slice)
@@ -140,13 +140,13 @@ class _MaternField(NamedTuple):
         return by_columns(multiply_block, columns, len(columns))
 
     def shapes(self) -> Float[np.ndarray, "m n"]:
-        """S with Γ = S Sᵀ."""
+        """Shapes S with Γ = S Sᵀ, the covariance of the cells."""
         return self.means @ (self.scale[:, None] * self.solve(np.diag(np.sqrt(self.mass))))
 
 
 def _covariance_factor(solve: Solve, mass: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
-    """F with F Fᵀ = A⁻¹ M A⁻¹. For a large mesh the columns are random fields of that covariance, which approximate
-    the diagonal of F Fᵀ."""
+    """Factor F of the covariance of the nodal values, F Fᵀ = A⁻¹ M A⁻¹. For a large mesh the columns of F are random
+    fields with this covariance, so that F Fᵀ approximates its diagonal."""
     if len(mass) <= _MAX_EXACT_NODES:
         return solve(np.diag(np.sqrt(mass)))
     noise = np.random.default_rng(0).standard_normal((len(mass), _NUM_SAMPLED_FIELDS)) / np.sqrt(_NUM_SAMPLED_FIELDS)

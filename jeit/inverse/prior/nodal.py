@@ -25,8 +25,8 @@ from jeit_solvers import (
 )
 from jeit_solvers.engines import on_host
 
-# Number of columns solved for at a time, by a plan's padded fronts and by fronts of their own size: with more, they
-# exceed the caches and memory grows.
+# Number of right-hand sides solved at a time, with a plan's padded fronts and with fronts of exact size: more would
+# exceed the caches.
 _COLUMNS_BY_PLAN, _COLUMNS_BY_FRONTS = 32, 256
 
 Solve = Callable[[Any], Any]
@@ -62,31 +62,31 @@ class NodalSystem(NamedTuple):
     def assemble(
         self, elements: Float[np.ndarray, "..."], diagonal: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " e"]:
-        """Assemble the element matrices `elements` (m, k, k) and add `diagonal` (n,); entries in the pattern's
-        order."""
+        """Assemble a matrix from the element matrices `elements` (m, k, k) and add `diagonal` (n,). Returns the entries
+        (e,) in the pattern's order."""
         element_matrices: Any = elements
         values = np.array(self.pattern.assemble(element_matrices))
         values[: self.pattern.size] += diagonal
         return values
 
     def inverse(self, values: Any) -> Solve:
-        """Factorise the matrix A whose entries in the pattern's order are `values`; return a function that solves
-        A X = B for columns B (n, k)."""
+        """Factorise the matrix A whose entries in the pattern's order are `values`, and return a function that solves A
+        X = B for columns B (n, k)."""
         factor = factorise_fronts(self.fronts, values)
         return lambda columns: by_columns(factor.solve, columns, len(columns))
 
 
 class FactorisedMatrix(NamedTuple):
-    """A factorised matrix A = L Lᵀ. **Fields**: `solve`: A⁻¹ times columns (n, k); `half_solve`: L⁻¹ times columns,
-    rows in an order of its own."""
+    """A factorised matrix A = L Lᵀ. ***Fields**: `solve`: function that returns A⁻¹ times columns (n, k); `half_solve`:
+    function that returns L⁻¹ times columns, with the rows in the order of the factorisation."""
 
     solve: Solve
     half_solve: Solve
 
 
 def factorise_matrix(plan: FactorisationPlan, fronts: Fronts, values: Any) -> FactorisedMatrix:
-    """Factorise a matrix with these values: in NumPy, with the order `fronts`, or inside jax.jit, jax.grad and
-    jax.vmap, with the compiled `plan`."""
+    """Factorise the matrix whose entries in the pattern's order are `values`: in NumPy, with the order `fronts`, or
+    inside `jax.jit`, `jax.grad` and `jax.vmap`, with the compiled `plan`."""
     if not isinstance(values, np.ndarray):
         factor = factorise(plan, values)
         return FactorisedMatrix(
@@ -100,15 +100,15 @@ def factorise_matrix(plan: FactorisationPlan, fronts: Fronts, values: Any) -> Fa
 
 
 def solve_columns(plan: FactorisationPlan, factor: Factor, columns: Any) -> Any:
-    """Solutions for columns (n, k). NumPy arrays are split over all cores."""
+    """Solutions of a factorised system for right-hand sides `columns` (n, k). NumPy arrays are split over all cores."""
     if not isinstance(columns, np.ndarray):
         return solve(plan, factor, columns)
     return by_columns(functools.partial(solve, plan, factor), columns, plan.size, _COLUMNS_BY_PLAN)
 
 
 def by_columns(function: Callable[[Any], Any], columns: Any, rows: int, at_once: int = _COLUMNS_BY_FRONTS) -> Any:
-    """Apply `function` to blocks of `at_once` columns of a NumPy array (n, k), in parallel on all cores; returns
-    (rows, k). `function` may itself call `by_columns` with all columns it is given."""
+    """Apply `function` to blocks of `at_once` columns of a NumPy array (n, k), in parallel on all cores; returns (rows,
+    k). `function` may itself call `by_columns` with all its columns."""
     num_columns = columns.shape[1]
     result = np.empty((rows, num_columns), columns.dtype)
 

@@ -1,7 +1,8 @@
 """Penalties of coefficients, minimised together with the data misfit, and the normal distributions they correspond to.
 
 A penalty ½ cᵀQc, up to terms linear in c, corresponds to a normal distribution of precision Q. A penalty that is not
-quadratic is replaced by the quadratic that touches it from above. The covariance Q⁻¹ is never formed as a matrix.
+quadratic is replaced by the quadratic form that touches the penalty from above. The covariance Q⁻¹ is never formed as a
+matrix.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ from jeit_solvers import (
 from jeit_solvers.engines import host, namespace
 from jeit_solvers.module import Module
 
-# Multiple of the identity, relative to the largest entry, added to a precision that has a null space before it is
-# inverted approximately.
+# Multiple of the identity, relative to the largest entry, added to a precision matrix with a null space before its
+# approximate inversion.
 _DIAGONAL_SHIFT = 1e-6
 
 
 class AbstractPenalty(Module):
-    """Base of all penalties of coefficients c; those of further unknowns come last."""
+    """Base of all penalties of coefficients c; the coefficients of further unknowns come last."""
 
     @property
     def is_standard_normal(self) -> bool:
@@ -54,12 +55,13 @@ class AbstractPenalty(Module):
 
     @abc.abstractmethod
     def diagonal(self, coefficients: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Diagonal of the penalty's quadratic form at c, used to scale gradient methods."""
+        """Diagonal of the penalty's quadratic form at c, which scales gradient methods."""
 
     @abc.abstractmethod
     def inverse_hessian(self, coefficients: Float[Array, " n"], free, columns: Float[Array, "n k"]) -> Array:
         """Approximate inverse of the penalty's Hessian at c, restricted to the coefficients marked in `free` (n,),
-        times columns that are zero elsewhere. It preconditions the computation of a minimum's derivatives."""
+        times `columns` that are zero for all other coefficients. This inverse preconditions the computation of a
+        minimum's derivatives."""
 
     def normal(self, coefficients: Float[Array, " n"]) -> AbstractNormal | None:
         """Normal distribution that corresponds to the penalty near c; None if the posterior is not nearly Gaussian."""
@@ -76,19 +78,19 @@ class Ridge(AbstractPenalty):
 
     @property
     def is_standard_normal(self) -> bool:
-        """True."""
+        """True: the penalty is ½‖c‖²."""
         return True
 
     def cost(self, coefficients):
-        """½ ‖c‖²."""
+        """Value ½ ‖c‖² of the penalty."""
         return 0.5 * coefficients @ coefficients
 
     def diagonal(self, coefficients):
-        """Ones."""
+        """Ones, the diagonal of the identity."""
         return namespace(coefficients).ones_like(coefficients)
 
     def inverse_hessian(self, coefficients, free, columns):
-        """The columns themselves."""
+        """The `columns` themselves, as the matrix is the identity."""
         return columns
 
     def normal(self, coefficients):
@@ -96,13 +98,13 @@ class Ridge(AbstractPenalty):
         return StandardNormal()
 
     def model(self, residual, jacobian, coefficients, data):
-        """Quadratic model of the objective for a Gauss-Newton step, in data space or coefficient space."""
+        """Objective and the function that computes a Gauss-Newton step, in data space or coefficient space."""
         return ridge_model(residual, jacobian, coefficients, data.covariance, data.precision)
 
 
 class QuadraticForm(AbstractPenalty):
     """Penalty ½ cᵀQc with sparse precision Q, whose entries at (`row`, `column`) are `value` (k,); further unknowns
-    have a unit ridge penalty."""
+    have the penalty ½ ‖c‖²."""
 
     row: Int[Array, " k"]
     column: Int[Array, " k"]
@@ -112,22 +114,23 @@ class QuadraticForm(AbstractPenalty):
 
     @classmethod
     def create(cls, row, column, value, hyperparameter, size: int) -> "QuadraticForm":
-        """Create with Q = λ² times the matrix with these entries, for λ = `hyperparameter`."""
+        """Create with Q = λ² times the matrix with the given entries, for λ = `hyperparameter`."""
         is_diagonal = len(row) == size and np.array_equal(row, column)
         return cls(row, column, hyperparameter**2 * value, size, bool(is_diagonal))
 
     def cost(self, coefficients):
-        """½ cᵀQc."""
+        """Value ½ cᵀQc of the penalty."""
         image, unknowns = coefficients[: self.size], coefficients[self.size :]
         return 0.5 * (jnp.sum(self.value * image[self.row] * image[self.column]) + unknowns @ unknowns)
 
     def diagonal(self, coefficients):
-        """Diagonal of Q."""
+        """Diagonal of the precision matrix Q."""
         diagonal = jnp.zeros(self.size).at[self.row].add(jnp.where(self.row == self.column, self.value, 0))
         return jnp.concatenate([diagonal, jnp.ones(coefficients.size - self.size)])
 
     def inverse_hessian(self, coefficients, free, columns):
-        """Inverse of Q plus a small multiple of the identity; a dense matrix unless Q is diagonal."""
+        """Inverse of Q plus a small multiple of the identity, times `columns`; computed as a dense matrix unless Q is
+        diagonal."""
         image_columns, unknown_columns = columns[: self.size], columns[self.size :]
         if self.is_diagonal:
             return jnp.concatenate([image_columns / self.value[:, None], unknown_columns])
@@ -145,15 +148,17 @@ class QuadraticForm(AbstractPenalty):
 
 
 class AbstractNormal(Module):
-    """Base of normal distributions of coefficients c (n,); those of further unknowns come last."""
+    """Base of normal distributions, with precision Q, of coefficients c (n,); the coefficients of further unknowns come
+    last."""
 
     @abc.abstractmethod
     def covariance_product(self, columns: Float[Array, "n k"]) -> Float[Array, "n k"]:
-        """Q⁻¹ times columns."""
+        """Covariance Q⁻¹ times `columns`."""
 
     @abc.abstractmethod
     def variance(self, basis: AbstractBasis) -> Float[Array, " m"]:
-        """Variance of the image in every cell: the diagonal of S Q⁻¹ Sᵀ plus the variance left out by the shapes."""
+        """Variance of the image in every cell: the diagonal of S Q⁻¹ Sᵀ for the `basis` S, plus the variance it leaves
+        out."""
 
     @abc.abstractmethod
     def num_draws(self, num_coefficients: int) -> int:
@@ -168,19 +173,19 @@ class StandardNormal(AbstractNormal):
     """Standard normal distribution, Q = I."""
 
     def covariance_product(self, columns):
-        """The columns themselves."""
+        """The `columns` themselves, as the matrix is the identity."""
         return columns
 
     def variance(self, basis):
-        """Prior variance of the basis."""
+        """Variance of the image: the prior variance of the basis."""
         return basis.variance()
 
     def num_draws(self, num_coefficients):
-        """Number of draws: one for each coefficient."""
+        """Numbers per sample: one for each coefficient."""
         return num_coefficients
 
     def drawn(self, numbers):
-        """The numbers themselves."""
+        """Samples: the `numbers` themselves."""
         return numbers
 
 
@@ -193,7 +198,7 @@ class SparseNormal(AbstractNormal):
     factor: Factor
 
     def covariance_product(self, columns):
-        """Q⁻¹ times columns, by sparse solves."""
+        """Q⁻¹ times `columns`, by sparse solves."""
         size = self.plan.size
         image_columns = solve_columns(self.plan, self.factor, columns[:size])
         return namespace(columns, image_columns).concatenate([image_columns, columns[size:]])
@@ -208,11 +213,11 @@ class SparseNormal(AbstractNormal):
         return host.where(row == column, 1.0, 2.0) @ block_entries / basis.cells.shape[1] ** 2
 
     def num_draws(self, num_coefficients):
-        """Number of draws: one for each pivot of the factor, padding included, and one for each further unknown."""
+        """Numbers per sample: one for each pivot of the factor, padding included, and one for each further unknown."""
         return num_coefficients - self.plan.size + self.plan.num_pivots
 
     def drawn(self, numbers):
-        """Samples, computed with one triangular factor of Q."""
+        """Samples, computed with a triangular factor of Q."""
         num_pivots = self.plan.num_pivots
         image = inverse_root(self.plan, self.factor, numbers[:num_pivots])
         return namespace(numbers, image).concatenate([image, numbers[num_pivots:]])

@@ -1,8 +1,9 @@
 """Priors of conductivity: quadratic energies xᵀQx of an image x, with precision matrix Q.
 
-A linear image minimises ‖W^½ (J x - v)‖² + λ² xᵀQx. With M measurements and m ≫ M cells it is computed in data space,
-which takes only products of the prior covariance Γ = Q⁻¹ with Jᵀ. If Q has a null space (Laplace: constant images), Γ
-is any generalised inverse and the null space is estimated from the data without penalty.
+A linear image minimises ‖W^½ (J x - v)‖² + λ² xᵀQx. With M measurements and m ≫ M cells the image is computed in data
+space, which takes only products of the prior covariance Γ = Q⁻¹ with Jᵀ. If Q has a null space (Laplace: constant
+images), Γ is any generalised inverse of Q, and the component in the null space is estimated from the data without
+penalty.
 """
 
 from __future__ import annotations
@@ -56,10 +57,10 @@ def check_prior(prior: Any) -> None:
 
 # Number of rows of a dense covariance computed at a time.
 _ROWS_AT_ONCE = 512
-# Fraction of a Gaussian prior's variance that its shapes may leave out; maximum number of shapes.
+# Fraction of a Gaussian prior's variance that the shapes of its basis may leave out; maximum number of shapes.
 _OMITTED_VARIANCE, _MAX_SHAPES = 1e-3, 2000
 # Number of cells above which images consist only of shapes that the data resolve, and the Laplace prior couples nodes
-# in place of cells; squared signal of a shape, relative to the largest, below which the data do not resolve it.
+# in place of cells; squared signal of a shape, relative to the largest, below which the data do not resolve the shape.
 _LARGE_MESH_CELLS, _MIN_SIGNAL = 30_000, 1e-12
 # Term added to the diagonal of a precision matrix that has constant images in its null space.
 _DIAGONAL_TERM = 1e-6
@@ -69,8 +70,8 @@ class AbstractPrior(Module):
     """Base of all priors on an image of one value per cell.
 
     A new quadratic prior is a subclass with `covariance_product`, `precision` and `basis`. A prior whose energy is not
-    xᵀQx overrides `penalty` and raises `ValueError` in the methods that do not apply. Real and imaginary part of a
-    complex image have the same prior; methods take the complex conjugate of a complex Jacobian.
+    xᵀQx overrides `penalty` and raises `ValueError` in methods that do not apply to such a prior. Real and imaginary
+    part of a complex image have the same prior; methods take the complex conjugate of a complex Jacobian.
 
     **Example:**
 
@@ -101,9 +102,9 @@ class AbstractPrior(Module):
     ) -> tuple[AbstractBasis, AbstractPenalty]:
         """Basis S of an image x = `reference` + S c, and the penalty of its coefficients c, weighted with λ.
 
-        `jacobian`: Jacobian of the whitened data with respect to the link's variable. `regions`: cells that share a
-        value. `per_cell`: whether every coefficient must be the value of a cell, as bounds require. Raises `ValueError`
-        for arguments that do not fit together.
+        `jacobian`: Jacobian of the whitened data with respect to the link's variable. `regions`: regions of cells that
+        share a value. `per_cell`: whether every coefficient must be the value of a cell, as bounds require. Raises
+        `ValueError` for invalid or inconsistent arguments.
         """
         assert jacobian is not None  # a quadratic prior may depend on it
         if not per_cell:
@@ -124,7 +125,7 @@ class AbstractPrior(Module):
         """Precision matrix Q (m, m), sparse."""
 
     def entries(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> tuple[Any, Any, Any]:
-        """Rows, columns and values of the nonzero entries of Q, (k,) each."""
+        """Rows, columns and values of the k nonzero entries of the precision matrix Q, (k,) each."""
         matrix = scipy.sparse.coo_array(self.precision(mesh, jacobian))
         return matrix.row, matrix.col, matrix.data
 
@@ -134,7 +135,7 @@ class AbstractPrior(Module):
         finite variance."""
 
     def informed_basis(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> AbstractBasis:
-        """Smaller basis that replaces S on meshes of many cells; see `informed_shapes`."""
+        """Basis with fewer shapes that replaces S on meshes of many cells; see `informed_shapes`."""
         return self.basis(mesh, jacobian)
 
     def null_space(self, mesh: Mesh) -> Float[Array, "m p"]:
@@ -153,11 +154,11 @@ class Tikhonov(AbstractPrior):
     """
 
     def covariance_product(self, mesh, jacobian):
-        """Jᵀ."""
+        """Product Γ Jᵀ = Jᵀ, because Γ = I."""
         return jacobian.T
 
     def precision(self, mesh, jacobian) -> scipy.sparse.sparray:
-        """Identity matrix."""
+        """Precision matrix Q, the identity matrix."""
         return scipy.sparse.csr_array(scipy.sparse.eye_array(mesh.num_cells))
 
     def basis(self, mesh, jacobian):
@@ -172,7 +173,7 @@ class Noser(AbstractPrior):
 
     **Arguments:**
 
-    - `exponent`: 1 penalises relative to full sensitivity, 0 is `Tikhonov`.
+    - `exponent`: 1 weights every cell with its squared sensitivity, 0 gives `Tikhonov`.
 
     **Example:**
 
@@ -184,11 +185,11 @@ class Noser(AbstractPrior):
     exponent: float = 0.5
 
     def covariance_product(self, mesh, jacobian):
-        """Jᵀ with its rows divided by the diagonal of Q."""
+        """Product Γ Jᵀ: Jᵀ with its rows divided by the diagonal of Q."""
         return jacobian.T / (abs(jacobian) ** 2).sum(axis=0)[:, None] ** self.exponent
 
     def precision(self, mesh, jacobian):
-        """The diagonal matrix Q."""
+        """Precision matrix Q, a diagonal matrix."""
         return scipy.sparse.diags_array(np.asarray(self.entries(mesh, jacobian)[2])).tocsr()
 
     def entries(self, mesh, jacobian):
@@ -217,7 +218,7 @@ class Laplace(AbstractPrior):
     """
 
     def covariance_product(self, mesh, jacobian):
-        """Γ Jᵀ, where Γ is the generalised inverse of Q with cell 0, or node 0, grounded."""
+        """Product Γ Jᵀ, where Γ is the generalised inverse of Q with the value of cell 0, or node 0, set to zero."""
         check_cells(mesh)
         if mesh.dimension == 3 and mesh.num_cells > _LARGE_MESH_CELLS and has_values(mesh, jacobian):
             return host.asarray(_node_covariance_product(mesh, np.asarray(jacobian).T, 0.0))
@@ -247,21 +248,21 @@ class Laplace(AbstractPrior):
         return DenseBasis(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
 
     def informed_basis(self, mesh, jacobian):
-        """Informed shapes (`informed_shapes`) in a solid, with a very small penalty on constant images; in a sheet,
-        `basis`."""
+        """Basis of the shapes that the data resolve (`informed_shapes`) in a solid, with a very small penalty on
+        constant images; in a sheet, `basis`."""
         if mesh.dimension != 3:
             return self.basis(mesh, jacobian)
         covariance_product = partial(_node_covariance_product, mesh, freedom=_DIAGONAL_TERM)
         return informed_shapes(np.asarray(jacobian), covariance_product, None)
 
     def null_space(self, mesh):
-        """Constant image (m, 1)."""
+        """Basis (m, 1) of the images of zero energy: the constant image."""
         return host.ones((mesh.num_cells, 1))
 
 
 class Gaussian(AbstractPrior):
     """Gaussian prior: a smooth random field with covariance Γ_ij = exp(-|x_i - x_j|² / 2 length²) between cell centres.
-    It does not depend on the mesh.
+    The field does not depend on the mesh.
 
     **Arguments:**
 
@@ -283,7 +284,8 @@ class Gaussian(AbstractPrior):
             raise ValueError(f"length must be positive, in metres; it is {self.length}.")
 
     def covariance_product(self, mesh, jacobian):
-        """Γ Jᵀ, computed in blocks of rows so that the dense Γ is never stored; on a grid if there are many cells."""
+        """Product Γ Jᵀ, computed in blocks of rows so that the dense Γ is never stored, or on a grid if there are many
+        cells."""
         scaled_centres = centroids(mesh) / (np.sqrt(2) * self.length)
         if not has_values(scaled_centres, jacobian):
             return _traced_product(jnp.asarray(scaled_centres), jnp.asarray(jacobian))
@@ -298,7 +300,8 @@ class Gaussian(AbstractPrior):
         )
 
     def basis(self, mesh, jacobian):
-        """Shapes that represent all but a thousandth of the variance: fewer than cells if `length` spans many cells.
+        """Basis of shapes that represent all but a thousandth of the variance. There are fewer shapes than cells if
+        `length` spans many cells.
 
         If the length or the mesh's points are traced, the basis is padded with zero shapes; the image is the same.
         """
@@ -319,7 +322,8 @@ class Gaussian(AbstractPrior):
         )
 
     def informed_basis(self, mesh, jacobian):
-        """Informed shapes (`informed_shapes`), computed on a grid; `basis` if the grid would be too large."""
+        """Basis of the shapes that the data resolve (`informed_shapes`), computed on a grid; `basis` if the grid would
+        be too large."""
         centres = np.asarray(centroids(mesh))
         if not GriddedGaussian.suits(centres, float(self.length)):
             return self.basis(mesh, jacobian)
@@ -339,10 +343,11 @@ def informed_shapes(
     covariance: Callable[[Float[np.ndarray, "m M"]], Any],
     variance: Float[np.ndarray, " m"] | None,
 ) -> DenseBasis:
-    """Basis of the shapes that data resolve, ΓJᵀ(JΓJᵀ)^-½, of which there are at most as many as data.
+    """Basis of the shapes that data with Jacobian J resolve under the prior covariance Γ, ΓJᵀ(JΓJᵀ)^-½. There are at
+    most as many shapes as data.
 
-    `covariance`: function that multiplies with Γ; `variance`: diagonal of Γ, if known. Shapes are in single precision,
-    which changes an image by a relative 1e-6.
+    `covariance`: function that multiplies an array by Γ; `variance`: diagonal of Γ, if known. Shapes are stored in
+    single precision, which changes an image by a relative 1e-6.
     """
     product = np.asarray(covariance(jacobian.T))
     data_covariance = jacobian @ product
@@ -356,8 +361,9 @@ def informed_shapes(
 
 
 def _node_covariance_product(mesh: Mesh, columns: Float[np.ndarray, "m k"], freedom: float) -> Float[np.ndarray, "m k"]:
-    """Γ times columns, where Γ is the inverse of twice the graph Laplacian of nodes that share an edge, averaged over
-    cells. `freedom` is added to the diagonal; if it is 0, node 0 is grounded."""
+    """Product of Γ with `columns`, where Γ is the inverse of twice the graph Laplacian of nodes that share an edge,
+    averaged over cells. `freedom` is added to the Laplacian's diagonal; if `freedom` is 0, the value of node 0 is set
+    to zero."""
     system = NodalSystem.create(mesh)
     neighbours = system.pattern.to_scipy(np.ones(system.pattern.num_entries))
     diagonal = 2 * (np.asarray(neighbours.sum(axis=1)).ravel() - 1) + freedom
@@ -371,7 +377,8 @@ def _node_covariance_product(mesh: Mesh, columns: Float[np.ndarray, "m k"], free
 
 @jax.jit
 def _traced_product(scaled_centres, jacobian):
-    """Γ Jᵀ from cell centres divided by √2 length, in blocks of rows, which derivatives recompute to save memory."""
+    """Product Γ Jᵀ from cell centres divided by √2 length, in blocks of rows. Derivatives recompute the blocks to save
+    memory."""
 
     @jax.checkpoint
     def covariance_rows(block):
@@ -392,7 +399,7 @@ def check_cells(mesh: Mesh) -> None:
 
 def cell_factorisation(mesh: Mesh, groups) -> tuple[SparsityPattern, FactorisationPlan]:
     """Sparsity pattern and factorisation plan of matrices over cells whose entries couple the cells of each of
-    `groups`. The mesh's points may be traced."""
+    `groups`. The coordinates of the mesh's points may be traced."""
     centres = centroids(mesh)
     with jax.ensure_compile_time_eval():
         pattern = SparsityPattern.from_elements(groups, size=mesh.num_cells)

@@ -1,16 +1,17 @@
-"""Total variation prior, for images that are piecewise constant: the penalty of an edge grows with its length and
-height, not with its sharpness.
+"""Total variation prior, for images that are piecewise constant: the penalty of an edge grows with the edge's length
+and height, not with its sharpness.
 
 In a sheet, and in a solid with bounds, the image has one value per cell. The energy is λ Σ_f l_f √(d_f² + β²) over the
 facets between cells, where d_f is the jump of the image across facet f and l_f is the facet's length divided by the
-size of the body (3-D: its area divided by the squared size). It is not quadratic. Lagged diffusivity replaces it at
-every iterate by the quadratic form ½ dᵀ diag(λ l_f / √(d_f² + β²)) d, which touches it there and lies above it
-elsewhere. A step is then as cheap as with a smooth prior and lowers the energy itself. Vogel and Oman, SIAM J. Sci.
-Comput. 17 (1996) 227-238; for EIT, Borsic, Graham, Adler and Lionheart, IEEE Trans. Med. Imaging 29 (2010) 44-54.
+size of the body (3-D: its area divided by the squared size). The energy is not quadratic. At every iterate, lagged
+diffusivity replaces the energy by the quadratic form ½ dᵀ diag(λ l_f / √(d_f² + β²)) d, which touches the energy at the
+iterate and lies above the energy elsewhere. A step is then as cheap as with a smooth prior and lowers the energy
+itself. Vogel and Oman, SIAM J. Sci. Comput. 17 (1996) 227-238; for EIT, Borsic, Graham, Adler and Lionheart, IEEE
+Trans. Med. Imaging 29 (2010) 44-54.
 
-In a solid without bounds the image is linear between nodes, which are about a fifth as many as the cells. The energy is
-λ/s² ∫ √(|∇x|² + (β/h)²) dV with the cell size h and the size s of the body. The quadratic form of lagged diffusivity is
-then a stiffness matrix of the nodes.
+In a solid without bounds the image is linear between nodes. There are about a fifth as many nodes as cells. The energy
+is λ/s² ∫ √(|∇x|² + (β/h)²) dV with the cell size h and the size s of the body. The quadratic form of lagged diffusivity
+is then a stiffness matrix of the nodes.
 """
 
 from __future__ import annotations
@@ -45,12 +46,13 @@ from jeit_solvers.engines import gather, has_values, host, namespace, on_host, s
 
 class NodalTotalVariation(AbstractPenalty):
     """Penalty Σ weight √(|∇x|² + steepness²) + ½ Σ pull c² of the nodal image x = reference + c; further unknowns have
-    a unit ridge penalty.
+    the penalty ½ ‖c‖².
 
-    **Fields**: `cells` (m, 4); `slope` (m, 4, 3): gradients of the basis functions, 1/m; `weight` (m,); `steepness`
-    (m,): gradient below which the penalty is nearly quadratic, 1/m; `pull` (n,): weight of the deviation from the
-    background; `reference` (n,); `pattern`, `plan`: sparsity pattern and factorisation plan of matrices over the nodes;
-    `fronts`: order of the factorisation of matrices at hand.
+    ***Fields**: `cells` (m, 4): nodes of the cells; `slope` (m, 4, 3): gradients of the basis functions, 1/m; `weight`
+    (m,): weight of each cell; `steepness` (m,): gradient below which the penalty is nearly quadratic, 1/m; `pull` (n,):
+    weight of the deviation from the background; `reference` (n,): image at c = 0; `pattern`, `plan`: sparsity pattern
+    and factorisation plan of matrices over the nodes; `fronts`: order of the factorisation of matrices with known
+    values.
     """
 
     cells: Int[Array, "m k"]
@@ -93,12 +95,12 @@ class NodalTotalVariation(AbstractPenalty):
 
     @property
     def tolerance(self) -> float:
-        """Relative change of the objective that ends a descent. It is larger than for other penalties, because lagged
-        diffusivity converges linearly and its last steps do not change the image visibly."""
+        """Relative change of the objective that ends a descent. The tolerance is larger than for other penalties,
+        because lagged diffusivity converges linearly and its last steps do not change the image visibly."""
         return 1e-4
 
     def cost(self, coefficients):
-        """Value of the penalty."""
+        """Value of the penalty at c."""
         image, unknowns = self._split_coefficients(coefficients)
         edges = (self.weight * self._smoothed_height(image)).sum()
         return edges + 0.5 * (self.pull * image**2).sum() + 0.5 * unknowns @ unknowns
@@ -112,8 +114,8 @@ class NodalTotalVariation(AbstractPenalty):
         )
 
     def inverse_hessian(self, coefficients, free, columns):
-        """Approximate inverse of the energy's Hessian; its stiffness is the Hessian's along the gradient, which
-        vanishes where the gradient is large."""
+        """Approximate inverse of the energy's Hessian, times columns. The stiffness is the second derivative along the
+        gradient, which vanishes where the gradient is large."""
         image, _ = self._split_coefficients(coefficients)
         size = self.pull.shape[0]
         is_free_node = free[:size]
@@ -132,8 +134,7 @@ class NodalTotalVariation(AbstractPenalty):
         return SparseNormal(self.pattern, self.plan, factorise(self.plan, values))
 
     def model(self, residual, jacobian, coefficients, data):
-        """Objective and step: Gauss-Newton for the data, lagged diffusivity for the energy, in data space, as in
-        `TotalVariationPenalty.model`."""
+        """Objective at c and the function that computes a step, as in `TotalVariationPenalty.model`."""
         image, unknowns = self._split_coefficients(coefficients)
         weighted_residual = data.precision @ residual
         cost = 0.5 * residual @ weighted_residual + self.cost(coefficients)
@@ -146,7 +147,7 @@ class NodalTotalVariation(AbstractPenalty):
             gradient = self.pull * image + self._divergence(flux)
             factor = factorise_matrix(self.plan, self.fronts, self._matrix(self._elements(stiffness), self.pull))
             columns = xp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1)
-            # Products with Γ are formed from half solves; the direction takes one more full solve.
+            # Products with Γ are formed from half solves; the step takes one more full solve.
             half_solution = factor.half_solve(columns)
             products = half_solution.T @ half_solution
             unknown_columns = jacobian[:, size:]
@@ -171,7 +172,7 @@ class NodalTotalVariation(AbstractPenalty):
         return namespace(self, stiffness).einsum("mid,mjd,m->mij", self.slope, self.slope, stiffness)
 
     def _matrix(self, elements, diagonal):
-        """Values of the matrix assembled from `elements`, plus `diagonal`."""
+        """Entries of the matrix assembled from `elements`, plus `diagonal`."""
         values = self.pattern.assemble(elements)
         xp = namespace(self, values)
         return values + xp.concatenate([diagonal, xp.zeros(len(values) - len(diagonal))])
@@ -181,21 +182,21 @@ class NodalTotalVariation(AbstractPenalty):
         return (self.slope * gather(image, self.cells)[:, :, None]).sum(axis=1)
 
     def _divergence(self, flux):
-        """Adjoint of `_gradient`."""
+        """Adjoint of `_gradient`, applied to a `flux` in every cell."""
         return sum_into(self.pull.shape, self.cells, (self.slope * flux[:, None]).sum(axis=-1))
 
     def _split_coefficients(self, coefficients):
-        """Coefficients of the image, and those of further unknowns."""
+        """Coefficients of the image, and coefficients of further unknowns."""
         size = self.pull.shape[0]
         return coefficients[:size], coefficients[size:]
 
     def _smoothed_height(self, image):
-        """√(|∇x|² + steepness²) per cell."""
+        """Smoothed gradient √(|∇x|² + steepness²) of an image x per cell."""
         squared = (self._gradient(self.reference + image) ** 2).sum(axis=1)
         return namespace(self, image).sqrt(squared + self.steepness**2)
 
 
-# Weight of the deviation from the background relative to λ: it determines the image where the data do not.
+# Weight of the deviation from the background relative to λ. This term determines the image where the data do not.
 _BACKGROUND_WEIGHT = 1e-3
 
 
@@ -203,12 +204,13 @@ class TotalVariation(AbstractPrior):
     """Total variation prior of `reconstruct`, for images that are piecewise constant.
 
     In a solid body the image is linear between nodes and a cell has the mean of its nodes; in a sheet every cell has
-    its own value. The energy is not quadratic, so linear images and the rules that choose λ cannot use it; λ is a
-    number, 300 by default.
+    its own value. The energy is not quadratic, so linear images and the rules that choose λ cannot use this prior; λ is
+    a number, 300 by default.
 
     **Arguments:**
 
-    - `smoothing`: β, the jump below which the penalty is nearly quadratic, on the link's scale (`Log()`: relative).
+    - `smoothing`: β, the jump of the image below which the penalty is nearly quadratic, on the link's scale (`Log()`:
+      relative change).
 
     Raises `ValueError` if the smoothing is not positive.
 
@@ -227,29 +229,30 @@ class TotalVariation(AbstractPrior):
 
     @property
     def is_quadratic(self) -> bool:
-        """False."""
+        """Whether the energy is quadratic: False."""
         return False
 
     @property
     def default_hyperparameter(self) -> float:
-        """Default λ, `EDGE_PRICE`."""
+        """Default hyperparameter λ, `EDGE_PRICE`."""
         return EDGE_PRICE
 
     def covariance_product(self, mesh, jacobian) -> NoReturn:
-        """Not available. Raises `ValueError`."""
+        """Not available for this prior. Raises `ValueError`."""
         _raise_not_quadratic("covariance")
 
     def precision(self, mesh, jacobian) -> NoReturn:
-        """Not available. Raises `ValueError`."""
+        """Not available for this prior. Raises `ValueError`."""
         _raise_not_quadratic("precision matrix")
 
     def basis(self, mesh, jacobian) -> NoReturn:
-        """Not available. Raises `ValueError`."""
+        """Not available for this prior. Raises `ValueError`."""
         _raise_not_quadratic("basis of independent shapes")
 
     def penalty(self, mesh, reference, hyperparameter, *, jacobian=None, regions=None, per_cell=False):
-        """Basis with one coefficient per cell (or node of a solid), and the penalty weighted with λ. An edge as long as
-        the body is wide has the penalty λ per unit of jump. Raises `ValueError` if `regions` are given."""
+        """Basis with one coefficient per cell (or node of a solid), and the total variation penalty weighted with λ. An
+        edge as long as the body is wide has the penalty λ per unit of jump. Raises `ValueError` if `regions` are
+        given."""
         if regions is not None:
             raise ValueError("regions: total variation finds its own; leave them out, or take another prior.")
         check_cells(mesh)
@@ -289,7 +292,7 @@ def _raise_not_quadratic(missing_quantity: str) -> NoReturn:
 
 class TotalVariationPenalty(AbstractPenalty):
     """Penalty Σ weight √(d² + β²) + ½ Σ level c², where d are the jumps of the image reference + c between neighbouring
-    cells; further unknowns have a unit ridge penalty.
+    cells; further unknowns have the penalty ½ ‖c‖².
 
     **Fields**: `pairs` (f, 2): neighbouring cells; `weight` (f,): λ times relative length of the facets; `level` (m,):
     weight of the deviation from the background; `smoothing`: β; `reference` (m,): image at c = 0; `pattern`, `plan`:
@@ -308,12 +311,12 @@ class TotalVariationPenalty(AbstractPenalty):
 
     @property
     def tolerance(self) -> float:
-        """Relative change of the objective that ends a descent. It is larger than for other penalties, because lagged
-        diffusivity converges linearly and its last steps do not change the image visibly."""
+        """Relative change of the objective that ends a descent. The tolerance is larger than for other penalties,
+        because lagged diffusivity converges linearly and its last steps do not change the image visibly."""
         return 1e-4
 
     def cost(self, coefficients):
-        """Value of the penalty."""
+        """Value of the penalty at c."""
         image, unknowns = self._split_coefficients(coefficients)
         edges = (self.weight * self._smoothed_height(image)).sum()
         return edges + 0.5 * (self.level * image**2).sum() + 0.5 * unknowns @ unknowns
@@ -326,8 +329,8 @@ class TotalVariationPenalty(AbstractPenalty):
         return jnp.concatenate([cell_stiffness, jnp.ones_like(unknowns)])
 
     def inverse_hessian(self, coefficients, free, columns):
-        """Approximate inverse of the energy's Hessian, whose weights are β² / (d² + β²) times those of the touching
-        quadratic form and vanish across large jumps."""
+        """Approximate inverse of the energy's Hessian, times columns. The weights in the Hessian are β² / (d² + β²)
+        times those of the touching quadratic form and vanish across large jumps."""
         image, _ = self._split_coefficients(coefficients)
         is_free_cell = free[: self.level.shape[0]]
         curvature = self.weight * self.smoothing**2 / self._smoothed_height(image) ** 3
@@ -346,18 +349,20 @@ class TotalVariationPenalty(AbstractPenalty):
         return jnp.concatenate([solve(self.plan, factor, image_columns), unknown_columns])
 
     def normal(self, coefficients):
-        """Normal distribution whose precision is the quadratic form that touches the energy at c. Each jump is normal
-        with variance √(d² + β²) / weight, as if position and height of the edges were known. None with bounds."""
+        """Normal distribution whose precision is the quadratic form that touches the energy at c; None with bounds.
+        Each jump is normal with variance √(d² + β²) / weight, as if position and height of the edges were known."""
         if self.between_bounds:
             return None
         image, _ = self._split_coefficients(coefficients)
         return SparseNormal(self.pattern, self.plan, self._factor(self.weight / self._smoothed_height(image)))
 
     def model(self, residual, jacobian, coefficients, data):
-        """Objective and step: Gauss-Newton for the data, lagged diffusivity for the energy, in data space.
+        """Objective at c and the function that computes a step in data space, by Gauss-Newton for the data and lagged
+        diffusivity for the energy.
 
-        The step is δ = -Γg - ΓJᵀ (JΓJᵀ + C)⁻¹ (r - JΓg), with the matrix Q of the touching quadratic form,
-        Γ = Q⁻¹ / (1 + damping), and the gradient g of the energy.
+        The step is δ = -Γg - ΓJᵀ (JΓJᵀ + C)⁻¹ (r - JΓg), with the residual r and its Jacobian J, the covariance C of
+        the data, the matrix Q of the touching quadratic form, Γ = Q⁻¹ / (1 + damping), and the gradient g of the
+        energy.
         """
         image, unknowns = self._split_coefficients(coefficients)
         weighted_residual = data.precision @ residual
@@ -388,21 +393,21 @@ class TotalVariationPenalty(AbstractPenalty):
         return cost, step
 
     def _solve(self, stiffness, columns):
-        """Q⁻¹ times columns, for the touching quadratic form with weights `stiffness` of the squared jumps."""
+        """Q⁻¹ times `columns`, where Q is the touching quadratic form with weights `stiffness` of the squared jumps."""
         return solve(self.plan, self._factor(stiffness), columns)
 
     def _factor(self, stiffness) -> Factor:
-        """Factorise Q for weights `stiffness` of the squared jumps."""
+        """Factorise the touching quadratic form Q with weights `stiffness` of the squared jumps."""
         facet_matrices = stiffness[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])
         return factorise(self.plan, self.pattern.assemble(facet_matrices, self.level[:, None, None]))
 
     def _divergence(self, flux):
-        """Adjoint of `_jump`."""
+        """Adjoint of `_jump`, applied to a `flux` across every facet."""
         first, second = self.pairs[:, 0], self.pairs[:, 1]
         return sum_into(self.level.shape, first, flux) - sum_into(self.level.shape, second, flux)
 
     def _split_coefficients(self, coefficients):
-        """Coefficients of the image, and those of further unknowns."""
+        """Coefficients of the image, and coefficients of further unknowns."""
         size = self.level.shape[0]
         return coefficients[:size], coefficients[size:]
 
@@ -411,5 +416,5 @@ class TotalVariationPenalty(AbstractPenalty):
         return image[self.pairs[:, 0]] - image[self.pairs[:, 1]]
 
     def _smoothed_height(self, image):
-        """√(d² + β²) per facet."""
+        """Smoothed jump √(d² + β²) of an image across each facet."""
         return namespace(self, image).sqrt(self._jump(self.reference + image) ** 2 + self.smoothing**2)

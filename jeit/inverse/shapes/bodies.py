@@ -1,9 +1,10 @@
-"""Base classes of bodies, the inclusions of a domain: conductivity of the mesh as a function of their coefficients.
+"""Base classes of bodies, the inclusions of a domain, which give the conductivity of the cells as a function of the
+bodies' coefficients.
 
     log σ/σ₀ = drift + Σ_bodies mixture(share, ± contrast),
 
-where `share` is the fraction of a cell that a body covers; a cell that is covered completely has ± contrast. Every
-coefficient is in units of its prior standard deviation, so the penalty is ½‖coefficients‖².
+where `share` is the fraction of a cell that a body covers; for a completely covered cell the mixture equals ± contrast.
+Every coefficient is in units of its prior standard deviation, so the penalty is ½‖coefficients‖².
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from jeit.arguments import describe, is_number
 from jeit.arguments.checks import Interval
 
-# Fields of `Bodies` that hold one value per body, except `start`.
+# Fields of `Bodies`, except `start`, that hold one value per body.
 _FIELDS_PER_BODY = ("sign", "is_other_kind", "same_material", "fixed_contrast")
 
 
@@ -30,11 +31,12 @@ class BodyPrior(abc.ABC):
 
     - `modes`: number of modes that describe a body's form; 1 gives disks and balls.
     - `place`: standard deviation of each coordinate of a body's centre about its start.
-    - `radius`, `radius_spread`: median of the mean radius, and standard deviation of its logarithm.
-    - `roughness`: standard deviation of the coefficients that make the form depart from round.
+    - `radius`, `radius_spread`: median of a body's mean radius, and standard deviation of the logarithm of the mean
+      radius.
+    - `roughness`: standard deviation of the coefficients that describe departures of the form from a disk or ball.
     - `drift`: standard deviation of the change of the bath's log conductivity between the two frames.
     - `apart`: reciprocal of the standard deviation of the overlap of two bodies, as a fraction of the domain. Without
-      this term two bodies of opposite sign could lie on each other and cancel.
+      this penalty on overlap, two bodies of opposite sign could lie on each other and cancel.
 
     Raises `ValueError` if a value is not positive.
     """
@@ -56,7 +58,7 @@ class BodyPrior(abc.ABC):
 
     @property
     def _numbers(self) -> dict[str, Any]:
-        """Fields whose values must be positive."""
+        """Fields of the prior whose values must be positive, by name."""
         return vars(self)
 
     @property
@@ -67,26 +69,28 @@ class BodyPrior(abc.ABC):
     @property
     @abc.abstractmethod
     def size(self) -> int:
-        """Number of coefficients of a body: centre, log radius, contrast and form."""
+        """Number of coefficients of a body, for its centre, log radius, contrast and form."""
 
     @abc.abstractmethod
     def deviation(self, span: float) -> Float[np.ndarray, " q"]:
-        """Prior standard deviations of a body's parameters; 1 for its contrast, whose scale `contrast_of` applies.
+        """Prior standard deviations of the q parameters of a body; 1 for the contrast, whose scale is applied in
+        `contrast_of`.
 
         `span`: longest side of the domain, metres.
         """
 
     @abc.abstractmethod
     def contrast_of(self, coefficient: float, other: bool) -> tuple[float, float]:
-        """Contrast of a body in log σ, without its sign, and its derivative with respect to the coefficient.
+        """Contrast of a body in log σ, without its sign, and the derivative of the contrast with respect to its
+        `coefficient`.
 
-        `other`: whether the body is of the form's other kind.
+        `other`: whether the body is of the other kind, a weak star or a column.
         """
 
 
 @dataclass(frozen=True)
 class Quantities:
-    """Properties of a body that the data determine: posterior medians, and 68 % intervals, with None for an open end.
+    """Posterior medians and 68 % intervals of the properties of a body, with None for an end that the data leave open.
 
     **Fields**: `change`, `change_interval`: change of conductivity relative to the background; `measure`,
     `measure_interval`: area, m², or volume, m³; `strength`, `strength_interval`: `measure` times (ρ - 1) / (ρ + n - 1),
@@ -116,18 +120,18 @@ TINY = 1e-30
 
 
 def polarisation(contrast, axes: int):
-    """(ρ - 1) / (ρ + n - 1) for ρ = e^`contrast` and n bounded `axes`: the strength of a round body per area or volume.
-    Ammari and Kang, Polarization and Moment Tensors (2007), chapter 4."""
+    """Strength of a round body per area or volume, (ρ - 1) / (ρ + n - 1), for the conductivity ratio ρ = e^`contrast`
+    and n bounded `axes`. Ammari and Kang, Polarization and Moment Tensors (2007), chapter 4."""
     return np.expm1(contrast) / (np.exp(contrast) + axes - 1)
 
 
 class BodyImage(NamedTuple):
-    """Image of bodies and its derivatives.
+    """Image of the conductivity of bodies, and derivatives of the image.
 
-    **Fields**: `image` (m,): log σ/σ₀; `slopes`: pairs of cells and derivatives of the image there, first with respect
-    to the drift in all cells (None), then with respect to each body's coefficients in the cells that it reaches;
-    `overlap`: overlap of every pair of bodies, as a fraction of the domain; `overlap_slope`: derivatives of the overlap
-    with respect to the drift and the coefficients of every body.
+    **Fields**: `image` (m,): log σ/σ₀; `slopes`: pairs of cells and derivatives of the image in these cells, first with
+    respect to the drift in all cells (None), then with respect to each body's coefficients in the cells that the body
+    reaches; `overlap`: overlap of every pair of bodies, as a fraction of the domain; `overlap_slope`: derivatives of
+    the overlap with respect to the drift and the coefficients of every body.
     """
 
     image: Float[np.ndarray, " m"]
@@ -139,8 +143,8 @@ class BodyImage(NamedTuple):
 class Covered(NamedTuple):
     """Coverage of cells by a body.
 
-    **Fields**: `cells` (c,): indices of the cells that the body reaches; `share` (c,): fraction of each that it covers;
-    `slope` (c, q): derivatives of `share` with respect to the body's coefficients.
+    **Fields**: `cells` (c,): indices of the cells that the body reaches; `share` (c,): fraction of each of these cells
+    that the body covers; `slope` (c, q): derivatives of `share` with respect to the body's coefficients.
     """
 
     cells: Any
@@ -150,14 +154,16 @@ class Covered(NamedTuple):
 
 @dataclass(frozen=True)
 class Bodies(abc.ABC):
-    """Bodies of one form. Their coefficients are the drift, then for each body centre, log radius, contrast and form.
+    """k bodies of one form, stars or ellipsoids. The n coefficients are the drift, then for each body the centre, log
+    radius, contrast and form.
 
     **Fields**: `prior`: prior of every body; `weight` (m,): measure of each cell as a fraction of the domain; `span`:
     longest side of the domain, metres; `start` (k, d): starting centres, metres; `sign` (k,): +1 for bodies more
-    conductive than the bath, -1 for less; `is_other_kind` (k,): whether a body is of the form's other kind (weak for
-    stars, a column for ellipsoids); `same_material` (k,): whether a body is of the same material as all other such
-    bodies of its sign: they share the contrast coefficient of the first, and those of the others have no effect;
-    `fixed_contrast` (k,): contrast at which a body is held, whatever its coefficient, NaN where it is estimated.
+    conductive than the bath, -1 for less; `is_other_kind` (k,): whether a body is of the other kind (weak for stars, a
+    column for ellipsoids); `same_material` (k,): whether a body is of the same material as all other bodies of its sign
+    that are marked here. Bodies of the same material share the contrast coefficient of the first of them; the contrast
+    coefficients of the others have no effect; `fixed_contrast` (k,): contrast at which a body is held, whatever its
+    coefficient, NaN where the contrast is estimated.
     """
 
     prior: Any
@@ -172,7 +178,7 @@ class Bodies(abc.ABC):
     @property
     @abc.abstractmethod
     def odds(self) -> float:
-        """Logarithm of the prior odds against the kinds that the bodies have."""
+        """Logarithm of the prior odds against the kinds of the bodies."""
 
     @property
     @abc.abstractmethod
@@ -183,13 +189,13 @@ class Bodies(abc.ABC):
     def with_other_kind(
         self, indices: Any, coefficients: Float[np.ndarray, " n"]
     ) -> tuple[Self, Float[np.ndarray, " n"]]:
-        """The bodies with those of `indices` changed to the other kind, with nearly the same effect on the
-        voltages; and their coefficients."""
+        """The bodies with those of `indices` changed to the other kind, with nearly the same effect on the voltages;
+        and the coefficients of all bodies."""
 
     @abc.abstractmethod
     def mixture(self, share: Float[np.ndarray, " c"], contrast: float) -> tuple[Any, Any, Any]:
-        """log σ/σ₀ (c,) of cells of which a body with signed `contrast` covers the fraction `share`; and its
-        derivatives with respect to `share` and `contrast`."""
+        """log σ/σ₀ (c,) of cells of which a body with signed `contrast` covers the fraction `share`; and the
+        derivatives of log σ/σ₀ with respect to `share` and `contrast`."""
 
     @abc.abstractmethod
     def coverage(self, k: int, row: Float[np.ndarray, " q"]) -> Covered:
@@ -201,7 +207,7 @@ class Bodies(abc.ABC):
 
     @abc.abstractmethod
     def body(self, k: int, coefficients: Float[np.ndarray, " n"], rise: float = np.nan) -> Any:
-        """Description of body k; its area or volume is that of the part inside the domain."""
+        """Description of body k, such as a `Star`. The area or volume is that of the part inside the domain."""
 
     @property
     def dimension(self) -> int:
@@ -214,21 +220,22 @@ class Bodies(abc.ABC):
 
     @property
     def first(self) -> Int[np.ndarray, " k"]:
-        """For each body, index of the body whose contrast coefficient it uses: itself, or the first of its material."""
+        """For each body, index of the body whose contrast coefficient applies: the body itself, or the first body of
+        its material."""
         order, owner = np.arange(len(self.sign)), np.arange(len(self.sign))
         for group in (self.same_material & (self.sign == sign) for sign in (-1, 1)):
             owner[group] = order[group].min(initial=len(order))
         return owner
 
     def rows(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "k q"]:
-        """Coefficients of every body, one row each, with shared contrasts filled in."""
+        """Coefficients of every body, one row per body, with shared contrast coefficients filled in."""
         rows = coefficients[1:].reshape(len(self.sign), self.prior.size).copy()
         rows[:, self.dimension + 1] = rows[self.first, self.dimension + 1]
         return rows
 
     def by_coefficients(self, row_derivatives: Float[np.ndarray, "r n"]) -> Float[np.ndarray, "r n"]:
-        """Convert derivatives with respect to the drift and the rows of `rows` to those with respect to the
-        coefficients, in which bodies of the same material share a contrast."""
+        """Convert derivatives with respect to the drift and the rows of `rows` to derivatives with respect to the
+        coefficients, in which bodies of the same material share a contrast coefficient."""
         row_derivatives, order = row_derivatives.copy(), np.arange(len(self.sign))
         contrast_columns = 1 + order * self.prior.size + self.dimension + 1
         for k in order[self.first != order]:
@@ -237,7 +244,7 @@ class Bodies(abc.ABC):
         return row_derivatives
 
     def of_radii(self, radii) -> Float[np.ndarray, " n"]:
-        """Coefficients of disks or balls at the starting centres; `radii` in metres."""
+        """Coefficients of disks or balls with these `radii` in metres at the starting centres."""
         rows = np.zeros((len(self.sign), self.prior.size))
         relative = np.log(np.asarray(radii, float) / (self.prior.radius * self.span)) / self.prior.radius_spread
         rows[:, self.dimension] = np.clip(relative, -2, 2)
@@ -252,17 +259,18 @@ class Bodies(abc.ABC):
         return np.log(self.prior.radius * self.span) + self.prior.radius_spread * row[self.dimension]
 
     def contrast(self, k: int, row: Float[np.ndarray, " q"]) -> tuple[float, float]:
-        """Contrast of body k in log σ, without its sign, and its derivative with respect to the coefficient."""
+        """Contrast of body k in log σ, without its sign, and the derivative of the contrast with respect to its
+        coefficient."""
         if np.isfinite(self.fixed_contrast[k]):
             return float(self.fixed_contrast[k]), 0.0
         return self.prior.contrast_of(row[self.dimension + 1], bool(self.is_other_kind[k]))
 
     def display_image(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
-        """log σ/σ₀ (m,) for display."""
+        """Image log σ/σ₀ (m,) of the bodies, for display."""
         return self.image(coefficients).image
 
     def subset(self, indices) -> Self:
-        """The bodies of `indices`."""
+        """Copy with only the bodies of `indices`."""
         indices = np.asarray(indices, int)
         return replace(self, **{name: getattr(self, name)[indices] for name in ("start", *_FIELDS_PER_BODY)})
 
@@ -274,7 +282,7 @@ class Bodies(abc.ABC):
     def split(self, k: int, coefficients, number: int) -> tuple[Self, Float[np.ndarray, " n"]]:
         """Replace body k by two round bodies of half its area or volume each, side by side along axis `number`.
 
-        Returns the bodies, the two new ones last, and their coefficients.
+        Returns the bodies, the two new bodies last, and the coefficients of all bodies.
         """
         others, remaining = self.without(k, coefficients)
         row, dimension = self.rows(coefficients)[k], self.dimension
@@ -292,7 +300,8 @@ class Bodies(abc.ABC):
         return replace(self, start=start, **other_fields), np.concatenate([remaining, half_row, half_row])
 
     def with_modes(self, modes: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
-        """The bodies with another number of modes, and their coefficients; added modes start at zero."""
+        """The bodies with another number of modes of their form, and their coefficients; the coefficients of added
+        modes are zero."""
         new_bodies = replace(self, prior=replace(self.prior, modes=modes))
         rows = np.zeros((len(self.sign), new_bodies.prior.size))
         num_shared = min(new_bodies.prior.size, self.prior.size)
@@ -300,7 +309,8 @@ class Bodies(abc.ABC):
         return new_bodies, np.append(coefficients[0], rows)
 
     def image(self, coefficients) -> BodyImage:
-        """log σ/σ₀ per cell, the overlaps of the bodies, and the derivatives of both."""
+        """Image log σ/σ₀ per cell, the overlaps of the bodies, and the derivatives of both with respect to the
+        coefficients."""
         num_cells, dimension = len(self.weight), self.dimension
         rows = self.rows(coefficients)
         coverages = [self.coverage(k, row) for k, row in enumerate(rows)]

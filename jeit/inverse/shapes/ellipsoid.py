@@ -1,10 +1,10 @@
 """Ellipsoids and columns as bodies in a solid, and the standard deviations of their contrasts.
 
-An ellipsoid is the image of the unit ball under r exp(S), with a symmetric S of zero trace. A column extends through
-the whole height of the domain; its cross-section is an ellipse of area π r².
+An ellipsoid is the image of the unit ball under r exp(S), with a symmetric matrix S of zero trace. A column extends
+through the whole height of the domain; its cross-section is an ellipse of area π r².
 
-`jeit.inverse.shapes.bodies` describes contrast and conductivity. The derivative of the matrix exponential is computed
-from eigenvectors: Higham, Functions of Matrices (SIAM 2008), section 3.2.
+Contrast and conductivity are defined in `jeit.inverse.shapes.bodies`. The derivative of the matrix exponential is
+computed from eigenvectors: Higham, Functions of Matrices (SIAM 2008), section 3.2.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from jeit.mesh import Mesh, measures
 from jeit_solvers.module import Module
 
 # Difference of log evidence above which only the likelier of two descriptions is reported (ellipsoid or column, one
-# material or several); maximum number of steps when an alternative is fitted; tolerance of that fit.
+# material or several); maximum number of steps and tolerance of the fit of an alternative description.
 _UNDECIDED_ODDS, _STEPS, _COARSE_TOLERANCE = 4.0, 8, 1e-2
 # Contribution of the mesh to the standard deviation of a contrast in log σ, in a sheet and in a solid. Balls of three
 # times the bath's conductivity are estimated as 3.87, 3.59 and 3.31 times as conductive if edges on their surfaces are
-# 0.7, 0.5 and 0.35 of the radius, and as 3.1 to 3.2 times if they are 0.25 of it. Disks of four times the conductivity
-# of a sheet are estimated as 4.0 to 4.2 times on meshes of 2,000 to 8,000 nodes.
+# 0.7, 0.5 and 0.35 of the radius, and as 3.1 to 3.2 times if the edges are 0.25 of the radius. Disks of four times the
+# conductivity of a sheet are estimated as 4.0 to 4.2 times on meshes of 2,000 to 8,000 nodes.
 _MESH_DEVIATION = {2: 0.03, 3: 0.1}
 
 
 def contrast_deviations(problem: ShapeProblem, fitted: Fit, free_fit: Fit | None = None) -> list[float]:
-    """Standard deviations of the contrasts of bodies, in log σ: those that the problem explains, and `unmodelled`."""
+    """Standard deviations of the contrasts of bodies, in log σ, including `unmodelled_deviations`."""
     return np.hypot(_contrasts(problem, fitted)[1], unmodelled_deviations(problem, fitted, free_fit)).tolist()
 
 
 def unmodelled_deviations(problem: ShapeProblem, fitted: Fit, free_fit: Fit | None = None) -> Float[np.ndarray, " k"]:
-    """Standard deviations of the contrasts of bodies, in log σ, that Laplace's approximation of the problem lacks: that
-    of the mesh, and that of the materials.
+    """Standard deviations of the contrasts of bodies, in log σ, due to errors that Laplace's approximation of the
+    problem lacks: the error of the mesh, and the choice of materials.
 
-    `free_fit`: fit with a material for each body. If the data do not rule it out, its contrasts are included.
+    `free_fit`: fit with a material for each body. If the data do not rule out this fit, its contrasts are included.
     """
     variance = np.full(len(fitted.bodies.sign), _MESH_DEVIATION[fitted.bodies.dimension] ** 2)
     if (
@@ -54,7 +54,7 @@ def unmodelled_deviations(problem: ShapeProblem, fitted: Fit, free_fit: Fit | No
 
 
 def _contrasts(problem: ShapeProblem, fitted: Fit) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Contrasts of bodies, and their standard deviations from Laplace's approximation."""
+    """Contrasts of the bodies of a fit in log σ, and their standard deviations from Laplace's approximation."""
     bodies = fitted.bodies
     contrasts = [bodies.contrast(k, row) for k, row in enumerate(bodies.rows(fitted.coefficients))]
     contrast, slope = np.array(contrasts).reshape(-1, 2).T
@@ -63,7 +63,7 @@ def _contrasts(problem: ShapeProblem, fitted: Fit) -> tuple[Float[np.ndarray, " 
 
 def alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | None, float]]:
     """For each body, the body of the other kind (ellipsoid or column) that explains the data about as well, and the
-    standard deviation of its contrast; None and NaN if there is none. The prior odds of the kinds are ignored."""
+    standard deviation of this body's contrast; None and NaN if there is none. The prior odds of kinds are ignored."""
     bodies, num_bodies = fitted.bodies, len(fitted.bodies.sign)
     if not num_bodies or bodies.prior.is_of_one_kind or not isinstance(bodies, Ellipsoids):
         return [(None, np.nan)] * num_bodies
@@ -80,7 +80,7 @@ def alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | N
 KINDS = ("either", "ellipsoids", "columns")
 """Kinds of bodies that a solid may contain: ellipsoids, columns through its whole height, or either."""
 
-# Barycentric weights of the twenty points at which a cell is sampled; each represents an equal part of the cell.
+# Barycentric coordinates of the twenty points at which a cell is sampled; all represent equal parts of the cell.
 _SAMPLES = np.array([[2 * n + 1 for n in indices] for indices in np.ndindex(4, 4, 4, 4) if sum(indices) == 3]) / 10
 # Width of the blur of a surface, in units of the cell size: large enough for the coverage to be differentiable, but
 # small, because blurred bodies are estimated too small and too strong.
@@ -90,8 +90,8 @@ _BLUR = 0.1
 # within 1 to 5 % with that on meshes whose facets follow the surface. A single exponent of 0.15 made the change due to
 # balls of 12 times the conductivity 13 to 19 % too large, an error proportional to the edge length.
 _POWERS = {1: -1.0, -1: 0.5}
-# Distance from a surface within which cells are refined, in units of the shortest half axis; lower limit of that half
-# axis, in units of the geometric mean of the three.
+# Distance from a surface within which cells are refined, in units of the body's shortest half axis; lower limit of this
+# half axis, in units of the geometric mean of the three.
 _BAND, _MIN_AXIS_RATIO = 0.1, 0.6
 # Distance from a surface, in widths of the blur, beyond which the covered share of a cell is less than 1e-8.
 _REACH = 20
@@ -105,7 +105,7 @@ _STRETCHES = np.array(
         np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0]]) / np.sqrt(2),
     ]
 )
-# 1 for the elements of that basis that stretch a column: those within the x-y plane and without trace there.
+# 1 for the elements of this basis that stretch a column: those within the x-y plane that have no trace in this plane.
 _LEVEL = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
 
 
@@ -115,13 +115,13 @@ class EllipsoidPrior(BodyPrior):
 
     **Arguments:**
 
-    - `modes`: 2, or 1 for balls.
+    - `modes`: 2 for ellipsoids, 1 for balls.
     - `place`, `radius`, `radius_spread`, `drift`, `apart`: as in `StarPrior`; `place` is small, because smooth images
       of solids locate bodies well.
-    - `roughness`: standard deviation of the five coefficients of S, the log stretches.
+    - `roughness`: standard deviation of the five coefficients of the log stretch S.
     - `contrast`, `contrast_spread`: median of the contrast in log σ, and standard deviation of its logarithm.
     - `odds_for_columns`: prior odds of a column relative to an ellipsoid; most tanks hold columns.
-    - `odds_for_one_material`: prior odds that all bodies of one sign are of one material, relative to one for each.
+    - `odds_for_one_material`: prior odds of one material for all bodies of a sign, relative to one for each body.
     - `kinds`: kinds of bodies considered, one of `KINDS`.
 
     Raises `ValueError` if a number is not positive or `kinds` is not in `KINDS`.
@@ -156,18 +156,18 @@ class EllipsoidPrior(BodyPrior):
 
     @property
     def size(self) -> int:
-        """Number of coefficients of a body: centre, log radius, contrast and, unless it is a ball, five stretches."""
+        """Number of coefficients of a body: centre, log radius, contrast and, except for balls, five stretches."""
         return 5 + 5 * (self.modes > 1)
 
     def deviation(self, span: float) -> Float[np.ndarray, " q"]:
-        """Prior standard deviations of a body's parameters, 1 for its contrast; `span`: longest side of the domain,
+        """Prior standard deviations of a body's parameters, 1 for the contrast; `span`: longest side of the domain,
         metres."""
         deviations = [self.place * span] * 3 + [self.radius_spread, 1.0]
         return np.concatenate([deviations, np.full(self.size - 5, self.roughness)])
 
     def contrast_of(self, coefficient: float, other: bool) -> tuple[float, float]:
-        """Contrast in log σ, without its sign, and its derivative with respect to the coefficient; the same for both
-        kinds."""
+        """Contrast of a body in log σ, without its sign, and its derivative with respect to the `coefficient`; the same
+        for both kinds."""
         contrast = self.contrast * np.exp(self.contrast_spread * coefficient)
         return contrast, self.contrast_spread * contrast
 
@@ -175,12 +175,12 @@ class EllipsoidPrior(BodyPrior):
 class Ellipsoid(Module):
     """Ellipsoid or column found in a solid.
 
-    **Fields**: `sign`: +1 if more conductive than the bath, -1 if less; `centre` (3,): metres; `axes` (3, 3): half axes
-    as rows, metres, the longest first; `volume`, `centroid` (3,): volume in m³ and centroid in metres of the part
-    inside the domain; `contrast`: contrast in log σ, without its sign; `column`: whether the body is a column, one of
-    whose half axes is half the domain's height; `alike`: whether the body is assumed to be of the same material as
+    **Fields**: `sign`: +1 if more conductive than the bath, -1 if less; `centre` (3,): centre, metres; `axes` (3, 3):
+    half axes as rows, metres, the longest first; `volume`, `centroid` (3,): volume in m³ and centroid in metres of the
+    part inside the domain; `contrast`: contrast in log σ, without its sign; `column`: whether the body is a column, one
+    of whose half axes is half the domain's height; `alike`: whether the body is assumed to be of the same material as
     others of its sign; `rise`: factor by which the minimum of the objective increases without this body, small for a
-    ghost; `quantities`: posterior medians and intervals, if they were estimated.
+    ghost; `quantities`: posterior medians and intervals of the body, None if not estimated.
 
     **Example:**
 
@@ -203,7 +203,7 @@ class Ellipsoid(Module):
 
     @property
     def measure(self) -> float:
-        """Volume, m³."""
+        """Volume of the part of the body inside the domain, m³."""
         return self.volume
 
     @property
@@ -213,11 +213,11 @@ class Ellipsoid(Module):
 
     @property
     def contrast_is_determined(self) -> bool:
-        """Whether the data determine the contrast: no end of its interval is open."""
+        """Whether the data determine the contrast: no end of the contrast's interval is open."""
         return self.quantities is None or None not in self.quantities.change_interval
 
     def with_quantities(self, known: Quantities) -> Ellipsoid:
-        """The body with its quantities; its volume and contrast become the medians."""
+        """Copy of the body with the quantities `known`; volume and contrast become the medians."""
         scale = (known.measure / max(self.volume, TINY)) ** (1 / self.bounded_axes)
         is_upright = self.column & (np.abs(self.axes[:, 2]) > 0.5 * np.linalg.norm(self.axes, axis=1))
         return replace(
@@ -239,10 +239,10 @@ class Ellipsoid(Module):
 
 @dataclass(frozen=True)
 class Ellipsoids(Bodies):
-    """Ellipsoids and columns on a mesh.
+    """Ellipsoids and columns on a mesh of m cells.
 
     **Fields**, besides those of `Bodies`: `points` (3, m, s): sampling points of the cells, metres; `width` (m,): width
-    of the blur, metres; `total`: volume of the domain, m³; `ends`: lowest and highest z of the domain, metres.
+    of the surfaces' blur, metres; `total`: volume of the domain, m³; `ends`: lowest and highest z, metres.
     """
 
     points: Float[np.ndarray, "3 m s"]
@@ -264,7 +264,7 @@ class Ellipsoids(Bodies):
         )
 
     def bounded_axes(self, k: int) -> int:
-        """2 for a column, else 3."""
+        """Number of axes along which body k is bounded: 2 for a column, else 3."""
         return 2 if self.is_other_kind[k] else 3
 
     @property
@@ -278,13 +278,13 @@ class Ellipsoids(Bodies):
 
     @property
     def num_splits(self) -> int:
-        """1: only the longest axis, because two neighbours that were fitted as one body make it long, and each trial
-        takes tens of forward solves."""
+        """Number of axes along which a split is tried: 1, the longest, because two neighbours fitted as one body make
+        this body long, and each trial takes tens of forward solves."""
         return 1
 
     def with_other_kind(self, indices, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
-        """The bodies, those of `indices` changed from ellipsoid to column or back at the same volume, and their
-        coefficients. Stretches that the new kind does not have are set to zero."""
+        """The bodies, of which those of `indices` are changed from ellipsoid to column or back at the same volume; and
+        the coefficients of all bodies. Stretches that the new kind does not have are set to zero."""
         rows, is_column = self.rows(coefficients), self.is_other_kind.copy()
         for k in indices:
             volume = max(self.body(k, coefficients).volume, 1e-6 * self.total) / np.pi
@@ -295,8 +295,8 @@ class Ellipsoids(Bodies):
         return replace(self, is_other_kind=is_column), np.append(coefficients[0], rows)
 
     def of_one_material(self, sign: int, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
-        """The bodies with all those of a sign made of one material, with the mean contrast coefficient and with radii
-        that keep the strengths; and their coefficients."""
+        """The bodies with all those of the given `sign` made of one material, with the mean contrast coefficient and
+        with radii that keep the strengths; and their coefficients."""
         rows, members, column = self.rows(coefficients), np.flatnonzero(self.sign == sign), self.dimension + 1
         old_coefficients = rows[:, column].copy()
         rows[members, column] = old_coefficients[members].mean()
@@ -317,8 +317,8 @@ class Ellipsoids(Bodies):
         return np.log(power_mean) / power, rise / (power * power_mean), share * (1 + rise) / power_mean
 
     def display_image(self, coefficients) -> Float[np.ndarray, " m"]:
-        """log σ/σ₀ (m,) for display. Partly covered cells have the geometric mean of body and bath, so the value is
-        halfway between them on the surface; the voltages are computed with `mixture` instead."""
+        """Image log σ/σ₀ (m,) of the bodies, for display. Partly covered cells have the geometric mean of body and
+        bath, so log σ on a surface is halfway between both; voltages are computed with `mixture` instead."""
         image = np.full(len(self.weight), coefficients[0] * self.prior.drift)
         for k, row in enumerate(self.rows(coefficients)):
             cells, share, _ = self.coverage(k, row)
@@ -326,7 +326,7 @@ class Ellipsoids(Bodies):
         return image
 
     def on(self, mesh: Mesh) -> Ellipsoids:
-        """The bodies on another mesh of the same domain."""
+        """Copy of the bodies on another mesh of the same domain."""
         bodies = Ellipsoids.create(mesh, self.prior, self.start, self.sign)
         return replace(bodies, is_other_kind=self.is_other_kind, same_material=self.same_material, span=self.span)
 
@@ -359,7 +359,7 @@ class Ellipsoids(Bodies):
         return False
 
     def _axes_of(self, k: int) -> Float[np.ndarray, "3"]:
-        """1 for the axes along which body k is bounded: x, y and, unless it is a column, z; else 0."""
+        """Mask of the axes along which body k is bounded: 1 for x, y and, unless body k is a column, z; else 0."""
         return np.array([1.0, 1.0, 0.0 if self.is_other_kind[k] else 1.0])
 
     def _shape_matrix(self, k: int, row) -> Float[np.ndarray, "3 3"]:
@@ -374,12 +374,13 @@ class Ellipsoids(Bodies):
         return float(max(axes[0], _MIN_AXIS_RATIO * np.cbrt(axes.prod())))
 
     def axis(self, k: int, row, number: int):
-        """Unit vector along axis `number` of body k, counted from the longest; for a column, of its cross-section."""
+        """Unit vector along axis `number` of body k, counted from the longest; for a column, along an axis of its
+        cross-section."""
         matrix = self._shape_matrix(k, row) * self._axes_of(k)
         return np.linalg.eigh(matrix)[1][:, 2 - number]
 
     def body(self, k: int, coefficients, rise: float = np.nan) -> Ellipsoid:
-        """Description of body k; volume and centroid are those of the part inside the domain."""
+        """Body k as an `Ellipsoid`, with volume and centroid of the part inside the domain."""
         row = self.rows(coefficients)[k]
         cells, share, _ = self.coverage(k, row)
         fractions = share * self.weight[cells]
@@ -426,11 +427,11 @@ class Ellipsoids(Bodies):
         return Covered(cells, inside.mean(axis=1), slopes)
 
     def _mask(self, k: int) -> Float[np.ndarray, "5"]:
-        """1 for the elements of the basis of S along which body k may be stretched, else 0."""
+        """Mask (5,) of the basis of S: 1 for the elements along which body k may be stretched, else 0."""
         return _LEVEL if self.is_other_kind[k] else np.ones(5)
 
     def _stretch(self, k: int, row) -> Float[np.ndarray, "3 3"]:
-        """Log stretch S of body k."""
+        """Log stretch S (3, 3) of body k, a symmetric matrix."""
         values = self.prior.roughness * row[5:] * self._mask(k)[: len(row) - 5]
         return np.tensordot(values, _STRETCHES[: len(values)], 1) if len(values) else np.zeros((3, 3))
 

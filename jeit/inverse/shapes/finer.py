@@ -1,4 +1,4 @@
-"""Refinement of a shape problem: the mesh is refined at the surfaces of the bodies.
+"""Refinement of the mesh of a shape problem at the surfaces of the bodies.
 
 A mesh that suffices for a smooth image resolves a body of a few cells badly. The error of the voltages is proportional
 to the edge length on the surface, differs between channels, and resembles the effect of another body. Bodies that were
@@ -27,15 +27,15 @@ from jeit.mesh.bisection import bisect_with_parents
 from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
 
-# Ratio of the number of nodes of the refined mesh to that of the given one, below which no longer edges are tried.
+# Ratio of the number of nodes of the refined mesh to that of the given mesh, below which no longer edges are tried.
 _MAX_NODES = 2.5
 
 
 class FinerModel(NamedTuple):
     """Shape problem on a refined mesh.
 
-    **Fields**: `problem`: the problem on the refined mesh; `bodies`: the bodies on it; `cell` (f,): index of the cell
-    of the given mesh that contains each refined cell.
+    **Fields**: `problem`: the problem on the refined mesh; `bodies`: the bodies on the refined mesh; `cell` (f,): index
+    of the cell of the given mesh that contains each refined cell.
     """
 
     problem: ShapeProblem
@@ -43,23 +43,24 @@ class FinerModel(NamedTuple):
     cell: Int[np.ndarray, " f"]
 
     def change(self, protocol: Protocol, image: Float[np.ndarray, " f"], field: Any) -> Float[np.ndarray, " M"]:
-        """Change of the voltages of `protocol`, in volts, due to the `image` of bodies (f,) and a `field`, (m,) on the
-        given mesh or 0, both in log σ."""
+        """Change of the voltages of `protocol`, in volts, due to the `image` (f,) of the bodies on the refined mesh and
+        a smooth `field`, (m,) on the given mesh or 0, both in log σ/σ₀."""
         model, background = self.problem.model.with_protocol(protocol), self.problem.background
         conductivity = self.conductivity(image, field)
         return solved_fields(model, conductivity).voltages - solved_fields(model, background).voltages
 
     def conductivity(self, image: Float[np.ndarray, " f"], field: Any) -> Float[np.ndarray, " f"]:
-        """Conductivity of the refined cells, S/m, for the `image` of bodies (f,) and a `field`, (m,) on the given mesh
-        or 0, both in log σ."""
+        """Conductivity of the refined cells, S/m, for the `image` (f,) of the bodies on the refined mesh and a smooth
+        `field`, (m,) on the given mesh or 0, both in log σ/σ₀."""
         return self.problem.background * np.exp(image + np.broadcast_to(field, self.cell.max() + 1)[self.cell])
 
 
 def refine_at_surfaces(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) -> FinerModel:
-    """Refine the mesh of a problem at the surfaces of the ellipsoids of a fit.
+    """Refine the mesh of a shape problem at the surfaces of the ellipsoids of a fit.
 
-    `edges`: lengths of the edges there, in units of the shortest half axis; the first that does not add too many nodes
-    is used, else the last. The difference that refinement makes to the background's voltages is added to the data.
+    `edges`: edge lengths on the surfaces, in units of an ellipsoid's shortest half axis. The first length that does not
+    add too many nodes is used, else the last. The change of the background's voltages due to refinement is added to the
+    data.
     """
     bodies, model = fit.bodies, problem.model
     assert isinstance(bodies, Ellipsoids)
@@ -79,7 +80,8 @@ def refine_at_surfaces(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) 
 
 
 def _tag_electrodes(mesh: Mesh, electrodes: AbstractElectrodes) -> tuple[Mesh, list[str]]:
-    """The mesh with the facets that each electrode covers as tags, which bisection preserves; and the tags' names."""
+    """The mesh with one tag per electrode, which marks the facets that the electrode covers and which bisection
+    preserves; and the tags' names."""
     parts = electrodes.parts if isinstance(electrodes, CombinedElectrodes) else (electrodes,)
     covered_facets = [
         column for part in parts if isinstance(part, FacetElectrodes) for column in np.asarray(part.covers).T
@@ -89,8 +91,8 @@ def _tag_electrodes(mesh: Mesh, electrodes: AbstractElectrodes) -> tuple[Mesh, l
 
 
 def _electrodes_on(mesh: Mesh, electrodes: AbstractElectrodes, names) -> AbstractElectrodes:
-    """Electrodes on the bisected mesh: those that cover facets from the tags `names`, all others
-    unchanged."""
+    """Electrodes on a bisected mesh. Electrodes that cover facets are made from the tags `names`; all other electrodes
+    are unchanged."""
     if isinstance(electrodes, CombinedElectrodes):
         return CombinedElectrodes(*[_electrodes_on(mesh, part, names) for part in electrodes.parts])
     if isinstance(electrodes, FacetElectrodes):

@@ -1,22 +1,23 @@
-"""Nonlinear least squares problem of bodies, optionally with a smooth conductivity field beside them.
+"""Nonlinear least squares problem of bodies, optionally with a smooth conductivity field in addition to the bodies.
 
 The smooth field represents other changes of conductivity in a solid: salt that has sunk from a ball of agar to the
-floor, a bath of uneven temperature, contacts that have changed. Without it, bodies would be distorted to explain them.
+floor, a bath of uneven temperature, contacts that have changed. Without the field, bodies would be distorted to explain
+these changes.
 
     log σ/σ₀ = bodies + level · field,    field ~ N(0, Γ), where Γ is the covariance of a smooth image's prior.
 
 The voltages that the bodies do not explain have the covariance C + level² J Γ Jᵀ, with the noise covariance C and the
 Jacobian J at the background. The level is chosen by the evidence. Kaipio and Somersalo, Journal of Computational and
-Applied Mathematics 198 (2007) 493, treat model errors as noise; MacKay, Neural Computation 4 (1992) 415, chooses levels
-by evidence.
+Applied Mathematics 198 (2007) 493, treat model errors as noise; MacKay, Neural Computation 4 (1992) 415, chooses
+hyperparameters by evidence.
 
 The coefficients c of the bodies minimise ½ rᵀ G r + ½ ‖c‖² + ½ Σ (apart · overlap)², with r = w (v(σ(c)) - ŷ), the data
 ŷ, their weights w and their precision G = C⁻¹.
 
-The evidence is the probability of the data, integrated over the coefficients. It compares bodies of any number and
-kind. Laplace's approximation at the minimum gives -log evidence = cost + ½ log det H + const, where H = 1 + JᵀC⁻¹J is
-the Hessian in units of the prior and J the Jacobian with respect to c: a coefficient costs more, the more precisely the
-data determine it. MacKay, Neural Computation 4 (1992) 415, section 2.
+The evidence is the probability of the data, integrated over the coefficients. The evidence compares descriptions with
+different numbers and kinds of bodies. Laplace's approximation at the minimum gives -log evidence = cost + ½ log det H +
+const, where H = 1 + JᵀC⁻¹J is the Hessian in units of the prior and J the Jacobian with respect to c: a coefficient
+costs more, the more precisely the data determine it. MacKay, Neural Computation 4 (1992) 415, section 2.
 """
 
 from __future__ import annotations
@@ -44,12 +45,12 @@ _LEVELS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
 
 @dataclass(frozen=True)
 class SmoothField:
-    """Smooth conductivity field beside the bodies, as a normal random field.
+    """Smooth conductivity field in addition to the bodies, modelled as a normal random field.
 
-    **Fields**: `image`: a smooth reconstruction from the same channels, whose basis the field has; `jacobian` (r, n):
-    derivatives of the channels of `bodies_problem` with respect to the field's coefficients of unit variance, at the
-    background; `scale` (m,): derivative of log σ with respect to the link's variable; `bodies_problem`: the problem of
-    bodies without the field.
+    **Fields**: `image`: a smooth reconstruction from the same channels, whose basis is also the basis of the field;
+    `jacobian` (r, n): derivatives of the channels of `bodies_problem` with respect to the field's coefficients of unit
+    variance, at the background; `scale` (m,): derivative of log σ with respect to the variable of the image's link;
+    `bodies_problem`: the problem of bodies without the field.
     """
 
     image: Reconstruction
@@ -59,7 +60,7 @@ class SmoothField:
 
     @classmethod
     def create(cls, image: Reconstruction, bodies_problem: ShapeProblem) -> SmoothField:
-        """Create a field from a smooth reconstruction `image`, for the problem of bodies `bodies_problem`.
+        """Create a smooth field from a smooth reconstruction `image`, for the problem of bodies `bodies_problem`.
 
         Raises `ValueError` unless `image` is a reconstruction of the same cells and channels with a smooth prior.
         """
@@ -81,11 +82,12 @@ class SmoothField:
         return cls(image, weight_ratio[:, None] * weighted_jacobian, scale, bodies_problem)
 
     def problem_at(self, level: float) -> ShapeProblem:
-        """The problem of bodies with the field of this level as additional noise."""
+        """The problem of bodies with the smooth field of this `level` as additional noise."""
         return self.bodies_problem.with_errors(level * self.jacobian)
 
     def likeliest_level(self, fit: Fit) -> float:
-        """Level with the largest evidence, given the voltages that the bodies do not explain."""
+        """Level of the smooth field with the largest evidence, given the voltages that the bodies of a `fit` do not
+        explain."""
         residual = self._residual(fit)
 
         def surprise(level: float) -> float:
@@ -95,21 +97,22 @@ class SmoothField:
         return min(_LEVELS, key=surprise)
 
     def estimate(self, level: float, fit: Fit) -> Float[np.ndarray, " m"]:
-        """Posterior mean of level · field (m,), in log σ/σ₀, given the voltages that the bodies do not explain."""
+        """Posterior mean (m,) of the smooth field, level · field in log σ/σ₀, given the voltages that the bodies of a
+        `fit` do not explain."""
         precision = self.problem_at(level).data.precision
         coefficients: Any = -(level**2) * self.jacobian.T @ (precision @ self._residual(fit))
         return self.scale * np.asarray(self.image.inversion.basis.expand(coefficients))
 
     def _residual(self, fit: Fit) -> Float[np.ndarray, " r"]:
-        """Residual of the weighted voltages: predicted for the bodies minus measured."""
+        """Residual of the weighted voltages: those predicted for the bodies of a `fit` minus those measured."""
         return fit.rows[0][: len(self.jacobian)]
 
 
 class Fit(NamedTuple):
     """Result of `ShapeProblem.fit`.
 
-    **Fields**: `bodies`; `coefficients` (n,): coefficients at the minimum; `cost`: objective there; `rows`: residual
-    and Jacobian of the fitted problem there, not multiplied by its precision.
+    **Fields**: `bodies`; `coefficients` (n,): coefficients of the bodies at the minimum; `cost`: objective at the
+    minimum; `rows`: residual and Jacobian at the minimum, not multiplied by the precision of the data.
     """
 
     bodies: Bodies
@@ -122,8 +125,8 @@ class Fit(NamedTuple):
 class ShapeProblem:
     """Least squares problem for the coefficients of bodies.
 
-    **Fields**: `model`: forward model of the independent channels; `data`: holds ŷ, w and G; `background` (m,): σ₀,
-    S/m (2-D: S); `rtol`: relative change of the cost that ends a fit.
+    **Fields**: `model`: forward model of the independent channels; `data`: independent voltages ŷ, their weights w and
+    precision G; `background` (m,): σ₀, S/m (2-D: S); `rtol`: relative change of the cost that ends a fit.
     """
 
     model: ForwardModel
@@ -132,8 +135,8 @@ class ShapeProblem:
     rtol: float = 3e-3
 
     def with_errors(self, rows: Float[np.ndarray, "r q"]) -> ShapeProblem:
-        """The problem with further errors of the data: `rows` of the weighted voltages, for coefficients of unit
-        variance."""
+        """Copy of the problem with further errors of the data: `rows` (r, q) hold the errors of the r weighted voltages
+        per unit of q coefficients of unit variance."""
         covariance = np.asarray(self.data.covariance) + rows @ rows.T
         new_matrices = (covariance, np.linalg.inv(covariance))
         return replace(self, data=eqx.tree_at(lambda data: (data.covariance, data.precision), self.data, new_matrices))
@@ -145,7 +148,7 @@ class ShapeProblem:
         conductivity = self.background * np.exp(image)
         fields = solved_fields(self.model, conductivity)
         weight = np.asarray(self.data.weight)
-        # The penalty of overlap is an additional datum of unit variance for every pair of bodies.
+        # The penalty on the overlap of bodies is an additional datum of unit variance for every pair of bodies.
         overlap_weight, pair_identity = bodies.prior.apart, np.eye(len(overlap))
 
         def jacobian():
@@ -165,7 +168,8 @@ class ShapeProblem:
         )
 
     def fit(self, bodies: Bodies, start: Float[np.ndarray, " n"], max_steps: int, rtol: float | None = None) -> Fit:
-        """Minimise the cost from `start` by the Levenberg-Marquardt method, in at most `max_steps` steps."""
+        """Minimise the cost of `bodies` from the coefficients `start` by the Levenberg-Marquardt method, in at most
+        `max_steps` steps."""
         undefined_rows = np.full((len(self.data.voltages), 1 + len(start)), np.nan)
         accepted: list[Any] = [undefined_rows[:, 0], undefined_rows[:, 1:]]
 
@@ -186,23 +190,25 @@ class ShapeProblem:
 
     @property
     def half_log_determinant(self) -> float:
-        """Contribution of the data's covariance to -log evidence: half the logarithm of its determinant."""
+        """Half the logarithm of the determinant of the data's covariance, the covariance's contribution to -log
+        evidence."""
         return 0.5 * float(np.linalg.slogdet(np.asarray(self.data.covariance))[1])
 
     def surprise(self, fit: Fit) -> float:
-        """-log evidence of the bodies of a fit, up to a constant, including the prior odds against their kinds."""
+        """Negative log evidence of the bodies of a `fit`, up to a constant, including the prior odds against their
+        kinds."""
         return fit.cost + 0.5 * float(np.linalg.slogdet(self._hessian(fit))[1]) + fit.bodies.odds
 
     def covariance(self, fit: Fit) -> Float[np.ndarray, "n n"]:
-        """Posterior covariance of the coefficients, from Laplace's approximation."""
+        """Posterior covariance (n, n) of the coefficients of the bodies of a `fit`, from Laplace's approximation."""
         return np.linalg.inv(self._hessian(fit))
 
     def deviations(self, fit: Fit) -> Float[np.ndarray, " n"]:
-        """Posterior standard deviations of the coefficients, from Laplace's approximation."""
+        """Posterior standard deviations (n,) of the coefficients of a `fit`, from Laplace's approximation."""
         return np.sqrt(np.diag(self.covariance(fit)))
 
     def _hessian(self, fit: Fit) -> Float[np.ndarray, "n n"]:
-        """Hessian H at the minimum of the cost."""
+        """Hessian H (n, n) of the cost at its minimum."""
         _, rows = fit.rows
         num_channels = len(self.data.voltages)
         weighted_rows = np.concatenate([self.data.precision @ rows[:num_channels], rows[num_channels:]])

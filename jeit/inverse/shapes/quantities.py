@@ -1,12 +1,12 @@
 """Place, contrast, area or volume, and strength of bodies, with credible intervals.
 
-To first order a small body's voltages depend on its strength alone: its area times (ρ - 1) / (ρ + 1), ρ being its
-conductivity relative to the background, or in a solid its volume times (ρ - 1) / (ρ + 2). Contrast and size are
-determined separately by the second order alone, so errors of the model overrule them first. Each body's contrast is
-therefore explored: with the contrast held at several values everything else is fitted again, and the evidence gives the
-posterior (Laplace's approximation for the other coefficients). The prior of the contrast is log-normal. Tierney and
-Kadane, Journal of the American Statistical Association 81 (1986) 82; Ammari and Kang, Polarization and Moment Tensors
-(2007), chapter 4, strength.
+To first order the voltages due to a small body depend on the body's strength alone: its area times (ρ - 1) / (ρ + 1),
+or in a solid its volume times (ρ - 1) / (ρ + 2), where ρ is the body's conductivity relative to the background.
+Contrast and size are determined separately only by the second order, so errors of the model affect them most. Each
+body's contrast is therefore explored: the contrast is held at several values, all other coefficients are fitted again,
+and the evidence gives the posterior of the contrast (Laplace's approximation for the other coefficients). The prior of
+the contrast is log-normal. Tierney and Kadane, Journal of the American Statistical Association 81 (1986) 82; Ammari and
+Kang, Polarization and Moment Tensors (2007), chapter 4, strength.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ _FIT_LIMITS, _LOG_POSTERIOR_DROP = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0
 _OPEN_END_RISE = 1.0
 # Probabilities of the ends of an interval, and numbers of contrasts and of normal deviates of the posterior's sample.
 _INTERVAL_PROBABILITIES, _NUM_CONTRASTS, _NUM_NORMAL_DEVIATES = (0.16, 0.84), 240, 31
-# Probability that the circle about a centroid holds the true one; and the step of the finite differences of a centroid,
-# in standard deviations of a coefficient.
+# Probability that the circle about a centroid holds the true centroid; and the step of the finite differences of a
+# centroid, in standard deviations of a coefficient.
 _CENTROID_PROBABILITY, _CENTROID_STEP = 0.68, 0.1
 # Standard deviation of a body's place due to an error of the fields, as a share of half the width of the domain times
 # the relative error: a body's voltages change by a factor of about e² over half the width, and a fifth of the error is
@@ -52,10 +52,10 @@ _FIELD_DISPLACEMENT = 0.1
 
 
 class Accuracy(NamedTuple):
-    """Accuracy of a difference of two frames. **Fields**: `noise` (M,): standard deviation of the channels,
-    volts, of all errors but those of `model_error`, the unknown part of electrode positions and contact impedances,
-    if any; relative standard deviations `size`, of the lengths of the described domain, and `strength`, of all
-    strengths, from errors of the background and the fields.
+    """Accuracy of a difference of two frames. **Fields**: `noise` (M,): standard deviation of the channels, volts, of
+    all errors except `model_error`; `model_error`: errors due to unknown electrode positions and contact impedances, or
+    None; `size`: relative standard deviation of the lengths of the described domain; `strength`: relative standard
+    deviation of all strengths due to errors of the background and the fields.
 
     **Example:**
 
@@ -73,10 +73,10 @@ class Accuracy(NamedTuple):
 def with_quantities(
     problem: ShapeProblem, fit: Fit, accuracy: Accuracy, unmodelled: Any, order: Any
 ) -> list[Quantities]:
-    """The quantities of bodies `order` of a `fit`; `unmodelled` (k,): standard deviations of the contrasts of all its
-    bodies due to errors that the problem does not contain.
+    """Quantities of the bodies of a `fit`, in the given `order` of indices. `unmodelled` (k,): standard deviations of
+    the contrasts of all k bodies due to errors that the problem does not contain.
 
-    `problem` has the noise of `accuracy` alone; its model error is that at the conductivity of the fit.
+    `problem` has the noise of `accuracy` alone; the model error is added for the conductivity of the fit.
     """
     if accuracy.model_error is not None:
         conductivity = problem.background * np.exp(fit.bodies.image(fit.coefficients).image)
@@ -125,8 +125,8 @@ def centroid_radius(
 
 
 def include_deviation(quantities: Quantities, body: Ellipsoid, other: Ellipsoid | None, deviation: float) -> Quantities:
-    """Widen the intervals of the `quantities` of a `body` so that they include those of the `other` description of the
-    body, if there is one, whose contrast has this standard deviation."""
+    """Widen the intervals of the `quantities` of a `body` so that they include the properties of the body's `other`
+    description, if there is one. `deviation`: standard deviation of the contrast of the other description."""
     if other is None:
         return quantities
     changes = np.expm1(other.sign * (other.contrast + deviation * np.array([-1, 1]))).tolist()
@@ -146,8 +146,9 @@ def _interval_hull(interval: Interval, values: Sequence[float]) -> Interval:
 
 
 class _FixedContrastFit(NamedTuple):
-    """A fit with a contrast held: `log_contrast`; `negative_log_likelihood`: -log likelihood, with all other
-    coefficients integrated out; `log_measure` and its standard `deviation`."""
+    """A fit in which the contrast of one body is held. **Fields**: `log_contrast`: logarithm of the held contrast;
+    `negative_log_likelihood`: -log likelihood, with all other coefficients integrated out; `log_measure`: logarithm of
+    the body's area or volume; `deviation`: standard deviation of `log_measure`."""
 
     log_contrast: float
     negative_log_likelihood: float
@@ -156,10 +157,11 @@ class _FixedContrastFit(NamedTuple):
 
 
 def quantify(problem: ShapeProblem, fit: Fit, k: int, unmodelled: float, accuracy: Accuracy) -> Quantities:
-    """Explore the contrast of body k of a `fit` in both directions, until it is improbable or at a bound.
+    """Quantities of body k of a `fit`, from an exploration of the body's contrast in both directions until the contrast
+    is improbable or at a bound.
 
-    `unmodelled`: standard deviation of the contrast due to errors that the problem does not contain, which leave the
-    strength as it is.
+    `unmodelled`: standard deviation of the contrast due to errors that the problem does not contain; these errors do
+    not change the strength.
     """
     bodies = fit.bodies
     contrast, slope = bodies.contrast(k, bodies.rows(fit.coefficients)[k])
@@ -208,8 +210,9 @@ def _fit_with_fixed_contrast(
     log_contrast: float,
     accuracy: Accuracy,
 ):
-    """The fit with the log contrast of body k, and of all others of its material, held at `log_contrast`, started from
-    one of `last_log_contrast` with equal strengths; and its coefficients."""
+    """Fit with the log contrast of body k, and of all other bodies of its material, held at `log_contrast`; and the
+    coefficients of the fit. The fit starts from `coefficients` of a fit at `last_log_contrast`, with radii that keep
+    the strengths."""
     start, same_material, sign = coefficients.copy(), bodies.first == bodies.first[k], bodies.sign[k]
     for body_index in np.flatnonzero(same_material).tolist():
         axes = bodies.bounded_axes(body_index)
@@ -229,18 +232,18 @@ def _fit_with_fixed_contrast(
 
 
 def _negative_log_evidence(fixed_fit: _FixedContrastFit) -> float:
-    """-log posterior of a held contrast, per unit of its logarithm, up to a constant."""
+    """Negative log posterior density of the logarithm of a held contrast, up to a constant."""
     return fixed_fit.negative_log_likelihood + _contrast_prior(fixed_fit.log_contrast)
 
 
 def _contrast_prior(log_contrast):
-    """-log density of a contrast, per unit of its logarithm, up to a constant."""
+    """Negative log prior density of the logarithm of a contrast, up to a constant."""
     return 0.5 * ((log_contrast - np.log(_MEDIAN_LOG_CONTRAST)) / _LOG_CONTRAST_DEVIATION) ** 2
 
 
 def _summary(sign: int, axes: int, unmodelled: float, fixed_fits: Sequence[_FixedContrastFit]) -> Quantities:
-    """Medians and intervals of the posterior, interpolated between the contrasts that were held and convolved with a
-    normal distribution of the deviation `unmodelled`; `axes`: number of axes along which the body is bounded."""
+    """Medians and intervals of the posterior, interpolated between the held contrasts and convolved with a normal
+    distribution of the standard deviation `unmodelled`; `axes`: number of axes along which the body is bounded."""
     log_contrasts, negative_log_likelihoods, log_measure, deviations = np.array(fixed_fits).T
     grid = np.linspace(log_contrasts[0], log_contrasts[-1], _NUM_CONTRASTS)
     grid_negative_log_likelihoods, grid_log_measures, grid_deviations = (
@@ -263,7 +266,7 @@ def _summary(sign: int, axes: int, unmodelled: float, fixed_fits: Sequence[_Fixe
         log_contrasts[0] == _LOG_CONTRAST_BOUNDS[0]
         and negative_log_likelihoods[0] < min_negative_log_likelihood + _OPEN_END_RISE
     )
-    # The contrast decides which end of the measure is open: the stronger, the smaller.
+    # The open end of the contrast decides which end of the area or volume is open: a stronger body is smaller.
     changes = [float(np.expm1(sign * values)) for values in _quantiles(contrast, weight)]
     change_limits: list[float | None] = [None if is_open_below else changes[0], None if is_open_above else changes[2]]
     min_measure, median_measure, max_measure = _quantiles(measures, weight)
@@ -279,8 +282,8 @@ def _summary(sign: int, axes: int, unmodelled: float, fixed_fits: Sequence[_Fixe
 
 
 def _quantiles(values: Float[np.ndarray, "g *s"], weight: Float[np.ndarray, " g"]) -> tuple[float, float, float]:
-    """Quantiles at the ends of an interval and the median, in ascending order: low, median, high. All values along the
-    first axis have its `weight`."""
+    """Weighted quantiles of `values` at the lower end of the interval, the median and the upper end. `weight` (g,):
+    weight of all values at each index of the first axis."""
     weight = np.repeat(weight, values[0].size)
     values, order = values.ravel(), np.argsort(values, axis=None)
     cumulative_weights = np.cumsum(weight[order])

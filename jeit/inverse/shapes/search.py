@@ -1,4 +1,4 @@
-"""Search for the bodies that explain a frame of voltages (`reconstruct_shapes`), including their number."""
+"""Search for the bodies, including their number, that explain a frame of voltages (`reconstruct_shapes`)."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ if TYPE_CHECKING:
 LEAST_RISE = 1.4
 _FIRST_STEPS, _STEPS, _REMOVAL_STEPS, _TRIAL_STEPS = 15, 40, 8, 6
 _COARSE_TOLERANCE = 1e-2
-# Number of starts in a row that the data do not support, after which the remaining, weaker ones are not tried.
+# Number of successive starts that the data do not support, after which the remaining, weaker starts are not tried.
 _MAX_UNSUPPORTED = 2
-# Factor by which the objective rises without a body, above which the body is beyond doubt.
+# Factor of the rise of the objective without a body above which the body is beyond doubt.
 _CERTAIN_RISE = 10.0
-# Maximum number of changes of the number or kind of bodies.
+# Maximum number of changes of the number or kind of bodies in a search.
 _MAX_CHANGES = 10
 # Maximum number of times that the mesh is refined at the bodies, which move as a result. Edge lengths on their
 # surfaces, in units of the shortest half axis, that are tried in turn: in the first refinement, when there may still be
 # ghosts among the bodies, and in later ones.
 _MAX_REFINEMENTS, _EDGE_LENGTHS = 3, ((0.7,), (0.25, 0.35, 0.5, 0.7))
-# Minimum gain of log evidence for accepting the richer of two descriptions of the bodies.
+# Minimum gain of log evidence for accepting the description of the bodies with more parameters.
 _MIN_EVIDENCE_GAIN = 2.0
 
 
@@ -57,7 +57,7 @@ Body = Star | Ellipsoid
 
 
 class FinerImage(Module):
-    """Conductivity on a refined mesh.
+    """Conductivity of reconstructed bodies on a refined mesh, for display.
 
     **Fields**: `model`: forward model on the refined mesh, with the same electrodes and a protocol of independent
     channels; `conductivity` (c,): conductivity of the refined cells, S/m.
@@ -72,13 +72,13 @@ class ShapeReconstruction(Module):
 
     **Fields**: `bodies`: `Star`s in a sheet, `Ellipsoid`s in a solid, in descending order of `rise`; `conductivity`
     (m,): S/m (2-D: S), in partly covered cells of a solid the geometric mean of body and bath; `voltages` (M,):
-    voltages predicted for the bodies; `misfit`: root mean square of predicted - measured over the channels used, in
-    standard deviations; `drift`: relative difference of the bath's conductivity from `background`; `doubtful`: bodies
-    that were removed because their `rise` is too small; `contrast_deviations`: posterior standard deviation of each
-    body's contrast due to noise, combined with that of the mesh (0.03, in solids 0.1); `alternatives`: for each body of
-    a solid, the body of the other kind (ellipsoid or column) if the data do not determine the kind, else None;
-    `alternative_deviations`: standard deviations of the contrasts of the alternatives, or NaN; `finer`:
-    for a solid with bodies, the conductivity on the last refined mesh, for display.
+    voltages predicted for the bodies; `misfit`: root mean square of predicted - measured voltages over the channels
+    used, in standard deviations; `drift`: relative difference of the bath's conductivity from `background`; `doubtful`:
+    bodies that were removed because their `rise` is too small; `contrast_deviations`: standard deviation of each body's
+    contrast in log σ, due to noise and the mesh (0.03, in solids 0.1); `alternatives`: for each body of a solid, the
+    body of the other kind (ellipsoid or column) if the data do not determine the kind, else None;
+    `alternative_deviations`: standard deviations of the contrasts of the alternatives, or NaN; `finer`: for a solid
+    with bodies, the conductivity on the last refined mesh, for display.
 
     **Example:**
 
@@ -101,17 +101,17 @@ class ShapeReconstruction(Module):
 
     @property
     def hyperparameter(self) -> float:
-        """NaN: the prior of shapes has no hyperparameter."""
+        """Hyperparameter: NaN, because the prior of shapes has no hyperparameter."""
         return float("nan")
 
     @property
     def rule(self) -> str:
-        """ "none", as no rule chooses a hyperparameter."""
+        """Rule that chose the hyperparameter: "none", as there is no hyperparameter."""
         return "none"
 
     @property
     def choice(self) -> None:
-        """None, as there is no hyperparameter."""
+        """Choice of the hyperparameter: None, as there is no hyperparameter."""
         return None
 
 
@@ -131,37 +131,37 @@ def reconstruct_shapes(
 ) -> ShapeReconstruction:
     """Estimate the bodies (star shapes in a sheet, ellipsoids in a solid) that explain measured voltages.
 
-    All bodies are first fitted together, as strong disks or balls. Then each body in turn is left out and the others
-    are fitted again; the body whose absence raises the objective least is removed, as long as the rise is small. This
-    removes ghosts due to model errors and missing electrodes, because other bodies can take their place. Remaining
-    bodies are split in two, or changed to the other kind (a weak star, or a column from floor to lid), if the evidence
-    favours it (`ShapeProblem.surprise`). The search is run twice, starting with a split and with a change of kind, and
-    the better result is kept.
+    All bodies are first fitted together, as strong disks or balls. Then each body in turn is left out and all other
+    bodies are fitted again; the body whose absence raises the objective least is removed, as long as the rise is small.
+    This removes ghosts (false bodies) due to model errors and missing electrodes, because other bodies can take their
+    place. Remaining bodies are split in two, or changed to the other kind (a weak star, or a column from floor to lid),
+    if the evidence (`ShapeProblem.surprise`) favours this change. The search is run twice, once starting with a split
+    and once with a change of kind, and the better result is kept.
 
     **Arguments:**
 
     - `model`: the forward model.
-    - `voltages` (M,): measured, volts.
-    - `background`: conductivity without bodies, one number or (m,), S/m (2-D: S); its drift is estimated.
+    - `voltages` (M,): measured voltages, volts.
+    - `background`: conductivity of the bath without bodies, one number or (m,), S/m (2-D: S); its drift is estimated.
     - `start`: sign, centre (x, y) or (x, y, z) and radius, in metres, of every possible body, for example of all
-      inclusions of an image. Surplus starts do no harm, and two bodies at one start are separated, but no body is added
-      where no start is given.
+      inclusions of an image. Starts without a body do no harm, and two bodies at one start are separated, but no body
+      is added where no start is given.
     - `noise`, `mask`: as in `jeit.inverse.reconstruct`.
     - `prior`: default `StarPrior()` for sheets, `EllipsoidPrior()` for solids.
-    - `least_rise`: bodies without which the objective rises by less than this factor, or that the evidence does not
-      favour, are treated as ghosts.
-    - `smooth`: an image of the same channels with a smooth prior and no bounds. Changes of conductivity besides the
-      bodies are then modelled as a `SmoothField`, whose level is chosen by the evidence, and only bodies that are
-      detected beside that field are fitted.
-    - `accuracy`: the errors with which the `quantities` of each body are estimated, in place of `noise`; without it
-      they are not estimated.
-    - `progress`: called with the name of each stage as it begins. Stages take up to a minute in a solid.
+    - `least_rise`: a body is a ghost if the objective without it rises by less than this factor, or if the evidence
+      does not favour it.
+    - `smooth`: an image reconstructed from the same channels with a smooth prior and no bounds. Changes of conductivity
+      besides the bodies are then modelled as a `SmoothField`, whose level is chosen by the evidence, and only bodies
+      that are detected in addition to this field are fitted.
+    - `accuracy`: errors of the data, used in place of `noise` to estimate the `quantities` of each body. None: no
+      quantities.
+    - `progress`: function called with the name of each stage as it begins. Stages take up to a minute in a solid.
 
-    Raises `ValueError` for arguments that do not fit together, and if `smooth` is not an image of these channels with a
-    smooth prior.
+    Raises `ValueError` for invalid or inconsistent arguments, and if `smooth` is not an image of the same channels with
+    a smooth prior.
 
     Kolehmainen, Arridge, Lionheart, Vauhkonen and Kaipio, Inverse Problems 15 (1999) 1375, boundaries by Fourier
-    coefficients; the choice by evidence is jeit's own.
+    coefficients; the choice of bodies by evidence is jeit's own.
 
     **Example:**
 
@@ -246,7 +246,7 @@ def reconstruct_shapes(
 
 
 def _check_start(start, dimension: int):
-    """Signs (k,), centres (k, d) and radii (k,) from `start`. Raises `ValueError` for invalid starts."""
+    """Signs (k,), centres (k, d) and radii (k,) of the bodies `start`. Raises `ValueError` for invalid starts."""
     try:
         sign = np.array([body[0] for body in start], float)
         centre = np.array([body[1] for body in start], float).reshape(-1, dimension)
@@ -260,29 +260,29 @@ def _check_start(start, dimension: int):
 
 
 def _grow_bodies(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int):
-    """Fit the bodies as disks or balls, and return them with all their modes, and their coefficients."""
+    """Fit the bodies as disks or balls, and return the bodies with all modes of their form, and their coefficients."""
     ball_fit = problem.fit(*bodies.with_modes(1, coefficients), steps, _COARSE_TOLERANCE)
     return ball_fit.bodies.with_modes(bodies.prior.modes, ball_fit.coefficients)
 
 
 class _FitSetting(NamedTuple):
-    """Setting in which bodies are fitted: the problem of bodies without a field, and the smooth field or None."""
+    """Setting in which bodies are fitted: the problem of bodies without a smooth field, and the field or None."""
 
     bodies_problem: ShapeProblem
     smooth_field: SmoothField | None
 
     def problem(self, level: float) -> ShapeProblem:
-        """The problem of bodies, with the smooth field of this level if there is a field."""
+        """The problem of bodies, with the smooth field of this `level` if there is a field."""
         return self.bodies_problem if self.smooth_field is None else self.smooth_field.problem_at(level)
 
     def on(self, bodies_problem: ShapeProblem) -> _FitSetting:
-        """The setting with the problem `bodies_problem` on another mesh."""
+        """Copy of the setting with the problem `bodies_problem` on another mesh."""
         return _FitSetting(
             bodies_problem, self.smooth_field and replace(self.smooth_field, bodies_problem=bodies_problem)
         )
 
     def weighted(self, data: Data) -> _FitSetting:
-        """The setting with other weights and errors of the data."""
+        """Copy of the setting with the weights and errors of `data`."""
         bodies_problem, smooth_field = replace(self.bodies_problem, data=data), self.smooth_field
         if smooth_field is not None:
             weight_ratio = np.asarray(data.weight) / np.asarray(self.bodies_problem.data.weight)
@@ -292,10 +292,10 @@ class _FitSetting(NamedTuple):
         return _FitSetting(bodies_problem, smooth_field)
 
     def fit_level(self, bodies: Bodies, coefficients, level: float, steps: int) -> tuple[float, Fit, float]:
-        """Alternate between fitting the bodies and lowering the field's level, until the level is the likeliest.
+        """Alternate between fitting the bodies and lowering the smooth field's level, until the level is the likeliest.
 
-        Returns the level, the fit and -log evidence. The level decreases from `level`, because bodies fitted with too
-        low a level would be distorted to explain what the field explains.
+        Returns the level, the fit of the bodies and -log evidence. The level decreases from `level`, because bodies
+        fitted with too low a level would be distorted to explain changes that belong to the field.
         """
         while True:
             problem = self.problem(level)
@@ -307,10 +307,10 @@ class _FitSetting(NamedTuple):
 
 
 def _add_bodies(setting: _FitSetting, bodies: Bodies, coefficients, num_sure: int = 0) -> tuple[float, Fit, list[int]]:
-    """Add bodies in their order to a smooth field, and keep each that the data support besides those before it.
+    """Add bodies in their order to a smooth field, and keep each body that the data support besides the earlier bodies.
 
-    Returns the level of the field, the fit, and the indices of the bodies kept. The first `num_sure` bodies are
-    beyond doubt and are fitted together: either of two bodies fitted alone would settle between them and not return.
+    Returns the level of the field, the fit, and the indices of the bodies kept. The first `num_sure` bodies are beyond
+    doubt and are fitted together, because either of two bodies fitted alone would settle between both.
     """
     rows = bodies.rows(coefficients)
     supported, num_refused = list(range(num_sure)), 0
@@ -335,7 +335,7 @@ class _SearchResult(NamedTuple):
 
 
 class _SearchState(NamedTuple):
-    """State of the search: the bodies `found` in a `setting`, with the field at its `level`."""
+    """State of the search: the bodies `found` in a `setting`, with the smooth field at its `level`."""
 
     setting: _FitSetting
     level: float
@@ -347,7 +347,7 @@ def _refine_meshes(
 ) -> tuple[_SearchState, FinerModel | None]:
     """Fit the bodies on meshes refined at their surfaces, until the surfaces stay within the refined cells.
 
-    Ghosts due to the coarse mesh are dropped. Returns the state and the last refined problem, or None.
+    Ghosts due to the coarse mesh are removed. Returns the state and the last refined problem, or None.
     """
     from jeit.inverse.shapes.finer import refine_at_surfaces
 
@@ -393,7 +393,7 @@ def _remove_unsupported(
     least_rise: float,
     min_costs: Float[np.ndarray, " k"] | None = None,
 ) -> _SearchResult:
-    """Remove bodies without which the others, fitted again, explain the data about as well; one at a time, starting
+    """Remove bodies without which the others, fitted again, explain the data about as well, one at a time, starting
     with the body whose absence raises the cost least.
 
     `min_costs`: lower limit of the cost without each body, if known.
@@ -417,7 +417,7 @@ def _remove_unsupported(
 
 
 def _split_bodies(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
-    """The bodies with one of them split in two; None if the data do not support the split."""
+    """Fit of the bodies with one body split in two; None if the data support no split."""
     bodies, coefficients, cost, _ = fitted
     starts = [
         _grow_bodies(problem, *bodies.split(k, coefficients, number), _TRIAL_STEPS)
@@ -429,8 +429,8 @@ def _split_bodies(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit 
 
 
 def _alternative_fits(problem: ShapeProblem, fitted: Fit) -> Fit | None:
-    """The bodies with one or all of them changed to the other kind, weak stars or columns; None if the data do not
-    support the change."""
+    """Fit of the bodies with one or all of them changed to the other kind (weak star or column); None if the data
+    support no change."""
     first_kind = np.flatnonzero(~fitted.bodies.is_other_kind & (not fitted.bodies.prior.is_of_one_kind))
     groups = [[k] for k in first_kind] + [first_kind] * (len(first_kind) > 1)
     change = _best_fit(problem, fitted, [fitted.bodies.with_other_kind(group, fitted.coefficients) for group in groups])
@@ -438,7 +438,7 @@ def _alternative_fits(problem: ShapeProblem, fitted: Fit) -> Fit | None:
 
 
 def _with_common_contrast(problem: ShapeProblem, fitted: Fit) -> Fit:
-    """The ellipsoids, with one material for all bodies of a sign where that is likelier than a material for each."""
+    """The ellipsoids with one material for all bodies of a sign, where this is likelier than a material for each."""
     for sign in (1, -1):
         bodies = fitted.bodies
         if isinstance(bodies, Ellipsoids) and ((bodies.sign == sign) & ~bodies.same_material).sum() > 1:
@@ -450,8 +450,8 @@ def _with_common_contrast(problem: ShapeProblem, fitted: Fit) -> Fit:
 def _best_fit(
     problem: ShapeProblem, fitted: Fit, starts: Sequence[tuple[Bodies, Float[np.ndarray, " n"]]]
 ) -> Fit | None:
-    """Make a few steps from each of several starts, and fit the best of them to convergence. None if its cost is more
-    than `_CERTAIN_RISE` times that of `fitted`."""
+    """Make a few steps from each of several starts, and fit from the best start to convergence. None if the cost after
+    the few steps is more than `_CERTAIN_RISE` times that of `fitted`."""
     trial_fits = [problem.fit(*start, _TRIAL_STEPS, _COARSE_TOLERANCE) for start in starts]
     best_trial = min(trial_fits, key=lambda trial: trial.cost, default=None)
     if best_trial is None or best_trial.cost > _CERTAIN_RISE * fitted.cost:
@@ -460,21 +460,21 @@ def _best_fit(
 
 
 def _is_supported(problem: ShapeProblem, simple_fit: Fit, other_fit: Fit) -> bool:
-    """Whether the evidence for `other_fit` exceeds that for `simple_fit` by the margin."""
+    """Whether the log evidence of `other_fit` exceeds that of `simple_fit` by `_MIN_EVIDENCE_GAIN`."""
     return problem.surprise(other_fit) + _MIN_EVIDENCE_GAIN <= problem.surprise(simple_fit)
 
 
 def _improve_fit(problem: ShapeProblem, result: _SearchResult, least_rise: float) -> _SearchResult:
-    """Search for better bodies, starting once with a split and once with a change of kind; the likelier result, or
-    `result` if neither change is supported."""
+    """Search for likelier bodies, starting once with a split and once with a change of kind. Returns the likelier
+    result, or `result` if the data support neither change."""
     changes = [_split_bodies(problem, result.fit, least_rise), _alternative_fits(problem, result.fit)]
     results = [_search_until_stable(problem, result, fit, least_rise) for fit in changes if fit is not None] or [result]
     return min(results, key=lambda candidate: problem.surprise(candidate.fit))
 
 
 def _search_until_stable(problem: ShapeProblem, result: _SearchResult, start: Fit, least_rise: float) -> _SearchResult:
-    """Search onwards from the bodies `start`: remove ghosts, then split a body or, if no split is supported,
-    change a kind, until no change is supported."""
+    """Continue the search from the bodies `start`: remove ghosts, then split a body or, if no split is supported,
+    change the kind of a body, until the data support no change."""
     for _ in range(_MAX_CHANGES):
         result = _remove_unsupported(problem, start, result.doubtful, least_rise)
         next_fit = _split_bodies(problem, result.fit, least_rise) or _alternative_fits(problem, result.fit)

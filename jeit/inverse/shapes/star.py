@@ -1,8 +1,8 @@
-"""Star-shaped bodies in a sheet, or in the plane of a tank: an outline r(θ) around a centre.
+"""Star-shaped bodies in a sheet, or in the plane of a tank, each with an outline r(θ) around a centre.
 
     log r(θ) = log r₀ + Σ (aₙ cos nθ + bₙ sin nθ),  n = 2 … N.
 
-`jeit.inverse.shapes.bodies` describes contrast and conductivity.
+Contrast and conductivity are defined in `jeit.inverse.shapes.bodies`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jeit.inverse.shapes.bodies import TINY, Bodies, BodyPrior, Covered, Quantit
 from jeit.mesh import Mesh, measures
 from jeit_solvers.module import Module
 
-# Barycentric weights of the six points at which a cell is sampled.
+# Barycentric coordinates of the six points at which a cell is sampled.
 _SAMPLES = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2.5, 2.5, 1], [2.5, 1, 2.5], [1, 2.5, 2.5]]) / 6
 # Width of the blur of an outline, in units of the cell size: large enough for the coverage to be differentiable.
 _BLUR = 0.2
@@ -28,20 +28,22 @@ _NUM_OUTLINE_POINTS = 128
 
 @dataclass(frozen=True)
 class StarPrior(BodyPrior):
-    """Prior of stars, for `reconstruct_shapes` in a sheet.
+    """Prior of star-shaped bodies, for `reconstruct_shapes` in a sheet.
 
     **Arguments:**
 
     - `modes`: N, number of the highest mode of an outline; 1 gives disks.
     - `place`: standard deviation of each coordinate of a body's centre about its start, in units of the longest side of
       the domain.
-    - `radius`, `radius_spread`: median of the mean radius, in the same unit, and standard deviation of its logarithm.
+    - `radius`, `radius_spread`: median of a body's mean radius, in the same unit, and standard deviation of the
+      logarithm of the mean radius.
     - `drift`: standard deviation of the change of the bath's log conductivity between the two frames.
     - `apart`: reciprocal of the standard deviation of the overlap of two bodies, as a fraction of the domain.
-    - `roughness`: standard deviation of a₂ and b₂; for aₙ and bₙ it is multiplied by 2/n.
-    - `contrast`, `contrast_spread`: mean and standard deviation of the contrast in log σ of a strong body, ten times as
-      conductive or resistive as the bath or more. Data hardly distinguish its contrast from a higher one, so the mean
-      is high and the standard deviation small.
+    - `roughness`: standard deviation of the outline's coefficients a₂ and b₂; aₙ and bₙ have 2/n times this standard
+      deviation.
+    - `contrast`, `contrast_spread`: mean and standard deviation of the contrast in log σ of a strong body, which is at
+      least ten times as conductive or resistive as the bath. Data hardly distinguish such a contrast from a higher one,
+      so the mean is high and the standard deviation small.
     - `weak_contrast`, `weak_spread`: median of the contrast in log σ of a weak body, and standard deviation of its
       logarithm.
     - `odds_against_weak`: prior odds of a strong body relative to a weak one.
@@ -63,19 +65,20 @@ class StarPrior(BodyPrior):
 
     @property
     def size(self) -> int:
-        """Number of coefficients of a body: centre, log radius, contrast, and two for each mode from the second."""
+        """Number of coefficients of a star: two for the centre, the log radius, the contrast, and two for each mode
+        from the second."""
         return 4 + 2 * (self.modes - 1)
 
     def deviation(self, span: float) -> Float[np.ndarray, " q"]:
-        """Prior standard deviations of a body's parameters, 1 for its contrast; `span`: longest side of the domain,
-        metres."""
+        """Prior standard deviations of the q parameters of a star, 1 for the contrast; `span`: longest side of the
+        domain, metres."""
         mode_deviations = self.roughness * 2 / np.arange(2, self.modes + 1)
         deviations = [self.place * span, self.place * span, self.radius_spread, 1.0]
         return np.concatenate([deviations, np.repeat(mode_deviations, 2)])
 
     def contrast_of(self, coefficient: float, other: bool) -> tuple[float, float]:
-        """Contrast in log σ, without its sign, of a body that is weak if `other`; and its derivative with respect to
-        the coefficient."""
+        """Contrast of a star in log σ, without its sign, and the derivative of the contrast with respect to its
+        `coefficient`. The star is weak if `other`."""
         if not other:
             return self.contrast + self.contrast_spread * coefficient, self.contrast_spread
         contrast = self.weak_contrast * np.exp(self.weak_spread * coefficient)
@@ -87,9 +90,10 @@ class Star(Module):
 
     **Fields**: `sign`: +1 if more conductive than the bath, -1 if less; `centre` (2,): centre of the star, metres;
     `outline` (k, 2): points of the outline, metres, counter-clockwise; `contrast`: contrast in log σ, without its sign;
-    `weak`: whether the body is weak, so that the data determine its contrast: for other bodies the contrast follows the
+    `weak`: whether the body is weak, so that the data determine its contrast; the contrast of other bodies follows the
     prior and is roughly a lower limit; `rise`: factor by which the minimum of the objective increases without this
-    body, small for a ghost; `quantities`: posterior medians and intervals, if they were estimated.
+    body, small for a ghost; `quantities`: posterior medians and intervals of the body's properties, None if not
+    estimated.
 
     **Example:**
 
@@ -109,29 +113,30 @@ class Star(Module):
 
     @property
     def area(self) -> float:
-        """Area, m²."""
+        """Area inside the outline, m²."""
         return float(abs(self._moments()[0]))
 
     @property
     def measure(self) -> float:
-        """Area, m²."""
+        """Area inside the outline, m²."""
         return self.area
 
     @property
     def contrast_is_determined(self) -> bool:
-        """Whether the data determine the contrast: no end of its interval is open, or without one the body is weak."""
+        """Whether the data determine the contrast: no end of the contrast's interval is open or, without an interval,
+        the body is weak."""
         return self.weak if self.quantities is None else None not in self.quantities.change_interval
 
     def with_quantities(self, known: Quantities) -> Star:
-        """The body with its quantities; its area and contrast become the medians, but the outline stays that of the fit
-        where the data leave open how small a strong body is."""
+        """Copy of the body with the quantities `known`. Area and contrast become the medians, but the fitted outline is
+        kept if the data leave open how small a strong body is."""
         scale = 1.0 if known.measure_interval[0] is None else np.sqrt(known.measure / max(self.area, TINY))
         outline = self.centroid + (self.outline - self.centroid) * scale
         return replace(self, outline=outline, contrast=float(np.abs(np.log1p(known.change))), quantities=known)
 
     @property
     def centroid(self) -> Float[np.ndarray, "2"]:
-        """Centroid of the area, (2,) metres."""
+        """Centroid of the area inside the outline, (2,) metres."""
         area, first = self._moments()
         return first / area
 
@@ -157,7 +162,7 @@ class Star(Module):
 
 
 class _StarValues(NamedTuple):
-    """Centre (x + iy, metres), log radius and `waves` aₙ - i bₙ of a star."""
+    """Parameters of a star: centre (x + iy, metres), log radius, and outline coefficients `waves` aₙ - i bₙ."""
 
     centre: complex
     log_radius: float
@@ -166,10 +171,11 @@ class _StarValues(NamedTuple):
 
 @dataclass(frozen=True)
 class Stars(Bodies):
-    """Stars on a mesh.
+    """Star-shaped bodies on a mesh of m cells.
 
     **Fields**, besides those of `Bodies`: `points` (m, s): sampling points of the cells, x + iy in metres; `width`
-    (m,): width of the blur, metres; `edges` (b, 2): end points of the edges of the domain's boundary, x + iy in metres.
+    (m,): width of the outline's blur in each cell, metres; `edges` (b, 2): end points of the edges of the domain's
+    boundary, x + iy in metres.
     """
 
     points: Complex[np.ndarray, "m s"]
@@ -193,17 +199,17 @@ class Stars(Bodies):
 
     @property
     def odds(self) -> float:
-        """Logarithm of the prior odds against weak bodies."""
+        """Logarithm of the prior odds against the weak bodies among the stars."""
         return float(self.is_other_kind.sum() * np.log(self.prior.odds_against_weak))
 
     @property
     def num_splits(self) -> int:
-        """2: both axes."""
+        """Number of axes along which splitting a star is tried: 2."""
         return 2
 
     def with_other_kind(self, indices, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
-        """The stars, those of `indices` made weak and enlarged to keep their effect on the electric field;
-        and their coefficients."""
+        """The stars, of which those of `indices` are made weak and enlarged to keep their effect on the electric field;
+        and the coefficients of the stars."""
         rows, is_weak = self.rows(coefficients), self.is_other_kind.copy()
         for k in indices:
             strength = np.tanh(self.contrast(k, rows[k])[0] / 2) / np.tanh(self.prior.weak_contrast / 2)
@@ -212,8 +218,9 @@ class Stars(Bodies):
         return replace(self, is_other_kind=is_weak), np.append(coefficients[0], rows)
 
     def mixture(self, share, contrast):
-        """2 artanh(share · tanh(contrast / 2)), Maxwell Garnett's formula: a partly covered cell has `share` times the
-        effect of a covered cell on the electric field. Also its derivatives with respect to `share` and `contrast`."""
+        """log σ/σ₀ of partly covered cells, 2 artanh(share · tanh(contrast / 2)), by Maxwell Garnett's formula: a
+        partly covered cell has `share` times the effect of a covered cell on the electric field. Also the derivatives
+        with respect to `share` and `contrast`."""
         strength = np.tanh(contrast / 2)
         artanh_slope = 1 / (1 - (share * strength) ** 2)
         return 2 * np.arctanh(share * strength), 2 * strength * artanh_slope, artanh_slope * share * (1 - strength**2)
@@ -250,8 +257,8 @@ class Stars(Bodies):
         return _StarValues(complex(*self.centre(k, row)), self.log_radius(row), values[0::2] - 1j * values[1::2])
 
     def _wave(self, waves, direction):
-        """Σ (aₙ cos nθ + bₙ sin nθ) and its derivative with respect to θ, for `direction` exp iθ; and the powers
-        exp inθ, n = 2 … N."""
+        """Value of Σ (aₙ cos nθ + bₙ sin nθ) and its derivative with respect to θ, for `direction` exp iθ; and the
+        powers exp inθ, n = 2 … N."""
         mode_numbers = np.arange(2, self.prior.modes + 1)
         repeated = np.broadcast_to(direction, (self.prior.modes, *direction.shape))
         powers = np.cumprod(repeated, axis=0, dtype=complex)[1:]
@@ -283,8 +290,8 @@ class Stars(Bodies):
 
 
 def _first_crossing_distances(centre: complex, direction, edges) -> tuple[Float[np.ndarray, " k"], bool]:
-    """Distance from `centre` at which the ray in each `direction` (k,) first crosses `edges` (b, 2), infinite if it
-    does not; and whether the closed line formed by the edges encloses `centre`."""
+    """Distances (k,) from `centre` at which the ray in each `direction` (k,) first crosses `edges` (b, 2), infinite if
+    the ray crosses none; and whether the closed line formed by the edges encloses `centre`."""
     edge_starts, edge_vectors = edges[:, 0] - centre, edges[:, 1] - edges[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         denominators = _cross_products(direction[:, None], edge_vectors)

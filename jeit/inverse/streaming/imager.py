@@ -1,9 +1,9 @@
 """Imaging of successive frames in bounded time (`Imager`): linear, or by Gauss-Newton steps from the last image.
 
 Everything that does not depend on the frame is computed once: the independent channels, the prior's basis, the
-hyperparameter, the electrodes' integrals, the matrix of linear images, and the combinations of the prior's shapes, a
-few dozen, that the data can resolve. Array shapes never change, so nothing is compiled again: a masked channel keeps
-its place but gets a variance so large that it has no effect.
+hyperparameter, the integrals over electrodes, the matrix of linear images, and the few dozen combinations of the
+prior's shapes that the data can resolve. Shapes of arrays never change, so nothing is compiled again: a masked channel
+keeps its place but gets a variance so large that the channel has no effect.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from jeit_solvers.module import Module
 
 FRAME_STEPS = 4
 """Default maximum number of iterations per frame."""
-# Default tolerance of the solver; default minimum signal of a shape (see `Parametrisation.informative`).
+# Default tolerance of the solver; default minimum signal of a shape of the prior (see `Parametrisation.informative`).
 _RTOL, _MIN_SIGNAL = 1e-3, 0.03
-# Ratio of the standard deviation assigned to masked channels to the largest noise. With a larger ratio, matrices of
+# Ratio of the standard deviation assigned to masked channels to the largest noise. With a larger ratio, covariances of
 # combinations that only masked channels measure could not be inverted in double precision.
 _MASKED_NOISE_RATIO = 1e3
 
 
 def check_memory(memory) -> None:
-    """Raises `ValueError` unless `memory` is a number of frames from 0."""
+    """Raise `ValueError` unless `memory`, a number of frames, is at least 0."""
     if not (is_number(memory) and memory >= 0):
         raise ValueError(f"memory must be a number of frames, or 0 for none; it is {describe(memory)}.")
 
@@ -51,9 +51,9 @@ class FrameEstimate(Module):
     """Result of an iterative `Imager` for one frame.
 
     **Fields**: `conductivity` (m,): S/m (2-D: S); `coefficients` (n,): coefficients of the image, from which the next
-    frame may start; `misfit`: root mean square of predicted - measured over the channels used, in standard deviations;
-    `iterations`: number of iterations; `converged`: whether another step would have changed the objective by less than
-    the tolerance.
+    frame may start; `misfit`: root mean square of predicted - measured voltages over the channels used, in standard
+    deviations; `iterations`: number of iterations; `converged`: whether another step would have changed the objective
+    by less than the tolerance.
     """
 
     conductivity: Float[Array, " m"]
@@ -66,9 +66,9 @@ class FrameEstimate(Module):
 class LinearMap(Module):
     """Linear image σ = `level` (m,) + `matrix` (m, k) · `estimator` (k, M) · voltages (M,), S/m (2-D: S).
 
-    k is the number of independent channels or of the prior's shapes, whichever is smaller. With a memory, `carry`
-    (k, k) times the last image's weights (k,), relative to those of an undisturbed frame, is added to the weights that
-    `matrix` multiplies.
+    k is the number of independent channels or of the prior's shapes, whichever is smaller. `matrix` multiplies k
+    weights. With a memory of earlier frames, `carry` (k, k) times the last image's weights (k,), relative to the
+    weights of an undisturbed frame, is added to the weights.
     """
 
     matrix: Float[Array, "m k"]
@@ -78,15 +78,15 @@ class LinearMap(Module):
 
 
 class Imager(Module):
-    """Imager for the frames of one sensor, created by `Imager.create`; `stream` passes frames to it and handles faulty
-    ones.
+    """Imager for the frames of one sensor, created by `Imager.create`. `stream` passes frames to the imager and handles
+    faulty frames.
 
-    **Fields**: `channels`: independent channels; `inversion`: the problem, whose data are replaced for every frame;
-    `noise` (M,): volts; `mask` (M,): True for channels that are used; `expected` (M,): voltages of an undisturbed
-    frame; `offset` (M,): model's minus sensor's voltages of the undisturbed body, added to frames; `touching` (L, M):
-    True for channels that drive or read each electrode; `tied`: pairs (P, 2) of reciprocal channels, and the ratio (P,)
-    of the second voltage to the first; `solver`: solver with its settings; `persistence`: fraction of the last image
-    that is expected in the next one, 0 without a memory.
+    **Fields**: `channels`: independent channels; `inversion`: the least squares problem, whose data are replaced for
+    every frame; `noise` (M,): standard deviation of the channels, volts; `mask` (M,): True for channels that are used;
+    `expected` (M,): voltages of an undisturbed frame; `offset` (M,): voltages of the undisturbed body predicted by the
+    model minus those measured, added to frames; `touching` (L, M): True for channels that drive or read each electrode;
+    `tied`: pairs (P, 2) of reciprocal channels, and the ratio (P,) of the second voltage to the first; `solver`: solver
+    with its settings; `persistence`: fraction of the last image that is expected in the next one, 0 without a memory.
 
     **Example:**
 
@@ -135,16 +135,16 @@ class Imager(Module):
 
         - `background`: conductivity of the undisturbed body, S/m (2-D: S).
         - `reference` (M,): measured frame of the undisturbed body, volts. Images are then computed from differences to
-          it, so that model errors cancel.
-        - `solver`: `GaussNewton()` (default), `LevenbergMarquardt()`, or `OneStep()` for linear images. Defaults are 4
-          steps per frame and a tolerance of 1e-3 for the relative change of the objective.
-        - `prior`: by default `Gaussian` with a length of about a twelfth of the body's width.
-        - `parametrisation`: link, regions and `informative` shapes.
+          the reference, so that model errors cancel.
+        - `solver`: `GaussNewton()` (default), `LevenbergMarquardt()`, or `OneStep()` for linear images. By default a
+          solver makes 4 steps per frame and has a tolerance of 1e-3 for the relative change of the objective.
+        - `prior`: by default `Gaussian` with a correlation length of about a twelfth of the body's width.
+        - `parametrisation`: link, regions and `informative` shapes of the images.
         - `memory`: number of frames over which images are correlated. The last image then predicts the next one (a
           steady-state Kalman filter for coefficients with covariance exp(-|t - t'| / memory) in time), which reduces
-          noise and adds a lag of part of the memory. With 0, every frame is imaged independently.
+          noise and delays changes by a part of the memory. With 0, every frame is imaged independently.
 
-        Other arguments are as in `reconstruct`. Raises `ValueError` for arguments that do not fit together.
+        Other arguments are as in `reconstruct`. Raises `ValueError` for invalid or inconsistent arguments.
 
         Kaipio, Karjalainen, Somersalo and Vauhkonen, Ann. N. Y. Acad. Sci. 873 (1999) 430-439.
         """
@@ -195,10 +195,11 @@ class Imager(Module):
         )
 
     def with_reference(self, reference: Float[Array | np.ndarray, " M"]) -> "Imager":
-        """The same imager for another frame (M,) of the undisturbed body, volts, such as after electrodes were wetted.
+        """Copy of the imager with another reference frame (M,) of the undisturbed body, volts, for example after
+        electrodes were wetted.
 
         Model, noise, hyperparameter and the channels in use stay, so nothing is compiled again. Raises `ValueError` for
-        a frame of another shape, one without a reading of a channel in use, and one that differs from the model's by a
+        a reference of another shape, without a reading of a channel in use, or different from the model's voltages by a
         factor of ten or in sign.
         """
         frame, used = np.asarray(reference, float), np.asarray(self.mask)
@@ -218,7 +219,7 @@ class Imager(Module):
 
     @property
     def start(self) -> Float[Array, " n"]:
-        """Coefficients of the background, from which the first frame starts."""
+        """Coefficients (n,) of the background, from which the iteration for the first frame starts."""
         return jnp.zeros(self.inversion.num_coefficients)
 
     @property
@@ -227,15 +228,16 @@ class Imager(Module):
         return 1 if self.solver.is_linear else self.solver.descent(FRAME_STEPS, _RTOL).history - 1
 
     def weighing(self, usable: Bool[Array, " M"]) -> Weighing:
-        """Map from frames to data in which only the `usable` channels have an effect."""
+        """`Weighing` that maps frames to data in which only the `usable` channels have an effect."""
         return self.channels.weigh(_masked_noise(self.noise, self.mask & usable))
 
     def linear_map(self, weighing: Weighing) -> LinearMap:
-        """Linear image of frames with this weighing: one Gauss-Newton step from the background."""
+        """Linear map from frames to images for a `weighing` of the channels: one Gauss-Newton step from the
+        background."""
         return _compute_linear_map(self.inversion, weighing, self.offset, self.persistence)
 
     def estimate(self, frame: Float[Array, " M"], weighing: Weighing, start: Float[Array, " n"]) -> FrameEstimate:
-        """Image of a frame (M,) in volts, computed by at most `steps` iterations from coefficients `start`.
+        """Image of a frame (M,) in volts, computed by at most `steps` iterations from the coefficients `start`.
 
         With a memory, `start` is also the prior mean, `persistence` times the last image's coefficients. Unused
         channels must hold finite voltages, preferably those of the last frame.
@@ -244,7 +246,8 @@ class Imager(Module):
 
 
 def _check_combination(solver: AbstractSolver, prior: AbstractPrior, parametrisation: Parametrisation, memory) -> None:
-    """Raise `ValueError` for settings that need a covariance the prior does not have, or unbounded time."""
+    """Raise `ValueError` for settings that require a covariance that the prior does not have, or that take unbounded
+    time per frame."""
     if memory > 0 and not prior.is_quadratic:
         raise ValueError("memory: total variation has no covariance to carry on; take another prior, or memory 0.")
     if solver.is_linear and not prior.is_quadratic:
@@ -255,8 +258,8 @@ def _check_combination(solver: AbstractSolver, prior: AbstractPrior, parametrisa
 
 
 def _check_reference(measured, predicted) -> None:
-    """Check units and polarity. Raise `ValueError` if measured and predicted voltages differ by a factor of ten or in
-    sign, which model errors do not explain."""
+    """Check units and polarity of a reference frame. Raise `ValueError` if measured and predicted voltages differ by a
+    factor of ten or in sign, which model errors do not explain."""
     ratio = measured @ predicted / (predicted @ predicted)
     if not 0.1 < ratio < 10:
         raise ValueError(
@@ -279,7 +282,7 @@ def _compute_linear_map(inversion: Inversion, weighing: Weighing, offset, persis
     if inversion.num_coefficients <= len(residual):
         shapes = jnp.eye(inversion.num_coefficients)
         carry_matrix = persistence * (shapes - gain @ jacobian)
-    else:  # not reached with a memory, because there are then no more shapes than data
+    else:  # not reached with a memory: there are then no more shapes than data
         shapes, gain = gain.T, jnp.eye(len(residual))
         carry_matrix = jnp.zeros_like(gain)
     matrix = jax.vmap(inversion.basis.expand)(shapes).T * inversion.link.slope(inversion.reference)[:, None]
@@ -301,7 +304,7 @@ def _estimate_frame(imager: Imager, frame, weighing: Weighing, start) -> FrameEs
     solution = optx.least_squares(
         residual, descent, start, inversion, options={"expand": expand}, max_steps=imager.steps, throw=False
     )
-    # The point reached by the last step has not been evaluated; its cost takes voltages but no Jacobian.
+    # The objective at the point reached by the last step is not known yet; it requires voltages but no Jacobian.
     state = solution.state
     cost = inversion.cost(state.trial)
     is_trial_better = cost < state.cost

@@ -1,4 +1,4 @@
-"""Streams: frames are checked and imaged one after another."""
+"""Streams of frames: each frame is checked for faults and imaged as it arrives."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from jeit_solvers.module import Module
 
 # Relative difference from an undisturbed frame above which a frame is faulty or from another sensor.
 _LARGEST_DIFFERENCE = 0.5
-# Relative difference from an undisturbed frame above which dead electrodes and saturation are looked for. An electrode
-# is dead if without its channels at most the second fraction of the difference is left, and if the median relative
-# change of its channels exceeds the third number.
+# Relative difference from an undisturbed frame above which a frame is checked for dead electrodes and saturation. An
+# electrode is dead if at most `_MAX_REMAINING_SHARE` of the difference is left without the electrode's channels, and if
+# the median relative change of these channels exceeds `_MIN_DEAD_CHANGE`.
 _SUSPECT_FACTOR, _MAX_REMAINING_SHARE, _MIN_DEAD_CHANGE = 0.15, 0.5, 0.5
 # Minimum fraction of the channels in use that must be usable.
 _MIN_CHANNELS = 0.5
@@ -36,7 +36,7 @@ _CORRELATION_THRESHOLD, _MIN_PAIRS, _EQUAL_TOLERANCE = 3.0, 10, 1e-12
 
 
 class FrameStatus(StrEnum):
-    """Status of a frame, as a string.
+    """Status of a frame of a stream, as a string.
 
     **Example:**
 
@@ -58,7 +58,7 @@ class FrameStatus(StrEnum):
 
 
 class FrameCheck:
-    """Check of the frames (M,) of a sensor for faults.
+    """Check of the frames of a sensor for faults. A frame is an array (M,) of voltages.
 
     `mask` (M,): True for channels that are used. `expected` (M,): voltages of an undisturbed frame. `touching` (L, M):
     True for channels that drive or read each electrode. `tied`: pairs (P, 2) of reciprocal channels, and the ratio (P,)
@@ -83,14 +83,15 @@ class FrameCheck:
 
     @np.errstate(over="ignore")  # a frame whose square overflows is treated as faulty
     def __call__(self, frame):
-        """Values, usable channels, status and reason of a raw frame."""
+        """Check a raw frame. Returns its voltages (M,), the mask (M,) of usable channels, the status, and the reason
+        for the status as a sentence."""
         values, usable, status, reason = self._inspect(frame)
         if status != FrameStatus.REFUSED and (noise := self._reason_unchanged(values, usable)):
             return values, usable, FrameStatus.UNCHANGED, f"{reason} {noise}".lstrip()
         return values, usable, status, reason
 
     def _reason_unchanged(self, values, usable) -> str:
-        """Sentence that says that a frame differs from an undisturbed one by noise only; empty if it does not."""
+        """Sentence that says that a frame differs from an undisturbed frame by noise only; empty otherwise."""
         change = np.where(usable, values - self.expected, 0)
         if np.linalg.norm(change) <= _EQUAL_TOLERANCE * self.expected_norm:
             return "It equals an undisturbed frame."
@@ -159,8 +160,8 @@ class FrameCheck:
         return values, usable, FrameStatus.IMAGED, ""
 
     def _remove_dead_electrode(self, difference, usable):
-        """Usable channels without those of a dead electrode, and a sentence; all usable channels and an empty string if
-        no electrode is dead."""
+        """Return the usable channels without those of a dead electrode, and a sentence that names the electrode; if no
+        electrode is dead, all usable channels and an empty string."""
         total_change = np.linalg.norm(difference)
         remaining_changes = np.array([np.linalg.norm(difference[usable & ~touching]) for touching in self.touching])
         # An electrode whose removal leaves too few channels, such as a common reference, cannot be left out.
@@ -183,14 +184,15 @@ class FrameCheck:
         return other_channels, f"Electrode {electrode + 1} seems to be dead; its channels are left out."
 
     def _saturated_channels(self, values, usable):
-        """Channels (M,) at which the amplifier is saturated."""
+        """Mask (M,) of the channels at which the amplifier is saturated."""
         is_far = np.abs(values - self.expected) > _SUSPECT_FACTOR * np.abs(self.expected)
         is_saturated = np.zeros_like(usable)
         for extreme in (values[usable].max(), values[usable].min()):
             at_extreme = usable & (values == extreme)
             if np.count_nonzero(at_extreme) < _MIN_SATURATED or not extreme:
                 continue
-            # Channels that are equal by symmetry, as in simulated frames, are also equal in the undisturbed frame.
+            # Channels whose readings are equal by symmetry, as in simulated frames, are also equal in the undisturbed
+            # frame.
             if (
                 is_far[at_extreme].all()
                 and np.ptp(self.expected[at_extreme]) > _EQUAL_EXPECTED * np.abs(self.expected[at_extreme]).max()
@@ -229,10 +231,10 @@ class FrameImage(Module):
     """Result for one frame of a stream.
 
     **Fields**: `number`: number of the frame, from 0; `conductivity` (m,): S/m (2-D: S), a NumPy array, None for a
-    refused frame; `status`; `reason`: sentence that explains the status, empty for an ordinary frame; `usable` (M,):
-    True for the channels used; `misfit`: root mean square of predicted - measured in standard deviations (NaN for
-    refused frames and linear images, for which no forward problem is solved); `iterations`: number of iterations;
-    `latency`: time from the frame to its image, seconds.
+    refused frame; `status`: `FrameStatus`; `reason`: sentence that explains the status, empty for an ordinary frame;
+    `usable` (M,): True for the channels used; `misfit`: root mean square of predicted - measured voltages in standard
+    deviations (NaN for refused frames and linear images, for which no forward problem is solved); `iterations`: number
+    of iterations; `latency`: time from the frame to its image, seconds.
 
     **Example:**
 
@@ -254,24 +256,24 @@ class FrameImage(Module):
 
     @property
     def imaged(self) -> bool:
-        """Whether the frame was imaged."""
+        """Whether the frame was imaged, and not refused."""
         return self.conductivity is not None
 
 
 def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     """Yield the image of each frame as soon as the frame arrives.
 
-    Iterative methods start from the last image; an imager with a memory also uses it as prior mean. Everything is
-    compiled before the first frame is requested. A frame is refused, and the stream continues, if it has another number
-    of channels, is not real, has fewer than half of the channels usable, reads zero everywhere (the current source has
-    failed), or differs from an undisturbed frame by more than half of it. Channels of a dead electrode and saturated
-    channels are left out, which `reason` reports. A frame that differs from an undisturbed one by noise only is imaged
-    with status "unchanged".
+    Iterative methods start from the last image; an imager with a memory also uses the last image as prior mean.
+    Everything is compiled before the first frame is requested. A frame is refused, and the stream continues, if it has
+    another number of channels, is not real, has fewer than half of the channels usable, reads zero everywhere (the
+    current source has failed), or differs from an undisturbed frame by more than half of the undisturbed voltages.
+    Channels of a dead electrode and saturated channels are left out and named in `reason`. A frame that differs from an
+    undisturbed frame by noise only is imaged with status "unchanged".
 
     **Arguments:**
 
     - `imager`: the imager of the sensor.
-    - `frames`: frames (M,), in volts; NaN marks channels without a reading.
+    - `frames`: iterable of frames (M,) in volts; NaN marks channels without a reading.
 
     Raises `ValueError` if `imager` is not an `Imager`, if `frames` is not iterable, and for an array of frames whose
     shape is not (frames, channels).
@@ -298,8 +300,8 @@ def _image_frames(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
 
 
 class StreamState:
-    """State of a stream between frames, for programs that receive frames one by one; `stream` uses it. Everything is
-    compiled when it is created.
+    """State of a stream between frames, for programs that receive frames one by one; `stream` also uses this class.
+    Everything is compiled when a state is created.
 
     **Arguments:**
 
@@ -329,7 +331,7 @@ class StreamState:
         self.coefficients = np.asarray(imager.start)
 
     def image(self, number: int, frame: Any) -> FrameImage:
-        """Image of one frame, or the reason why it was refused."""
+        """Image of the frame with this `number`, or the reason why the frame was refused."""
         start_time = time.perf_counter()
         values, usable, status, reason = self.check(frame)
         if status == FrameStatus.REFUSED:
@@ -358,8 +360,8 @@ class StreamState:
         self.weighing = self.imager.weighing(jnp.asarray(usable))
         if self.imager.solver.is_linear:
             linear = self.imager.linear_map(self.weighing)
-            # Reading the matrix takes most of the time of a linear image. It multiplies differences, so single
-            # precision suffices; BLAS reads it in half the time in column-major order.
+            # Reading the matrix takes most of the time of a linear image. The matrix multiplies differences, so single
+            # precision suffices; BLAS reads the matrix in half the time in column-major order.
             self.matrix = np.asfortranarray(linear.matrix, np.float32)
             self.estimator = np.asarray(linear.estimator)
             self.expected_weights = self.estimator @ self.expected
@@ -367,7 +369,8 @@ class StreamState:
             self.level = np.asarray(linear.level) + np.asarray(linear.matrix) @ self.expected_weights
 
     def _estimate(self, frame):
-        """Conductivity, misfit, number of iterations, and whether the image converged."""
+        """Image a checked frame. Returns the conductivity, the misfit, the number of iterations, and whether the image
+        converged."""
         if self.imager.solver.is_linear:
             weights = self.estimator @ frame - self.expected_weights
             if self.imager.persistence > 0:

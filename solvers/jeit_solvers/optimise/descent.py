@@ -1,11 +1,12 @@
 """Minimisation by descent, without or with bounds, and the status with which a minimisation ends.
 
 `Descent` steps to the minima of local quadratic models, with a line search, behind the interface of optimistix. A
-Gauss-Newton or Levenberg-Marquardt step is the minimum of a quadratic model of the cost. The cheapest way to find it
-depends on the structure of the problem, which the caller knows and a general least-squares solver does not.
+Gauss-Newton or Levenberg-Marquardt step leads to the minimum of a quadratic model of the cost. The cheapest way to find
+this minimum depends on the structure of the problem, which the caller knows and a general least-squares solver does
+not.
 
-jaxopt, which is used for problems with bounds, is no longer developed. It is imported only in this module, so that it
-can be replaced in one place.
+jaxopt, which is used for problems with bounds, is no longer developed. The package is imported only in this module, so
+that it can be replaced in one place.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ from jeit_solvers.module import Module
 
 
 class Status(StrEnum):
-    """Status with which a minimisation ended. Each member equals its word, so `status == "converged"` works; details
-    such as the number of steps are reported in a separate sentence.
+    """Status with which a minimisation ended. Each member equals a word, so `status == "converged"` works; details such
+    as the number of steps are reported in a separate sentence.
 
     **Example:**
 
@@ -70,7 +71,7 @@ class Status(StrEnum):
 
 
 def ended(result: optx.RESULTS) -> Status:
-    """Status of an optimistix result. Works only outside `jax.jit`; see `ended_number`.
+    """Convert an optimistix result to a `Status`, outside `jax.jit` only; see `ended_number`.
 
     **Arguments:**
 
@@ -86,7 +87,7 @@ def ended(result: optx.RESULTS) -> Status:
 
 
 def ended_number(result: optx.RESULTS) -> Int[Array, ""]:
-    """`Status.number` of an optimistix result; works inside `jax.jit`, too.
+    """Convert an optimistix result to the number of a `Status`; works inside `jax.jit`, too.
 
     **Arguments:**
 
@@ -107,8 +108,8 @@ Objective = Callable[[Float[Array, " n"]], Float[Array, ""]]
 
 
 class BoundedMinimum(Module):
-    """Result of a minimisation with bounds. **Fields**: `x`: (n,) the minimum; `steps`: number of steps; `converged`:
-    whether a step along the projected gradient would change no coordinate by more than the tolerance.
+    """Result of a minimisation with bounds. **Fields**: `x`: (n,) position of the minimum; `steps`: number of steps;
+    `converged`: whether a step along the projected gradient would change no coordinate by more than the tolerance.
 
     **Example:**
 
@@ -140,13 +141,13 @@ def lbfgsb(
     max_steps: int,
     tolerance: float,
 ) -> BoundedMinimum:
-    """Minimise with bounds by L-BFGS-B, inside `jax.jit`.
+    """Minimise a function with bounds by L-BFGS-B, inside `jax.jit`.
 
     **Arguments:**
 
-    - `objective`: function of (n,) that returns a number; coordinates should be of similar magnitude.
-    - `start` (n,): point to start from.
-    - `lower`, `upper` (n,): bounds.
+    - `objective`: function of an array (n,) that returns a number; coordinates should be of similar magnitude.
+    - `start` (n,): starting point.
+    - `lower`, `upper` (n,): bounds of the coordinates.
     - `max_steps`: maximum number of steps.
     - `tolerance`: maximum change of a coordinate in a step along the projected gradient at convergence.
 
@@ -170,7 +171,7 @@ def projected_gradient(
     max_steps: int,
     tolerance: float,
 ) -> BoundedMinimum:
-    """Minimise with bounds by accelerated projected gradients, with more but cheaper steps than `lbfgsb`.
+    """Minimise a function with bounds by accelerated projected gradients, with more but cheaper steps than `lbfgsb`.
 
     **Arguments:**
 
@@ -200,18 +201,20 @@ def scipy_lbfgsb(
     max_steps: int = 500,
     callback: Callable[[Array], None] | None = None,
 ) -> tuple[Float[np.ndarray, "*shape"], float, Status]:
-    """Minimise with bounds by SciPy's L-BFGS-B; returns the minimum, the value there, and the status.
+    """Minimise a function with bounds by SciPy's L-BFGS-B; returns the position of the minimum, the value at the
+    minimum, and the status.
 
     Byrd, Lu, Nocedal and Zhu, SIAM J. Sci. Comput. 16 (1995) 1190-1208.
 
     **Arguments:**
 
-    - `value_and_gradient`: function of an array of the shape of `start` that returns both, compiled by the caller.
-    - `start`: point to start from.
+    - `value_and_gradient`: function of an array of the shape of `start` that returns value and gradient, compiled by
+      the caller.
+    - `start`: starting point.
     - `lower`, `upper`: bounds, which broadcast to the shape of `start`.
     - `tolerance`: given to SciPy as `ftol` and `gtol`.
     - `max_steps`: maximum number of steps.
-    - `callback`: called with every accepted point.
+    - `callback`: function called with every accepted point.
 
     **Example:**
 
@@ -240,7 +243,8 @@ def scipy_lbfgsb(
     return result.x.reshape(shape), float(result.fun), status
 
 
-# Minimum scale of a shortened step, and fraction of the predicted decrease that an accepted step must achieve.
+# Minimum scale of a shortened step, and fraction of the predicted decrease of the cost that an accepted step must
+# achieve.
 _MIN_SCALE = 2.0**-20
 _SUFFICIENT_DECREASE = 1e-4
 # Rounding error of a cost, which is a sum of many squares, in units of its machine precision.
@@ -265,13 +269,14 @@ class DescentState(Module):
 
 
 class Descent(optx.AbstractLeastSquaresSolver):
-    """Gauss-Newton with a backtracking line search, or Levenberg-Marquardt, on quadratic models that the caller
-    provides.
+    """Gauss-Newton method with a backtracking line search, or Levenberg-Marquardt method, on quadratic models that the
+    caller provides.
 
-    For `optimistix.least_squares(residual, Descent(), c, arguments, options={"expand": expand})`, where `expand(c,
-    arguments)` returns the cost at c and a function `step(damping)`. This function returns the direction to the minimum
-    of the model at c, and the slope and curvature of the model along it: cost(c + s·direction) ≈ cost + s·slope +
-    s²·curvature / 2. The penalty of the model is weighted with 1 + `damping`, see `ridge_step`.
+    The solver is used in `optimistix.least_squares(residual, Descent(), c, arguments, options={"expand": expand})`,
+    where `expand(c, arguments)` returns the cost at c and a function `step(damping)`. This function returns the
+    direction to the minimum of the model at c, and the slope and curvature of the model along the direction: cost(c +
+    s·direction) ≈ cost + s·slope + s²·curvature / 2. The penalty of the model is weighted with 1 + `damping`, see
+    `ridge_step`.
 
     **Arguments:**
 
@@ -295,7 +300,8 @@ class Descent(optx.AbstractLeastSquaresSolver):
     norm: Callable[..., Any] = optx.two_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """The initial state, whose first trial point is the start. Raises `ValueError` if the options lack `expand`."""
+        """Return the initial state, whose first trial point is the start. Raises `ValueError` if the options lack
+        `expand`."""
         if "expand" not in options:
             raise ValueError("Descent needs options={'expand': function}; see its documentation.")
         xp = namespace(y)
@@ -316,11 +322,13 @@ class Descent(optx.AbstractLeastSquaresSolver):
         )
 
     def step(self, fn, y, args, options, state, tags):
-        """Evaluate the trial point. If its cost is low enough, continue from it; otherwise try a shorter step."""
+        """Evaluate the trial point. If its cost is low enough, continue from the trial point; otherwise try a shorter
+        step."""
         xp = namespace(y)
         cost, step = options["expand"](state.trial, args)
         predicted_decrease = -(state.scale * state.slope + 0.5 * state.scale**2 * state.curvature)
-        # Close to the minimum steps change the cost by less than its rounding, and lead nearer all the same.
+        # Close to the minimum, steps change the cost by less than its rounding error, but still lead nearer to the
+        # minimum.
         rounding_error = _ROUNDING_FACTOR * np.finfo(y.dtype).eps * state.cost
         is_accepted = xp.isfinite(cost) & (
             cost <= state.cost + rounding_error - _SUFFICIENT_DECREASE * predicted_decrease
@@ -371,8 +379,8 @@ class Descent(optx.AbstractLeastSquaresSolver):
     def at_once(
         self, expand: Callable[..., Any], start: Float[np.ndarray, " n"], arguments: Any, max_steps: int
     ) -> tuple[Any, DescentState]:
-        """Take in NumPy the same steps that `optimistix.least_squares` takes in a compiled program. Returns the final
-        point and state."""
+        """Descend in NumPy with the same steps that `optimistix.least_squares` takes in a compiled program. Returns the
+        final point and state."""
         options, point = {"expand": expand}, start
         unused: Any = None  # further arguments from optimistix, which are not used
         state = self.init(unused, point, arguments, options, unused, unused, unused)

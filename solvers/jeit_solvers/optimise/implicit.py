@@ -1,12 +1,12 @@
-"""Derivatives of a minimum with respect to the problem, by the implicit function theorem, independent of the solver.
+"""Derivatives of a minimum with respect to the problem's data, by the implicit function theorem, for any solver.
 
 At a minimum x̂(p) of a cost with gradient g(x, p), the gradient stays zero when the problem p changes, so that
 
     H dx̂ = -∂g/∂p dp,   H = ∂g/∂x,
 
-with the full Hessian H, not its Gauss-Newton approximation. The system is solved by conjugate gradients, which need
-only products with H, preconditioned by a model of H such as the Gauss-Newton approximation. Krantz and Parks, The
-Implicit Function Theorem (2002); Blondel et al., NeurIPS 35 (2022) 5230-5242.
+with the full Hessian H, not its Gauss-Newton approximation. The linear system is solved by conjugate gradients, which
+need only products with H, preconditioned by an approximation of H such as the Gauss-Newton matrix. Krantz and Parks,
+The Implicit Function Theorem (2002); Blondel et al., NeurIPS 35 (2022) 5230-5242.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from jaxtyping import Array, Float
 
 from jeit_solvers.engines import undifferentiated
 
-# Relative tolerance of the linear system, and maximum number of conjugate-gradient steps; with a good model of the
-# Hessian about a dozen steps are taken.
+# Relative tolerance of the linear system, and maximum number of conjugate-gradient steps; with a good preconditioner
+# about a dozen steps are taken.
 _TOLERANCE, _MAX_STEPS = 1e-11, 500
-# Length below which a Newton step to the minimum is the last one, because the remaining error is of the order of its
-# square; measured as the square root of the decrease of the cost. And the maximum number of Newton steps.
+# Length, measured as the square root of the decrease of the cost, below which a Newton step to the minimum is the last
+# step, because the remaining error is of the order of its square. And the maximum number of Newton steps.
 _LAST_STEP_LENGTH, _MAX_NEWTON_STEPS = 1e-6, 8
 
 Gradient = Callable[[Float[Array, " n"], Any], Float[Array, " n"]]
@@ -36,22 +36,22 @@ Preconditioner = Callable[[Float[Array, " n"], Any], LinearMap]
 def as_minimum(
     point: Float[Array, " n"], problem: Any, gradient: Gradient, precondition: Preconditioner
 ) -> Float[Array, " n"]:
-    """Give a minimum that a solver has found the derivatives that it has with respect to the problem. Returns `point`
-    unchanged.
+    """Give a minimum found by a solver its derivatives with respect to the problem. Returns `point` with unchanged
+    values.
 
     The computation of `point` is not differentiated. Derivatives are evaluated at the minimum itself, found by a few
-    Newton steps from `point`, so they are as accurate as the gradient even if the solver stopped early; if the Newton
-    steps fail, they are evaluated at `point`. Differentiable any number of times, in forward and reverse mode, and
-    under `jax.vmap`.
+    Newton steps from `point`, so the derivatives are as accurate as the gradient even if the solver stopped early; if
+    the Newton steps fail, derivatives are evaluated at `point`. The result is differentiable any number of times, in
+    forward and reverse mode, and under `jax.vmap`.
 
     **Arguments:**
 
-    - `point` (n,): near the minimum.
+    - `point` (n,): point near the minimum, the result of a solver.
     - `problem`: a pytree, with respect to whose arrays the minimum is differentiated.
     - `gradient`: function of (x, problem) that returns the gradient (n,) of the cost, zero at the minimum; its
-      derivative with respect to x must be symmetric and positive definite there.
-    - `precondition`: function of (x, problem) that returns a function of a vector, which applies the inverse of a model
-      of this derivative.
+      derivative with respect to x, the Hessian, must be symmetric and positive definite at the minimum.
+    - `precondition`: function of (x, problem) that returns a function of a vector, which applies the inverse of an
+      approximation of the Hessian.
 
     **Example:**
 
@@ -76,7 +76,7 @@ def _minimum_jvp(primals, tangents):
     problem_tangent = tangents[1]
     if not jax.tree.leaves(problem_tangent):
         return point, jnp.zeros_like(point)
-    # Treated as constants: only the minimum is differentiated, not the steps that lead to it.
+    # Point and problem are constants here: only the minimum is differentiated, not the Newton steps that lead to it.
     start_point, constant_problem = undifferentiated((solver_point, problem))
     model = precondition(start_point, constant_problem)
     refined_point = point + jax.lax.stop_gradient(_refine(start_point, constant_problem, gradient, model) - start_point)
@@ -134,7 +134,7 @@ def _conjugate_gradients(
 def _refine(
     point: Float[Array, " n"], problem: Any, gradient: Gradient, preconditioner: LinearMap
 ) -> Float[Array, " n"]:
-    """Find the minimum by Newton's method, started at a nearby point. The iteration continues as long as the steps
+    """Find the minimum by Newton's method, started at a nearby `point`. The iteration continues as long as the steps
     become shorter in the norm of the Hessian."""
 
     def step(state):

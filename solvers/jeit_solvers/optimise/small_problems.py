@@ -24,17 +24,17 @@ from jeit_solvers.module import Module
 Expansion = Callable[[Array, Any], tuple[Array, Array, Array]]
 
 _MAX_DAMPING = 1e12
-# Minimum number of functions for which gathering is worthwhile.
+# Minimum number of functions for which gathering the unfinished functions saves time.
 _MIN_GATHERED = 32
 # Number of steps that the whole batch takes before the unfinished functions are gathered.
 _WHOLE_BATCH_STEPS = 8
-# Distance between points for finite differences of slopes in a Hessian.
+# Distance between points for the finite differences of slopes that give a Hessian.
 _DIFFERENCE_STEP = 1e-6
 
 
 class Minimum(Module):
-    """Result of the batch. **Fields**: `x`: (n, F) minima; `value`: (F,); `converged`: (F,); `steps`: maximum number of
-    steps of any function.
+    """Minima of a batch of F functions. **Fields**: `x`: (n, F) positions of the minima; `value`: (F,) values at the
+    minima; `converged`: (F,) whether each minimisation converged; `steps`: largest number of steps of a function.
 
     **Example:**
 
@@ -59,7 +59,7 @@ def solve_small(matrix: Float[Array, "n n F"], right_hand_sides: Float[Array, "n
     **Arguments:**
 
     - `matrix` (n, n, F): the matrices.
-    - `right_hand_sides` (n, F): one for each matrix.
+    - `right_hand_sides` (n, F): one vector for each matrix.
 
     **Example:**
 
@@ -84,7 +84,7 @@ def gradient_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> F
 
     **Arguments:**
 
-    - `value`: function that maps (n, F) to (F,), analytic.
+    - `value`: analytic function that maps an array (n, F) to the values (F,).
     - `x` (n, F): the points.
 
     **Example:**
@@ -99,8 +99,8 @@ def gradient_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> F
 
 
 def hessian_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Float[Array, "n n F"]:
-    """Hessians (n, n, F) at x of F functions, one per column. NumPy uses central differences of complex steps, which
-    are accurate to about eight digits.
+    """Hessians (n, n, F) at x of F functions, one per column. In NumPy they are computed by central differences of
+    complex-step derivatives, accurate to about eight digits.
 
     **Arguments:**
 
@@ -172,7 +172,7 @@ def symmetric_small(rows: Sequence[Sequence[Array]]) -> Float[Array, "n n F"]:
 
 
 def inverse_small(matrix: Float[Array, "n n F"]) -> Float[Array, "n n F"]:
-    """The inverses of F symmetric positive definite matrices.
+    """Inverses (n, n, F) of F symmetric positive definite matrices.
 
     **Arguments:**
 
@@ -190,7 +190,7 @@ def inverse_small(matrix: Float[Array, "n n F"]) -> Float[Array, "n n F"]:
 
 
 class _State(Module):
-    """State of each function in a batch."""
+    """State of the minimisation of each function in a batch."""
 
     x: Array
     value: Array
@@ -203,7 +203,7 @@ class _State(Module):
 
 
 class _Limits(NamedTuple):
-    """Bounds of the unknowns, and limits of the steps."""
+    """Bounds of the unknowns, maximum size and number of steps, and tolerance."""
 
     lower: Array
     upper: Array
@@ -227,21 +227,21 @@ def minimise_small(
 ) -> Minimum:
     """Minimise F functions of n unknowns with bounds by projected, damped Newton steps (Bertsekas 1982).
 
-    An unknown at a bound is held there if its gradient points outwards; the others take a step. Damping is that of
-    Levenberg and Marquardt, scaled by the diagonal. Functions that are not finite at their start stay there, not
-    converged, with an infinite value; the same holds for functions marked in `skip`.
+    An unknown at a bound is held there if the function decreases outwards; all other unknowns take a step. Steps are
+    damped as in the Levenberg-Marquardt method, scaled by the Hessian's diagonal. Functions that are not finite at
+    their start stay there, not converged, with an infinite value; the same holds for functions marked in `skip`.
 
-    All functions take eight steps together. The unfinished ones, usually few, are then gathered and continue. In a
+    All functions take eight steps together. The unfinished functions, usually few, are then gathered and continue. In a
     compiled program, whose arrays have fixed sizes, a quarter of the batch is gathered at a time.
 
     **Arguments:**
 
     - `expand`: function of (x, data) that returns values (F,), gradients (n, F) and positive definite Hessians (n, n,
-      F), or approximations of these.
-    - `start` (n, F): points to start from.
+      F), or approximations of the Hessians.
+    - `start` (n, F): starting points.
     - `data`: arrays whose last axis is F.
-    - `finish`: expansion of the gathered functions, for example a costlier one with the exact Hessian; by default
-      `expand`.
+    - `finish`: function used in place of `expand` for the gathered functions, for example with the exact, costlier
+      Hessian; by default `expand`.
     - `lower`, `upper` (n, 1): bounds.
     - `largest_step` (n, 1): maximum step of each unknown.
     - `max_steps`: maximum number of steps.
@@ -293,8 +293,8 @@ def minimise_small(
 
 
 def _first_true_indices(flags: Bool[Array, " F"], max_count: int) -> Int[Array, " i"]:
-    """Indices of the first true entries: in NumPy at most `max_count` of them; in JAX exactly `max_count`, where
-    missing ones are F, the number of flags."""
+    """Indices of the first true entries of `flags`: in NumPy at most `max_count` indices; in JAX exactly `max_count`,
+    filled up with F, the number of flags."""
     if isinstance(flags, np.ndarray):
         return host.flatnonzero(flags)[:max_count]
     return jnp.nonzero(flags, size=max_count, fill_value=flags.size)[0]
@@ -315,7 +315,7 @@ def _next_step(state: _State, limits: _Limits) -> tuple[Array, Array]:
 
 
 def _take_steps(state: _State, data, steps: int, expand: Expansion, limits: _Limits) -> _State:
-    """Take up to `steps` steps of all functions, fewer if all are done."""
+    """Take up to `steps` steps of the minimisation of all functions, fewer if all functions are done."""
     xp = namespace(state, data)
 
     def body(loop):
@@ -325,7 +325,8 @@ def _take_steps(state: _State, data, steps: int, expand: Expansion, limits: _Lim
         trial, predicted_decrease = _next_step(state, limits)
         value, gradient, matrix = expand(trial, data)
         is_lower = (value <= state.value) & ~state.is_done
-        # A step that is cut off at a bound may lead uphill; then a more damped one, closer to the gradient, is tried.
+        # A step that is cut off at a bound may lead uphill; then a more damped step, closer to the negative gradient,
+        # is tried.
         is_settled = (
             (predicted_decrease >= 0) & (predicted_decrease <= limits.tolerance * (1 + xp.abs(state.value))) & ~is_start
         )

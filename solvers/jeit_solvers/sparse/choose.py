@@ -1,4 +1,4 @@
-"""Solvers of sparse systems for lineax, direct and iterative, and the choice between them."""
+"""Direct and iterative solvers of sparse systems for lineax, and the choice of a solver."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from jeit_solvers.sparse.padded_fronts_jax import Factor, factorise, solve
 from jeit_solvers.sparse.pattern import SparsityPattern
 
 # Maximum number of floating-point operations of a factorisation that is compiled, on a CPU and on an accelerator. On a
-# CPU, compiling a longer one takes more time than it saves; on an accelerator, its padded index maps must fit in
-# memory.
+# CPU, compiling a longer factorisation takes more time than it saves; on an accelerator, the padded index maps must fit
+# in memory.
 _MAX_COMPILED_OPERATIONS_CPU, _MAX_COMPILED_OPERATIONS = 5e7, 2e10
 # Floating-point operations of a factorisation per second; time in seconds and memory in bytes that multigrid takes for
 # 32 right-hand sides, per entry of the matrix. Measured on two cores with solids of 50,000 to 1,000,000 nodes.
 _OPERATIONS_PER_SECOND = 4e10
 _MULTIGRID_SECONDS, _MULTIGRID_BYTES = 5e-6, 400.0
-# A factorisation is chosen if it takes no longer than this factor times multigrid, which is less accurate.
+# A factorisation is chosen if it takes no longer than this factor times the time of multigrid, which is less accurate.
 _DIRECT_TIME_FACTOR = 1.5
 
 
 class ConjugateGradient(MatrixSolver):
-    """Conjugate gradients, preconditioned with the diagonal, for `SparseSymmetric` operators.
+    """Conjugate gradient solver, preconditioned with the diagonal of the matrix, for `SparseSymmetric` operators.
 
-    Iteration stops when |M^-1 (b - A x)| <= tolerance |M^-1 b|, where M is the diagonal. The criterion is scaled by M
-    because the right-hand side may be dominated by rows with large entries, such as those of good contacts, and a
-    residual that is small relative to these may be large elsewhere. The result is `RESULTS.max_steps_reached` after the
-    last step, and `RESULTS.breakdown` for a direction p with p^T A p <= 0, which does not exist for a positive definite
-    matrix. Complex symmetric systems are solved by the conjugate orthogonal variant, with p^T in place of p^* (van der
-    Vorst and Melissen, IEEE Trans. Magn. 26, 1990).
+    Iteration stops when |M^-1 (b - A x)| <= tolerance |M^-1 b|, where M is the diagonal of A. The criterion is scaled
+    by M because rows with large entries, such as those of good contacts, may dominate the right-hand side b, and a
+    residual that is small relative to these rows may be large elsewhere. The result is `RESULTS.max_steps_reached`
+    after `max_steps` steps, and `RESULTS.breakdown` for a direction p with p^T A p <= 0, which does not exist for a
+    positive definite matrix. Complex symmetric systems are solved by the conjugate orthogonal variant, with p^T in
+    place of p^* (van der Vorst and Melissen, IEEE Trans. Magn. 26, 1990).
 
     **Arguments:**
 
-    - `tolerance`: of the residual, see above.
+    - `tolerance`: tolerance of the scaled residual.
     - `max_steps`: maximum number of steps, by default ten per unknown, at most 10,000.
     - `reason`: why this solver is used, in words.
 
@@ -85,8 +85,9 @@ class ConjugateGradient(MatrixSolver):
 
 
 class Iterate(NamedTuple):
-    """State of conjugate gradients. **Fields**: `solution`: x; `residual`: r = b - A x; `direction`: search direction
-    p; `weight`: r^T M^-1 r; `step`: number of steps; `converged`, `broken_down`: why the iteration ends."""
+    """State of a conjugate gradient iteration for A x = b. **Fields**: `solution`: x; `residual`: r = b - A x;
+    `direction`: search direction p; `weight`: r^T M^-1 r with the preconditioner M; `step`: number of steps;
+    `converged`, `broken_down`: why the iteration ends."""
 
     solution: Inexact[Array, " n"]
     residual: Inexact[Array, " n"]
@@ -100,7 +101,7 @@ class Iterate(NamedTuple):
 def conjugate_gradient(
     operator: SparseSymmetric, vector: Inexact[Array, " n"], tolerance: float, max_steps: int
 ) -> Iterate:
-    """The last iterate of conjugate gradients that start at x = 0, preconditioned with the diagonal M of the matrix."""
+    """Last iterate of conjugate gradients, started at x = 0 and preconditioned with the diagonal M of the matrix."""
     inverse_diagonal = 1 / operator.pattern.diagonal(operator.values)
     direction = inverse_diagonal * vector
     target = tolerance * jnp.linalg.norm(direction)
@@ -138,10 +139,11 @@ def conjugate_gradient(
 
 
 class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
-    """Direct solver for `SparseSymmetric` operators, with the plan that `analyse` makes for their pattern.
+    """Direct solver for `SparseSymmetric` operators, with the plan that `analyse` makes for the operators' pattern.
 
-    `init` factorises the matrix and `compute` solves. The same factor serves the adjoint, so `lineax.linear_solve` is
-    differentiated without another factorisation. A matrix that is not positive definite gives `RESULTS.singular`.
+    `init` factorises the matrix and `compute` solves. The same factor serves the adjoint system, so
+    `lineax.linear_solve` is differentiated without another factorisation. A matrix that is not positive definite gives
+    `RESULTS.singular`.
 
     **Arguments:**
 
@@ -159,7 +161,7 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
     reason: str = eqx.field(static=True, default="chosen by the user")
 
     def init(self, operator: lineax.AbstractLinearOperator, options: dict[str, Any]) -> Factor:
-        """Factorise the operator's matrix. Raises `ValueError` if its pattern is not that of the plan."""
+        """Factorise the operator's matrix. Raises `ValueError` if the matrix has another pattern than the plan."""
         del options
         operator = require_sparse_symmetric(operator, "SparseCholesky")
         if (operator.pattern.size, operator.pattern.num_entries) != (self.plan.size, self.plan.num_entries):
@@ -171,7 +173,7 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
         return factorise(self.plan, operator.values)
 
     def solve_columns(self, state: Factor, columns: Inexact[Array, "n k"]) -> Inexact[Array, "n k"]:
-        """Solutions for several right-hand sides."""
+        """Solutions (n, k) for k right-hand sides `columns`."""
         return solve(self.plan, state, columns)
 
     def compute(
@@ -182,11 +184,11 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
         return solve(self.plan, state, vector), lineax.RESULTS.successful, {}
 
     def transpose(self, state: Factor, options: dict[str, Any]) -> tuple[Factor, dict[str, Any]]:
-        """The matrix is its own transpose."""
+        """Return the factor, because the matrix equals its transpose."""
         return state, options
 
     def conj(self, state: Factor, options: dict[str, Any]) -> tuple[Factor, dict[str, Any]]:
-        """The conjugate matrix has the conjugate factor."""
+        """Return the conjugate factor, which is the factor of the conjugate matrix."""
         return jax.tree.map(lambda block: block.conj(), state), options
 
     def assume_full_rank(self) -> bool:
@@ -195,8 +197,8 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
 
 
 class FrontalCholesky(MatrixSolver):
-    """Direct solver for large real or complex `SparseSymmetric` operators, with fronts of their own size, found by
-    `find_fronts`. It runs in NumPy: compiled programs call it, which keeps their compilation short.
+    """Direct solver for large real or complex `SparseSymmetric` operators, with exact (not padded) fronts from
+    `find_fronts`. The solver runs in NumPy. Compiled programs call NumPy, which keeps their compilation short.
 
     A matrix that is not positive definite gives `RESULTS.singular`.
 
@@ -216,8 +218,8 @@ class FrontalCholesky(MatrixSolver):
     reason: str = eqx.field(static=True, default="chosen by the user")
 
     def init(self, operator: lineax.AbstractLinearOperator, options: dict[str, Any]) -> SparseSymmetric:
-        """Return the matrix itself, which is factorised when it is needed. Raises `ValueError` if its pattern is not
-        that of the fronts."""
+        """Return the matrix itself, which is factorised when a solution is needed. Raises `ValueError` if the matrix
+        has another pattern than the fronts."""
         del options
         operator = require_sparse_symmetric(operator, "FrontalCholesky")
         if (operator.pattern.size, operator.pattern.num_entries) != (self.fronts.size, self.fronts.num_entries):
@@ -229,13 +231,14 @@ class FrontalCholesky(MatrixSolver):
         return operator
 
     def solve_columns(self, state: SparseSymmetric, columns: Inexact[Array, "n k"]) -> Inexact[Array, "n k"]:
-        """Solutions for several right-hand sides."""
+        """Solutions (n, k) for k right-hand sides `columns`."""
         return solve_at_once(self.fronts, state.values, columns)
 
     def compute(
         self, state: SparseSymmetric, vector: Inexact[Array, " n"], options: dict[str, Any]
     ) -> tuple[Inexact[Array, " n"], lineax.RESULTS, dict[str, Any]]:
-        """Solve. A failed factorisation yields NaN, which `lineax.linear_solve` reports as singular."""
+        """Solve for one right-hand side. A failed factorisation yields NaN, which `lineax.linear_solve` reports as
+        singular."""
         del options
         return self.solve_columns(state, vector[:, None])[:, 0], lineax.RESULTS.successful, {}
 
@@ -254,17 +257,19 @@ def choose_solver(
     memory_limit: float | None = None,
     tolerance: float = 1e-10,
 ) -> ColumnSolver | ConjugateGradient:
-    """Choose a direct solver if its factor fits in memory and multigrid is not much faster; `solver.reason` states why.
+    """Choose a solver for sparse systems: a direct solver if its factor fits in memory and multigrid is not much
+    faster; `solver.reason` states why.
 
-    Small matrices are factorised by compiled programs, large ones by NumPy, which compiled programs call: compilation
-    of a factorisation takes seconds. On accelerators all matrices are factorised there that the memory admits. Without
-    PyAMG (the extra `large`), conjugate gradients take the place of multigrid where a factor does not fit.
+    Small matrices are factorised by compiled programs. Large matrices are factorised by NumPy, which compiled programs
+    call, because compilation of a factorisation takes seconds. On accelerators all matrices that fit in memory are
+    factorised by compiled programs. Without PyAMG (the extra `large`), conjugate gradients replace multigrid where a
+    factor does not fit in memory.
 
     **Arguments:**
 
     - `pattern`: sparsity pattern of the matrices.
-    - `coordinates` (n, d): of the unknowns, as for `analyse`.
-    - `memory_limit`: maximum memory of a factorisation in bytes; default: half of that of the machine.
+    - `coordinates` (n, d): coordinates of the unknowns, as for `analyse`.
+    - `memory_limit`: maximum memory of a factorisation in bytes; default: half of the machine's memory.
     - `tolerance`: tolerance of iterative solvers.
 
     **Example:**

@@ -1,13 +1,13 @@
 """Nested dissection: an elimination order with little fill, computed in NumPy and SciPy once per sparsity pattern.
 
-The graph is halved recursively. Each halving removes a *separator*, a set of nodes without which no edge connects the
-two halves. Eliminating halves before separators keeps fill low: O(n log n) entries and O(n^1.5) operations for a planar
-mesh (George, SIAM J. Numer. Anal. 10, 1973).
+The graph of the matrix is halved recursively. Each halving removes a *separator*, a set of nodes without which no edge
+connects the two halves. Eliminating halves before separators keeps fill low: O(n log n) entries and O(n^1.5) operations
+for a planar mesh (George, SIAM J. Numer. Anal. 10, 1973).
 
 If coordinates of the nodes are given, a part is halved by a straight line (in three dimensions by a plane). Otherwise
-its halves are the nodes that are nearer, in graph distance, to one or to the other of two nodes that lie far apart. The
-smallest possible separator is found by a maximum matching of the edges between the halves (König's theorem; Pothen and
-Fan, ACM Trans. Math. Softw. 16, 1990).
+the halves of a part are the nodes nearer, in graph distance, to either of two nodes that lie far apart. The smallest
+possible separator is found by a maximum matching of the edges between the halves (König's theorem; Pothen and Fan, ACM
+Trans. Math. Softw. 16, 1990).
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_bipartite_matching
 
-# Coordinates are rounded to this number of decimals of their extent, so that the order does not depend on rounding
-# errors.
+# Coordinates are rounded to this number of decimals of their extent, so that the elimination order does not depend on
+# rounding errors.
 _COORDINATE_DECIMALS = 7
 
 
 def nested_dissection(graph: csr_array, depth: int, coordinates: np.ndarray | None = None) -> np.ndarray:
     """Split a symmetric graph (n, n) without diagonal into a complete binary tree of `depth` levels of separators.
 
-    Returns for each node of the graph the tree node that it belongs to (n,): the root is 0, the children of t are 2 t +
-    1 and 2 t + 2; leaves hold the nodes that belong to no separator. With `coordinates` (n, d) of the nodes, each
-    separator lies along a straight line or plane; without, separators are found from graph distances.
+    Returns the tree node (n,) to which each node of the graph belongs: the root is 0, the children of t are 2 t + 1 and
+    2 t + 2; leaves hold the nodes that belong to no separator. With `coordinates` (n, d) of the nodes, each separator
+    lies along a straight line or plane; without `coordinates`, separators are found from graph distances.
     """
     size = _num_nodes(graph)
     owner, halving = np.zeros(size, dtype=np.int64), np.arange(size)
@@ -47,7 +47,7 @@ def nested_dissection(graph: csr_array, depth: int, coordinates: np.ndarray | No
 
 
 def _edges_within_parts(part: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The edges that connect two nodes of the same part."""
+    """Edges, as `rows` and `columns`, that connect two nodes of the same part of a graph."""
     is_inside = (part[rows] == part[columns]) & (part[rows] >= 0)
     return rows[is_inside], columns[is_inside]
 
@@ -58,13 +58,13 @@ def _halve_parts(
     """Halve every part of a graph. Returns for every node (n,) 0 or 1 for the halves, 2 for the separator between them.
 
     `part`: (n,) index of the part of each node, -1 for none; `num_parts`: number of parts; `rows`, `columns`: edges
-    within parts. Several separators are tried for each part; the best one minimises its size plus a penalty for
-    imbalance.
+    within parts. Several separators are tried for each part; the best separator minimises its number of nodes plus a
+    penalty for imbalance of the halves.
     """
     nodes = np.flatnonzero(part >= 0)
     node_parts = part[nodes]
     counts = np.bincount(node_parts, minlength=num_parts)
-    # Fronts are padded to the largest one of their stage. The smaller the part, the more an even split is worth, and
+    # Fronts are padded to the largest front of their stage. The smaller the part, the more an even split is worth, and
     # the less an additional node in the separator costs.
     is_small = counts < 400
     price_of_imbalance = np.where(is_small, 0.5, 0.1)
@@ -92,7 +92,8 @@ def _halve_parts(
 def _splitting_functions(
     graph: csr_array, nodes: np.ndarray, part: np.ndarray, num_parts: int, coordinates
 ) -> list[np.ndarray]:
-    """Functions on `nodes` (k,): each part is split at a value of such a function, into nodes below and above it."""
+    """Functions on `nodes` (k,), by which parts can be split: each part is split into the nodes at which a function is
+    below or above a value."""
     if coordinates is not None:
         return _projected_coordinates(coordinates[nodes], part, num_parts)
     order = np.argsort(part, kind="stable")
@@ -104,8 +105,8 @@ def _splitting_functions(
 
 
 def _projected_coordinates(coordinates: np.ndarray, part: np.ndarray, num_parts: int) -> list[np.ndarray]:
-    """Coordinates along the long axis of each part and along two directions on either side of it, because nearly square
-    parts have no clear long axis."""
+    """Coordinates of the nodes along the long axis of their part, and along two directions on either side of this axis,
+    because nearly square parts have no clear long axis."""
     dimension = coordinates.shape[1]
 
     def sums(values):
@@ -123,7 +124,7 @@ def _projected_coordinates(coordinates: np.ndarray, part: np.ndarray, num_parts:
 
 
 def _distance_function(graph: csr_array) -> np.ndarray:
-    """Function on the nodes of one part of a graph, computed from graph distances, at a value of which the part is
+    """Function on the nodes of one part of a graph, computed from graph distances, by whose values the part is
     split."""
     size = _num_nodes(graph)
     if size == 1:
@@ -144,7 +145,7 @@ def _distance_function(graph: csr_array) -> np.ndarray:
 
 
 def _distance_difference(graph: csr_array) -> np.ndarray:
-    """Difference of the graph distances to two nodes that lie far apart. The nodes where it has a given value lie
+    """Difference of each node's graph distances to two nodes that lie far apart. Nodes with equal differences lie
     nearly on a straight line."""
     start = breadth_first_order(graph, 0, directed=False, return_predecessors=False)[-1]
     from_start = _graph_distances(graph, start)
@@ -173,8 +174,8 @@ def _graph_distances(graph: csr_array, start: int) -> np.ndarray:
 
 
 def _minimum_vertex_cover(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Smallest set of nodes that contains an end of every edge (lower[i], upper[i]). By König's theorem it has as many
-    nodes as a maximum matching has edges."""
+    """Smallest set of nodes that contains an end of every edge (lower[i], upper[i]). By König's theorem this set has as
+    many nodes as a maximum matching has edges."""
     if lower.size == 0:
         return np.empty(0, dtype=np.int64)
     left_nodes, left_local = np.unique(lower, return_inverse=True)

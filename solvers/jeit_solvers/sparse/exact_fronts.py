@@ -1,4 +1,4 @@
-"""Order of elimination with exact fronts, each of its own size; matrices are factorised in it by NumPy
+"""Order of elimination with exact (not padded) fronts. NumPy factorises matrices in this order
 (`exact_fronts_numpy.py`).
 
 A *front* is a small dense matrix: its *pivots* are rows that are eliminated together, and its *border* consists of the
@@ -22,8 +22,8 @@ from jeit_solvers.sparse.dissection import nested_dissection
 from jeit_solvers.sparse.padded_fronts import checked_coordinates, graph_of
 from jeit_solvers.sparse.pattern import SparsityPattern
 
-# Size of the fronts at the leaves of the tree: small enough to be treated as dense, and large enough for the time of
-# BLAS to exceed that of calling it.
+# Size of the fronts at the leaves of the elimination tree: small enough to be treated as dense, and large enough for
+# the time in BLAS to exceed that of calling BLAS.
 _LEAF_SIZE = 128
 # Number of levels of the elimination tree above the subtrees that are eliminated in parallel.
 _LEVELS_ABOVE_SUBTREES = 3
@@ -33,12 +33,12 @@ _CURVE_BITS = 10
 
 class Front(NamedTuple):
     """Dense matrix of one elimination step. **Fields**: `pivots`: number p of its pivots; `border`: number b of its
-    border rows; `first`: number of the first pivot; `rows`: (b,) numbers of the rows of the border, ascending;
-    `entries`: range of the matrix entries of its pivots; `panel_indices`: indices of these entries in the flattened
-    panel (p, p + b), the rows of the pivots; `children`: numbers of the fronts that have this front as their parent;
-    `rows_in_parent`: (b,) indices of the border rows among the rows of the parent, whose pivots come first;
-    `num_parent_pivots`: number of border rows that are pivots of the parent; `num_subtree_rows`: number of border rows
-    that are eliminated within the front's independent subtree."""
+    border rows; `first`: number of the first pivot; `rows`: (b,) numbers of the border rows, ascending; `entries`:
+    range of the matrix entries in the rows of its pivots; `panel_indices`: indices of these entries in the flattened
+    panel (p, p + b), which holds the rows of the pivots; `children`: numbers of the fronts that have this front as
+    their parent; `rows_in_parent`: (b,) indices of the border rows among the rows of the parent, in which the pivots
+    come first; `num_parent_pivots`: number of border rows that are pivots of the parent; `num_subtree_rows`: number of
+    border rows that are eliminated within the front's independent subtree."""
 
     pivots: int
     border: int
@@ -55,13 +55,13 @@ class Front(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class Fronts:
     """Fronts of a sparsity pattern, in the order of their elimination. Two objects are equal if their patterns and
-    orders are.
+    orders are equal.
 
     **Fields**: `size`, `num_entries`: rows and entries of the pattern; `order`: (n,) matrix rows in the order of
     elimination; `entry_order`: (nnz,) entries of the matrix in the order of the fronts that hold them; `fronts`: all
-    fronts; `steps`: for each step the slices of fronts that can be eliminated in parallel, first the subtrees and then
-    the fronts of each level above them; `top`: number of the first row that a front above the subtrees eliminates;
-    `key`: digest of the pattern and the order, by which objects are compared.
+    fronts; `steps`: for each step of the elimination the slices of fronts that can be eliminated in parallel: first the
+    subtrees, then the fronts of each level above the subtrees; `top`: number of the first row that a front above the
+    subtrees eliminates; `key`: digest of the pattern and the order, by which objects are compared.
 
     **Example:**
 
@@ -96,7 +96,7 @@ class Fronts:
 
     @property
     def num_factor_entries(self) -> int:
-        """Number of entries of the factor as it is stored."""
+        """Number of stored entries of the factor."""
         return sum(front.pivots * (front.pivots + front.border) for front in self.fronts)
 
     @property
@@ -121,7 +121,7 @@ def find_fronts(pattern: SparsityPattern, coordinates: Any = None) -> Fronts:
 
     - `pattern`, `coordinates`: as for `analyse`.
 
-    Raises `ValueError` if the shape of the coordinates does not fit or they are not finite.
+    Raises `ValueError` if the coordinates have another shape or are not finite.
 
     **Example:**
 
@@ -171,7 +171,8 @@ def _post_order_positions(nodes: np.ndarray, level: np.ndarray, depth: int) -> n
     """Positions of nodes of a complete binary tree in post-order: every node comes after all nodes below it."""
     position = np.full(len(nodes), 2 ** (depth + 1) - 2)
     for above in range(depth):
-        # The ancestor of a node just below level `above`: a left one comes before its whole right sibling.
+        # The ancestor of a node just below level `above`: a left ancestor comes before the whole subtree of its right
+        # sibling.
         height = level - above - 1
         is_left = (height >= 0) & ((((nodes + 1) >> np.maximum(height, 0)) & 1) == 0)
         position -= np.where(height >= 0, 1 + np.where(is_left, 2 ** (depth - above) - 1, 0), 0)
@@ -203,8 +204,8 @@ class _EliminationTree:
         self.entry_order = np.argsort(holder, kind="stable")
 
     def _find_borders(self, count: int) -> None:
-        """Find the rows of each front's border: the later rows of its entries, and the borders of its children without
-        its own pivots; and its parent, which eliminates the first of them."""
+        """Find the border rows of each front, i.e. the later rows of the front's entries and the borders of its
+        children without its own pivots; and the parent of each front, which eliminates the first of these rows."""
         size, front = self.size, self.front
         first, second = front[self.early], front[self.late]
         pending = np.unique((first * size + self.late)[first != second])
@@ -228,7 +229,7 @@ class _EliminationTree:
         return np.where(is_pivot, rows - self.first[fronts], self.pivots[fronts] + in_border)
 
     def fronts(self, top: int) -> tuple[Front, ...]:
-        """All fronts; `top`: number of the first row above the subtrees."""
+        """All fronts of the tree; `top`: number of the first row that a front above the subtrees eliminates."""
         holder = self.front[self.early]
         height = self.pivots + self.border
         panel_indices = (self.early - self.first[holder]) * height[holder] + self._local_indices(holder, self.late)

@@ -19,20 +19,20 @@ from jeit_solvers.engines import call_numpy, has_values, host
 from jeit_solvers.sparse.exact_fronts import Fronts
 from jeit_solvers.sparse.operator import LastMatrix
 
-# Number of operations from which fronts are distributed over the cores; a product with k vectors takes k operations for
-# each entry of the factor.
+# Minimum number of operations for which fronts are distributed over the cores; a product with k vectors takes k
+# operations for each entry of the factor.
 _MIN_PARALLEL_OPERATIONS = 5e9
-# Number of rows of a child's Schur complement that are added to its parent together. Each such block includes some
-# entries below the diagonal, which are not needed.
+# Number of rows of a child front's Schur complement that are added to the parent front together. Each such block
+# includes some entries below the diagonal, which are not needed.
 _ADDED_ROWS = 64
-# Maximum number of entries of a factor that is cached for the next call.
+# Maximum number of entries of a factor that `solve_at_once` caches for the next call.
 _MAX_CACHED_ENTRIES = 100_000_000
 
 
 class FrontalFactor(NamedTuple):
-    """A factorised matrix A = L Lᵀ. **Fields**: `fronts`: the fronts of its pattern; `panels`: for each front the rows
-    (p, p + b) of Lᵀ that belong to its pivots. `panels` is None if A (for a complex matrix, its real part) is not
-    positive definite; solutions are then NaN.
+    """A factorised sparse matrix A = L Lᵀ. **Fields**: `fronts`: the fronts of the sparsity pattern of A; `panels`: for
+    each front the rows (p, p + b) of Lᵀ that belong to its p pivots, with b border rows. `panels` is None if A (for a
+    complex matrix, its real part) is not positive definite; solutions are then NaN.
 
     **Example:**
 
@@ -51,7 +51,8 @@ class FrontalFactor(NamedTuple):
         return self.panels is not None
 
     def solve(self, right_hand_sides: Inexact[np.ndarray, "n k"]) -> Inexact[np.ndarray, "n k"]:
-        """Solution x of A x = b. Raises `ValueError` for another shape."""
+        """Solution x of A x = b for `right_hand_sides` b (n, k). Raises `ValueError` for right-hand sides of another
+        shape."""
         if self._splits_complex(right_hand_sides):
             return self.solve(np.real(right_hand_sides)) + 1j * self.solve(np.imag(right_hand_sides))
         vectors = self.half_solve(right_hand_sides)
@@ -67,13 +68,14 @@ class FrontalFactor(NamedTuple):
         return solution
 
     def quadratic_form(self, right_hand_sides: Inexact[np.ndarray, "n k"]) -> Inexact[np.ndarray, "k k"]:
-        """bᵀ A⁻¹ b (for complex values not conjugated), from `half_solve` alone."""
+        """Quadratic form bᵀ A⁻¹ b of `right_hand_sides` b (complex values are not conjugated), computed from
+        `half_solve` alone."""
         half = self.half_solve(right_hand_sides)
         return half.T @ half
 
     def half_solve(self, right_hand_sides: Inexact[np.ndarray, "n k"]) -> Inexact[np.ndarray, "n k"]:
-        """Y = L⁻¹ P b, rows in the order of elimination, so that Yᵀ Y = bᵀ A⁻¹ b. Raises `ValueError` for another
-        shape."""
+        """Half of a solve: Y = L⁻¹ P b for `right_hand_sides` b, with rows in the order of elimination P, so that Yᵀ Y
+        = bᵀ A⁻¹ b. Raises `ValueError` for right-hand sides of another shape."""
         shape, size = np.shape(right_hand_sides), self.fronts.size
         if len(shape) != 2 or shape[0] != size:
             raise ValueError(f"right-hand sides must have shape (n, k) with n = {size}; got {shape}.")
@@ -95,7 +97,7 @@ class FrontalFactor(NamedTuple):
         _for_each_slice(forward, subtrees, self._num_operations(vectors))
         for update in subtree_updates:
             later_rows += update
-        for level in levels:  # one after the other, for their borders overlap
+        for level in levels:  # levels run one after the other, because borders of their fronts overlap
             _for_each_slice(lambda front_slice: self._eliminate_forward(vectors, later_rows, front_slice), level, 0.0)
         return vectors
 
@@ -108,13 +110,14 @@ class FrontalFactor(NamedTuple):
         return float(vectors.shape[1] * self.fronts.num_factor_entries)
 
     def _eliminate_forward(self, vectors: np.ndarray, later: np.ndarray, front_slice: slice) -> None:
-        """Forward elimination for some fronts: replace the rows of their pivots by those of L⁻¹ P b, and subtract their
-        contributions from the rows of their borders. Border rows above the subtrees are in `later`."""
+        """Forward elimination for the fronts `front_slice`: replace the rows of `vectors` at the pivots by those of L⁻¹
+        P b, and subtract the contributions of the pivots from the rows of the borders. Border rows above the subtrees
+        are in `later`."""
         assert self.panels is not None
         top = self.fronts.top
         for front, panel in zip(self.fronts.fronts[front_slice], self.panels[front_slice], strict=True):
             pivot_rows = vectors[front.first : front.first + front.pivots]
-            if not pivot_rows.any():  # as in a part of the body without electrodes
+            if not pivot_rows.any():  # e.g. in a part of the body without electrodes
                 continue
             solve_triangle(panel, pivot_rows, transposed=False)
             if front.border:
@@ -123,8 +126,8 @@ class FrontalFactor(NamedTuple):
                 later[front.rows[num_inside:] - top] -= contributions[num_inside:]
 
     def _substitute_back(self, vectors: np.ndarray, front_slice: slice) -> None:
-        """Back substitution for some fronts: replace the rows of their pivots by those of the solution. Later rows of
-        the solution are already known."""
+        """Back substitution for the fronts `front_slice`: replace the rows of `vectors` at the pivots by those of the
+        solution. Later rows of the solution are already known."""
         assert self.panels is not None
         for front, panel in zip(
             reversed(self.fronts.fronts[front_slice]), reversed(self.panels[front_slice]), strict=True
@@ -141,7 +144,7 @@ def factorise_fronts(fronts: Fronts, values: Inexact[np.ndarray, " nnz"]) -> Fro
     **Arguments:**
 
     - `fronts`: from `find_fronts`.
-    - `values` (nnz,): of the matrix, in the order of the pattern that the fronts were made for.
+    - `values` (nnz,): entries of the matrix, in the order of the pattern for which the fronts were made.
 
     Raises `ValueError` for values of another shape.
 
@@ -177,8 +180,8 @@ def factorise_fronts(fronts: Fronts, values: Inexact[np.ndarray, " nnz"]) -> Fro
 def solve_at_once(
     fronts: Fronts, values: Inexact[Array, " nnz"], columns: Inexact[Array, "n k"]
 ) -> Inexact[Array, "n k"]:
-    """Solve for k right-hand sides (n, k), also inside `jax.jit`, where the compiled program calls NumPy. The last
-    factor is cached, because derivatives solve with the same matrix again."""
+    """Solve for k right-hand sides `columns` (n, k), also inside `jax.jit`, where the compiled program calls NumPy. The
+    last factor is cached, because derivatives solve with the same matrix again."""
     dtype = jnp.result_type(values, columns)
     if has_values(values, columns):
         return host.asarray(_solve_in_numpy(fronts, dtype, values, columns))
@@ -199,8 +202,8 @@ _LAST_FACTOR = LastMatrix()
 def _eliminate_front(
     fronts: Fronts, ordered_values: np.ndarray, panels: list[Any], schur_complements: list[Any], front_index: int
 ) -> bool:
-    """Assemble and eliminate one front, and store its panel and the Schur complement for its parent. Returns False if
-    the front is not positive definite."""
+    """Assemble and eliminate one front, and store the front's panel and its Schur complement, which is added to the
+    parent front. Returns False if the front is not positive definite."""
     front = fronts.fronts[front_index]
     num_pivots, num_border = front.pivots, front.border
     panel = np.zeros((num_pivots, num_pivots + num_border), ordered_values.dtype)
@@ -224,7 +227,7 @@ def _eliminate_front(
 
 
 def _add_rows(matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: np.ndarray) -> None:
-    """Add a block (r, c) to the given rows and columns of a matrix, both in ascending order."""
+    """Add a `block` (r, c) to the given rows (r,) and columns (c,) of a matrix, both in ascending order."""
     first, last = int(rows[0]), int(rows[-1]) + 1
     start, stop = int(columns[0]), int(columns[-1]) + 1
     if stop - start > len(columns):
@@ -239,7 +242,7 @@ def _add_rows(matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: 
 
 def _for_each_slice(function: Any, slices: tuple[slice, ...], operations: float) -> None:
     """Apply `function` to each slice of fronts, on several cores if there are enough operations. BLAS is limited to one
-    thread: its own threads are ten times slower when another program occupies a core."""
+    thread, because its own threads are ten times slower when another program occupies a core."""
     if operations > _MIN_PARALLEL_OPERATIONS and len(slices) > 1:
         on_cores(function, slices)
         return

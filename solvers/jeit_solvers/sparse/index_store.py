@@ -18,13 +18,13 @@ from jeit_solvers.engines import add_into, as_array, gather, gather_or_zero, has
 
 
 class Slot(NamedTuple):
-    """Position and shape of an index array in the store."""
+    """Position and shape of an index array in an `IndexStore`."""
 
     start: int
     shape: tuple[int, ...]
 
     def read(self, indices: Int[Array, " total"]) -> Int[Array, "..."]:
-        """The index array, read from the packed store."""
+        """Read the index array from the packed store `indices`."""
         stop = self.start + math.prod(self.shape)
         if has_values(indices):
             return np.asarray(indices)[self.start : stop].reshape(self.shape)  # pyright: ignore[reportReturnType]
@@ -32,14 +32,14 @@ class Slot(NamedTuple):
 
 
 class IndexStore:
-    """Collects index arrays while a plan is made."""
+    """Collects index arrays while a plan or pattern is made."""
 
     def __init__(self):
         self._arrays: list[np.ndarray] = []
         self._total = 0
 
     def add(self, array: np.ndarray) -> Slot:
-        """Store an integer array; returns the slot from which it is read later."""
+        """Store an integer array, and return the `Slot` from which the array is read later."""
         slot = Slot(self._total, tuple(array.shape))
         self._arrays.append(array.astype(np.int32).ravel())
         self._total += array.size
@@ -56,7 +56,7 @@ class IndexStore:
 
 
 class PaddedSum(NamedTuple):
-    """Sums of scattered contributions. Scattering is slow on a CPU, so most contributions are *gathered*.
+    """Plan for sums of scattered contributions. Scattering is slow on a CPU, so most contributions are *gathered*.
 
     `gather` (width, sums) holds the indices of the contributions to each sum, with an index out of range where a sum
     has fewer than `width`. `overflow_sum` and `overflow_source` hold pairs of a sum and a contribution beyond `width`,
@@ -93,7 +93,7 @@ class PaddedSum(NamedTuple):
     def apply(
         self, indices: Int[Array, " total"], contributions: Inexact[Array, "sources *k"]
     ) -> Inexact[Array, "sums *k"]:
-        """The sums of the given contributions."""
+        """Compute the sums of the given contributions."""
         shape = self.gather.shape[1], *contributions.shape[1:]
         total = namespace(contributions).zeros(shape, contributions.dtype)
         if isinstance(contributions, np.ndarray):
@@ -111,7 +111,7 @@ class PaddedSum(NamedTuple):
         self, indices: Any, contributions: Inexact[Array, "sources *k"], total: Any, start: int, stop: int
     ) -> None:
         """In NumPy, add the sums with indices from `start` up to, but not including, `stop` to `total` (sums, k) in
-        place. They are processed in chunks, so that temporary arrays stay in the cache."""
+        place. The sums are processed in chunks, so that temporary arrays stay in the cache."""
         chunk_size = max(1, _NUMPY_CHUNK // math.prod(contributions.shape[1:]))
         gathered: Any = self.gather.read(indices)
         for first in range(start, stop, chunk_size) if len(gathered) else ():
@@ -129,8 +129,9 @@ class PaddedSum(NamedTuple):
     def read_back(
         self, indices: Int[Array, " total"], sums: Inexact[Array, " sums"], into: Inexact[Array, " sources"]
     ) -> Inexact[Array, " sources"]:
-        """`into` with the entry of each contribution replaced by its sum (by one of its sums if it is added to
-        several). `into` must have one entry more than there are contributions; this last entry is overwritten."""
+        """Array `into` with the entry of each contribution replaced by the sum to which it is added (by one of the sums
+        if there are several). `into` must have one entry more than there are contributions; this last entry is
+        overwritten."""
         for layer in self.gather.read(indices):
             into = set_at(into, layer, sums)
         if self.overflow_sum.shape[0]:
@@ -139,15 +140,15 @@ class PaddedSum(NamedTuple):
         return into
 
 
-# Cost of a scattered contribution relative to a gathered one, measured on two Zen 4 cores.
+# Cost of a scattered contribution relative to a gathered contribution, measured on two Zen 4 cores.
 _SCATTER_COST = 4.0
 # Number of entries that NumPy gathers at a time.
 _NUMPY_CHUNK = 16384
 
 
 class IndexLayout:
-    """A static description that computes its hash only once, because JAX hashes and compares it at every call of a
-    jitted function."""
+    """A static description of index arrays that computes its hash only once, because JAX hashes and compares static
+    arguments at every call of a jitted function."""
 
     def __init__(self, *content: Any):
         self.content = content

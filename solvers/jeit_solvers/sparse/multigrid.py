@@ -1,10 +1,11 @@
 """Conjugate gradients for several right-hand sides at once, preconditioned by smoothed-aggregation multigrid, in NumPy.
 
-Time and memory grow in proportion to the number of unknowns: this is for systems that are too large to factorise. PyAMG
-makes the levels from the matrix alone (Vanek, Mandel and Brezina, Computing 56, 1996). A cycle works on several columns
-at once and in single precision, which halves its memory traffic; the gradients are in double precision. The smoother is
-a Chebyshev polynomial of the matrix scaled by the sums of the absolute values of its rows, which bound the spectrum
-without an estimate (Baker, Falgout, Kolev and Yang, SIAM J. Sci. Comput. 33, 2011).
+Time and memory grow in proportion to the number of unknowns, so multigrid suits systems that are too large to
+factorise. PyAMG makes the levels from the matrix alone (Vanek, Mandel and Brezina, Computing 56, 1996). A multigrid
+cycle works on several right-hand sides at once and in single precision, which halves the memory traffic; the conjugate
+gradients are computed in double precision. The smoother is a Chebyshev polynomial of the matrix, scaled by the sums of
+the absolute values of its rows, which bound the spectrum (Baker, Falgout, Kolev and Yang, SIAM J. Sci. Comput. 33,
+2011).
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from jeit_solvers.cores import number_of_cores, on_cores
 from jeit_solvers.sparse.operator import LastMatrix, NumpySolver, pattern_key
 from jeit_solvers.sparse.pattern import SparsityPattern
 
-# Maximum number of right-hand sides that are iterated together. More of them share each read of the matrix; fewer fit
-# in the cache.
+# Maximum number of right-hand sides that are iterated together. More right-hand sides share each read of the matrix;
+# fewer right-hand sides fit in the cache.
 _MAX_COLUMNS = 16
-# Maximum number of unknowns of the coarsest level, of which the inverse is computed.
+# Maximum number of unknowns of the coarsest level, whose matrix is inverted.
 _MAX_COARSEST_SIZE = 500
 # The smoother damps the spectrum of the scaled matrix from an eighth of its bound on, by a Chebyshev polynomial of
 # degree 2, of which these are the inverse roots.
@@ -33,9 +34,10 @@ _WEIGHTS = tuple(1 / (_MIDDLE + sign * _HALF * np.sqrt(0.5)) for sign in (1, -1)
 
 
 class Level(NamedTuple):
-    """A level of a hierarchy, in single precision. **Fields**: `matrix`: (n, n); `scale`: (n, 1), the inverse sums of
-    the absolute values of its rows; `prolongation`, `restriction`: (n, c) from the next coarser level and (c, n) to it;
-    on the coarsest level None, and `inverse` (n, n) of its matrix instead."""
+    """A level of a multigrid hierarchy, in single precision. **Fields**: `matrix`: (n, n); `scale`: (n, 1), reciprocals
+    of the sums of absolute values of the matrix's rows; `prolongation`, `restriction`: matrices (n, c) from the next
+    coarser level and (c, n) to it, None on the coarsest level; `inverse`: (n, n) inverse of the matrix on the coarsest
+    level, else None."""
 
     matrix: Any
     scale: np.ndarray
@@ -45,8 +47,9 @@ class Level(NamedTuple):
 
 
 class Hierarchy(NamedTuple):
-    """A matrix with levels that precondition it. **Fields**: `matrix`: (n, n); `levels`: of its real part, from the
-    finest to the coarsest; None if its diagonal is not positive or its values are not finite."""
+    """A matrix and the multigrid levels of its preconditioner. **Fields**: `matrix`: (n, n); `levels`: levels of the
+    matrix's real part, from the finest to the coarsest; None if the diagonal is not positive or values are not
+    finite."""
 
     matrix: csr_array
     levels: list[Level] | None
@@ -56,15 +59,15 @@ class Multigrid(NumpySolver):
     """Conjugate gradients preconditioned by multigrid, for large real or complex `SparseSymmetric` operators.
 
     Iteration ends when the residual is less than the tolerance times the right-hand side, and the preconditioned
-    residual, which is about the error, less than the tolerance times the preconditioned right-hand side: rows with
-    large entries, such as those of good contacts, dominate the former alone. A column for which that takes more than
-    the maximum number of steps is NaN, and so are all solutions if the matrix is not positive definite. It runs in
-    NumPy: compiled programs call it. Complex symmetric systems are solved by the conjugate orthogonal variant,
-    preconditioned by their real part.
+    residual, which is about the error, less than the tolerance times the preconditioned right-hand side. The second
+    condition is needed because rows with large entries, such as those of good contacts, dominate the residual. A
+    solution is NaN if its iteration does not end within the maximum number of steps. All solutions are NaN if the
+    matrix is not positive definite. The solver runs in NumPy; compiled programs call it. Complex symmetric systems are
+    solved by the conjugate orthogonal variant, preconditioned with the real part of the matrix.
 
     **Arguments:**
 
-    - `tolerance`: of the residual, see above.
+    - `tolerance`: tolerance of both residuals.
     - `max_steps`: maximum number of steps.
     - `reason`: why this solver is used, in words.
 
@@ -92,7 +95,7 @@ class Multigrid(NumpySolver):
             raise ImportError("Multigrid needs pyamg: pip install 'jeit[large]', or in a clone '.[large]'.")
 
     def solve_in_numpy(self, pattern: SparsityPattern, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Solutions (n, k) for columns (n, k); NaN where there is none."""
+        """Solutions (n, k) for right-hand sides `columns` (n, k); NaN where the iteration failed."""
         key = pattern_key(pattern)
         matrix_hierarchy = _LAST_HIERARCHY.get_or_compute(key, values, lambda: hierarchy(pattern.to_scipy(values)))
         dtype = np.result_type(values, columns, float)
@@ -139,7 +142,7 @@ def _build_level(pyamg_level: Any) -> Level:
     row_sums = abs(matrix).sum(axis=1).reshape(-1, 1)
     scale = (1 / np.where(row_sums > 0, row_sums, 1)).astype(
         np.float32
-    )  # rows of zeros, as PyAMG makes of isolated nodes
+    )  # for rows of zeros, which PyAMG makes of isolated nodes
     if not hasattr(pyamg_level, "P"):
         return Level(matrix, scale, inverse=np.linalg.pinv(matrix.toarray(), hermitian=True).astype(np.float32))
     prolongation = csr_array(pyamg_level.P).astype(np.float32)
@@ -147,7 +150,7 @@ def _build_level(pyamg_level: Any) -> Level:
 
 
 def _v_cycle(levels: list[Level], right_hand_side: np.ndarray) -> np.ndarray:
-    """Apply one V-cycle to right-hand sides (n, k), started at zero."""
+    """Apply one multigrid V-cycle, started at zero, to right-hand sides (n, k)."""
     level, *coarser = levels
     if level.inverse is not None:
         return level.inverse @ right_hand_side
@@ -171,8 +174,8 @@ def _relax(level: Level, solution: np.ndarray, right_hand_side: np.ndarray, weig
 
 
 def _precondition(levels: list[Level], residual: np.ndarray, norms: np.ndarray) -> np.ndarray:
-    """Apply a V-cycle to residuals (n, k). They are divided by their `norms` (k,) first, because single precision has a
-    limited range."""
+    """Apply a multigrid V-cycle to residuals (n, k). The residuals are first divided by their `norms` (k,), because
+    single precision has a limited range."""
     scale = np.where(norms > 0, norms, 1) / np.sqrt(len(residual))
     single = np.complex64 if np.iscomplexobj(residual) else np.float32
     scaled = np.multiply(residual, 1 / scale, out=np.empty(residual.shape, single), casting="unsafe")
@@ -182,7 +185,8 @@ def _precondition(levels: list[Level], residual: np.ndarray, norms: np.ndarray) 
 def _conjugate_gradients(
     hierarchy: Hierarchy, right_hand_side: np.ndarray, tolerance: float, max_steps: int
 ) -> np.ndarray:
-    """Solve for right-hand sides (n, k) by preconditioned conjugate gradients. Columns that do not converge are NaN."""
+    """Solve for right-hand sides (n, k) by preconditioned conjugate gradients. Solutions that do not converge are
+    NaN."""
     assert hierarchy.levels is not None
     solution, residual, norm = np.zeros_like(right_hand_side), right_hand_side.copy(), _column_norms(right_hand_side)
     preconditioned = _precondition(hierarchy.levels, residual, norm)

@@ -1,7 +1,7 @@
 """Entries of A⁻¹ between nearby unknowns of a sparse matrix A, by block elimination of a block tridiagonal matrix.
 
-The unknowns are partitioned into blocks, called *strips*, such that A couples each strip only to the one before and the
-one after it: they are the levels of a breadth-first search that starts at one side of the body. With the diagonal
+The unknowns are partitioned into blocks, called *strips*, such that A couples each strip only to the strips before and
+after it. The strips are the levels of a breadth-first search that starts at one side of the body. With the diagonal
 blocks A_i of strip i and the blocks E_i between strips i and i + 1, elimination from the first strip on gives
 
     P_i = (A_i - Eᵀ_(i-1) P_(i-1) E_(i-1))⁻¹,  W_i = P_i E_i,
@@ -59,7 +59,7 @@ class Strips(Module):
         `selected` (n,): the unknowns between which the inverse is needed."""
         longest, *other_axes = coordinates.T[np.argsort(-np.ptp(coordinates, axis=0))]
         strip = _breadth_first_levels(pattern, longest)
-        # Neighbours in a strip are neighbours in memory.
+        # Unknowns that are neighbours in a strip are neighbours in memory.
         order = np.lexsort((*other_axes[::-1], ~selected, strip))
         counts = np.bincount(strip)
         index_in_strip = np.empty(len(strip), int)
@@ -68,13 +68,13 @@ class Strips(Module):
         num_selected = int(np.bincount(strip[selected], minlength=1).max())
         num_selected = min(
             -(-max(num_selected, 1) // 8) * 8, strip_size
-        )  # rounded to few sizes, because a program is compiled for each
+        )  # rounded to few sizes, because a program is compiled for each size
         return cls((strip * strip_size + index_in_strip).astype(np.int32), len(counts), strip_size, num_selected)
 
     @property
     def place(self) -> Int[np.ndarray, " n"]:
-        """Places (n,) of the selected unknowns, in 0 … `num_strips` · `selected_per_strip` - 1; meaningless for
-        others."""
+        """Places (n,) of the selected unknowns, in 0 … `num_strips` · `selected_per_strip` - 1; meaningless for other
+        unknowns."""
         return self.position // self.strip_size * self.selected_per_strip + self.position % self.strip_size
 
     def max_strip_distance(self, groups: Int[np.ndarray, "g k"]) -> int:
@@ -83,7 +83,7 @@ class Strips(Module):
         return max(1, int((strips.max(axis=1) - strips.min(axis=1)).max()))
 
     def spread(self, rows: Inexact[Array, "n *k"]) -> Inexact[Array, "p *k"]:
-        """Reorder rows (n, …) of the unknowns to the order of places. Places without an unknown get zeros."""
+        """Reorder `rows` (n, …), one per unknown, to the order of places. Places without an unknown get zeros."""
         shape = self.num_strips * self.strip_size, *rows.shape[1:]
         spread = (
             jnp.zeros(shape, rows.dtype)
@@ -112,7 +112,7 @@ class NearInverse(Module):
     right: Inexact[Array, "p r"]
 
     def blocks(self, places: Int[Array, "g k"]) -> Inexact[Array, "g k k"]:
-        """Blocks of G between the places of each group."""
+        """Blocks (g, k, k) of the inverse G between the k places of each group."""
         _, selected, width = self.band.shape
         added = self.left[places] @ jnp.swapaxes(self.right[places], 1, 2)
         if self.band.size >= 2**31:  # places are 32-bit integers, and their products would overflow
@@ -123,15 +123,15 @@ class NearInverse(Module):
         return self.band.reshape(-1).at[index].get(mode="promise_in_bounds") + added
 
     def add(self, left: Inexact[Array, "p r"], right: Inexact[Array, "p r"]) -> "NearInverse":
-        """G + left rightᵀ, which must be symmetric; both factors have rows in the order of places."""
+        """The sum G + left rightᵀ, which must be symmetric. Both factors have rows in the order of places."""
         factors = (jnp.concatenate(factor_pair, axis=1) for factor_pair in ((self.left, left), (self.right, right)))
         return NearInverse(self.band, *factors)
 
 
 @partial(jax.jit, static_argnums=2)
 def near_inverse(strips: Strips, operator: SparseSymmetric, max_distance: int) -> NearInverse:
-    """Compute the entries of A⁻¹ between selected unknowns that are at most a few strips apart. They are NaN if A is
-    not positive definite.
+    """Compute the entries of A⁻¹ between selected unknowns that are at most a few strips apart. The entries are NaN if
+    A is not positive definite.
 
     **Arguments:**
 
@@ -179,7 +179,7 @@ def near_inverse(strips: Strips, operator: SparseSymmetric, max_distance: int) -
 
 def _strip_blocks(strips: Strips, operator: SparseSymmetric):
     """Diagonal blocks A_i and blocks E_i between neighbouring strips, both (num_strips, strip_size, strip_size). Strips
-    are filled up with unknowns that are not coupled to others."""
+    are padded to equal size with unknowns that are not coupled to others."""
     shape = strips.num_strips, strips.strip_size, strips.strip_size
     position = jnp.asarray(strips.position)
     rows, columns = position[operator.pattern.rows], position[operator.pattern.columns]

@@ -1,4 +1,4 @@
-"""Sparse symmetric matrices as lineax operators, and what their solvers have in common."""
+"""Sparse symmetric matrices as lineax operators, and base classes of their solvers."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from jeit_solvers.sparse.pattern import SparsityPattern
 
 
 class SparseSymmetric(lineax.AbstractLinearOperator):
-    """The symmetric (n, n) matrix with the given values (nnz,) in a sparsity pattern, as a lineax operator.
+    """A symmetric (n, n) matrix with the given values (nnz,) in a sparsity pattern, as a lineax operator.
 
     Real matrices are assumed to be positive definite, as the solvers of this package require. Complex matrices are
-    symmetric, not Hermitian. Differentiable with respect to the values. Raises `ValueError` for values of another shape
-    than that of the pattern, and for values that are not floating point.
+    symmetric, not Hermitian. Products and solutions are differentiable with respect to the values. Raises `ValueError`
+    for values of another shape than that of the pattern, and for values that are not floating point.
 
     **Arguments:**
 
-    - `values` (nnz,): in the order of the pattern, diagonal first.
+    - `values` (nnz,): entries of the matrix in the order of the pattern, diagonal first.
     - `pattern`: sparsity pattern.
 
     **Example:**
@@ -54,7 +54,7 @@ class SparseSymmetric(lineax.AbstractLinearOperator):
         self.pattern = pattern
 
     def mv(self, vector: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
-        """The product with a vector (n,)."""
+        """Product of the matrix with a vector (n,)."""
         return self.pattern.multiply(self.values, vector)
 
     def as_matrix(self) -> Inexact[Array, "n n"]:
@@ -117,7 +117,8 @@ def _(operator: SparseSymmetric) -> bool:
 
 
 def require_sparse_symmetric(operator: lineax.AbstractLinearOperator, solver: str) -> SparseSymmetric:
-    """The operator, if it is a `SparseSymmetric`; otherwise raises a ValueError that explains how to make one."""
+    """Return the operator if it is a `SparseSymmetric`. Raises `ValueError` otherwise, with an explanation of how to
+    make a `SparseSymmetric`."""
     if isinstance(operator, lineax.TaggedLinearOperator):
         operator = operator.operator
     if not isinstance(operator, SparseSymmetric):
@@ -129,7 +130,7 @@ def require_sparse_symmetric(operator: lineax.AbstractLinearOperator, solver: st
 
 
 class MatrixSolver(lineax.AbstractLinearSolver[SparseSymmetric]):
-    """Solver whose state is the matrix itself."""
+    """Base of linear solvers whose state is the matrix itself."""
 
     def init(self, operator: lineax.AbstractLinearOperator, options: dict[str, Any]) -> SparseSymmetric:
         """Return the matrix itself. Raises `ValueError` for another kind of operator."""
@@ -137,11 +138,11 @@ class MatrixSolver(lineax.AbstractLinearSolver[SparseSymmetric]):
         return require_sparse_symmetric(operator, type(self).__name__)
 
     def transpose(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
-        """The matrix is its own transpose."""
+        """Return the matrix, which equals its transpose."""
         return state, options
 
     def conj(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
-        """The conjugate matrix."""
+        """Return the conjugate matrix."""
         return SparseSymmetric(state.values.conj(), state.pattern), options
 
     def assume_full_rank(self) -> bool:
@@ -150,7 +151,7 @@ class MatrixSolver(lineax.AbstractLinearSolver[SparseSymmetric]):
 
 
 class NumpySolver(MatrixSolver):
-    """Base of solvers for several right-hand sides at once, in NumPy: compiled programs call them.
+    """Base of solvers for several right-hand sides at once that run in NumPy; compiled programs call them.
 
     A solver is a subclass with `solve_in_numpy`.
 
@@ -163,10 +164,10 @@ class NumpySolver(MatrixSolver):
 
     @abc.abstractmethod
     def solve_in_numpy(self, pattern: SparsityPattern, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Solutions (n, k) for columns (n, k); NaN where there is none."""
+        """Solutions (n, k) for right-hand sides `columns` (n, k); NaN where the solver fails."""
 
     def solve_columns(self, state: SparseSymmetric, columns: Inexact[Array, "n k"]) -> Inexact[Array, "n k"]:
-        """Solutions for several right-hand sides."""
+        """Solutions (n, k) for k right-hand sides `columns`."""
         pattern, dtype = state.pattern, jnp.result_type(state.values, columns)
         shape = jax.ShapeDtypeStruct(columns.shape, dtype)
 
@@ -202,21 +203,21 @@ def pattern_key(pattern: SparsityPattern) -> bytes:
 
 
 class LastMatrix:
-    """Cache of one result, such as a factor, for the matrix that was used last: derivatives solve with the same matrix
-    again."""
+    """Cache of one result, such as a factor, for the matrix that was used last, because derivatives solve with the same
+    matrix again."""
 
     def __init__(self) -> None:
         self._last: tuple[bytes, Any] | None = None
 
     def get_or_compute(self, key: bytes, values: np.ndarray, compute: Callable[[], Any], *, keep: bool = True) -> Any:
-        """Return what `compute` returns for the matrix with the given values (nnz,), from the cache if the last call
+        """Return the result of `compute` for the matrix with the given values (nnz,), from the cache if the last call
         was for the same matrix. `key` distinguishes sparsity patterns; with `keep` False the result is not cached."""
         digest = hashlib.blake2b(np.ascontiguousarray(values).tobytes(), digest_size=16).digest()
         key += values.dtype.str.encode() + digest
         cached = self._last  # another thread may replace it meanwhile
         if cached is not None and cached[0] == key:
             return cached[1]
-        self._last = cached = None  # its memory serves the next
+        self._last = cached = None  # frees the memory for the next result
         result = compute()
         self._last = (key, result) if keep else None
         return result

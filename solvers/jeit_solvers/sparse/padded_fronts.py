@@ -1,5 +1,5 @@
-"""Plan of a factorisation with padded fronts: elimination tree, fronts and stages. `padded_fronts_jax.py` carries it
-out.
+"""Plan of a sparse factorisation with padded fronts: elimination tree, fronts and stages. `padded_fronts_jax.py`
+carries out the plan.
 
 A *front* is a small dense matrix: its *pivots* are rows that are eliminated together, and its *border* consists of the
 later rows that their elimination changes (multifrontal method; Duff and Reid, ACM Trans. Math. Softw. 9, 1983). Fronts
@@ -23,22 +23,22 @@ from jeit_solvers.sparse.dissection import nested_dissection
 from jeit_solvers.sparse.index_store import IndexLayout, IndexStore, PaddedSum, Slot
 from jeit_solvers.sparse.pattern import SparsityPattern
 
-# Size of the fronts at the leaves of the tree: large enough for efficient matrix products, and small enough to be
-# treated as dense.
+# Size of the fronts at the leaves of the elimination tree: large enough for efficient matrix products, and small enough
+# to be treated as dense.
 _LEAF_SIZE = 24
 # Number of floating-point operations that take about as long as the launch of the operations of a stage.
 _OPERATIONS_WORTH_A_STAGE = 1e6
 
 
 class EliminationTree:
-    """Fronts of a sparsity pattern, numbered from 0, and their borders.
+    """Elimination tree: fronts of a sparsity pattern, numbered from 0, and their borders.
 
     - `front`, `place`: (n,) front of each matrix row, and index of the row among the pivots of the front.
-    - `parent`, `stage`, `slot`: (fronts,) parent of each front (-1 at the root), its stage, and its position in the
-      stage.
-    - `early`, `late`: (nnz,) the two rows of each matrix entry, first the one that is eliminated earlier.
-    - `borders`: for each stage the sorted keys front * n + row of its borders; `batch`, `pivots`, `border`: number of
-      fronts of each stage and their padded shape.
+    - `parent`, `stage`, `slot`: (fronts,) parent of each front (-1 at the root), stage of each front, and position of
+      the front in the stage.
+    - `early`, `late`: (nnz,) the two rows of each matrix entry: the row that is eliminated earlier, and the other row.
+    - `borders`: for each stage the sorted keys front * n + row of the border rows of its fronts; `batch`, `pivots`,
+      `border`: number of fronts of each stage, and padded numbers of pivots and border rows.
     """
 
     def __init__(self, pattern: SparsityPattern, coordinates: np.ndarray | None):
@@ -86,8 +86,8 @@ class EliminationTree:
         self.slot[stage_order] = rank_within(self.stage[stage_order])
 
     def _find_borders(self) -> None:
-        """Find the border of each front: the later rows of its entries, and the borders of its children without its own
-        pivots."""
+        """Find the border of each front: the later rows of the front's entries, and the borders of its children without
+        its own pivots."""
         first, second = self.front[self.early], self.front[self.late]
         pending = np.unique(first[first != second] * self.size + self.late[first != second])
         self.borders = []
@@ -101,7 +101,8 @@ class EliminationTree:
             pending = np.unique(np.concatenate([pending[~is_in_stage], inherited]))
 
     def position(self, fronts: np.ndarray, rows: np.ndarray, stage: int) -> np.ndarray:
-        """Local indices of matrix rows in fronts of one stage: pivots first, then the border."""
+        """Local indices of matrix rows within fronts of one stage, in which the pivots come first and then the
+        border."""
         keys, border = fronts * self.size + rows, self.borders[stage]
         in_border = np.searchsorted(border, keys) - np.searchsorted(border, fronts * self.size)
         return np.where(self.front[rows] == fronts, self.place[rows], self.pivots[stage] + in_border)
@@ -112,7 +113,7 @@ def _merged_levels(largest_separators: np.ndarray) -> list[int]:
     separator of each level.
 
     Eliminating a separator together with the two separators below it saves a stage, but wastes operations on the zeros
-    between these two. They are merged if the waste costs less than a stage.
+    between the two lower separators. Levels are merged if these operations cost less than a stage.
     """
 
     def operations(batch: int, pivots: int, border: int) -> float:
@@ -123,7 +124,7 @@ def _merged_levels(largest_separators: np.ndarray) -> list[int]:
         height, pivots = 1, int(largest_separators[level])
         while level > 0:
             # About half of a front's surroundings are separators of the next levels above, so its border is a few times
-            # as long as these.
+            # as long as these separators.
             batch, next_separator = 2 ** (level - 1), int(largest_separators[level - 1])
             border = 3 * next_separator
             separate_operations = operations(2 * batch, pivots, border) + operations(batch, next_separator, border)
@@ -136,21 +137,22 @@ def _merged_levels(largest_separators: np.ndarray) -> list[int]:
 
 
 def rank_within(groups: np.ndarray) -> np.ndarray:
-    """Position of every element among the equal elements of a sorted array of small integers."""
+    """Position of every element of a sorted array of small integers among the elements equal to it."""
     counts = np.bincount(groups)
     return np.arange(groups.size) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def graph_of(rows: np.ndarray, columns: np.ndarray, size: int) -> csr_array:
-    """Graph of the pattern: its entries without the diagonal, in both triangles."""
+    """Graph of a sparsity pattern: the entries without the diagonal, in both triangles."""
     rows, columns = rows[size:], columns[size:]
     coordinates = (np.concatenate([rows, columns]), np.concatenate([columns, rows]))
     return csr_array((np.ones(2 * rows.size, dtype=np.int8), coordinates), shape=(size, size))
 
 
 class Link(NamedTuple):
-    """Transfer to a stage from the fronts of an earlier stage `source`. **Fields**: `panel`, `corner`: sums of the
-    entries of that stage's flattened Schur complements; `rows`: sums of its flattened right-hand-side updates."""
+    """Transfer of contributions from the fronts of an earlier stage `source` to a stage. **Fields**: `panel`, `corner`:
+    sums of the entries of the flattened Schur complements of `source`; `rows`: sums of the flattened right-hand-side
+    updates of `source`."""
 
     source: int
     panel: PaddedSum
@@ -159,7 +161,8 @@ class Link(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """A batch of fronts padded to one shape: in each front `pivots` rows are eliminated and `border` rows updated.
+    """A stage of a factorisation: a batch of fronts padded to one shape. In each front `pivots` rows are eliminated and
+    `border` rows updated.
 
     `entries` adds the values of the matrix, followed by a one for padded pivots, to the first columns of the fronts
     (batch, pivots + border, pivots). `right_hand_side` (batch, pivots) holds indices of matrix rows, `above` (batch,
@@ -179,9 +182,9 @@ class Stage(NamedTuple):
 class FactorisationPlan(Module):
     """Order of elimination and index maps of a sparsity pattern for `factorise` and `solve`; made by `analyse`.
 
-    **Fields**: `indices` (total,): all index maps; `layout`: which part of `indices` each of them is; `size`: number of
-    rows n; `num_entries`: number of entries of the pattern. The index maps are one leaf of the pytree; pass a plan to a
-    jitted function as an argument.
+    **Fields**: `indices` (total,): all index maps; `layout`: position of each index map in `indices`; `size`: number of
+    rows n; `num_entries`: number of entries of the pattern. The index maps are one leaf of the plan's pytree; pass a
+    plan to a jitted function as an argument.
 
     **Example:**
 
@@ -203,7 +206,7 @@ class FactorisationPlan(Module):
 
     @property
     def solution(self) -> Slot:
-        """Index of each matrix row among the pivots of all stages, which are concatenated in their order."""
+        """Index of each matrix row among the pivots of all stages, concatenated in the order of the stages."""
         return self.layout.content[1]
 
     @property
@@ -227,15 +230,15 @@ class FactorisationPlan(Module):
 
 
 def analyse(pattern: SparsityPattern, coordinates: Any = None) -> FactorisationPlan:
-    """Find the order of elimination and the index maps of the direct solver for a sparsity pattern. Runs in NumPy and
-    SciPy, outside `jit`, once per pattern.
+    """Find the order of elimination and the index maps of the direct solver for a sparsity pattern. The analysis runs
+    in NumPy and SciPy, outside `jax.jit`, once per pattern.
 
     **Arguments:**
 
     - `pattern`: sparsity pattern of n unknowns.
-    - `coordinates` (n, d): of the unknowns; they give a better order than the pattern alone.
+    - `coordinates` (n, d): coordinates of the unknowns, which give a better order than the pattern alone.
 
-    Raises a ValueError if the shape of the coordinates does not fit or they are not finite.
+    Raises `ValueError` if the coordinates have another shape or are not finite.
 
     **Example:**
 
@@ -247,8 +250,8 @@ def analyse(pattern: SparsityPattern, coordinates: Any = None) -> FactorisationP
 
 
 def checked_coordinates(pattern: SparsityPattern, coordinates: Any) -> np.ndarray | None:
-    """Coordinates (n, d) of the unknowns as an array, or None. Raises `ValueError` for another shape, and if they are
-    not finite."""
+    """Coordinates (n, d) of the unknowns as an array, or None. Raises `ValueError` if the coordinates have another
+    shape or are not finite."""
     if coordinates is None:
         return None
     coordinates = np.asarray(coordinates, dtype=float)
@@ -262,8 +265,8 @@ def checked_coordinates(pattern: SparsityPattern, coordinates: Any) -> np.ndarra
 
 
 def _plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> FactorisationPlan:
-    """Make the plan with all index maps for an elimination tree. If a plan of the same tree is in use, for example in a
-    forward model on the mesh of which a prior also needs matrices, its index maps are shared."""
+    """Make the factorisation plan with all index maps for an elimination tree. If a plan of the same tree is in use,
+    for example by a forward model on whose mesh a prior also needs matrices, the index maps of this plan are shared."""
     key = _plan_key(pattern, tree)
     indices, layout = _CACHED_INDICES.get(key), _CACHED_LAYOUTS.get(key)
     if indices is None or layout is None:
@@ -279,14 +282,15 @@ def _plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> Factorisat
 
 
 def _plan_key(pattern: SparsityPattern, tree: EliminationTree) -> bytes:
-    """Key of the plan of a tree in the cache of plans."""
+    """Key of the plan of an elimination tree in the cache of plans."""
     digest = hashlib.blake2b(digest_size=16)
     for array in (pattern.rows, pattern.columns, tree.front, tree.place, tree.parent, tree.stage, tree.slot):
         digest.update(np.asarray(array).tobytes())
     return digest.digest()
 
 
-# Index maps of plans in use, because making a plan of a solid takes seconds, and storing it hundreds of megabytes.
+# Index maps of plans in use. They are shared, because making a plan for a solid takes seconds and storing it takes
+# hundreds of megabytes.
 _CACHED_INDICES: WeakValueDictionary[bytes, Array] = WeakValueDictionary()
 _CACHED_LAYOUTS: WeakValueDictionary[bytes, IndexLayout] = WeakValueDictionary()
 
@@ -325,7 +329,7 @@ def _build_stage(store: IndexStore, pattern: SparsityPattern, tree: EliminationT
 def _plan_matrix_entries(
     store: IndexStore, pattern: SparsityPattern, tree: EliminationTree, stage: int, height: int
 ) -> PaddedSum:
-    """Sums that add the values of the matrix to the fronts that eliminate them, and ones to the diagonal of padded
+    """Sums that add the entries of the matrix to the fronts that eliminate them, and ones to the diagonal of padded
     pivots."""
     batch, pivots = int(tree.batch[stage]), tree.pivots[stage]
     entries = np.flatnonzero(tree.stage[tree.front[tree.early]] == stage)

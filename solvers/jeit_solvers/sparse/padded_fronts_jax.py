@@ -1,7 +1,8 @@
-"""Factorisation, solution and products with the inverse, in batches of padded fronts (`padded_fronts.py`).
+"""Factorisation and solution of sparse symmetric systems, and products with the inverse, in batches of padded fronts
+(`padded_fronts.py`).
 
-Runs as compiled JAX programs, which can be batched and differentiated; for NumPy arrays, which need no compilation, in
-NumPy.
+The functions run as compiled JAX programs, which can be batched and differentiated; for NumPy arrays they run in NumPy,
+without compilation.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from jeit_solvers.module import Module
 from jeit_solvers.sparse.index_store import IndexLayout
 from jeit_solvers.sparse.padded_fronts import FactorisationPlan, Stage
 
-# Minimum number of entries of the fronts of a stage for which threads are used; number of entries of the fronts that
+# Minimum number of entries in the fronts of a stage for which threads are used; number of entries in the fronts that
 # are updated together.
 _MIN_PARALLEL_ENTRIES, _UPDATED_ENTRIES = 200_000, 100_000
 
@@ -31,8 +32,8 @@ class Factor(Module):
     """A factorised matrix A = L L^T: two arrays for every stage of its plan.
 
     **Fields**: `inverses`: (batch, pivots, pivots) inverses of the diagonal blocks of L; `lowers`: (batch, border,
-    pivots) blocks below them. Solving therefore needs only matrix products. For a complex symmetric A, transposes are
-    not conjugated.
+    pivots) blocks of L below the diagonal blocks. Solving therefore needs only matrix products. For a complex symmetric
+    A, transposes are not conjugated.
 
     **Example:**
 
@@ -53,8 +54,8 @@ class Factor(Module):
         return jnp.all(jnp.stack([jnp.all(jnp.isfinite(diagonal), axis=(-2, -1)) for diagonal in diagonals]), axis=0)
 
     def require_positive_definite(self) -> None:
-        """Raise a ValueError if the matrix was not positive definite. Does nothing inside `jax.jit`, `jax.grad` or
-        `jax.vmap`, where values are not known yet."""
+        """Raise `ValueError` if the matrix was not positive definite. The check is omitted inside `jax.jit`, `jax.grad`
+        or `jax.vmap`, where values are not known yet."""
         verdict = self.positive_definite
         if has_values(verdict) and not verdict.all():
             raise ValueError(
@@ -75,7 +76,7 @@ def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor
     **Arguments:**
 
     - `plan`: from `analyse`.
-    - `values` (nnz,): of the matrix, in the order of the pattern that the plan was made for.
+    - `values` (nnz,): entries of the matrix, in the order of the pattern for which the plan was made.
 
     **Example:**
 
@@ -119,14 +120,15 @@ def _factorise_stages(layout: IndexLayout, indices: Int[Array, " total"], values
     return Factor(tuple(inverses), tuple(lowers))
 
 
-# Compiled separately, so that a second program with the same plan does not trace it again.
+# Compiled separately, so that a second program with the same plan does not trace the factorisation again.
 _factorise = jax.jit(_factorise_stages, static_argnums=0)
 
 
 def _factorise_in_numpy(
     layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[np.ndarray, " nnz"]
 ) -> Factor:
-    """The same as `_factorise_stages`, in NumPy and in place, with the fronts of a stage distributed over the cores."""
+    """Factorise as `_factorise_stages`, but in NumPy and in place, with the fronts of a stage distributed over the
+    cores."""
     stages, _ = layout.content
     extended = np.concatenate([values, np.ones(1, values.dtype)])
     inverses, lowers, schur_complements = [], [], []
@@ -149,8 +151,8 @@ def _factorise_in_numpy(
 def _eliminate_fronts(
     stage: Stage, indices, extended, schur_complements, panel, corner, inverse, lower, front_slice: slice
 ) -> None:
-    """Assemble and eliminate the fronts `front_slice` of a stage, in place. `schur_complements`: those of all earlier
-    stages."""
+    """Assemble and eliminate the fronts `front_slice` of a stage, in place. `schur_complements`: Schur complements of
+    all earlier stages."""
 
     def add_contributions(padded_sum, contributions, target):
         size = target[0].size
@@ -172,13 +174,13 @@ def _eliminate_fronts(
 
 
 def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-    """Solution x of A x = b.
+    """Solution x of A x = b for a factorised matrix A.
 
     **Arguments:**
 
     - `plan`: from `analyse`.
     - `factor`: from `factorise`.
-    - `right_hand_sides` (n,) or (n, k): one or several b.
+    - `right_hand_sides` (n,) or (n, k): b, one or several vectors.
 
     Raises `ValueError` for other shapes.
 
@@ -207,8 +209,8 @@ _solve = jax.jit(_solve_stages, static_argnums=0)
 
 
 def _solve_batch(batchable, plain, axis_size, batched, indices, factor, vectors):
-    """Batching rule: a batch of right-hand sides for one factor is solved as more columns, a batch of factors one by
-    one."""
+    """Batching rule of `solve`: a batch of right-hand sides for one factor is solved as additional columns, and a batch
+    of factors one by one."""
     if any(jax.tree.leaves(batched[:2])):
         return one_by_one(batchable, plain, axis_size, batched, indices, factor, vectors)
     size, count = vectors.shape[1:]
@@ -219,9 +221,10 @@ def _solve_batch(batchable, plain, axis_size, batched, indices, factor, vectors)
 def half_solve(
     plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n k"]
 ) -> Inexact[Array, "rows k"]:
-    """Y = L^-1 P b, with rows in the order of elimination and rows of zeros for padding, so that Y^T Y = b^T A^-1 b.
+    """Half of a solve: Y = L^-1 P b, with rows in the order of elimination P and rows of zeros for padding, so that Y^T
+    Y = b^T A^-1 b.
 
-    Takes half the work of `solve`, if only products with the inverse are needed.
+    This function takes half the work of `solve`, and suffices for quadratic forms of the inverse.
 
     **Arguments:**
 
@@ -245,7 +248,7 @@ def half_solve(
 def quadratic_form(
     plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n k"]
 ) -> Inexact[Array, "k k"]:
-    """b^T A^-1 b, symmetric (for complex values not conjugated), by the forward half of a solve.
+    """Symmetric quadratic form b^T A^-1 b (complex values are not conjugated), computed by the forward half of a solve.
 
     **Arguments:**
 
@@ -262,8 +265,8 @@ def quadratic_form(
 
 
 def inverse_root(plan: FactorisationPlan, factor: Factor, rows: Inexact[Array, "rows k"]) -> Inexact[Array, "n k"]:
-    """P^T L^-T times vectors, with rows as returned by `half_solve`. Standard normal vectors are mapped to vectors with
-    covariance A^-1.
+    """Product of P^T L^-T, a root of A^-1, with vectors whose rows are as returned by `half_solve`. Standard normal
+    vectors are mapped to vectors with covariance A^-1.
 
     **Arguments:**
 
@@ -290,9 +293,9 @@ def inverse_root(plan: FactorisationPlan, factor: Factor, rows: Inexact[Array, "
 def inverse_entries(plan: FactorisationPlan, factor: Factor) -> Inexact[Array, " nnz"]:
     """Entries (nnz,) of A^-1 at the positions of the pattern of A, in the order of the pattern, diagonal first.
 
-    They are computed from the factor by a recursion from the root of the elimination tree down, in about the time of a
-    factorisation; all of A^-1 would take as many solves as there are rows. Takahashi, Fagan and Chin, Proc. 8th PICA
-    Conf. (1973) 63-69; Erisman and Tinney, Commun. ACM 18 (1975) 177-179.
+    The entries are computed from the factor by a recursion from the root of the elimination tree down, in about the
+    time of a factorisation. All entries of A^-1 would take as many solves as there are rows. Takahashi, Fagan and Chin,
+    Proc. 8th PICA Conf. (1973) 63-69; Erisman and Tinney, Commun. ACM 18 (1975) 177-179.
 
     **Arguments:**
 
@@ -313,9 +316,9 @@ def inverse_entries(plan: FactorisationPlan, factor: Factor) -> Inexact[Array, "
 def _inverse_entries(
     layout: IndexLayout, num_entries: int, indices: Int[Array, " total"], factor: Factor
 ) -> Inexact[Array, " nnz"]:
-    """Entries of the inverse Z, front by front from the root down. With A = L L^T and the part Z_bb of a front's border
-    taken from its parent, the other parts are Z_bp = -Z_bb K and Z_pp = L_pp^-T L_pp^-1 + K^T Z_bb K, where K = L_bp
-    L_pp^-1."""
+    """Entries of the inverse Z = A^-1, computed front by front from the root down. With A = L L^T and the part Z_bb
+    between a front's border rows b taken from the parent front, the parts with the front's pivots p are Z_bp = -Z_bb K
+    and Z_pp = L_pp^-T L_pp^-1 + K^T Z_bb K, where K = L_bp L_pp^-1."""
     stages, _ = layout.content
     xp, dtype = namespace(factor), factor.inverses[0].dtype
     entries = xp.zeros(num_entries + 2, dtype)  # one more for padded pivots, and one for positions outside the pattern
@@ -339,12 +342,12 @@ def _inverse_entries(
         if number in first_child:
             fronts[number] = front_block
         if stage.border and first_child[stage.parent] == number:
-            del fronts[stage.parent]  # no front further down needs it
+            del fronts[stage.parent]  # no front further down needs the parent's part
     return entries[:num_entries]
 
 
 def _border_block(above: Inexact[Array, "parents height height"], rows: Int[Array, "batch border"]):
-    """Entries of the inverse between the rows of the children's borders, read from the parents' fronts; zero for
+    """Entries of the inverse between the border rows of child fronts, read from the parents' fronts; zero for
     padding."""
     height = above.shape[-1]
     slot, local_index = rows // height, rows % height
@@ -392,7 +395,8 @@ def _check_columns(
 def _forward_stages(
     layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
 ) -> list[Inexact[Array, "batch pivots k"]]:
-    """L^-1 times the vectors, stage by stage. The pivot rows of a front gather the updates of its children."""
+    """Product of L^-1 with the vectors (n, k), stage by stage. The pivot rows of a front gather the updates of its
+    children."""
     stages, _ = layout.content
     count = vectors.shape[1]
     reduced, updates = [], []
@@ -419,8 +423,8 @@ def _backward_stages(
     factor: Factor,
     reduced: list[Inexact[Array, "batch pivots k"]],
 ) -> Inexact[Array, "rows k"]:
-    """L^-T times the vectors, from the root down: the pivots of all stages. The solution at the border of a front is
-    read from its parent."""
+    """Product of L^-T with the vectors `reduced`, from the root down; returns the rows of the pivots of all stages. The
+    solution at the border of a front is read from the parent front."""
     count, xp = reduced[0].shape[-1], namespace(reduced)
     fronts: dict[int, Inexact[Array, "rows k"]] = {}
     pivot_values = []

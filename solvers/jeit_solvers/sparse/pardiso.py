@@ -1,8 +1,8 @@
 """PARDISO, the direct solver of Intel's oneMKL, for sparse symmetric systems on a CPU.
 
-Users select it where jeit's own factorisation takes too much memory or time (Schenk and Gärtner, Future Gener. Comput.
-Syst. 20, 2004). Complex symmetric systems are solved as real symmetric ones of twice the size, since pypardiso, the
-binding, passes real matrices only.
+Users select PARDISO where jeit's own factorisation takes too much memory or time (Schenk and Gärtner, Future Gener.
+Comput. Syst. 20, 2004). Complex symmetric systems are solved as real symmetric systems of twice the size, because the
+binding, pypardiso, passes real matrices only.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from scipy.sparse import block_array, csr_array, csr_matrix, triu
 from jeit_solvers.sparse.operator import LastMatrix, NumpySolver, pattern_key
 from jeit_solvers.sparse.pattern import SparsityPattern
 
-# oneMKL's numbers of matrix types: real symmetric positive definite, and real symmetric indefinite.
+# Numbers by which oneMKL denotes matrix types: real symmetric positive definite, and real symmetric indefinite.
 _DEFINITE, _INDEFINITE = 2, -2
 
 
 class Pardiso(NumpySolver):
     """Direct solver for real or complex `SparseSymmetric` operators by PARDISO (oneMKL).
 
-    The last factorisation is kept, and used again for the same matrix, as derivatives do. All solutions are NaN if a
-    real matrix is not positive definite, or if PARDISO fails. It runs on the CPU: compiled programs call it.
+    The last factorisation is kept, and used again when the same matrix is solved, for example for derivatives. All
+    solutions are NaN if a real matrix is not positive definite, or if PARDISO fails. PARDISO runs on the CPU; compiled
+    programs call it.
 
     **Arguments:**
 
@@ -49,7 +50,7 @@ class Pardiso(NumpySolver):
             raise ImportError("Pardiso needs pypardiso: pip install 'jeit[mkl]', or in a clone '.[mkl]'.")
 
     def solve_in_numpy(self, pattern: SparsityPattern, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Solutions (n, k) for the columns (n, k)."""
+        """Solutions (n, k) for the right-hand sides `columns` (n, k)."""
         factor = _LAST_FACTOR.get_or_compute(
             pattern_key(pattern), values, lambda: _Factor(csr_array(pattern.to_scipy(values)))
         )
@@ -57,12 +58,12 @@ class Pardiso(NumpySolver):
 
 
 class _Factor:
-    """Factorisation of a symmetric matrix (n, n)."""
+    """Factorisation of a symmetric matrix (n, n) by PARDISO."""
 
     def __init__(self, matrix: csr_array):
         self.is_complex = np.iscomplexobj(matrix)
         if self.is_complex:
-            # (A + iB)(x + iy) = f + ig, with the second row negated.
+            # The equations (A + iB)(x + iy) = f + ig in real form, with the second row negated.
             real, imaginary = matrix.real, matrix.imag
             matrix = csr_array(block_array([[real, -imaginary], [-imaginary, -real]]))
         upper = csr_matrix(triu(matrix, format="csr"), dtype=np.float64)
@@ -80,7 +81,7 @@ class _Factor:
             self.failed = True
 
     def solve(self, columns: np.ndarray) -> np.ndarray:
-        """Solutions (n, k); NaN if the matrix could not be factorised."""
+        """Solutions (n, k) for right-hand sides `columns`; NaN if the matrix could not be factorised."""
         is_complex_input = np.iscomplexobj(columns)
         if self.failed:
             return np.full(columns.shape, np.nan, complex if self.is_complex or is_complex_input else float)

@@ -25,10 +25,10 @@ class SparsityPattern(Module):
     `(rows[k], columns[k])` and at `(columns[k], rows[k])`. The diagonal comes first, `values[:n]`, then the entries
     below it, row by row.
 
-    **Fields**: `indices` (total,): row and column of every entry, and the index maps of `assemble`; `layout`: which
-    part of `indices` each of them is; `size`: number of rows n. Build a pattern with `from_elements`, `from_entries` or
-    `from_matrix`. Its indices are one leaf of the pytree, so they are not compiled into a jitted function to which the
-    pattern is passed as an argument.
+    **Fields**: `indices` (total,): row and column of every entry, and the index maps of `assemble`; `layout`: position
+    of each of these arrays in `indices`; `size`: number of rows n. Build a pattern with `from_elements`, `from_entries`
+    or `from_matrix`. The indices are one leaf of the pattern's pytree, so they are not compiled into a jitted function
+    to which the pattern is passed as an argument.
 
     **Example:**
 
@@ -67,7 +67,7 @@ class SparsityPattern(Module):
 
     @classmethod
     def from_elements(cls, groups: Sequence[Any], size: int) -> Self:
-        """The pattern of a finite-element matrix, in which the nodes of each element are coupled.
+        """Pattern of a finite-element matrix, in which the nodes of each element are coupled.
 
         **Arguments:**
 
@@ -75,8 +75,8 @@ class SparsityPattern(Module):
           2) … A group may add couplings that no other group has.
         - `size`: number of nodes, n.
 
-        Raises a ValueError for node numbers out of range, for elements that contain a node twice, and for nodes that
-        belong to no element (their row would be empty and the matrix singular).
+        Raises `ValueError` for node numbers out of range, for elements that contain a node twice, and for nodes that
+        belong to no element (the node's row would be empty and the matrix singular).
         """
         size = _checked_size(size)
         if len(groups) == 0:
@@ -105,10 +105,10 @@ class SparsityPattern(Module):
 
     @classmethod
     def from_entries(cls, rows: Any, columns: Any, size: int) -> Self:
-        """The pattern with the given entries, each named as (row, column) or as (column, row).
+        """Pattern with the given entries, each named as (row, column) or as (column, row).
 
         `assemble` then takes one array (entries,) in the order given here; entries named more than once are added up.
-        Raises a ValueError for indices out of range and for rows without a diagonal entry.
+        Raises `ValueError` for indices out of range and for rows without a diagonal entry.
         """
         size = _checked_size(size)
         rows = _checked_integers(rows, "from_entries: `rows`")
@@ -127,7 +127,7 @@ class SparsityPattern(Module):
         """Pattern and values (nnz,) of a symmetric SciPy sparse matrix or dense array, which must contain both
         triangles.
 
-        Raises a ValueError unless the matrix is square, symmetric (not Hermitian: complex values are not conjugated),
+        Raises `ValueError` unless the matrix is square, symmetric (not Hermitian: complex values are not conjugated),
         finite and without missing diagonal entries.
         """
         if not issparse(matrix):
@@ -158,7 +158,7 @@ class SparsityPattern(Module):
         keys = []
         for rows, columns in zip(row_lists, column_lists, strict=True):
             above, below = np.maximum(rows, columns), np.minimum(rows, columns)
-            # Entries on the diagonal get negative keys, so that they come first, in the order of rows.
+            # Entries on the diagonal get negative keys, so that these entries come first, in the order of rows.
             keys.append(np.where(above == below, above - size, above * size + below))
         unique, entry_of_value = np.unique(np.concatenate(keys), return_inverse=True)
         on_diagonal = np.zeros(size, dtype=bool)
@@ -185,10 +185,10 @@ class SparsityPattern(Module):
     def assemble(self, *element_matrices: Inexact[Array, "..."] | None) -> Inexact[Array, " nnz"]:
         """Add up element matrices to the values (nnz,) of the matrix.
 
-        Takes one argument for each group of the pattern, in their order: symmetric matrices (m, k, k), of which only
-        the lower triangles are read; or the packed lower triangles (k (k + 1) / 2, m), rows in the order of
-        `numpy.tril_indices(k)`; or None for a group that contributes nothing. Values are real or complex. Raises
-        `ValueError` for another number of arguments, or if all are None.
+        The method takes one argument for each group of elements of the pattern, in the order of the groups: symmetric
+        matrices (m, k, k), of which only the lower triangles are read; or the packed lower triangles (k (k + 1) / 2,
+        m), rows in the order of `numpy.tril_indices(k)`; or None for a group that contributes nothing. Values are real
+        or complex. Raises `ValueError` for another number of arguments, or if all are None.
         """
         if len(element_matrices) != len(self._assembly):
             raise ValueError(
@@ -276,8 +276,8 @@ class AssemblyMap(NamedTuple):
     def create(
         cls, store: IndexStore, entry: np.ndarray, size: int, num_entries: int, shape: tuple[int, ...]
     ) -> "AssemblyMap":
-        """Make the map. `entry`: index of the matrix entry of each packed value (pairs, m), row by row, or of each
-        value (m,)."""
+        """Make the map of a group. `entry`: index of the matrix entry of each packed value (pairs, m), row by row, or
+        of each value (m,)."""
         source = np.arange(entry.size)
         on_diagonal = entry < size
         return cls(
