@@ -131,12 +131,12 @@ def reconstruct_shapes(
 ) -> ShapeReconstruction:
     """Estimate the bodies (star shapes in a sheet, ellipsoids in a solid) that explain measured voltages.
 
-    All bodies are first fitted together, as strong disks or balls. Then each body in turn is left out and all other
-    bodies are fitted again; the body whose absence raises the objective least is removed, as long as the rise is small.
-    This removes ghosts (false bodies) due to model errors and missing electrodes, because other bodies can take their
-    place. Remaining bodies are split in two, or changed to the other kind (a weak star, or a column from floor to lid),
-    if the evidence (`ShapeProblem.surprise`) favours this change. The search is run twice, once starting with a split
-    and once with a change of kind, and the better result is kept.
+    All bodies are first fitted together, as disks or balls of high contrast. Then each body in turn is left out and all
+    other bodies are fitted again; the body whose absence raises the objective least is removed, as long as the rise is
+    small. This removes ghosts (false bodies) due to model errors and missing electrodes, because other bodies can take
+    their place. Remaining bodies are split in two, or changed to the other kind (a weak star, or a column from floor to
+    lid), if the evidence (`ShapeProblem.surprise`) favours this change. The search is run twice, once starting with a
+    split and once with a change of kind, and the better result is kept.
 
     **Arguments:**
 
