@@ -61,7 +61,7 @@ class Multigrid(NumpySolver):
     Iteration ends when the residual is less than the tolerance times the right-hand side, and the preconditioned
     residual, which is about the error, less than the tolerance times the preconditioned right-hand side. The second
     condition is needed because rows with large entries, such as those of good contacts, dominate the residual. A
-    solution is NaN if its iteration does not end within the maximum number of steps. All solutions are NaN if the
+    solution is NaN if its iteration does not end within the maximum number of steps, or before a step shows that the
     matrix is not positive definite. The solver runs in NumPy; compiled programs call it. Complex symmetric systems are
     solved by the conjugate orthogonal variant, preconditioned with the real part of the matrix.
 
