@@ -2,7 +2,7 @@
 
 Bending a sheet without thickness changes no voltage. In a layer 5 mm thick it stretches the touched side by a sixth.
 The presses on the bent skin are classified by a model trained on the bent skin and by one trained on the flat skin. See
-`bent_sheet.png`.
+`bent_sheet.png`. Takes 20 s and 0.8 GB on two cores.
 """
 
 import matplotlib.pyplot as plt

@@ -1,6 +1,6 @@
 """A skin is cut, used further and mended, after Park et al. 2022: detection of the events, and touches beside the cut.
 
-See `cut_and_repair.png`.
+See `cut_and_repair.png`. Takes 15 s and 0.5 GB on two cores.
 """
 
 import equinox as eqx

@@ -1,5 +1,5 @@
-"""Compare two layouts of 32 electrodes on a 200 × 200 × 10 mm skin, with touches everywhere; see
-`design_a_skin.png`."""
+"""Compare two layouts of 32 electrodes on a 200 × 200 × 10 mm skin, with touches everywhere; see `design_a_skin.png`.
+Takes 8 s and 0.7 GB on two cores."""
 
 from matplotlib.figure import Figure
 

@@ -1,5 +1,5 @@
 """The gradient of a voltage with respect to electrode positions, checked by moving an electrode; see
-`design_gradient.png`."""
+`design_gradient.png`. Takes 7 s and 0.6 GB on two cores."""
 
 import equinox as eqx
 import jax

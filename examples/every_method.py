@@ -1,4 +1,5 @@
-"""One frame imaged by every method: a conductive disc and a resistive block in a disk; see `every_method.png`."""
+"""One frame imaged by every method: a conductive disc and a resistive block in a disk; see `every_method.png`. Takes 8
+s and 0.7 GB on two cores."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,5 @@
-"""A pat, a tickle and a stroke on a simulated skin, tracked by 25 microphones; see `hear_a_stroke.png`."""
+"""A pat, a tickle and a stroke on a simulated skin, tracked by 25 microphones; see `hear_a_stroke.png`. Takes 10 s and
+0.7 GB on two cores."""
 
 import jax
 import numpy as np

@@ -1,4 +1,5 @@
-"""A light tap on a simulated skin, located by 25 microphones with two methods; see `hear_a_touch.png`."""
+"""A light tap on a simulated skin, located by 25 microphones with two methods; see `hear_a_touch.png`. Takes 15 s and
+0.8 GB on two cores."""
 
 import jax
 import numpy as np

@@ -1,5 +1,6 @@
 """Why the contrast and the area of a body are hard to separate, and how reliable their intervals are in tanks that
-differ from their description; see `trust_mechanism.png` and `how_far_to_trust.png`."""
+differ from their description; see `trust_mechanism.png` and `how_far_to_trust.png`. Takes 30 s and 0.4 GB on two
+cores."""
 
 import numpy as np
 from matplotlib.figure import Figure

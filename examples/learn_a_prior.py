@@ -1,5 +1,5 @@
 """Learn the weight and the correlation length of a prior from examples, by the gradient of the image error; see
-`learn_a_prior.png`."""
+`learn_a_prior.png`. Takes 7 s and 0.5 GB on two cores."""
 
 from typing import Any
 

@@ -1,7 +1,7 @@
 """Classify gestures on a skin while it is touched: train on simulated recordings, then classify in a program's loop.
 
 The stream is read from a file; `jeit.live.prepare("serial:/dev/ttyACM0@115200", ...)` reads it from a device. See
-`live_gestures.png`.
+`live_gestures.png`. Takes 50 s and 1 GB on two cores.
 """
 
 import jax

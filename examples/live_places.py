@@ -1,7 +1,7 @@
 """A robot's loop over live frames: locate a rod in a tank sixty times a second, without a browser.
 
 The tank is simulated; `jeit.live.prepare("serial:/dev/ttyACM0@115200", "empty.csv", description="tank.toml")` opens a
-measured one. See `live_places.png`.
+measured one. See `live_places.png`. Takes 15 s and 0.7 GB on two cores.
 """
 
 import matplotlib.pyplot as plt

@@ -1,4 +1,5 @@
-"""A vibrator at 169 places of a simulated skin, located by two methods; see `localisation_error.png`."""
+"""A vibrator at 169 places of a simulated skin, located by two methods; see `localisation_error.png`. Takes 15 s and
+0.6 GB on two cores."""
 
 import jax
 import numpy as np

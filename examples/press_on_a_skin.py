@@ -1,4 +1,4 @@
-"""A press on a simulated skin, imaged in a few lines; see `press_on_a_skin.png`."""
+"""A press on a simulated skin, imaged in a few lines; see `press_on_a_skin.png`. Takes 4 s and 0.4 GB on two cores."""
 
 import jax
 import numpy as np

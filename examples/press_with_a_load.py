@@ -1,4 +1,5 @@
-"""A load in newtons on a skin: indenter, pressure, conductivity and a frame over time; see `press_with_a_load.png`."""
+"""A load in newtons on a skin: indenter, pressure, conductivity and a frame over time; see `press_with_a_load.png`.
+Takes 6 s and 0.5 GB on two cores."""
 
 import jax
 import matplotlib.pyplot as plt

@@ -28,6 +28,11 @@ MOST = {
 }
 
 
+@pytest.mark.parametrize("example", gallery.examples(), ids=lambda example: example.name)
+def test_an_example_states_its_time_and_memory(example):
+    assert gallery.cost(example) in gallery.page()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [file.stem for file in sorted(FOLDER.glob("*.py"))])
 def test_example(name, tmp_path, monkeypatch):
