@@ -308,13 +308,13 @@ def test_the_overview_cuts_through_the_strongest_change(tank, image, patches):
     titles = {one.get_title() for one in figure.axes} - {""}
     strongest = np.asarray(centroids(tank))[np.abs(image).argmax()]
     assert titles == {Plane.at(axis, float(one)).name for axis, one in zip("xyz", strongest, strict=True)}
-    inclusions = [Inclusion(-1, (-0.03, 0.06, 0.06), 1e-4, -1e-3)]
+    inclusions = [Inclusion(-1, (-0.03, 0.06, 0.06), 1e-4, -1e-3, centroid_radius=2.34e-3)]
     figure = plot_solid(tank, image, patches, inclusions=inclusions)
     assert {one.get_title() for one in figure.axes} - {""} == {"x = −30 mm", "y = 60 mm", "z = 60 mm"}
     space = plot_isosurfaces(tank, image, inclusions=[*inclusions, Inclusion(1, (0.0, 0.0, 0.1), 1e-4, 1e-3)])
     assert [line.get_marker() for line in space.lines if line.get_marker() in ("+", "_")] == ["_", "+"]
     (words,) = [text.get_text() for one in figure.axes for text in one.texts if "found" in text.get_text()]
-    assert "100 cm³ at (−30, 60, 60) mm" in words
+    assert "100 cm³ at (−30, 60, 60) ±2.3 mm" in words
 
 
 def test_a_constant_image_is_drawn(tank):

@@ -111,10 +111,11 @@ def _caption(ax: Axes, common_point, levels, inclusions: Sequence[Inclusion], *,
     for inclusion in inclusions[:_MAX_LISTED]:
         sign = "+" if inclusion.sign > 0 else "−"
         column = "column of " if inclusion.is_column else ""
-        lines.append(f"{sign}  {column}{1e6 * inclusion.area:.3g} cm³ at ({_position_text(inclusion.centroid)}) mm")
+        radius = "" if inclusion.centroid_radius is None else f" ±{1e3 * inclusion.centroid_radius:.2g}"
+        place = f"({_position_text(inclusion.centroid)}){radius} mm"
+        lines.append(f"{sign}  {column}{1e6 * inclusion.area:.3g} cm³ at {place}")
         if inclusion.contrast_interval is not None:
-            radius_text = f", within {1e3 * inclusion.centroid_radius:.2g} mm" if inclusion.centroid_radius else ""
-            lines.append(f"    {interval_text(inclusion.contrast_interval, signed_percent)}{radius_text}")
+            lines.append(f"    {interval_text(inclusion.contrast_interval, signed_percent)}")
     if len(inclusions) > _MAX_LISTED:
         lines.append(f"and {len(inclusions) - _MAX_LISTED} more")
     ax.text(0, 0.9, "\n".join(lines), transform=ax.transAxes, va="top", fontsize=8.5, color=INK, linespacing=1.6)
