@@ -1,4 +1,4 @@
-"""Reader of numeric variables in MATLAB files, with error messages that tell the user what to do.
+"""Reader of numeric variables in MATLAB files, with error messages that say what the user can do.
 
 This module decodes numeric arrays of format 5 ("MAT-File Format" by The MathWorks) without SciPy, because crafted files
 can crash SciPy's reader. Compressed data are decompressed only up to the size that the file declares.

@@ -31,7 +31,7 @@ _RANK_TOLERANCE = 1e-9
 class Data(Module):
     """Voltages of r independent channels and their noise.
 
-    ***Fields**: `voltages` (r,): estimated voltages ŷ, volts; `weight` (r,): weights of the voltages, 1 / volts;
+    **Fields**: `voltages` (r,): estimated voltages ŷ, volts; `weight` (r,): weights of the voltages, 1 / volts;
     `covariance`, `precision` (r, r): covariance of weight · ŷ, and its inverse, which has a unit diagonal; `rest`: the
     constant c of `jeit.inverse.channels`, the sum of squared residuals that no conductivity can explain.
     """

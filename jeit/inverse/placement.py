@@ -52,7 +52,7 @@ _MIN_NOISE = 0.1
 class Uncertainty:
     """Uncertainty of the description of a sensor, as standard deviations. All but `position` are relative: 0.1 is 10 %.
 
-    ***Fields**: `position`: standard deviation of electrode positions, metres, in every direction in which electrodes
+    **Fields**: `position`: standard deviation of electrode positions, metres, in every direction in which electrodes
     can move; default: 0.0175 of the width of the body, which is 2° on a disk. `drift`: of the logarithm of each contact
     impedance, between the reference and the frame. `size`: of the lengths of the body. `other`: of all other errors of
     the model, as a share of the difference of the two frames; if the misfit of the reference is larger, the misfit is
@@ -112,7 +112,7 @@ class ModelError(NamedTuple):
     """Error of the model, and thereby of predicted differences of two frames, because electrode positions and contact
     impedances are known only as well as the reference frame determines them.
 
-    ***Fields**: `factor` (p, p): F with the posterior covariance F Fᵀ of the shifts, metres, and of the logarithms of
+    **Fields**: `factor` (p, p): F with the posterior covariance F Fᵀ of the shifts, metres, and of the logarithms of
     the contact impedances; `drift`: standard deviation of the change of the logarithm of each contact impedance between
     the reference and the frame.
 

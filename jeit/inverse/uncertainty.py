@@ -44,7 +44,7 @@ _ROWS_AT_ONCE = 32
 class Posterior(Module):
     """Posterior of an image: a Gaussian distribution of the image's coefficients with mean ĉ, created by `posterior`.
 
-    ***Fields**: `inversion`: the least squares problem; `coefficients` (n,): ĉ; `jacobian` (r, n): Jacobian J at ĉ;
+    **Fields**: `inversion`: the least squares problem; `coefficients` (n,): ĉ; `jacobian` (r, n): Jacobian J at ĉ;
     `root` (r, r): W with WᵀW = (JQ⁻¹Jᵀ + C)⁻¹; `cross` (r, n): JQ⁻¹; `prior`: normal distribution of precision Q.
 
     **Example:**

@@ -76,6 +76,8 @@ def faults(path: Path) -> list[str]:
         elif not said:
             found.append(f"{name}: no docstring")
             continue
+        if "***" in said + said_of_class:
+            found.append(f"{name}: three asterisks, which are no mark")
         for error in sorted(raised(function).union(*(private.get(one, set()) for one in called(function)))):
             if not re.search(rf"\b[Rr]aise|{error}", f"{said} {said_of_class}"):
                 found.append(f"{name}: does not say that it raises {error}")

@@ -91,7 +91,6 @@ def test_the_radius_of_a_place_holds_68_percent_of_a_posterior(dimension):
     problem = SimpleNamespace(
         model=SimpleNamespace(mesh=SimpleNamespace(points=middle + np.array([[-1.0] * dimension, [1.0] * dimension]))),
         covariance=lambda fit: covariance,
-        deviations=lambda fit: np.sqrt(np.diag(covariance)),
     )
     bodies = SimpleNamespace(body=body, prior=SimpleNamespace(size=size), span=2.0)
     fit = SimpleNamespace(bodies=bodies, coefficients=np.zeros(number))
@@ -104,6 +103,10 @@ def test_the_radius_of_a_place_holds_68_percent_of_a_posterior(dimension):
     assert displaced == pytest.approx(np.hypot(radius, np.linalg.norm(shown)))
     wider = centroid_radius(problem, fit, 1, centroid, accuracy._replace(strength=0.1))  # pyright: ignore
     assert wider > 1.02 * radius
+    slope[:] = 0  # a body that cannot move
+    assert centroid_radius(problem, fit, 1, centroid - shown, accuracy._replace(size=0.0)) == pytest.approx(  # pyright: ignore
+        np.linalg.norm(shown)
+    )
 
 
 @pytest.mark.slow

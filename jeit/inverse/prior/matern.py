@@ -98,7 +98,7 @@ class Matern(AbstractPrior):
 class _MaternField(NamedTuple):
     """Matérn field on the nodes of a mesh.
 
-    ***Fields**: `means` (m, n): matrix that averages nodal values over each cell; `solve`: function that solves systems
+    **Fields**: `means` (m, n): matrix that averages nodal values over each cell; `solve`: function that solves systems
     with A = κ²M + K; `mass` (n,): lumped mass M of the nodes; `scale` (n,): factors that give every node unit variance;
     `fields` (n, k): F, where F Fᵀ approximates the covariance of the nodal values.
     """

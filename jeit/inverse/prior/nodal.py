@@ -77,7 +77,7 @@ class NodalSystem(NamedTuple):
 
 
 class FactorisedMatrix(NamedTuple):
-    """A factorised matrix A = L Lᵀ. ***Fields**: `solve`: function that returns A⁻¹ times columns (n, k); `half_solve`:
+    """A factorised matrix A = L Lᵀ. **Fields**: `solve`: function that returns A⁻¹ times columns (n, k); `half_solve`:
     function that returns L⁻¹ times columns, with the rows in the order of the factorisation."""
 
     solve: Solve

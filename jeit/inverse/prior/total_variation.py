@@ -48,7 +48,7 @@ class NodalTotalVariation(AbstractPenalty):
     """Penalty Σ weight √(|∇x|² + steepness²) + ½ Σ pull c² of the nodal image x = reference + c; further unknowns have
     the penalty ½ ‖c‖².
 
-    ***Fields**: `cells` (m, 4): nodes of the cells; `slope` (m, 4, 3): gradients of the basis functions, 1/m; `weight`
+    **Fields**: `cells` (m, 4): nodes of the cells; `slope` (m, 4, 3): gradients of the basis functions, 1/m; `weight`
     (m,): weight of each cell; `steepness` (m,): gradient below which the penalty is nearly quadratic, 1/m; `pull` (n,):
     weight of the deviation from the background; `reference` (n,): image at c = 0; `pattern`, `plan`: sparsity pattern
     and factorisation plan of matrices over the nodes; `fronts`: order of the factorisation of matrices with known

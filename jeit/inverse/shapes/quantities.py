@@ -104,11 +104,11 @@ def centroid_radius(
     """
     bodies, prior_size = fit.bodies, fit.bodies.prior.size
     indices = np.arange(1 + k * prior_size, 1 + (k + 1) * prior_size)
-    deviations = problem.deviations(fit)
+    coefficient_covariance = problem.covariance(fit)[np.ix_(indices, indices)]
     slopes = []
-    for index in indices:
+    for index, deviation in zip(indices, np.sqrt(np.diag(coefficient_covariance)), strict=True):
         step = np.zeros(len(fit.coefficients))
-        step[index] = _CENTROID_STEP * deviations[index]
+        step[index] = _CENTROID_STEP * deviation
         ends = [bodies.body(k, fit.coefficients + direction * step).centroid for direction in (-1, 1)]
         slopes.append((ends[1] - ends[0]) / (2 * step[index]))
     slope = np.stack(slopes, axis=1)
@@ -116,12 +116,14 @@ def centroid_radius(
     points = np.asarray(problem.model.mesh.points)
     scaling_error = accuracy.size * (centroid - (points.min(axis=0) + points.max(axis=0)) / 2)
     field_error = _FIELD_DISPLACEMENT * accuracy.strength * bodies.span / 2
-    covariance = slope @ problem.covariance(fit)[np.ix_(indices, indices)] @ slope.T
+    covariance = slope @ coefficient_covariance @ slope.T
     covariance += np.outer(scaling_error, scaling_error) + field_error**2 * np.eye(len(centroid))
-    variances = np.linalg.eigvalsh(covariance)
-    scale = np.sum(variances**2) / np.sum(variances)
-    squared_radius = scale * chdtri(np.sum(variances) / scale, 1 - _CENTROID_PROBABILITY)
-    return float(np.sqrt(squared_radius + np.sum((centroid - shown_centroid) ** 2)))
+    variance = np.trace(covariance)
+    squared_radius = np.sum((centroid - shown_centroid) ** 2)
+    if variance > 0:
+        scale = np.sum(covariance**2) / variance
+        squared_radius += scale * chdtri(variance / scale, 1 - _CENTROID_PROBABILITY)
+    return float(np.sqrt(squared_radius))
 
 
 def include_deviation(quantities: Quantities, body: Ellipsoid, other: Ellipsoid | None, deviation: float) -> Quantities:
