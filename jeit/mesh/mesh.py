@@ -96,8 +96,8 @@ class Mesh(Module):
 
         In 2-D each loop of `facets` starts at its node of the lowest index; the outer loop runs counter-clockwise,
         holes clockwise. For a surface in space the longest loop comes first. The triangles of a closed surface are
-        oriented outward, those of an open surface as most of its triangles are given. `points` may be traced by JAX;
-        the coordinates are then not checked, and the cells must already be positively oriented.
+        oriented outward. Those of an open surface all get the orientation that most of them have in the input. `points`
+        may be traced by JAX. The coordinates are then not checked, and the cells must already be positively oriented.
 
         Raises `ValueError` if arrays have the wrong shape or type, or contain NaN or indices out of range; if the mesh
         has degenerate, duplicated or overlapping cells, unused or coincident nodes, facets shared by three cells, or

@@ -1,4 +1,4 @@
-"""`Module`: an `equinox.Module` whose methods are bound quickly."""
+"""`Module`: an `equinox.Module` whose methods take less time to look up."""
 
 from __future__ import annotations
 

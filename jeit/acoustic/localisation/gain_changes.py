@@ -10,8 +10,8 @@ eliminated, have the matrix
     A + 1 / deviation²,    A = Σ_f S (W − W J (Jᵀ W J)⁻¹ Jᵀ W) S.
 
 The inverse of this matrix is the covariance of the changes given the recording. A single touch reduces the covariance
-little; touches all over the skin determine the changes. The changes are applied only if they are significant: if, with
-the right-hand side b, the statistic bᵀ A⁺ b is larger than is due to the errors of the decay models.
+little; touches all over the skin determine the changes. The changes are applied only if they are significant: b is the
+right-hand side of the equations, and bᵀ A⁺ b must exceed the value that errors of the decay models alone explain.
 """
 
 from __future__ import annotations

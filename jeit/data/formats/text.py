@@ -366,7 +366,7 @@ def frames_in_table(
     default_axis: str = "rows",
 ) -> Frames:
     """Frames of a two-dimensional array. `counts`: see `frames_in_text`; `heading`: names of the columns;
-    `default_axis`: "rows" or "columns", whichever are frames if the numbers of channels do not decide."""
+    `default_axis`: "rows" or "columns". It states which of them are frames if the numbers of channels leave it open."""
     stated_axis = layout.frames_in
     is_transposed = stated_axis == "columns" if stated_axis else _are_columns(table.shape, counts, default_axis)
     rows = table.T if is_transposed else table

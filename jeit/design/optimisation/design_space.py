@@ -154,7 +154,8 @@ class DesignSpace(Module):
 
 
 def varied_of(skin: Skin) -> Varied:
-    """Current values of the parameters of a sheet that a layout optimisation may vary."""
+    """Current positions, radii and contact impedances of a skin's electrodes and its thickness: the quantities that a
+    layout optimisation may vary."""
     discs = skin.model.electrodes
     contact_impedance = discs.contact_impedance  # pyright: ignore[reportAttributeAccessIssue]
     return Varied(skin.layout.centres, skin.layout.diameters / 2, contact_impedance, jnp.asarray(skin.thickness, float))

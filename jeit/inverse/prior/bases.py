@@ -71,7 +71,7 @@ class DiagonalBasis(AbstractBasis):
         return self.deviation.shape[0]
 
     def expand(self, coefficients):
-        """S c: each coefficient times the deviation of its cell."""
+        """S c: each coefficient multiplied by the prior standard deviation of its cell."""
         return self.deviation * coefficients
 
     def restrict(self, rows):

@@ -90,7 +90,8 @@ class BodyPrior(abc.ABC):
 
 @dataclass(frozen=True)
 class Quantities:
-    """Posterior medians and 68 % intervals of the properties of a body, with None for an end that the data leave open.
+    """Posterior medians and 68 % intervals of the properties of a body. A limit of an interval that the data do not
+    determine is None.
 
     **Fields**: `change`, `change_interval`: change of conductivity relative to the background; `measure`,
     `measure_interval`: area, m², or volume, m³; `strength`, `strength_interval`: `measure` times (ρ - 1) / (ρ + n - 1),

@@ -24,7 +24,7 @@ _LARGEST_DIFFERENCE = 0.5
 # electrode is dead if at most `_MAX_REMAINING_SHARE` of the difference is left without the electrode's channels, and if
 # the median relative change of these channels exceeds `_MIN_DEAD_CHANGE`.
 _SUSPECT_FACTOR, _MAX_REMAINING_SHARE, _MIN_DEAD_CHANGE = 0.15, 0.5, 0.5
-# Minimum fraction of the channels in use that must be usable.
+# Minimum number of channels with valid readings, as a fraction of the channels in use.
 _MIN_CHANNELS = 0.5
 # Minimum number of channels with equal readings, above or below all others, that count as saturated; relative
 # difference within which their undisturbed voltages count as equal.

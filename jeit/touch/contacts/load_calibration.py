@@ -7,7 +7,7 @@ peak = s exp(b ρ² + c ρ⁴) F / (F + F½),
 where s, b, c and F½ are fitted, and ρ is the distance of the contact from the middle of the skin, divided by the skin's
 radius. The peak rises with the load and saturates, as conductivity under pressure does, and is larger near the
 electrodes. A calibration is valid for one indenter, or similar indenters: a wider contact under the same load has
-another peak.
+a different peak.
 """
 
 from __future__ import annotations

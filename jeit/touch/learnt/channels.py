@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-# Number of pattern scores compared; maximum number of presses stored. Distances are divided by the norm of the frame's
-# scores plus this fraction of the presses' median norm.
+# Number of channel patterns whose scores are compared; maximum number of presses stored. Distances are divided by the
+# norm of the frame's scores plus this fraction of the presses' median norm.
 _NUM_SCORES, _MAX_STORED_PRESSES, _NORM_OFFSET_FRACTION = 8, 4000, 0.5
 _USUAL_QUANTILE = 0.99
 

@@ -93,7 +93,7 @@ class PaddedSum(NamedTuple):
     def apply(
         self, indices: Int[Array, " total"], contributions: Inexact[Array, "sources *k"]
     ) -> Inexact[Array, "sums *k"]:
-        """Compute the sums of the given contributions."""
+        """Compute all sums from the contributions, with the plan stored in `indices`."""
         shape = self.gather.shape[1], *contributions.shape[1:]
         total = namespace(contributions).zeros(shape, contributions.dtype)
         if isinstance(contributions, np.ndarray):

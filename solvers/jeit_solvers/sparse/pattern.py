@@ -154,7 +154,8 @@ class SparsityPattern(Module):
 
     @classmethod
     def _from_contributions(cls, row_lists, column_lists, shapes, size, caller, reason) -> Self:
-        """Pattern of the unique entries of all groups, with a map from the values of each group to the entries."""
+        """Pattern of the unique entries of all groups of contributions, and for each contribution the index of its
+        entry."""
         keys = []
         for rows, columns in zip(row_lists, column_lists, strict=True):
             above, below = np.maximum(rows, columns), np.minimum(rows, columns)
