@@ -33,9 +33,12 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
 # Tracing creates many small objects, which would trigger Python's garbage collection again and again.
 gc.set_threshold(100_000, 20, 50)
 
-# The same programs are compiled in every run, and many in both workers: keep them all.
+# The same programs are compiled in every run, and many in both workers and in the processes that tests start: keep them
+# all. The variables are for the processes.
 jax.config.update("jax_compilation_cache_dir", str(ROOT / ".jax_cache"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+os.environ["JAX_COMPILATION_CACHE_DIR"] = str(ROOT / ".jax_cache")
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 
 # Most of a test's time is compilation. Compile quickly and run a little slower; XLA_FLAGS="" tests the users' settings.
 from jeit.start import quick_compilation  # noqa: E402, after JAX's cache folder is set

@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from jeit.design.skin.touched_cells import TouchedCells
@@ -85,7 +84,5 @@ def contents(store: Path) -> dict[str, bytes]:
 
 def in_another_process(code: str, *arguments, **environment: str) -> subprocess.CompletedProcess:
     """Run Python `code` with these arguments and environment variables in another process, and wait for its end."""
-    variables = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir)} | environment
-    return subprocess.run(
-        [sys.executable, "-c", code, *map(str, arguments)], env=variables, capture_output=True, text=True, timeout=120
-    )
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=120)

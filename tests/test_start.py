@@ -21,7 +21,7 @@ print(jax.config.jax_compilation_cache_dir, events.count("/jax/compilation_cache
 
 def run(home, program=PROGRAM, **variables):
     """The cache folder of a new process, and the number of programs that it found there."""
-    kept = ("JAX_COMPILATION_CACHE_DIR", "JEIT_COMPILATION_CACHE")
+    kept = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "JEIT_COMPILATION_CACHE")
     environment = {name: value for name, value in os.environ.items() if name not in kept}
     environment |= {"XDG_CACHE_HOME": str(home), "LOCALAPPDATA": str(home), "HOME": str(home)} | variables
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=120)
