@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from jeit.arguments import describe, is_number
-from jeit.image.merit import CONDUCTIVE, RESISTIVE
+from jeit.image.rasters import CONDUCTIVE, RESISTIVE
 from jeit.mesh import Mesh, centroids, measures
 from jeit.mesh.geometry import interior_facets
 

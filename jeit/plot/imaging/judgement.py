@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocato
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
-from jeit.image.merit import FiguresOfMerit
+from jeit.image.rasters import FiguresOfMerit
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.plot.axes import (
     INK,
