@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from jeit.inverse.hyperparameter.choice import EDGE_PRICE
 from jeit.inverse.prior.bases import DiagonalBasis, NodalBasis
-from jeit.inverse.prior.nodal import factorise_matrix
+from jeit.inverse.prior.linear_algebra import factorise_matrix
 from jeit.inverse.prior.penalties import AbstractPenalty, SparseNormal
 from jeit.inverse.prior.priors import AbstractPrior, cell_factorisation, check_cells
 from jeit.mesh import Mesh, gradients, measures
