@@ -59,7 +59,9 @@ FORMATS: dict[str, Format] = {
     "carefusion": Format("clinical.Carefusion", (".eit",), described=True, own_protocol=True),
     "swisstom": Format("clinical.Swisstom", (".eit",), described=True, own_protocol=True),
     "goettingen": Format("clinical.Goettingen", (".get",), described=True, own_protocol=True),
-    "cn0565": Format("cn0565", (".txt", ".csv", ".dat", ".log"), described=True, borrows=True, own_protocol=True),
+    "cn0565": Format(
+        "boards.Cn0565", (".txt", ".csv", ".dat", ".log"), described=True, borrows=True, own_protocol=True
+    ),
     "quadrupoles": Format(
         "quadrupoles",
         (".txt", ".csv", ".dat", ".data", ".ohm", ".shm"),
@@ -67,7 +69,7 @@ FORMATS: dict[str, Format] = {
         borrows=True,
         own_protocol=True,
     ),
-    "openeit": Format("openeit", (".txt", ".csv", ".dat", ".log", ".bin"), described=True, borrows=True),
+    "openeit": Format("boards.OpenEit", (".txt", ".csv", ".dat", ".log", ".bin"), described=True, borrows=True),
     "table": Format("table", _TABLES, described=True, borrows=True),
     # A table with 208 rows of pairs of real and imaginary parts and a bundled description; used only if named
     # explicitly.
