@@ -15,7 +15,7 @@ from jeit.electrodes.electrodes import (
     check_dimension,
 )
 from jeit.mesh import Body, Mesh, Refine
-from jeit.mesh.geometry import boundary_loops, facet_measures
+from jeit.mesh.mesh import boundary_loops, facet_measures
 from jeit.mesh.outline.straight_sided import along_loop
 from jeit.mesh.topology import along
 from jeit_solvers.engines import (

@@ -13,7 +13,7 @@ from jeit.inverse.prior.matern import Matern
 from jeit.inverse.prior.priors import Gaussian, Laplace
 from jeit.layout import ring
 from jeit.mesh import box, centroids, disk
-from jeit.mesh.geometry import interior_facets
+from jeit.mesh.mesh import interior_facets
 from jeit.protocol import adjacent
 
 

@@ -38,7 +38,7 @@ from jeit.inverse.prior.penalties import (
     Ridge,
 )
 from jeit.mesh import Mesh, centroids
-from jeit.mesh.geometry import interior_facets
+from jeit.mesh.mesh import interior_facets
 from jeit_solvers import (
     FactorisationPlan,
     SparsityPattern,

@@ -29,7 +29,7 @@ from jeit.inverse.prior.linear_algebra import factorise_matrix
 from jeit.inverse.prior.penalties import AbstractPenalty, SparseNormal
 from jeit.inverse.prior.priors import AbstractPrior, cell_factorisation, check_cells
 from jeit.mesh import Mesh, gradients, measures
-from jeit.mesh.geometry import interior_facets
+from jeit.mesh.mesh import interior_facets
 from jeit_solvers import (
     Factor,
     FactorisationPlan,
