@@ -12,7 +12,7 @@ from benchmarks.harness.case import Case, Options, Result, Table
 from benchmarks.harness.timing import say
 from benchmarks.problems.cut_tanks import draw
 from jeit import image_difference
-from jeit.image.merit import challenge_score
+from jeit.image.rasters import challenge_score
 from jeit.imaging import ImagingSettings
 
 TANKS, FIRST = 70, 200_000

@@ -19,7 +19,7 @@ from benchmarks.harness.machine import ROOT
 from benchmarks.harness.timing import say
 from benchmarks.problems.cut_tanks import without
 from jeit.data import read
-from jeit.image.merit import challenge_score
+from jeit.image.rasters import challenge_score
 from jeit.imaging import ImagingSettings, image_difference
 
 LEVELS, TARGETS = range(1, 8), range(1, 5)

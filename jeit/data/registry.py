@@ -18,15 +18,16 @@ _MEMORY_FACTOR = 4
 
 @dataclass(frozen=True)
 class Format:
-    """A file format. **Fields**: `module`: name of the module that reads the format; `endings`: suffixes of files in
-    the format; `described`: whether a description may accompany a file; `borrows`: whether a file may use the
-    description of another measurement (`like` of `read`); `own_protocol`: whether files state their protocol, so that a
-    description states only the body; `bundled`: name of the bundled description that always applies, or None.
+    """A file format. **Fields**: `reading`: name of the module that reads the format, or of a class in it, such as
+    "kuopio.Kit4"; `endings`: suffixes of files in the format; `described`: whether a description may accompany a file;
+    `borrows`: whether a file may use the description of another measurement (`like` of `read`); `own_protocol`: whether
+    files state their protocol, so that a description states only the body; `bundled`: name of the bundled description
+    that always applies, or None.
 
     The module is imported only when a file has one of the suffixes `endings`.
     """
 
-    module: str
+    reading: str
     endings: tuple[str, ...]
     described: bool = False
     borrows: bool = False
@@ -35,8 +36,11 @@ class Format:
 
     @property
     def reader(self) -> Any:
-        """The module that reads files of this format; it defines `DESCRIPTION`, `recognises(path)` and `read(path)`."""
-        return importlib.import_module(f"jeit.data.formats.{self.module}")
+        """The module or class that reads files of this format; it defines `DESCRIPTION`, `recognises(path)` and
+        `read(path)`."""
+        module_name, _, class_name = self.reading.partition(".")
+        module = importlib.import_module(f"jeit.data.formats.{module_name}")
+        return getattr(module, class_name) if class_name else module
 
     def recognises(self, path: Path) -> bool:
         """Whether a file is of this format, judged by its suffix and its content."""
@@ -44,17 +48,20 @@ class Format:
 
 
 _TABLES = (".csv", ".txt", ".dat", ".npy", ".npz")
-# A file is read by the first format that recognises it. To add a format, write a module like kit4.py and list it here.
+# A file is read by the first format that recognises it. To add a format, write a class like Kit4 in kuopio.py, or a
+# module like table.py, and list it here.
 FORMATS: dict[str, Format] = {
-    "kit4": Format("kit4", (".mat",)),
-    "ktc2023": Format("ktc2023", (".mat",)),
+    "kit4": Format("kuopio.Kit4", (".mat",)),
+    "ktc2023": Format("kuopio.Ktc2023", (".mat",)),
     "eidors": Format("eidors", (".mat",), described=True, borrows=True),
     "sciospec": Format("sciospec", (".eit",), described=True, own_protocol=True),
-    "draeger": Format("draeger", (".eit",), described=True, own_protocol=True),
-    "carefusion": Format("carefusion", (".eit",), described=True, own_protocol=True),
-    "swisstom": Format("swisstom", (".eit",), described=True, own_protocol=True),
-    "goettingen": Format("goettingen", (".get",), described=True, own_protocol=True),
-    "cn0565": Format("cn0565", (".txt", ".csv", ".dat", ".log"), described=True, borrows=True, own_protocol=True),
+    "draeger": Format("clinical.Draeger", (".eit",), described=True, own_protocol=True),
+    "carefusion": Format("clinical.Carefusion", (".eit",), described=True, own_protocol=True),
+    "swisstom": Format("clinical.Swisstom", (".eit",), described=True, own_protocol=True),
+    "goettingen": Format("clinical.Goettingen", (".get",), described=True, own_protocol=True),
+    "cn0565": Format(
+        "boards.Cn0565", (".txt", ".csv", ".dat", ".log"), described=True, borrows=True, own_protocol=True
+    ),
     "quadrupoles": Format(
         "quadrupoles",
         (".txt", ".csv", ".dat", ".data", ".ohm", ".shm"),
@@ -62,7 +69,7 @@ FORMATS: dict[str, Format] = {
         borrows=True,
         own_protocol=True,
     ),
-    "openeit": Format("openeit", (".txt", ".csv", ".dat", ".log", ".bin"), described=True, borrows=True),
+    "openeit": Format("boards.OpenEit", (".txt", ".csv", ".dat", ".log", ".bin"), described=True, borrows=True),
     "table": Format("table", _TABLES, described=True, borrows=True),
     # A table with 208 rows of pairs of real and imaginary parts and a bundled description; used only if named
     # explicitly.
@@ -149,13 +156,14 @@ def _recognise(file: Path, description: str | Path | None, like: Measurement | N
             return name
     _check_mark(file)
     if file.suffix.lower() == ".mat":
-        from jeit.data.formats import eidors, kit4, ktc2023
+        from jeit.data.formats import eidors
+        from jeit.data.formats.kuopio import Kit4, Ktc2023
         from jeit.files import matlab
 
         if has_description or eidors.find_description(file) is not None:
             return "eidors"
         names = matlab.variable_names(file)
-        for reader in (kit4, ktc2023):
+        for reader in (Kit4, Ktc2023):
             missing_variables = [
                 min(kind - names, key=len) for kind in reader.VARIABLES if len(kind & names) == len(kind) - 1
             ]
@@ -167,7 +175,7 @@ def _recognise(file: Path, description: str | Path | None, like: Measurement | N
         listed_names = listed(sorted(names))
         raise ValueError(
             f"{file.name} is a .mat file of no known kind; it holds {listed_names}. `jeit describe {file.name}` finds "
-            f"out what it can, and writes a description. Known: {kit4.DESCRIPTION}; {ktc2023.DESCRIPTION}; "
+            f"out what it can, and writes a description. Known: {Kit4.DESCRIPTION}; {Ktc2023.DESCRIPTION}; "
             f"{eidors.DESCRIPTION}."
         )
     suffix = file.suffix.lower()

@@ -15,8 +15,8 @@ from jeit.electrodes.electrodes import (
     check_dimension,
 )
 from jeit.mesh import Body, Mesh, Refine
-from jeit.mesh.geometry import boundary_loops, facet_measures
-from jeit.mesh.outline import polyline
+from jeit.mesh.mesh import boundary_loops, facet_measures
+from jeit.mesh.outline.straight_sided import along_loop
 from jeit.mesh.topology import along
 from jeit_solvers.engines import (
     either_engine,
@@ -80,7 +80,7 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         """
         edge = body.loops(720)[0]
         centres, half_width = along(np.asarray(self.position), np.asarray(edge)), np.asarray(self.width) / 2
-        ends = polyline.along(edge, np.concatenate([centres - half_width, centres + half_width]))
+        ends = along_loop(edge, np.concatenate([centres - half_width, centres + half_width]))
         return (Refine(np.asarray(ends), factor=4.0),)
 
     def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:

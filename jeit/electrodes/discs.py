@@ -19,7 +19,7 @@ from jeit.electrodes.electrodes import (
 )
 from jeit.mesh import Body, Mesh, Refine, measures, normals
 from jeit.mesh.geodesic import Triangles, unfold
-from jeit.mesh.geometry import facet_measures
+from jeit.mesh.mesh import facet_measures
 from jeit_solvers.engines import has_values, host, namespace, on_host, sum_into, undifferentiated, values_at_once
 
 # Half-width of the smooth edge of a disc's window, relative to the local cell size. Smaller values approximate the

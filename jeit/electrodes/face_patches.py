@@ -25,7 +25,7 @@ from jeit.electrodes.electrodes import (
 from jeit.electrodes.facets import covered_moments
 from jeit.mesh import Body, Mesh, OwnMesh, Rectangle, Refine, Solid
 from jeit.mesh.checks import size_checked
-from jeit.mesh.geometry import facet_measures
+from jeit.mesh.mesh import facet_measures
 from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undifferentiated, values_at_once
 
 # Distance from a face, relative to the size of the body, within which a position lies on the face; also used in checks

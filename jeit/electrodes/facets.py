@@ -26,7 +26,7 @@ from jeit.electrodes.electrodes import (
     replace_contact_impedance,
 )
 from jeit.mesh import Body, Mesh, Refine
-from jeit.mesh.geometry import facet_measures
+from jeit.mesh.mesh import facet_measures
 from jeit_solvers.engines import has_values, namespace, sum_into, undifferentiated, values_at_once
 
 # Covered fraction of a triangle below which the fraction counts as zero: such a fraction has few correct digits, which

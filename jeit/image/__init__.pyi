@@ -1,8 +1,7 @@
 from .image_series import ImageSeries, Oscillation, amplitude_spectrum, oscillation
 from .inclusions import Inclusion, SolidForm, find_inclusions
-from .merit import FiguresOfMerit, figures_of_merit
 from .plane import Cut, Plane, TriangleSurface, cut_by_plane, isosurface_of, node_values
-from .raster import Raster
+from .rasters import FiguresOfMerit, Raster, figures_of_merit
 from .segmentation import ball_region, box_region, half_region, segment
 
 __all__ = [

@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from jeit.arguments import describe, is_number
-from jeit.image.merit import CONDUCTIVE, RESISTIVE
+from jeit.image.rasters import CONDUCTIVE, RESISTIVE
 from jeit.mesh import Mesh, centroids, measures
-from jeit.mesh.geometry import interior_facets
+from jeit.mesh.mesh import interior_facets
 
 
 def ball_region(mesh: Mesh, centre: ArrayLike, radius: float) -> Bool[np.ndarray, " m"]:

@@ -18,7 +18,8 @@ from jeit.arguments import counted, did_you_mean, listed, percent
 from jeit.data import Measurement, read
 from jeit.data.description import Description, TableLayout, parse_description
 from jeit.data.exchange import assignments
-from jeit.data.formats import openeit, quadrupoles
+from jeit.data.formats import quadrupoles
+from jeit.data.formats.boards import OpenEit
 from jeit.data.formats.table import measurement_in
 from jeit.data.formats.text import Frames, frames_in_table, frames_in_text, read_text
 from jeit.data.quality import reciprocity_error
@@ -168,8 +169,8 @@ def find_description(
     if (format_name := format_with_protocol(path)) is not None:
         progress("read")
         return _described_body(path, format_name, geometry, electrodes, reference or path, known or {})
-    if not known and openeit.recognises(path):
-        known = openeit.protocol_table(path)
+    if not known and OpenEit.recognises(path):
+        known = OpenEit.protocol_table(path)
     number = (known or {}).get("number")
     if number is not None and not _FEWEST <= number <= _MOST:
         raise ValueError(f"number must be from {_FEWEST} to {_MOST} electrodes; it is {number}.")
@@ -261,8 +262,8 @@ class _Numbers:
             )
         if key is not None:
             raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
-        if openeit.recognises(path):
-            table = openeit.numbers(path)[0]
+        if OpenEit.recognises(path):
+            table = OpenEit.numbers(path)[0]
             shape, sizes = f"{counted(len(table), 'line')} of {table.shape[1]}", table.shape[1:]
             return cls(path, lambda counts: frames_in_table(table, counts, _UNKNOWN_LAYOUT), shape, sizes)
         text = read_text(path)

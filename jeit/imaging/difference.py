@@ -19,7 +19,7 @@ from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster, SolidForm
 from jeit.image.inclusions import inclusion_regions
-from jeit.image.merit import CONDUCTIVE, RESISTIVE
+from jeit.image.rasters import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically
 from jeit.imaging.calibration import Clock, threads_for
 from jeit.imaging.method import AUTO, METHODS, ImagingSettings, MethodOptions, as_settings

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jeit.data import Measurement, load_description, read
 from jeit.data.description import Description
-from jeit.data.formats.openeit import frames_in
+from jeit.data.formats.boards import OpenEit
 from jeit.data.formats.table import description_like
 from jeit.data.formats.text import LineNumbers
 
@@ -119,7 +119,7 @@ class LineReading:
             self.note = text[:_MAX_TEXT_LENGTH]
             return None
         word = _FRAME_WORD.match(line.strip())
-        numbers = next(frames_in(line), None) if word else self._parse_numbers(text)
+        numbers = next(OpenEit.frames_in(line), None) if word else self._parse_numbers(text)
         if numbers is None or not len(numbers):
             return text if len(text) <= _MAX_TEXT_LENGTH else f"{text[: _MAX_TEXT_LENGTH - 1]}…"
         row = np.array(numbers, float)

@@ -3,9 +3,8 @@ from .cell_quality import Quality, quality
 from .files import read, write
 from .generate.refine import Refine
 from .geodesic import Geodesics, SurfacePlaces, Triangles, Unfolding, Unrolled, unfold, unroll
-from .geometry import centroids, check_flat, gradients, measures, normals
 from .gmsh import from_gmsh
-from .mesh import Mesh
+from .mesh import Mesh, centroids, check_flat, gradients, measures, normals
 from .outline import Disk, Domain, Polygon, Rectangle
 from .outline.domain import Body
 from .solid_body import OwnMesh, Solid

@@ -1,14 +1,12 @@
 from .axes import ColourScale
-from .imaging.hyperparameter import plot_choice, plot_figures_of_merit
 from .imaging.image import plot_admittivity, plot_image, plot_mesh
+from .imaging.judgement import plot_choice, plot_figures_of_merit
 from .imaging.series import plot_frames
-from .solid.curved_skin import plot_curved_skin
 from .solid.interactive import view_solid
 from .solid.isosurfaces import plot_isosurfaces
-from .solid.overview import plot_solid
 from .solid.scene import Camera
-from .solid.shaded_surface import plot_surface
-from .solid.slices import plot_slice, plot_slices
+from .solid.slices import plot_slice, plot_slices, plot_solid
+from .solid.surfaces import plot_curved_skin, plot_surface
 
 __all__ = [
     "Camera",

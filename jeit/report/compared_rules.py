@@ -146,7 +146,7 @@ def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
     `_MAX_MARKED`."""
     from jeit.plot import ColourScale, plot_image
     from jeit.plot.axes import INK
-    from jeit.plot.imaging.hyperparameter import COLOURS
+    from jeit.plot.imaging.judgement import COLOURS
 
     num_inclusions = len(outcome.inclusions)
     marked_inclusions = outcome.inclusions if num_inclusions <= _MAX_MARKED else ()

@@ -129,7 +129,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     scale = FACTOR if result.iterative else CHANGE
     electrodes = result.electrodes
     if result.mesh.dimension == 3:
-        from jeit.plot.solid.overview import plot_solid
+        from jeit.plot.solid.slices import plot_solid
 
         figure = plot_solid(result.mesh, _drawn_values(result), electrodes, inclusions=result.inclusions, scale=scale)
         figure.suptitle(result.measurement.name)

@@ -41,7 +41,7 @@ def page(value: Any) -> str | None:
 
 def _draw_mesh(mesh: Any) -> Figure:
     if mesh.is_surface:
-        from jeit.plot.solid.shaded_surface import plot_surface
+        from jeit.plot.solid.surfaces import plot_surface
 
         figure = Figure(figsize=(5.0, 4.6), layout="constrained")
         plot_surface(np.asarray(mesh.points), np.asarray(mesh.cells), ax=figure.subplots())
@@ -99,7 +99,7 @@ def _draw_series(series: Any) -> Figure:
 
 
 def _draw_figures_of_merit(figures: Any) -> Figure:
-    from jeit.plot.imaging.hyperparameter import plot_figures_of_merit
+    from jeit.plot.imaging.judgement import plot_figures_of_merit
 
     figure = Figure(figsize=(10.6, 5.6), layout="constrained")
     target_figures = jax.tree.map(np.atleast_1d, figures)

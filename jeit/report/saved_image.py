@@ -316,10 +316,9 @@ def drawn_values(image: SavedImage) -> tuple[np.ndarray, "ColourScale"]:
 
 def _draw_figures(image: SavedImage, camera, levels, planes, axis: str, slices: int) -> dict[str, "Figure"]:
     from jeit.plot.solid.isosurfaces import plot_isosurfaces
-    from jeit.plot.solid.overview import plot_solid
     from jeit.plot.solid.scene import CORNER_VIEW, Camera
-    from jeit.plot.solid.shaded_surface import plot_surface
-    from jeit.plot.solid.slices import plot_slice, plot_slices
+    from jeit.plot.solid.slices import plot_slice, plot_slices, plot_solid
+    from jeit.plot.solid.surfaces import plot_surface
 
     first_camera = CORNER_VIEW if camera is None else camera
     values, scale = drawn_values(image)

@@ -15,7 +15,7 @@ from jeit.arguments import check_kind, describe, is_number
 from jeit.electrodes import AbstractElectrodes
 from jeit.files import whole_files
 from jeit.mesh import Mesh, write
-from jeit.mesh.geometry import facet_measures
+from jeit.mesh.mesh import facet_measures
 from jeit.report.folder import results_folder
 
 # Minimum share of the surface around a node that an electrode must cover for the node to count as under the electrode.

@@ -34,9 +34,9 @@ from .optimise.small_problems import (
 from .sparse.choose import ColumnSolver, ConjugateGradient, DirectSolver, FrontalCholesky, SparseCholesky, choose_solver
 from .sparse.exact_fronts import Fronts, find_fronts
 from .sparse.exact_fronts_numpy import FrontalFactor, factorise_fronts
-from .sparse.multigrid import Multigrid
 from .sparse.near_inverse import NearInverse, Strips, near_inverse
 from .sparse.operator import NumpySolver, SparseSymmetric
+from .sparse.optional_packages import Multigrid, Pardiso
 from .sparse.padded_fronts import FactorisationPlan, analyse
 from .sparse.padded_fronts_jax import (
     Factor,
@@ -47,7 +47,6 @@ from .sparse.padded_fronts_jax import (
     quadratic_form,
     solve,
 )
-from .sparse.pardiso import Pardiso
 from .sparse.pattern import SparsityPattern
 
 __all__ = [

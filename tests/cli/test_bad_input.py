@@ -21,7 +21,7 @@ from jeit.inverse import Gaussian, Noser, back_projection, calibrate, one_step, 
 from jeit.mesh import Disk, Mesh, Polygon, Rectangle, Refine, box, disk
 from jeit.plot import plot_image
 from jeit.plot.imaging.image import plot_raster
-from jeit.plot.imaging.voltages import plot_voltages
+from jeit.plot.imaging.judgement import plot_voltages
 
 SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 CELLS = np.array([[0, 1, 2], [0, 2, 3]])

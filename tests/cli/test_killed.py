@@ -32,7 +32,7 @@ sys.exit(main(sys.argv[1:]))
 """
 # The function in which the process dies, the number of the call, and the files that exist then.
 STREAM = {
-    "its third line": ("jeit.report.growing", "GrowingTable", "write", 4, {"frames.csv"}),
+    "its third line": ("jeit.report.stream", "GrowingTable", "write", 4, {"frames.csv"}),
     "its images": ("zipfile", "_ZipWriteFile", "write", 3, {"frames.csv"}),
     "its sheet": ("jeit.plot.imaging.series", "FramePicture", "show", 3, {"frames.csv", "images.npz"}),
     "its film": ("jeit.plot.imaging.series", "FramePicture", "show", 9, {"frames.csv", "images.npz", "frames.png"}),

@@ -5,9 +5,8 @@ import signal
 import numpy as np
 import pytest
 
-from jeit.cli import live_frames
-from jeit.cli.live_frames import LiveFrames
-from jeit.cli.stopping import Stopping
+from jeit.cli import streams
+from jeit.cli.streams import LiveFrames, Stopping
 
 
 @pytest.fixture
@@ -22,7 +21,7 @@ def clock(monkeypatch):
             return self.now
 
     own = Clock()
-    monkeypatch.setattr(live_frames, "time", own)
+    monkeypatch.setattr(streams, "time", own)
     return own
 
 

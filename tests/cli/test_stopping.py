@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer import Exit
 
-from jeit.cli.stopping import Stopping
+from jeit.cli.streams import Stopping
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
@@ -94,7 +94,7 @@ def test_a_frame_in_progress_is_finished(tank, streamed, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_while_images_are_written_and_by_a_second_signal(tank, streamed, tmp_path, monkeypatch):
-    from jeit.report.growing import GrowingRows
+    from jeit.report.stream import GrowingRows
 
     write, times = GrowingRows.write_npz, [1]
 

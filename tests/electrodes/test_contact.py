@@ -20,7 +20,7 @@ from jeit.electrodes import (
 from jeit.forward import ForwardModel
 from jeit.layout import grid, ring
 from jeit.mesh import Mesh, box, cylinder, disk, layer, rectangle
-from jeit.mesh.geometry import facet_measures
+from jeit.mesh.mesh import facet_measures
 from jeit.protocol import adjacent
 
 ROUNDING = 1e-12

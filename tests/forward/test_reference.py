@@ -19,7 +19,7 @@ from jeit.forward import ForwardModel
 from jeit.forward.exact import ConductingDisk, point_transfer_impedance
 from jeit.inverse import Laplace, Noser, Tikhonov, one_step
 from jeit.mesh import Mesh
-from jeit.mesh.geometry import interior_facets
+from jeit.mesh.mesh import interior_facets
 from jeit.protocol import from_channels
 
 QUICK = ["circ2d_cem_576", "cyl3d_pem_768"]  # both electrode models in both dimensions; the others run in CI

@@ -19,7 +19,7 @@ from jeit.files import check_archive, matlab, read_toml
 from jeit.layout import read_layout
 from jeit.mesh import read as read_mesh
 from jeit.report.folder import results
-from jeit.report.growing import GrowingTable
+from jeit.report.stream import GrowingTable
 
 ZEROS = 3000  # million, of a decompression bomb
 

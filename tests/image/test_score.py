@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from jeit.image.merit import challenge_score
+from jeit.image.rasters import challenge_score
 
 
 def by_convolution(first, second):

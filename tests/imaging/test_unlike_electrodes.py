@@ -11,7 +11,7 @@ from jeit import image_difference
 from jeit.data import Measurement, read
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
-from jeit.image.merit import challenge_score
+from jeit.image.rasters import challenge_score
 from jeit.imaging import ImagingSettings, prepare_difference
 from jeit.inverse.channels import electrode_misfits
 from jeit.layout import ring

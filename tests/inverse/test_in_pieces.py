@@ -12,7 +12,7 @@ from jeit.inverse import Laplace, one_step
 from jeit.inverse.linear import greit
 from jeit.inverse.linearisation import Linearisation, combined_jacobian
 from jeit.inverse.prior.bases import DenseBasis, DiagonalBasis, NodalBasis
-from jeit.inverse.prior.nodal import by_columns
+from jeit.inverse.prior.linear_algebra import by_columns
 from jeit.layout import ring
 from jeit.mesh import Disk, box
 from jeit.protocol import adjacent

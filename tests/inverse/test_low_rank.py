@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from jeit.inverse.prior.low_rank import pivoted_cholesky, traced_pivoted_cholesky
+from jeit.inverse.prior.linear_algebra import pivoted_cholesky, traced_pivoted_cholesky
 
 
 def test_factors_reproduce_the_covariance_and_equal_traced_ones():

@@ -8,12 +8,12 @@ from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import one_step, posterior, reconstruct
 from jeit.inverse.prior import priors
-from jeit.inverse.prior.low_rank import GriddedGaussian
+from jeit.inverse.prior.linear_algebra import GriddedGaussian
 from jeit.inverse.prior.matern import Matern
 from jeit.inverse.prior.priors import Gaussian, Laplace
 from jeit.layout import ring
 from jeit.mesh import box, centroids, disk
-from jeit.mesh.geometry import interior_facets
+from jeit.mesh.mesh import interior_facets
 from jeit.protocol import adjacent
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jeit.mesh import Mesh, disk, measures, polygon, rectangle
-from jeit.mesh.geometry import boundary_loops, facet_measures
+from jeit.mesh.mesh import boundary_loops, facet_measures
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 TWO_TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jeit.mesh import box, centroids, disk, gradients, layer, measures, polygon
-from jeit.mesh.geometry import facet_measures
+from jeit.mesh.mesh import facet_measures
 
 PLANE = polygon([[0, 0], [0.3, 0], [0.3, 0.1], [0.1, 0.1], [0.1, 0.3], [0, 0.3]], cell_size=0.05)
 SOLID = layer(disk(0.1, num_points=40), 0.03, 2)

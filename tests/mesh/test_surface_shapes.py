@@ -27,7 +27,7 @@ from jeit.mesh import (
     surface_of,
     tube,
 )
-from jeit.mesh.geometry import facet_measures
+from jeit.mesh.mesh import facet_measures
 
 SHEET = rectangle(0.2, 0.1, num_points=300)
 

@@ -14,7 +14,7 @@ from jeit.forward import ForwardModel
 from jeit.image import Raster
 from jeit.mesh import Mesh, centroids, gradients, measures, normals, quality, rectangle
 from jeit.mesh._surface import first_crossing
-from jeit.mesh.geometry import boundary_loops, facet_measures
+from jeit.mesh.mesh import boundary_loops, facet_measures
 
 FLAT = rectangle(0.2, 0.1, num_points=200)
 TURN = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]

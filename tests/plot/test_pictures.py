@@ -25,8 +25,8 @@ from jeit.plot import ColourScale, plot_image, plot_mesh
 from jeit.plot.axes import FACTOR, extent_of, hide_axes
 from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions, draw_outlines
 from jeit.plot.imaging.image import plot_raster, plot_sensitivity
+from jeit.plot.imaging.judgement import plot_voltages
 from jeit.plot.imaging.series import plot_series
-from jeit.plot.imaging.voltages import plot_voltages
 from jeit.protocol import adjacent
 
 RADIUS = 0.05

@@ -11,7 +11,7 @@ from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import disk
 from jeit.plot import plot_choice
-from jeit.plot.imaging.hyperparameter import COLOURS
+from jeit.plot.imaging.judgement import COLOURS
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from jeit.image.merit import FiguresOfMerit
+from jeit.image.rasters import FiguresOfMerit
 from jeit.plot import plot_figures_of_merit
 
 

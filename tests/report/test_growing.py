@@ -14,8 +14,7 @@ from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
 from jeit.report import write_stream
-from jeit.report.growing import GrowingRows, GrowingTable, Sample
-from jeit.report.stream import _StreamSummary
+from jeit.report.stream import GrowingRows, GrowingTable, Sample, _StreamSummary
 
 
 @pytest.fixture(scope="module")

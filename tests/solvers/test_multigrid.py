@@ -12,7 +12,7 @@ import sparse_problems
 from sparse_problems import dense
 
 from jeit_solvers import ConjugateGradient, Multigrid, SparseSymmetric, SparsityPattern, choose_solver
-from jeit_solvers.sparse import choose, multigrid
+from jeit_solvers.sparse import choose, optional_packages
 
 pytest.importorskip("pyamg", reason="PyAMG, of the extra `large`, is not installed")
 
@@ -20,9 +20,9 @@ pytest.importorskip("pyamg", reason="PyAMG, of the extra `large`, is not install
 @pytest.fixture(autouse=True)
 def of_many_levels(monkeypatch):
     """Give small problems three levels, and groups of few columns."""
-    monkeypatch.setattr(multigrid, "_MAX_COARSEST_SIZE", 3)
-    monkeypatch.setattr(multigrid, "_MAX_COLUMNS", 2)
-    monkeypatch.setattr(multigrid, "_LAST_HIERARCHY", multigrid.LastMatrix())
+    monkeypatch.setattr(optional_packages, "_MAX_COARSEST_SIZE", 3)
+    monkeypatch.setattr(optional_packages, "_MAX_COLUMNS", 2)
+    monkeypatch.setattr(optional_packages, "_LAST_HIERARCHY", optional_packages.LastMatrix())
 
 
 def problem(case):
@@ -169,7 +169,7 @@ def test_invalid_requests_are_refused(monkeypatch):
         Multigrid(max_steps=0)
     with pytest.raises(ValueError, match=r"Multigrid solves systems with `SparseSymmetric`"):
         Multigrid().init(lineax.MatrixLinearOperator(np.eye(3)), {})
-    monkeypatch.setattr(multigrid, "find_spec", lambda _: None)
+    monkeypatch.setattr(optional_packages, "find_spec", lambda _: None)
     with pytest.raises(ImportError, match=r"needs pyamg: pip install 'jeit\[large\]'"):
         Multigrid()
 

@@ -10,10 +10,10 @@ import sparse_problems
 from sparse_problems import dense
 
 from jeit_solvers import Pardiso, SparseSymmetric
-from jeit_solvers.sparse import pardiso
+from jeit_solvers.sparse import optional_packages
 
 installed = pytest.mark.skipif(
-    pardiso.find_spec("pypardiso") is None, reason="pypardiso, of the extra `mkl`, is not installed"
+    optional_packages.find_spec("pypardiso") is None, reason="pypardiso, of the extra `mkl`, is not installed"
 )
 
 
@@ -82,6 +82,6 @@ def test_threads_do_not_disturb_each_other():
 
 
 def test_error_without_the_package_names_it(monkeypatch):
-    monkeypatch.setattr(pardiso, "find_spec", lambda name: None)
+    monkeypatch.setattr(optional_packages, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"Pardiso needs pypardiso: pip install 'jeit\[mkl\]'"):
         Pardiso()

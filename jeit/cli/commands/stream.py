@@ -119,7 +119,7 @@ def stream(
 
     from jeit.arguments import counted
     from jeit.cli.console import Steps, plain_console, say_written, scaled
-    from jeit.cli.stopping import FrameCounter, Stopping
+    from jeit.cli.streams import FrameCounter, Stopping
     from jeit.data.imageable import mask_spikes
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, parse_frames, prepare_imager
     from jeit.inverse import stream as stream_images

@@ -1,4 +1,5 @@
-"""Readers of measured data, one module per file format: published data sets, instruments, and plain tables.
+"""Readers of measured data, a module or a class for each file format: published data sets, instruments, and plain
+tables.
 
 Files of instruments do not state the positions of the electrodes; a description beside them (`[geometry]`,
 `[electrodes]`) does. The notes of a measurement state assumptions on properties of a format that are not published,

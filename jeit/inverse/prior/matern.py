@@ -22,10 +22,10 @@ from jaxtyping import Float
 
 from jeit.arguments import check_has_values
 from jeit.inverse.prior.bases import DenseBasis
-from jeit.inverse.prior.nodal import NodalSystem, Solve, by_columns
+from jeit.inverse.prior.linear_algebra import NodalSystem, Solve, by_columns
 from jeit.inverse.prior.priors import AbstractPrior, Gaussian, Laplace, Noser, Tikhonov, informed_shapes
 from jeit.mesh import Mesh, gradients, measures
-from jeit.mesh.geometry import facet_measures
+from jeit.mesh.mesh import facet_measures
 from jeit_solvers.engines import has_values, host, on_host
 
 # Length in the Robin condition at the wall, in units of 1/κ.

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jeit.inverse.channels import Data
 from jeit.inverse.prior.bases import AbstractBasis, DiagonalBasis, NodalBasis
-from jeit.inverse.prior.nodal import solve_columns
+from jeit.inverse.prior.linear_algebra import solve_columns
 from jeit_solvers import (
     Factor,
     FactorisationPlan,

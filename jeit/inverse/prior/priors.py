@@ -25,15 +25,20 @@ from scipy.spatial.distance import cdist
 from jeit.arguments import check_has_values, check_kind
 from jeit.inverse.hyperparameter.choice import RULE
 from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, Regions
-from jeit.inverse.prior.low_rank import GriddedGaussian, pivoted_cholesky, traced_pivoted_cholesky
-from jeit.inverse.prior.nodal import NodalSystem, by_columns
+from jeit.inverse.prior.linear_algebra import (
+    GriddedGaussian,
+    NodalSystem,
+    by_columns,
+    pivoted_cholesky,
+    traced_pivoted_cholesky,
+)
 from jeit.inverse.prior.penalties import (
     AbstractPenalty,
     QuadraticForm,
     Ridge,
 )
 from jeit.mesh import Mesh, centroids
-from jeit.mesh.geometry import interior_facets
+from jeit.mesh.mesh import interior_facets
 from jeit_solvers import (
     FactorisationPlan,
     SparsityPattern,

@@ -25,11 +25,11 @@ from jaxtyping import Array, Float, Int
 
 from jeit.inverse.hyperparameter.choice import EDGE_PRICE
 from jeit.inverse.prior.bases import DiagonalBasis, NodalBasis
-from jeit.inverse.prior.nodal import factorise_matrix
+from jeit.inverse.prior.linear_algebra import factorise_matrix
 from jeit.inverse.prior.penalties import AbstractPenalty, SparseNormal
 from jeit.inverse.prior.priors import AbstractPrior, cell_factorisation, check_cells
 from jeit.mesh import Mesh, gradients, measures
-from jeit.mesh.geometry import interior_facets
+from jeit.mesh.mesh import interior_facets
 from jeit_solvers import (
     Factor,
     FactorisationPlan,

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from jeit.mesh.outline.disk import Disk
 from jeit.mesh.outline.domain import Domain, Pen
-from jeit.mesh.outline.polygon import Polygon
-from jeit.mesh.outline.rectangle import Rectangle
+from jeit.mesh.outline.straight_sided import Polygon, Rectangle
 
 # Classes of outlines by the name of the shape that `describe` returns and files contain.
 OUTLINES: dict[str, type[Domain]] = {"disk": Disk, "rectangle": Rectangle, "polygon": Polygon}

@@ -73,7 +73,7 @@ class Domain(Body):
 
     Readers, layouts, rasters and mesh builders use only the methods defined here, so a new outline needs only one
     class. Arc length runs counter-clockwise along the outer edge. For outlines with straight sides, or approximated by
-    chords, each method can be a single call of a function in `jeit.mesh.outline.polyline`; see `Polygon`.
+    chords, each method can be a single call of a function in `jeit.mesh.outline.straight_sided`; see `Polygon`.
 
     **Example:**
 

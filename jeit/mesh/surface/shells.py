@@ -10,8 +10,7 @@ from jeit.arguments import check_name, describe
 from jeit.mesh._surface import first_crossing
 from jeit.mesh.checks import size_checked
 from jeit.mesh.generate import unstructured
-from jeit.mesh.geometry import normals
-from jeit.mesh.mesh import Mesh
+from jeit.mesh.mesh import Mesh, normals
 from jeit.mesh.outline.domain import check_length
 from jeit.mesh.solids import stacked_cells, stacked_wall
 from jeit.mesh.topology import odd_permutation

@@ -16,7 +16,7 @@ from jeit.arguments import interval_text, signed_percent
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes
 from jeit.image import Inclusion
-from jeit.image.merit import CONDUCTIVE, RESISTIVE
+from jeit.image.rasters import CONDUCTIVE, RESISTIVE
 from jeit.inverse.shapes import Star
 from jeit.mesh import Mesh
 from jeit.plot.axes import INK, axes_or_new

@@ -20,7 +20,7 @@ from jeit.mesh import Mesh
 from jeit.plot.axes import CHANGE, INK, ColourScale, FittedScale, axes_or_new, check_scale
 from jeit.plot.solid.body import add_electrodes, add_hull, number_electrodes
 from jeit.plot.solid.scene import CORNER_VIEW, Camera, Scene, hide_axes_in_space, mark_sign
-from jeit.plot.solid.shaded_surface import colours_of, mappable
+from jeit.plot.solid.surfaces import colours_of, mappable
 
 _DASH_PATTERN = {"fill": False, "edgecolor": INK, "linewidth": 1, "linestyle": (0, (4, 3)), "zorder": 3}
 

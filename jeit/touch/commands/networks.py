@@ -54,7 +54,7 @@ def image_by_network(
     from jeit.arguments import counted
     from jeit.cli.console import Steps, plain_console, say_written
     from jeit.cli.options import make_folder
-    from jeit.cli.stopping import FrameCounter, Stopping
+    from jeit.cli.streams import FrameCounter, Stopping
     from jeit.design import describes_skin, read_described_skin
     from jeit.imaging.stream_preparation import parse_frames
     from jeit.report.stream import PICTURES

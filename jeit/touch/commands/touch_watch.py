@@ -132,8 +132,7 @@ def watch(
 
     from jeit.arguments.extras import need_extra
     from jeit.cli.console import Steps, plain_console
-    from jeit.cli.live_frames import LiveFrames
-    from jeit.cli.stopping import Stopping
+    from jeit.cli.streams import LiveFrames, Stopping
     from jeit.data import load_description, read_frame_recording
     from jeit.imaging.stream_preparation import parse_frames
     from jeit.touch import GestureModel, TouchImages, TouchWatch

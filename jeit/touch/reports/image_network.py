@@ -13,8 +13,7 @@ from jaxtyping import Float, Int
 from jeit.arguments import counted
 from jeit.files import clear_unfinished, written_whole
 from jeit.report.folder import as_plain_values, results, results_folder, version_of, write_json
-from jeit.report.growing import GrowingRows, GrowingTable, Sample, reporting_partial_results
-from jeit.report.stream import PICTURES
+from jeit.report.stream import PICTURES, GrowingRows, GrowingTable, Sample, reporting_partial_results
 from jeit.touch.networks import ImageNetwork, LearntImages
 from jeit.touch.networks.linear_channels import depth_centroids
 from jeit.touch.networks.measured import FrameDepth

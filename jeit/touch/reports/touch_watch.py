@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from jeit.arguments import counted
 from jeit.report.folder import as_plain_values, results, results_folder, version_of, write_json, write_rows
-from jeit.report.growing import GrowingTable
+from jeit.report.stream import GrowingTable
 from jeit.touch import LearntGestures, NamedTouch, RecordedContacts, TouchImages, TouchWatch, WatchedFrame
 from jeit.touch.gestures.gesture_model import GESTURE_FILE
 

@@ -14,8 +14,8 @@ from jeit_solvers.cores import memory_of_machine
 from jeit_solvers.engines import has_values
 from jeit_solvers.sparse.exact_fronts import Fronts, find_fronts
 from jeit_solvers.sparse.exact_fronts_numpy import solve_at_once
-from jeit_solvers.sparse.multigrid import Multigrid, multigrid_is_installed
 from jeit_solvers.sparse.operator import MatrixSolver, NumpySolver, SparseSymmetric, require_sparse_symmetric
+from jeit_solvers.sparse.optional_packages import Multigrid, multigrid_is_installed
 from jeit_solvers.sparse.padded_fronts import FactorisationPlan, analyse
 from jeit_solvers.sparse.padded_fronts_jax import Factor, factorise, solve
 from jeit_solvers.sparse.pattern import SparsityPattern

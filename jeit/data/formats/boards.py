@@ -1,0 +1,363 @@
+"""Readers of the text that boards send over a serial line: Analog Devices' CN0565 kit and OpenEIT devices.
+
+The last frame of a recording may be cut off, and is left out. Other frames that lost characters are masked, so that
+later frames keep their indices.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from array import array
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from jeit.arguments import counted, listed
+from jeit.data.description import Description, parse_description
+from jeit.data.formats.recording import Recording, content_of, description_of, measurement_of
+from jeit.data.formats.table import description_like, find_description
+from jeit.data.measurement import Measurement
+from jeit.data.unstated import with_signs
+from jeit.protocol import Protocol
+
+# Amplitude in amperes where no description states the current.
+_ASSUMED_CURRENT = 1e-3
+
+
+class Cn0565:
+    """Reader of recorded output of Analog Devices' CN0565 kit, which sends text over a serial line.
+
+    A frame is a line that begins with "!V": integers of 32 bits in hexadecimal digits, separated by commas, alternately
+    the real and the imaginary part of a voltage. Drives begin at each electrode in turn; the current flows between this
+    electrode and the electrode that is the force distance away. For each drive, voltages are measured from each
+    electrode in turn to the electrode that is the sense distance away, without the pairs that contain a driven
+    electrode. With 8, 16 or 32 electrodes and both distances 1, the default of the kit's programs, there are 40, 208 or
+    928 voltages. Other lines are answers to commands and messages.
+    """
+
+    DESCRIPTION = "lines of Analog Devices' CN0565 kit ('!V' and hexadecimal numbers), of 8, 16 or 32 electrodes"
+    # A terminal program may write the time before a frame.
+    _FRAME_LINE = re.compile(rb"^[^!\r\n]{0,80}!V[ \t]{0,8}([0-9A-Fa-fxX, \t]*)(.*)$", re.MULTILINE)
+    _HEXADECIMAL = re.compile(rb"(?:0[xX])?([0-9A-Fa-f]{1,8})")
+    # Number of bytes read to recognise a file; minimum number of numbers in a frame.
+    _HEAD_BYTES, _MIN_NUMBERS = 65536, 8
+    _ELECTRODE_COUNTS = (8, 16, 32)
+    _SCALE_NOTES = (
+        "the numbers are those of the converter: neither their unit nor the current is known (1 mA is assumed): trust "
+        "relative changes, not volts.",
+    )
+    _DISTANCE_HINT = (
+        'with force and sense distance F and S it is kind = "skip", skipped = F - 1, measurement_skipped = S - 1, '
+        'order = "fixed"'
+    )
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether a file contains a frame of a CN0565 kit near its start."""
+        with path.open("rb") as file:
+            head = file.read(cls._HEAD_BYTES)
+        return any(len(words) >= cls._MIN_NUMBERS for words in cls._frames(head))
+
+    @classmethod
+    def read(
+        cls, path: Path, description: str | Path | None = None, like: Measurement | None = None, key: str | None = None
+    ) -> Measurement:
+        """Read all frames of a CN0565 recording. The section `[protocol]` of the description states the current, and
+        distances other than 1; without a description, the body and the protocol are those of `like`, a measurement of
+        the same sensor.
+
+        Raises `ValueError` if `numbers` does, if no protocol is described and the number of voltages does not agree
+        with distances of 1, and if a `key` is given, because the file contains no arrays.
+        """
+        _check_no_key(path, key)
+        values, notes = cls.numbers(path)
+        lender = _lender(path, description, like)
+        sensor_description = description_of(path, description) if lender is None else description_like(lender)
+        protocol, protocol_notes = cls._protocol(path, sensor_description, values.shape[1], lender)
+        sensor_description = replace(sensor_description, protocol_section=None)
+        measurement = measurement_of(
+            path, Recording(values, protocol, notes=(*cls._SCALE_NOTES, *protocol_notes, *notes)), sensor_description
+        )
+        return with_signs(measurement, like)
+
+    @classmethod
+    def _protocol(
+        cls, path: Path, sensor_description: Description, num_voltages: int, like: Measurement | None
+    ) -> tuple[Protocol, tuple[str, ...]]:
+        """The protocol of a recording with `num_voltages` voltages per frame, and notes on assumptions."""
+        if like is not None and like.protocol.num_measurements == num_voltages:
+            return like.protocol, ()
+        candidates = [pair for pair in sensor_description.protocols(path) if pair[0].num_measurements == num_voltages]
+        if candidates:
+            # For every drive, the kit measures in the order of electrode numbers, unless the description states
+            # another order.
+            protocol, options = next(
+                (candidate for candidate in candidates if 'order = "fixed"' in candidate[1]), candidates[0]
+            )
+            return protocol, (f"[protocol] {options} is taken, as the kit sends.",) if options else ()
+        if sensor_description.protocol_section is not None:
+            protocol = sensor_description.protocol(path)
+            assert protocol is not None
+            raise ValueError(
+                f"{sensor_description.origin}: '{protocol.name}' has {protocol.num_measurements} channels, and a frame "
+                f"of {path.name} {num_voltages}: {cls._DISTANCE_HINT}."
+            )
+        num_electrodes = next((count for count in cls._ELECTRODE_COUNTS if count * (count - 3) == num_voltages), None)
+        if num_electrodes is None:
+            usual_counts = listed([f"{count * (count - 3)} ({count} electrodes)" for count in cls._ELECTRODE_COUNTS])
+            raise ValueError(
+                f"{path.name}: {num_voltages} voltages in a frame; with force and sense distance 1 they are "
+                f"{usual_counts}. Give a description with [protocol]: {cls._DISTANCE_HINT}."
+            )
+        table: dict[str, Any] = {
+            "kind": "adjacent",
+            "number": num_electrodes,
+            "order": "fixed",
+            "current": _ASSUMED_CURRENT,
+        }
+        protocol = parse_description({"protocol": table}, path.name).protocol(path)
+        assert protocol is not None
+        return protocol, ("force and sense distance are taken to be 1 (adjacent pairs); the file does not say them.",)
+
+    @classmethod
+    def numbers(cls, path: Path) -> tuple[Complex[np.ndarray, "F M"], tuple[str, ...]]:
+        """Read the voltages of each frame, in steps of the converter, and notes. Frames in which characters were lost,
+        i.e. that are longer or shorter than most frames or have a cell that is not a number, are NaN.
+
+        Raises `ValueError` if there is no frame, or if most frames have an odd number of numbers.
+        """
+        frames = list(cls._frames(content_of(path)))
+        if not frames:
+            raise ValueError(f"{path.name}: no line begins with '!V', as those of a CN0565 do.")
+        lengths = [len(frame) for frame in frames]
+        frame_length = _usual_length(lengths)
+        if frame_length % 2 or not frame_length:
+            raise ValueError(
+                f"{path.name}: most lines have {counted(frame_length, 'number')}; give real and imaginary parts in "
+                "turn, an even number. Are lines cut off?"
+            )
+        notes = []
+        if len(frames) > 1 and lengths[-1] < frame_length:
+            notes.append(_cut_off_note(lengths[-1]))
+            del frames[-1]
+        values = np.full((len(frames), frame_length), np.nan)
+        for frame_index, frame in enumerate(frames):
+            if len(frame) == frame_length and None not in frame:
+                values[frame_index] = frame
+        notes += _notes_on_damage(np.isnan(values[:, 0]))
+        return values[:, 0::2] + 1j * values[:, 1::2], tuple(notes)
+
+    @classmethod
+    def _frames(cls, content: bytes) -> Iterator[list[float | None]]:
+        """Yield the numbers of each line that is a frame; None for a cell that is not a number, and for text after the
+        numbers."""
+        for line in cls._FRAME_LINE.finditer(content):
+            cells = [cell.strip() for cell in line[1].split(b",")]
+            while cells and not cells[-1]:
+                cells.pop()
+            values = [cls._number(cell) for cell in cells]
+            yield [*values, None] if line[2].strip() else values
+            for _ in range(line[2].count(b"!V")):  # a line end was lost; later frames keep their indices
+                yield [None]
+
+    @classmethod
+    def _number(cls, cell: bytes) -> float | None:
+        """The signed 32-bit integer in a cell of hexadecimal digits; None if the cell is not a number."""
+        match = cls._HEXADECIMAL.fullmatch(cell)
+        if match is None:
+            return None
+        value = int(match[1], 16)
+        return float(value - 2**32 if value >= 2**31 else value)
+
+
+class OpenEit:
+    """Reader of the text that OpenEIT devices send: the word "magnitudes" and the numbers of a frame, as OpenEIT's
+    dashboard records them, with or without line ends.
+
+    The number of numbers in a frame shows the protocol of the firmware: 32, 192 or 896 for 8, 16 or 32 electrodes
+    driven in opposite pairs, from every electrode; 928 for 32 electrodes driven in adjacent pairs; 28 for all pairs of
+    8 electrodes, with the first device. Measurement pairs are adjacent, in the order of the electrodes. The numbers are
+    magnitudes of impedances in ohms, and zero for an open circuit.
+    """
+
+    DESCRIPTION = "lines of an OpenEIT device ('magnitudes: …'), of 8, 16 or 32 electrodes"
+    _FRAME_WORD = re.compile(rb"\s{0,40}magnitudes\s{0,40}:", re.IGNORECASE)
+    _NUMBER = re.compile(rb"\d{1,30}(?:\.\d{0,30})?(?:[eE][-+]?\d{1,3})?")
+    # Number of bytes at the start that must contain the word "magnitudes", and number of bytes from which a file is
+    # recognised.
+    _WORD_SEARCH_BYTES, _HEAD_BYTES = 4096, 2_000_000
+    # Section [protocol] for each protocol of the firmware, by number of channels.
+    _PROTOCOL_TABLES: ClassVar[dict[int, dict[str, Any]]] = {
+        **{
+            channels: {"kind": "opposite", "number": count, "drives": "all", "order": "fixed"}
+            for channels, count in ((32, 8), (192, 16), (896, 32))
+        },
+        928: {"kind": "adjacent", "number": 32, "order": "fixed"},
+        28: {"kind": "two_terminal", "number": 8},
+    }
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether a file has the word "magnitudes" near its start, and frames whose length belongs to a protocol of the
+        OpenEIT firmware."""
+        with path.open("rb") as file:
+            head = file.read(cls._WORD_SEARCH_BYTES)
+            first_word = cls._FRAME_WORD.search(head)
+            if first_word is None:
+                return False
+            head += file.read(cls._HEAD_BYTES - len(head))
+        return _usual_length([len(frame) for frame in cls.frames_in(head)]) in cls._PROTOCOL_TABLES
+
+    @classmethod
+    def read(
+        cls, path: Path, description: str | Path | None = None, like: Measurement | None = None, key: str | None = None
+    ) -> Measurement:
+        """Read all frames of an OpenEIT recording. The section `[protocol]` of the description takes precedence over
+        the firmware's protocol, which only determines options that the section does not state; without a description,
+        the body is that of `like`, a measurement of the same sensor.
+
+        Raises `ValueError` if `numbers` does, and if a `key` is given, because the file contains no arrays.
+        """
+        _check_no_key(path, key)
+        values, notes = cls.numbers(path)
+        lender = _lender(path, description, like)
+        sensor_description = description_of(path, description) if lender is None else description_like(lender)
+        table = {**cls._PROTOCOL_TABLES[values.shape[1]], "current": _ASSUMED_CURRENT}
+        protocol = parse_description({"protocol": table}, path.name).protocol(path)
+        assert protocol is not None
+        for candidate, options in sensor_description.protocols(path):
+            if cls._have_same_channels(candidate, protocol):
+                protocol, sensor_description = candidate, replace(sensor_description, protocol_section=None)
+                notes = (*notes, f"[protocol] {options} is taken, as the firmware sends.") if options else notes
+                break
+        if sensor_description.protocol_section is None and sensor_description.layout.scale == 1:
+            current = float(np.abs(np.asarray(protocol.drive)).max())
+            values = current * values
+            notes = (f"the numbers are taken for ohms, as of a calibrated device, times {1e3 * current:g} mA.", *notes)
+        recording = Recording(values, protocol, notes=notes)
+        return with_signs(measurement_of(path, recording, sensor_description), like)
+
+    @staticmethod
+    def _have_same_channels(first: Protocol, second: Protocol) -> bool:
+        """Whether two protocols have the same channels, apart from the current."""
+        if first.num_electrodes != second.num_electrodes or first.num_measurements != second.num_measurements:
+            return False
+        drives = (np.sign(np.asarray(protocol.channel_drive)) for protocol in (first, second))
+        measurements = (np.asarray(protocol.channel_measurement) for protocol in (first, second))
+        return all((ours == theirs).all() for ours, theirs in (drives, measurements))
+
+    @classmethod
+    def numbers(cls, path: Path) -> tuple[Float[np.ndarray, "F M"], tuple[str, ...]]:
+        """Read the numbers of each frame of an OpenEIT recording, and notes. NaN replaces zero (an open circuit), a
+        cell that is not a number, a last number that may be cut off, and all numbers of frames that are longer or
+        shorter than most frames because characters were lost.
+
+        Raises `ValueError` if the frames belong to no protocol of the firmware, or to two protocols.
+        """
+        content = content_of(path)
+        frames = list(cls.frames_in(content))
+        lengths = [len(frame) for frame in frames]
+        frame_length = _usual_length(lengths)
+        if not frames:
+            raise ValueError(f"{path.name}: no frame begins with 'magnitudes:', as those of an OpenEIT device do.")
+        if frame_length not in cls._PROTOCOL_TABLES:
+            known_counts = listed(
+                [f"{channels} ({table['number']} electrodes)" for channels, table in cls._PROTOCOL_TABLES.items()]
+            )
+            raise ValueError(
+                f"{path.name}: most frames have {counted(frame_length, 'number')}; the firmware sends {known_counts}. "
+                "Read it as a table."
+            )
+        if other_counts := [
+            number for number in cls._PROTOCOL_TABLES if number != frame_length and lengths.count(number) > 1
+        ]:
+            raise ValueError(
+                f"{path.name}: {lengths.count(frame_length)} frames have {frame_length} numbers, and "
+                f"{lengths.count(other_counts[0])} have {other_counts[0]}: give the recordings of different devices in "
+                "a file each."
+            )
+        notes = []
+        first_word = cls._FRAME_WORD.search(content)
+        prefix = content[: first_word.start()].strip(b"\xef\xbb\xbf \r\n\t") if first_word is not None else b""
+        if prefix:
+            notes.append(f"{counted(len(prefix), 'character')} before the first 'magnitudes:' are left out.")
+        if len(frames) > 1 and lengths[-1] < frame_length:
+            notes.append(_cut_off_note(lengths[-1]))
+            del frames[-1], lengths[-1]
+        elif content[-1:].isdigit() and lengths[-1] == frame_length:
+            frames[-1][-1] = np.nan
+            notes.append("nothing follows the last number, which may be cut off: masked.")
+        # Frames between which the word "magnitudes" is lost appear as one long frame; its length shows the number of
+        # lost frames, so that later frames keep their indices.
+        frame_indices = np.cumsum([0, *(max(1, round(length / frame_length)) for length in lengths)])
+        is_complete = np.zeros(frame_indices[-1], bool)
+        is_complete[
+            [
+                frame_index
+                for frame_index, length in zip(frame_indices[:-1], lengths, strict=True)
+                if length == frame_length
+            ]
+        ] = True
+        values = np.full((len(is_complete), frame_length), np.nan)
+        values[is_complete] = [frame for frame in frames if len(frame) == frame_length]
+        notes += _notes_on_damage(~is_complete)
+        values = np.where(values == 0, np.nan, values)
+        if num_missing := int(np.isnan(values[is_complete]).sum()):
+            notes.append(f"{counted(num_missing, 'reading')} of zero, as of an open circuit, or illegible: masked.")
+        return values, tuple(notes)
+
+    @classmethod
+    def frames_in(cls, content: bytes) -> Iterator[array]:
+        """Yield the numbers of each frame; NaN for a cell that is not a number. Empty cells, and words after the last
+        number of a frame, are left out."""
+        word_spans = [(match.start(), match.end()) for match in cls._FRAME_WORD.finditer(content)]
+        for (_, start), (stop, _) in itertools.pairwise([*word_spans, (len(content), 0)]):
+            cells = [cell.split() for cell in content[start:stop].split(b",")]
+            cells = [cell for cell in cells if cell]
+            while cells and not cells[-1][0][:1].isdigit():
+                cells.pop()
+            yield array("d", (cls._cell_value(cell, is_last=cell is cells[-1]) for cell in cells))
+
+    @classmethod
+    def _cell_value(cls, words: list[bytes], *, is_last: bool) -> float:
+        """The number in a cell of `words`, NaN if the cell is not a number; words may follow the last number of a
+        frame."""
+        is_number = cls._NUMBER.fullmatch(words[0]) and (is_last or len(words) == 1)
+        value = float(words[0]) if is_number else np.nan
+        return value if np.isfinite(value) else np.nan
+
+    @classmethod
+    def protocol_table(cls, path: Path) -> dict[str, Any]:
+        """The section `[protocol]` of a description, without the current, for a file of OpenEIT."""
+        return cls._PROTOCOL_TABLES[cls.numbers(path)[0].shape[1]]
+
+
+def _check_no_key(path: Path, key: str | None) -> None:
+    if key is not None:
+        raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
+
+
+def _lender(path: Path, description: str | Path | None, like: Measurement | None) -> Measurement | None:
+    """The measurement whose description a file borrows: `like` if no description is given or beside the file."""
+    return like if description is None and find_description(path) is None else None
+
+
+def _usual_length(lengths: list[int]) -> int:
+    """Most common length of all frames except the last frame, which may be cut off."""
+    return Counter(lengths[:-1] or lengths).most_common(1)[0][0] if lengths else 0
+
+
+def _cut_off_note(length: int) -> str:
+    return f"the last frame is cut off after {counted(length, 'number')}, and left out."
+
+
+def _notes_on_damage(is_damaged: Bool[np.ndarray, " F"]) -> list[str]:
+    """A note on the frames in which characters were lost; none without such frames."""
+    frames = [str(frame_index) for frame_index in np.flatnonzero(is_damaged)]
+    return [f"characters are lost in frame{'s' * (len(frames) > 1)} {listed(frames)}: masked."] if frames else []

@@ -1,0 +1,353 @@
+"""Outlines that consist of closed loops with straight sides: `Polygon`, possibly with holes, and `Rectangle`, meshed in
+rows unless refinement or node positions are requested; and the functions of loops that such an outline calls.
+
+`loops` contains the vertices (k, 2) of each loop in metres, the first not repeated: the outer loop counter-clockwise,
+holes clockwise. Distances are computed with NumPy if all values are known, because JAX would compile again for every
+number of points. For checks of loops see `jeit.mesh.topology`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
+
+from jeit.mesh import topology
+from jeit.mesh.checks import size_checked, warn_large
+from jeit.mesh.generate import structured
+from jeit.mesh.generate.curve import closed_line
+from jeit.mesh.generate.refine import Refinement
+from jeit.mesh.generate.unstructured import Target, check_total, mesh_within
+from jeit.mesh.mesh import Mesh
+from jeit.mesh.outline.domain import Domain, Pen, check_length, check_near_origin, check_position, numerics
+from jeit_solvers.engines import as_array, either_engine, has_values, namespace
+
+Loop = Float[Array, "k 2"]
+
+
+class Polygon(Domain):
+    """A simple polygon, possibly with holes, in metres; arc length starts at the first vertex.
+
+    **Arguments:**
+
+    - `vertices` (k, 2): corners of the outer edge, metres.
+    - `holes`: corners (h, 2) of each hole, metres.
+
+    **Example:**
+
+    ```python
+    corner = Polygon([[0, 0], [0.2, 0], [0.2, 0.1], [0.1, 0.2], [0, 0.2]])
+    corner.mesh(num_points=200)
+    ```
+    """
+
+    vertices: Float[Array, "k 2"]
+    holes: tuple[Float[Array, "h 2"], ...]
+
+    def __init__(self, vertices: ArrayLike, holes: Sequence[ArrayLike] = ()):
+        """`vertices` (k, 2) of the outline and of each of `holes`, in order, in metres, without a repetition of the
+        first vertex.
+
+        Either orientation is accepted; the outline is stored counter-clockwise, holes clockwise. Raises `ValueError`
+        for fewer than three vertices, repeated vertices, an outline that crosses or touches itself, and holes that are
+        not inside the outline.
+        """
+        if not has_values(vertices, holes):
+            self.vertices = jnp.asarray(vertices)
+            self.holes = tuple(jnp.asarray(hole) for hole in holes)
+            return
+        outer = topology.check_loop(vertices, "vertices", clockwise=False)
+        inner = [topology.check_loop(hole, f"holes[{k}]", clockwise=True) for k, hole in enumerate(holes)]
+        topology.check_apart(outer, inner)
+        check_near_origin("vertices", outer, np.ptp(outer, axis=0).max())
+        warn_large(float(np.ptp(outer, axis=0).max()), "vertices")
+        self.vertices = as_array(outer)
+        self.holes = tuple(as_array(hole) for hole in inner)
+
+    @property
+    def area(self) -> Float[Array, ""]:
+        """Area inside the outline minus the area of the holes, in m² (shoelace formula)."""
+        return area_of_loops(self.loops())
+
+    @property
+    def perimeter(self) -> Float[Array, ""]:
+        """Length of the outer outline in m."""
+        return loop_length(self.vertices)
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Bounding box (x_min, x_max, y_min, y_max) in metres."""
+        lower_corner, upper_corner = (
+            np.min(np.asarray(self.vertices), axis=0),
+            np.max(np.asarray(self.vertices), axis=0),
+        )
+        return (float(lower_corner[0]), float(upper_corner[0]), float(lower_corner[1]), float(upper_corner[1]))
+
+    def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
+        """Points (…, 2) on the outer outline at `arc_length` (…) in metres from the first vertex."""
+        return along_loop(self.vertices, arc_length)
+
+    def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
+        """Vertices of the outline and of every hole."""
+        return (self.vertices, *self.holes)
+
+    def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
+        """Whether each of `points` (…, 2), in metres, lies inside the outline and outside the holes (even-odd rule)."""
+        return loops_contain(self.loops(), points)
+
+    def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
+        """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside and in holes."""
+        return distance_from_loops(self.loops(), points)
+
+    def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
+        """Move those of `points` (p, 2), metres, that lie outside or in a hole to the nearest point on a side."""
+        return nearest_in_loops(self.loops(), points)
+
+    def describe(self) -> dict:
+        """Name of the shape, vertices, and vertices of the holes if there are any."""
+        holes = {"holes": [np.asarray(hole).tolist() for hole in self.holes]} if self.holes else {}
+        return {"shape": "polygon", "vertices": np.asarray(self.vertices).tolist(), **holes}
+
+    def draw(self, pen: Pen) -> None:
+        """Draw the outline and each hole as a loop."""
+        for loop in self.loops():
+            pen.loop(np.asarray(loop))
+
+    @size_checked()
+    def mesh(
+        self,
+        num_points: int | None = None,
+        cell_size: float | None = None,
+        refine: Refinement = None,
+        *,
+        boundary_points: ArrayLike | None = None,
+        interior_points: ArrayLike | None = None,
+    ) -> Mesh:
+        """Mesh the polygon. The arguments and the errors raised are those of `jeit.mesh.polygon`."""
+        curves = [closed_line(np.asarray(loop)) for loop in self.loops()]
+        target = Target.create(num_points, cell_size)
+        return mesh_within(curves, float(self.area), target, refine, boundary_points, interior_points)
+
+
+class Rectangle(Domain):
+    """A rectangle with sides along the axes, in metres; arc length starts at the lower left corner.
+
+    **Arguments:**
+
+    - `width`, `height`: lengths along x and along y, metres, positive.
+    - `centre` (x, y): centre in metres.
+
+    **Example:**
+
+    ```python
+    skin = Rectangle(0.2, 0.1)
+    skin.vertices
+    ```
+    """
+
+    width: float
+    height: float
+    centre: tuple[float, float]
+
+    def __init__(self, width: float, height: float, centre: Sequence[float] = (0.0, 0.0)):
+        """`width` (along x) and `height` (along y), and `centre` (x, y) are in metres. Raises `ValueError` unless width
+        and height are positive and the centre is finite."""
+        self.width = check_length("width", width)
+        self.height = check_length("height", height)
+        self.centre = check_position("centre", centre)
+        if has_values(self.width, self.height):
+            check_near_origin("centre", self.centre, min(self.width, self.height))
+
+    @property
+    def area(self) -> float:
+        """Width times height in m²."""
+        return self.width * self.height
+
+    @property
+    def perimeter(self) -> float:
+        """Perimeter 2 (width + height) in m."""
+        return 2.0 * (self.width + self.height)
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Bounding box (x_min, x_max, y_min, y_max) in metres."""
+        x, y = self.centre
+        return (x - self.width / 2, x + self.width / 2, y - self.height / 2, y + self.height / 2)
+
+    @property
+    def vertices(self) -> Float[Array, "4 2"]:
+        """Corners (4, 2) in metres, counter-clockwise from the lower left one."""
+        x_min, x_max, y_min, y_max = self.extent
+        return as_array([[x_min, y_min], [x_max, y_min], [x_max, y_max], [x_min, y_max]])
+
+    def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
+        """Points (…, 2) on the outline at `arc_length` (…) in metres, counter-clockwise from the lower left."""
+        return along_loop(self.vertices, arc_length)
+
+    def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
+        """Vertices of the rectangle."""
+        return (self.vertices,)
+
+    @either_engine
+    def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
+        """Whether each of `points` (…, 2), in metres, lies in the rectangle or on its edge."""
+        xp = namespace(self, points)
+        offset = abs(xp.asarray(points) - xp.asarray(self.centre))
+        half = 0.5 * xp.asarray([self.width, self.height])
+        return (offset <= half * (1 + 1e-12)).all(axis=-1)
+
+    def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
+        """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
+        return distance_from_loops(self.loops(), points)
+
+    def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
+        """Move those of `points` (p, 2), metres, that lie outside to the nearest point on a side."""
+        return nearest_in_loops(self.loops(), points)
+
+    def describe(self) -> dict:
+        """Name of the shape, width, height and centre."""
+        sides = {"width": float(self.width), "height": float(self.height)}
+        return {"shape": "rectangle", **sides, "centre": [float(x) for x in self.centre]}
+
+    def draw(self, pen: Pen) -> None:
+        """Draw the rectangle as one loop of four sides."""
+        pen.loop(np.asarray(self.vertices))
+
+    @size_checked()
+    def mesh(
+        self,
+        num_points: int | None = None,
+        cell_size: float | None = None,
+        refine: Refinement = None,
+        *,
+        boundary_points: ArrayLike | None = None,
+        interior_points: ArrayLike | None = None,
+    ) -> Mesh:
+        """Mesh the rectangle and tag its sides. The arguments and the errors raised are those of
+        `jeit.mesh.rectangle`."""
+        target = Target.create(num_points, cell_size)
+        if refine is None and boundary_points is None and interior_points is None:
+            mesh = self._mesh_rows(target)
+        else:
+            curve = closed_line(np.asarray(self.vertices))
+            mesh = mesh_within([curve], self.area, target, refine, boundary_points, interior_points)
+        return self.tagged(mesh)
+
+    def tagged(self, mesh: Mesh) -> Mesh:
+        """Add tags for the sides of the rectangle to a mesh of the rectangle."""
+        return Mesh(mesh.points, mesh.cells, mesh.facets, self._side_facets(mesh))
+
+    def _mesh_rows(self, target: Target) -> Mesh:
+        x_min, _, y_min, _ = self.extent
+        rows = structured.choose_rows(self.width, self.height, target.num_points, target.cell_size)
+        check_total(rows[0] * rows[1], "cell_size")
+        points, cells = structured.row_rectangle(self.width, self.height, *rows)
+        return Mesh.create(points + np.array([x_min, y_min]), cells)
+
+    def _side_facets(self, mesh: Mesh) -> dict:
+        """Indices of the facets on each side, by the name of the side."""
+        left, right, bottom, top = self.extent
+        ends = np.asarray(mesh.points)[np.asarray(mesh.facets)]
+        tolerance = 1e-9 * max(self.width, self.height)
+        sides = {"left": (0, left), "right": (0, right), "bottom": (1, bottom), "top": (1, top)}
+        return {
+            name: as_array(np.flatnonzero((np.abs(ends[:, :, axis] - value) < tolerance).all(axis=1)), np.int32)
+            for name, (axis, value) in sides.items()
+        }
+
+
+def loop_length(loop: Loop) -> Float[Array, ""]:
+    """Length of a loop in m."""
+    return jnp.sum(_side_lengths(loop))
+
+
+def area_of_loops(loops: Sequence[Loop]) -> Float[Array, ""]:
+    """Area inside the first loop minus the area of the holes, m² (shoelace formula)."""
+    outer, *holes = (_shoelace(loop) for loop in loops)
+    return sum(holes, outer)
+
+
+@either_engine
+def along_loop(loop: Loop, arc_length: ArrayLike) -> Float[Array, "... 2"]:
+    """Points (…, 2) on a loop at `arc_length` (…) in metres from its first vertex, taken modulo the length of the
+    loop."""
+    xp = namespace(loop)
+    closed_loop = xp.concatenate([loop, loop[:1]])
+    stops = xp.concatenate([xp.zeros(1), xp.cumsum(_side_lengths(loop))])
+    wrapped_length = xp.mod(xp.asarray(arc_length, dtype=stops.dtype), stops[-1])
+    return xp.stack([xp.interp(wrapped_length, stops, closed_loop[:, axis]) for axis in range(2)], axis=-1)
+
+
+@either_engine
+def loops_contain(loops: Sequence[Loop], points: ArrayLike) -> Bool[Array, "..."]:
+    """Whether each of `points` (…, 2) lies inside the first loop and outside the holes (even-odd rule)."""
+    if namespace(loops, points) is np:
+        point_array = np.asarray(points)
+        return topology.inside(point_array.reshape(-1, 2), loops).reshape(point_array.shape[:-1])  # pyright: ignore
+    points = jnp.asarray(points)
+    is_inside = jnp.zeros(points.shape[:-1], bool)
+    for loop in loops:
+        is_inside = is_inside ^ _is_inside(loop, points)
+    return is_inside
+
+
+def distance_from_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, " p"]:
+    """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
+    xp = numerics(loops, points)
+    point_array, is_inside, nearest_points = _project_onto_loops(xp, loops, points)
+    distances = xp.sqrt(((point_array - nearest_points) ** 2).sum(axis=1) + 1e-24)  # differentiable at zero, too
+    return jnp.asarray(xp.where(is_inside, distances, -distances))
+
+
+def nearest_in_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "p 2"]:
+    """Move those of `points` (p, 2) that lie outside to the nearest point on a side; points inside are returned
+    unchanged."""
+    xp = numerics(loops, points)
+    point_array, is_inside, nearest_points = _project_onto_loops(xp, loops, points)
+    return jnp.asarray(xp.where(is_inside[:, None], point_array, nearest_points))
+
+
+def _project_onto_loops(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tuple[Any, Any, Any]:
+    """Convert `points` (p, 2) to an array; also returns whether each lies inside (p,), and the nearest point on a side
+    (p, 2)."""
+    chains, point_array = [xp.asarray(loop) for loop in loops], xp.asarray(points, float)
+    start = xp.concatenate(chains)
+    sides = xp.concatenate([xp.roll(loop, -1, axis=0) for loop in chains]) - start
+    offset = point_array[:, None] - start
+    fraction = xp.clip((offset * sides).sum(axis=-1) / (sides**2).sum(axis=-1), 0, 1)
+    on_sides = start + fraction[..., None] * sides  # (p, s, 2)
+    closest_side = xp.argmin(((point_array[:, None] - on_sides) ** 2).sum(axis=-1), axis=1)
+    nearest_points = xp.take_along_axis(on_sides, closest_side[:, None, None], axis=1)[:, 0]
+    is_inside = (
+        topology.inside(point_array, chains) if xp is np else jax.lax.stop_gradient(loops_contain(chains, point_array))
+    )
+    return point_array, is_inside, nearest_points
+
+
+def _side_lengths(loop: Loop) -> Float[Array, " k"]:
+    xp = namespace(loop)
+    return xp.sqrt(((xp.roll(loop, -1, axis=0) - loop) ** 2).sum(axis=1))
+
+
+def _shoelace(loop: Loop) -> Float[Array, ""]:
+    x, y = loop[:, 0], loop[:, 1]
+    return 0.5 * jnp.sum(x * jnp.roll(y, -1) - jnp.roll(x, -1) * y)
+
+
+def _is_inside(loop: Loop, points: Float[Array, "... 2"]) -> Bool[Array, "..."]:
+    """Even-odd rule: count the sides that a ray towards +x crosses."""
+
+    def toggle_at_crossing(is_inside: Array, side: Array) -> tuple[Array, None]:
+        (x0, y0), (x1, y1) = side
+        spans_point = (y0 > points[..., 1]) != (y1 > points[..., 1])
+        side_height = jnp.where(spans_point, y1 - y0, 1.0)
+        x = x0 + (points[..., 1] - y0) * (x1 - x0) / side_height
+        return is_inside ^ (spans_point & (points[..., 0] < x)), None
+
+    sides = jnp.stack([loop, jnp.roll(loop, -1, axis=0)], axis=1)
+    return jax.lax.scan(toggle_at_crossing, jnp.zeros(points.shape[:-1], bool), sides)[0]
