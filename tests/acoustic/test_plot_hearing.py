@@ -12,7 +12,7 @@ from jeit.acoustic import Calibration, MicrophoneArray
 from jeit.acoustic.calibration.calibrate import CalibrationFit
 from jeit.acoustic.decay import InverseSquare
 from jeit.acoustic.localisation.locations import Locations
-from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.microphones import IntensityNoise
 from jeit.acoustic.plots import (
     MapMarks,
     plot_error_curve,

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jeit.acoustic.decay import DECAYS
-from jeit.acoustic.microphones import MicrophoneArray
-from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.microphones import IntensityNoise, MicrophoneArray
 from jeit.acoustic.signal._arrays import check_extent, check_microphones
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.surface import AbstractSurface, CurvedSurface, Plane
