@@ -19,8 +19,8 @@ from jeit.acoustic import Localiser, MicrophoneArray, Recording, Taps, calibrate
 from jeit.acoustic.decay import InverseSquare
 from jeit.acoustic.microphones import IntensityNoise
 from jeit.acoustic.simulate import SoundingSkin, microphone_grid, simulate_calibration_taps, simulate_stroke
-from jeit.acoustic.simulate.microphones import Readout
 from jeit.acoustic.simulate.propagation import expected_power, noise_power
+from jeit.acoustic.simulate.sounding_skin import Readout
 from jeit.acoustic.surface import make_surface
 from jeit.mesh import Rectangle
 
