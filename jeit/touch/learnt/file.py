@@ -29,9 +29,8 @@ from jeit.touch.learnt.imaged import ContactFeatures, ImageFeatures, ImageRecons
 from jeit.touch.learnt.labels import LearntKeys, LearntLabels, StandardisedFeatures
 from jeit.touch.learnt.learnt_skin import LearntSkin
 from jeit.touch.learnt.methods import GaussianProcess, LinearEnsemble, QuadraticDiscriminant
-from jeit.touch.learnt.network import Network
+from jeit.touch.learnt.neural_networks import Network, TemporalNetwork
 from jeit.touch.learnt.numbers import DeviationModel, LearntNumbers
-from jeit.touch.learnt.temporal_network import TemporalNetwork
 
 _SCHEMA_FILE = "schema.json"
 # Matches the number of an object in the schema of a skops file, also where the number is part of a file name.
