@@ -24,8 +24,7 @@ from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 from jeit.touch.learnt.array_models import Forest, NearestNeighbours, SupportVectorMachine
 from jeit.touch.learnt.channels import Channels, Neighbourhood
-from jeit.touch.learnt.features import Features, WhitenedChanges
-from jeit.touch.learnt.imaged import ContactFeatures, ImageFeatures, ImageReconstruction
+from jeit.touch.learnt.features import ContactFeatures, Features, ImageFeatures, ImageReconstruction, WhitenedChanges
 from jeit.touch.learnt.labels import LearntKeys, LearntLabels, StandardisedFeatures
 from jeit.touch.learnt.learnt_skin import LearntSkin
 from jeit.touch.learnt.methods import GaussianProcess, LinearEnsemble, QuadraticDiscriminant
