@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.special import chdtri
 
-from jeit.acoustic.calibration.calibration import Calibration
-from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
+from jeit.acoustic.calibration.calibration import Calibration, calibrated_intensities
 from jeit.acoustic.localisation.locate import GAIN_DRIFT, locate
 from jeit.acoustic.localisation.locations import MAX_NUMPY_FRAMES, Locations
 from jeit.acoustic.signal.intensity import IntensitySettings

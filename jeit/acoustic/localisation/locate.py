@@ -9,14 +9,13 @@ import jax
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
-from jeit.acoustic.calibration.calibration import Calibration
+from jeit.acoustic.calibration.calibration import Calibration, calibrated_intensities
 from jeit.acoustic.localisation.array_changes import (
     GainChanges,
     covariance_with_gains,
     estimate_gain_changes,
     find_setup_changes,
 )
-from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
 from jeit.acoustic.localisation.localiser import Localiser, SourceEstimate
 from jeit.acoustic.localisation.locations import MAX_NUMPY_FRAMES, Locations, LocationStatus
 from jeit.acoustic.localisation.two_sources import locate_two
