@@ -286,7 +286,7 @@ def compare(
     from jeit.design import compare_layouts
     from jeit.design.comparison import check_same_outline
     from jeit.design.reports import write_layout_comparison
-    from jeit.design.skin.protocol import skin_protocol
+    from jeit.design.skin.names import skin_protocol
     from jeit.design.skin.skin import skins_of
 
     _check_layer(thickness, conductivity)
