@@ -17,10 +17,10 @@ from benchmarks.harness.timing import Timed, say, timed
 from benchmarks.opponents.scipy_localiser import PlainLocaliser
 from jeit.acoustic import Localiser, MicrophoneArray, Recording, Taps, calibrate_microphones, locate, track
 from jeit.acoustic.decay import InverseSquare
-from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.microphones import IntensityNoise
 from jeit.acoustic.simulate import SoundingSkin, microphone_grid, simulate_calibration_taps, simulate_stroke
-from jeit.acoustic.simulate.microphones import Readout
 from jeit.acoustic.simulate.propagation import expected_power, noise_power
+from jeit.acoustic.simulate.sounding_skin import Readout
 from jeit.acoustic.surface import make_surface
 from jeit.mesh import Rectangle
 

@@ -20,8 +20,8 @@ from benchmarks.harness.timing import say
 from jeit.acoustic import Intensities, Localiser, Taps, calibrate_microphones, cramer_rao, locate, tap_intensities
 from jeit.acoustic.localisation.locate import microphones_in_use
 from jeit.acoustic.simulate import SoundingSkin, microphone_grid, simulate_calibration_taps
-from jeit.acoustic.simulate.microphones import MicrophoneModel
 from jeit.acoustic.simulate.propagation import expected_power, noise_power
+from jeit.acoustic.simulate.sounding_skin import MicrophoneModel
 from jeit.layout import grid
 
 RATIOS = (0, 5, 10, 15, 20, 25, 30, 35, 40)

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jeit.design.skin.protocol import skin_protocol
+from jeit.design.skin.names import skin_protocol
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.layout import named_layout, ring

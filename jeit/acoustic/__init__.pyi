@@ -25,8 +25,7 @@ from .simulate import (
     simulate_tickle,
     simulate_wind,
 )
-from .touches import LocatedTouches, locate_touches
-from .tracking import track
+from .touches import LocatedTouches, locate_touches, track
 
 __all__ = [
     "Burst",

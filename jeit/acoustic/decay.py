@@ -12,7 +12,6 @@ from typing import ClassVar, Self
 
 from jaxtyping import Array, Float
 
-from jeit.acoustic.noise import column
 from jeit.arguments import check_name
 from jeit_solvers.engines import host, namespace
 from jeit_solvers.module import Module
@@ -201,6 +200,12 @@ class AttenuatedInverseSquare(AbstractDecay):
         `Exponential`."""
         low, high = InverseSquare.bounds(extent), Exponential.bounds(extent)
         return (*low[0], high[0][1]), (*low[1], high[1][1])
+
+
+def column(values: Float[Array, " M"], broadcast_to: Array) -> Array:
+    """Reshape `values` (M,), one per microphone, so that the values broadcast along the first axis of
+    `broadcast_to`."""
+    return values.reshape((-1,) + (1,) * (broadcast_to.ndim - 1))
 
 
 def _stack_logarithms(*parameters: Float[Array, " M"]) -> Float[Array, "K M"]:

@@ -16,10 +16,9 @@ from .plots import (
 from .reports import write_improved_layout, write_layout_comparison, write_study_report
 from .scores import TouchPrior, layout_scores
 from .sensitivity import sensitivity_map
-from .skin.indentation import Bell, Hemisphere
 from .skin.skin import Skin
 from .skin.skin_file import describes_skin, read_described_skin
-from .skin.touch_grid import touch_grid, touches_away_from_the_edge
+from .skin.touches import Bell, Hemisphere, touch_grid, touches_away_from_the_edge
 from .study import open_results, read_study, run_study, study_progress
 from .taxels import find_taxels
 

@@ -256,7 +256,7 @@ def _prepare_sound(source: str, calibration: str | Path, rate: float | None) -> 
     """Create the source of intensities and the view of a calibrated array of microphones. The file `source` may contain
     sound samples or intensities."""
     from jeit.acoustic import Calibration, read_recording
-    from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
+    from jeit.acoustic.calibration.calibration import calibrated_intensities
     from jeit.live.views.sound import SoundView
 
     loaded_calibration = Calibration.load(calibration)

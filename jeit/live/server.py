@@ -49,8 +49,7 @@ def serve(
     need_extra("live", "a page in the browser")
     import uvicorn
 
-    from jeit.live.page.application import make_application
-    from jeit.live.page.guard import is_loopback
+    from jeit.live.page.application import is_loopback, make_application
     from jeit.live.page.wire import MAX_COMMAND_LENGTH
 
     if token is None and not is_loopback(host):

@@ -10,7 +10,7 @@ import pytest
 from jeit.acoustic import Localiser, MicrophoneArray
 from jeit.acoustic.decay import InverseSquare
 from jeit.acoustic.localisation.localiser import METHODS
-from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.microphones import IntensityNoise
 from jeit.acoustic.surface import make_surface
 from jeit.layout import grid
 

@@ -10,7 +10,7 @@ from microphone_arrays import MICROPHONES, OUTLINE, array
 
 from jeit.acoustic import Calibration, IntensitySettings, MicrophoneArray
 from jeit.acoustic.decay import AttenuatedInverseSquare, Exponential
-from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.microphones import IntensityNoise
 from jeit.acoustic.surface import make_surface
 from jeit.mesh import Polygon
 

@@ -5,7 +5,7 @@ import pytest
 from microphone_arrays import OUTLINE, array, inside, listen, localise, models, received_power
 
 from jeit.acoustic import Calibration, Intensities, Taps, calibrate_microphones, cramer_rao, locate
-from jeit.acoustic.localisation.gain_changes import GainChanges, covariance_with_gains
+from jeit.acoustic.localisation.array_changes import GainChanges, covariance_with_gains
 from jeit.acoustic.localisation.localiser import Localiser
 from jeit.layout import grid
 

@@ -12,7 +12,7 @@ from jeit.acoustic import Calibration, MicrophoneArray
 from jeit.acoustic.calibration.calibrate import CalibrationFit
 from jeit.acoustic.decay import InverseSquare
 from jeit.acoustic.localisation.locations import Locations
-from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.microphones import IntensityNoise
 from jeit.acoustic.plots import (
     MapMarks,
     plot_error_curve,
@@ -23,7 +23,7 @@ from jeit.acoustic.plots import (
 )
 from jeit.acoustic.plots.surface_view import ESTIMATE_COLOUR
 from jeit.acoustic.surface import make_surface
-from jeit.acoustic.tracking import Touch, Track
+from jeit.acoustic.touches import Touch, Track
 from jeit.layout import grid
 
 OUTLINE = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])

@@ -7,8 +7,8 @@ import pytest
 from microphone_arrays import array, inside, noisy, received_power
 
 from jeit.acoustic import Localiser
-from jeit.acoustic.localisation import setup_changes
-from jeit.acoustic.localisation.setup_changes import find_setup_changes
+from jeit.acoustic.localisation import array_changes
+from jeit.acoustic.localisation.array_changes import find_setup_changes
 
 # test_locate has an exchange in the quick suite, with the compiled program.
 pytestmark = pytest.mark.slow
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(autouse=True)
 def in_numpy(monkeypatch):
     """As many frames as trial changes: each number needs a large program, with the same results as NumPy."""
-    monkeypatch.setattr(setup_changes.Localiser, "create", functools.partial(Localiser.create, compiled=False))
+    monkeypatch.setattr(array_changes.Localiser, "create", functools.partial(Localiser.create, compiled=False))
 
 
 def frames(number=24, noise=0.05, seed=0):

@@ -8,9 +8,9 @@ import pytest
 from microphone_arrays import MICROPHONES, OUTLINE
 
 from jeit.acoustic import Calibration, IntensitySettings, MicrophoneArray, Recording, intensities, locate
+from jeit.acoustic.calibration.calibration import calibrated_intensities
 from jeit.acoustic.decay import InverseSquare
-from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
-from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.microphones import IntensityNoise
 from jeit.acoustic.simulate import SoundingSkin, simulate_silence
 from jeit.acoustic.simulate.propagation import expected_power, transfer
 from jeit.acoustic.surface import make_surface

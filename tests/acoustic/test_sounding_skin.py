@@ -16,10 +16,9 @@ from jeit.acoustic.simulate import (
     simulate_tap,
     simulate_tickle,
 )
-from jeit.acoustic.simulate.microphones import MicrophoneModel, Readout
 from jeit.acoustic.simulate.propagation import expected_power, noise_power, nominal_power, transfer
 from jeit.acoustic.simulate.sound import superpose
-from jeit.acoustic.simulate.sounding_skin import Elastomer, ElastomerLayer
+from jeit.acoustic.simulate.sounding_skin import Elastomer, ElastomerLayer, MicrophoneModel, Readout
 from jeit.data import RoundSkin, simulate_press
 
 KEY = jax.random.key(0)
@@ -147,7 +146,7 @@ def test_drawn_bursts_have_the_expected_power(small):
 def test_the_chunks_of_a_calibration_do_not_matter(small, monkeypatch):
     places = [(0.0, 0.01), (0.03, 0.02), (-0.08, 0.0)]
     whole = simulate_calibration_taps(small, KEY, places, repeats=2, duration=0.1)
-    monkeypatch.setattr("jeit.acoustic.simulate.calibration_recording.MAX_CHUNK_SAMPLES", 12_000)
+    monkeypatch.setattr("jeit.acoustic.simulate.touches.MAX_CHUNK_SAMPLES", 12_000)
     # Two chunks of two places, the last one twice.
     parts = simulate_calibration_taps(small, KEY, places, repeats=2, duration=0.1)
     np.testing.assert_allclose(parts.samples, whole.samples, rtol=1e-9, atol=1e-12)

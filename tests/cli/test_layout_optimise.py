@@ -10,7 +10,7 @@ from rich.console import Console
 
 from jeit.cli.app import as_command
 from jeit.cli.console import Steps
-from jeit.design.commands.layout_optimise import RESULTS, _parse_region
+from jeit.design.commands.layout import _OPTIMISATION_FILES, _parse_region
 from jeit.layout import Layout, read_layout, write_layout
 from jeit.mesh import Disk, Rectangle
 
@@ -26,7 +26,7 @@ def test_the_optimised_layout_is_written_and_scores_higher(tmp_path):
     write_layout(Layout(centres, 8e-3, outline=Rectangle(0.1, 0.1)), start)
     options = ["--steps", 6, "--num-points", 200, "--minimum-spacing-mm", 15, "--keep-out", "-30,0,8", "--quiet"]
     run(start, "--output", tmp_path / "out", *options)
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(RESULTS)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(_OPTIMISATION_FILES)
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     before, after = report["start"], report["optimised"]
     assert after["worst_sensitivity_V"] > 1.5 * before["worst_sensitivity_V"]

@@ -20,7 +20,7 @@ from jeit.acoustic import (
     read_taps,
     write_recording,
 )
-from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
+from jeit.acoustic.calibration.calibration import calibrated_intensities
 from jeit.acoustic.reports import write_calibration, write_track
 from jeit.cli import main
 from jeit.layout import grid

@@ -20,7 +20,7 @@ from jeit.design import (
     touches_away_from_the_edge,
 )
 from jeit.design.sensitivity import SensitivityMap
-from jeit.design.skin.protocol import skin_protocol
+from jeit.design.skin.names import skin_protocol
 from jeit.electrodes import FaceDiscs, SurfaceDiscs
 from jeit.forward import ForwardModel
 from jeit.inverse import one_step

@@ -11,7 +11,7 @@ from matplotlib.tri import TriContourSet
 
 from jeit.design import touch_grid
 from jeit.design.plots import plot_sensitivity_histograms, plot_taxel_areas, plot_taxels
-from jeit.design.plots.taxels import plot_similarity
+from jeit.design.plots.responses import plot_similarity
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.taxels import Taxels
 from jeit.layout import grid
@@ -190,7 +190,7 @@ def test_histograms_share_their_bins(ax):
     ],
 )
 def test_refuses_bad_input(match, draw, monkeypatch, ax):
-    monkeypatch.setattr("jeit.design.plots.taxels.axes_or_new", lambda *_: ax)
+    monkeypatch.setattr("jeit.design.plots.responses.axes_or_new", lambda *_: ax)
     with pytest.raises(ValueError, match=match):
         draw(four())
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from jeit.design import Skin
-from jeit.design.skin.resting_skin import RestingSkin
 from jeit.design.skin.touched_cells import TouchedCells
-from jeit.design.skin.voltage_changes import touch_changes
+from jeit.design.skin.voltage_changes import RestingSkin, touch_changes
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle
 from jeit.touch.simulate import BarIndenter, DiscIndenter, Indent, indented_cells

@@ -23,7 +23,7 @@ from jeit.design import (
 )
 from jeit.design.comparison import comparison_figures
 from jeit.design.measurements import random_selections
-from jeit.design.skin.protocol import skin_protocol
+from jeit.design.skin.names import skin_protocol
 from jeit.layout import Layout, grid
 from jeit.mesh import Polygon, Rectangle
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.design import Skin
-from jeit.design.skin.protocol import skin_protocol
+from jeit.design.skin.names import skin_protocol
 from jeit.design.skin.skin import skins_of
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle

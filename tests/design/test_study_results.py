@@ -20,7 +20,7 @@ from jeit.design import (
 )
 from jeit.design.measurements import nearest_pairs
 from jeit.design.sensitivity import SensitivityMap
-from jeit.design.skin.protocol import skin_protocol
+from jeit.design.skin.names import skin_protocol
 from jeit.design.skin.sheet_touches import sheet_touches
 from jeit.design.skin.touched_cells import touched_cells
 from jeit.design.skin.voltage_changes import touch_changes

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jeit.design import Bell, Hemisphere, defaults
-from jeit.design.skin.protocol import skin_protocol
+from jeit.design.skin.names import skin_protocol
 from jeit.design.study import read_study
 from jeit.electrodes import FaceDiscs
 from jeit.layout import Layout, grid, write_layout

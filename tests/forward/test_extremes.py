@@ -9,9 +9,8 @@ import pytest
 from exact_arithmetic import exact, exact_change
 from extremes import CONTACTS, KINDS, compiled, middles, miss, uneven, with_contacts
 
-from jeit.design.skin.resting_skin import RestingSkin
 from jeit.design.skin.touched_cells import TouchedCells
-from jeit.design.skin.voltage_changes import touch_changes
+from jeit.design.skin.voltage_changes import RestingSkin, touch_changes
 from jeit.forward import ForwardModel
 from jeit.inverse import calibrate, one_step
 from jeit_solvers.engines import on_device, on_host

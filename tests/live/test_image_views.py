@@ -16,8 +16,8 @@ from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear import OneStep
 from jeit.layout import ring
 from jeit.live import ConductivityView, LiveFrame
+from jeit.live.views.conductivity import PixelGrid, channel_names, electrode_curves, scene_of
 from jeit.live.views.contacts import ContactsView
-from jeit.live.views.scene import PixelGrid, channel_names, electrode_curves, scene_of
 from jeit.mesh import Disk, centroids, cylinder, sphere
 from jeit.protocol import adjacent, reference_electrode
 from jeit.touch import CellFinder, ImageNoise, find_contacts, track_contacts

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from stand_in import StandIn
 
-from jeit.live.page.guard import host_allowed
+from jeit.live.page.application import host_allowed
 from jeit.live.page.hub import Hub, Viewer
 from jeit.live.page.wire import (
     MAX_COMMAND_LENGTH,

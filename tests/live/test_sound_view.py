@@ -5,7 +5,7 @@ import pytest
 
 from jeit.acoustic import Calibration, Intensities, Localiser, MicrophoneArray, locate
 from jeit.acoustic.decay import InverseSquare
-from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.microphones import IntensityNoise
 from jeit.acoustic.surface import make_surface
 from jeit.layout import grid
 from jeit.live import LiveFrame

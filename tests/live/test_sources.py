@@ -11,13 +11,11 @@ import pytest
 from small_sensor import CHANNELS, measured, noisy
 
 from jeit.data import write_table
-from jeit.live import folder_source, line_source, preparation
-from jeit.live.connections import SerialPort, Server, StandardInput, connection_to
-from jeit.live.folder_source import WatchedFolder
-from jeit.live.line_source import LineSource, ReadAhead
+from jeit.live import line_source, preparation
+from jeit.live.line_source import LineSource, ReadAhead, SerialPort, Server, StandardInput, connection_to
 from jeit.live.lines import LineReading
 from jeit.live.preparation import first_frames
-from jeit.live.sources import AbstractSource, PlayedRecording, open_source
+from jeit.live.sources import AbstractSource, PlayedRecording, WatchedFolder, open_source
 
 FRAMES = noisy(12)
 posix = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals and pipes of POSIX")
@@ -297,7 +295,7 @@ def test_a_silent_device_is_reported(monkeypatch):
 
 
 def test_files_that_appear_in_a_folder_are_frames(tmp_path, monkeypatch):
-    monkeypatch.setattr(folder_source, "_READ_TIMEOUT", 0.1)
+    monkeypatch.setattr("jeit.live.sources._READ_TIMEOUT", 0.1)
     reference = measured()
     (tmp_path / "old.csv").write_bytes(line(FRAMES[0]))
     source = open_source(str(tmp_path), reference=reference)

@@ -16,8 +16,7 @@ from jeit.acoustic.calibration.calibration import Calibration
 from jeit.acoustic.calibration.robust_least_squares import TapFit, fit_taps, standard_errors
 from jeit.acoustic.calibration.usable_microphones import LeftOutTaps, check_received, exclude_unusable, locate_left_out
 from jeit.acoustic.decay import DECAYS, AbstractDecay, find_decay
-from jeit.acoustic.microphones import MicrophoneArray
-from jeit.acoustic.noise import IntensityNoise, noise_from_negative_powers
+from jeit.acoustic.microphones import IntensityNoise, MicrophoneArray, noise_from_negative_powers
 from jeit.acoustic.signal.faults import describe_faults, intensity_faults
 from jeit.acoustic.signal.intensity import IntensitySettings, check_settings, tap_intensities
 from jeit.acoustic.signal.recording import Taps

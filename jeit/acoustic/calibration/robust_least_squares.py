@@ -8,7 +8,7 @@ microphone has its own shape, with the variation of the shapes over the array as
 from its given position. Between fits, the noise and the weights are re-estimated from the residuals, until convergence.
 Each step takes a `TapFit` and returns a new `TapFit`.
 
-The noise of a microphone consists of a relative error and an additive deviation; see `jeit.acoustic.noise`.
+The noise of a microphone consists of a relative error and an additive deviation; see `jeit.acoustic.microphones`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 
 from jeit.acoustic.calibration.decay_fit import DecayProblem, fit_strengths, fit_within, log_covariance
 from jeit.acoustic.decay import AbstractDecay
-from jeit.acoustic.noise import MIN_RELATIVE_ERROR, IntensityNoise, noise_from_negative_powers
+from jeit.acoustic.microphones import MIN_RELATIVE_ERROR, IntensityNoise, noise_from_negative_powers
 from jeit_solvers.engines import host, on_host, slopes
 from jeit_solvers.module import Module
 

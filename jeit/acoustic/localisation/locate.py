@@ -9,15 +9,17 @@ import jax
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
-from jeit.acoustic.calibration.calibration import Calibration
-from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
-from jeit.acoustic.localisation.gain_changes import GainChanges, covariance_with_gains, estimate_gain_changes
+from jeit.acoustic.calibration.calibration import Calibration, calibrated_intensities
+from jeit.acoustic.localisation.array_changes import (
+    GainChanges,
+    covariance_with_gains,
+    estimate_gain_changes,
+    find_setup_changes,
+)
 from jeit.acoustic.localisation.localiser import Localiser, SourceEstimate
 from jeit.acoustic.localisation.locations import MAX_NUMPY_FRAMES, Locations, LocationStatus
-from jeit.acoustic.localisation.setup_changes import find_setup_changes
 from jeit.acoustic.localisation.two_sources import locate_two
-from jeit.acoustic.microphones import MicrophoneArray
-from jeit.acoustic.noise import IntensityNoise, noise_from_negative_powers
+from jeit.acoustic.microphones import IntensityNoise, MicrophoneArray, noise_from_negative_powers
 from jeit.acoustic.signal.faults import describe_faults
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.signal.recording import Intensities, Recording

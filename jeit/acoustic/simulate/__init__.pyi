@@ -1,10 +1,7 @@
-from .calibration_recording import simulate_calibration_taps
-from .microphones import microphone_grid
 from .people import SoundClip, SoundingPerson, simulate_sound_clips
-from .sound import simulate_silence
-from .sounding_skin import SoundingSkin
-from .synthesis import Burst
-from .touches import simulate_pat, simulate_stroke, simulate_tap, simulate_tickle
+from .sound import Burst, simulate_silence
+from .sounding_skin import SoundingSkin, microphone_grid
+from .touches import simulate_calibration_taps, simulate_pat, simulate_stroke, simulate_tap, simulate_tickle
 from .wind_sound import simulate_room_sound, simulate_wind
 
 __all__ = [

@@ -10,9 +10,18 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, simulate_recording, simulate_silence
+from jeit.acoustic.simulate.sound import (
+    FIRST_ONSET,
+    HOP,
+    Burst,
+    SimulatedSound,
+    block_times,
+    microphone_noise,
+    sample_times,
+    simulate_recording,
+    simulate_silence,
+)
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
-from jeit.acoustic.simulate.synthesis import FIRST_ONSET, Burst, microphone_noise, sample_times
 from jeit.acoustic.simulate.touches import NOMINAL_SPEED
 from jeit.acoustic.simulate.wind_sound import TURBULENCE, simulate_room_sound, simulate_wind
 from jeit.arguments import check_key, check_kind, check_name, describe

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from jeit.acoustic.simulate.microphones import NUM_SLOTS, SLOT_TIME
-from jeit.acoustic.simulate.sounding_skin import SoundingSkin
+from jeit.acoustic.simulate.sounding_skin import NUM_SLOTS, SLOT_TIME, SoundingSkin
 
 
 def band_filter(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float[Array, " F"]:

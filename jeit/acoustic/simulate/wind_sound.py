@@ -9,16 +9,17 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jeit.acoustic.simulate.propagation import band_filter, noise_power, transfer
-from jeit.acoustic.simulate.sound import SimulatedSound, block_times
-from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
-from jeit.acoustic.simulate.synthesis import (
+from jeit.acoustic.simulate.sound import (
     RINGING_TIME,
+    SimulatedSound,
     bin_frequencies,
+    block_times,
     microphone_noise,
     num_filled_bins,
     sample_times,
     transform_size,
 )
+from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.arguments.checks import check_not_negative, check_positive
 
 # Number of source positions in an air jet, and number of frequencies at which the total power of the sources is

@@ -1,5 +1,4 @@
-from .sensitivity_map import plot_sensitivity_histograms, plot_sensitivity_map
-from .taxels import plot_taxel_areas, plot_taxels
+from .responses import plot_sensitivity_histograms, plot_sensitivity_map, plot_taxel_areas, plot_taxels
 from .travel import plot_travel
 from .unrolled_skin import plot_unrolled
 

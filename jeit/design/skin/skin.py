@@ -13,11 +13,10 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import IN_MILLIMETRES, brief, check_kind, check_metres, page, picture
 from jeit.design.defaults import CELL_SIZE, CONDUCTIVITY, CONTACT_IMPEDANCE, CONTRAST, NUM_LAYERS, THICKNESS
-from jeit.design.skin.indentation import AbstractIndentation, Bell
-from jeit.design.skin.protocol import skin_protocol
-from jeit.design.skin.reached_cells import touched_surface
+from jeit.design.skin.names import skin_protocol
 from jeit.design.skin.sheet_touches import SheetTouches, sheet_touches
-from jeit.design.skin.touched_cells import TouchedCells, touched_cells
+from jeit.design.skin.touched_cells import TouchedCells, touched_cells, touched_surface
+from jeit.design.skin.touches import AbstractIndentation, Bell
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs
 from jeit.forward import ForwardModel

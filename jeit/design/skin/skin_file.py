@@ -10,10 +10,9 @@ from pydantic import Field, model_validator
 
 from jeit.design import defaults
 from jeit.design.skin.described_surface import described_surface
-from jeit.design.skin.protocol import ProtocolName, skin_protocol
+from jeit.design.skin.names import ProtocolName, curved_layout, skin_protocol, study_layout
 from jeit.design.skin.skin import Skin
 from jeit.design.skin.surface_tables import SURFACE, SurfaceTable, check_keys_of_surface
-from jeit.design.study.layouts import curved_layout, study_layout
 from jeit.files import MOST_ELECTRODES, check_memory, read_toml
 from jeit.files.schema import Number, Table, Word
 from jeit.mesh import Rectangle

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from jeit.design import defaults
 from jeit.design.defaults import OPTIMALITY, ScoreName
-from jeit.design.skin.protocol import ProtocolName
+from jeit.design.skin.names import ProtocolName
 from jeit.design.skin.skin_file import (
     CELL,
     CONDUCTIVITY,

@@ -12,8 +12,7 @@ from jaxtyping import Float
 from jeit.data.description import Description
 from jeit.inverse.streaming.stream import FrameStatus, StreamState
 from jeit.live.pictures import AbstractView, LiveFrame, Marker, Picture
-from jeit.live.views.conductivity import ConductivityView, mean_frame
-from jeit.live.views.scene import PixelGrid, scene_of
+from jeit.live.views.conductivity import ConductivityView, PixelGrid, mean_frame, scene_of
 from jeit.touch import (
     CellFinder,
     Contact,

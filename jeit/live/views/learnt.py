@@ -11,9 +11,8 @@ from jeit.data.description import Description
 from jeit.imaging.preparation import imaging_mesh
 from jeit.inverse.streaming.stream import FrameStatus
 from jeit.live.pictures import AbstractView, LiveFrame, Marker, Picture, Scene
-from jeit.live.views.conductivity import mean_frame
+from jeit.live.views.conductivity import closed_outline, electrode_curves, mean_frame
 from jeit.live.views.contacts import StepwiseGenerator
-from jeit.live.views.scene import closed_outline, electrode_curves
 from jeit.touch import LearntSkin, Touches
 from jeit.touch.learnt.presses import NO_TOUCH
 from jeit.touch.networks import FrameDepth, ImageNetwork, resting_frame, stream_depths

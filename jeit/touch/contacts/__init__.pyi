@@ -1,6 +1,5 @@
 from .cell_finder import CellFinder
-from .finder import Contact, find_contacts
-from .image_noise import ImageNoise
+from .finder import Contact, ImageNoise, find_contacts
 from .load_calibration import Load, LoadCalibration
 from .raster_finder import RasterFinder, RasterStages
 from .tracker import ContactTracker, TouchPath, track_contacts

@@ -11,8 +11,7 @@ from jeit.arguments import describe, is_number
 from jeit.image.segmentation import basins, shared_facets
 from jeit.mesh import Mesh, centroids, measures
 from jeit.mesh.geodesic import Triangles
-from jeit.touch.contacts.finder import AbstractFinder, Contact, check_finder, check_share
-from jeit.touch.contacts.image_noise import ImageNoise
+from jeit.touch.contacts.finder import AbstractFinder, Contact, ImageNoise, check_finder, check_share
 
 # Number of standard deviations beyond which a Gaussian is treated as zero.
 _CUTOFF_DEVIATIONS = 3.0

@@ -1,16 +1,164 @@
-"""Find contacts in images."""
+"""Find contacts in images that are stronger than the noise of images of the untouched skin: standard deviations and
+covariance of the cells."""
 
 from abc import abstractmethod
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy import sparse
 
-from jeit.arguments import check_kind, describe, is_number
+from jeit.arguments import check_kind, counted, describe, is_number, real_array
+from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.mesh import Mesh, check_flat
-from jeit.touch.contacts.image_noise import ImageNoise
 from jeit_solvers.module import Module
+
+# Minimum number of frames for estimating the standard deviation.
+_MIN_NUM_FRAMES = 10
+# For normal noise: ratio of the standard deviation to the median absolute value; number of standard deviations beyond
+# which cells are removed; ratio of the standard deviation of all cells to that of the remaining cells.
+_DEVIATION_PER_MEDIAN, _CLIPPING_DEVIATIONS, _CLIPPED_DEVIATION = 1.4826, 3.0, 1.0136
+# Maximum number of rounds of clipping.
+_MAX_ROUNDS = 20
+
+
+class ImageNoise(Module):
+    """Noise of linear images.
+
+    **Fields**: `deviation` (m,): standard deviation of every cell, in the unit of the image; `factor` (r, m): matrix
+    whose product factorᵀ factor is the covariance of the cells, None if the covariance is unknown.
+
+    **Example:**
+
+    ```python
+    noise = ImageNoise.of_frames(linear, empty)
+    contacts = find_contacts(finder, image, noise)
+    ```
+    """
+
+    deviation: Float[np.ndarray, " m"]
+    factor: Float[np.ndarray, "r m"] | None = None
+
+    def __check_init__(self):
+        """Check the fields.
+
+        Raises `ValueError` for deviations that are negative or not finite, and a factor for another number of cells.
+        """
+        requirement = "an array (m,), one number a cell, zero or more and finite, in the unit of the image"
+        check_kind("deviation", self.deviation, (np.ndarray, jax.Array), requirement)
+        deviation = real_array("deviation", self.deviation, requirement)
+        if deviation.ndim != 1:
+            raise ValueError(f"deviation must be {requirement}; it has shape {deviation.shape}.")
+        if not (np.isfinite(deviation).all() and (deviation >= 0).all()):
+            raise ValueError(f"deviation must be {requirement}; some of it is negative or not finite.")
+        if self.factor is not None and np.shape(self.factor)[1:] != deviation.shape:
+            shape = np.shape(self.factor)
+            raise ValueError(f"factor has shape {shape}; give (r, {deviation.size}), a column for each cell.")
+
+    @classmethod
+    def of_frames(cls, reconstruction: LinearReconstruction, frames: Float[np.ndarray, "n M"]) -> "ImageNoise":
+        """Estimate the noise from at least ten repeated frames (n, M), volts, of the untouched skin.
+
+        Images are computed of the deviations of the frames from their mean. The noise includes drift only if the frames
+        span as long a time as later readings. Raises `ValueError` for fewer than ten frames, a number of channels other
+        than M of the reconstruction, NaN, and frames that are all the same.
+        """
+        check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
+        frames = real_array("frames", frames, "voltages (n, M)")
+        if frames.ndim != 2 or len(frames) < _MIN_NUM_FRAMES:
+            raise ValueError(
+                f"frames has shape {frames.shape}; give (n, {reconstruction.num_measurements}) volts of an untouched "
+                f"skin, {counted(_MIN_NUM_FRAMES, 'frame')} or more."
+            )
+        if (frames == frames[0]).all():
+            raise ValueError("frames are all the same and show no noise. Give what was read, not copies of a frame.")
+        noise_images = np.asarray(reconstruction.image(frames - frames.mean(axis=0)))
+        return cls._from_factor(noise_images / np.sqrt(len(frames) - 1))
+
+    @classmethod
+    def of_images(cls, images: Float[np.ndarray, "n m"]) -> "ImageNoise":
+        """Estimate the noise from at least ten images (n, m) of the untouched skin. Raises `ValueError` for fewer than
+        ten images, NaN, and images that are all the same."""
+        images = real_array("images", images, "changes of conductivity (n, m)")
+        if images.ndim != 2 or len(images) < _MIN_NUM_FRAMES or not np.isfinite(images).all():
+            raise ValueError(
+                f"images has shape {images.shape}; give {counted(_MIN_NUM_FRAMES, 'image')} or more of the untouched "
+                "skin, (n, m), without NaN."
+            )
+        if (images == images[0]).all():
+            raise ValueError("images are all the same and show no noise. Give those of frames that were read.")
+        return cls._from_factor((images - images.mean(axis=0)) / np.sqrt(len(images) - 1))
+
+    @classmethod
+    def of_channels(cls, reconstruction: LinearReconstruction, deviation: ArrayLike) -> "ImageNoise":
+        """Compute the noise from the standard deviations of independent channels, (M,) or one number for all, volts.
+
+        The difference of two frames has √2 times the standard deviation of one frame. Raises `ValueError` for
+        deviations that are negative, not finite, all zero, or for another number of channels.
+        """
+        check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
+        num_channels = reconstruction.num_measurements
+        deviation = real_array("deviation", deviation, f"one number, or ({num_channels},), volts")
+        if deviation.shape not in ((), (num_channels,)):
+            raise ValueError(f"deviation has shape {deviation.shape}; give one number, or ({num_channels},), volts.")
+        if not (np.isfinite(deviation).all() and (deviation >= 0).all() and deviation.any()):
+            raise ValueError("deviation must be finite, zero or more, and not zero for all channels, in volts.")
+        return cls._from_factor(np.broadcast_to(deviation, num_channels)[:, None] * np.asarray(reconstruction.matrix).T)
+
+    @classmethod
+    def of_image(cls, image: Float[np.ndarray, " m"]) -> "ImageNoise":
+        """Estimate the noise from an image (m,) alone, with or without contacts, by sigma clipping.
+
+        Cells more than three standard deviations from the median are removed, repeatedly. The standard deviation of the
+        remaining cells is taken as that of every cell. Artefacts of a contact all over the image, and ringing, count as
+        noise, so that weak contacts beside strong ones are missed. Cells that are noisier than most are mistaken for
+        contacts. Raises `ValueError` for an image that is not (m,), finite and real.
+        """
+        values = np.asarray(image)
+        if values.ndim != 1 or not values.size or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+            raise ValueError("image must be real and finite, one value a cell (m,).")
+        return cls(np.full(values.shape, _clipped_deviation(values)))
+
+    @classmethod
+    def _from_factor(cls, factor: np.ndarray) -> "ImageNoise":
+        return cls(np.sqrt((factor**2).sum(axis=0)), factor)
+
+    def distance(self, slope: Float[np.ndarray, "m 2"]) -> float:
+        """Compute the root mean square displacement, metres, of a position that is computed from a noisy image.
+
+        `slope` (m, 2): derivative of the position with respect to the image, metres per unit of the image. If the
+        covariance of the cells is unknown, the result is an upper bound.
+        """
+        if self.factor is None:
+            return float(np.linalg.norm(self.deviation @ np.abs(slope)))
+        return float(np.linalg.norm(self.factor @ slope))
+
+    def smoothed(self, smoothing: sparse.csr_array) -> Float[np.ndarray, " m"]:
+        """Standard deviation (m,) of the image after smoothing by a matrix (m, m).
+
+        If the covariance of the cells is unknown, the result is an upper bound.
+        """
+        if self.factor is None:
+            return smoothing @ self.deviation
+        return np.sqrt(((smoothing @ self.factor.T) ** 2).sum(axis=1))
+
+
+def _clipped_deviation(values: Float[np.ndarray, " m"]) -> float:
+    """Standard deviation of the values (m,) without outliers, those beyond three standard deviations of the median.
+
+    To decide which values are outliers, the standard deviation is estimated from the median distance from the median.
+    """
+    remaining_values = values
+    for _ in range(_MAX_ROUNDS):
+        median = np.median(remaining_values)
+        spread = _DEVIATION_PER_MEDIAN * np.median(np.abs(remaining_values - median))
+        values_within = values[np.abs(values - median) <= _CLIPPING_DEVIATIONS * spread]
+        if len(values_within) == len(remaining_values):
+            break
+        remaining_values = values_within
+    return float(_CLIPPED_DEVIATION * remaining_values.std())
 
 
 class Contact(Module):

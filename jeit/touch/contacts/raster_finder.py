@@ -24,12 +24,12 @@ from jeit.touch.contacts.cell_finder import gaussian_means
 from jeit.touch.contacts.finder import (
     AbstractFinder,
     Contact,
+    ImageNoise,
     check_finder,
     noise_or_estimate,
     restore_sign,
     signed_image,
 )
-from jeit.touch.contacts.image_noise import ImageNoise
 from jeit_solvers.module import Module
 
 # Width in pixels of the band along a contact's edge in which noise may add cells to the contact, or remove them.

@@ -19,7 +19,7 @@ from jeit.touch.gestures.features import (
 from jeit.touch.learnt.array_models import Forest
 from jeit.touch.learnt.extras import apply_over_folds
 from jeit.touch.learnt.methods import CLASSIFIERS, log_odds
-from jeit.touch.learnt.temporal_network import TemporalNetwork
+from jeit.touch.learnt.neural_networks import TemporalNetwork
 
 
 def fit_logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest:

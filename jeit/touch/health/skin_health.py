@@ -24,9 +24,8 @@ from jeit.touch.health.event import (
     is_distinct,
     lasting_step,
 )
-from jeit.touch.health.finding import Finding, LastingChange, classify_change
+from jeit.touch.health.finding import Finding, ImagedSkin, LastingChange, classify_change
 from jeit.touch.health.healthy import HealthyState, average_frames
-from jeit.touch.health.imaged_skin import ImagedSkin
 
 # Time longer than any touch is held (patience): seconds; number of windows if frames have no times.
 PATIENCE, _PATIENCE_WINDOWS = 30.0, 3

@@ -1,6 +1,5 @@
 from .placed_map import PlacedMap, drawn_map, read_map, write_map
-from .quality import MapQuality, learning_curves, map_quality, time_constant
-from .self_organising_map import SelfOrganisingMap, fit_maps
+from .self_organising_map import MapQuality, SelfOrganisingMap, fit_maps, learning_curves, map_quality, time_constant
 from .several_touches import MapTouch, neuron_shares, touches_reported
 from .training import MapSchedule
 

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from jeit.touch.learnt import labels as label_methods
 from jeit.touch.learnt import numbers as number_methods
-from jeit.touch.learnt.imaged import ImageReconstruction
+from jeit.touch.learnt.features import ImageReconstruction
 from jeit.touch.learnt.labels import learn_keys, learn_labels
 from jeit.touch.learnt.numbers import LearntNumbers, learn_numbers
 from jeit.touch.learnt.presses import Presses

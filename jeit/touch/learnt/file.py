@@ -24,14 +24,12 @@ from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 from jeit.touch.learnt.array_models import Forest, NearestNeighbours, SupportVectorMachine
 from jeit.touch.learnt.channels import Channels, Neighbourhood
-from jeit.touch.learnt.features import Features, WhitenedChanges
-from jeit.touch.learnt.imaged import ContactFeatures, ImageFeatures, ImageReconstruction
+from jeit.touch.learnt.features import ContactFeatures, Features, ImageFeatures, ImageReconstruction, WhitenedChanges
 from jeit.touch.learnt.labels import LearntKeys, LearntLabels, StandardisedFeatures
 from jeit.touch.learnt.learnt_skin import LearntSkin
 from jeit.touch.learnt.methods import GaussianProcess, LinearEnsemble, QuadraticDiscriminant
-from jeit.touch.learnt.network import Network
+from jeit.touch.learnt.neural_networks import Network, TemporalNetwork
 from jeit.touch.learnt.numbers import DeviationModel, LearntNumbers
-from jeit.touch.learnt.temporal_network import TemporalNetwork
 
 _SCHEMA_FILE = "schema.json"
 # Matches the number of an object in the schema of a skops file, also where the number is part of a file name.

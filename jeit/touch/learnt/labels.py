@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float
 
 from jeit.touch.learnt.array_models import Forest
 from jeit.touch.learnt.extras import apply_over_folds
-from jeit.touch.learnt.features import FORMS, Features, Forms, standardisation
-from jeit.touch.learnt.imaged import ImageReconstruction
+from jeit.touch.learnt.features import FORMS, Features, Forms, ImageReconstruction, standardisation
 from jeit.touch.learnt.methods import CLASSIFIERS, covariance_shrinkage, fit_sharpness, log_odds, probabilities
 
 METHODS = ("auto", *CLASSIFIERS)

@@ -18,7 +18,7 @@ from jeit.touch.learnt import numbers as number_methods
 from jeit.touch.learnt.answers import METHODS, Standing, learn_quantities, places_and_folds
 from jeit.touch.learnt.channels import Channels, choose_channels
 from jeit.touch.learnt.extras import apply_over_threads, one_thread
-from jeit.touch.learnt.imaged import ImageReconstruction, check_imaged
+from jeit.touch.learnt.features import ImageReconstruction, check_imaged
 from jeit.touch.learnt.labels import LearntKeys, LearntLabels
 from jeit.touch.learnt.numbers import LearntNumbers
 from jeit.touch.learnt.presses import (

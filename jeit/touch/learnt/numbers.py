@@ -12,8 +12,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from jeit.touch.learnt.extras import apply_over_folds
-from jeit.touch.learnt.features import Features, Forms
-from jeit.touch.learnt.imaged import ImageReconstruction
+from jeit.touch.learnt.features import Features, Forms, ImageReconstruction
 from jeit.touch.learnt.methods import CHANNEL_METHODS, QUICK_METHODS, REGRESSORS
 
 _NUM_SIMILAR, _TARGET_COVERAGES = 40, ((1.0, 0.6827), (1.96, 0.95))

@@ -1,9 +1,18 @@
 from .contacts import plot_contact_stages, plot_contacts
 from .health import plot_health, plot_health_course
 from .kohonen_map import plot_map
-from .learning import plot_confusion, plot_force_errors, plot_key_errors, plot_place_errors, plot_tried
+from .learnt import (
+    plot_answers,
+    plot_confusion,
+    plot_depth_map,
+    plot_force_errors,
+    plot_key_errors,
+    plot_losses,
+    plot_place_errors,
+    plot_places,
+    plot_tried,
+)
 from .timeline import plot_changes, plot_sound_labels, plot_timeline, plot_touch_paths
-from .touches import plot_answers, plot_depth_map, plot_losses, plot_places
 
 __all__ = [
     "plot_answers",

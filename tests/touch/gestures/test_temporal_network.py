@@ -16,8 +16,8 @@ from jeit.touch.gestures.features import (
     sequence_features,
 )
 from jeit.touch.gestures.gesture_classifiers import feature_forms
-from jeit.touch.learnt import temporal_network
-from jeit.touch.learnt.temporal_network import TemporalNetwork
+from jeit.touch.learnt import neural_networks
+from jeit.touch.learnt.neural_networks import TemporalNetwork
 
 
 def test_the_sequence_is_the_time_course():
@@ -44,7 +44,7 @@ def test_the_sequence_is_the_time_course():
 def test_an_order_in_time_is_learnt(monkeypatch):
     """Classes with the same values in rising or falling order: no mean or maximum distinguishes them."""
     rng = np.random.default_rng(0)
-    monkeypatch.setattr(temporal_network, "_NUM_EPOCHS", 20)
+    monkeypatch.setattr(neural_networks, "_NUM_COURSE_EPOCHS", 20)
     label = rng.integers(0, 2, 400)
     course = np.sort(rng.normal(size=(400, 8, 2)), axis=1)
     course[label == 1] = course[label == 1, ::-1]

@@ -5,7 +5,7 @@ import pytest
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, ring
 from jeit.touch import LearntSkin, Presses, read_skin, write_skin
-from jeit.touch.learnt.imaged import ContactFeatures, ImageFeatures, ImageReconstruction
+from jeit.touch.learnt.features import ContactFeatures, ImageFeatures, ImageReconstruction
 
 RADIUS = 0.05
 ELECTRODES = BoundaryElectrodes(ring(RADIUS, 12), width=0.008, contact_impedance=0.01)

@@ -11,7 +11,7 @@ from made_skins import record
 from jeit.touch import LearntSkin, PlacedMap, Presses, SelfOrganisingMap, read_skin, write_skin
 from jeit.touch.learnt.array_models import Forest
 from jeit.touch.learnt.methods import REGRESSORS
-from jeit.touch.learnt.network import Network
+from jeit.touch.learnt.neural_networks import Network
 
 FRESH = record(30, seed=1)
 

@@ -6,8 +6,8 @@ import pytest
 
 from jeit.acoustic import Recording
 from jeit.acoustic.simulate import SoundingPerson, SoundingSkin, microphone_grid, simulate_sound_clips
-from jeit.acoustic.simulate.microphones import MicrophoneModel
 from jeit.acoustic.simulate.people import MODALITIES
+from jeit.acoustic.simulate.sounding_skin import MicrophoneModel
 from jeit.touch.listening import Levels, Listener, ModalityNetwork, SoundImages, sound_images
 from jeit.touch.listening.learners import LEARNERS, NetworkListener, TrainingSet
 from jeit.touch.listening.modality_network import NetworkAnswers, library_plan, paper_plan

@@ -20,7 +20,7 @@ import pytest
 from small_networks import PRESET, SHAPE, bits
 
 from jeit.design import Skin
-from jeit.design.skin.protocol import skin_protocol
+from jeit.design.skin.names import skin_protocol
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle
 from jeit.protocol import adjacent

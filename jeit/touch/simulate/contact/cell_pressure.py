@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from jeit.design.skin.reached_cells import millimetre_text
-from jeit.design.skin.touched_cells import pad_rows
+from jeit.design.skin.touched_cells import millimetre_text, pad_rows
 from jeit.touch.simulate.contact.indenters import DiscIndenter
 from jeit.touch.simulate.contact.press import AbstractSupport, Press
 from jeit.touch.simulate.contact.samples import Samples

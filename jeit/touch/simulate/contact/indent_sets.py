@@ -12,7 +12,7 @@ import numpy as np
 
 from jeit.arguments import check_kind, describe
 from jeit.design import Skin
-from jeit.design.skin.resting_skin import RestingSkin
+from jeit.design.skin.voltage_changes import RestingSkin
 from jeit.design.study.contents import Contents
 from jeit.touch.simulate.contact.indents import IndentDraws, depth_maps, relative_changes, resting_skin
 

@@ -12,8 +12,8 @@ from scipy.spatial import KDTree
 
 from jeit.arguments import check_key, check_kind, check_metres, describe, is_number, real_array
 from jeit.design import Skin
-from jeit.design.skin.resting_skin import RestingSkin
 from jeit.design.skin.touched_cells import TouchedCells, pad_rows
+from jeit.design.skin.voltage_changes import RestingSkin
 from jeit.mesh import Domain, centroids
 from jeit.touch.simulate.contact.indenters import AbstractIndenter, check_indenter
 from jeit.touch.simulate.contact.joined import check_angle, check_position

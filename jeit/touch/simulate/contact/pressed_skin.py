@@ -28,8 +28,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_key, check_kind, check_name, describe, is_number, real_array
-from jeit.design.skin.reached_cells import is_curved
-from jeit.design.skin.touched_cells import TouchedCells, pad_rows
+from jeit.design.skin.touched_cells import TouchedCells, is_curved, pad_rows
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
 from jeit.forward.changes import ContactSensitivity

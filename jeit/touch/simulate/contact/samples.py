@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jeit.design.skin.reached_cells import is_curved, millimetre_text, touched_surface
+from jeit.design.skin.touched_cells import is_curved, millimetre_text, touched_surface
 from jeit.mesh import Mesh, check_flat, measures
 from jeit.mesh.geodesic import Triangles
 from jeit.touch.simulate.contact.press import Press

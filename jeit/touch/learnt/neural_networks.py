@@ -1,7 +1,8 @@
-"""A small convolutional network that classifies touches from time courses and from features of the whole touch.
+"""Two small neural networks, trained with equinox and optax, and evaluated in NumPy: `Network` is fully connected, and
+`TemporalNetwork` is convolutional and classifies touches from time courses and from features of the whole touch.
 
-A few networks with different initial weights are trained at once with equinox and optax, and their probabilities are
-averaged. The networks are evaluated in NumPy, in a fraction of a millisecond per touch.
+`Network` takes microseconds per frame. For `TemporalNetwork`, a few networks with different initial weights are trained
+at once, and their probabilities are averaged. It takes a fraction of a millisecond per touch.
 """
 
 from __future__ import annotations
@@ -12,13 +13,102 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-_HIDDEN_SIZE, _DENSE_SIZE, _KERNEL_SIZE = 24, 32, 5
-_NUM_NETWORKS, _BATCH_SIZE, _NUM_EPOCHS, _LEARNING_RATE, _WEIGHT_DECAY = 2, 64, 45, 3e-3, 2e-2
+_BATCH_SIZE = 64
+# Settings of `Network`, which takes frames.
+_FRAME_HIDDEN_SIZE, _NUM_FRAME_EPOCHS = 64, 150
+_FRAME_LEARNING_RATE, _FRAME_WEIGHT_DECAY = 3e-3, 1e-2
+# Standard deviation of the noise added to features in each batch, relative to their scale.
+_FRAME_FEATURE_NOISE = 0.1
+# Settings of `TemporalNetwork`, which takes time courses.
+_COURSE_HIDDEN_SIZE, _DENSE_SIZE, _KERNEL_SIZE = 24, 32, 5
+_NUM_NETWORKS, _NUM_COURSE_EPOCHS = 2, 45
+_COURSE_LEARNING_RATE, _COURSE_WEIGHT_DECAY = 3e-3, 2e-2
 # Standard deviation of the noise added to features in each batch, in the features' unit; amount of label smoothing;
 # dropout rate of the inputs of the dense layer.
-_FEATURE_NOISE, _LABEL_SMOOTHING, _DROPOUT_RATE = 0.15, 0.05, 0.2
+_COURSE_FEATURE_NOISE, _LABEL_SMOOTHING, _DROPOUT_RATE = 0.15, 0.05, 0.2
+
+
+@dataclass(frozen=True)
+class Network:
+    """A fully connected neural network with tanh between layers.
+
+    `weights` (outputs, inputs) and `biases` (outputs,) of each layer; `scale`: number by which each feature is divided
+    before the first layer.
+    """
+
+    weights: list[Float[np.ndarray, "o i"]]
+    biases: list[Float[np.ndarray, " o"]]
+    scale: Float[np.ndarray, " k"]
+
+    def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
+        """Predict targets (frames, targets) from features (frames, features)."""
+        values = features / self.scale
+        for layer_index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            values = values @ weight.T + bias
+            values = np.tanh(values) if layer_index + 1 < len(self.weights) else values
+        return values
+
+    @classmethod
+    def train(cls, features, targets) -> "Network":
+        """Train a network by Adam with weight decay and a decreasing learning rate, with noise added to the features of
+        each batch."""
+        import jax
+        import jax.numpy as jnp
+
+        size = float(np.sqrt(np.mean(features**2))) or 1.0
+        scale = np.full(features.shape[1], size)
+        batches = _draw_batches(len(features), _NUM_FRAME_EPOCHS)
+        layers = _compiled_frame_training(len(batches))(
+            jnp.asarray(_pad_rows(features / scale), jnp.float32),
+            jnp.asarray(_pad_rows(targets), jnp.float32),
+            jnp.asarray(batches),
+            jax.random.split(jax.random.key(0)),
+        )
+        layers = [(np.asarray(layer.weight, float), np.asarray(layer.bias, float)) for layer in layers]
+        return cls([weight for weight, _ in layers], [bias for _, bias in layers], scale)
+
+
+@functools.cache
+def _compiled_frame_training(num_steps: int) -> Callable[..., Any]:
+    """Return a function that trains a network in `num_steps` steps of Adam, compiled once for each shape of its
+    arguments.
+
+    The arguments of the function are features, targets, the rows of each batch, and two random keys; the function
+    returns the layers.
+    """
+    import equinox as eqx
+    import jax
+    import jax.numpy as jnp
+    import optax
+
+    optimiser = optax.adamw(
+        optax.cosine_decay_schedule(_FRAME_LEARNING_RATE, num_steps), weight_decay=_FRAME_WEIGHT_DECAY
+    )
+
+    @jax.jit
+    def train(features, targets, batches, keys):
+        sizes = features.shape[1], targets.shape[1], _FRAME_HIDDEN_SIZE, 2
+        network = eqx.nn.MLP(*sizes, activation=jnp.tanh, dtype=jnp.float32, key=keys[0])
+        parameters, static_part = eqx.partition(network, eqx.is_inexact_array)
+
+        def loss(parameters, index, key):
+            noisy_features = features[index] + _FRAME_FEATURE_NOISE * jax.random.normal(
+                key, (_BATCH_SIZE, features.shape[1]), features.dtype
+            )
+            return jnp.mean((jax.vmap(eqx.combine(parameters, static_part))(noisy_features) - targets[index]) ** 2)
+
+        def update(carry, index):
+            parameters, state, key = carry
+            key, step_key = jax.random.split(key)
+            updates, state = optimiser.update(jax.grad(loss)(parameters, index, step_key), state, parameters)
+            return (eqx.apply_updates(parameters, updates), state, key), None
+
+        parameters = jax.lax.scan(update, (parameters, optimiser.init(parameters), keys[1]), batches)[0][0]
+        return parameters.layers
+
+    return train
 
 
 @dataclass(frozen=True)
@@ -76,16 +166,11 @@ class TemporalNetwork:
         import jax.numpy as jnp
 
         classes, class_indices = np.unique(label, return_inverse=True)
-        num_steps = _NUM_EPOCHS * max(1, -(-len(features) // _BATCH_SIZE))
-        rng = np.random.default_rng(0)
-        order = np.concatenate([rng.permutation(len(features)) for _ in range(_NUM_EPOCHS)])
-        # The number of touches is padded to a multiple of the batch size, so that cross-validation folds of about the
-        # same size share the compiled function; no batch uses the added rows.
-        num_padding_rows = -len(features) % _BATCH_SIZE
-        parameters = _compiled_training(num_steps, whole, values, len(classes))(
-            jnp.asarray(np.pad(features, ((0, num_padding_rows), (0, 0))), jnp.float32),
-            jnp.asarray(np.pad(class_indices, (0, num_padding_rows))),
-            jnp.asarray(np.resize(order, (num_steps, _BATCH_SIZE))),
+        batches = _draw_batches(len(features), _NUM_COURSE_EPOCHS)
+        parameters = _compiled_course_training(len(batches), whole, values, len(classes))(
+            jnp.asarray(_pad_rows(features), jnp.float32),
+            jnp.asarray(_pad_rows(class_indices)),
+            jnp.asarray(batches),
             jax.random.split(jax.random.key(0), _NUM_NETWORKS),
         )
         return cls(*(np.asarray(parameter, float) for parameter in parameters), whole=whole, classes_=classes)
@@ -105,7 +190,7 @@ def _neighbouring_steps(course, engine):
 
 
 @functools.cache
-def _compiled_training(num_steps: int, whole: int, values: int, num_classes: int) -> Callable[..., Any]:
+def _compiled_course_training(num_steps: int, whole: int, values: int, num_classes: int) -> Callable[..., Any]:
     """Return a function that trains networks in `num_steps` steps of AdamW, compiled once for each shape of its
     arguments.
 
@@ -116,11 +201,13 @@ def _compiled_training(num_steps: int, whole: int, values: int, num_classes: int
     import jax.numpy as jnp
     import optax
 
-    optimiser = optax.adamw(optax.cosine_decay_schedule(_LEARNING_RATE, num_steps), weight_decay=_WEIGHT_DECAY)
+    optimiser = optax.adamw(
+        optax.cosine_decay_schedule(_COURSE_LEARNING_RATE, num_steps), weight_decay=_COURSE_WEIGHT_DECAY
+    )
     sizes = [
-        (_HIDDEN_SIZE, _KERNEL_SIZE * values),
-        (_HIDDEN_SIZE, _KERNEL_SIZE * _HIDDEN_SIZE),
-        (_DENSE_SIZE, whole + 2 * _HIDDEN_SIZE),
+        (_COURSE_HIDDEN_SIZE, _KERNEL_SIZE * values),
+        (_COURSE_HIDDEN_SIZE, _KERNEL_SIZE * _COURSE_HIDDEN_SIZE),
+        (_DENSE_SIZE, whole + 2 * _COURSE_HIDDEN_SIZE),
         (num_classes, _DENSE_SIZE),
     ]
 
@@ -137,7 +224,7 @@ def _compiled_training(num_steps: int, whole: int, values: int, num_classes: int
 
     def loss(weights, features, class_indices, key):
         noise_key, dropout_key = jax.random.split(key)
-        noisy_features = features + _FEATURE_NOISE * jax.random.normal(noise_key, features.shape, features.dtype)
+        noisy_features = features + _COURSE_FEATURE_NOISE * jax.random.normal(noise_key, features.shape, features.dtype)
         target_probabilities = (1 - _LABEL_SMOOTHING) * jax.nn.one_hot(
             class_indices, num_classes
         ) + _LABEL_SMOOTHING / num_classes
@@ -169,3 +256,17 @@ def _compiled_training(num_steps: int, whole: int, values: int, num_classes: int
         return jax.vmap(train_network)(keys)
 
     return train
+
+
+def _draw_batches(num_rows: int, num_epochs: int) -> Int[np.ndarray, "T b"]:
+    """Return the rows of each batch (steps, rows in a batch), in a random order in each of `num_epochs` epochs."""
+    num_steps = num_epochs * max(1, -(-num_rows // _BATCH_SIZE))
+    rng = np.random.default_rng(0)
+    order = np.concatenate([rng.permutation(num_rows) for _ in range(num_epochs)])
+    return np.resize(order, (num_steps, _BATCH_SIZE))
+
+
+def _pad_rows(values: np.ndarray) -> np.ndarray:
+    """Pad the rows of `values` (n, …) with zeros to a multiple of the batch size, so that cross-validation folds of
+    about the same size share the compiled function; no batch uses the added rows."""
+    return np.pad(values, [(0, -len(values) % _BATCH_SIZE), *[(0, 0)] * (values.ndim - 1)])

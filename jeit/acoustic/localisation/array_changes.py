@@ -1,4 +1,5 @@
-"""Changes of the microphones' gains since the calibration, estimated from the touches of a recording.
+"""Changes of the microphones since the calibration, found from the touches of a recording: changed gains, exchanged
+microphones, and microphones whose response has changed.
 
 A change h_i of the logarithm of gain i adds s_i h_i to the level of microphone i in every frame, where s_i = S_i / (S_i
 + N_i) for the received power S_i and the noise floor N_i. The changes have a normal prior of mean 0 and are the same
@@ -12,11 +13,14 @@ eliminated, have the matrix
 The inverse of this matrix is the covariance of the changes given the recording. A single touch reduces the covariance
 little; touches all over the skin determine the changes. The changes are applied only if they are significant: b is the
 right-hand side of the equations, and bᵀ A⁺ b must exceed the value that errors of the decay models alone explain.
+
+Exchanged and altered microphones are searched for from the misfit of located touches.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import combinations
 from typing import NamedTuple
 
 import equinox as eqx
@@ -25,7 +29,7 @@ from jaxtyping import Bool, Float
 from scipy.special import chdtrc
 
 from jeit.acoustic.localisation.likelihood import Likelihood
-from jeit.acoustic.localisation.localiser import SourceEstimate
+from jeit.acoustic.localisation.localiser import Localiser, SourceEstimate
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.surface import longer_side, to_space
 from jeit_solvers import inverse_small
@@ -46,6 +50,14 @@ _FALSE_CHANGE, _RANK_TOLERANCE = 0.01, 1e-8
 # Fraction of its trace that is added to the diagonal of the Fisher matrix of a frame, which is singular where few
 # microphones respond.
 _RIDGE = 1e-12
+# Number of the loudest frames that are used; misfit per degree of freedom above which changes of the setup are searched
+# for; value at which the misfit per degree of freedom is clipped; maximum ratio of the misfits after and before an
+# accepted change.
+_NUM_FRAMES, _LARGE_MISFIT, _MAX_MISFIT, _MAX_MISFIT_RATIO = 24, 3.0, 100.0, 0.7
+# Maximum number of changes of the setup that are searched for.
+_MAX_CHANGES = 4
+# A single microphone is left out for a test only if more than this number of microphones are not yet changed.
+_MIN_REMAINING = 5
 
 
 class GainChanges(NamedTuple):
@@ -227,3 +239,82 @@ def _inverse_fisher(fisher) -> np.ndarray:
     """Inverses (3, 3, F) of the Fisher matrices of F frames. A ridge makes singular matrices definite."""
     regularised_fisher = fisher + _RIDGE * np.maximum(np.trace(fisher), 1.0) * np.eye(len(fisher))[:, :, None]
     return np.asarray(inverse_small(regularised_fisher))
+
+
+class SetupChanges(NamedTuple):
+    """Changes of the setup since the calibration.
+
+    **Fields**: `exchanged`: pairs of indices of exchanged microphones; `altered`: indices of microphones whose response
+    has changed.
+    """
+
+    exchanged: list[tuple[int, int]]
+    altered: list[int]
+
+
+def find_setup_changes(
+    microphone_array: MicrophoneArray, power: Float[np.ndarray, "F M"], use: Bool[np.ndarray, "F M"]
+) -> SetupChanges:
+    """Find changes of the setup that explain the misfit of touches: with the microphones exchanged back, or left out,
+    one source explains the frames.
+
+    `power` (F, M): intensities minus the noise floor of frames with a touch; `use` (F, M): mask of the usable
+    intensities. Only the loudest frames are used. The search is greedy: it repeatedly accepts the change that lowers
+    the misfit most, so it finds several changes only if each change alone lowers the misfit. No changes are returned
+    for fewer than three frames, if one source explains the frames without a change, or if no change explains the
+    misfit.
+    """
+    loudest_frames = np.argsort(-np.where(use, power, 0.0).sum(axis=1))[:_NUM_FRAMES]
+    changes = SetupChanges([], [])
+    if len(loudest_frames) < 3:
+        return changes
+    loudest_frames = loudest_frames[np.arange(_NUM_FRAMES) % len(loudest_frames)]
+    power, use = np.where(use, power, 0.0)[loudest_frames], use[loudest_frames]
+    localiser = Localiser.create(microphone_array)
+
+    def mean_misfit(states: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        """Mean misfit per degree of freedom for each candidate change, given by the order and the mask of the
+        channels."""
+        estimates = localiser(
+            np.concatenate([power[:, order] for order, _ in states]),
+            np.concatenate([use[:, order] & mask for order, mask in states]),
+        )
+        ratio = np.asarray(estimates.misfit) / np.maximum(np.asarray(estimates.freedom), 1)
+        return np.minimum(np.nan_to_num(ratio, nan=_MAX_MISFIT), _MAX_MISFIT).reshape(len(states), -1).mean(axis=1)
+
+    state = np.arange(power.shape[1]), np.ones(power.shape[1], bool)
+    current_misfit = float(mean_misfit([state])[0])
+    remaining = np.flatnonzero(use.any(axis=0))
+    while (
+        current_misfit > _LARGE_MISFIT
+        and len(changes.exchanged) + len(changes.altered) < _MAX_CHANGES
+        and remaining.size
+    ):
+        # Altered microphones come first among the candidate changes, since exchanging an altered microphone may lower
+        # the misfit too.
+        singles = [(int(k),) for k in remaining if remaining.size > _MIN_REMAINING]
+        candidates = singles + [(int(k), int(m)) for k, m in combinations(remaining, 2)]
+        candidate_states = [_apply_change(state, channels) for channels in candidates]
+        misfits = mean_misfit(candidate_states)
+        best_index = int(misfits.argmin())
+        if not misfits[best_index] < _MAX_MISFIT_RATIO * current_misfit:
+            break
+        current_misfit, state = float(misfits[best_index]), candidate_states[best_index]
+        channels = candidates[best_index]
+        if len(channels) == 2:
+            changes.exchanged.append((channels[0], channels[1]))
+        else:
+            changes.altered.append(channels[0])
+        remaining = remaining[~np.isin(remaining, channels)]
+    return changes if current_misfit <= _LARGE_MISFIT else SetupChanges([], [])
+
+
+def _apply_change(state: tuple[np.ndarray, np.ndarray], channels: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the order and the mask of the microphones' channels after exchanging two channels, or leaving out one
+    channel."""
+    order, mask = (array.copy() for array in state)
+    if len(channels) == 2:
+        order[list(channels)] = order[list(channels[::-1])]
+    else:
+        mask[channels[0]] = False
+    return order, mask
