@@ -96,7 +96,7 @@ class Mesh(Module):
 
         **Arguments**: `points` (n, 2) or (n, 3): coordinates in metres; `cells`: zero-based node indices of triangles
         (m, 3), in the plane or in space, or of tetrahedra (m, 4), in either orientation; `tags`: names of groups of
-        boundary facets, each given by the facets' nodes, (t, d) integers in any order, or by indices (t,) into the
+        boundary facets, each specified by the facets' nodes, (t, d) integers in any order, or by indices (t,) into the
         resulting `facets`.
 
         In 2-D each loop of `facets` starts at its node of the lowest index; the outer loop runs counter-clockwise,

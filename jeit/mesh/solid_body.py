@@ -73,7 +73,7 @@ class Solid(Body):
 
 
 class OwnMesh(Body):
-    """A body given as a mesh, which is used without remeshing.
+    """A body defined by an existing mesh, which is used without remeshing.
 
     **Arguments:**
 
@@ -121,7 +121,7 @@ class OwnMesh(Body):
         }
 
     def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Refinement = None) -> Mesh:
-        """The given mesh; all arguments are ignored."""
+        """Return the stored mesh; all arguments are ignored."""
         return self.given
 
 

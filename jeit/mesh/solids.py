@@ -39,7 +39,7 @@ def disk(
     - `num_points`: number of nodes, met within about 5 % (default 1,200); or `cell_size`: edge length in metres.
     - `centre` (x, y): centre of the disk in metres.
     - `refine`: one or several `Refine`, or a function that takes points (p, 2) and returns the requested edge lengths
-      there (p,) in metres, which are scaled by a common factor if `num_points` is given.
+      (p,) at these points in metres. If `num_points` is specified, the lengths are scaled by a common factor.
     - `num_boundary`: number of nodes on the circle; the cells grow from the circle inwards.
     - `boundary_points`: angles in radians at which nodes are placed.
     - `interior_points` (k, 2): positions in metres at which nodes are placed.
@@ -339,7 +339,7 @@ def cylinder(
 
 
 def base_counter(area: float, height: float, num_layers: int | None) -> Callable[[int], int]:
-    """Function that returns how many nodes the base of a solid has, given the number of nodes of the solid."""
+    """Return a function that computes the number of nodes of a solid's base from the number of nodes of the solid."""
     return lambda num_points: choose_layers(area, height, num_points, None, num_layers)[0] or num_points
 
 

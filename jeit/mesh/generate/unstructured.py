@@ -35,7 +35,7 @@ class Target:
     """Target size of a mesh.
 
     **Fields**: `num_points`: number of nodes; `cell_size`: cell size in metres, or None to use `num_points`;
-    `is_requested`: whether the number of nodes was given rather than a default.
+    `is_requested`: whether the number of nodes was specified; otherwise it is the default.
     """
 
     num_points: int
@@ -72,8 +72,8 @@ def check_total(num_points: float, name: str) -> None:
 
 
 def check_positions(name: str, positions: ArrayLike) -> np.ndarray:
-    """Convert `positions` along an outline to an array (k,). Raises `ValueError` for another shape, no positions, NaN
-    or infinity."""
+    """Convert `positions` along an outline to an array (k,). Raises `ValueError` for a different shape, no positions,
+    NaN or infinity."""
     array = np.asarray(positions, dtype=float)
     if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
         raise ValueError(
@@ -146,7 +146,7 @@ def _merge_with_corners(curve: Curve, positions: np.ndarray) -> np.ndarray:
             "closer than a millionth of the outline (a corner counts). Make them equal or move one."
         )
     is_distinct = gaps > 1e-9
-    # Of coinciding positions, keep the corner's, so that corners are not moved.
+    # Replace a position that coincides with a corner by the corner, so that corners are not moved.
     distinct_stops = stops[is_distinct]
     if len(curve.corners):
         corner_distances = np.abs(distinct_stops[:, None] - curve.corners)
@@ -177,8 +177,8 @@ def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> n
 
 
 def _required_spacing(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (k, 2) of required nodes, and the distance (k,) of each required node to the nearest other one, or to
-    the nearest side that the node does not lie on."""
+    """Positions (k, 2) of required nodes, and the distance (k,) of each required node to the nearest other required
+    node, or to the nearest side that the node does not lie on, whichever is smaller."""
     chains = [curve.at(stop) for curve, stop in zip(curves, stops, strict=True)]
     required_nodes = np.concatenate([*chains, fixed])
     if len(required_nodes) < 2:

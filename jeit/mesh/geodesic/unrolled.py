@@ -204,8 +204,8 @@ def _flatten_rigidly(cells, plane_corners, points: np.ndarray) -> np.ndarray:
 
 
 def _turn_upright(points: np.ndarray, space: np.ndarray) -> np.ndarray:
-    """Rotate the flat `points` so that the z axis of space points upward, or y or x if z has little slope, and centre
-    them at the origin. The map is not mirrored, since the surface is seen from outside."""
+    """Rotate the flat `points` so that the z axis of space points upward, or the y or x axis if z has little slope, and
+    centre them at the origin. The map is not mirrored, since the surface is seen from outside."""
     points = points - points.mean(axis=0)
     for axis in (2, 1, 0):
         height = space[:, axis] - space[:, axis].mean()
