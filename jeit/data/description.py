@@ -113,9 +113,9 @@ class Description:
     uncertainty: Uncertainty | None = None
 
     def protocols(self, path: str | Path) -> list[tuple[Protocol, str]]:
-        """The protocols that agree with the description for the data file at `path`. The first protocol has the default
-        values of all options that the description does not state; further protocols have other values, which the text
-        beside each protocol states."""
+        """Return the protocols that agree with the description for the data file at `path`, each with a text. The first
+        protocol has the default values of all options that the description does not state. Further protocols have
+        different values of these options, which the text states."""
         default_protocol = self.protocol(path)
         if default_protocol is None or self.protocol_section is None:
             return []
@@ -146,7 +146,8 @@ class Description:
 
     @property
     def mean_removed(self) -> bool:
-        """Whether the data file stores currents, and potentials of all electrodes whose mean is subtracted."""
+        """Whether the data file stores currents, and potentials of all electrodes from which their mean is
+        subtracted."""
         section = self.protocol_section
         if section is None or section.kind != "measured" or section.measurement_key is not None:
             return False
@@ -163,7 +164,7 @@ class Description:
 
     def model(self, path: str | Path, *, num_points: int | None = None) -> ForwardModel:
         """A forward model of the described body with the protocol of the data file at `path`. A new mesh has about
-        `num_points` nodes; `num_points` is not given for a body that is described by a mesh.
+        `num_points` nodes; `num_points` must be None for a body that is described by a mesh.
 
         Raises `ValueError` if geometry, electrodes or protocol are not described, if `num_points` is missing, and if
         `num_points` is given with a mesh.
@@ -206,8 +207,8 @@ def load_description(which: str | Path) -> Description:
 
 
 def parse_description(table: dict[str, Any], origin: str, folder: str | Path = ".") -> Description:
-    """Check a description given as nested dictionaries and return it; relative file names in the description refer to
-    `folder`.
+    """Check nested dictionaries that specify a description, and create the description; relative file names in the
+    description refer to `folder`.
 
     Raises `ValueError`, with the faulty keys, for an invalid description.
     """
@@ -259,7 +260,7 @@ def _layout(data: DataTable) -> TableLayout:
         scale=scale,
         polarity=data.polarity,
         gains=() if data.gains is None else tuple(data.gains.tolist()),
-        # The saturation level is given in the unit of the file, but compared with voltages from which the gain is
+        # The saturation level is stated in the unit of the file, but compared with voltages from which the gain is
         # removed.
         saturation=None if data.saturation is None else data.saturation * abs(scale),
         frame_names=tuple(data.frame_names),

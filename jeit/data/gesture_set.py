@@ -19,8 +19,8 @@ from jeit.files import need, npz_arrays, written_whole
 
 
 def join(measurements: Sequence[Measurement]) -> Measurement:
-    """Join the frames of measurements of the same set-up in the given order. Times are kept if all measurements have
-    times and the joined times increase.
+    """Join the frames of measurements of the same set-up in the given order. Their times are also joined if all
+    measurements have times and the joined times increase.
 
     The body, the electrodes and the notes are taken from the first measurement. Raises `ValueError` for an empty
     sequence, and if two measurements have different protocols.
@@ -196,7 +196,7 @@ class GestureSet:
     `start`: (n + 1,) index of the first frame of each recording, followed by the number of frames F; `seconds`: (F,)
     times of the frames, from 0 in each recording; `voltages`: (F, M) volts, NaN for missing readings; `reference`: (M,)
     volts, mean of frames of the untouched skin before the recordings; `untouched`: (u, M) volts, u frames of the
-    untouched skin, recorded over as long a time as the gestures.
+    untouched skin, recorded over a period as long as the gestures.
 
     **Example:**
 

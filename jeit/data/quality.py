@@ -184,8 +184,8 @@ def impossible_signs(
     **Arguments:**
 
     - `measurement`: the frames.
-    - `order` (electrodes,): the electrodes as they follow each other along the boundary; by default the order is found
-      from the positions of the electrodes.
+    - `order` (electrodes,): the electrodes as they follow each other along the boundary; by default the order is
+      computed from the positions of the electrodes.
 
     **Example:**
 
@@ -344,7 +344,7 @@ def order_note(measurement: Measurement) -> str | None:
 
 
 def follows(order: Int[np.ndarray, " L"]) -> bool:
-    """Whether the electrode numbers in `order` increase by one all the way round, or decrease by one."""
+    """Whether the electrode numbers in the cyclic `order` increase by one at every step, or decrease by one."""
     steps = (np.roll(order, -1) - order) % len(order)
     return bool((steps == 1).all() or (steps == len(order) - 1).all())
 

@@ -112,8 +112,8 @@ def screen(
 
 
 def _hint_of_number(number: int, channels: int) -> str:
-    """Text on what may be wrong if `number` numbers are not complete frames of `channels` voltages: missing lines, or
-    another number of electrodes."""
+    """Text on what may be wrong if `number` numbers are not complete frames of `channels` voltages: missing lines, or a
+    different number of electrodes."""
     if 0 < channels - number <= channels // 4:
         return f" They are {number} numbers, {channels - number} fewer than a frame has: is a line missing?"
     counts = {

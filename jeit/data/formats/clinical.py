@@ -1,7 +1,7 @@
 """Readers of recordings by clinical systems: Dräger, Carefusion, Göttingen and Swisstom.
 
-The systems of Dräger, Carefusion and Göttingen measure the same frame, see `jeit.data.formats.recording`. The scale of
-the voltages is not published by any maker; a note of each measurement says so.
+The systems of Dräger, Carefusion and Göttingen measure the same channels, see `jeit.data.formats.recording`. The scale
+of the voltages is not published by any maker; a note of each measurement says so.
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ from jeit.protocol import from_channels
 
 DESCRIPTION = "text with a line for each measurement: electrodes a, b, m, n and the voltage or resistance"
 _HEAD_BYTES, _MAX_HEADING_LINES = 65536, 400
-# Names, in letters and digits, of the four electrodes: current enters at the first and leaves at the second; the
-# voltage is the potential of the third minus that of the fourth.
+# Column names, reduced to letters and digits, of the four electrodes: current enters at the first and leaves at the
+# second; the voltage is the potential of the third minus that of the fourth.
 _ELECTRODE_NAMES = (
     ("a", "b", "m", "n"),
     ("c1", "c2", "p1", "p2"),
@@ -43,7 +43,7 @@ _ELECTRODE_NAMES = (
         for pair in (("f", "s"), ("i", "v"), ("drive", "sense"), ("drive", "measure"), ("force", "sense"))
     ),
 )
-# Names of the measured quantities, and of other columns that are read.
+# Column names of the measured quantities, and of other columns that are read.
 _COLUMN_NAMES = {
     "real": ("real", "re", "realraw", "vreal", "ureal"),
     "imag": ("imag", "im", "imagraw", "vimag", "uimag"),
@@ -347,8 +347,8 @@ def _arrange_frames(
     values: Inexact[np.ndarray, " R"],
     like: Measurement | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...]]:
-    """Arrange the values of lines in frames: electrodes (channels, 4), voltages (frames, channels), times of the
-    frames, and notes. Voltages are NaN for channels that have no line in a frame."""
+    """Arrange the values of lines in frames. Returns the electrodes (channels, 4), voltages (frames, channels), times
+    of the frames, and notes. Voltages are NaN for channels that have no line in a frame."""
     channels, channel_of_line = np.unique(electrodes, axis=0, return_inverse=True)
     channel_of_line, notes = channel_of_line.ravel(), ()
     frame_of_line, frame_notes = _frame_of_lines(path, table.column("frame"), channel_of_line, len(channels))

@@ -24,7 +24,7 @@ from jeit.arguments import counted
 from jeit.data.description import TableLayout
 from jeit.files import check_memory
 
-# Bytes of memory per byte of text: a number may consist of two characters, and is stored twice in eight bytes.
+# Bytes of memory per byte of text: a number may take only two characters, and is stored twice, in eight bytes each.
 _MEMORY_FACTOR = 8
 # Number of lines from which separators are detected, and maximum number of lines of a heading.
 _NUM_SAMPLE_LINES, _MAX_HEADING_LINES = 40, 100
@@ -93,8 +93,8 @@ _NUMBER_FORMATS = (
 
 
 class LineNumbers:
-    """Parser of successive lines of numbers. The separators are detected in the first line, and again in a later line
-    that they do not fit."""
+    """Parser of successive lines of numbers. The separators are detected in the first line, and again in each later
+    line that cannot be read with them."""
 
     def __init__(self):
         self._format: _NumberFormat | None = None
@@ -119,7 +119,7 @@ class LineNumbers:
 
 def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = None) -> Text:
     """Read the numbers of a text file. The `delimiter` between numbers and `skip_rows`, the number of heading lines,
-    are detected if they are not given.
+    are detected if they are None.
 
     Raises `ValueError`, with the line, for a file that contains anything but numbers or that was cut off.
     """
@@ -302,8 +302,8 @@ class Frames(NamedTuple):
 
 
 def frames_in_text(text: Text, counts: Sequence[int], layout: TableLayout, name: str) -> Frames:
-    """Frames of a text file. `counts`: numbers of channels that a frame may have; the first is that of the described
-    protocol.
+    """Return the frames of a text file. `counts`: numbers of channels that a frame may have; the first is that of the
+    described protocol.
 
     A last line or frame that is cut off is left out. Raises `ValueError` for lines of unequal length that are not
     frames wrapped over several lines.
@@ -344,7 +344,7 @@ def _wrapped_frames(text: Text, counts: Sequence[int]) -> tuple[int, int] | None
     candidates = []
     for index, count in enumerate(counts):
         num_frames, num_left_over = divmod(int(line_ends[-1]), count)
-        # With a number of channels that is not the described number, values after the last complete frame mean that a
+        # For a number of channels other than the described number, values after the last complete frame mean that a
         # line is missing.
         if index and num_left_over:
             continue
@@ -366,7 +366,7 @@ def frames_in_table(
     default_axis: str = "rows",
 ) -> Frames:
     """Frames of a two-dimensional array. `counts`: see `frames_in_text`; `heading`: names of the columns;
-    `default_axis`: "rows" or "columns". It states which of them are frames if the numbers of channels leave it open."""
+    `default_axis`: "rows" or "columns", whichever are frames if the numbers of channels do not determine this."""
     stated_axis = layout.frames_in
     is_transposed = stated_axis == "columns" if stated_axis else _are_columns(table.shape, counts, default_axis)
     rows = table.T if is_transposed else table
