@@ -195,12 +195,13 @@ def _arc_points(mesh: Mesh, centre: np.ndarray, width: float) -> np.ndarray:
 
 @either_engine
 def _project(position, mesh: Mesh):
-    """Nearest boundary facet (L,) of each position, arc length (L,) of the foot point along it, and distance (L,).
+    """Nearest boundary facet (L,) of each position, arc length (L,) of the foot point along this facet, and distance
+    (L,) from the boundary.
 
     The foot point p(t) on an edge is where the offset of the position from p(t) is perpendicular to the tangent τ(t) =
-    (1-t)τ_0 + tτ_1, interpolated between the corners of the edge; the tangent at a corner bisects those of the two
-    edges that meet there. For positions on the edge this is the ordinary projection, but its derivative is continuous
-    where an electrode slides across a corner.
+    (1-t)τ_0 + tτ_1, interpolated between the corners of the edge; the tangent at a corner bisects the tangents of the
+    two edges that meet there. For positions on the edge this is the ordinary projection, but its derivative is
+    continuous where an electrode slides across a corner.
     """
     xp = namespace(position, mesh)
     corners = mesh.points[mesh.facets]

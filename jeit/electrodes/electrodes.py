@@ -98,7 +98,7 @@ class AbstractElectrodes(Module):
 
     @abc.abstractmethod
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """Refinements of a plane mesh at the electrodes; empty if the electrodes know none."""
+        """Refinements of a plane mesh at the electrodes; empty if the electrodes request none."""
 
     def describe(self) -> dict[str, Any]:
         """Kind, number, positions and sizes of the electrodes; lengths in metres."""
@@ -163,15 +163,15 @@ class AbstractPointElectrodes(AbstractElectrodes):
 def replace_contact_impedance(
     electrodes: AbstractCompleteElectrodes, contact_impedance: ArrayLike
 ) -> AbstractCompleteElectrodes:
-    """Copy electrodes with another `contact_impedance`, one number or (L,). Raises `ValueError` for values that are not
+    """Copy electrodes with a new `contact_impedance`, one number or (L,). Raises `ValueError` for values that are not
     positive."""
     values = as_electrode_values("contact_impedance", contact_impedance, electrodes.num_electrodes, unit="ohm·m²")
     return eqx.tree_at(lambda complete_electrodes: complete_electrodes.contact_impedance, electrodes, values)
 
 
 def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) -> Float[Array, " L"]:
-    """Broadcast a positive number or array (L,) to floats (L,). Raises `ValueError` for another shape, and for values
-    that are not positive."""
+    """Broadcast a positive number or array (L,) to floats (L,). Raises `ValueError` for a different shape, and for
+    values that are not positive."""
     if has_values(values):
         values = real_array(
             name, values, f"one number for all electrodes or one for each of the {num_electrodes}, in {unit}"
@@ -210,7 +210,7 @@ def as_positions(position, dimensions: tuple[int, ...]) -> Float[Array, "L d"]:
 
 
 def check_dimension(electrodes: str, mesh: Mesh, dimension: int) -> None:
-    """Raise `ValueError` for a surface in space, and for a mesh of another dimension than `dimension`."""
+    """Raise `ValueError` for a surface in space, and for a mesh whose dimension is not `dimension`."""
     if mesh.is_surface:
         raise ValueError(
             f"{electrodes} do not live on a surface in space; PointElectrodes and NodeElectrodes do, plates along its "
