@@ -24,7 +24,7 @@ def ring(
     centre: tuple[float, float] = (0.0, 0.0),
     height: float | None = None,
 ) -> np.ndarray:
-    """Positions evenly spaced on a circle: (L, 2) metres, or (L, 3) at a given height (3-D tanks).
+    """Positions evenly spaced on a circle: (L, 2) metres, or (L, 3) if `height` is specified (3-D tanks).
 
     **Arguments:**
 

@@ -162,7 +162,7 @@ def skip(
 
     **Arguments:**
 
-    - `skipped`: number of electrodes between the two driven ones.
+    - `skipped`: number of electrodes between the two driven electrodes.
     - `measurement_skipped`: number of electrodes between the two measured electrodes, by default `skipped`.
     - `num_electrodes`, `current`, `driven_electrodes`, `reciprocal`, `order`: as in `adjacent`.
 
@@ -255,8 +255,8 @@ def all_against_one(
     - `common`: index of the electrode against which all others are driven.
     - `measurement`: "common" also measures every electrode against `common` ((L - 1)² channels, all of which use a
       driven electrode); "adjacent" measures pairs of neighbouring electrodes.
-    - `driven_electrodes`: whether to measure also on electrodes that carry current. Default True for
-      `measurement="common"`, which requires True, else False.
+    - `driven_electrodes`: whether to measure also on electrodes that carry current. The default is True for
+      `measurement="common"`, which requires True, and False otherwise.
 
     Raises `ValueError` if `common` is not an electrode, for `measurement="common"` with `driven_electrodes=False`, and
     as `adjacent` does.
@@ -300,7 +300,7 @@ def reference_electrode(
     **Arguments:**
 
     - `num_boundary`: number of boundary electrodes, at least 4.
-    - `skipped`: number of electrodes between the two driven ones.
+    - `skipped`: number of electrodes between the two driven electrodes.
     - `reference`: index of the reference electrode among the `num_boundary + 1` electrodes; by default the last.
     - `current`, `driven_electrodes`, `order`: as in `adjacent`.
 
@@ -346,7 +346,7 @@ def two_terminal(
     - `pairs` (P, 2): indices of electrodes from 0; by default all L(L - 1)/2 pairs.
     - `current`: amplitude in amperes.
 
-    Raises `ValueError` if a pair contains an electrode twice, or one that does not exist.
+    Raises `ValueError` if a pair contains an electrode twice, or an electrode that does not exist.
 
     **Example:**
 
@@ -388,7 +388,7 @@ def bipolar(
     - `drive_pairs` (S, 2), `measurement_pairs` (K, 2): indices of electrodes from 0, the positive electrode first.
     - `name`: name of the protocol in reports.
 
-    Raises `ValueError` if a pair contains an electrode twice, or one that does not exist.
+    Raises `ValueError` if a pair contains an electrode twice, or an electrode that does not exist.
 
     **Example:**
 

@@ -55,15 +55,15 @@ def transfer_between_drives(
     mask: np.ndarray,
     deviation: np.ndarray | None = None,
 ) -> tuple[Inexact[np.ndarray, "F S S"], Bool[np.ndarray, "S S"], Float[np.ndarray, "S S"]]:
-    """Voltage that every drive pattern, used as a measurement pattern, would measure while each drive flows: a
-    symmetric matrix for any body.
+    """Compute the voltage that every drive pattern, used as a measurement pattern, would measure while the currents of
+    each drive flow: a symmetric matrix for any body.
 
     `voltages` (F, M): voltages of F frames and M channels, volts; `mask` (M,): True for usable channels; `deviation`
     (M,): standard deviation of the independent noise of each channel, volts, by default one; the other arguments are
     those of `Protocol`. Returns, for S drive patterns:
 
     - `transfer` (F, S, S), watts: `drive[i] @ Z @ drive[j]` in entry (i, j), combined from the channels measured while
-      drive j flows(Z: transfer impedance). For example, the voltage of a skip-1 pair is the sum of those of two
+      drive j flows (Z: transfer impedance). For example, the voltage of a skip-1 pair is the sum of the voltages of two
       adjacent pairs.
     - `is_known` (S, S): whether drive i is a linear combination of the measurement patterns of drive j.
     - `noise` (S, S), watts: standard deviation of each entry of `transfer`.
