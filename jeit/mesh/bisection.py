@@ -31,16 +31,16 @@ _BISECTION_STEPS = 30
 def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.ndarray, " m"]]) -> Mesh:
     """Refine a mesh until no cell's longest edge exceeds the length that `size` allows.
 
-    Neighbouring cells are divided as needed to keep the mesh conforming. Tags are kept, and the boundary keeps its
-    shape.
+    Neighbouring cells are divided as needed to keep the mesh conforming. The new mesh has the same tags, and its
+    boundary has the same shape.
 
     **Arguments:**
 
     - `mesh`: the mesh to refine.
     - `size`: function of the corners of cells (m, k, s), metres, that returns the maximum length of the longest edge of
-      each cell (m,), metres; infinity leaves a cell as it is.
+      each cell (m,), metres; infinity leaves a cell unchanged.
 
-    Raises `ValueError` if `size` does not return one positive number per cell, or asks for more than 2,000,000 nodes.
+    Raises `ValueError` if `size` does not return one positive number per cell, or requires more than 2,000,000 nodes.
 
     **Example:**
 
@@ -53,8 +53,8 @@ def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.nda
 
 
 def bisect_with_parents(mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]]) -> tuple[Mesh, Int[np.ndarray, " m"]]:
-    """Refine a mesh as `bisect` does. Also returns, for each cell of the new mesh, the index of the cell of the given
-    mesh that contains it. Raises `ValueError` as `bisect` does."""
+    """Refine a mesh as `bisect` does. Also returns, for each cell of the new mesh, the index of the cell of the
+    original mesh that contains it. Raises `ValueError` as `bisect` does."""
     split_mesh = _SplitMesh.from_mesh(mesh)
     parent = np.arange(len(split_mesh.cells))
     exceeds_size = _exceeds_size(split_mesh, slice(None), size)

@@ -261,16 +261,16 @@ def write(
     cell_data: Mapping[str, ArrayLike] | None = None,
     point_data: Mapping[str, ArrayLike] | None = None,
 ) -> None:
-    """Write a mesh, with its tags or with values per cell and per node, in the format given by the file name's
-    extension.
+    """Write a mesh, with its tags or with values per cell and per node. The extension of the file name determines the
+    format.
 
-    `.msh` files (Gmsh 2.2) keep the tags, as physical groups, and values per node, but not values per cell; other
-    formats keep values per node and per cell, but not the tags. Plane meshes are written at z = 0.
+    `.msh` files (Gmsh 2.2) contain the tags, as physical groups, and values per node, but not values per cell. Files of
+    other formats contain values per node and per cell, but not the tags. Plane meshes are written at z = 0.
 
     **Arguments:**
 
     - `mesh`: the mesh.
-    - `path`: the file; its extension gives the format.
+    - `path`: the file; its extension determines the format.
     - `cell_data`: values per cell (m, …), by name.
     - `point_data`: values per node (n, …), by name.
 
@@ -384,7 +384,7 @@ def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
     points = points[used_points]
     new_index = np.full(len(content.points), -1)
     new_index[used_points] = np.arange(len(used_points))
-    # The cells are not yet oriented, so boundary facets are found as the facets that occur once.
+    # The cells are not yet oriented, so boundary facets are identified as the facets that occur once.
     keys, occurrences = np.unique(
         topology.facet_keys(topology.cell_facets(cells), len(used_points)), return_counts=True
     )

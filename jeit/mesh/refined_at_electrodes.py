@@ -113,8 +113,8 @@ def _divide_axis(stops: Float[np.ndarray, " s"], max_size: float) -> Float[np.nd
 
 
 def _largest_cell_size(count_nodes: Callable[[float], float], num_points: int, max_size: float) -> float:
-    """Size of the largest cells for which a mesh has about `num_points` nodes; `max_size` if even cells of that size
-    give more nodes."""
+    """Size of the largest cells for which a mesh has about `num_points` nodes; `max_size` if even a mesh with cells of
+    this size has more nodes."""
     if count_nodes(max_size) >= num_points:
         return max_size
     cell_size: Any = brentq(

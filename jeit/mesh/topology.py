@@ -151,7 +151,7 @@ def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray
 
 
 def check_apart(outer: np.ndarray, holes: Sequence[np.ndarray]) -> None:
-    """Raise `ValueError` unless every hole lies inside the outline and separate from the other holes."""
+    """Raise `ValueError` unless every hole lies inside the outline and is separate from the other holes."""
     for k, hole in enumerate(holes):
         if not inside(hole, [outer]).all() or _touches(hole, outer):
             raise ValueError(f"holes[{k}]: does not lie strictly inside the outline. Move or shrink it.")

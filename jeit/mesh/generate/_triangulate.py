@@ -84,7 +84,8 @@ class Front:
 def triangulate(front: Front, points: np.ndarray) -> np.ndarray:
     """Delaunay triangles (m, 3) inside the outline, counter-clockwise."""
     outline = points[: front.num_outline]
-    # Distant auxiliary nodes keep the outline off the convex hull, where collinear nodes would produce slivers.
+    # With distant auxiliary nodes, the outline is not part of the convex hull, where collinear nodes would produce
+    # slivers.
     extent = np.ptp(outline, axis=0).max()
     angle = 2 * np.pi * (np.arange(16) + 0.37) / 16
     auxiliary_nodes = outline.mean(axis=0) + 4 * extent * np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -58,7 +58,7 @@ _USER_SIZE_GROWTH = 0.45
 
 
 class Refine(Module):
-    """Smaller cells near given points, or along the whole outline.
+    """Request for smaller cells near specified points, or along the whole outline.
 
     At a distance r from the nearest of `points`, the edges of cells have lengths of at most h + growth · max(r −
     distance, 0), where h is the cell size at the points: `cell_size`, or the background cell size divided by `factor`.
@@ -98,7 +98,7 @@ class Refine(Module):
         growth: float = 0.35,
         distance: float = 0.0,
     ):
-        """Give exactly one of `cell_size` and `factor`. Raises `ValueError` on values out of range."""
+        """Exactly one of `cell_size` and `factor` must be specified. Raises `ValueError` on values out of range."""
         if points is not None:
             points = np.atleast_2d(np.asarray(points, dtype=float))
             if points.ndim != 2 or points.shape[1] != 2 or not len(points) or not np.isfinite(points).all():
@@ -159,7 +159,7 @@ class SizeField:
 
     @property
     def is_user_function(self) -> bool:
-        """Whether `refine` is a function given by the user."""
+        """Whether `refine` is a user's function."""
         return self._user_size is not None
 
     def at(self, points: np.ndarray) -> Callable[[float], np.ndarray]:

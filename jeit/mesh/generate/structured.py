@@ -1,7 +1,7 @@
 """Structured triangulations: concentric rings of cells in a disk, rows of cells in a rectangle.
 
 Both triangulations consist of chains of nodes laid side by side. Where the numbers of nodes of neighbouring chains
-differ slightly, the offset between the chains varies gradually, so that triangles range between equilateral and
+differ slightly, the offset between the chains varies gradually. Triangles then range between equilateral and
 right-angled, and no angle is smaller than about 40°.
 """
 

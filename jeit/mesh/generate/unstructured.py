@@ -1,4 +1,4 @@
-"""Unstructured plane meshes with a given number of nodes or cell size, local refinement, and nodes at given
+"""Unstructured plane meshes with a specified number of nodes or cell size, local refinement, and nodes at specified
 positions."""
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Target:
 
     @staticmethod
     def create(num_points: int | None, cell_size: float | None) -> Target:
-        """Create a target from the two arguments of a mesh function. Raises `ValueError` if both arguments are given or
-        one is out of range."""
+        """Create a target from the two arguments of a mesh function. Raises `ValueError` if both arguments are
+        specified or one of them is out of range."""
         if num_points is not None and cell_size is not None:
             raise ValueError("num_points, cell_size: give one of the two, not both.")
         if cell_size is not None:
@@ -210,8 +210,8 @@ def _interior_samples(curves: list[Curve]) -> np.ndarray:
 
 
 def _estimate_num_nodes(curves: list[Curve], size: Size, area: float) -> float:
-    """Estimate the number of nodes of a mesh whose cell sizes are given by the function `size`, from samples inside the
-    domain and along its outline."""
+    """Estimate the number of nodes of a mesh whose cell sizes are the values of the function `size`, from samples
+    inside the domain and along its outline."""
     num_nodes = area * float(np.mean(1.0 / size(_interior_samples(curves)) ** 2))
     for curve in curves:
         num_nodes += curve.length * float(np.mean(1.0 / size(curve.at(np.linspace(0, curve.length, 400)))))

@@ -34,7 +34,7 @@ _MAX_SPHERE_ANGLE = 2.6
 # Maximum disagreement, as a fraction of the side of a triangle, between distances at its corners that belong to the
 # same wave.
 _WAVE_TOLERANCE = 0.02
-# Maximum distance of given points from the surface, relative to the surface's extent, chosen so that points on the
+# Maximum distance of a user's points from the surface, relative to the surface's extent, chosen so that points on the
 # other side of a thick skin are accepted.
 _MAX_OFF_SURFACE = 0.25
 
@@ -249,7 +249,7 @@ class Geodesics(Module):
                 start, end, side, x, y, curvature=(curvatures[ends[0]] + curvatures[ends[1]]) / 2
             )
             # Where paths from two directions meet, the distances at the ends of a side belong to different waves, and
-            # contradict the distance at the third corner. The path is then taken through a corner.
+            # contradict the distance at the third corner. In that case the path passes through a corner.
             with np.errstate(invalid="ignore", over="ignore"):
                 source_x, source_depth, _ = _virtual_source(start, end, side)
                 _, corner_x, corner_y = _triangle_coordinates(corners[:, first], corners[:, second], corners[:, third])
@@ -278,7 +278,7 @@ def _triangle_coordinates(start, end, corner):
 def _distances_across(start, end, side, x, y, *, same_source: Any = True, curvature: Any = 0.0):
     """Distances at corners, computed from the distances at the `start` and `end` of the opposite sides, and whether the
     path through the start is shorter than the path through the end. Paths across the interior of a side are considered
-    only where `same_source` is True, i.e. where the distances at both of its ends are from the same source.
+    only where `same_source` is True, i.e. where the distances at both ends of the side are from the same source.
     `curvature`: mean Gaussian curvature along the path, 1/m²."""
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         through_start = np.sqrt(x**2 + y**2) + start
@@ -301,7 +301,7 @@ def _distances_across(start, end, side, x, y, *, same_source: Any = True, curvat
 
 
 def _virtual_source(start, end, side):
-    """Virtual source of a wave with given distances at the start and the end of a side: its coordinate along the side,
+    """Virtual source of a wave with known distances at the start and the end of a side: its coordinate along the side,
     its distance behind the side, and the square of this distance, which is negative for incompatible distances."""
     source_x = (start**2 - end**2 + side**2) / (2 * side)
     squared_depth = start**2 - source_x**2

@@ -1,4 +1,5 @@
-"""`Triangles`: a triangulated surface in space as arrays, with the nearest point on it to any given point."""
+"""`Triangles`: a triangulated surface in space as arrays, with a search for the point of the surface that is nearest to
+any point."""
 
 from __future__ import annotations
 

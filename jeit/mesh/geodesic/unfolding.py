@@ -4,8 +4,8 @@ The triangle that contains the point is not moved. Every other triangle is conne
 crosses the fewest triangles, and is rotated about the side that it shares with the previous triangle of this path,
 until it lies in the same plane. On a developable surface, such as a bent sheet, the result does not depend on the path,
 and straight lines in the plane are exactly the geodesics on the triangles. On other surfaces the result depends on the
-path; `Unfolding.exact` is False for the points where it does. The functions take NumPy or JAX arrays and can be
-differentiated and batched.
+path; `Unfolding.exact` is False for the points for which it depends on the path. The functions accept NumPy or JAX
+arrays and can be differentiated and batched.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ class Unfolding(NamedTuple):
 
 
 def unfold(mesh: Mesh, places: Float[Array, "L 3"], max_distance: Float[Array, "L m"]) -> Unfolding:
-    """Unfold the triangles around points on a surface into the plane: those whose centroids lie within `max_distance`
-    of each point in a straight line, and which are connected to the triangle that contains the point.
+    """Unfold the triangles around points on a surface into the plane: the triangles whose centroids lie within a
+    straight-line distance `max_distance` of a point, and which are connected to the triangle that contains the point.
 
     **Arguments:**
 
@@ -143,8 +143,8 @@ def _opposite_sides(cells) -> Int[Array, " h"]:
 
 def _connect(neighbour, is_near: Bool[Array, "L m"], root):
     """Find the triangles near each point (`is_near`) that are connected to the triangle `root` (L,) across sides.
-    Returns whether each triangle (L, m) is connected, and the number of its side (L, m) that leads towards the root;
-    −1 for the root itself and for triangles that are not connected."""
+    Returns whether each triangle (L, m) is connected, and the number (L, m) of the side across which the path to the
+    root leads; −1 for the root itself and for triangles that are not connected."""
     xp = namespace(neighbour, is_near)
     cell = xp.arange(is_near.shape[1])
     neighbour = neighbour.reshape(-1, 3)

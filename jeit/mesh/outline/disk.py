@@ -21,7 +21,7 @@ from jeit_solvers.engines import as_array
 
 
 class Disk(Domain):
-    """A disk of given radius and centre, in metres; arc length starts at angle 0.
+    """A disk with a radius and a centre in metres; arc length starts at angle 0.
 
     **Arguments:**
 

@@ -168,8 +168,8 @@ def check_length(name: str, value: Any, size_factor: float = 1.0) -> Any:
 
 
 def check_near_origin(name: str, coordinates: Any, size: Any) -> None:
-    """Raise `ValueError` with the argument's `name` if an outline of `size` metres, whose position is given by
-    `coordinates` in metres, is so far from the origin that it loses accuracy. Traced values are not checked."""
+    """Raise `ValueError` with the argument's `name` if an outline of `size` metres, with `coordinates` in metres, is so
+    far from the origin that the coordinates lose accuracy. Traced values are not checked."""
     if not has_values(coordinates, size):
         return
     distance = float(np.max(np.abs(np.asarray(coordinates))))

@@ -181,7 +181,7 @@ class Rectangle(Domain):
 
     @property
     def vertices(self) -> Float[Array, "4 2"]:
-        """Corners (4, 2) in metres, counter-clockwise from the lower left one."""
+        """Corners (4, 2) in metres, counter-clockwise from the lower left corner."""
         x_min, x_max, y_min, y_max = self.extent
         return as_array([[x_min, y_min], [x_max, y_min], [x_max, y_max], [x_min, y_max]])
 

@@ -1,4 +1,4 @@
-"""Shells of a given thickness on surfaces in space; bending of sheets; and surfaces of solids."""
+"""Shells of a specified thickness on surfaces in space; bending of sheets; and surfaces of solids."""
 
 from __future__ import annotations
 
@@ -136,10 +136,11 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
     """Bend a flat sheet around a cylinder that touches the sheet from below along its middle.
 
     Like paper, the sheet is not stretched: it is folded along straight lines parallel to the cylinder's axis and stays
-    flat between them, so all lengths and all voltages are preserved. The folds run along the rows of nodes if the mesh
-    has rows (`jeit.mesh.rectangle` has them for axis "x"). Otherwise the sheet is divided into `num_folds` strips, and
-    cells are cut where folds cross them; `bend(mesh, numpy.inf)` is the flat sheet with the same cells. Fold lines lie
-    on the cylinder. The upper side of the sheet becomes the outer side of the surface. Tags are kept.
+    flat between these lines, so all lengths and all voltages are preserved. The folds run along the rows of nodes if
+    the mesh has rows (the meshes of `jeit.mesh.rectangle` have rows for axis "x"). Otherwise the sheet is divided into
+    `num_folds` strips, and cells are cut where folds cross them; `bend(mesh, numpy.inf)` is the flat sheet with the
+    same cells. Fold lines lie on the cylinder. The upper side of the sheet becomes the outer side of the surface. The
+    surface has the tags of the sheet.
 
     **Arguments:**
 
@@ -292,8 +293,8 @@ def shell(
     - `normals` (n, 3): unit normals at the nodes; default: `jeit.mesh.node_normals`, which may be less accurate.
 
     Raises `ValueError` for a mesh that is not a surface in space, a thickness that is not positive, no layers, a shell
-    that intersects itself, and a thickness at which prisms turn inside out, as they do beyond the radius of curvature;
-    the message then states the position and the maximum thickness.
+    that intersects itself, and a thickness, such as one above the radius of curvature, at which prisms turn inside out.
+    In the last case, the message states the position and the maximum thickness.
 
     **Example:**
 
@@ -313,7 +314,7 @@ def shell(
     directions = directions if outward else -directions
     tetrahedra = stacked_cells(cells, num_nodes, num_layers)
     # Sorting the corners in `stacked_cells` inverts some prisms. The second of the three tetrahedra of a prism has the
-    # opposite orientation to the other two.
+    # opposite orientation to the other two tetrahedra.
     orientation = np.where(odd_permutation(cells) ^ (not outward), -1.0, 1.0)
     tetrahedron_signs = np.tile(np.outer(orientation, (1, -1, 1)).ravel(), num_layers)
 

@@ -72,7 +72,8 @@ def forearm(
     **Arguments:**
 
     - `length`: length of the sleeve in metres.
-    - `wrist`, `elbow`: radius of a circular section in metres, or semi-axes (along x, along y) of an elliptical one.
+    - `wrist`, `elbow`: radius of a circular section in metres, or semi-axes (along x, along y) of an elliptical
+      section.
     - `num_points`, `cell_size`, `num_around`: as in `tube`.
 
     Raises `ValueError` for invalid or contradictory arguments.
