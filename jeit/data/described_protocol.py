@@ -177,7 +177,7 @@ def _number_end(text: str, start: int) -> int:
 
 
 def _matches(pattern: str, text: str) -> bool:
-    """Whether a text matches a pattern in which * stands for any text. Each part between two * is matched at its first
+    """Whether a text matches a pattern in which * matches any text. Each part between two * is matched at its first
     occurrence, so no part is searched for twice."""
     first_part, *later_parts = pattern.split("*")
     if not later_parts:

@@ -344,7 +344,7 @@ def _spikes(
 
 def _faulty_channels(change: Inexact[np.ndarray, " n"], channels: np.ndarray) -> list[int]:
     """Return the faulty channels among one or two channels that contradict the other channels or each other: the
-    channel that changed far more, or both."""
+    channel with the far larger change, or both channels if their changes are similar."""
     size = np.abs(change[channels])
     is_single = size.max() > _FAULT_RATIO * size.min()
     return [int(channels[size.argmax()])] if is_single else channels.tolist()

@@ -112,8 +112,8 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
     """Complete electrodes that are discs inside a sheet (2-D mesh), independent of its nodes.
 
     The indicator function of the disc is replaced by a smooth window whose edge is half a cell wide, so that the
-    contact integrals are differentiable in position and radius and converge to those of the sharp disc as the mesh is
-    refined.
+    contact integrals are differentiable in position and radius and converge to the integrals of the sharp disc as the
+    mesh is refined.
 
     **Fields**: `position` (L, 2): positions of the L discs, metres; `radius` (L,): metres; `contact_impedance` (L,):
     ohm·m².

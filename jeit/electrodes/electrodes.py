@@ -18,11 +18,12 @@ from jeit_solvers.module import Module
 class Contact(Module):
     """Contact integrals of a set of L electrodes on a mesh, divided by contact impedance.
 
-    In the complete electrode model every electrode l adds the energy (1/z_l) ∫_l (u - U_l)². With P1 basis functions φ
-    this energy is determined by:
+    In the complete electrode model every electrode l adds the energy (1/z_l) ∫_l (u - U_l)². With P1 basis functions φ,
+    the following integrals determine this energy:
 
     - `mass` (q, k, k), in siemens: Σ_l (1/z_l) ∫ φ_i φ_j over the q facets or cells, with k nodes each, that electrodes
-      may touch, and `nodes` (q, k): their nodes; one pair of arrays for each kind of electrode;
+      may touch, and `nodes` (q, k): nodes of these facets or cells; there is one pair of arrays `mass` and `nodes` for
+      each kind of electrode;
     - `load` (n, L), in siemens: (1/z_l) ∫ φ_i, with column sums |e_l| / z_l, |e_l| being the size of the electrode.
 
     Point electrodes have no contact energy: `load` contains φ_i at the electrode, dimensionless; `mass` is zero, and
@@ -83,7 +84,7 @@ class AbstractElectrodes(Module):
 
     @abc.abstractmethod
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> "AbstractElectrodes":
-        """Copy of the electrodes with other contact impedances, one number or (L,), ohm·m² (ohm·m for arcs).
+        """Copy of the electrodes with new contact impedances, one number or (L,), ohm·m² (ohm·m for arcs).
 
         Raises `ValueError` for point electrodes, which have no contact impedance.
         """
@@ -125,7 +126,7 @@ class AbstractPlacedElectrodes(AbstractCompleteElectrodes):
     position: eqx.AbstractVar[Float[Array, "L d"]]
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """Copy of the electrodes with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for values
+        """Copy of the electrodes with new contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for values
         that are not positive."""
         return replace_contact_impedance(self, contact_impedance)
 

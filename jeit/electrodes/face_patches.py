@@ -207,10 +207,10 @@ _UNIT_TRIANGLE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 class FacePatches(AbstractMovableElectrodes):
     """Complete electrodes that are rectangles on the surface of a 3-D mesh, independent of its nodes.
 
-    A patch lies in the tangent plane at its position: its width is horizontal (perpendicular to z), its height runs up
-    the surface; on a horizontal face, width is along x and height along y. On a curved face the patch covers the
-    projection of the rectangle onto the face: on a cylinder of radius R, an electrode of arc length a has the width 2 R
-    sin(a / 2 R).
+    A patch lies in the tangent plane at its position: its width is horizontal (perpendicular to z), and its height runs
+    upward along the surface. On a horizontal face, width is along x and height along y. On a curved face the patch
+    covers the projection of the rectangle onto the face: on a cylinder of radius R, an electrode of arc length a has
+    the width 2 R sin(a / 2 R).
 
     **Fields**: `position` (L, 3): centres of the L electrodes on the surface, metres; `width`, `height` (L,): metres;
     `contact_impedance` (L,): ohm·m².

@@ -29,8 +29,8 @@ from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.mesh import facet_measures
 from jeit_solvers.engines import has_values, namespace, sum_into, undifferentiated, values_at_once
 
-# Covered fraction of a triangle below which the fraction counts as zero: such a fraction has few correct digits, which
-# would matter for small contact impedances.
+# Covered fraction of a triangle below which the fraction counts as zero: such a fraction has few correct digits, and
+# its errors would be amplified by small contact impedances.
 _MIN_COVERED_FRACTION = 1e-12
 
 
@@ -141,7 +141,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         )
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """Copy of the electrodes with other contact impedances, ohm·m² (ohm·m in 2-D). Raises `ValueError` for values
+        """Copy of the electrodes with new contact impedances, ohm·m² (ohm·m in 2-D). Raises `ValueError` for values
         that are not positive."""
         return replace_contact_impedance(self, contact_impedance)
 

@@ -53,7 +53,7 @@ def ring(
 
 
 def ring_and_centre(radius: float, num_electrodes: int, **options: Any) -> np.ndarray:
-    """Positions of a `ring` of electrodes and, last, of one electrode in its centre: (num_electrodes + 1, d) metres.
+    """Positions of a `ring` of electrodes and, last, of one electrode at its centre: (num_electrodes + 1, d) metres.
     See `jeit.protocol.reference_electrode` for the use of the central electrode.
 
     **Arguments:**

@@ -41,8 +41,8 @@ def spread(
     """Positions on a surface, spread evenly over it: (L, 3) metres.
 
     The counterpart of `quasi_uniform` for surfaces: each position is the centroid of the part of the surface that is
-    closer to it than to any other position, by distances along the surface. The positions are computed by Lloyd's
-    algorithm, starting from farthest-point sampling, and are deterministic.
+    closer, along the surface, to this position than to any other. The positions are computed by Lloyd's algorithm,
+    starting from farthest-point sampling, and are deterministic.
 
     **Arguments:**
 
@@ -52,8 +52,8 @@ def spread(
     - `margin`: minimum distance of positions from the edge of the surface, metres.
     - `iterations`: maximum number of iterations.
 
-    Raises `ValueError` for fewer than one position, a margin that leaves no room for electrodes, and in the same cases
-    as `Triangles.of`.
+    Raises `ValueError` for fewer than one position, a margin that leaves no room for electrodes, and as `Triangles.of`
+    does.
 
     **Example:**
 
@@ -108,7 +108,7 @@ def _initial_nodes(geodesics: Geodesics, usable: np.ndarray, weight: np.ndarray,
         probabilities = weight[usable] / weight.sum()
         return np.random.default_rng(0).choice(usable, number, replace=False, p=probabilities)
     points = geodesics.surface.points
-    # The first node is the one farthest from the centroid, so that the result depends on the surface only.
+    # The first node is the node farthest from the centroid, so that the result depends on the surface only.
     centroid = np.average(points[usable], axis=0, weights=weight[usable])
     nodes = [usable[np.linalg.norm(points[usable] - centroid, axis=1).round(9).argmax()]]
     distances = geodesics.distances(points[nodes[:1]])[0]

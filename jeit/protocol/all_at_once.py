@@ -87,7 +87,7 @@ def from_matrices(
     - `measurement` (K, L): weights of the electrode potentials, one row per measurement pattern.
     - `select` (S, K): True for the combinations of drive and measurement pattern that are measured; by default all.
     - `name`: name in reports.
-    - `large_currents`: accept currents above 1 A, which are otherwise taken for an error of units.
+    - `large_currents`: accept currents above 1 A, which are otherwise rejected as probable errors of units.
 
     Raises `ValueError` for patterns that `Protocol` rejects, currents above 1 A (unless `large_currents`), and a
     `select` whose shape is not (S, K).
@@ -132,7 +132,7 @@ def from_channels(
       once.
     - `drive_index` (M,): 0-based index of the drive of each channel.
     - `name`: name in reports.
-    - `large_currents`: accept currents above 1 A, which are otherwise taken for an error of units.
+    - `large_currents`: accept currents above 1 A, which are otherwise rejected as probable errors of units.
 
     Raises `ValueError` for patterns that `Protocol` rejects, currents above 1 A (unless `large_currents`), and a
     `drive_index` whose length is not M.

@@ -1,7 +1,7 @@
 """Protocols with drive and measurement patterns that are pairs of electrodes.
 
 Electrodes are counted from 0. For each drive pair, `+current` enters at the first electrode and leaves at the second.
-The voltage of each measurement pair is the potential of the first electrode minus that of the second.
+The voltage of each measurement pair is the potential of the first electrode minus the potential of the second.
 """
 
 from __future__ import annotations
@@ -125,8 +125,8 @@ def adjacent(
     - `num_electrodes`: number of electrodes L, at least 4.
     - `current`: amplitude in amperes.
     - `driven_electrodes`: whether to measure also on electrodes that carry current (L² channels).
-    - `reciprocal`: "half" keeps the first of every two channels that are equal by reciprocity, "all" keeps both
-      channels.
+    - `reciprocal`: "half" measures only the first of every two channels that are equal by reciprocity, "all" measures
+      both channels.
     - `order`: "rotating" starts the measurements of each drive at the driven pair, "fixed" starts them at electrode 0.
 
     Raises `ValueError` for an invalid number of electrodes, current or option.

@@ -337,7 +337,7 @@ class Protocol(Module):
 
         Returns `pairs` (P, 2) and `ratio` (P,) such that `v[pairs[:, 1]] = ratio * v[pairs[:, 0]]` for any body without
         magnetic bias. In each pair, the drive pattern of either channel is proportional to the measurement pattern of
-        the other. Some protocols have no such pairs, for example opposite drive with adjacent measurement. See
+        the other channel. Some protocols have no such pairs, for example opposite drive with adjacent measurement. See
         `jeit.protocol.reciprocity` for reciprocity between combinations of channels.
         """
         return reciprocal_channel_pairs(

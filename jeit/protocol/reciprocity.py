@@ -1,4 +1,5 @@
-"""Reciprocity: driving at a and measuring at b gives the same voltage as driving at b and measuring at a.
+"""Reciprocity: driving at electrodes a and measuring at electrodes b yields the same voltage as driving at b and
+measuring at a.
 
 The transfer impedance S (L, L) of any body with (symmetric) conductivity is symmetric: `m @ S @ d = d @ S @ m` for a
 drive pattern d and a measurement pattern m. Therefore, if two channels (d, m) and (d', m') satisfy d' = a m and m' = b
@@ -79,7 +80,7 @@ def transfer_between_drives(
         if channels.size == 0:
             continue
         rows, scale = measurement[measurement_index[channels]], deviation[channels]
-        # Among all combinations of channels that equal a drive, choose the one with the least noise.
+        # Among all combinations of channels that equal a drive, choose the combination with the least noise.
         combination = drive @ np.linalg.pinv(rows / scale[:, None], rcond=1e-10) / scale
         is_known[:, drive_number] = np.linalg.norm(combination @ rows - drive, axis=1) <= 1e-8 * drive_norms
         transfer[:, :, drive_number] = voltages[:, channels] @ combination.T

@@ -1,7 +1,7 @@
 """Readers of the text that boards send over a serial line: Analog Devices' CN0565 kit and OpenEIT devices.
 
-The last frame of a recording may be cut off, and is left out. Other frames that lost characters are masked, so that
-later frames keep their indices.
+The last frame of a recording may be cut off, and is left out. Other frames in which characters were lost are masked, so
+that the indices of later frames do not change.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Cn0565:
         distances other than 1; without a description, the body and the protocol are those of `like`, a measurement of
         the same sensor.
 
-        Raises `ValueError` if `numbers` does, if no protocol is described and the number of voltages does not agree
+        Raises `ValueError` as `numbers` does, if no protocol is described and the number of voltages does not agree
         with distances of 1, and if a `key` is given, because the file contains no arrays.
         """
         _check_no_key(path, key)
@@ -222,7 +222,7 @@ class OpenEit:
         the firmware's protocol, which only determines options that the section does not state; without a description,
         the body is that of `like`, a measurement of the same sensor.
 
-        Raises `ValueError` if `numbers` does, and if a `key` is given, because the file contains no arrays.
+        Raises `ValueError` as `numbers` does, and if a `key` is specified, because the file contains no arrays.
         """
         _check_no_key(path, key)
         values, notes = cls.numbers(path)
@@ -294,7 +294,7 @@ class OpenEit:
             frames[-1][-1] = np.nan
             notes.append("nothing follows the last number, which may be cut off: masked.")
         # Frames between which the word "magnitudes" is lost appear as one long frame; its length shows the number of
-        # lost frames, so that later frames keep their indices.
+        # lost frames, so that the indices of later frames do not change.
         frame_indices = np.cumsum([0, *(max(1, round(length / frame_length)) for length in lengths)])
         is_complete = np.zeros(frame_indices[-1], bool)
         is_complete[

@@ -39,7 +39,7 @@ class Kit4:
     DESCRIPTION = "KIT4 tank archive (.mat with Uel, CurrentPattern, MeasPattern)"
     VARIABLES = (frozenset({"Uel", "CurrentPattern", "MeasPattern"}),)
     """Variables that identify a file of the archive."""
-    # Contact impedance: a fit to the empty tank gives about 1e-4 m / 1.3 mS.
+    # Contact impedance: a fit to measurements of the empty tank yields about 1e-4 m / 1.3 mS.
     _TANK = _Tank(0.14, 0.025, contact_impedance=0.08, clockwise=True)
 
     @classmethod
@@ -90,7 +90,7 @@ class Ktc2023:
     DESCRIPTION = "Kuopio Tomography Challenge 2023 (.mat with Mpat, and Inj and Uel or Injref and Uelref)"
     VARIABLES = (frozenset({"Mpat", "Inj", "Uel"}), frozenset({"Mpat", "Injref", "Uelref"}))
     """Variables that identify a file of the challenge, and a reference file."""
-    # Contact impedance: a fit to the empty tank gives nearly zero.
+    # Contact impedance: a fit to measurements of the empty tank yields nearly zero.
     _TANK = _Tank(0.115, 0.115 * np.radians(5.625), contact_impedance=0.01, clockwise=False)
 
     @classmethod

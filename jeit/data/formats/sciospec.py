@@ -75,10 +75,10 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
 
 
 def read_all(paths: Sequence[Path], description: str | Path | None = None) -> Measurement:
-    """Read several Sciospec files of the same set-up and join their frames in the given order.
+    """Read several Sciospec files of the same set-up and join their frames in the order of `paths`.
 
-    If each file contains one frame, `[data] frame_rate` of a description sets the times; otherwise the times are the
-    dates in the files. Raises `ValueError` as `read` and `jeit.data.gesture_set.join` do.
+    If each file contains one frame, `[data] frame_rate` of a description determines the times; otherwise the times are
+    the dates in the files. Raises `ValueError` as `read` and `jeit.data.gesture_set.join` do.
     """
     joined = join([read(path, description) for path in paths])
     rate = description_of(paths[0], description).layout.frame_rate

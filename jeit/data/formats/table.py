@@ -39,7 +39,7 @@ _MAX_RESIDUAL_MEAN = 0.01
 
 
 def recognises(path: Path) -> bool:
-    """Whether the suffix of a file is that of a table of numbers, such as .csv."""
+    """Whether a file has the suffix of a table of numbers, such as .csv."""
     return path.suffix.lower() in SUFFIXES
 
 
@@ -114,7 +114,7 @@ it."""
 
 
 def channel_counts(protocols: Protocols) -> list[int]:
-    """Numbers of channels of the candidate protocols; the first is that of the described protocol."""
+    """Numbers of channels of the candidate protocols; the first is the number of channels of the described protocol."""
     return [*dict.fromkeys(protocol.num_measurements for protocol, _ in protocols)]
 
 
@@ -194,7 +194,7 @@ def measurement_from(
     """Scale frames (frames, channels) in the unit of the file to volts as the description states, and mask unusable
     voltages. `protocol`: the protocol stored in the file, or None.
 
-    Raises `ValueError` if there is no protocol, if the number of frame names differs from that of the frames, and if
+    Raises `ValueError` if there is no protocol, if the number of frame names is not the number of frames, and as
     `screen` does.
     """
     protocol = protocol or sensor_description.protocol(path)
@@ -263,7 +263,7 @@ def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray
     if layout.component == "imaginary":
         return np.imag(frames)
     if layout.component == "magnitude":
-        # The magnitude takes the sign of the real part, because a magnitude alone has no sign.
+        # The magnitude receives the sign of the real part, because a magnitude alone has no sign.
         return np.abs(frames) * np.where(np.real(frames) < 0, -1.0, 1.0)
     return frames if layout.component == "complex" else np.real(frames)
 
@@ -302,7 +302,7 @@ def _voltages(arrays: dict[str, np.ndarray], layout: TableLayout, path: Path) ->
 
 
 def _stored_protocol(arrays: dict[str, np.ndarray]) -> Protocol | None:
-    """The protocol in a file written by `write_table`; None if the file holds no protocol."""
+    """The protocol in a file written by `write_table`; None if the file contains no protocol."""
     if not all(array in arrays for array in PROTOCOL_ARRAYS):
         return None
     name = str(arrays.get("protocol_name", "custom"))

@@ -40,7 +40,7 @@ _DELIMITER_HINT = (
     "Set [data] delimiter and skip_rows in the description, if it is a heading or cells are separated otherwise."
 )
 
-# Integer times that increase by at least this step may be milliseconds as well as seconds.
+# Integer times that increase by at least this step may be seconds or milliseconds.
 _MIN_MILLISECOND_STEP = 5
 
 
@@ -190,7 +190,7 @@ def rectangle(text: Text, name: str) -> Inexact[np.ndarray, "R C"]:
 
 
 def _line_pattern(line: str) -> str:
-    """A line with # in place of each number, so that "Frame 1" and "Frame 2" give the same pattern."""
+    """A line with # in place of each number, so that "Frame 1" and "Frame 2" have the same pattern."""
     return re.sub(r"\d+", "#", line.strip())
 
 
@@ -221,7 +221,7 @@ def _detect_format(lines: Sequence[str]) -> _NumberFormat:
 
 
 def _has_decimal_commas(number_format: _NumberFormat, lines: Sequence[str]) -> bool:
-    """Whether commas are decimal points: in most cells that contain a comma, the comma stands between two digits."""
+    """Whether commas are decimal points: in most cells that contain a comma, the comma is between two digits."""
     cells = [cell for line in lines for cell in _without_label(line).split(number_format.delimiter) if "," in cell]
     decimal_cells = [cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell.strip(' \t\r\n"'))]
     return len(decimal_cells) > 0.9 * len(cells)
@@ -229,8 +229,8 @@ def _has_decimal_commas(number_format: _NumberFormat, lines: Sequence[str]) -> b
 
 def _heading_length(number_format: _NumberFormat, lines: Sequence[str]) -> int:
     """Return the number of heading lines at the start of a file. A line belongs to the heading if at least half of its
-    cells are words, if its length differs from that of the lines of numbers, or if it numbers the columns, as in saved
-    data frames."""
+    cells are words, if its number of cells differs from that of all lines of numbers, or if it numbers the columns, as
+    in saved data frames."""
     row_lengths = {len(row) for line in lines if (row := number_format.numbers(line))}
     for line_index, line in enumerate(lines):
         cells = number_format.cells(line)
@@ -302,8 +302,8 @@ class Frames(NamedTuple):
 
 
 def frames_in_text(text: Text, counts: Sequence[int], layout: TableLayout, name: str) -> Frames:
-    """Return the frames of a text file. `counts`: numbers of channels that a frame may have; the first is that of the
-    described protocol.
+    """Return the frames of a text file. `counts`: numbers of channels that a frame may have; the first is the number of
+    channels of the described protocol.
 
     A last line or frame that is cut off is left out. Raises `ValueError` for lines of unequal length that are not
     frames wrapped over several lines.
