@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jeit.data.description_tables import ElectrodesTable, FacetsTable, GeometryTable, MeshTable, PlacedTable
 
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
-# Size of the body divided by the length that a key of `[geometry]` gives.
+# Size of the body divided by the length that a key of `[geometry]` specifies.
 _SIZE_FACTORS = {"radius": 2.0, "width": 1.0, "depth": 1.0, "height": 1.0, "thickness": 1.0}
 
 
@@ -185,7 +185,7 @@ def _mesh_from_file(table: MeshTable, folder: Path, origin: str) -> OwnMesh:
 
 
 def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str) -> AbstractElectrodes:
-    """Construct the electrodes that the section `[electrodes]` of a description specifies, on the `body` if it is
+    """Construct the electrodes that the section `[electrodes]` of a description specifies, on `body` if the body is
     described.
 
     Raises `ValueError` if the electrodes are not valid.

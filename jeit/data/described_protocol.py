@@ -56,14 +56,14 @@ def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: P
         raise located(error, origin, "protocol") from None
 
 
-# Options of protocols that a description may leave out, and their possible values; the constructor's default is first.
+# Options of protocols that a description may omit, and their possible values; the constructor's default is first.
 _OPTION_VALUES = {"driven_electrodes": (False, True), "order": ("rotating", "fixed"), "reciprocal": ("all", "half"),
          "drives": ("distinct", "all")}  # fmt: skip
 
 
 def variants(table: ProtocolTable) -> list[tuple[ProtocolTable, str]]:
-    """Return `table`, then copies of it with other values of the options that `table` does not state, each with the
-    text that states these options in a description."""
+    """Return `table`, then copies of it with different values of the options that `table` does not state. Each table is
+    paired with the text that states these options in a description."""
     fields = type(table).model_fields
     open_options = [name for name in _OPTION_VALUES if name in fields and name not in table.model_fields_set]
     open_options = [name for name in open_options if fields[name].default in _OPTION_VALUES[name]]
@@ -152,7 +152,7 @@ def _current_amplitude(table: DrivenTable, path: Path) -> float:
 
 
 def number_in_name(pattern: str, name: str) -> float | None:
-    """Return the first number, such as 30 or 0.5, at the position of {current} of the `pattern` in the file name
+    """Return the first number, such as 30 or 0.5, at the position of {current} in the `pattern`, from the file name
     `name`; * in the pattern matches any text. None if the name does not match the pattern."""
     prefix, _, suffix = pattern.partition("{current}")
     start = 0
@@ -177,7 +177,7 @@ def _number_end(text: str, start: int) -> int:
 
 
 def _matches(pattern: str, text: str) -> bool:
-    """Whether a text matches a pattern in which * stands for any text. Each part between two * is matched at its first
+    """Whether a text matches a pattern in which * matches any text. Each part between two * is matched at its first
     occurrence, so no part is searched for twice."""
     first_part, *later_parts = pattern.split("*")
     if not later_parts:

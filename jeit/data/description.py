@@ -20,14 +20,15 @@ A description has these sections, of which only `[protocol]` is required (`tank6
   `other`, both (electrodes, electrodes) in ohm, and `current` or `power`. Or "measured", for a .mat or .npz data file
   that contains the currents in the variable `drive_key` (default "current_patterns"), one pattern per column, or per
   row with `patterns_in` = "rows". In that case `measurement` states how the potentials of all electrodes are read:
-  "mean-removed" (minus the mean of all), "mean" (against the mean of the other electrodes), "adjacent", or "against" an
-  electrode `reference`; alternatively `measurement_key` names a matrix of measurement patterns in the file.
+  "mean-removed" (each minus the mean of all potentials), "mean" (each against the mean of the other electrodes),
+  "adjacent", or "against" an electrode `reference`; alternatively `measurement_key` names a matrix of measurement
+  patterns in the file.
 - `[data]`: `frames_in` = "columns" or "rows"; `delimiter`, `skip_rows`; `time_column`, whether the first number of a
   frame is its time; `complex_pairs`, `component`; `gain`, or `gains`, one for each measurement pattern of the protocol;
   `polarity`, `unit`, `saturation`; `frame_names`; `keys`: variables to read from a .mat or .npz file; `axes`: order of
   the axes of a three-dimensional array (default: electrodes, patterns, frames); `frames` = "all", or "mean" for their
-  average; `frame_rate` in frames per second. If the arrangement or the `polarity` is left out, it is detected from the
-  numbers, and a note states the result.
+  average; `frame_rate` in frames per second. If the arrangement or the `polarity` is not stated, it is detected from
+  the numbers, and a note states the result.
 - `[uncertainty]`: standard deviations: `position` of electrodes in metres, or `position_degrees` on a disk or cylinder;
   `contact_drift_percent`, change of contact impedances from the reference to a frame; `size_percent` of the body;
   `other_percent`, other errors of the difference between frame and reference. See `jeit.inverse.Uncertainty`.
@@ -113,9 +114,9 @@ class Description:
     uncertainty: Uncertainty | None = None
 
     def protocols(self, path: str | Path) -> list[tuple[Protocol, str]]:
-        """The protocols that agree with the description for the data file at `path`. The first protocol has the default
-        values of all options that the description does not state; further protocols have other values, which the text
-        beside each protocol states."""
+        """Return the protocols that agree with the description for the data file at `path`, each with a text. The first
+        protocol has the default values of all options that the description does not state. Further protocols have
+        different values of these options, which the text states."""
         default_protocol = self.protocol(path)
         if default_protocol is None or self.protocol_section is None:
             return []
@@ -146,7 +147,8 @@ class Description:
 
     @property
     def mean_removed(self) -> bool:
-        """Whether the data file stores currents, and potentials of all electrodes whose mean is subtracted."""
+        """Whether the data file stores currents, and potentials of all electrodes from which their mean is
+        subtracted."""
         section = self.protocol_section
         if section is None or section.kind != "measured" or section.measurement_key is not None:
             return False
@@ -163,10 +165,10 @@ class Description:
 
     def model(self, path: str | Path, *, num_points: int | None = None) -> ForwardModel:
         """A forward model of the described body with the protocol of the data file at `path`. A new mesh has about
-        `num_points` nodes; `num_points` is not given for a body that is described by a mesh.
+        `num_points` nodes; `num_points` must be None for a body that is described by a mesh.
 
         Raises `ValueError` if geometry, electrodes or protocol are not described, if `num_points` is missing, and if
-        `num_points` is given with a mesh.
+        `num_points` is specified for a mesh.
         """
         domain, electrodes, protocol = self.domain, self.electrodes, self.protocol(path)
         if domain is None or electrodes is None or protocol is None:
@@ -206,8 +208,8 @@ def load_description(which: str | Path) -> Description:
 
 
 def parse_description(table: dict[str, Any], origin: str, folder: str | Path = ".") -> Description:
-    """Check a description given as nested dictionaries and return it; relative file names in the description refer to
-    `folder`.
+    """Check nested dictionaries that specify a description, and create the description; relative file names in the
+    description refer to `folder`.
 
     Raises `ValueError`, with the faulty keys, for an invalid description.
     """
@@ -231,8 +233,8 @@ def parse_description(table: dict[str, Any], origin: str, folder: str | Path = "
 
 
 def _uncertainty(table: UncertaintyTable, domain: Body | None, origin: str) -> Uncertainty:
-    """Uncertainty from the section `[uncertainty]`. Raises `ValueError` if `position_degrees` is given for a body that
-    is not round."""
+    """Uncertainty from the section `[uncertainty]`. Raises `ValueError` if `position_degrees` is specified for a body
+    that is not round."""
     position = table.position
     if table.position_degrees is not None:
         outline = domain.outline if isinstance(domain, Solid) else domain
@@ -259,7 +261,7 @@ def _layout(data: DataTable) -> TableLayout:
         scale=scale,
         polarity=data.polarity,
         gains=() if data.gains is None else tuple(data.gains.tolist()),
-        # The saturation level is given in the unit of the file, but compared with voltages from which the gain is
+        # The saturation level is stated in the unit of the file, but compared with voltages from which the gain is
         # removed.
         saturation=None if data.saturation is None else data.saturation * abs(scale),
         frame_names=tuple(data.frame_names),

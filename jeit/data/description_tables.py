@@ -355,8 +355,8 @@ class MatricesTable(Table):
 
 
 class ChannelsTable(Table):
-    """Section `[protocol]` that gives for each channel the indices, counted from 0, of its drive pattern (in amperes)
-    and of its measurement pattern."""
+    """Section `[protocol]` that specifies for each channel the indices, counted from 0, of its drive pattern (in
+    amperes) and of its measurement pattern."""
 
     subject = "a protocol of channels"
     kind: Literal["channels"]

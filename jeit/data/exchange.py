@@ -39,7 +39,7 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
     - `path`: path of the .npz file.
 
     Raises `ValueError` for a suffix other than .npz, and for a body or electrodes that a description cannot express (a
-    mesh or an outline of your own, and electrodes on facets of a mesh).
+    mesh, an outline of a user's class, and electrodes on facets of a mesh).
 
     **Example:**
 
@@ -125,7 +125,7 @@ def _toml(value) -> str:
 
 def from_pyeit(mesh: Any, protocol: Any, *, current: float = 1.0) -> ForwardModel:
     """Convert a mesh and a protocol of pyEIT to a forward model with point electrodes and the same order of channels.
-    With the conductivity `mesh.perm`, the model gives the voltages of pyEIT's `EITForward.solve_eit`.
+    With the conductivity `mesh.perm`, the model yields the voltages of pyEIT's `EITForward.solve_eit`.
 
     **Arguments:**
 
@@ -165,8 +165,8 @@ def from_eidors(path: str | Path, variable: str | None = None) -> ForwardModel:
     """Read a forward model of EIDORS, saved by `save('tank.mat', 'fwd_model', '-v7')`: nodes, elements, electrodes with
     their contact impedances, and stimulation and measurement patterns with their signs.
 
-    Electrodes of one node become point electrodes. SciPy reads the file, so read only files from people you trust.
-    Lengths in the file must be in metres.
+    If all electrodes consist of one node, they become point electrodes. SciPy reads the file, so read only files from
+    people you trust. Lengths in the file must be in metres.
 
     **Arguments:**
 

@@ -19,8 +19,8 @@ from jeit.files import need, npz_arrays, written_whole
 
 
 def join(measurements: Sequence[Measurement]) -> Measurement:
-    """Join the frames of measurements of the same set-up in the given order. Times are kept if all measurements have
-    times and the joined times increase.
+    """Join the frames of measurements of the same set-up in the order of `measurements`. Their times are also joined if
+    all measurements have times and the joined times increase.
 
     The body, the electrodes and the notes are taken from the first measurement. Raises `ValueError` for an empty
     sequence, and if two measurements have different protocols.
@@ -87,13 +87,13 @@ def read_frame_recording(path: str | Path, description: Description | None = Non
     An NPZ file of F frames and M channels contains `frames` or `voltages` (F, M), and optionally times `seconds` or
     `time` (F,), and `reference`, one frame (M,) or several frames (r, M) of the untouched skin. A table (.csv, .txt,
     .dat, .npy) has one frame per row unless `[data]` of the description states otherwise; its frames named "reference"
-    are taken as the reference. If the table has one column more than the protocol has channels, the first column
-    contains the times, as in `jeit.data.read`.
+    become the reference. If the table has one column more than the protocol has channels, the first column contains the
+    times, as in `jeit.data.read`.
 
-    Without a description, or without a protocol in it, any number of channels is accepted, and voltages keep the unit
-    of the file. Raises `FileNotFoundError` if the file does not exist, and `ValueError` for a file that is neither NPZ
-    nor a table, for a number of channels that differs from that of the protocol, and for times that decrease, are not
-    finite, or do not match the number of frames.
+    Without a description, or without a protocol in it, any number of channels is accepted, and voltages are returned in
+    the unit of the file. Raises `FileNotFoundError` if the file does not exist, and `ValueError` for a file that is
+    neither NPZ nor a table, for a number of channels that differs from the protocol's, and for times that decrease, are
+    not finite, or do not match the number of frames.
 
     **Arguments:**
 
@@ -196,7 +196,7 @@ class GestureSet:
     `start`: (n + 1,) index of the first frame of each recording, followed by the number of frames F; `seconds`: (F,)
     times of the frames, from 0 in each recording; `voltages`: (F, M) volts, NaN for missing readings; `reference`: (M,)
     volts, mean of frames of the untouched skin before the recordings; `untouched`: (u, M) volts, u frames of the
-    untouched skin, recorded over as long a time as the gestures.
+    untouched skin, recorded over a period as long as the gestures.
 
     **Example:**
 

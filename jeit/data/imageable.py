@@ -34,12 +34,12 @@ MOST_DIFFERENCE_RECIPROCITY_ERROR = 0.63
 _MIN_COSINE = -0.5
 # Maximum fraction of the difference between frame and reference that is due to rounding of the voltages.
 _MAX_ROUNDING = 0.7
-# A spike deviates from the value that the other channels imply by this many robust standard deviations and by more than
-# the typical change of a channel, and explains this fraction of the unexplained power; maximum number of spikes in a
-# frame.
+# Minimum deviation of a spike from the value that the other channels imply, in robust standard deviations; minimum
+# fraction of the unexplained power that a spike explains; maximum number of spikes in a frame. The deviation of a spike
+# must also exceed the typical change of a channel.
 _SPIKE_DEVIATIONS, _SPIKE_SHARE, _MAX_SPIKES = 10.0, 0.5, 8
-# Of two channels that contradict each other, one is faulty if its change is larger than that of the other by this
-# factor.
+# Of two channels that contradict each other, one is faulty if its change is larger than the change of the other channel
+# by this factor.
 _FAULT_RATIO = 3.0
 # Minimum fraction of a channel that the other channels leave undetermined; smaller fractions are rounding errors.
 _MIN_FREE_SHARE = 1e-6
@@ -311,7 +311,7 @@ def _spikes(
     """Indices of the channels with spikes in a weighted `change` (n,) of n channels; `rounding` (n,): standard
     deviation of the change due to rounding.
 
-    Allowing a suspected channel to read anything adds its unit vector to the basis. The power that this vector
+    If a suspected channel may have any value, its unit vector is added to the basis. The power that this vector
     explains, `gain`, is compared with the power that the basis alone leaves unexplained.
     """
     residual, free_share = change - basis @ (basis.T @ change), 1 - np.sum(basis**2, axis=1)
@@ -344,15 +344,15 @@ def _spikes(
 
 def _faulty_channels(change: Inexact[np.ndarray, " n"], channels: np.ndarray) -> list[int]:
     """Return the faulty channels among one or two channels that contradict the other channels or each other: the
-    channel that changed far more, or both."""
+    channel with the far larger change, or both channels if their changes are similar."""
     size = np.abs(change[channels])
     is_single = size.max() > _FAULT_RATIO * size.min()
     return [int(channels[size.argmax()])] if is_single else channels.tolist()
 
 
 def rounding_of_difference(frame: Measurement, reference: Measurement) -> Float[np.ndarray, " M"]:
-    """Standard deviation (channels,), in volts, of the difference of two frames due to the rounding of both; 0 for
-    channels that are not usable in both frames."""
+    """Standard deviation (channels,), in volts, of the difference of two frames due to rounding of their voltages; 0
+    for channels that are not usable in both frames."""
     deviations = [
         rounding_deviation(np.asarray(measurement.voltages)[0], np.asarray(measurement.mask)[0])
         for measurement in (frame, reference)
@@ -396,8 +396,8 @@ def _rejection_reason(
     own_errors: dict[str, float | None],
     cosine: float,
 ) -> str:
-    """Why a frame cannot be imaged; empty if it can. `own_errors`: reciprocity errors of frame and reference by name;
-    `cosine`: cosine of the angle between frame and reference."""
+    """Reason why a frame cannot be imaged; empty if it can. `own_errors`: reciprocity errors of frame and reference by
+    name; `cosine`: cosine of the angle between frame and reference."""
     if num_usable < num_electrodes:
         return (
             f"only {counted(num_usable, 'channel')} usable in both it and its reference, for {num_electrodes} "

@@ -226,7 +226,7 @@ class Measurement(Module):
         """The same measurement with fewer usable channels.
 
         `usable`: boolean, (channels,) or (frames, channels); `reason`: text that is added to the notes. Raises
-        `ValueError` if `usable` has another shape.
+        `ValueError` if `usable` has a different shape.
         """
         usable_array = jnp.asarray(usable)
         if usable_array.dtype != bool or usable_array.shape not in ((self.num_channels,), self.mask.shape):

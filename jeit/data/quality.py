@@ -112,8 +112,8 @@ def estimate_noise(measurement: Measurement) -> NoiseEstimate | None:
     channels and repeated frames.
 
     - Reciprocity: two channels that must be equal differ by √2 standard deviations of the noise; combinations of
-      channels are treated likewise. The estimate includes drift and gain errors, which cancel in a difference of two
-      frames: to obtain the noise of a difference, pass the difference as the measurement.
+      channels that must be equal are treated in the same way. The estimate includes drift and gain errors, which cancel
+      in a difference of two frames: to obtain the noise of a difference, pass the difference as the measurement.
     - Repeated frames (8 or more, without frame names): differences of successive frames.
 
     The estimate is 1.4826 times the median absolute difference; it is robust against outliers in up to half of the
@@ -149,10 +149,10 @@ def expected_signs(protocol: Protocol, order: Int[np.ndarray, " L"]) -> Int[np.n
     body.
 
     On the boundary of a simply connected sheet the potential falls monotonically from source to sink along both arcs
-    between them: a local extremum elsewhere would contradict the maximum principle, whatever the (positive)
-    conductivity. The sign of a voltage between two electrodes of the same arc is therefore known. `order` (L,) lists
-    the L electrodes as they follow each other along the boundary. The sign is 0 for channels that do not drive and
-    measure by pairs of electrodes.
+    between them: a local extremum elsewhere would contradict the maximum principle, for any (positive) conductivity.
+    The sign of a voltage between two electrodes of the same arc is therefore known. `order` (L,) lists the L electrodes
+    as they follow each other along the boundary. The sign is 0 for channels that do not drive and measure by pairs of
+    electrodes.
     """
     num_electrodes = protocol.num_electrodes
     rank = np.empty(num_electrodes, dtype=int)
@@ -177,15 +177,15 @@ def impossible_signs(
 ) -> Float[np.ndarray, " F"] | None:
     """Fraction of the usable voltages of each frame whose sign is impossible on a passive body.
 
-    The sign of a complex voltage is that of its real part. Voltages that are pure noise have the wrong sign half of the
-    time, so the fraction of noisy channels is about twice the returned fraction. Returns None if the electrodes are not
-    known to lie along the boundary of an outline, or if no channel has a known sign. See `expected_signs`.
+    The sign of a complex voltage is the sign of its real part. Voltages that are pure noise have the wrong sign half of
+    the time, so the fraction of noisy channels is about twice the returned fraction. Returns None if the electrodes are
+    not known to lie along the boundary of an outline, or if no channel has a known sign. See `expected_signs`.
 
     **Arguments:**
 
     - `measurement`: the frames.
-    - `order` (electrodes,): the electrodes as they follow each other along the boundary; by default the order is found
-      from the positions of the electrodes.
+    - `order` (electrodes,): the electrodes as they follow each other along the boundary; by default the order is
+      computed from the positions of the electrodes.
 
     **Example:**
 
@@ -263,7 +263,7 @@ def _asymmetry(
     """Asymmetry of the matrix T of transfer between drives (`reciprocity_error`). Returns the entries of T - Tᵀ
     (watts), their standard deviation for noise of the given `deviation` (default: one volt per channel), and the
     entries of T with its diagonal, to which the asymmetry is compared. The entries of T are divided by their noise if
-    `deviation` is given.
+    `deviation` is specified.
 
     The diagonal is included because for the optimal currents of `jeit.protocol.optimal` a change of the body alters
     only the diagonal.
@@ -344,7 +344,7 @@ def order_note(measurement: Measurement) -> str | None:
 
 
 def follows(order: Int[np.ndarray, " L"]) -> bool:
-    """Whether the electrode numbers in `order` increase by one all the way round, or decrease by one."""
+    """Whether the electrode numbers in the cyclic `order` increase by one at every step, or decrease by one."""
     steps = (np.roll(order, -1) - order) % len(order)
     return bool((steps == 1).all() or (steps == len(order) - 1).all())
 

@@ -1,4 +1,4 @@
-"""Registry of file formats. `read` recognises the format from the content of a file, unless the format is given."""
+"""Registry of file formats. `read` recognises the format from the content of a file, unless the format is specified."""
 
 from __future__ import annotations
 

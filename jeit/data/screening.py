@@ -112,8 +112,8 @@ def screen(
 
 
 def _hint_of_number(number: int, channels: int) -> str:
-    """Text on what may be wrong if `number` numbers are not complete frames of `channels` voltages: missing lines, or
-    another number of electrodes."""
+    """Text on what may be wrong if `number` numbers are not complete frames of `channels` voltages: missing lines, or a
+    different number of electrodes."""
     if 0 < channels - number <= channels // 4:
         return f" They are {number} numbers, {channels - number} fewer than a frame has: is a line missing?"
     counts = {
@@ -173,8 +173,9 @@ def _saturated(values: np.ndarray, usable: np.ndarray, saturation: float | None)
 def _current_flow(
     values: np.ndarray, usable: np.ndarray, protocol: Protocol
 ) -> tuple[Bool[np.ndarray, "F S"], Bool[np.ndarray, "F S"]]:
-    """Masks (frames, drives) of the drives without current, whose voltages are a thousand times smaller than those of
-    the median drive, and of the drives with current. Both masks are False for drives without a usable voltage."""
+    """Masks (frames, drives) of the drives without current, whose voltages are a thousand times smaller than the
+    voltages of the median drive, and of the drives with current. Both masks are False for drives without a usable
+    voltage."""
     index = np.asarray(protocol.drive_index)
     largest = np.full((values.shape[0], protocol.num_drives), -1.0)
     np.maximum.at(largest.T, index, np.where(usable, np.abs(values), -1.0).T)

@@ -1,4 +1,4 @@
-"""The transfer impedance of a measured body, and the voltages that the body would give under other patterns.
+"""The transfer impedance of a measured body, and the voltages of the body for other patterns.
 
 The transfer impedance Z (L, L) of L electrodes is symmetric with rows that sum to zero, so it has L (L - 1) / 2
 independent entries. Any set of patterns that determines Z, such as L - 1 independent currents on all electrodes,
@@ -23,8 +23,8 @@ _NUM_COPIES = 4
 
 
 def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]:
-    """The transfer impedance (F, L, L) of F frames and L electrodes, in ohm: column l has the potentials of all
-    electrodes, minus their mean, per ampere into electrode l.
+    """Compute the transfer impedance (F, L, L) of F frames and L electrodes, in ohm: column l contains the potentials
+    of all electrodes, minus their mean, per ampere into electrode l.
 
     The transfer impedance is the symmetric matrix that fits the usable voltages in the least-squares sense.
 
@@ -72,9 +72,9 @@ def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]
 
 
 def as_driven(reference: Measurement, measurement: Measurement) -> Measurement:
-    """The reference converted to the protocol of a measurement on the same electrodes. The reference is returned
-    unchanged if only the amplitude of the currents differs, or if its patterns do not determine the voltages of the
-    other protocol."""
+    """Convert the reference to the protocol of a measurement on the same electrodes. The reference is returned
+    unchanged if only the amplitude of the currents differs, or if its patterns do not determine the voltages of that
+    protocol."""
     ours, theirs = measurement.protocol, reference.protocol
     if ours.num_electrodes != theirs.num_electrodes or ours.same_patterns(theirs) or _proportional(ours, theirs):
         return reference
@@ -96,11 +96,11 @@ def _proportional(ours: Protocol, theirs: Protocol) -> bool:
 
 
 def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
-    """Compute the voltages that another `protocol` on the same electrodes would have measured.
+    """Compute the voltages that a different `protocol` on the same electrodes would have measured.
 
-    A typical use is a reference that was measured with other currents than the frames. Noise is amplified if the
-    measured patterns barely determine the new voltages. Raises `ValueError` for another number of electrodes, and if
-    the measured voltages do not determine the transfer impedance.
+    A typical use is a reference that was measured with currents that differ from those of the frames. Noise is
+    amplified if the measured patterns barely determine the new voltages. Raises `ValueError` if the numbers of
+    electrodes differ, and if the measured voltages do not determine the transfer impedance.
 
     **Arguments:**
 

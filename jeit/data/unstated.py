@@ -20,8 +20,8 @@ from jeit.mesh import Solid
 from jeit.protocol import Protocol
 from jeit.protocol.patterns import shares_electrode
 
-# Maximum reciprocity error for which the described order of channels is trusted, and maximum ratio of the error of
-# another order to the error of the described order for which the other order is used.
+# Maximum reciprocity error for which the described order of channels is trusted. A different order is used only if its
+# error, divided by the error of the described order, is below the second value.
 _MAX_TRUSTED_ERROR, _MAX_ERROR_RATIO = 0.25, 0.4
 # Cosine of the angle between a frame and its reference below which the frame or the reference has the opposite sign.
 _OPPOSITE_COSINE = -0.5
@@ -31,11 +31,11 @@ def fitting_protocol(
     frames: Inexact[np.ndarray, "F M"], protocols: Sequence[tuple[Protocol, str]], like: Measurement | None = None
 ) -> tuple[Protocol | None, tuple[str, ...]]:
     """Select the protocol among the candidates `protocols` that has as many channels as the frames and obeys
-    reciprocity. Returns the protocol, None without candidates, and a note if it is not the described protocol
+    reciprocity. Returns the protocol (None if there are no candidates), and a note if it is not the described protocol
     `protocols[0]`.
 
     The described protocol is used unless it violates reciprocity and another candidate does not. If a measurement
-    `like` of the same sensor is given, its protocol is the first candidate, because properties detected in the
+    `like` of the same sensor is specified, its protocol is the first candidate, because properties detected in the
     reference apply to the frames.
     """
     if not protocols:
@@ -81,8 +81,8 @@ def driven_zeros(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> Bool
 
 def with_signs(measurement: Measurement, like: Measurement | None = None) -> Measurement:
     """The measurement with corrected signs of the voltages, and a note if a sign is changed. If all voltages have the
-    same sign, i.e. are magnitudes, they receive the signs of a passive body; if they have the opposite signs of `like`,
-    a measurement of the same sensor, all signs are reversed."""
+    same sign, i.e. are magnitudes, they receive the signs of a passive body; if their signs are opposite to those of
+    `like`, a measurement of the same sensor, all signs are reversed."""
     values, usable = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     if like is not None and like.protocol.same_patterns(measurement.protocol):
         common_channels = usable.all(axis=0) & np.asarray(like.mask).all(axis=0)

@@ -102,8 +102,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         start, end = _covered_intervals(self.position, self.width, mesh)
         length = facet_measures(mesh)[:, None]
         # The basis functions on an edge are φ_1 = t / length and φ_0 = 1 - φ_1. Simpson's rule is exact for their
-        # products over [start, end] and sums only positive terms, so it is accurate also for edges that an electrode
-        # hardly covers.
+        # products over [start, end]. It sums only positive terms, so it is also accurate for edges of which an
+        # electrode covers only a small part.
         phi_end = xp.stack([start, (start + end) / 2, end]) / length
         phi_start = 1 - phi_end
         weights = (end - start) * np.array([1.0, 4.0, 1.0], start.dtype)[:, None, None, None] / 6
@@ -195,12 +195,13 @@ def _arc_points(mesh: Mesh, centre: np.ndarray, width: float) -> np.ndarray:
 
 @either_engine
 def _project(position, mesh: Mesh):
-    """Nearest boundary facet (L,) of each position, arc length (L,) of the foot point along it, and distance (L,).
+    """Nearest boundary facet (L,) of each position, arc length (L,) of the foot point along this facet, and distance
+    (L,) from the boundary.
 
     The foot point p(t) on an edge is where the offset of the position from p(t) is perpendicular to the tangent τ(t) =
-    (1-t)τ_0 + tτ_1, interpolated between the corners of the edge; the tangent at a corner bisects those of the two
-    edges that meet there. For positions on the edge this is the ordinary projection, but its derivative is continuous
-    where an electrode slides across a corner.
+    (1-t)τ_0 + tτ_1, interpolated between the corners of the edge; the tangent at a corner bisects the tangents of the
+    two edges that meet there. For positions on the edge, the foot point is the ordinary projection, but its derivative
+    is continuous where an electrode slides across a corner.
     """
     xp = namespace(position, mesh)
     corners = mesh.points[mesh.facets]

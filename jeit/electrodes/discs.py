@@ -112,8 +112,8 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
     """Complete electrodes that are discs inside a sheet (2-D mesh), independent of its nodes.
 
     The indicator function of the disc is replaced by a smooth window whose edge is half a cell wide, so that the
-    contact integrals are differentiable in position and radius and converge to those of the sharp disc as the mesh is
-    refined.
+    contact integrals are differentiable in position and radius and converge to the integrals of the sharp disc as the
+    mesh is refined.
 
     **Fields**: `position` (L, 2): positions of the L discs, metres; `radius` (L,): metres; `contact_impedance` (L,):
     ohm·m².
@@ -169,9 +169,10 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
 class FaceDiscs(AbstractDiscs, AbstractMovableElectrodes):
     """Complete electrodes that are discs on flat or curved faces of a 3-D mesh, independent of its nodes.
 
-    On a curved face a disc covers the points within a straight distance `radius` of its position, as cut out by a ball.
-    On a face with radius of curvature R, its radius measured along the surface is then larger by the fraction radius² /
-    24 R²: 0.3 % for a radius of R / 4, 1 % for R / 2. Discs with radii up to R are covered completely.
+    On a curved face a disc covers the points within a straight-line distance `radius` of its position, as cut out by a
+    ball. On a face with radius of curvature R, the disc's radius measured along the surface is then larger by the
+    fraction radius² / 24 R²: 0.3 % for a radius of R / 4, 1 % for R / 2. Discs with radii up to R are covered
+    completely.
 
     **Fields**: `position` (L, 3): points on the surface, metres; `radius` (L,): metres; `contact_impedance` (L,):
     ohm·m².
@@ -271,9 +272,9 @@ def same_face(mesh: Mesh, position: Float[Array, "L 3"], radius: Float[Array, " 
     """Matrix (b, L): 1 if boundary triangle b may lie on the same flat or curved face as electrode L, also if that face
     continues around an edge of the body, otherwise 0.
 
-    This keeps an electrode on a thin layer from reaching through to the opposite face. On a face with radius of
-    curvature R, the plane of a triangle at the rim of a disc of radius r passes r² / 2R from the disc's centre and is
-    rotated by 2 arcsin(r / 2R); for r = R the distance is r / 2 and the angle 60°. The matrix has no derivatives.
+    The matrix prevents an electrode on a thin layer from reaching through to the opposite face. On a face with radius
+    of curvature R, the plane of a triangle at the rim of a disc of radius r passes r² / 2R from the disc's centre and
+    is rotated by 2 arcsin(r / 2R); for r = R the distance is r / 2 and the angle 60°. The matrix has no derivatives.
     """
     normal, corner = facet_normals(mesh), mesh.points[mesh.facets[:, 0]]
     height = abs(normal @ position.T - (normal * corner).sum(axis=1)[:, None])
@@ -351,11 +352,12 @@ class SurfaceDiscs(AbstractDiscs):
     """Complete electrodes that are discs in a curved sheet, a surface of triangles in space, independent of its nodes.
 
     These are the `SheetDiscs` of curved sheets. Where the surface around the centre is developable, as in bent sheets
-    and tubes, a disc consists exactly of the points within a geodesic distance of its radius, so bending does not
-    change the contact integrals. Elsewhere a disc consists of the points within a straight distance of its radius whose
-    normals point to the same side as at its centre; on a surface with radius of curvature R, its radius along the
-    surface is larger by the fraction radius² / 24 R². The integrals are differentiable in position along the surface; a
-    displacement off the surface has no first-order effect.
+    and tubes, a disc consists exactly of the points whose geodesic distance from its centre is at most its radius, so
+    bending does not change the contact integrals. Elsewhere a disc consists of the points whose straight-line distance
+    from its centre is at most its radius, and whose normals point to the same side as the normal at its centre. On a
+    surface with radius of curvature R, the radius of such a disc along the surface is larger by the fraction radius² /
+    24 R². The integrals are differentiable in position along the surface; a displacement off the surface has no
+    first-order effect.
 
     **Fields**: `position` (L, 3): points on the surface, metres; `radius` (L,): metres; `contact_impedance` (L,):
     ohm·m².
@@ -409,8 +411,8 @@ class SurfaceDiscs(AbstractDiscs):
         return window_contact(mesh.cells, area, window, nearest, self.contact_impedance, mesh.num_points)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for discs that lie off the surface, extend over its border, are as large as its radius of
-        curvature, overlap, or are too small for the mesh."""
+        """Raise `ValueError` for discs that lie off the surface, extend over its border, are as large as the surface's
+        radius of curvature, overlap, or are too small for the mesh."""
         if not mesh.is_surface:
             raise ValueError(
                 "SurfaceDiscs need a mesh that is a surface in space, such as jeit.mesh.tube makes; this one is not."
@@ -424,7 +426,7 @@ class SurfaceDiscs(AbstractDiscs):
 
 def check_on_surface(position, radius, surface: Triangles) -> None:
     """Raise `ValueError` for discs at `position` (L, 3) with `radius` (L,), metres, that are farther from the surface
-    than their radius, extend over its border, or are as large as its radius of curvature."""
+    than their radius, extend over its border, or are as large as the surface's radius of curvature."""
     position, radius = np.asarray(position), np.asarray(radius)
     nearest = surface.nearest(position)
     margins = surface.distance_to_border(nearest.points)

@@ -55,7 +55,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         return namespace(self).concatenate([part.contact_impedance for part in self.parts])
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """Copy of the electrodes with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for values
+        """Copy of the electrodes with new contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for values
         that are not positive."""
         values = as_electrode_values("contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²")
         pieces = jnp.split(values, np.cumsum([part.num_electrodes for part in self.parts])[:-1])

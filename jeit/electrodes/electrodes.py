@@ -18,11 +18,12 @@ from jeit_solvers.module import Module
 class Contact(Module):
     """Contact integrals of a set of L electrodes on a mesh, divided by contact impedance.
 
-    In the complete electrode model every electrode l adds the energy (1/z_l) ∫_l (u - U_l)². With P1 basis functions φ
-    this energy is determined by:
+    In the complete electrode model every electrode l adds the energy (1/z_l) ∫_l (u - U_l)². With P1 basis functions φ,
+    the following integrals determine this energy:
 
     - `mass` (q, k, k), in siemens: Σ_l (1/z_l) ∫ φ_i φ_j over the q facets or cells, with k nodes each, that electrodes
-      may touch, and `nodes` (q, k): their nodes; one pair of arrays for each kind of electrode;
+      may touch, and `nodes` (q, k): nodes of these facets or cells; there is one pair of arrays `mass` and `nodes` for
+      each kind of electrode;
     - `load` (n, L), in siemens: (1/z_l) ∫ φ_i, with column sums |e_l| / z_l, |e_l| being the size of the electrode.
 
     Point electrodes have no contact energy: `load` contains φ_i at the electrode, dimensionless; `mass` is zero, and
@@ -83,7 +84,7 @@ class AbstractElectrodes(Module):
 
     @abc.abstractmethod
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> "AbstractElectrodes":
-        """Copy of the electrodes with other contact impedances, one number or (L,), ohm·m² (ohm·m for arcs).
+        """Copy of the electrodes with new contact impedances, one number or (L,), ohm·m² (ohm·m for arcs).
 
         Raises `ValueError` for point electrodes, which have no contact impedance.
         """
@@ -98,7 +99,7 @@ class AbstractElectrodes(Module):
 
     @abc.abstractmethod
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """Refinements of a plane mesh at the electrodes; empty if the electrodes know none."""
+        """Refinements of a plane mesh at the electrodes; empty if the electrodes request none."""
 
     def describe(self) -> dict[str, Any]:
         """Kind, number, positions and sizes of the electrodes; lengths in metres."""
@@ -125,7 +126,7 @@ class AbstractPlacedElectrodes(AbstractCompleteElectrodes):
     position: eqx.AbstractVar[Float[Array, "L d"]]
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """Copy of the electrodes with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for values
+        """Copy of the electrodes with new contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for values
         that are not positive."""
         return replace_contact_impedance(self, contact_impedance)
 
@@ -163,15 +164,15 @@ class AbstractPointElectrodes(AbstractElectrodes):
 def replace_contact_impedance(
     electrodes: AbstractCompleteElectrodes, contact_impedance: ArrayLike
 ) -> AbstractCompleteElectrodes:
-    """Copy electrodes with another `contact_impedance`, one number or (L,). Raises `ValueError` for values that are not
+    """Copy electrodes with a new `contact_impedance`, one number or (L,). Raises `ValueError` for values that are not
     positive."""
     values = as_electrode_values("contact_impedance", contact_impedance, electrodes.num_electrodes, unit="ohm·m²")
     return eqx.tree_at(lambda complete_electrodes: complete_electrodes.contact_impedance, electrodes, values)
 
 
 def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) -> Float[Array, " L"]:
-    """Broadcast a positive number or array (L,) to floats (L,). Raises `ValueError` for another shape, and for values
-    that are not positive."""
+    """Broadcast a positive number or array (L,) to floats (L,). Raises `ValueError` for a different shape, and for
+    values that are not positive."""
     if has_values(values):
         values = real_array(
             name, values, f"one number for all electrodes or one for each of the {num_electrodes}, in {unit}"
@@ -210,7 +211,7 @@ def as_positions(position, dimensions: tuple[int, ...]) -> Float[Array, "L d"]:
 
 
 def check_dimension(electrodes: str, mesh: Mesh, dimension: int) -> None:
-    """Raise `ValueError` for a surface in space, and for a mesh of another dimension than `dimension`."""
+    """Raise `ValueError` for a surface in space, and for a mesh whose dimension is not `dimension`."""
     if mesh.is_surface:
         raise ValueError(
             f"{electrodes} do not live on a surface in space; PointElectrodes and NodeElectrodes do, plates along its "

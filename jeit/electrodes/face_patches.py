@@ -28,8 +28,8 @@ from jeit.mesh.checks import size_checked
 from jeit.mesh.mesh import facet_measures
 from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undifferentiated, values_at_once
 
-# Distance from a face, relative to the size of the body, within which a position lies on the face; also used in checks
-# of electrodes.
+# Distance from a face, relative to the size of the body, within which a position is taken to lie on the face; also used
+# in checks of electrodes.
 _FACE_TOLERANCE = 1e-3
 # Number of points on the rim of a patch on a horizontal face.
 _NUM_RIM_POINTS = 16
@@ -37,11 +37,11 @@ _NUM_RIM_POINTS = 16
 
 @size_checked()
 def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None = None) -> Mesh:
-    """Mesh a body with smaller cells at the electrodes: with those that the electrodes' `refinement` requests or, for
-    rectangular electrodes on solids, with layers and rows of cells that end at the electrodes.
+    """Mesh a body with smaller cells at the electrodes: with the cell sizes that the electrodes' `refinement` requests
+    or, for rectangular electrodes on solids, with layers and rows of cells that end at the edges of the electrodes.
 
     The edges of rectangular electrodes on a box, and their upper and lower edges on the wall of another solid, coincide
-    with cell faces. A body that is given as a mesh is not remeshed.
+    with cell faces. An `OwnMesh` is not remeshed.
 
     **Arguments:**
 
@@ -49,7 +49,7 @@ def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None
     - `electrodes`: the electrodes, with lengths in metres.
     - `num_points`: number of nodes, approximately.
 
-    Raises `ValueError` if `num_points` is missing, or if it is given for a body that is a mesh.
+    Raises `ValueError` if `num_points` is missing, or if it is specified for an `OwnMesh`.
 
     **Example:**
 
@@ -103,12 +103,13 @@ def _electrode_ends(
     centre: Float[np.ndarray, " L"], half_size: Float[np.ndarray, " L"], selected
 ) -> Float[np.ndarray, " e"]:
     """Positions along an axis where the selected electrodes begin and end, from their `centre` and `half_size` along
-    it."""
+    this axis."""
     return np.concatenate([(centre - half_size)[selected], (centre + half_size)[selected]])
 
 
 def _rim_points(outline, centre, half_size, is_horizontal: bool) -> Float[np.ndarray, "p 2"]:
-    """Points on the rim of an electrode, seen from above: around it on a horizontal face, its two ends on a wall."""
+    """Points on the rim of an electrode, seen from above: all around an electrode on a horizontal face, and the two
+    ends of an electrode on a wall."""
     if is_horizontal:
         angle = 2 * np.pi * np.arange(_NUM_RIM_POINTS) / _NUM_RIM_POINTS
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -124,7 +125,7 @@ def _rim_points(outline, centre, half_size, is_horizontal: bool) -> Float[np.nda
     )
 
 
-# Distance between two electrodes, divided by the smaller one's size, below which they are at the same position.
+# Distance between two electrodes, divided by the size of the smaller electrode, below which they count as coincident.
 _MIN_SEPARATION = 1e-3
 
 Distance = Callable[[Float[np.ndarray, "L 3"]], Float[np.ndarray, " L"]]
@@ -206,10 +207,10 @@ _UNIT_TRIANGLE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 class FacePatches(AbstractMovableElectrodes):
     """Complete electrodes that are rectangles on the surface of a 3-D mesh, independent of its nodes.
 
-    A patch lies in the tangent plane at its position: its width is horizontal (perpendicular to z), its height runs up
-    the surface; on a horizontal face, width is along x and height along y. On a curved face the patch covers the
-    projection of the rectangle onto the face: on a cylinder of radius R, an electrode of arc length a has the width 2 R
-    sin(a / 2 R).
+    A patch lies in the tangent plane at its position: its width is horizontal (perpendicular to z), and its height runs
+    upward along the surface. On a horizontal face, width is along x and height along y. On a curved face the patch
+    covers the projection of the rectangle onto the face: on a cylinder of radius R, an electrode of arc length a has
+    the width 2 R sin(a / 2 R).
 
     **Fields**: `position` (L, 3): centres of the L electrodes on the surface, metres; `width`, `height` (L,): metres;
     `contact_impedance` (L,): ohm·m².
@@ -265,8 +266,8 @@ class FacePatches(AbstractMovableElectrodes):
 
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
-        """Exact contact integrals over the parts of boundary triangles that lie within the patches as seen along their
-        normals."""
+        """Exact contact integrals over the parts of boundary triangles that lie within the patches, seen along the
+        normals of the patches."""
         xp = namespace(self, mesh)
         area, half_size = facet_measures(mesh), xp.stack([self.width, self.height], axis=-1) / 2
         normal, tangent, upward = tangent_frames(mesh, self.position)
@@ -319,10 +320,11 @@ class FacePatches(AbstractMovableElectrodes):
 
 
 def _reaching_patches(mesh: Mesh, position, half_size, frames):
-    """Patches (b, k) that may cover a part of each boundary triangle, nearest first, and whether each patch does.
+    """Patches (b, k) that may cover a part of each boundary triangle, nearest first, and whether each patch reaches the
+    triangle.
 
-    A triangle must lie on the same side of the body as the patch: it must have a similar normal, and a smaller depth
-    than the size of the patch. The results have no derivatives.
+    A triangle must lie on the same side of the body as the patch: it must have a similar normal, and its distance from
+    the plane of the patch must be less than half the longer side of the patch. The results have no derivatives.
     """
     xp = namespace(mesh, position)
     corners = mesh.points[mesh.facets]

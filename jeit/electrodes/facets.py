@@ -1,12 +1,12 @@
 """Electrodes that consist of boundary facets, and integrals over the part of a triangle that a rectangle covers.
 
 The integrals of P1 functions over the intersection of a triangle and a rectangle are exact, and differentiable in the
-coordinates of both.
+coordinates of triangle and rectangle.
 
-The triangle is clipped by moving the parts beyond a side of the rectangle onto the line of that side. Its closed
-outline remains closed: it surrounds the intersection once and otherwise runs back and forth along the side, which
-contributes nothing. Every triangle thus becomes a polygon with the same number of corners, which fit into one array,
-and the integrals follow from the corners.
+The triangle is clipped by moving the parts beyond a side of the rectangle onto the line of that side. The outline
+remains closed: it surrounds the intersection once and otherwise runs back and forth along the side, which contributes
+nothing. Every triangle thus becomes a polygon with the same number of corners, which fit into one array, and the
+integrals follow from the corners.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.mesh import facet_measures
 from jeit_solvers.engines import has_values, namespace, sum_into, undifferentiated, values_at_once
 
-# Covered fraction of a triangle below which the fraction counts as zero: such a fraction has few correct digits, which
-# would matter for small contact impedances.
+# Covered fraction of a triangle below which the fraction counts as zero: such a fraction has few correct digits, and
+# its errors would be amplified by small contact impedances.
 _MIN_COVERED_FRACTION = 1e-12
 
 
@@ -70,7 +70,7 @@ def covered_moments(
     mass = (mass + fan_areas.sum(axis=-1)[..., None, None] * corner.astype(coordinates.dtype)) / 12
     # For triangles that are barely touched, only rounding errors remain, which small contact impedances would amplify:
     # set the value to zero, but keep its derivative. The load is computed as the sum of the mass, since for small
-    # contact impedances any difference between them would drive currents.
+    # contact impedances any difference between load and mass would drive currents.
     mass = mass - undifferentiated(xp.where(mass.sum(axis=(-1, -2), keepdims=True) > _MIN_COVERED_FRACTION, 0, mass))
     mass = (mass + xp.swapaxes(mass, -1, -2)) / 2
     return mass.sum(axis=-1), mass
@@ -141,7 +141,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         )
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """Copy of the electrodes with other contact impedances, ohm·m² (ohm·m in 2-D). Raises `ValueError` for values
+        """Copy of the electrodes with new contact impedances, ohm·m² (ohm·m in 2-D). Raises `ValueError` for values
         that are not positive."""
         return replace_contact_impedance(self, contact_impedance)
 
@@ -183,7 +183,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` if the electrodes were made for a mesh whose number of boundary facets is not that of
+        """Raise `ValueError` if the electrodes were created for a mesh with a different number of boundary facets than
         `mesh`."""
         if self.covers.shape[0] != mesh.facets.shape[0]:
             raise ValueError(
@@ -193,7 +193,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
 
 
 def plates(mesh: Mesh, tags: Sequence[str], contact_impedance: ArrayLike) -> FacetElectrodes:
-    """Electrodes that cover whole tagged faces of a mesh.
+    """Create electrodes that cover whole tagged faces of a mesh.
 
     **Arguments:**
 
@@ -218,7 +218,7 @@ def plates(mesh: Mesh, tags: Sequence[str], contact_impedance: ArrayLike) -> Fac
 
 
 def electrodes_from_nodes(mesh: Mesh, nodes: Sequence, contact_impedance: ArrayLike) -> FacetElectrodes:
-    """Complete electrodes given by nodes: each electrode covers the boundary facets whose nodes all belong to it.
+    """Create complete electrodes from nodes: each electrode covers the boundary facets whose nodes all belong to it.
 
     For electrodes with one node each use `NodeElectrodes`.
 

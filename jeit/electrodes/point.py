@@ -151,7 +151,7 @@ class NodeElectrodes(AbstractPointElectrodes):
         return _point_contact(self.contact_nodes(mesh), sum_into((mesh.num_points, self.num_electrodes), index, ones))
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for an electrode whose node index is not one of `mesh`."""
+        """Raise `ValueError` for an electrode whose index is not that of a node of `mesh`."""
         if has_values(self.nodes) and int(self.nodes.max()) >= mesh.num_points:
             raise ValueError(
                 f"nodes: index {int(self.nodes.max())} is out of range for a mesh of {mesh.num_points} nodes; indices "

@@ -202,7 +202,7 @@ def read_surface_layout(path: str | Path, surface: Mesh, *, outward: bool = True
 
     The columns are `x_mm`, `y_mm`, `z_mm`, `diameter_mm` and optionally `label` and `contact_impedance_ohm_m2`, in the
     format of `read_layout`. Positions are moved to the surface. Raises `FileNotFoundError` if there is no such file,
-    and `ValueError` for an invalid table, naming the line, and in the same cases as `SurfaceLayout`.
+    and `ValueError` for an invalid table, naming the line, and as `SurfaceLayout` does.
 
     **Arguments:**
 

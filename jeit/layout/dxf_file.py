@@ -63,7 +63,7 @@ class _DxfPen:
 
 
 class _Entity(NamedTuple):
-    """An entity of a DXF drawing: its kind, and those of its values that are used, in the unit of the drawing."""
+    """An entity of a DXF drawing: its kind, and the values that are used for this kind, in the unit of the drawing."""
 
     kind: str
     circle: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -71,18 +71,19 @@ def write_layout(layout: Layout | SurfaceLayout, path: str | Path) -> None:
     """Write an electrode layout to a file, in millimetres. The suffix of the file determines the format, as in
     `read_layout`.
 
-    A layout that is read back differs by rounding only (below a millionth of a millimetre), except that a rectangle is
-    read as a polygon. DXF and SVG files contain a drawing to scale, with x to the right and y up. The lines to be cut
-    are on the layers (groups in SVG) `OUTLINE`, in red, and `ELECTRODES`, in blue; labels are on `LABELS`. Coordinates
-    y in an SVG file are minus those of the layout, since the y axis of SVG points down. A `SurfaceLayout` is written to
-    CSV only, with a column `z_mm`, and is read with `read_surface_layout`.
+    A layout that is read back differs from the written layout by rounding only (below a millionth of a millimetre),
+    except that a rectangle is read as a polygon. DXF and SVG files contain a drawing to scale, with x to the right and
+    y up. The lines to be cut are on the layers (groups in SVG) `OUTLINE`, in red, and `ELECTRODES`, in blue; labels are
+    on `LABELS`. The y coordinates in an SVG file are the negatives of the y coordinates in the layout, since the y axis
+    of SVG points down. A `SurfaceLayout` is written to CSV only, with a column `z_mm`, and is read with
+    `read_surface_layout`.
 
     **Arguments:**
 
     - `layout`: the layout.
     - `path`: the file, .csv, .dxf or .svg.
 
-    Raises `ValueError` for another suffix or a path that cannot be written; `ImportError` if the extra `cad` is
+    Raises `ValueError` for any other suffix or a path that cannot be written; `ImportError` if the extra `cad` is
     missing.
 
     **Example:**

@@ -19,7 +19,7 @@ from jeit_solvers.module import Module
 
 def check_labels(labels: Sequence[str] | None, num_electrodes: int) -> tuple[str, ...]:
     """Check the labels of `num_electrodes` electrodes and return them as a tuple; by default "1", "2", … Raises
-    `ValueError` for another number of labels, for invalid labels, and for labels that are repeated."""
+    `ValueError` for a wrong number of labels, for invalid labels, and for labels that are repeated."""
     if labels is None:
         return tuple(str(index + 1) for index in range(num_electrodes))
     labels = list(labels)
@@ -145,8 +145,8 @@ class Layout(Module):
     def sheet_discs(self, contact_impedance: ArrayLike | None = None) -> SheetDiscs:
         """Create the electrodes for a forward model on a sheet.
 
-        `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if the
-        contact impedance is neither given nor known from the layout.
+        `contact_impedance`: contact impedance, ohm·m², by default the layout's. Raises `ValueError` if the contact
+        impedance is neither specified nor known from the layout.
         """
         impedance = self.contact_impedance if contact_impedance is None else contact_impedance
         if impedance is None:

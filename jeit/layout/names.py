@@ -24,7 +24,7 @@ def ring(
     centre: tuple[float, float] = (0.0, 0.0),
     height: float | None = None,
 ) -> np.ndarray:
-    """Positions evenly spaced on a circle: (L, 2) metres, or (L, 3) at a given height (3-D tanks).
+    """Positions evenly spaced on a circle: (L, 2) metres, or (L, 3) if `height` is specified (3-D tanks).
 
     **Arguments:**
 
@@ -53,7 +53,7 @@ def ring(
 
 
 def ring_and_centre(radius: float, num_electrodes: int, **options: Any) -> np.ndarray:
-    """Positions of a `ring` of electrodes and, last, of one electrode in its centre: (num_electrodes + 1, d) metres.
+    """Positions of a `ring` of electrodes and, last, of one electrode at its centre: (num_electrodes + 1, d) metres.
     See `jeit.protocol.reference_electrode` for the use of the central electrode.
 
     **Arguments:**

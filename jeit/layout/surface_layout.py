@@ -41,8 +41,8 @@ def spread(
     """Positions on a surface, spread evenly over it: (L, 3) metres.
 
     The counterpart of `quasi_uniform` for surfaces: each position is the centroid of the part of the surface that is
-    closer to it than to any other position, by distances along the surface. The positions are computed by Lloyd's
-    algorithm, starting from farthest-point sampling, and are deterministic.
+    closer, along the surface, to this position than to any other. The positions are computed by Lloyd's algorithm,
+    starting from farthest-point sampling, and are deterministic.
 
     **Arguments:**
 
@@ -52,8 +52,8 @@ def spread(
     - `margin`: minimum distance of positions from the edge of the surface, metres.
     - `iterations`: maximum number of iterations.
 
-    Raises `ValueError` for fewer than one position, a margin that leaves no room for electrodes, and in the same cases
-    as `Triangles.of`.
+    Raises `ValueError` for fewer than one position, a margin that leaves no room for electrodes, and as `Triangles.of`
+    does.
 
     **Example:**
 
@@ -93,7 +93,8 @@ def spread(
 
 
 def _nearest_positions(triangles: Triangles, position: Float[np.ndarray, "L 3"]) -> np.ndarray:
-    """Index of the nearest position of each node, by the distance in space and the difference of their normals."""
+    """Index of the position nearest to each node, according to the distance in space and the difference of the
+    normals."""
     half_spacing = 0.5 * np.sqrt(triangles.areas.sum() / len(position))
     scaled_normals = half_spacing * triangles.normals[triangles.nearest(position).triangle]
     tree = KDTree(np.hstack([position, scaled_normals]))
@@ -107,7 +108,7 @@ def _initial_nodes(geodesics: Geodesics, usable: np.ndarray, weight: np.ndarray,
         probabilities = weight[usable] / weight.sum()
         return np.random.default_rng(0).choice(usable, number, replace=False, p=probabilities)
     points = geodesics.surface.points
-    # The first node is the one farthest from the centroid, so that the result depends on the surface only.
+    # The first node is the node farthest from the centroid, so that the result depends on the surface only.
     centroid = np.average(points[usable], axis=0, weights=weight[usable])
     nodes = [usable[np.linalg.norm(points[usable] - centroid, axis=1).round(9).argmax()]]
     distances = geodesics.distances(points[nodes[:1]])[0]
@@ -166,10 +167,10 @@ class SurfaceLayout(Module):
         """`diameters` and `contact_impedance` may be one value for all electrodes. Centres are moved to the nearest
         point of the surface, which must be within the radius of the electrode.
 
-        Raises `ValueError` for a mesh that is not a surface in space, for electrodes that are farther from the surface
-        than their radius, extend beyond its edge, are as large as its radius of curvature, or overlap, if labels are
-        repeated or not one for each electrode, and for a surface so small or so large that its lengths cannot be in
-        metres.
+        Raises `ValueError` for a mesh that is not a surface in space; for electrodes that are farther from the surface
+        than their radius, extend beyond the edge of the surface, are as large as its radius of curvature, or overlap;
+        if labels are repeated or not one for each electrode; and for a surface so small or so large that its lengths
+        cannot be in metres.
         """
         check_kind("surface", surface, Mesh, "a surface in space, such as jeit.mesh.tube(0.03, 0.15)")
         if not surface.is_surface:
@@ -231,10 +232,11 @@ class SurfaceLayout(Module):
         return Geodesics.create(self.surface).between(self.centres)
 
     def discs(self, contact_impedance: ArrayLike | None = None, *, sheet: bool = True) -> SurfaceDiscs | FaceDiscs:
-        """Create the electrodes for a forward model of the surface as a `sheet`, or else of a layer on the surface.
+        """Create the electrodes for a forward model of the surface as a sheet if `sheet` is True, otherwise of a layer
+        on the surface.
 
-        `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if the
-        contact impedance is neither given nor known from the layout.
+        `contact_impedance`: contact impedance, ohm·m², by default the layout's. Raises `ValueError` if the contact
+        impedance is neither specified nor known from the layout.
         """
         impedance = self.contact_impedance if contact_impedance is None else contact_impedance
         if impedance is None:
@@ -243,8 +245,8 @@ class SurfaceLayout(Module):
 
 
 def _check_apart(centres: np.ndarray, diameters: np.ndarray, labels: Sequence[str]) -> None:
-    """Raise `ValueError` for discs that overlap. Distances between discs are straight, since for discs that overlap
-    they hardly differ from distances along the surface."""
+    """Raise `ValueError` for discs that overlap. Straight-line distances are used, since for discs that overlap they
+    hardly differ from distances along the surface."""
     gaps = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
     np.fill_diagonal(gaps, np.inf)
     if gaps.min() < -_ROUNDING:

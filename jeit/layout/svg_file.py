@@ -64,7 +64,7 @@ def compose_transforms(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
 
 
 def transform_points(points, matrix: np.ndarray) -> np.ndarray:
-    """Apply the transform with the given `matrix` (2, 3) to points (k, 2)."""
+    """Apply the transform `matrix` (2, 3) to points (k, 2)."""
     return np.asarray(points, float).reshape(-1, 2) @ matrix[:, :2].T + matrix[:, 2]
 
 
@@ -182,7 +182,7 @@ _STRAIGHT_SHAPES = ("rect", "polygon", "polyline", "path")
 
 def write_svg(layout: Layout, file: BinaryIO) -> None:
     """Write an electrode layout as an SVG drawing. Layout and drawing have the same origin; the y axis of the drawing
-    points down, so y coordinates in the drawing are minus those of the layout."""
+    points down, so y coordinates in the drawing are the negatives of the y coordinates in the layout."""
     x_min, x_max, y_min, y_max = layout.extent
     view_left, view_top = millimetres(x_min - _MARGIN), millimetres(-y_max - _MARGIN)
     width, height = millimetres(x_max - x_min + 2 * _MARGIN), millimetres(y_max - y_min + 2 * _MARGIN)

@@ -2,7 +2,7 @@
 
 Outlines without a mesh: `Disk`, `Rectangle`, `Polygon`. Plane meshes: `disk`, `rectangle`, `polygon`, refined locally
 with `Refine`. Solids: `layer`, `box`, `cylinder`. Surfaces in space: `tube`, `forearm`, `sphere`, `cap`, `bend`, and
-`surface_of` a solid; `shell` gives a surface a thickness. Meshes from other sources: `Mesh.create`, `read`,
+`surface_of` a solid; `shell` thickens a surface to a solid. Meshes from other sources: `Mesh.create`, `read`,
 `from_gmsh`. Distances along a surface: `Geodesics`; its flattening: `unroll`. Measurements are made on a `Body`, which
 is an outline, a `Solid` or an `OwnMesh`.
 """

@@ -40,8 +40,8 @@ def first_crossing(points: np.ndarray, cells: np.ndarray) -> tuple[int, int] | N
 def _near_pairs(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
     """Yield pairs (p, 2) of triangles whose bounding boxes overlap, in batches.
 
-    Triangles are grouped by size and each group has its own search tree, so that a few large triangles do not widen the
-    search for all other triangles.
+    Triangles are grouped by size, and each group has its own search tree. A few large triangles then do not enlarge the
+    search radius of all other triangles.
     """
     centroids = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
@@ -58,7 +58,7 @@ def _near_pairs(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
             num_neighbours = np.fromiter(map(len, neighbours), int, len(neighbours))
             first = np.repeat(queried, num_neighbours)
             second = members[np.concatenate([np.asarray(indices, int) for indices in neighbours])]
-            # A pair of triangles of the same size class is found twice; keep it once.
+            # A pair of triangles of the same size class occurs twice; return it once.
             is_first_occurrence = np.where(size_class[first] == size_class[second], first < second, True)
             boxes_overlap = (lower_corners[first] <= upper_corners[second]).all(axis=1) & (
                 lower_corners[second] <= upper_corners[first]
@@ -127,7 +127,7 @@ def _pierces(start: np.ndarray, end: np.ndarray, corners: np.ndarray, tolerance:
 
 def _overlap_in_plane(first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:
     """Whether the two triangles with corners `first` and `second` (p, 3, 3) are coplanar and overlap, as booleans (p,).
-    Coplanar triangles do not overlap if the line through an edge of one of them separates them."""
+    Coplanar triangles do not overlap if the line through an edge of either triangle separates them."""
     normal = np.cross(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0])
     unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     height = np.einsum("pki,pi->pk", second - first[:, :1], unit)

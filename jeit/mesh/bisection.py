@@ -2,8 +2,8 @@
 that a size function allows, `cut` divides cells along a surface.
 
 An edge is split in all the cells around it, so the mesh stays conforming. `bisect` splits an edge at its midpoint, and
-only if it is the longest edge of every cell around it, so that cells keep their shape: Rivara, International Journal
-for Numerical Methods in Engineering 20 (1984) 745.
+only if it is the longest edge of every cell around it, so that repeated splitting does not make cells thin: Rivara,
+International Journal for Numerical Methods in Engineering 20 (1984) 745.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from jeit.arguments import check_kind, describe
 from jeit.mesh.checks import MOST_POINTS, size_checked
 from jeit.mesh.mesh import Mesh
 
-# Maximum distance from the end of an edge to the point where a surface crosses the edge, divided by the edge's length,
-# at which the end is moved onto the surface.
+# An end of an edge is moved onto a surface that crosses the edge if its distance from the crossing, divided by the
+# edge's length, is below this value.
 _MAX_MOVE = 0.25
-# Minimum volume of a cell after its nodes have moved, divided by its volume before.
+# Minimum volume of a cell after its nodes have moved, divided by its volume before the move.
 _MIN_VOLUME_RATIO = 0.1
 # Number of bisection steps to locate the point where a surface crosses an edge.
 _BISECTION_STEPS = 30
@@ -31,16 +31,16 @@ _BISECTION_STEPS = 30
 def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.ndarray, " m"]]) -> Mesh:
     """Refine a mesh until no cell's longest edge exceeds the length that `size` allows.
 
-    Neighbouring cells are divided as needed to keep the mesh conforming. Tags are kept, and the boundary keeps its
-    shape.
+    Neighbouring cells are divided as needed to keep the mesh conforming. The new mesh has the same tags, and its
+    boundary has the same shape.
 
     **Arguments:**
 
     - `mesh`: the mesh to refine.
     - `size`: function of the corners of cells (m, k, s), metres, that returns the maximum length of the longest edge of
-      each cell (m,), metres; infinity leaves a cell as it is.
+      each cell (m,), metres; infinity leaves a cell unchanged.
 
-    Raises `ValueError` if `size` does not return one positive number per cell, or asks for more than 2,000,000 nodes.
+    Raises `ValueError` if `size` does not return one positive number per cell, or requires more than 2,000,000 nodes.
 
     **Example:**
 
@@ -53,8 +53,8 @@ def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.nda
 
 
 def bisect_with_parents(mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]]) -> tuple[Mesh, Int[np.ndarray, " m"]]:
-    """Refine a mesh as `bisect` does. Also returns, for each cell of the new mesh, the index of the cell of the given
-    mesh that contains it. Raises `ValueError` as `bisect` does."""
+    """Refine a mesh as `bisect` does. Also returns, for each cell of the new mesh, the index of the cell of the
+    original mesh that contains it. Raises `ValueError` as `bisect` does."""
     split_mesh = _SplitMesh.from_mesh(mesh)
     parent = np.arange(len(split_mesh.cells))
     exceeds_size = _exceeds_size(split_mesh, slice(None), size)
@@ -171,8 +171,9 @@ def _exceeds_size(split_mesh: _SplitMesh, selected_cells, size) -> Bool[np.ndarr
 
 
 def _move_nodes_onto(split_mesh: _SplitMesh, level) -> tuple[_SplitMesh, Float[np.ndarray, " n"]]:
-    """Move nodes that are near the surface `level` = 0 onto this surface, along edges. Nodes of the boundary stay, and
-    nodes whose movement would leave a cell with hardly any volume. Also returns the values of `level` at all nodes."""
+    """Move nodes that are near the surface `level` = 0 onto this surface, along edges. Nodes of the boundary are not
+    moved, nor are nodes whose movement would reduce the volume of a cell to less than `_MIN_VOLUME_RATIO` times its
+    value. Also returns the values of `level` at all nodes."""
     points, cells = split_mesh.points, split_mesh.cells
     levels = np.asarray(level(points))
     if levels.shape != (len(points),) or not np.isfinite(levels).all():
@@ -242,12 +243,13 @@ def _longest_edge_lengths(points, cells) -> Float[np.ndarray, " m"]:
 
 
 def _longest_edge_of_cell(edge_indices, rank) -> Int[np.ndarray, " m"]:
-    """Index of the longest edge of each cell, by the ranks of the edges."""
+    """Index of the longest edge of each cell, determined from the ranks of the edges by length."""
     return np.take_along_axis(edge_indices, np.argmax(rank[edge_indices], axis=1)[:, None], axis=1)[:, 0]
 
 
 def _is_longest_around(edge_indices, rank) -> Bool[np.ndarray, " e"]:
-    """Whether each edge is the longest edge of every cell that contains it, by the ranks of the edges."""
+    """Whether each edge is the longest edge of every cell that contains it, according to the ranks of the edges by
+    length."""
     return np.bincount(_longest_edge_of_cell(edge_indices, rank), minlength=len(rank)) == np.bincount(
         edge_indices.ravel(), minlength=len(rank)
     )

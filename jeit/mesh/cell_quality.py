@@ -22,7 +22,7 @@ class Quality(Module):
     **Fields**: `dimension`: 2 for triangles, 3 for tetrahedra; `num_points`: number of nodes; `smallest_angle` (m,):
     the smallest angle of a triangle, or the smallest angle between two faces of a tetrahedron, degrees; `radius_ratio`
     (m,): `dimension` times the radius of the inscribed circle or sphere divided by the radius of the circumscribed
-    circle or sphere, from 0 for a flat cell to 1 for a regular one; `shortest_edge`, `longest_edge` (m,): lengths in
+    circle or sphere, from 0 for a flat cell to 1 for a regular cell; `shortest_edge`, `longest_edge` (m,): lengths in
     metres.
 
     **Example:**
@@ -113,7 +113,7 @@ def _tetrahedron_measures(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def merge_points(points: np.ndarray, cells: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     """Merge points (n, d) closer than `tolerance` metres to each other, and renumber the cells (m, k).
 
-    The first point of each group is kept. Cells with two merged corners are removed.
+    Each group of such points is replaced by its first point. Cells with two corners in the same group are removed.
     """
     close_pairs = KDTree(points).query_pairs(tolerance, output_type="ndarray")
     graph = coo_array((np.ones(len(close_pairs)), close_pairs.T), shape=(len(points), len(points)))

@@ -15,10 +15,10 @@ from scipy.spatial import KDTree
 
 from jeit.mesh import topology
 
-# Minimum area of a cell divided by the square of its longest edge, or minimum volume divided by the cube: gradients on
-# flatter cells are inaccurate in double precision.
+# Minimum area of a cell divided by the square of its longest edge, or minimum volume divided by the cube of its longest
+# edge. Gradients on flatter cells are inaccurate in double precision.
 _MIN_MEASURE = 1e-10
-# Nodes whose distance, relative to the extent of the mesh, is at most this are treated as coincident.
+# Maximum distance between two nodes, relative to the extent of the mesh, at which they are treated as coincident.
 _COINCIDENT_DISTANCE = 1e-10
 # Maximum number of nodes: the three node numbers of a facet are packed into one 64-bit integer.
 MOST_POINTS = 2_000_000
@@ -187,14 +187,14 @@ def _match_facets(name: str, nodes: np.ndarray, facets: np.ndarray) -> np.ndarra
 
 
 LARGE = 10.0
-"""Size in metres above which a warning is given: no tank or skin is larger."""
+"""Size in metres above which a warning is issued: no tank or skin is larger."""
 _SIZE_CHECKED: ContextVar[bool] = ContextVar("size_checked", default=False)
 
 
 @contextmanager
 def size_checked() -> Iterator[None]:
-    """Context manager or decorator that suppresses warnings about large sizes, for meshes made from a body or another
-    mesh whose size has been checked before."""
+    """Context manager or decorator that suppresses warnings about large sizes, for meshes created from a body or mesh
+    whose size has already been checked."""
     token = _SIZE_CHECKED.set(True)
     try:
         yield
@@ -203,10 +203,10 @@ def size_checked() -> Iterator[None]:
 
 
 def warn_large(extent: float, name: str, size_factor: float = 1.0, *, of_file: bool = False) -> None:
-    """Warn if a length of `extent` metres is probably in another unit, because the object is too large.
+    """Warn if an object is so large that its length of `extent` metres was probably specified in a different unit.
 
-    `size_factor`: size of the object divided by `extent`; `of_file`: whether the length may come from a file, for which
-    the message suggests a scale. Inside `size_checked` there is no warning.
+    `size_factor`: size of the object divided by `extent`; `of_file`: whether the length may come from a file; if so,
+    the message suggests a scale. No warning is issued inside `size_checked`.
     """
     if not size_factor * extent > LARGE or _SIZE_CHECKED.get():
         return

@@ -49,13 +49,14 @@ FORMATS = {
 # Memory needed to read a mesh, divided by the size of its file.
 _MEMORY_FACTOR = 4
 _INCLUDE = re.compile(rb"^[ \t]*\*[ \t]*include", re.IGNORECASE | re.MULTILINE)
-# First pattern: sets in an Abaqus file that are given by their first and last number. Second pattern: counts in a VTK
-# file, including the numbers of grid points along each axis.
+# First pattern: sets in an Abaqus file that are specified by their first and last number. Second pattern: counts in a
+# VTK file, including the numbers of grid points along each axis.
 _GENERATED_SET = re.compile(rb"^[ \t]*\*.*generate", re.IGNORECASE | re.MULTILINE)
 _VTK_COUNTS = re.compile(
     rb"^[ \t]*(DIMENSIONS|POINTS|CELLS|CELL_TYPES|\w+_COORDINATES)((?:[ \t]+\d+)+)", re.IGNORECASE | re.MULTILINE
 )
-# In a .msh file: sections that start with a count, integers of at least eight digits, and the layout of a binary node.
+# For .msh files: patterns of sections that start with a count and of integers of at least eight digits, and the layout
+# of a binary node.
 _MSH_COUNTS = re.compile(rb"^\$(Nodes|Elements|PhysicalNames)\s*?\n\s*(\d+)\r?\n", re.MULTILINE)
 _LONG_INTEGER = re.compile(rb"(?<![\w.+-])\d{8,}(?![\d.eE])")
 _MSH_NODE = np.dtype([("number", "<i4"), ("place", "<f8", 3)])
@@ -222,7 +223,7 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
     - `path`: the file.
     - `scale`: length of the file's unit in metres: 1e-3 for millimetres, 0.0254 for inches.
     - `trusted`: whether to read all formats of meshio without checks, including files that the file refers to. By
-      default only the file itself is read, within the memory limit (environment variable JEIT_FILE_GB).
+      default only the file itself is read, and only if it fits the memory limit (environment variable JEIT_FILE_GB).
 
     Raises `FileNotFoundError` if the file does not exist. Raises `ValueError` if the file is not a mesh file, refers to
     other files, or contains cells other than linear triangles or tetrahedra, or a mesh that `Mesh.create` rejects.
@@ -260,20 +261,20 @@ def write(
     cell_data: Mapping[str, ArrayLike] | None = None,
     point_data: Mapping[str, ArrayLike] | None = None,
 ) -> None:
-    """Write a mesh, with its tags or with values per cell and per node, in the format given by the file name's
-    extension.
+    """Write a mesh, with its tags or with values per cell and per node. The extension of the file name determines the
+    format.
 
-    `.msh` files (Gmsh 2.2) keep the tags, as physical groups, and values per node, but not values per cell; other
-    formats keep values per node and per cell, but not the tags. Plane meshes are written at z = 0.
+    `.msh` files (Gmsh 2.2) contain the tags, as physical groups, and values per node, but not values per cell. Files of
+    other formats contain values per node and per cell, but not the tags. Plane meshes are written at z = 0.
 
     **Arguments:**
 
     - `mesh`: the mesh.
-    - `path`: the file; its extension gives the format.
+    - `path`: the file; its extension determines the format.
     - `cell_data`: values per cell (m, …), by name.
     - `point_data`: values per node (n, …), by name.
 
-    Raises `ValueError` for an unknown format, and for values that are complex or of the wrong number.
+    Raises `ValueError` for an unknown format, and for values that are complex or whose number does not match the mesh.
 
     **Example:**
 
@@ -329,8 +330,8 @@ def _check_data(argument: str, name: str, value: ArrayLike, length: int) -> np.n
 
 
 def _call_meshio(path: Path, action: Any, *, writing: bool = False) -> Any:
-    """Call `action` with the module meshio as its argument, and raise `ValueError` where meshio prints a message or
-    exits the interpreter."""
+    """Call `action` with the module meshio as its argument. Exceptions other than `OSError`, and exits of the
+    interpreter, are converted to `ValueError`; what meshio prints is captured for the message."""
     import meshio  # takes a tenth of a second
 
     output = io.StringIO()
@@ -383,7 +384,7 @@ def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
     points = points[used_points]
     new_index = np.full(len(content.points), -1)
     new_index[used_points] = np.arange(len(used_points))
-    # The cells are not yet oriented, so boundary facets are found as the facets that occur once.
+    # The cells are not yet oriented, so boundary facets are identified as the facets that occur once.
     keys, occurrences = np.unique(
         topology.facet_keys(topology.cell_facets(cells), len(used_points)), return_counts=True
     )

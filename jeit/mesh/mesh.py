@@ -96,7 +96,7 @@ class Mesh(Module):
 
         **Arguments**: `points` (n, 2) or (n, 3): coordinates in metres; `cells`: zero-based node indices of triangles
         (m, 3), in the plane or in space, or of tetrahedra (m, 4), in either orientation; `tags`: names of groups of
-        boundary facets, each given by the facets' nodes, (t, d) integers in any order, or by indices (t,) into the
+        boundary facets, each specified by the facets' nodes, (t, d) integers in any order, or by indices (t,) into the
         resulting `facets`.
 
         In 2-D each loop of `facets` starts at its node of the lowest index; the outer loop runs counter-clockwise,
@@ -146,7 +146,8 @@ def check_flat(mesh: Mesh, what: str) -> None:
     **Arguments:**
 
     - `mesh`: any mesh.
-    - `what`: plural noun in the error message for what requires a flat sheet or a solid, such as "rasters".
+    - `what`: plural noun for the error message that names the objects that require a flat sheet or a solid, such as
+      "rasters".
 
     **Example:**
 
@@ -188,7 +189,7 @@ def measures(mesh: Mesh) -> Float[Array, " m"]:
 @either_engine
 def gradients(mesh: Mesh) -> Float[Array, "m k s"]:
     """Gradients (m, d + 1, s), in 1/m, of the d + 1 linear basis functions on every cell, where d is the dimension of
-    the cells and s that of the space.
+    the cells and s the dimension of the space.
 
     φ_i is 1 at node i of the cell and 0 at its other nodes. With E the matrix of edges x_i − x_0, the gradients of φ_1
     … φ_d are the columns of E⁻¹, and the gradient of φ_0 is minus their sum. E⁻¹ is computed from cross products of

@@ -1,9 +1,9 @@
 """Meshes of solids whose cells are smallest at the planes that contain edges of electrodes, because the current density
 is unbounded at the edges of electrodes.
 
-Along each axis, the cells at the planes are a twentieth of the largest ones (`_SMALLEST_CELL`) and grow away from the
-planes, up to a maximum size that follows from the number of nodes. A box is graded along x, y and z; a solid above any
-other outline is graded along z, and its plane mesh is refined separately.
+Along each axis, the cell size at the planes is a twentieth of the largest cell size (`_SMALLEST_CELL`) and increases
+away from the planes, up to a maximum size that follows from the number of nodes. A box is graded along x, y and z; a
+solid above any other outline is graded along z, and its plane mesh is refined separately.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Disk, Domain, Rectangle
 from jeit.mesh.solids import layer
 
-# Size of the cells at the planes divided by that of the largest cells, and growth of the cell size per length away from
-# a plane.
+# Size of the cells at the planes divided by the size of the largest cells, and increase of the cell size per unit of
+# distance from a plane.
 _SMALLEST_CELL, _CELL_GROWTH = 0.05, 0.8
 # Distance between two planes, relative to the size of the body, below which they are merged.
 _MERGE_DISTANCE = 1e-4
@@ -113,8 +113,8 @@ def _divide_axis(stops: Float[np.ndarray, " s"], max_size: float) -> Float[np.nd
 
 
 def _largest_cell_size(count_nodes: Callable[[float], float], num_points: int, max_size: float) -> float:
-    """Size of the largest cells for which a mesh has about `num_points` nodes; `max_size` if even cells of that size
-    give more nodes."""
+    """Size of the largest cells for which a mesh has about `num_points` nodes; `max_size` if even a mesh with cells of
+    this size has more nodes."""
     if count_nodes(max_size) >= num_points:
         return max_size
     cell_size: Any = brentq(

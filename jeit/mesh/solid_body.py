@@ -59,7 +59,7 @@ class Solid(Body):
     def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Refinement = None) -> Mesh:
         """Mesh the solid with layers of tetrahedra that are about as high as the cells of the outline's mesh are wide.
 
-        The mesh has the tags 'bottom', 'top', 'side', and those of the outline's mesh. Raises `ValueError` as
+        The mesh has the tags 'bottom', 'top', 'side', and the tags of the outline's mesh. Raises `ValueError` as
         `jeit.mesh.box` does.
         """
         from jeit.mesh.solids import base_counter, choose_layers, layer
@@ -73,7 +73,7 @@ class Solid(Body):
 
 
 class OwnMesh(Body):
-    """A body given as a mesh, which is used without remeshing.
+    """A body defined by an existing mesh, which is used without remeshing.
 
     **Arguments:**
 
@@ -121,7 +121,7 @@ class OwnMesh(Body):
         }
 
     def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Refinement = None) -> Mesh:
-        """The given mesh; all arguments are ignored."""
+        """Return the stored mesh; all arguments are ignored."""
         return self.given
 
 

@@ -39,7 +39,7 @@ def disk(
     - `num_points`: number of nodes, met within about 5 % (default 1,200); or `cell_size`: edge length in metres.
     - `centre` (x, y): centre of the disk in metres.
     - `refine`: one or several `Refine`, or a function that takes points (p, 2) and returns the requested edge lengths
-      there (p,) in metres, which are scaled by a common factor if `num_points` is given.
+      (p,) at these points in metres. If `num_points` is specified, the lengths are scaled by a common factor.
     - `num_boundary`: number of nodes on the circle; the cells grow from the circle inwards.
     - `boundary_points`: angles in radians at which nodes are placed.
     - `interior_points` (k, 2): positions in metres at which nodes are placed.
@@ -181,11 +181,11 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
     """Extrude a plane mesh to a plate from z = 0 to `thickness`; the prism above each triangle is divided into three
     tetrahedra.
 
-    With n nodes in the plane mesh, node k · n + i is its node i at the height z = k · thickness / num_layers, or at the
-    k-th of `heights`. Tags: 'bottom' (z = 0), 'top' (z = thickness), 'side', and the tags of the plane mesh for the
-    parts of the side above its edges; tags 'bottom' and 'top' of the plane mesh are renamed to 'front' and 'back'.
-    Every side face of a prism is divided along the diagonal that rises from its lower-numbered to its higher-numbered
-    node, so that the tetrahedra of neighbouring prisms match.
+    With n nodes in the plane mesh, node k · n + i is node i of the plane mesh at the height z = k · thickness /
+    num_layers, or at the k-th of `heights`. Tags: 'bottom' (z = 0), 'top' (z = thickness), 'side', and the tags of the
+    plane mesh for the parts of the side above its edges; tags 'bottom' and 'top' of the plane mesh are renamed to
+    'front' and 'back'. Every side face of a prism is divided along the diagonal that rises from its lower-numbered to
+    its higher-numbered node, so that the tetrahedra of neighbouring prisms match.
 
     **Arguments:**
 
@@ -339,14 +339,14 @@ def cylinder(
 
 
 def base_counter(area: float, height: float, num_layers: int | None) -> Callable[[int], int]:
-    """Function that returns how many nodes the base of a solid has, given the number of nodes of the solid."""
+    """Return a function that computes the number of nodes of a solid's base from the number of nodes of the solid."""
     return lambda num_points: choose_layers(area, height, num_points, None, num_layers)[0] or num_points
 
 
 def choose_layers(
     area: float, height: float, num_points: int | None, cell_size: float | None, num_layers: int | None
 ) -> tuple[int | None, int]:
-    """Number of nodes of the base of `area` m² (None if a cell size is given), and number of layers up to `height`
+    """Number of nodes of the base of `area` m² (None if a cell size is specified), and number of layers up to `height`
     metres."""
     target = unstructured.Target.create(num_points, cell_size)
     if num_layers is not None:

@@ -151,7 +151,7 @@ def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray
 
 
 def check_apart(outer: np.ndarray, holes: Sequence[np.ndarray]) -> None:
-    """Raise `ValueError` unless every hole lies inside the outline and separate from the other holes."""
+    """Raise `ValueError` unless every hole lies inside the outline and is separate from the other holes."""
     for k, hole in enumerate(holes):
         if not inside(hole, [outer]).all() or _touches(hole, outer):
             raise ValueError(f"holes[{k}]: does not lie strictly inside the outline. Move or shrink it.")
@@ -196,8 +196,8 @@ def _signed_area_of_corner(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.nd
 
 
 def _intersecting_sides(first: np.ndarray, second: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
-    """Yield, in order and in batches, pairs (p, 2) of a side of the first loop and a side of the second that cross or
-    come within `tolerance` of each other. Only sides whose bounding boxes overlap are tested."""
+    """Yield, in order and in batches, pairs (p, 2) of a side of the first loop and a side of the second loop that cross
+    or come within `tolerance` of each other. Only sides whose bounding boxes overlap are tested."""
     a, b, c, d = first, np.roll(first, -1, axis=0), second, np.roll(second, -1, axis=0)
     lower_corners, upper_corners = np.minimum(a, b) - tolerance, np.maximum(a, b) + tolerance
     other_lower_corners, other_upper_corners = np.minimum(c, d), np.maximum(c, d)

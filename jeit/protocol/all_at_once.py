@@ -47,7 +47,7 @@ def measurement_patterns(num_electrodes: int, measurement: Reading, reference: i
     - `reference`: reference electrode of "against".
 
     Raises `ValueError` for an invalid number of electrodes or option, for a `reference` that is not an electrode, and
-    for a `reference` with another `measurement` than "against".
+    for a `reference` if `measurement` is not "against".
 
     **Example:**
 
@@ -79,7 +79,7 @@ def from_matrices(
     large_currents: bool = False,
 ) -> Protocol:
     """Create a protocol that combines every drive pattern with every measurement pattern. Channels are in the order of
-    `select.ravel()`: all measurements of the first drive, then all of the second, and so on.
+    `select.ravel()`: all measurements of the first drive, then all measurements of the second drive, and so on.
 
     **Arguments:**
 
@@ -87,10 +87,10 @@ def from_matrices(
     - `measurement` (K, L): weights of the electrode potentials, one row per measurement pattern.
     - `select` (S, K): True for the combinations of drive and measurement pattern that are measured; by default all.
     - `name`: name in reports.
-    - `large_currents`: accept currents above 1 A, which are otherwise taken for an error of units.
+    - `large_currents`: accept currents above 1 A, which are otherwise rejected as probable errors of units.
 
     Raises `ValueError` for patterns that `Protocol` rejects, currents above 1 A (unless `large_currents`), and a
-    `select` of another shape than (S, K).
+    `select` whose shape is not (S, K).
 
     **Example:**
 
@@ -132,10 +132,10 @@ def from_channels(
       once.
     - `drive_index` (M,): 0-based index of the drive of each channel.
     - `name`: name in reports.
-    - `large_currents`: accept currents above 1 A, which are otherwise taken for an error of units.
+    - `large_currents`: accept currents above 1 A, which are otherwise rejected as probable errors of units.
 
     Raises `ValueError` for patterns that `Protocol` rejects, currents above 1 A (unless `large_currents`), and a
-    `drive_index` of another length than M.
+    `drive_index` whose length is not M.
 
     **Example:**
 
@@ -197,8 +197,8 @@ def trigonometric(
 
     The drives are cos(θ), sin(θ), cos(2θ), sin(2θ), ... with θ = 2πl/L at electrode l. These patterns best distinguish
     a disk with a centred inclusion from a homogeneous disk (Isaacson 1986; Gisser, Isaacson and Newell 1988). 16
-    electrodes give 240 channels. On a solid, θ still follows the electrodes' numbers; the drives are then complete, but
-    not optimal.
+    electrodes give 240 channels. On a solid, θ still follows the electrodes' numbers; the drives then still determine
+    the transfer impedance, but are not optimal.
 
     **Arguments:**
 
@@ -282,16 +282,16 @@ def optimal(
       (`ForwardModel.transfer_impedance`, or measured: `jeit.data.transfer_impedance`). Without `other`, the drives are
       the eigenvectors of `transfer`.
     - `number`: maximum number of drives, by default L - 1; if Z₁ - Z₂ has a lower rank, there are fewer drives.
-    - `power`: if given, in watts, the drives I maximise ‖(Z₁ - Z₂) I‖ for fixed power Iᵀ Z₁ I (Cheney and Isaacson
+    - `power`: if specified, in watts, the drives I maximise ‖(Z₁ - Z₂) I‖ for fixed power Iᵀ Z₁ I (Cheney and Isaacson
       1992), and each drive dissipates `power` in the first body. `power` requires `other`, and `current` is then not
       used.
     - `measurement`, `reference`: as in `measurement_patterns`.
-    - `current`: unless `power` is given, the drives I maximise ‖(Z₁ - Z₂) I‖ for fixed ‖I‖. These drives are singular
-      vectors of Z₁ - Z₂ (Isaacson 1986; Gisser, Isaacson and Newell 1990), each scaled so that the maximum current of
-      an electrode is `current` amperes.
+    - `current`: unless `power` is specified, the drives I maximise ‖(Z₁ - Z₂) I‖ for fixed ‖I‖. These drives are
+      singular vectors of Z₁ - Z₂ (Isaacson 1986; Gisser, Isaacson and Newell 1990), each scaled so that the maximum
+      current of an electrode is `current` amperes.
 
     Raises `ValueError` for matrices that are not square, real, finite, and symmetric to within a tenth; for equal
-    matrices; if `power` is given and some currents dissipate no power in `transfer`; and for invalid options.
+    matrices; if `power` is specified and some currents dissipate no power in `transfer`; and for invalid options.
 
     **Example:**
 

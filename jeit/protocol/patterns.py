@@ -1,7 +1,7 @@
 """Protocols with drive and measurement patterns that are pairs of electrodes.
 
 Electrodes are counted from 0. For each drive pair, `+current` enters at the first electrode and leaves at the second.
-The voltage of each measurement pair is the potential of the first electrode minus that of the second.
+The voltage of each measurement pair is the potential of the first electrode minus the potential of the second.
 """
 
 from __future__ import annotations
@@ -125,8 +125,8 @@ def adjacent(
     - `num_electrodes`: number of electrodes L, at least 4.
     - `current`: amplitude in amperes.
     - `driven_electrodes`: whether to measure also on electrodes that carry current (L² channels).
-    - `reciprocal`: "half" keeps the first of every two channels that are equal by reciprocity, "all" keeps both
-      channels.
+    - `reciprocal`: "half" measures only the first of every two channels that are equal by reciprocity, "all" measures
+      both channels.
     - `order`: "rotating" starts the measurements of each drive at the driven pair, "fixed" starts them at electrode 0.
 
     Raises `ValueError` for an invalid number of electrodes, current or option.
@@ -162,7 +162,7 @@ def skip(
 
     **Arguments:**
 
-    - `skipped`: number of electrodes between the two driven ones.
+    - `skipped`: number of electrodes between the two driven electrodes.
     - `measurement_skipped`: number of electrodes between the two measured electrodes, by default `skipped`.
     - `num_electrodes`, `current`, `driven_electrodes`, `reciprocal`, `order`: as in `adjacent`.
 
@@ -255,8 +255,8 @@ def all_against_one(
     - `common`: index of the electrode against which all others are driven.
     - `measurement`: "common" also measures every electrode against `common` ((L - 1)² channels, all of which use a
       driven electrode); "adjacent" measures pairs of neighbouring electrodes.
-    - `driven_electrodes`: whether to measure also on electrodes that carry current. Default True for
-      `measurement="common"`, which requires True, else False.
+    - `driven_electrodes`: whether to measure also on electrodes that carry current. The default is True for
+      `measurement="common"`, which requires True, and False otherwise.
 
     Raises `ValueError` if `common` is not an electrode, for `measurement="common"` with `driven_electrodes=False`, and
     as `adjacent` does.
@@ -300,7 +300,7 @@ def reference_electrode(
     **Arguments:**
 
     - `num_boundary`: number of boundary electrodes, at least 4.
-    - `skipped`: number of electrodes between the two driven ones.
+    - `skipped`: number of electrodes between the two driven electrodes.
     - `reference`: index of the reference electrode among the `num_boundary + 1` electrodes; by default the last.
     - `current`, `driven_electrodes`, `order`: as in `adjacent`.
 
@@ -346,7 +346,7 @@ def two_terminal(
     - `pairs` (P, 2): indices of electrodes from 0; by default all L(L - 1)/2 pairs.
     - `current`: amplitude in amperes.
 
-    Raises `ValueError` if a pair contains an electrode twice, or one that does not exist.
+    Raises `ValueError` if a pair contains an electrode twice, or an electrode that does not exist.
 
     **Example:**
 
@@ -388,7 +388,7 @@ def bipolar(
     - `drive_pairs` (S, 2), `measurement_pairs` (K, 2): indices of electrodes from 0, the positive electrode first.
     - `name`: name of the protocol in reports.
 
-    Raises `ValueError` if a pair contains an electrode twice, or one that does not exist.
+    Raises `ValueError` if a pair contains an electrode twice, or an electrode that does not exist.
 
     **Example:**
 

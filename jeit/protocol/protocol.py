@@ -55,7 +55,7 @@ def check_patterns(patterns, pattern_kind: str) -> None:
 
 
 def check_indices(index, num_patterns: int, name: str, pattern_kind: str) -> None:
-    """Raise `ValueError` unless `index` (M,) holds 0-based indices of patterns, as integers below `num_patterns`."""
+    """Raise `ValueError` unless `index` (M,) contains 0-based indices of patterns, as integers below `num_patterns`."""
     if index.ndim != 1 or index.shape[0] == 0:
         raise ValueError(
             f"Protocol: {name} has shape {tuple(index.shape)}; give one integer per channel, at least one."
@@ -120,7 +120,7 @@ def electrode_indices(electrodes, num_electrodes: int) -> np.ndarray:
 
 
 def check_pairs(pairs, num_electrodes: int, argument_name: str) -> np.ndarray:
-    """Return electrode pairs (P, 2) as 0-based indices. Raises `ValueError` for arrays of another shape or type,
+    """Return electrode pairs (P, 2) as 0-based indices. Raises `ValueError` for arrays of a different shape or type,
     electrodes that do not exist, and an electrode paired with itself."""
     values = np.asarray(pairs)
     if values.ndim != 2 or values.shape[1] != 2 or values.shape[0] == 0 or values.dtype.kind not in "iu":
@@ -270,10 +270,11 @@ class Protocol(Module):
         return shared[np.asarray(self.drive_index), np.asarray(self.measurement_index)]
 
     def subset(self, keep: ArrayLike) -> "Protocol":
-        """Protocol with only the channels `keep`, and the drive and measurement patterns that they use.
+        """Create a protocol with only the channels selected by `keep`, and the drive and measurement patterns that they
+        use.
 
         `keep` is a boolean mask (M,) or a sequence of channel indices; the corresponding voltages are `voltages[...,
-        keep]`. Raises `ValueError` for a mask of another length, or if no channel is kept.
+        keep]`. Raises `ValueError` for a mask of a wrong length, or if no channel is selected.
         """
         channels = np.asarray(keep)
         if channels.dtype == bool:
@@ -302,14 +303,14 @@ class Protocol(Module):
         )
 
     def repeated_facts(self, channels: ArrayLike | None = None) -> int:
-        """Number of redundant channels: channels whose measurement patterns are linear combinations of those of other
-        channels of the same drive.
+        """Number of redundant channels: channels whose measurement patterns are linear combinations of the measurement
+        patterns of other channels of the same drive.
 
         `channels` (K,): indices of the channels that are considered, by default all. If L voltages are computed from
         the potentials of many electrodes, for example by subtracting the mean potential, they contain L - 1 independent
-        values with L - 1 independent noises. If all measurements of a drive are differences of two electrodes, they are
-        assumed to be measured one by one with independent noise, even if the pairs form a ring, and no channel of this
-        drive is counted.
+        values with L - 1 independent noise values. If all measurements of a drive are differences of two electrodes,
+        they are assumed to be measured one by one with independent noise, even if the pairs form a ring. No channel of
+        such a drive is counted.
         """
         rows = np.asarray(self.measurement)
         used_channels = np.arange(self.num_measurements) if channels is None else np.asarray(channels)
@@ -336,7 +337,7 @@ class Protocol(Module):
 
         Returns `pairs` (P, 2) and `ratio` (P,) such that `v[pairs[:, 1]] = ratio * v[pairs[:, 0]]` for any body without
         magnetic bias. In each pair, the drive pattern of either channel is proportional to the measurement pattern of
-        the other. Some protocols have no such pairs, for example opposite drive with adjacent measurement. See
+        the other channel. Some protocols have no such pairs, for example opposite drive with adjacent measurement. See
         `jeit.protocol.reciprocity` for reciprocity between combinations of channels.
         """
         return reciprocal_channel_pairs(

@@ -1,4 +1,5 @@
-"""Reciprocity: driving at a and measuring at b gives the same voltage as driving at b and measuring at a.
+"""Reciprocity: driving at electrodes a and measuring at electrodes b yields the same voltage as driving at b and
+measuring at a.
 
 The transfer impedance S (L, L) of any body with (symmetric) conductivity is symmetric: `m @ S @ d = d @ S @ m` for a
 drive pattern d and a measurement pattern m. Therefore, if two channels (d, m) and (d', m') satisfy d' = a m and m' = b
@@ -55,15 +56,15 @@ def transfer_between_drives(
     mask: np.ndarray,
     deviation: np.ndarray | None = None,
 ) -> tuple[Inexact[np.ndarray, "F S S"], Bool[np.ndarray, "S S"], Float[np.ndarray, "S S"]]:
-    """Voltage that every drive pattern, used as a measurement pattern, would measure while each drive flows: a
-    symmetric matrix for any body.
+    """Compute the voltage that every drive pattern, used as a measurement pattern, would measure while the currents of
+    each drive flow: a symmetric matrix for any body.
 
     `voltages` (F, M): voltages of F frames and M channels, volts; `mask` (M,): True for usable channels; `deviation`
     (M,): standard deviation of the independent noise of each channel, volts, by default one; the other arguments are
     those of `Protocol`. Returns, for S drive patterns:
 
     - `transfer` (F, S, S), watts: `drive[i] @ Z @ drive[j]` in entry (i, j), combined from the channels measured while
-      drive j flows(Z: transfer impedance). For example, the voltage of a skip-1 pair is the sum of those of two
+      drive j flows (Z: transfer impedance). For example, the voltage of a skip-1 pair is the sum of the voltages of two
       adjacent pairs.
     - `is_known` (S, S): whether drive i is a linear combination of the measurement patterns of drive j.
     - `noise` (S, S), watts: standard deviation of each entry of `transfer`.
@@ -79,7 +80,7 @@ def transfer_between_drives(
         if channels.size == 0:
             continue
         rows, scale = measurement[measurement_index[channels]], deviation[channels]
-        # Among all combinations of channels that equal a drive, choose the one with the least noise.
+        # Among all combinations of channels that equal a drive, choose the combination with the least noise.
         combination = drive @ np.linalg.pinv(rows / scale[:, None], rcond=1e-10) / scale
         is_known[:, drive_number] = np.linalg.norm(combination @ rows - drive, axis=1) <= 1e-8 * drive_norms
         transfer[:, :, drive_number] = voltages[:, channels] @ combination.T

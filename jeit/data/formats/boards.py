@@ -1,7 +1,7 @@
 """Readers of the text that boards send over a serial line: Analog Devices' CN0565 kit and OpenEIT devices.
 
-The last frame of a recording may be cut off, and is left out. Other frames that lost characters are masked, so that
-later frames keep their indices.
+The last frame of a recording may be cut off, and is left out. Other frames in which characters were lost are masked, so
+that the indices of later frames do not change.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class Cn0565:
     """Reader of recorded output of Analog Devices' CN0565 kit, which sends text over a serial line.
 
     A frame is a line that begins with "!V": integers of 32 bits in hexadecimal digits, separated by commas, alternately
-    the real and the imaginary part of a voltage. Drives begin at each electrode in turn; the current flows between this
-    electrode and the electrode that is the force distance away. For each drive, voltages are measured from each
-    electrode in turn to the electrode that is the sense distance away, without the pairs that contain a driven
-    electrode. With 8, 16 or 32 electrodes and both distances 1, the default of the kit's programs, there are 40, 208 or
-    928 voltages. Other lines are answers to commands and messages.
+    the real and the imaginary part of a voltage. For each electrode in turn, the current flows between this electrode
+    and the electrode whose number differs by the force distance. For each drive, voltages are measured from each
+    electrode in turn to the electrode whose number differs by the sense distance, except for pairs that contain a
+    driven electrode. With 8, 16 or 32 electrodes and both distances 1, the default of the kit's programs, there are 40,
+    208 or 928 voltages. Other lines are answers to commands and messages.
     """
 
     DESCRIPTION = "lines of Analog Devices' CN0565 kit ('!V' and hexadecimal numbers), of 8, 16 or 32 electrodes"
@@ -72,7 +72,7 @@ class Cn0565:
         distances other than 1; without a description, the body and the protocol are those of `like`, a measurement of
         the same sensor.
 
-        Raises `ValueError` if `numbers` does, if no protocol is described and the number of voltages does not agree
+        Raises `ValueError` as `numbers` does, if no protocol is described and the number of voltages does not agree
         with distances of 1, and if a `key` is given, because the file contains no arrays.
         """
         _check_no_key(path, key)
@@ -95,8 +95,8 @@ class Cn0565:
             return like.protocol, ()
         candidates = [pair for pair in sensor_description.protocols(path) if pair[0].num_measurements == num_voltages]
         if candidates:
-            # For every drive, the kit measures in the order of electrode numbers, unless the description states
-            # another order.
+            # For every drive, the kit measures in the order of electrode numbers, unless the description states a
+            # different order.
             protocol, options = next(
                 (candidate for candidate in candidates if 'order = "fixed"' in candidate[1]), candidates[0]
             )
@@ -127,8 +127,8 @@ class Cn0565:
 
     @classmethod
     def numbers(cls, path: Path) -> tuple[Complex[np.ndarray, "F M"], tuple[str, ...]]:
-        """Read the voltages of each frame, in steps of the converter, and notes. Frames in which characters were lost,
-        i.e. that are longer or shorter than most frames or have a cell that is not a number, are NaN.
+        """Return the voltages of each frame, in steps of the converter, and notes. Frames in which characters were
+        lost, i.e. that are longer or shorter than most frames or have a cell that is not a number, are NaN.
 
         Raises `ValueError` if there is no frame, or if most frames have an odd number of numbers.
         """
@@ -180,7 +180,7 @@ class OpenEit:
     """Reader of the text that OpenEIT devices send: the word "magnitudes" and the numbers of a frame, as OpenEIT's
     dashboard records them, with or without line ends.
 
-    The number of numbers in a frame shows the protocol of the firmware: 32, 192 or 896 for 8, 16 or 32 electrodes
+    The count of numbers in a frame identifies the protocol of the firmware: 32, 192 or 896 for 8, 16 or 32 electrodes
     driven in opposite pairs, from every electrode; 928 for 32 electrodes driven in adjacent pairs; 28 for all pairs of
     8 electrodes, with the first device. Measurement pairs are adjacent, in the order of the electrodes. The numbers are
     magnitudes of impedances in ohms, and zero for an open circuit.
@@ -222,7 +222,7 @@ class OpenEit:
         the firmware's protocol, which only determines options that the section does not state; without a description,
         the body is that of `like`, a measurement of the same sensor.
 
-        Raises `ValueError` if `numbers` does, and if a `key` is given, because the file contains no arrays.
+        Raises `ValueError` as `numbers` does, and if a `key` is specified, because the file contains no arrays.
         """
         _check_no_key(path, key)
         values, notes = cls.numbers(path)
@@ -254,7 +254,7 @@ class OpenEit:
 
     @classmethod
     def numbers(cls, path: Path) -> tuple[Float[np.ndarray, "F M"], tuple[str, ...]]:
-        """Read the numbers of each frame of an OpenEIT recording, and notes. NaN replaces zero (an open circuit), a
+        """Return the numbers of each frame of an OpenEIT recording, and notes. NaN replaces zero (an open circuit), a
         cell that is not a number, a last number that may be cut off, and all numbers of frames that are longer or
         shorter than most frames because characters were lost.
 
@@ -294,7 +294,7 @@ class OpenEit:
             frames[-1][-1] = np.nan
             notes.append("nothing follows the last number, which may be cut off: masked.")
         # Frames between which the word "magnitudes" is lost appear as one long frame; its length shows the number of
-        # lost frames, so that later frames keep their indices.
+        # lost frames, so that the indices of later frames do not change.
         frame_indices = np.cumsum([0, *(max(1, round(length / frame_length)) for length in lengths)])
         is_complete = np.zeros(frame_indices[-1], bool)
         is_complete[
@@ -344,7 +344,8 @@ def _check_no_key(path: Path, key: str | None) -> None:
 
 
 def _lender(path: Path, description: str | Path | None, like: Measurement | None) -> Measurement | None:
-    """The measurement whose description a file borrows: `like` if no description is given or beside the file."""
+    """The measurement whose description is used for a file: `like` if no description is specified and none lies beside
+    the file, otherwise None."""
     return like if description is None and find_description(path) is None else None
 
 

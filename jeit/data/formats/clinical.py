@@ -1,7 +1,7 @@
 """Readers of recordings by clinical systems: Dräger, Carefusion, Göttingen and Swisstom.
 
-The systems of Dräger, Carefusion and Göttingen measure the same frame, see `jeit.data.formats.recording`. The scale of
-the voltages is not published by any maker; a note of each measurement says so.
+The systems of Dräger, Carefusion and Göttingen measure the same channels, see `jeit.data.formats.recording`. The scale
+of the voltages is not published by any maker; a note of each measurement says so.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Draeger:
     Numbers are little-endian. Bytes 0-3 are the version of the format and bytes 4-7 the length of the header text;
     frames begin at byte 16 + this length. The text states the frame rate as "Framerate [Hz]:". A frame has 5,495 bytes
     in version 50 and later, and 5,200 bytes in version 32. A frame begins with 600 numbers of eight bytes. The first
-    208 numbers, and the 208 numbers from number 322 on, are two parts whose weighted sum gives the voltages of the
+    208 numbers, and the 208 numbers from number 322 on, are two parts whose weighted sum is the voltages of the
     adjacent protocol. The maker has not published the weights; the weights used here are estimates by users.
     """
 
@@ -45,7 +45,7 @@ class Draeger:
     # Bytes per frame for each version of the format. Frames of version 31 are too short for the known layout.
     _FRAME_BYTES: ClassVar = {0x20: 5200, 0x33: 5495}
     _PREFIX_BYTES = 16
-    # Index of the first number of the second part of the voltages, and the weights of both parts.
+    # Index of the first number of the second part of the voltages, and the weights of the two parts.
     _SECOND_PART, _WEIGHTS = 322, (9.8242e-4, 1.9607e-4)
     _SCALE_NOTES = (
         "the scale of the voltages is an estimate, not published: trust relative changes, not volts.",
@@ -97,7 +97,7 @@ class Draeger:
 class Carefusion:
     """Reader of recordings by Carefusion's Goe-MF II (.eit): XML in UTF-16, followed by binary segments.
 
-    `<Header>N bytes</Header>` gives the offset of the first segment. A segment begins with six little-endian integers
+    `<Header>N bytes</Header>` states the offset of the first segment. A segment begins with six little-endian integers
     of four bytes: the type of the segment, a channel, the frame number counted from 0, the bytes per item, the number
     of items, and an integer of unknown meaning; the items follow. Type 3 is a frame of 256 numbers of four bytes; the
     208 numbers from the 48th on are the voltages of the adjacent protocol. Type 7 is an image of 912 numbers. Other

@@ -2,7 +2,7 @@
 Tomography Challenge 2023.
 
 The .mat files contain current patterns in milliamperes, differences of neighbouring electrodes, and one frame of
-voltages. A reader states the tank, which the files do not.
+voltages. The readers add the tank, which the files do not describe.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from jeit.protocol import from_matrices
 
 class _Tank(NamedTuple):
     """A tank with electrodes at equal distances, the first at 12 o'clock. **Fields**: `radius`, metres;
-    `electrode_width`, metres; `contact_impedance`: initial value for calibration, in ohm·m; `clockwise`: direction of
-    the electrodes' numbers."""
+    `electrode_width`, metres; `contact_impedance`: initial value for calibration, in ohm·m; `clockwise`: whether the
+    numbers of the electrodes increase clockwise."""
 
     radius: float
     electrode_width: float
@@ -38,8 +38,8 @@ class Kit4:
 
     DESCRIPTION = "KIT4 tank archive (.mat with Uel, CurrentPattern, MeasPattern)"
     VARIABLES = (frozenset({"Uel", "CurrentPattern", "MeasPattern"}),)
-    """Variables of its files."""
-    # Contact impedance: a fit to the empty tank gives about 1e-4 m / 1.3 mS.
+    """Variables that identify a file of the archive."""
+    # Contact impedance: a fit to measurements of the empty tank yields about 1e-4 m / 1.3 mS.
     _TANK = _Tank(0.14, 0.025, contact_impedance=0.08, clockwise=True)
 
     @classmethod
@@ -53,7 +53,7 @@ class Kit4:
         channels.
 
         Channels are ordered drive by drive. The 16 differences of a drive sum to zero, so 15 are independent; all 16
-        are kept, including differences at driven electrodes (`Measurement.without_driven_channels` masks these
+        are returned, including differences at driven electrodes (`Measurement.without_driven_channels` masks these
         channels). The tank has a radius of 0.14 m; electrode 1 is at 12 o'clock, and the other electrodes follow
         clockwise.
 
@@ -89,8 +89,8 @@ class Ktc2023:
 
     DESCRIPTION = "Kuopio Tomography Challenge 2023 (.mat with Mpat, and Inj and Uel or Injref and Uelref)"
     VARIABLES = (frozenset({"Mpat", "Inj", "Uel"}), frozenset({"Mpat", "Injref", "Uelref"}))
-    """Variables of its files, and of the reference."""
-    # Contact impedance: a fit to the empty tank gives nearly zero.
+    """Variables that identify a file of the challenge, and a reference file."""
+    # Contact impedance: a fit to measurements of the empty tank yields nearly zero.
     _TANK = _Tank(0.115, 0.115 * np.radians(5.625), contact_impedance=0.01, clockwise=False)
 
     @classmethod
@@ -148,8 +148,8 @@ def _measurement(
     tank: _Tank,
     notes: tuple[str, ...],
 ) -> Measurement:
-    """Screen a frame of `voltages`, ordered drive by drive, with the protocol `name` of the `currents` of D drives, in
-    milliamperes, and K `differences` of L electrodes."""
+    """Screen a frame of `voltages`, ordered drive by drive, with a protocol called `name` that consists of the
+    `currents` of D drives, in milliamperes, and K `differences` of L electrodes."""
     protocol = from_matrices(
         1e-3 * currents.T,
         differences.T.astype(float),

@@ -8,7 +8,7 @@ electrode, the number of measurements, a comment with the names of the columns, 
 electrodes counted from 1. A unit follows the name of a column: `u/mV`, `i [mA]`.
 
 Channels are sorted by their electrodes; the order of the lines has no effect. If a reference of the same sensor is
-given, frames have the channels of the reference; channels without a line are masked.
+specified, frames have the channels of the reference; channels without a line are masked.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from jeit.protocol import from_channels
 
 DESCRIPTION = "text with a line for each measurement: electrodes a, b, m, n and the voltage or resistance"
 _HEAD_BYTES, _MAX_HEADING_LINES = 65536, 400
-# Names, in letters and digits, of the four electrodes: current enters at the first and leaves at the second; the
-# voltage is the potential of the third minus that of the fourth.
+# Column names, reduced to letters and digits, of the four electrodes: current enters at the first and leaves at the
+# second; the voltage is the potential of the third minus the potential of the fourth.
 _ELECTRODE_NAMES = (
     ("a", "b", "m", "n"),
     ("c1", "c2", "p1", "p2"),
@@ -43,7 +43,7 @@ _ELECTRODE_NAMES = (
         for pair in (("f", "s"), ("i", "v"), ("drive", "sense"), ("drive", "measure"), ("force", "sense"))
     ),
 )
-# Names of the measured quantities, and of other columns that are read.
+# Column names of the measured quantities, and of other columns that are read.
 _COLUMN_NAMES = {
     "real": ("real", "re", "realraw", "vreal", "ureal"),
     "imag": ("imag", "im", "imagraw", "vimag", "uimag"),
@@ -98,8 +98,8 @@ def read(
     states the body; its section `[electrodes]` may leave out positions that the file contains. The section `[protocol]`
     states the current if the file does not.
 
-    Raises `ValueError`, with the line, for lines that do not match the heading, and if a `key` is given, because the
-    file contains no arrays.
+    Raises `ValueError`, with the line, for lines that do not match the heading, and if a `key` is specified, because
+    the file contains no arrays.
     """
     if key is not None:
         raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
@@ -245,8 +245,8 @@ def _header_positions(path: Path, preceding_lines: Sequence[tuple[int, list[str]
 
 
 def _describe_body(path: Path, description: str | Path | None, positions: np.ndarray | None) -> Description:
-    """Return the `description`, else the description beside the file, else an empty description. If it states no
-    positions of electrodes, the `positions` from the file are added."""
+    """Return the `description`, else the description beside the file, else an empty description. If the description
+    states no positions of electrodes, the `positions` from the file are added."""
     description_source = find_description(path) if description is None else description
     if description_source is None:
         return parse_description({}, path.name)
@@ -347,8 +347,8 @@ def _arrange_frames(
     values: Inexact[np.ndarray, " R"],
     like: Measurement | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, tuple[str, ...]]:
-    """Arrange the values of lines in frames: electrodes (channels, 4), voltages (frames, channels), times of the
-    frames, and notes. Voltages are NaN for channels that have no line in a frame."""
+    """Arrange the values of lines in frames. Returns the electrodes (channels, 4), voltages (frames, channels), times
+    of the frames, and notes. Voltages are NaN for channels that have no line in a frame."""
     channels, channel_of_line = np.unique(electrodes, axis=0, return_inverse=True)
     channel_of_line, notes = channel_of_line.ravel(), ()
     frame_of_line, frame_notes = _frame_of_lines(path, table.column("frame"), channel_of_line, len(channels))

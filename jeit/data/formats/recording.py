@@ -48,7 +48,7 @@ def content_of(path: Path) -> bytes:
 
 
 def description_of(path: Path, description: str | Path | None) -> Description:
-    """Return the given description, else the description beside the file, else an empty description. Raises
+    """Return the specified description, else the description beside the file, else an empty description. Raises
     `ValueError` if the description is not valid."""
     description_source = find_description(path) if description is None else description
     return parse_description({}, path.name) if description_source is None else load_description(description_source)
@@ -56,10 +56,10 @@ def description_of(path: Path, description: str | Path | None) -> Description:
 
 def measurement_of(path: Path, recording: Recording, sensor_description: Description) -> Measurement:
     """Convert a recording to a measurement of the described body. Protocol, times and frame names of the description
-    take precedence over those of the recording.
+    take precedence over the protocol, times and frame names of the recording.
 
-    Raises `ValueError` if the number of channels differs from that of the protocol, or the number of names from that of
-    frames.
+    Raises `ValueError` if the protocol has a different number of channels, or if the number of names is not the number
+    of frames.
     """
     layout = sensor_description.layout
     notes = (*recording.notes, *component_notes(recording.voltages, layout))

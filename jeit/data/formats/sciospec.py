@@ -1,6 +1,6 @@
 """Reader of Sciospec EIT recordings (.eit): text files, one per frame.
 
-The first line states the number of header lines. The following lines give, one value per line: the version of the
+The first line states the number of header lines. The following lines contain, one value per line: the version of the
 format (in headers of at least 11 lines), the name of the setup, date and time, the lowest and the highest frequency
 (hertz), the spacing of frequencies (1: logarithmic, 0: linear), the number of frequencies, the current (amperes), and
 the frame rate. Later lines may list channels, as "MeasurementChannels: 1,2,3". After the header, every injection has a
@@ -56,8 +56,8 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
     """Read one Sciospec file: one frame per frequency, named by the frequency, of potentials minus their mean over the
     electrodes.
 
-    With `[protocol] kind = "measured"` in a description, its `measurement` selects another reading of the potentials,
-    such as "adjacent" differences. Channels that the header does not list are left out.
+    With `[protocol] kind = "measured"` in a description, its `measurement` selects a different way of reading the
+    potentials, such as "adjacent" differences. Channels that the header does not list are left out.
 
     Raises `ValueError`, with the faulty line, for an invalid file.
     """
@@ -75,10 +75,10 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
 
 
 def read_all(paths: Sequence[Path], description: str | Path | None = None) -> Measurement:
-    """Read several Sciospec files of the same set-up and join their frames in the given order.
+    """Read several Sciospec files of the same set-up and join their frames in the order of `paths`.
 
-    If each file contains one frame, `[data] frame_rate` of a description sets the times; otherwise the times are the
-    dates in the files. Raises `ValueError` as `read` and `jeit.data.gesture_set.join` do.
+    If each file contains one frame, `[data] frame_rate` of a description determines the times; otherwise the times are
+    the dates in the files. Raises `ValueError` as `read` and `jeit.data.gesture_set.join` do.
     """
     joined = join([read(path, description) for path in paths])
     rate = description_of(paths[0], description).layout.frame_rate

@@ -33,13 +33,13 @@ SUFFIXES = (".csv", ".txt", ".dat", ".npy", ".npz")
 _TEXT_ARRAYS = ("mask", "protocol_name", "frame_names", "notes", "times")
 
 AXES = ("electrodes", "patterns", "frames")
-"""Names of the axes of an array of voltages, in their default order; a description can state another order."""
+"""Names of the axes of an array of voltages, in their default order; a description can state a different order."""
 # Maximum mean of the potentials of a current pattern, relative to the largest potential, that counts as zero.
 _MAX_RESIDUAL_MEAN = 0.01
 
 
 def recognises(path: Path) -> bool:
-    """Whether the suffix of a file is that of a table of numbers, such as .csv."""
+    """Whether a file has the suffix of a table of numbers, such as .csv."""
     return path.suffix.lower() in SUFFIXES
 
 
@@ -109,11 +109,12 @@ def read(
 
 
 Protocols = Sequence[tuple[Protocol, str]]
-"""Candidate protocols, the described one first, each with the options that a description would have to state."""
+"""Candidate protocols, the described protocol first, each with the options that a description would have to state for
+it."""
 
 
 def channel_counts(protocols: Protocols) -> list[int]:
-    """Numbers of channels of the candidate protocols; the first is that of the described protocol."""
+    """Numbers of channels of the candidate protocols; the first is the number of channels of the described protocol."""
     return [*dict.fromkeys(protocol.num_measurements for protocol, _ in protocols)]
 
 
@@ -193,7 +194,7 @@ def measurement_from(
     """Scale frames (frames, channels) in the unit of the file to volts as the description states, and mask unusable
     voltages. `protocol`: the protocol stored in the file, or None.
 
-    Raises `ValueError` if there is no protocol, if the number of frame names differs from that of the frames, and if
+    Raises `ValueError` if there is no protocol, if the number of frame names is not the number of frames, and as
     `screen` does.
     """
     protocol = protocol or sensor_description.protocol(path)
@@ -248,7 +249,7 @@ def numbers(path: Path, layout: TableLayout) -> tuple[np.ndarray, tuple[str, ...
 
 def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray:
     """Frames (frames, channels), in the unit of the file, of a table with the arrangement `layout`. Raises `ValueError`
-    if rows are pairs of real and imaginary parts and their number is odd."""
+    if rows are pairs of real and imaginary parts and the number of rows is odd."""
     frames = table.T if table.ndim == 2 and layout.frames_in == "columns" else np.atleast_2d(table)
     if layout.complex_pairs:
         if len(frames) % 2:
@@ -262,7 +263,7 @@ def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray
     if layout.component == "imaginary":
         return np.imag(frames)
     if layout.component == "magnitude":
-        # The magnitude takes the sign of the real part, because a magnitude alone has no sign.
+        # The magnitude receives the sign of the real part, because a magnitude alone has no sign.
         return np.abs(frames) * np.where(np.real(frames) < 0, -1.0, 1.0)
     return frames if layout.component == "complex" else np.real(frames)
 
@@ -275,8 +276,8 @@ def component_notes(values: np.ndarray, layout: TableLayout) -> tuple[str, ...]:
 
 
 def _from_numpy(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """The arrays `keys` and the arrays that `write_table` stores of an NPZ file, by name, or the array of an NPY file
-    as "voltages"."""
+    """Read from an NPZ file, by name, the arrays `keys` and the arrays that `write_table` stores; or from an NPY file
+    its array, as "voltages"."""
     try:
         if path.suffix.lower() == ".npy":
             return {"voltages": npy_array(path)}
@@ -301,7 +302,7 @@ def _voltages(arrays: dict[str, np.ndarray], layout: TableLayout, path: Path) ->
 
 
 def _stored_protocol(arrays: dict[str, np.ndarray]) -> Protocol | None:
-    """The protocol in a file written by `write_table`; None if the file holds no protocol."""
+    """The protocol in a file written by `write_table`; None if the file contains no protocol."""
     if not all(array in arrays for array in PROTOCOL_ARRAYS):
         return None
     name = str(arrays.get("protocol_name", "custom"))
@@ -309,7 +310,7 @@ def _stored_protocol(arrays: dict[str, np.ndarray]) -> Protocol | None:
 
 
 def _with_stored_texts(description: Description, arrays: dict[str, np.ndarray]) -> Description:
-    """The description, completed by frame names (if it has none) and notes from a file written by `write_table`."""
+    """The description with added frame names (if it has none) and notes from a file written by `write_table`."""
     frame_names = description.layout.frame_names or _texts(arrays, "frame_names")
     notes = (*description.notes, *_texts(arrays, "notes"))
     return replace(description, layout=replace(description.layout, frame_names=frame_names), notes=notes)
@@ -331,7 +332,7 @@ def frames_of(values: np.ndarray, axes: tuple[str, ...], name: str) -> Inexact[n
     """Frames (frames, channels) from an array of voltages with the given `axes`, with channels ordered drive by drive;
     an array of two axes is one frame.
 
-    Raises `ValueError` for an array with another number of axes.
+    Raises `ValueError` for an array with a different number of axes.
     """
     axis_names = tuple(axes or AXES)
     if values.ndim == len(axis_names) - 1:

@@ -24,7 +24,7 @@ from jeit.arguments import counted
 from jeit.data.description import TableLayout
 from jeit.files import check_memory
 
-# Bytes of memory per byte of text: a number may consist of two characters, and is stored twice in eight bytes.
+# Bytes of memory per byte of text: a number may take only two characters, and is stored twice, in eight bytes each.
 _MEMORY_FACTOR = 8
 # Number of lines from which separators are detected, and maximum number of lines of a heading.
 _NUM_SAMPLE_LINES, _MAX_HEADING_LINES = 40, 100
@@ -40,7 +40,7 @@ _DELIMITER_HINT = (
     "Set [data] delimiter and skip_rows in the description, if it is a heading or cells are separated otherwise."
 )
 
-# Integer times that increase by at least this step may be milliseconds as well as seconds.
+# Integer times that increase by at least this step may be seconds or milliseconds.
 _MIN_MILLISECOND_STEP = 5
 
 
@@ -93,8 +93,8 @@ _NUMBER_FORMATS = (
 
 
 class LineNumbers:
-    """Parser of successive lines of numbers. The separators are detected in the first line, and again in a later line
-    that they do not fit."""
+    """Parser of successive lines of numbers. The separators are detected in the first line, and again in each later
+    line that cannot be read with them."""
 
     def __init__(self):
         self._format: _NumberFormat | None = None
@@ -119,7 +119,7 @@ class LineNumbers:
 
 def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = None) -> Text:
     """Read the numbers of a text file. The `delimiter` between numbers and `skip_rows`, the number of heading lines,
-    are detected if they are not given.
+    are detected if they are None.
 
     Raises `ValueError`, with the line, for a file that contains anything but numbers or that was cut off.
     """
@@ -190,7 +190,7 @@ def rectangle(text: Text, name: str) -> Inexact[np.ndarray, "R C"]:
 
 
 def _line_pattern(line: str) -> str:
-    """A line with # in place of each number, so that "Frame 1" and "Frame 2" give the same pattern."""
+    """A line with # in place of each number, so that "Frame 1" and "Frame 2" have the same pattern."""
     return re.sub(r"\d+", "#", line.strip())
 
 
@@ -221,7 +221,7 @@ def _detect_format(lines: Sequence[str]) -> _NumberFormat:
 
 
 def _has_decimal_commas(number_format: _NumberFormat, lines: Sequence[str]) -> bool:
-    """Whether commas are decimal points: in most cells that contain a comma, the comma stands between two digits."""
+    """Whether commas are decimal points: in most cells that contain a comma, the comma is between two digits."""
     cells = [cell for line in lines for cell in _without_label(line).split(number_format.delimiter) if "," in cell]
     decimal_cells = [cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell.strip(' \t\r\n"'))]
     return len(decimal_cells) > 0.9 * len(cells)
@@ -229,8 +229,8 @@ def _has_decimal_commas(number_format: _NumberFormat, lines: Sequence[str]) -> b
 
 def _heading_length(number_format: _NumberFormat, lines: Sequence[str]) -> int:
     """Return the number of heading lines at the start of a file. A line belongs to the heading if at least half of its
-    cells are words, if its length differs from that of the lines of numbers, or if it numbers the columns, as in saved
-    data frames."""
+    cells are words, if its number of cells differs from that of all lines of numbers, or if it numbers the columns, as
+    in saved data frames."""
     row_lengths = {len(row) for line in lines if (row := number_format.numbers(line))}
     for line_index, line in enumerate(lines):
         cells = number_format.cells(line)
@@ -302,8 +302,8 @@ class Frames(NamedTuple):
 
 
 def frames_in_text(text: Text, counts: Sequence[int], layout: TableLayout, name: str) -> Frames:
-    """Frames of a text file. `counts`: numbers of channels that a frame may have; the first is that of the described
-    protocol.
+    """Return the frames of a text file. `counts`: numbers of channels that a frame may have; the first is the number of
+    channels of the described protocol.
 
     A last line or frame that is cut off is left out. Raises `ValueError` for lines of unequal length that are not
     frames wrapped over several lines.
@@ -344,7 +344,7 @@ def _wrapped_frames(text: Text, counts: Sequence[int]) -> tuple[int, int] | None
     candidates = []
     for index, count in enumerate(counts):
         num_frames, num_left_over = divmod(int(line_ends[-1]), count)
-        # With a number of channels that is not the described number, values after the last complete frame mean that a
+        # For a number of channels other than the described number, values after the last complete frame mean that a
         # line is missing.
         if index and num_left_over:
             continue
@@ -366,7 +366,7 @@ def frames_in_table(
     default_axis: str = "rows",
 ) -> Frames:
     """Frames of a two-dimensional array. `counts`: see `frames_in_text`; `heading`: names of the columns;
-    `default_axis`: "rows" or "columns". It states which of them are frames if the numbers of channels leave it open."""
+    `default_axis`: "rows" or "columns", whichever are frames if the numbers of channels do not determine this."""
     stated_axis = layout.frames_in
     is_transposed = stated_axis == "columns" if stated_axis else _are_columns(table.shape, counts, default_axis)
     rows = table.T if is_transposed else table

@@ -1,4 +1,5 @@
-"""Delaunay triangulation of points within an outline whose segments are kept as edges, and repair of bad cells.
+"""Delaunay triangulation of points within an outline, with all outline segments as edges of cells, and repair of bad
+cells.
 
 The steps:
 
@@ -42,7 +43,7 @@ class Front:
 
     @property
     def num_held(self) -> int:
-        """Number of nodes that may not move: those on the outline and the fixed ones."""
+        """Number of nodes that may not move: the nodes on the outline and the fixed nodes."""
         return self.num_outline + len(self.fixed)
 
     def points(self) -> np.ndarray:
@@ -83,7 +84,8 @@ class Front:
 def triangulate(front: Front, points: np.ndarray) -> np.ndarray:
     """Delaunay triangles (m, 3) inside the outline, counter-clockwise."""
     outline = points[: front.num_outline]
-    # Distant auxiliary nodes keep the outline off the convex hull, where collinear nodes would produce slivers.
+    # With distant auxiliary nodes, the outline is not part of the convex hull, where collinear nodes would produce
+    # slivers.
     extent = np.ptp(outline, axis=0).max()
     angle = 2 * np.pi * (np.arange(16) + 0.37) / 16
     auxiliary_nodes = outline.mean(axis=0) + 4 * extent * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -393,10 +395,10 @@ def generate(
     """Mesh the region inside the first of `curves` and outside the other curves, which are holes: points (n, 2) and
     cells (m, 3).
 
-    `stops` are arc lengths on each curve, and `fixed` points (f, 2) inside, at which nodes are placed; `size` returns
-    the requested edge length at points (p, 2). If a `front` already filled for this size is given, the steps
-    `outline_nodes` and `fill` are skipped. Node 0 is the first node of the first curve. Raises `ValueError` if no mesh
-    with the guaranteed minimum angle is found.
+    Nodes are placed at `stops`, arc lengths on each curve, and at `fixed`, points (f, 2) inside the region. `size`
+    returns the requested edge length at points (p, 2). If `front` is specified, it must already be filled for this
+    size, and the steps `outline_nodes` and `fill` are skipped. Node 0 is the first node of the first curve. Raises
+    `ValueError` if no mesh with the guaranteed minimum angle is found.
     """
     for guard_ratio in (1.0, 0.5, 0.25):
         if front is None:

@@ -1,4 +1,4 @@
-"""Local refinement of plane meshes, and the error for meshes with too few nodes."""
+"""Local refinement of plane meshes, and the error for a requested number of nodes that is too small."""
 
 from __future__ import annotations
 
@@ -52,28 +52,28 @@ def nodes_of_solid(num_requested: int | None, count_base_nodes: Callable[[int], 
         raise ValueError(f"num_points: {error.solid.format(asked=num_requested, least=f'{min_points:.0f}')}") from None
 
 
-# Growth of the edge length per length away from nodes that lie close together, and in a size function given by the
-# user.
+# Maximum increase of the edge length per unit of distance, away from nodes that lie close together and in a user's size
+# function.
 _USER_SIZE_GROWTH = 0.45
 
 
 class Refine(Module):
-    """Smaller cells near given points, or along the whole outline.
+    """Request for smaller cells near specified points, or along the whole outline.
 
     At a distance r from the nearest of `points`, the edges of cells have lengths of at most h + growth · max(r −
     distance, 0), where h is the cell size at the points: `cell_size`, or the background cell size divided by `factor`.
 
-    The current density is singular at the edges of electrodes, so refinement there pays. For 16 electrodes that cover
-    half the rim of a disk, `disk(radius, num_points=1200, refine=Refine(edges, factor=5, growth=0.3),
+    The current density is singular at the edges of electrodes, so refinement there is effective. For 16 electrodes that
+    cover half the rim of a disk, `disk(radius, num_points=1200, refine=Refine(edges, factor=5, growth=0.3),
     boundary_points=angles)`, with `edges` the end points of the electrodes and `angles` the angles of these points,
-    reduces the maximum error of a voltage between electrodes without current from 2.2 % (uniform rings) to 0.5 %. With
-    10,000 nodes and `factor=8, growth=0.4` the error falls below 0.1 % (for contact impedance times conductivity
+    reduces the maximum error of a voltage between electrodes that carry no current from 2.2 % (uniform rings) to 0.5 %.
+    With 10,000 nodes and `factor=8, growth=0.4` the error falls below 0.1 % (for contact impedance times conductivity
     between 0.01 and 0.1 radii).
 
     **Fields**: `points` (k, 2): coordinates in metres, or None for the whole outline; `cell_size`: in metres; `factor`:
     ratio of the background cell size to the cell size at the points, at least 1; `growth`: increase of the edge length
-    per length, at most 1 (default 0.35; above 0.7 cells are visibly stretched); `distance`: distance in metres from the
-    points within which cells keep their smallest size.
+    per unit of distance, at most 1 (default 0.35; above 0.7 cells are visibly stretched); `distance`: distance in
+    metres from the points within which cells have their smallest size.
 
     **Example:**
 
@@ -98,7 +98,7 @@ class Refine(Module):
         growth: float = 0.35,
         distance: float = 0.0,
     ):
-        """Give exactly one of `cell_size` and `factor`. Raises `ValueError` on values out of range."""
+        """Exactly one of `cell_size` and `factor` must be specified. Raises `ValueError` on values out of range."""
         if points is not None:
             points = np.atleast_2d(np.asarray(points, dtype=float))
             if points.ndim != 2 or points.shape[1] != 2 or not len(points) or not np.isfinite(points).all():
@@ -138,8 +138,8 @@ class SizeField:
     """Requested edge length at any point, for a given background cell size."""
 
     def __init__(self, curves: list[Curve], refine: Refinement, required_nodes: np.ndarray, spacing: np.ndarray):
-        """`required_nodes` (k, 2): positions where nodes must be; `spacing` (k,): distance of each of these nodes to
-        the nearest other node or side.
+        """`required_nodes` (k, 2): positions at which nodes are required; `spacing` (k,): distance of each of these
+        nodes to the nearest other node or side.
 
         Raises `ValueError` if `refine` contains anything but `Refine` objects.
         """
@@ -159,12 +159,12 @@ class SizeField:
 
     @property
     def is_user_function(self) -> bool:
-        """Whether `refine` is a function given by the user."""
+        """Whether `refine` is a user's function."""
         return self._user_size is not None
 
     def at(self, points: np.ndarray) -> Callable[[float], np.ndarray]:
-        """Edge lengths (p,) at points (p, 2), as a function of the background cell size in metres. If the user gave a
-        size function, the argument is instead the factor by which its sizes are multiplied."""
+        """Return a function that computes the edge lengths (p,) at points (p, 2) from the background cell size, metres.
+        If `refine` is a user's size function, the argument is instead the factor by which its sizes are multiplied."""
         if self._user_size is not None:
             user_sizes, required_sizes = self._user_size(points), self._required_size(points)
             return lambda factor: np.minimum(factor * user_sizes, required_sizes)
@@ -212,8 +212,8 @@ def _size_at_close_nodes(required_nodes: np.ndarray, spacing: np.ndarray) -> Siz
 
 
 def limited(curves: list[Curve], function: Callable[[np.ndarray], Any], resolution: int = 128) -> Size:
-    """Limit the growth of a user's size function f to g = `_USER_SIZE_GROWTH`: min over y of f(y) + g |x − y| at point
-    x.
+    """Limit the growth of a user's size function f to g = `_USER_SIZE_GROWTH`: the size at a point x becomes the
+    minimum over y of f(y) + g |x − y|.
 
     The minimum is computed on a grid by Dijkstra's algorithm; where f(x) itself is smaller than the minimum on the
     grid, f(x) is used. Raises `ValueError` if the function does not return one positive, finite size per point.

@@ -1,7 +1,7 @@
 """Structured triangulations: concentric rings of cells in a disk, rows of cells in a rectangle.
 
 Both triangulations consist of chains of nodes laid side by side. Where the numbers of nodes of neighbouring chains
-differ slightly, the offset between the chains varies gradually, so that triangles range between equilateral and
+differ slightly, the offset between the chains varies gradually. Triangles then range between equilateral and
 right-angled, and no angle is smaller than about 40°.
 """
 
@@ -22,7 +22,8 @@ def zip_chains(outer: np.ndarray, inner: np.ndarray, *, is_closed: bool) -> np.n
     """Triangles (t, 3) between two chains of nodes that run in the same direction, `inner` to the left of `outer`.
 
     `outer` and `inner` are node indices, evenly spaced along their chains; a closed chain returns to its first node.
-    Every segment is joined to the node opposite to it on the other chain, in the order of the segments' midpoints.
+    Each segment of a chain forms a triangle with the node opposite to it on the other chain. The triangles are ordered
+    by the midpoints of their segments.
     """
     num_outer, num_inner = (len(outer), len(inner)) if is_closed else (len(outer) - 1, len(inner) - 1)
     # Midpoints multiplied by 2 N_outer N_inner, as integers, so that ties are exact.
@@ -55,8 +56,8 @@ def choose_rings(num_points: int) -> tuple[int, int]:
     for num_rings in range(max(1, int(guessed_rings) - 1), int(guessed_rings) + 3):
         for num_boundary in range(max(5, int(4.9 * num_rings)), int(7.3 * num_rings) + 2):
             num_nodes = 1 + int(ring_counts(num_rings, num_boundary).sum())
-            # The most regular triangles have six times as many boundary nodes as rings; deviate only to meet the number
-            # of nodes.
+            # The most regular triangles have six times as many boundary nodes as rings; deviate from this ratio only to
+            # meet the number of nodes.
             deviation = abs(num_nodes / num_points - 1.0)
             cost = (
                 deviation > 0.03,

@@ -1,4 +1,4 @@
-"""Unstructured plane meshes with a given number of nodes or cell size, local refinement, and nodes at given
+"""Unstructured plane meshes with a specified number of nodes or cell size, local refinement, and nodes at specified
 positions."""
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Target:
     """Target size of a mesh.
 
     **Fields**: `num_points`: number of nodes; `cell_size`: cell size in metres, or None to use `num_points`;
-    `is_requested`: whether the number of nodes was given rather than a default.
+    `is_requested`: whether the number of nodes was specified; otherwise it is the default.
     """
 
     num_points: int
@@ -44,8 +44,8 @@ class Target:
 
     @staticmethod
     def create(num_points: int | None, cell_size: float | None) -> Target:
-        """Create a target from the two arguments of a mesh function. Raises `ValueError` if both arguments are given or
-        one is out of range."""
+        """Create a target from the two arguments of a mesh function. Raises `ValueError` if both arguments are
+        specified or one of them is out of range."""
         if num_points is not None and cell_size is not None:
             raise ValueError("num_points, cell_size: give one of the two, not both.")
         if cell_size is not None:
@@ -72,8 +72,8 @@ def check_total(num_points: float, name: str) -> None:
 
 
 def check_positions(name: str, positions: ArrayLike) -> np.ndarray:
-    """Convert `positions` along an outline to an array (k,). Raises `ValueError` for another shape, no positions, NaN
-    or infinity."""
+    """Convert `positions` along an outline to an array (k,). Raises `ValueError` for a different shape, no positions,
+    NaN or infinity."""
     array = np.asarray(positions, dtype=float)
     if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
         raise ValueError(
@@ -146,7 +146,7 @@ def _merge_with_corners(curve: Curve, positions: np.ndarray) -> np.ndarray:
             "closer than a millionth of the outline (a corner counts). Make them equal or move one."
         )
     is_distinct = gaps > 1e-9
-    # Of coinciding positions, keep the corner's, so that corners are not moved.
+    # Replace a position that coincides with a corner by the corner, so that corners are not moved.
     distinct_stops = stops[is_distinct]
     if len(curve.corners):
         corner_distances = np.abs(distinct_stops[:, None] - curve.corners)
@@ -177,8 +177,8 @@ def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> n
 
 
 def _required_spacing(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (k, 2) of required nodes, and the distance (k,) of each required node to the nearest other one, or to
-    the nearest side that the node does not lie on."""
+    """Positions (k, 2) of required nodes, and the distance (k,) of each required node to the nearest other required
+    node, or to the nearest side that the node does not lie on, whichever is smaller."""
     chains = [curve.at(stop) for curve, stop in zip(curves, stops, strict=True)]
     required_nodes = np.concatenate([*chains, fixed])
     if len(required_nodes) < 2:
@@ -210,8 +210,8 @@ def _interior_samples(curves: list[Curve]) -> np.ndarray:
 
 
 def _estimate_num_nodes(curves: list[Curve], size: Size, area: float) -> float:
-    """Estimate the number of nodes of a mesh whose cell sizes are given by the function `size`, from samples inside the
-    domain and along its outline."""
+    """Estimate the number of nodes of a mesh whose cell sizes are the values of the function `size`, from samples
+    inside the domain and along its outline."""
     num_nodes = area * float(np.mean(1.0 / size(_interior_samples(curves)) ** 2))
     for curve in curves:
         num_nodes += curve.length * float(np.mean(1.0 / size(curve.at(np.linspace(0, curve.length, 400)))))

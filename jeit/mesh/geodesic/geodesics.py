@@ -2,15 +2,15 @@
 
 A wave front propagates over the triangles. From the distances at two corners of a triangle, the triangle and the
 virtual source of the wave are laid into one plane. If the straight line from the source to the third corner crosses the
-side between the two corners, its length is the distance at the third corner; otherwise the shortest path passes through
-one of the two corners. The distance is exact where the triangles between the source and the corner can be laid into one
-plane. (Novotni and Klein, WSCG 2002, 341-347, who extend the fast marching of Kimmel and Sethian, PNAS 95 (1998)
-8431-8435, to circular waves.)
+side between the two corners, the length of this line is the distance at the third corner; otherwise the shortest path
+passes through one of the two corners. The distance is exact where the triangles between the source and the corner can
+be laid into one plane. (Novotni and Klein, WSCG 2002, 341-347, who extend the fast marching of Kimmel and Sethian, PNAS
+95 (1998) 8431-8435, to circular waves.)
 
-On other surfaces, Gaussian curvature K changes the curvature of the front: after a path of length d, by about K d/3;
-the formula for a sphere of Gaussian curvature K is used. Updates only ever lower distances, so the nodes may be
-processed in any order: the neighbours of all nodes whose distance has changed are updated, for all sources together,
-until no distance changes.
+On other surfaces, Gaussian curvature K changes the curvature of the front, by about K d/3 after a path of length d. The
+formula for a sphere of Gaussian curvature K is used. Updates never increase a distance, so the nodes may be processed
+in any order: the neighbours of all nodes whose distance has changed are updated, for all sources together, until no
+distance changes.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from jeit_solvers.module import Module
 _MIN_DECREASE, _SOURCES_PER_BATCH = 1e-10, 128
 # Maximum length of a path on a sphere, in radians: near the antipode the wave converges to a point.
 _MAX_SPHERE_ANGLE = 2.6
-# Tolerated disagreement between the distances at the corners of a triangle, as a fraction of its side, if they belong
-# to the same wave.
+# Maximum disagreement, as a fraction of the side of a triangle, between distances at its corners that belong to the
+# same wave.
 _WAVE_TOLERANCE = 0.02
-# Maximum distance of given points from the surface, relative to the surface's extent: points on the other side of a
-# thick skin are accepted.
+# Maximum distance of a user's points from the surface, relative to the surface's extent, chosen so that points on the
+# other side of a thick skin are accepted.
 _MAX_OFF_SURFACE = 0.25
 
 
@@ -93,8 +93,8 @@ class Geodesics(Module):
         *,
         limit: float = np.inf,
     ) -> Float[np.ndarray, "s p"]:
-        """Geodesic distances (s, p), metres, from `sources` (s, 3) to `targets` (p, 3), or (s, n) to all nodes if there
-        are no targets. Points off the surface are replaced by the nearest points on the surface.
+        """Geodesic distances (s, p), metres, from `sources` (s, 3) to `targets` (p, 3), or (s, n) to all nodes if
+        `targets` is None. Points off the surface are replaced by the nearest points on the surface.
 
         Distances beyond `limit`, metres, and between disconnected parts are infinite. Raises `ValueError` for points
         farther from the surface than a quarter of its extent.
@@ -199,8 +199,8 @@ class Geodesics(Module):
         return lengths.reshape(-1, num_nodes), curvatures.reshape(-1, num_nodes)
 
     def _opposite_corners(self, nodes, values):
-        """For each of `nodes`, all corners of triangles whose opposite side ends at the node; and, repeated for each of
-        these corners, the node's entry of `values`. Returns the repeated values first."""
+        """Find, for each of `nodes`, the corners of triangles whose opposite side ends at the node. Returns, for each
+        of these corners, the node's entry of `values`, and the index of the corner."""
         num_corners = self.first[nodes + 1] - self.first[nodes]
         ends = np.cumsum(num_corners)
         offset = np.arange(ends[-1]) - np.repeat(ends - num_corners, num_corners)
@@ -208,7 +208,8 @@ class Geodesics(Module):
 
     def near(self, sources: ArrayLike, targets: SurfacePlaces, limit: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """For each of the `sources` (s, 3), the indices of the targets within a geodesic distance of `limit` metres,
-        and their geodesic distances in metres. Only targets within `limit` in a straight line are considered."""
+        and their geodesic distances in metres. Only targets whose straight-line distance is at most `limit` are
+        considered."""
         source_places = self.surface.nearest(sources)
         tree, neighbours = KDTree(targets.points), []
         for batch_start in range(0, len(source_places.triangle), _SOURCES_PER_BATCH):
@@ -234,8 +235,8 @@ class Geodesics(Module):
     def _distances_in_triangles(
         self, sources: SurfacePlaces, lengths: Float[np.ndarray, "s n"], curvatures, targets: SurfacePlaces, source=None
     ):
-        """Distances (s, p) at points inside triangles; or (p,), if `source` gives the index of the source for each
-        target."""
+        """Distances (s, p) from the sources to targets inside triangles; or (p,), if `source` contains the index of the
+        source for each target."""
         cells = self.surface.cells[targets.triangle]
         corners = self.surface.points[cells]
         source_rows = np.arange(len(lengths))[:, None] if source is None else source
@@ -248,7 +249,7 @@ class Geodesics(Module):
                 start, end, side, x, y, curvature=(curvatures[ends[0]] + curvatures[ends[1]]) / 2
             )
             # Where paths from two directions meet, the distances at the ends of a side belong to different waves, and
-            # contradict the distance at the third corner. The path is then taken through a corner.
+            # contradict the distance at the third corner. In that case the path passes through a corner.
             with np.errstate(invalid="ignore", over="ignore"):
                 source_x, source_depth, _ = _virtual_source(start, end, side)
                 _, corner_x, corner_y = _triangle_coordinates(corners[:, first], corners[:, second], corners[:, third])
@@ -277,7 +278,7 @@ def _triangle_coordinates(start, end, corner):
 def _distances_across(start, end, side, x, y, *, same_source: Any = True, curvature: Any = 0.0):
     """Distances at corners, computed from the distances at the `start` and `end` of the opposite sides, and whether the
     path through the start is shorter than the path through the end. Paths across the interior of a side are considered
-    only where `same_source` is True, i.e. where the distances at both of its ends are from the same source.
+    only where `same_source` is True, i.e. where the distances at both ends of the side are from the same source.
     `curvature`: mean Gaussian curvature along the path, 1/m²."""
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         through_start = np.sqrt(x**2 + y**2) + start
@@ -300,7 +301,7 @@ def _distances_across(start, end, side, x, y, *, same_source: Any = True, curvat
 
 
 def _virtual_source(start, end, side):
-    """Virtual source of a wave with given distances at the start and the end of a side: its coordinate along the side,
+    """Virtual source of a wave with known distances at the start and the end of a side: its coordinate along the side,
     its distance behind the side, and the square of this distance, which is negative for incompatible distances."""
     source_x = (start**2 - end**2 + side**2) / (2 * side)
     squared_depth = start**2 - source_x**2
@@ -324,9 +325,9 @@ def _front_flattening(curvature, length):
 
 
 def _gaussian_curvature(surface: Triangles, corners: _Corners) -> Float[np.ndarray, " n"]:
-    """Gaussian curvature (n,) at the nodes, 1/m²: angle defect, i.e. 2π minus the sum of the angles at the node,
-    divided by a third of the area of its triangles; both are averaged over two rings of neighbours. Nodes on the border
-    do not contribute."""
+    """Gaussian curvature (n,) at the nodes, 1/m²: the angle defect, i.e. 2π minus the sum of the angles at the node,
+    divided by a third of the area of its triangles. Defect and area are averaged over two rings of neighbours. Nodes on
+    the border do not contribute."""
     num_nodes, node = len(surface.points), corners.node
     angle = np.arctan2(corners.y, corners.x), np.arctan2(corners.y, corners.side - corners.x)
     angle_defect = 2 * np.pi - np.bincount(node, np.pi - angle[0] - angle[1], num_nodes)

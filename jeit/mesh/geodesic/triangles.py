@@ -1,4 +1,5 @@
-"""`Triangles`: a triangulated surface in space as arrays, with the nearest point on it to any given point."""
+"""`Triangles`: a triangulated surface in space as arrays, with a search for the point of the surface that is nearest to
+any point."""
 
 from __future__ import annotations
 
@@ -15,10 +16,10 @@ _CANDIDATES = 16
 
 
 class SurfacePlaces(Module):
-    """A number p of points on a triangulated surface.
+    """Points on a triangulated surface; p is their number.
 
     **Fields**: `triangle` (p,): index of the triangle; `weights` (p, 3): barycentric coordinates in this triangle;
-    `points` (p, 3): positions, metres; `away` (p,): distance of the originally given point from the surface, metres.
+    `points` (p, 3): positions, metres; `away` (p,): distance from the surface of the point that was projected, metres.
 
     **Example:**
 
@@ -40,7 +41,7 @@ class SurfacePlaces(Module):
 
 
 class Triangles(Module):
-    """Triangles of a surface in space, with the geometry that geodesics need; usually made of a mesh, by
+    """Triangles of a surface in space, with the geometry that geodesics need; usually created from a mesh by
     `Triangles.of`.
 
     **Fields**: `points` (n, 3) metres; `cells` (m, 3), counter-clockwise as seen from outside.
@@ -139,7 +140,7 @@ class Triangles(Module):
         return interpolated / np.linalg.norm(interpolated, axis=1, keepdims=True)
 
     def distance_to_border(self, places: ArrayLike) -> Float[np.ndarray, " p"]:
-        """Straight distances (p,) of points (p, 3) from the border, metres; infinite for a closed surface."""
+        """Straight-line distances (p,) of points (p, 3) from the border, metres; infinite for a closed surface."""
         border, positions = self.border, np.asarray(places, float)
         if not len(border):
             return np.full(len(positions), np.inf)

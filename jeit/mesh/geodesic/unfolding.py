@@ -1,11 +1,11 @@
 """`unfold`: the triangles of a surface around a point, unfolded into the plane of the triangle that contains the point.
 
-The triangle that contains the point keeps its place. Every other triangle is connected to this triangle by the path
-that crosses the fewest triangles, and is rotated about the side that it shares with the previous triangle of this path,
+The triangle that contains the point is not moved. Every other triangle is connected to this triangle by the path that
+crosses the fewest triangles, and is rotated about the side that it shares with the previous triangle of this path,
 until it lies in the same plane. On a developable surface, such as a bent sheet, the result does not depend on the path,
 and straight lines in the plane are exactly the geodesics on the triangles. On other surfaces the result depends on the
-path; `Unfolding.exact` is False for the points where it does. The functions take NumPy or JAX arrays and can be
-differentiated and batched.
+path; `Unfolding.exact` is False for the points for which it depends on the path. The functions accept NumPy or JAX
+arrays and can be differentiated and batched.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class Unfolding(NamedTuple):
     """Unfolded triangles around L points on a surface of m triangles; lengths in metres.
 
     **Fields**: `corners` (m, 3, 2): corners of each triangle in its own plane; `turn` (L, m, 2): cosine and sine of the
-    angle by which the corners are rotated, and `shift` (L, m, 2): the vector by which they are then translated, to come
-    to lie in the plane of the triangle that contains each point; `place` (L, 2): position of each point in this plane;
-    `reached` (L, m): whether a triangle is unfolded around a point; `exact` (L,): whether the reached triangles form a
+    angle by which the corners are rotated, and `shift` (L, m, 2): the vector by which they are then translated, into
+    the plane of the triangle that contains each point; `place` (L, 2): position of each point in this plane; `reached`
+    (L, m): whether a triangle is unfolded around a point; `exact` (L,): whether the reached triangles form a
     developable surface and are at most 128 triangles away from the point.
 
     **Example:**
@@ -62,8 +62,8 @@ class Unfolding(NamedTuple):
 
 
 def unfold(mesh: Mesh, places: Float[Array, "L 3"], max_distance: Float[Array, "L m"]) -> Unfolding:
-    """Unfold the triangles around points on a surface into the plane: those whose centroids lie within `max_distance`
-    of each point in a straight line, and which are connected to the triangle that contains the point.
+    """Unfold the triangles around points on a surface into the plane: the triangles whose centroids lie within a
+    straight-line distance `max_distance` of a point, and which are connected to the triangle that contains the point.
 
     **Arguments:**
 
@@ -111,8 +111,8 @@ def _rotate(turn, points):
 
 
 def _containing_triangles(positions, frames, plane_corners) -> Int[Array, " L"]:
-    """Index of the triangle that contains each point: the nearest one, by height above its plane and distance outside
-    it."""
+    """Index of the triangle that contains each point: the triangle with the smallest sum of squares of the point's
+    height above its plane and the point's distance outside it."""
     xp = namespace(positions, plane_corners)
     origin, axes, normal = frames
     offset = positions[:, None] - origin
@@ -143,8 +143,8 @@ def _opposite_sides(cells) -> Int[Array, " h"]:
 
 def _connect(neighbour, is_near: Bool[Array, "L m"], root):
     """Find the triangles near each point (`is_near`) that are connected to the triangle `root` (L,) across sides.
-    Returns whether each triangle (L, m) is connected, and the number of its side (L, m) that leads towards the root;
-    −1 for the root itself and for triangles that are not connected."""
+    Returns whether each triangle (L, m) is connected, and the number (L, m) of the side across which the path to the
+    root leads; −1 for the root itself and for triangles that are not connected."""
     xp = namespace(neighbour, is_near)
     cell = xp.arange(is_near.shape[1])
     neighbour = neighbour.reshape(-1, 3)
@@ -163,7 +163,7 @@ def _connect(neighbour, is_near: Bool[Array, "L m"], root):
 
 def _transforms_across_sides(plane_corners, opposite):
     """Rotation (h, 2), as cosine and sine, and translation (h, 2) for each half-edge (a side of one triangle), from the
-    plane of its triangle into that of the triangle on the other side."""
+    plane of its triangle into the plane of the neighbouring triangle."""
     xp = namespace(plane_corners)
     start, end = plane_corners.reshape(-1, 2), xp.roll(plane_corners, -1, axis=1).reshape(-1, 2)
     side, opposite_side = end - start, start[opposite] - end[opposite]

@@ -1,10 +1,11 @@
 """`Unrolled`: a curved surface flattened into the plane, in metres, with the stretch of each triangle.
 
 Developable surfaces (cylinders, cones, bent sheets) are flattened without stretch, apart from the deviations of the
-triangles from the developable surface. All others are flattened as rigidly as possible: rotations of the triangles and
-positions of the nodes are fitted in turn by least squares (Liu, Zhang, Xu, Gotsman and Gortler, SGP 2008), starting
-from a conformal map (Lévy, Petitjean, Ray and Maillot, SIGGRAPH 2002). A sleeve is cut along a shortest path from one
-open end to the other; a closed surface is cut between its two extreme nodes along the axis of its largest extent.
+triangles from the developable surface. All other surfaces are flattened as rigidly as possible: rotations of the
+triangles and positions of the nodes are alternately fitted by least squares (Liu, Zhang, Xu, Gotsman and Gortler, SGP
+2008), starting from a conformal map (Lévy, Petitjean, Ray and Maillot, SIGGRAPH 2002). A sleeve is cut along a shortest
+path from one open end to the other; a closed surface is cut between its two extreme nodes along the axis of its largest
+extent.
 """
 
 from __future__ import annotations
@@ -125,7 +126,8 @@ def _edges(triangles: Float[np.ndarray, "m 3 2"]) -> Float[np.ndarray, "m 2 2"]:
 
 
 def _conformal_map(cells, plane_corners, num_nodes: int) -> np.ndarray:
-    """Least-squares conformal map, which preserves angles as well as possible; the two farthest nodes are fixed."""
+    """Least-squares conformal map, which preserves angles as well as possible; two nodes far from each other are
+    fixed."""
     held_nodes = _farthest_nodes(cells, plane_corners, num_nodes)
     side_vectors = np.stack(
         [
@@ -204,8 +206,8 @@ def _flatten_rigidly(cells, plane_corners, points: np.ndarray) -> np.ndarray:
 
 
 def _turn_upright(points: np.ndarray, space: np.ndarray) -> np.ndarray:
-    """Rotate the flat `points` so that the z axis of space points upward, or y or x if z has little slope, and centre
-    them at the origin. The map is not mirrored, since the surface is seen from outside."""
+    """Rotate the flat `points` so that the z axis of space points upward, or the y or x axis if z has little slope, and
+    centre them at the origin. The map is not mirrored, since the surface is seen from outside."""
     points = points - points.mean(axis=0)
     for axis in (2, 1, 0):
         height = space[:, axis] - space[:, axis].mean()

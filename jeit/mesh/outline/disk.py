@@ -21,7 +21,7 @@ from jeit_solvers.engines import as_array
 
 
 class Disk(Domain):
-    """A disk of given radius and centre, in metres; arc length starts at angle 0.
+    """A disk with a radius and a centre in metres; arc length starts at angle 0.
 
     **Arguments:**
 
@@ -83,7 +83,7 @@ class Disk(Domain):
         return as_array(self.radius - self._from_centre(points)[1])
 
     def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
-        """Move those of `points` (p, 2), metres, that lie outside the disk radially onto the circle."""
+        """Move the `points` (p, 2), metres, that lie outside the disk radially onto the circle."""
         offset, distance = self._from_centre(points)
         xp = numerics(self, points)
         return as_array(xp.asarray(self.centre) + offset * xp.minimum(1, self.radius / distance[:, None]))

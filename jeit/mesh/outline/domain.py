@@ -19,7 +19,7 @@ from jeit_solvers.module import Module
 
 
 class Body(Module):
-    """Base class of all bodies: plane outlines (`Domain`), solids above an outline (`Solid`), and given meshes
+    """Base class of all bodies: plane outlines (`Domain`), solids above an outline (`Solid`), and existing meshes
     (`OwnMesh`).
 
     **Example:**
@@ -59,7 +59,8 @@ _MAX_DISTANCE_FROM_ORIGIN = 1e6
 
 
 class Pen(Protocol):
-    """Interface to draw outlines, into a drawing file or a geometry kernel. The first stroke encloses the others."""
+    """Interface to draw outlines, into a drawing file or a geometry kernel. The first circle or loop drawn encloses all
+    others."""
 
     def circle(self, centre: tuple[float, float], radius: float) -> None:
         """Draw a circle; lengths in metres."""
@@ -123,7 +124,8 @@ class Domain(Body):
 
     @abc.abstractmethod
     def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
-        """Move those of `points` (p, 2), metres, that lie outside the outline to the nearest point on its edge."""
+        """Move each of `points` (p, 2), metres, that lies outside the outline to the nearest point on the edge of the
+        outline."""
 
     @abc.abstractmethod
     def describe(self) -> dict[str, Any]:
@@ -166,8 +168,8 @@ def check_length(name: str, value: Any, size_factor: float = 1.0) -> Any:
 
 
 def check_near_origin(name: str, coordinates: Any, size: Any) -> None:
-    """Raise `ValueError` with the argument's `name` if an outline of `size` metres, whose position is given by
-    `coordinates` in metres, is so far from the origin that it loses accuracy. Traced values are not checked."""
+    """Raise `ValueError` with the argument's `name` if an outline of `size` metres, with `coordinates` in metres, is so
+    far from the origin that the coordinates lose accuracy. Traced values are not checked."""
     if not has_values(coordinates, size):
         return
     distance = float(np.max(np.abs(np.asarray(coordinates))))

@@ -1,5 +1,5 @@
 """Outlines that consist of closed loops with straight sides: `Polygon`, possibly with holes, and `Rectangle`, meshed in
-rows unless refinement or node positions are requested; and the functions of loops that such an outline calls.
+rows unless refinement or node positions are requested; and functions of loops for such outlines.
 
 `loops` contains the vertices (k, 2) of each loop in metres, the first not repeated: the outer loop counter-clockwise,
 holes clockwise. Distances are computed with NumPy if all values are known, because JAX would compile again for every
@@ -105,7 +105,7 @@ class Polygon(Domain):
         return distance_from_loops(self.loops(), points)
 
     def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
-        """Move those of `points` (p, 2), metres, that lie outside or in a hole to the nearest point on a side."""
+        """Move each of `points` (p, 2), metres, that lies outside or in a hole to the nearest point on a side."""
         return nearest_in_loops(self.loops(), points)
 
     def describe(self) -> dict:
@@ -181,7 +181,7 @@ class Rectangle(Domain):
 
     @property
     def vertices(self) -> Float[Array, "4 2"]:
-        """Corners (4, 2) in metres, counter-clockwise from the lower left one."""
+        """Corners (4, 2) in metres, counter-clockwise from the lower left corner."""
         x_min, x_max, y_min, y_max = self.extent
         return as_array([[x_min, y_min], [x_max, y_min], [x_max, y_max], [x_min, y_max]])
 
@@ -206,7 +206,7 @@ class Rectangle(Domain):
         return distance_from_loops(self.loops(), points)
 
     def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
-        """Move those of `points` (p, 2), metres, that lie outside to the nearest point on a side."""
+        """Move each of `points` (p, 2), metres, that lies outside to the nearest point on a side."""
         return nearest_in_loops(self.loops(), points)
 
     def describe(self) -> dict:
@@ -305,7 +305,7 @@ def distance_from_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array
 
 
 def nearest_in_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "p 2"]:
-    """Move those of `points` (p, 2) that lie outside to the nearest point on a side; points inside are returned
+    """Move each of `points` (p, 2) that lies outside to the nearest point on a side; points inside are returned
     unchanged."""
     xp = numerics(loops, points)
     point_array, is_inside, nearest_points = _project_onto_loops(xp, loops, points)
@@ -313,8 +313,8 @@ def nearest_in_loops(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "
 
 
 def _project_onto_loops(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tuple[Any, Any, Any]:
-    """Convert `points` (p, 2) to an array; also returns whether each lies inside (p,), and the nearest point on a side
-    (p, 2)."""
+    """Convert `points` (p, 2) to an array. Also returns whether each point lies inside (p,), and the point on a side
+    that is nearest to it (p, 2)."""
     chains, point_array = [xp.asarray(loop) for loop in loops], xp.asarray(points, float)
     start = xp.concatenate(chains)
     sides = xp.concatenate([xp.roll(loop, -1, axis=0) for loop in chains]) - start

@@ -1,4 +1,5 @@
-"""Surfaces in space (sleeves, spheres, bent sheets) and shells, which give a surface a thickness."""
+"""Surfaces in space (sleeves, spheres, bent sheets) and shells, which are solids of a certain thickness on a
+surface."""
 
 from __future__ import annotations
 

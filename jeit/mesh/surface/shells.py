@@ -1,4 +1,4 @@
-"""Shells of a given thickness on surfaces in space; bending of sheets; and surfaces of solids."""
+"""Shells of a specified thickness on surfaces in space; bending of sheets; and surfaces of solids."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
     **Arguments:**
 
     - `mesh`: a mesh of tetrahedra.
-    - `tag`: name in `mesh.tags` of the triangles to extract, by default all of the boundary.
+    - `tag`: name in `mesh.tags` of the triangles to extract; by default, the whole boundary is extracted.
 
     Raises `ValueError` for a mesh that is not a solid, an unknown tag, and triangles that do not form one surface: for
     a shell, choose 'inner' or 'outer'.
@@ -44,8 +44,8 @@ def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
         return Mesh.create(np.asarray(mesh.points)[used_nodes], cells.reshape(facets.shape))
 
 
-# Minimum cosine of the angle between the mean normal at a node and those of its triangles: below it, the node lies on a
-# crease, which is not smoothed.
+# Minimum cosine of the angle between the mean normal at a node and the normals of its triangles: below it, the node is
+# treated as part of a crease, where the mean normal is used.
 _MIN_CREASE_COSINE = np.cos(np.radians(50.0))
 # Number of coefficients of the quadratic surface fitted to neighbours, and minimum ratio of the smallest to the largest
 # eigenvalue of the normal equations of this fit.
@@ -55,10 +55,10 @@ _NUM_COEFFICIENTS, _MIN_EIGENVALUE_RATIO = 5, 1e-6
 def node_normals(mesh: Mesh) -> np.ndarray:
     """Unit normals (n, 3) at the nodes of a surface in space.
 
-    A quadratic surface is fitted to the first and second neighbours of each node; on a smooth surface its normal is
-    accurate to second order in the cell size, also at the border. At creases, and where there are too few neighbours,
-    the normal is the angle-weighted mean of the normals of the triangles. The normals are computed with NumPy and have
-    no derivatives. Raises `ValueError` for a solid.
+    A quadratic surface is fitted to the first and second neighbours of each node; on a smooth surface, the normal of
+    the fit is accurate to second order in the cell size, also at the border. At creases, and where there are too few
+    neighbours, the normal is the angle-weighted mean of the normals of the triangles. The normals are computed with
+    NumPy and have no derivatives. Raises `ValueError` for a solid.
 
     **Arguments:**
 
@@ -91,7 +91,8 @@ def node_normals(mesh: Mesh) -> np.ndarray:
 
 def _fit_slopes(points: np.ndarray, cells: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit a quadratic surface to the first and second neighbours of each node, as a height above the plane
-    perpendicular to `normal`. Returns its slopes (n, 3) at the nodes, and whether the neighbours determine it."""
+    perpendicular to `normal`. Returns the slopes (n, 3) of the fit at the nodes, and whether the neighbours determine
+    the fit."""
     num_nodes = len(points)
     pairs = np.concatenate([cells[:, [a, b]] for a in range(3) for b in range(3)])
     adjacency = coo_array((np.ones(len(pairs)), pairs.T), shape=(num_nodes, num_nodes)).tocsr()
@@ -135,10 +136,11 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
     """Bend a flat sheet around a cylinder that touches the sheet from below along its middle.
 
     Like paper, the sheet is not stretched: it is folded along straight lines parallel to the cylinder's axis and stays
-    flat between them, so all lengths and all voltages are preserved. The folds run along the rows of nodes if the mesh
-    has rows (`jeit.mesh.rectangle` has them for axis "x"). Otherwise the sheet is divided into `num_folds` strips, and
-    cells are cut where folds cross them; `bend(mesh, numpy.inf)` is the flat sheet with the same cells. Fold lines lie
-    on the cylinder. The upper side of the sheet becomes the outer side of the surface. Tags are kept.
+    flat between these lines, so all lengths and all voltages are preserved. The folds run along the rows of nodes if
+    the mesh has rows (the meshes of `jeit.mesh.rectangle` have rows for axis "x"). Otherwise the sheet is divided into
+    `num_folds` strips, and cells are cut where folds cross them; `bend(mesh, numpy.inf)` is the flat sheet with the
+    same cells. Fold lines lie on the cylinder. The upper side of the sheet becomes the outer side of the surface. The
+    surface has the tags of the sheet.
 
     **Arguments:**
 
@@ -177,7 +179,8 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
 
 
 def _fold_positions(positions: np.ndarray, corners: np.ndarray, bent_axis: int, num_folds: int | None) -> np.ndarray:
-    """Coordinates in metres, across the sheet, of the lines along which it is bent, its two borders included."""
+    """Coordinates in metres, across the sheet, of the lines along which it is bent, including the two borders of the
+    sheet."""
     width = np.ptp(positions)
     sorted_positions = np.sort(positions)
     rows = sorted_positions[np.concatenate([[True], np.diff(sorted_positions) > _LINE_TOLERANCE * width])]
@@ -286,12 +289,12 @@ def shell(
     - `surface`: a surface in space.
     - `thickness`: thickness of the skin in metres.
     - `num_layers`: number of layers of prisms.
-    - `outward`: whether the skin extends outward from the surface, or else inward.
+    - `outward`: whether the skin extends outward from the surface; otherwise it extends inward.
     - `normals` (n, 3): unit normals at the nodes; default: `jeit.mesh.node_normals`, which may be less accurate.
 
     Raises `ValueError` for a mesh that is not a surface in space, a thickness that is not positive, no layers, a shell
-    that intersects itself, and a thickness at which prisms turn inside out, as they do beyond the radius of curvature;
-    the message then states the position and the maximum thickness.
+    that intersects itself, and a thickness, such as one above the radius of curvature, at which prisms turn inside out.
+    In the last case, the message states the position and the maximum thickness.
 
     **Example:**
 
@@ -310,7 +313,8 @@ def shell(
     directions = node_normals(surface) if normals is None else _check_normals(normals, num_nodes)
     directions = directions if outward else -directions
     tetrahedra = stacked_cells(cells, num_nodes, num_layers)
-    # Sorting the corners inverted some prisms, and the second of the three tetrahedra has the opposite orientation.
+    # Sorting the corners in `stacked_cells` inverts some prisms. The second of the three tetrahedra of a prism has the
+    # opposite orientation to the other two tetrahedra.
     orientation = np.where(odd_permutation(cells) ^ (not outward), -1.0, 1.0)
     tetrahedron_signs = np.tile(np.outer(orientation, (1, -1, 1)).ravel(), num_layers)
 

@@ -72,7 +72,8 @@ def forearm(
     **Arguments:**
 
     - `length`: length of the sleeve in metres.
-    - `wrist`, `elbow`: radius of a circular section in metres, or semi-axes (along x, along y) of an elliptical one.
+    - `wrist`, `elbow`: radius of a circular section in metres, or semi-axes (along x, along y) of an elliptical
+      section.
     - `num_points`, `cell_size`, `num_around`: as in `tube`.
 
     Raises `ValueError` for invalid or contradictory arguments.
@@ -135,7 +136,7 @@ def _arc_lengths(a: float, b: float) -> np.ndarray:
 
 
 def _sleeve_mesh(height: float, semi_axes: np.ndarray, num_per_ring: int) -> Mesh:
-    """Mesh a sleeve from rows of nodes on ellipses with `semi_axes` (r + 1, 2), evenly spaced along each."""
+    """Mesh a sleeve from rows of nodes on ellipses with `semi_axes` (r + 1, 2), evenly spaced along each ellipse."""
     rings = []
     for row, (a, b) in enumerate(semi_axes):
         turns = (np.arange(num_per_ring) + row % 2 / 2) / num_per_ring
@@ -174,8 +175,8 @@ def _triangles_between_rings(lower_ring: np.ndarray, upper_ring: np.ndarray, low
 def sphere(radius: float, *, num_points: int | None = None, cell_size: float | None = None) -> Mesh:
     """Mesh a closed sphere around the origin.
 
-    Every triangle of an icosahedron is divided into k² triangles, which are projected onto the sphere. This makes 10 k²
-    + 2 nodes; k is chosen to come closest to the requested number of nodes or cell size.
+    Every triangle of an icosahedron is divided into k² triangles, which are projected onto the sphere. The mesh has 10
+    k² + 2 nodes; k is chosen so that the number of nodes or the cell size is closest to the requested value.
 
     **Arguments:**
 
