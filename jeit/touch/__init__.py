@@ -3,8 +3,8 @@
 There are functions and classes for contacts (detection in images, tracking, loads in newtons), learnt skins (from
 recorded presses, without a model), self-organising maps, gestures, the health of a skin (cuts, failing electrodes,
 repair), its attributes (resolution), sounds of touches, networks that estimate maps of indentation depth, the training
-of networks, and the simulation of presses, people and damage. Results are drawn by `plot_…`. What users need of the
-subpackages is exported here.
+of networks, and the simulation of presses, people and damage. The functions `plot_…` draw results. The functions and
+classes that users need are exported here.
 
 `LogitBoostClassifier`, and scikit-learn with it, is imported when it is first used.
 """
