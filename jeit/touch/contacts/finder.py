@@ -44,7 +44,8 @@ class ImageNoise(Module):
     def __check_init__(self):
         """Check the fields.
 
-        Raises `ValueError` for deviations that are negative or not finite, and a factor for another number of cells.
+        Raises `ValueError` for deviations that are negative or not finite, and a factor with a different number of
+        cells.
         """
         requirement = "an array (m,), one number a cell, zero or more and finite, in the unit of the image"
         check_kind("deviation", self.deviation, (np.ndarray, jax.Array), requirement)
@@ -96,7 +97,7 @@ class ImageNoise(Module):
         """Compute the noise from the standard deviations of independent channels, (M,) or one number for all, volts.
 
         The difference of two frames has √2 times the standard deviation of one frame. Raises `ValueError` for
-        deviations that are negative, not finite, all zero, or for another number of channels.
+        deviations that are negative, not finite, all zero, or for a different number of channels.
         """
         check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
         num_channels = reconstruction.num_measurements

@@ -184,7 +184,7 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
         or not is_distinct(projections, first_frame)
     ):
         return None
-    # The step may be at another frame than the boundary between the windows.
+    # The step need not be at the boundary between the windows.
     return Step(channel_medians(frames[first_frame:]) - channel_medians(frames[:first_frame]), size, first_frame)
 
 

@@ -158,15 +158,15 @@ class LocalChange:
         self.inverse = _inverse_between(matrix, nodes)
 
     def impedance(self, change: Float[np.ndarray, "c ..."]) -> Float[np.ndarray, "L L"]:
-        """Transfer impedance matrix (electrodes, electrodes), ohms, after a `change` of the conductivity in the
-        region's cells: scalars (cells,) or tensors (cells, d, d) in d dimensions."""
+        """Compute the transfer impedance matrix (electrodes, electrodes), ohms, after a `change` of the conductivity in
+        the region's cells: scalars (cells,) or tensors (cells, d, d) in d dimensions."""
         return self._impedance(self._solve_change(change)[1])
 
     def derivatives(
         self, change: Float[np.ndarray, "c ..."], directions: list[Float[np.ndarray, "c ..."]]
     ) -> tuple[Float[np.ndarray, "L L"], list[Float[np.ndarray, "L L"]]]:
-        """Transfer impedance matrix (electrodes, electrodes), ohms, after a `change` of conductivity in the region, and
-        its derivatives along the changes in `directions`."""
+        """Compute the transfer impedance matrix (electrodes, electrodes), ohms, after a `change` of conductivity in the
+        region, and its derivatives along the changes in `directions`."""
         cells, product, solution = self._solve_change(change)
         fields: Any = unit_fields(solution, product, self.resistance)[0]  # pyright: ignore[reportArgumentType]
         node_fields = np.zeros((self.solution.shape[0], fields.shape[1]))
@@ -218,8 +218,8 @@ class LocalChange:
 
 
 def _inverse_between(matrix, nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t t"]:
-    """Inverse of a sparse symmetric matrix, restricted to some nodes: inverse of the Schur complement without the other
-    nodes."""
+    """Compute the inverse of a sparse symmetric matrix, restricted to `nodes`: the inverse of the Schur complement
+    after elimination of all other nodes."""
     others = np.setdiff1d(np.arange(matrix.shape[0]), nodes)
     schur_complement = matrix[nodes][:, nodes].toarray()
     if len(others):

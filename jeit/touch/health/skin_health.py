@@ -206,7 +206,8 @@ class SkinHealth:
     def deny(self, event: HealthEvent) -> "SkinHealth":
         """Return the state after the user has denied an event because it was a held press, not damage.
 
-        The reference voltages are reset to those before the event. Raises `ValueError` for an event of another skin.
+        The reference voltages are reset to those before the event. Raises `ValueError` for an event of a different
+        skin.
         """
         if self._pending is not None and self.held is not None and event.number == self.held.number:
             return replace(self, _pending=None)
@@ -219,8 +220,8 @@ class SkinHealth:
 
         The median of the `frames` of the repaired, untouched skin, volts, is the new reference. The method may also be
         called before the first frame of a later day, with untouched frames of that day: changes in the meantime, such
-        as of gains, are then not reported as events. Raises `ValueError` for another number of channels, or readings in
-        fewer than half of them.
+        as of gains, are then not reported as events. Raises `ValueError` for a different number of channels, or
+        readings in fewer than half of them.
         """
         checked_frames = _check_frames("frames", np.atleast_2d(real_array("frames", frames, "(n, M) volts")))
         if checked_frames.shape[1] != self.reference.size:
@@ -262,7 +263,7 @@ class SkinHealth:
         """Reconstruct conductivity changes (frames, cells), S/m (2-D: S), relative to the present skin with its cuts.
 
         Only trusted channels are used; the image of a frame without a reading is NaN. Raises `ValueError` without a
-        forward model, and for frames with another number of channels.
+        forward model, and for frames with a different number of channels.
         """
         if self.skin is None:
             raise ValueError("images need a forward model: give model and conductivity to SkinHealth.fit.")
@@ -495,7 +496,8 @@ class SkinHealth:
         )
 
     def _with_status(self, event: HealthEvent, status: EventStatus) -> "SkinHealth":
-        """Return the state after setting the status of an event. Raises `ValueError` for an event of another skin."""
+        """Return the state after setting the status of an event. Raises `ValueError` for an event of a different
+        skin."""
         check_kind("event", event, HealthEvent, "one of health.events, or health.held")
         if not event.number < len(self.events):
             raise ValueError(f"event {event.number} does not belong to this skin, which has {len(self.events)} events.")
