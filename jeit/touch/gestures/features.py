@@ -29,7 +29,8 @@ _FURTHER_FEATURES = (
     "roughness", "pauses", "centre of gravity", "breadth",
 )  # fmt: skip
 COURSE_FEATURES = (*FEATURES, *_FURTHER_FEATURES, *(f"course {instant + 1}" for instant in range(_NUM_INSTANTS)))
-"""Names of the features of `course_features`: the seven, further ones of the time course, and samples of P."""
+"""Names of the features of `course_features`: the seven features, further features of the time course, and samples of
+P."""
 
 NUM_SEQUENCE_INSTANTS = 32
 SEQUENCE_VALUES = ("change", "share", "mean", "area", "half", "speed", "distance", "along")
@@ -145,7 +146,7 @@ def _seven_features(course: ChangeCourse) -> list[float]:
 
 
 def _further_features(course: ChangeCourse) -> list[float]:
-    """Compute the features of one touch in `COURSE_FEATURES` after the first seven, in the order of that list."""
+    """Compute the features of one touch that follow the first seven in `COURSE_FEATURES`, in this order."""
     has_centroid = np.isfinite(course.centroid[:, 0])  # a frame below the level has no centroid
     centroids, seconds = course.centroid[has_centroid], course.seconds[has_centroid]
     steps = np.linalg.norm(np.diff(centroids, axis=0), axis=1)

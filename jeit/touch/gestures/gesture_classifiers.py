@@ -47,7 +47,8 @@ FEATURE_FORMS: dict[str, Callable[..., Any]] = {
     "course": course_features,
     "sequence": sequence_features,
 }
-"""Functions that compute features of touches, by name: the seven, those with more of the time course, and all."""
+"""Functions that compute features of touches, by name: the seven features; these and features of the time course; both
+and the sampled time course."""
 
 
 def feature_forms(method: str) -> tuple[str, ...]:

@@ -29,7 +29,7 @@ from jeit.touch.learnt.extras import apply_in_parts
 from jeit.touch.learnt.file import read_plain, write_plain
 from jeit.touch.learnt.methods import fit_sharpness, log_odds, probabilities
 
-# Two skins whose conductivities differ by this factor or more are considered different, or given in different units.
+# Minimum ratio of the conductivities of two skins that are considered different, or to have different units.
 _MIN_CONDUCTIVITY_RATIO = 5.0
 
 
