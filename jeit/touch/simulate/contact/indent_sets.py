@@ -18,7 +18,7 @@ from jeit.touch.simulate.contact.indents import IndentDraws, depth_maps, relativ
 
 # Version of the simulation, to be increased when its results change.
 _VERSION = 2
-# Lock with which only one thread of a worker computes the data shared by all chunks.
+# Lock that lets only one thread of a worker compute the data shared by all chunks.
 _RESTING_SKIN_LOCK = Lock()
 _UNITS_AND_MEANINGS = {
     "change": ("1", "change of each channel's voltage, relative to the skin at rest"),
@@ -76,8 +76,8 @@ class IndentSet:
         return _digest(arrays, str(settings))
 
     def solve(self, chunk: int) -> dict[str, np.ndarray]:
-        """Simulate a chunk of k touches: relative changes of voltages (k, M) and depth maps (k, rows, columns), by the
-        names of their arrays in the store."""
+        """Simulate a chunk of k touches; return relative changes of voltages (k, M) and depth maps (k, rows, columns),
+        by the names of their arrays in the store."""
         key = jax.random.fold_in(jax.random.key(self.seed), chunk)
         touches = self.draws.draw(key, len(self.chunks[chunk]))
         depths = depth_maps(touches, self.places) / float(self.skin.thickness)
@@ -135,7 +135,7 @@ def _shared_resting_skin(skin_and_depth: _SkinAndDepth) -> RestingSkin | None:
 
 
 def _digest(arrays: Any, text: str) -> str:
-    """SHA-256 hash of a tree of arrays and a text."""
+    """Compute the SHA-256 hash of a tree of arrays and a text."""
     leaves, structure = jax.tree.flatten(arrays)
     hasher = hashlib.sha256(f"{text} {structure}".encode())
     for leaf in leaves:
@@ -144,15 +144,15 @@ def _digest(arrays: Any, text: str) -> str:
 
 
 def image_places(skin: Skin, columns: int, rows: int) -> np.ndarray:
-    """Centres (rows, columns, 2) of the pixels of a grid over the bounding box of a skin, metres; row 0 is at the
-    minimum y."""
+    """Return the centres (rows, columns, 2) of the pixels of a grid over the bounding box of a skin, metres; row 0 is
+    at the minimum y."""
     low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
     return pixel_places((low_x, high_x, low_y, high_y), (rows, columns))
 
 
 def pixel_places(extent: tuple[float, float, float, float], shape: tuple[int, int]) -> np.ndarray:
-    """Centres (rows, columns, 2) of the pixels of a grid over a box (x_min, x_max, y_min, y_max), metres; row 0 is at
-    the minimum y."""
+    """Return the centres (rows, columns, 2) of the pixels of a grid over a box (x_min, x_max, y_min, y_max), metres;
+    row 0 is at the minimum y."""
     (low_x, high_x, low_y, high_y), (rows, columns) = extent, shape
     x = low_x + (high_x - low_x) * (np.arange(columns) + 0.5) / columns
     y = low_y + (high_y - low_y) * (np.arange(rows) + 0.5) / rows

@@ -21,7 +21,8 @@ class AbstractIndenter(Module):
 
     @abc.abstractmethod
     def gap(self, points: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "..."]:
-        """Return the height of the surface above its lowest point at `points` (…, 2), metres; infinite beside it."""
+        """Return the height of the surface above its lowest point at `points` (…, 2), metres; infinite beside the
+        body."""
 
     @property
     @abc.abstractmethod
@@ -248,7 +249,8 @@ class DepthMapIndenter(AbstractIndenter):
         self.height, self.pixel = height, float(pixel)
 
     def gap(self, points):
-        """Return the maximum height of the surface minus its height at the points; infinity where it is missing."""
+        """Return the maximum height of the surface minus its height at the points; infinity where there is no
+        surface."""
         centre_pixel = (np.array(self.height.shape) - 1) / 2
         pixel_coordinates = np.moveaxis(np.asarray(points)[..., ::-1] / self.pixel + centre_pixel, -1, 0)
         flat_heights = map_coordinates(self.height, pixel_coordinates.reshape(2, -1), order=1, cval=np.nan)

@@ -20,14 +20,14 @@ from jeit.touch.simulate.contact.press import (
 )
 from jeit_solvers.module import Module
 
-# Number of pixels along a side: of the raster on which the contact is located; of the raster on which the approach is
-# found that balances the load.
+# Number of pixels along a side of the raster on which the contact is located, and of the raster on which the approach
+# that balances the load is computed.
 _NUM_COARSE_PIXELS, _NUM_FINE_PIXELS = 24, 96
 
 
 class FoundationPressure(AbstractPressure):
-    """Pressure max(k (approach − gap), 0) on a Winkler foundation with `stiffness` k in Pa/m, evaluated without a
-    raster at any point, at which the indenter's surface is `gap` above its lowest point."""
+    """Pressure max(k (approach − gap), 0) on a Winkler foundation with `stiffness` k in Pa/m, evaluated at any point
+    without a raster. The gap is the height of the indenter's surface at the point above its lowest point."""
 
     indenter: AbstractIndenter
     stiffness: float
@@ -115,7 +115,8 @@ class Foundation(AbstractSupport):
 def water_level(
     gap: Float[np.ndarray, "*n q"], area: Float[np.ndarray, "*n q"], volume: Float[np.ndarray, "*n"] | float
 ) -> Float[np.ndarray, "*n"]:
-    """Compute the level δ at which Σ area · max(δ − gap, 0) equals `volume`: that of water over ground of height `gap`.
+    """Compute the level δ at which Σ area · max(δ − gap, 0) equals `volume`, as that of water over ground of height
+    `gap`.
 
     The level is 0 if every gap is infinite. If the m lowest points are under water, δ = (volume + Σ area · gap) / Σ
     area over these points. This is exact for the smallest m for which the next point is not under water.
@@ -293,7 +294,7 @@ def material(name: str) -> Material:
 
     - `name`: "velostat", "conductive fabric" or "hydrogel".
 
-    Raises `ValueError` for another name.
+    Raises `ValueError` for other names.
 
     **Example:**
 

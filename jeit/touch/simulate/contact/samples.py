@@ -88,14 +88,15 @@ class Samples(NamedTuple):
         )
 
     def lattice_points(self, cells: Int[np.ndarray, " c"], fineness: int) -> Float[np.ndarray, "c s d"]:
-        """Return sample points (c, s, d) in the given cells, on a lattice whose points increase with `fineness`."""
+        """Return sample points (c, s, d) in `cells`, on a lattice with s points per cell; s increases with
+        `fineness`."""
         if self.curved is None:
             return lattice(self.corners[cells], fineness)
         return _curved_lattice(self.corners[cells], self.curved.corners[cells], fineness)
 
     def check(self, presses: Sequence[Press]) -> None:
-        """Raise `ValueError` for presses whose positions have another number of coordinates than the sample points, and
-        for positions off a curved skin."""
+        """Raise `ValueError` for presses whose positions do not have as many coordinates as the sample points, and for
+        positions off a curved skin."""
         dimension, skin_kind = self.points.shape[-1], "flat" if self.curved is None else "curved"
         for press in presses:
             if len(press.position) != dimension:
@@ -167,7 +168,8 @@ def _barycentric_weights(num_corners: int, fineness: int) -> Float[np.ndarray, "
 
 
 def _curved_lattice(corners, normals, fineness: int) -> Float[np.ndarray, "m s 3"]:
-    """Return the points of `lattice`, moved from flat triangles onto the curved surface that these approximate."""
+    """Return the points of `lattice`, moved from the flat triangles onto the curved surface that the triangles
+    approximate."""
     weights = _barycentric_weights(corners.shape[1], fineness)
     return project_to_curved_surface(
         np.einsum("sk,mkd->msd", weights, corners), weights, corners[:, None], normals[:, None]
