@@ -99,8 +99,8 @@ def least_detected(amount: ArrayLike, detected: ArrayLike) -> float:
     """Compute the smallest amount, such as a distance, that is detected in half of the trials.
 
     An amount may be the separation of two points that are distinguished, or the gap between two touches. `amount` (n,):
-    amount in each of n trials, in any unit, which is that of the result; `detected` (n,): whether the amount was
-    detected, true or false. The result is infinite if no amount is detected in half of the trials. The share of
+    amount in each of n trials, in any unit, which is also the unit of the result; `detected` (n,): whether the amount
+    was detected, true or false. The result is infinite if no amount is detected in half of the trials. The share of
     detections is assumed to rise with the amount (isotonic regression), and is interpolated linearly between amounts.
     Raises `ValueError` for arrays of different lengths, and NaN.
     """

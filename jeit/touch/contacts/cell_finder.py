@@ -68,7 +68,8 @@ def outline_of_cells(points: Float[np.ndarray, "n d"], cells: Int[np.ndarray, "c
 
 
 class CellFinder(AbstractFinder):
-    """Finds contacts in images on a mesh: every peak, with the cells around it that exceed a share of its height.
+    """Finds contacts in images on a mesh: each contact is a peak, with the cells around it that exceed a share of its
+    height.
 
     In the centroid of a contact, cells are weighted by their excess above this share of the peak. The excess is zero at
     the contact's edge, so that the centroid does not jump when a cell joins or leaves the contact. Peaks that are weak,

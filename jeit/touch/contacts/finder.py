@@ -167,10 +167,10 @@ class Contact(Module):
 
     **Fields**: `centroid`: (x, y), or (x, y, z) on a surface in space, metres; `area`: area of the region, m²; `peak`:
     strongest change in the region, with its sign, in the unit of the image; `integral`: integral of the change over the
-    region, in the unit of the image times m²; `contour` (k, d): k points of the region's outline, metres, of which the
-    first is not repeated at the end; `deviation`: root mean square displacement of the centroid by noise of the image
-    (see `ImageNoise`), to first order, metres. The deviation includes neither the blur of the image nor systematic
-    errors.
+    region, in the unit of the image times m²; `contour` (k, d): k points of the region's outline, metres, without
+    repetition of the first point at the end; `deviation`: root mean square displacement of the centroid by noise of the
+    image (see `ImageNoise`), to first order, metres. The deviation includes neither the blur of the image nor
+    systematic errors.
 
     **Example:**
 

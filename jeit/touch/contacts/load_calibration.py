@@ -6,8 +6,8 @@ peak = s exp(b ρ² + c ρ⁴) F / (F + F½),
 
 where s, b, c and F½ are fitted, and ρ is the distance of the contact from the middle of the skin, divided by the skin's
 radius. The peak rises with the load and saturates, as conductivity under pressure does, and is larger near the
-electrodes. A calibration is valid for one indenter, or similar indenters: a wider contact under the same load has
-a different peak.
+electrodes. A calibration is valid for the indenter with which it was recorded, and for similar indenters: a wider
+contact under the same load has a different peak.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class LoadCalibration(Module):
         """Estimate the load of a contact, newtons, and its standard deviation.
 
         The standard deviation includes the uncertainty of the parameters and the scatter of peaks about the curve, but
-        no change of the skin since calibration: if all gains are g times as large, the peaks are g times as large too.
+        no change of the skin since calibration. If all gains become g times as large, for example, so do the peaks.
         Raises `ValueError` for a peak above the calibrated peaks, where the curve does not determine the load, for a
         peak of the opposite sign, and for a contact farther from the centre than the calibrated contacts.
         """

@@ -68,7 +68,7 @@ class RasterFinder(AbstractFinder):
     - `pixels`: number of pixels along a side of the raster.
     - `smoothing`: standard deviation of the Gaussian that smooths images before the other steps, metres; see
       `CellFinder`.
-    - `block`: width of the block with whose mean a pixel is compared, an odd number of pixels.
+    - `block`: width of the block of pixels around a pixel, an odd number of pixels.
     - `constant`: number of grey levels by which a pixel must exceed the mean of its block.
     - `opening`: width of the ellipse of the opening, an odd number of pixels.
     - `floor`: number of standard deviations of the noise that a cell must exceed to belong to a contact; without a
@@ -237,11 +237,11 @@ class RasterFinder(AbstractFinder):
         """Compute the uncertainty of cells' membership in a contact: slope (m,) against the cell's value, and standard
         deviation (m,) of the independent part.
 
-        A cell is wholly inside or outside a contact (membership 1 or 0). A cell whose smoothed value exceeds the
-        threshold by `excess` on average, with standard deviation σ, is inside with probability p = Φ(z), z = excess /
-        σ, where Φ and φ are the normal distribution and its density. On average, its membership changes with its value
-        at the rate φ(z) / σ; the remaining part of the membership has the standard deviation √(p (1 − p) − φ(z)²),
-        independently for each cell.
+        A cell is wholly inside or outside a contact (membership 1 or 0). Suppose that the smoothed value of a cell
+        exceeds the threshold by `excess` on average, with standard deviation σ. The cell is then inside with
+        probability p = Φ(z), z = excess / σ, where Φ and φ are the normal distribution and its density. On average, the
+        cell's membership changes with its value at the rate φ(z) / σ. The remaining part of the membership has the
+        standard deviation √(p (1 − p) − φ(z)²), independently for each cell.
         """
         num_pixels = np.bincount(cell_indices, minlength=self.num_cells)
         mean_excess = np.bincount(cell_indices, excess, minlength=self.num_cells) / np.maximum(num_pixels, 1)

@@ -12,8 +12,8 @@ from jeit.arguments import check_kind, check_metres, describe, is_number, real_a
 from jeit.touch.contacts.finder import Contact
 from jeit_solvers.module import Module
 
-# Share of the error of a touch's predicted velocity by which the velocity is corrected: one half averages the noise of
-# two frames.
+# Fraction of the error of a touch's velocity that is corrected in each frame: one half averages the noise of two
+# frames.
 _VELOCITY_GAIN = 0.5
 # Maximum time for which a touch may be hidden by the contact of another touch, as a multiple of `gap`.
 _HIDDEN_GAPS = 4
@@ -23,8 +23,8 @@ class TouchPath(Module):
     """Path of one touch over the skin.
 
     **Fields**: `number`: rank of the touch in order of onset, from 0; `times` (T,): times of the T frames in which the
-    touch was seen, seconds; `position` (T, 2): centroids, metres; `peak` (T,): peaks, in the unit of the images; `area`
-    (T,): areas, m².
+    touch was detected, seconds; `position` (T, 2): centroids, metres; `peak` (T,): peaks, in the unit of the images;
+    `area` (T,): areas, m².
     """
 
     number: int
@@ -79,12 +79,12 @@ class ContactTracker(Module):
     """State of the tracking of touches from frame to frame.
 
     `tracker.follow(time, contacts)` returns the state after the next frame; `tracker` is not changed. Contacts are
-    assigned to the touches whose predicted positions (position + velocity · time) are nearest, with the minimum sum of
-    distances. The distance of a contact from the predicted position of its touch is at most the sum of two lengths:
-    `reach`, metres, which allows for noise of positions, and the distance that a touch covers between two frames at the
-    maximum speed `fastest`, m/s. A touch ends `gap` seconds after the first frame without a contact. A touch that may
-    be hidden in another touch's contact, as when two fingers cross, is assumed to continue at its velocity for at most
-    4 `gap`.
+    assigned to touches such that the sum of the distances between contacts and predicted positions (position + velocity
+    · time) is minimal. The distance of a contact from the predicted position of its touch is at most the sum of two
+    lengths: `reach`, metres, which allows for noise of positions, and the distance that a touch covers between two
+    frames at the maximum speed `fastest`, m/s. A touch ends `gap` seconds after the first frame without a contact. A
+    touch that may be hidden in another touch's contact, as when two fingers cross, is assumed to continue at its
+    velocity for at most 4 `gap`.
 
     **Fields**: `gap`, `reach`, `fastest`: as above; `least`: minimum number of frames of a touch that is reported;
     `time`: time of the last frame, -inf before the first; `open`, `closed`: current touches, and touches that have
@@ -243,7 +243,7 @@ def without_side_lobes(touches: list[TouchPath], weakest: float) -> list[TouchPa
 
 
 def _update_touch(touch: _TrackedTouch, time: float, contact: Contact) -> _TrackedTouch:
-    """Return the state of a touch after a frame in which it is seen as this contact."""
+    """Return the state of a touch after a frame in which `contact` is assigned to it."""
     velocity_error = (contact.centroid - touch.predicted_position(time)) / (time - touch.time)
     velocity = touch.velocity + _VELOCITY_GAIN * velocity_error
     return _TrackedTouch(touch.number, time, contact.centroid, velocity, (*touch.observations, (time, contact)))

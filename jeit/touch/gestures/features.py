@@ -62,7 +62,7 @@ def touch_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Touc
     """Compute the seven features of n touches by Silvera Tawil et al. (2011), table II and section IV-A.
 
     Let x_e be the change of conductivity of mesh element e, P(t) = max_e x_e the maximum change at time t, and t* the
-    time at which P is largest. The features, in the order of `FEATURES`, are: P at t*; minimum of x_e over all elements
+    time of the maximum of P. The features, in the order of `FEATURES`, are: P at t*; minimum of x_e over all elements
     and frames of the touch; fraction of the elements with x_e ≥ P / 2 at t*; mean of x_e at t* over the elements above
     the touch level; duration from the first to the last frame above the level, s; mean of |dP/dt|, 0 for a single
     frame; distance between the first and the last centroid, m.

@@ -22,12 +22,12 @@ from jeit.touch.gestures import GestureModel, StreamTouch, TouchLevel, TouchStre
 from jeit.touch.gestures.touch_images import TouchImages
 
 # Minimum untouched time between two touches, in seconds and in frames, of which the longer applies; untouched time
-# after which the reference frame follows the skin's drift, seconds; time constant with which it follows, seconds.
+# after which the reference frame follows the skin's drift, and time constant of this adaptation, both in seconds.
 _MIN_GAP, _MIN_GAP_FRAMES, _SETTLING_TIME, _DRIFT_TIME_CONSTANT = 0.1, 2.5, 0.5, 2.0
 # Maximum fraction of the initial untouched frames that may exceed the touch level of the model.
 _MAX_FRACTION_ABOVE_LEVEL = 0.1
-# A change opposite to a touch shows that the skin was touched when its reference was recorded: minimum ratio of this
-# change to the touch level; minimum time, seconds, for which it lasts.
+# A change of the sign opposite to a touch shows that the skin was touched when its reference was recorded: minimum
+# ratio of this change to the touch level; minimum duration of this change, seconds.
 _MIN_OPPOSITE_RATIO, _MIN_OPPOSITE_TIME = 3.0, 0.5
 
 
@@ -66,8 +66,8 @@ class WatchedFrame:
 
     **Fields**: `second`: time of the frame, seconds; `image`: image of the frame, None in the result after the last
     frame; `peak`: maximum change, S, NaN if the frame was refused; `touched`: whether the skin is touched; `named`:
-    touch that was classified at this frame, which may still continue, or None; `ended`: touches that have ended for
-    good; `latency`: time from the frame to the result, seconds; `note`: remark on the frame, or an empty string.
+    touch that was classified at this frame but may still continue, or None; `ended`: touches that have ended for good;
+    `latency`: time from the frame to the result, seconds; `note`: remark on the frame, or an empty string.
 
     **Example:**
 

@@ -34,8 +34,8 @@ _BAND_HALF_WIDTH, _END_NARROWING = 1.5, 2.0
 _INITIAL_SPOT_RADIUS, _MAX_SPOT_RADIUS, _SPOT_EXTENT, _SPOT_DEPTHS, _MAX_SPOT_DEPTH = 0.05, 0.1, 3.0, (0.5, -0.5), 6.0
 # Initial offset of a bend from the middle of a straight path, divided by the length of the path.
 _BEND_OFFSET = 0.2
-# Maximum ratio of misfits for accepting a bent path in place of a straight path, and a partial cut in place of a cut
-# through the whole depth.
+# Maximum ratio of the misfit of a bent path to that of a straight path, for the bent path to be accepted; the same for
+# a partial cut and a cut through the whole depth.
 _MAX_BEND_RATIO, _MAX_PARTIAL_RATIO = 0.7, 0.4
 # Misfit below which a cut through the whole depth is certain; ratio of misfits above which the worse of the fits of a
 # complete and a partial cut is excluded; maximum standard deviation of an end of the path, in mesh edges.

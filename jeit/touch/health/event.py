@@ -24,10 +24,10 @@ class EventKind(StrEnum):
     CUT = "cut"
     """Conductivity is permanently lost along a path."""
     DEAD = "dead electrode"
-    """The channels of an electrode have changed by far more than its contact explains."""
+    """The channels of an electrode have changed by far more than a change of its contact explains."""
     TORN = "torn wire"
-    """The channels of an electrode read almost nothing, or all the same constant; a dead electrode may look the
-    same."""
+    """The channels of an electrode read almost nothing, or all the same constant; a dead electrode may have the same
+    effect."""
     LOOSE = "loose electrode"
     """The contact of an electrode has become worse, and fluctuates."""
     NOISY = "noisy channel"

@@ -231,8 +231,8 @@ def kind_of_fault(
     return EventKind.DEAD
 
 
-# For a change in only one electrode's channels: maximum fraction of its sum of squares that a fitted cut leaves
-# unexplained if a cut beside the electrode is the cause; for a failing contact, the fraction is larger.
+# Maximum misfit of a fitted cut, as a fraction of the change's sum of squares, for a change of only one electrode's
+# channels to be attributed to a cut beside the electrode. For a failing contact, the misfit is larger.
 _MAX_CUT_MISFIT = 0.1
 
 

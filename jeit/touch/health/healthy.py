@@ -1,10 +1,10 @@
 """The healthy state of a skin: principal directions of its touches, usual changes, and steadiness of its channels.
 
 Frames are averaged to steps in time. Single channels that are noisy, jump, or are stuck are detected from their changes
-from step to step. Two measures of variation are computed for every channel in a window of steps: the mean of the
-smaller half of the magnitudes of these changes, which touches hardly affect, and the mean of all magnitudes, which
-responds to jumps. Both measures, in two consecutive windows, are compared with those of healthy windows and of the
-other channels. If many channels exceed the limits of their measures at once, the cause is a touch, not faulty channels.
+from step to step. Two measures of variation are computed for every channel in a window of steps. The mean of the
+smaller half of the magnitudes of these changes is hardly affected by touches; the mean of all magnitudes responds to
+jumps. Both measures, in two consecutive windows, are compared with the measures of healthy windows and of the other
+channels. If many channels exceed the limits of their measures at once, the cause is a touch, not faulty channels.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _SMALL_FRACTION, _MIN_READ_FRACTION = 0.5, 0.5
 # Limit of a variation measure: minimum, as a multiple of the usual value; multiple of the maximum among healthy
 # windows; increase of the second multiple, to be divided by the number of windows.
 _MIN_LIMIT_RATIO, _UNSTEADY_FACTOR, _UNSTEADY_INCREASE = 3.0, 2.0, 12.0
-# Minimum fraction of steps in which a healthy channel must change for the channel ever to count as stuck.
+# Minimum fraction of steps in which a healthy channel changes; a channel that changes less often never counts as stuck.
 _MIN_MOVING_FRACTION = 0.6
 # Maximum fraction of channels that may be noisy or stuck at once.
 _MAX_UNSTEADY_FRACTION = 0.1
@@ -145,8 +145,7 @@ def _usual_variation(measures: Float[np.ndarray, "n 2 M"], noise: Float[np.ndarr
 _MAX_WINDOW_STEPS, _MIN_WINDOW_STEPS, _MIN_NUM_WINDOWS = 48, 5, 8
 # Minimum and maximum length of windows, in frames, for a healthy recording without a quiet interval.
 _MIN_WINDOW_FRAMES, _MAX_WINDOW_FRAMES = 12, 64
-# If the length of a window is not given: the length as a multiple of the longest touch; its minimum as a fraction of
-# the recording.
+# Default length of a window: the length as a multiple of the longest touch; its minimum as a fraction of the recording.
 _WINDOW_PER_TOUCH, _MIN_WINDOW_FRACTION = 3.0, 1 / 40
 # Limit of a change between windows: multiple of the maximum among healthy windows; minimum, in standard deviations of
 # healthy changes; increase of the multiple, to be divided by the number of windows.
@@ -179,16 +178,17 @@ _DEVIATION_PER_MEAN_MAGNITUDE = float(np.sqrt(np.pi / 2))
 class HealthyState:
     """Healthy state of a skin and its usual variation, learnt from a recording.
 
-    **Fields**, of each channel where not said otherwise: `reference`: voltage of the untouched skin, volts; `used`:
-    whether the channel has readings; `noise`: noise from frame to frame, volts; `span` (2, channels): minimum and
-    maximum change in the recording, volts; `stride`: number of frames averaged to a step in time; `window`: number of
-    steps of a window; `scale`: usual change between consecutive windows, volts; `limit`: limit of the change between
-    windows (`change_size`) for a change that lasts; `sudden_limit`: limit, not exceeded by touches either, above which
-    a change may be reported at once; `level_scale`: usual change between any two windows, volts; `level_limit`: limit
-    for a change from the healthy recording to another recording; `touch_directions` (channels, directions): principal
-    directions of touches, orthonormal in units of noise; `max_fraction_outside`: maximum fraction of the energy of
-    touches outside of these directions; `steadiness`: steadiness of single channels; `period`: seconds between frames,
-    or 1; `is_brief`: whether the recording was too short for its touches, so that limits are twice as high.
+    **Fields**, where arrays without a stated shape contain one value for each channel: `reference`: voltage of the
+    untouched skin, volts; `used`: whether the channel has readings; `noise`: noise from frame to frame, volts; `span`
+    (2, channels): minimum and maximum change in the recording, volts; `stride`: number of frames averaged to a step in
+    time; `window`: number of steps of a window; `scale`: usual change between consecutive windows, volts; `limit`:
+    limit of the change between windows (`change_size`) for a change that lasts; `sudden_limit`: limit, not exceeded by
+    touches either, above which a change may be reported at once; `level_scale`: usual change between any two windows,
+    volts; `level_limit`: limit for a change from the healthy recording to another recording; `touch_directions`
+    (channels, directions): principal directions of touches, orthonormal in units of noise; `max_fraction_outside`:
+    maximum fraction of the energy of touches outside of these directions; `steadiness`: steadiness of single channels;
+    `period`: seconds between frames, or 1; `is_brief`: whether the recording was too short for its touches, so that
+    limits are twice as high.
     """
 
     reference: Float[np.ndarray, " M"]

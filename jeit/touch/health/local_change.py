@@ -1,8 +1,8 @@
 """Voltages after a local change of conductivity, computed by low-rank updates on a locally refined mesh.
 
-To refine a flat mesh locally, triangles are halved across their longest edge. Rivara's closure: a triangle with any
-halved edge has its longest edge halved too, so that no triangle becomes thinner than half of the original triangle, and
-there are no hanging nodes.
+To refine a flat mesh locally, triangles are halved across their longest edge. By Rivara's closure, the longest edge of
+every triangle with a halved edge is halved too. As a result, there are no hanging nodes, and no triangle becomes
+thinner than half of the original triangle.
 
 If the conductivity changes in one region only, voltages are computed by dense low-rank updates of the solution before
 the change. With the grounded matrix A of stiffness and contact mass, the loads B (`jeit.forward.transfer`) and a change
@@ -130,7 +130,7 @@ _SHRINKAGE_FACTOR = 0.85
 class LocalChange:
     """Voltages of a `model` whose conductivity changes only within about `radius` metres of a `centre` (x, y).
 
-    `conductivity` (cells,): conductivity before the change, S/m (2-D: S). The attribute `cells` holds the indices of
+    `conductivity` (cells,): conductivity before the change, S/m (2-D: S). The attribute `cells` contains the indices of
     the cells in the region, whose conductivity may change.
     """
 

@@ -94,7 +94,7 @@ class SelfOrganisingMap:
     def activity(self, frames: ArrayLike) -> Float[np.ndarray, "n R C"]:
         """Compute the activity (frames, rows, columns) of every neuron for frames (frames, channels).
 
-        The activity is 1 / (1 + distance / scale), which is 1 if the given frame is the neuron's own frame. Raises
+        The activity is 1 / (1 + distance / scale), which is 1 if the frame is the neuron's own frame. Raises
         `ValueError` as `distances` does.
         """
         return 1 / (1 + self.distances(frames) / self.scale)

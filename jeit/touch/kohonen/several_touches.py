@@ -35,11 +35,11 @@ class MapTouch:
 def neuron_shares(placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "R C"]:
     """Compute the share (rows, columns) of each neuron of a map in a frame by non-negative least squares.
 
-    The frame's change from the `reference`, the frame of the untouched skin, is approximated by the sum of the changes
-    of the neurons' frames from the reference, times their shares; neurons without a place have share 0. Changes of
-    small touches add up, and touches have one sign, so few of the non-negative shares differ from 0 (Lawson and Hanson
-    1974). Raises `ValueError` if `placed` is no map with places, and for more than one frame, a number of channels that
-    is not that of the map, and NaN.
+    The frame's change from the `reference`, the frame of the untouched skin, is approximated by a weighted sum of the
+    changes of the neurons' frames from the reference. The weights are the shares; neurons without a place have share 0.
+    Changes of small touches add up, and touches have one sign, so few of the non-negative shares differ from 0 (Lawson
+    and Hanson 1974). Raises `ValueError` if `placed` is no map with places, and for more than one frame, a number of
+    channels that is not that of the map, and NaN.
     """
     touch_sum = _TouchSum.from_frame(placed, frame, reference)
     shares = np.zeros(placed.learnt.shape)
@@ -59,7 +59,7 @@ def touches_reported(
 
     Neurons with a share in the frame (`neuron_shares`) are grouped into possible touches. Touches are added one after
     another, as long as each reduces the residual sum of squares by at least 25 times the residual variance of a
-    channel, the larger of those of the frame and the map.
+    channel, the larger of the residual variances of the frame and the map.
 
     **Arguments:**
 

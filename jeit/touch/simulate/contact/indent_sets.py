@@ -16,7 +16,7 @@ from jeit.design.skin.voltage_changes import RestingSkin
 from jeit.design.study.contents import Contents
 from jeit.touch.simulate.contact.indents import IndentDraws, depth_maps, relative_changes, resting_skin
 
-# Version of the simulation, to be increased when its results change.
+# Version of the simulation, which must be increased if a change of the code changes the results.
 _VERSION = 2
 # Lock that lets only one thread of a worker compute the data shared by all chunks.
 _RESTING_SKIN_LOCK = Lock()
@@ -30,7 +30,7 @@ class IndentSet:
     """A set of `number` random touches drawn from `draws`, with the noise-free voltages of a `skin`.
 
     `seed`: random seed, which determines the touches. `shape`: (rows, columns) of the maps of indentation depth over
-    the skin. `chunk`: number of touches that are simulated and written at once; it also affects the random numbers.
+    the skin. `chunk`: number of touches that are simulated and written at once, which also affects the random numbers.
     """
 
     def __init__(
@@ -130,7 +130,8 @@ class _SkinAndDepth:
 
 @lru_cache(maxsize=1)
 def _shared_resting_skin(skin_and_depth: _SkinAndDepth) -> RestingSkin | None:
-    """Return the data of a skin at rest that all its chunks and sets share; about a gigabyte for a 3-D layer."""
+    """Return the data of a skin at rest that all chunks and sets of the skin share; about a gigabyte for a 3-D
+    layer."""
     return resting_skin(skin_and_depth.skin, skin_and_depth.depth)
 
 

@@ -187,7 +187,8 @@ class RevolvedIndenter(AbstractIndenter):
         self.indentation = indentation
 
     def gap(self, points):
-        """Return the depth of the profile in its middle minus its depth at the points; infinity beyond its reach."""
+        """Return the depth of the profile in its middle minus its depth at `points`; infinity beyond the reach of the
+        indenter."""
         distances = _distance_from_origin(points)
         max_depth = float(self.indentation.depth_at(host.zeros(())))
         gaps = max_depth - np.asarray(self.indentation.depth_at(distances))
@@ -220,7 +221,7 @@ def ball_indenter(diameter: float) -> RevolvedIndenter:
 
 
 class DepthMapIndenter(AbstractIndenter):
-    """An indenter given by an image of its surface heights, centred at the origin and interpolated linearly.
+    """An indenter whose surface heights are an image, centred at the origin and interpolated linearly.
 
     **Fields**: `height`: (rows, columns), height of the surface towards the skin in metres, NaN where there is no
     surface; row 0 is at the minimum y; `pixel`: side of a pixel in metres.

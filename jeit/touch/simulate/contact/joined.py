@@ -31,8 +31,8 @@ from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise,
 from jeit_solvers.engines import host, on_host
 from jeit_solvers.module import Module
 
-# Minimum conductance between the sheets, relative to σ₂ divided by the area of the skin, which fixes the potential of
-# an upper sheet without contact.
+# Minimum conductance per area between the sheets, relative to σ₂ divided by the area of the skin. It determines the
+# potential of an upper sheet without contact.
 _MIN_RELATIVE_CONDUCTANCE = 1e-9
 
 

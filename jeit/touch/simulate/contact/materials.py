@@ -150,7 +150,8 @@ class Material(Module):
     - `conductivity`, `thickness`: conductivity, S/m, and thickness, metres, of the conductor at rest.
     - `support`: mechanical support that carries the load.
     - `saturation`, `half_pressure`: c and p½ (pascals) of the conductivity σ = σ₀ (1 + c q / (q + p½)) under an
-      effective pressure q: c is the limit of the relative change, and p½ the pressure at which half of it is reached.
+      effective pressure q: c is the limit of the relative change at high pressure, and p½ the pressure at half this
+      change.
     - `hysteresis`: maximum difference of q between unloading and loading, divided by the maximum pressure.
     - `creep`: pairs of the share of q that responds with delay, and the time constant of this response, seconds.
     - `conductivity_trend`, `contact_trend`: relative drift of the conductivity and of the contact impedance of each

@@ -118,7 +118,7 @@ def check_load(load) -> None:
 
 
 def check_resolved(contact: Bool[np.ndarray, "N N"], pixel) -> None:
-    """Raise `ValueError` unless a contact, (N, N) pixels of a raster, covers at least one; `pixel`: sides of a pixel,
+    """Raise `ValueError` unless a contact (N, N) on a raster covers at least one pixel; `pixel`: sides of a pixel,
     metres."""
     if not contact.any():
         raise ValueError(

@@ -25,7 +25,7 @@ from jeit.touch.simulate.contact.indents import PressDraws
 from jeit.touch.simulate.contact.press import Press
 from jeit.touch.simulate.contact.pressed_skin import PressedSkin, check_seconds
 
-# Version of the simulation, to be increased when its results change.
+# Version of the simulation, which must be increased if a change of the code changes the results.
 _VERSION = 1
 _UNITS_AND_MEANINGS = {
     "voltages": ("V", "what the channels read"),

@@ -35,10 +35,10 @@ class ElectrodeFault(Module):
     **Fields**
 
     - `electrode`: number of the electrode, from 0.
-    - `kind`: "dead": the contact impedance is multiplied by 10⁷, the source is limited to five times its maximum
-      voltage at rest, and measurements on the electrode read only noise. "loose": the factor of the contact impedance
-      fluctuates between 10 and 1,000, with a time constant of half a second. "torn": the electrode is disconnected;
-      channels with this electrode read noise, or the constant `rail`.
+    - `kind`: "dead": the contact impedance is multiplied by 10⁷, and the voltage of the current source limited to five
+      times its maximum at rest; measurements on the electrode read only noise. "loose": the factor of the contact
+      impedance fluctuates between 10 and 1,000, with a time constant of half a second. "torn": the electrode is
+      disconnected; channels with this electrode read noise, or the constant `rail`.
     - `rail`: constant reading of the channels of a torn electrode, volts, or None.
 
     **Example:**

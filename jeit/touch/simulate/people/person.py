@@ -175,8 +175,8 @@ _MIN_SKIN_SIDE = 0.06
 class Person(Module):
     """A simulated person, who makes gestures with a force, contact size, duration and speed of their own.
 
-    **Fields**: `medians` (6, 5): median, over the touches of this person, of force, radius of the contact, duration,
-    speed and path (columns) for each of the six gestures (rows), in SI units.
+    **Fields**: `medians` (6, 5): medians over the touches of this person, in SI units: force, radius of the contact,
+    duration, speed and path (columns) for each of the six gestures (rows).
 
     **Example:**
 
@@ -211,9 +211,9 @@ class Person(Module):
     ) -> tuple[MovingPress, Float[np.ndarray, " T"]]:
         """Simulate a gesture of this person at a random place on a skin with this `outline`.
 
-        Returns the moving press and the times (T,) of its frames, seconds, at `rate` frames/s, which begin before and
-        end after the touch. Force, radius, duration, speed and path are log-normally distributed about the medians of
-        the person. Raises `ValueError` for invalid arguments, and for a skin too small for a hand.
+        Returns the moving press and the times (T,) of its frames, seconds, at `rate` frames/s. The frames begin before
+        the touch and end after it. Force, radius, duration, speed and path are log-normally distributed about the
+        medians of the person. Raises `ValueError` for invalid arguments, and for a skin too small for a hand.
         """
         check_key(key)
         check_name("gesture", gesture, GESTURES)
