@@ -1,10 +1,10 @@
 """Estimate from frames of voltages where and how hard a skin is touched, and with which object.
 
-There are functions and classes for contacts (detection in images, tracking, loads in newtons), learnt skins (from
-recorded presses, without a model), self-organising maps, gestures, the health of a skin (cuts, failing electrodes,
-repair), its attributes (resolution), sounds of touches, networks that estimate maps of indentation depth, the training
-of networks, and the simulation of presses, people and damage. Results are drawn by `plot_…`. What users need of the
-subpackages is exported here.
+Contacts are detected in images and tracked, and their loads estimated in newtons. Learnt skins and self-organising maps
+need recorded presses, but no forward model. Further functions and classes are for gestures, the health of a skin (cuts,
+failing electrodes, repair), its attributes (resolution), sounds of touches, networks that estimate maps of indentation
+depth, the training of networks, and the simulation of presses, people and damage. The functions `plot_…` draw results.
+The functions and classes that users need are exported here.
 
 `LogitBoostClassifier`, and scikit-learn with it, is imported when it is first used.
 """

@@ -30,7 +30,7 @@ class Localisation(NamedTuple):
     """Error of the estimated places of touches.
 
     `mean`, `deviation` and `most`: mean, standard deviation and maximum of the error, metres; `missed`: share of
-    touches that were not found.
+    touches that were not detected.
     """
 
     mean: float
@@ -55,11 +55,11 @@ def weber_ratio(load: ArrayLike, response: ArrayLike) -> tuple[Float[np.ndarray,
     """Compute Weber's ratio at each of k loads: the smallest relative change of load that can be detected.
 
     A change of load is detected if it changes the response by one standard deviation (d′ = 1). So the ratio is the
-    standard deviation of the response, divided by the slope of the response against the load, and by the load. The
-    ratio is infinite at loads where the response does not rise with the load. `load` (n,), newtons: three or more
-    different loads, each applied three times or more; `response` (n,), in any unit, such as the peak of an image.
-    Returns the loads (k,), newtons, and the ratios (k,). Raises `ValueError` for fewer loads than three, loads that are
-    not positive, arrays of different lengths, and NaN.
+    standard deviation of the response, divided by the load and by the slope of the response against the load. The ratio
+    is infinite at loads where the response does not rise with the load. `load` (n,), newtons: three or more different
+    loads, each applied three times or more; `response` (n,), in any unit, such as the peak of an image. Returns the
+    loads (k,), newtons, and the ratios (k,). Raises `ValueError` for fewer than three loads, loads that are not
+    positive, arrays of different lengths, and NaN.
     """
     load, response = _check_pair("load", load, "response", response)
     if (load <= 0).any():
@@ -78,9 +78,10 @@ def weber_ratio(load: ArrayLike, response: ArrayLike) -> tuple[Float[np.ndarray,
 
 
 def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
-    """Compute the error of places `found` (n, 2) or (n, 3) for touches at the true places `place`, metres.
+    """Compute the error of estimated places `found` (n, 2) or (n, 3) of touches whose true places are `place`, metres.
 
-    `found` is NaN for touches that were not found. Raises `ValueError` for other shapes, and if no touch was found.
+    `found` is NaN for touches that were not detected. Raises `ValueError` for other shapes, and if no touch was
+    detected.
     """
     place = real_array("place", place, "metres (n, 2) or (n, 3)")
     found = real_array("found", found, "metres, as many as places, NaN where nothing was found")
@@ -98,8 +99,8 @@ def least_detected(amount: ArrayLike, detected: ArrayLike) -> float:
     """Compute the smallest amount, such as a distance, that is detected in half of the trials.
 
     An amount may be the separation of two points that are distinguished, or the gap between two touches. `amount` (n,):
-    amount in each of n trials, in any unit, which is that of the result; `detected` (n,): whether the amount was
-    detected, true or false. The result is infinite if no amount is detected in half of the trials. The share of
+    amount in each of n trials, in any unit, which is also the unit of the result; `detected` (n,): whether the amount
+    was detected, true or false. The result is infinite if no amount is detected in half of the trials. The share of
     detections is assumed to rise with the amount (isotonic regression), and is interpolated linearly between amounts.
     Raises `ValueError` for arrays of different lengths, and NaN.
     """
@@ -137,10 +138,10 @@ def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, floa
     """Compute the rise time and the fall time, seconds, of the response to a touch that begins and ends abruptly.
 
     `seconds` (T,): times of the frames; `response` (T,): the response at these times. Nothing touches the skin before
-    the first frame. The rise time is that in which the response rises from 10 to 90 % of its maximum. The fall time is
-    that from the last value above 90 % until the response is below 10 %; it is infinite if the recording ends before.
-    Raises `ValueError` for arrays of different lengths, times that do not increase, NaN, and a response that is nowhere
-    positive.
+    the first frame. The rise time is the time in which the response rises from 10 to 90 % of its maximum. The fall time
+    is the time from the last value above 90 % to the next value below 10 %; it is infinite if the recording ends before
+    this value. Raises `ValueError` for arrays of different lengths, times that do not increase, NaN, and a response
+    that is nowhere positive.
     """
     seconds, response = _check_pair("seconds", seconds, "response", response)
     if (np.diff(seconds) <= 0).any():
@@ -181,8 +182,8 @@ def _check_pair(
 # Number of untouched frames; number of repetitions of each load and of each area; number of places; number of trials of
 # each separation.
 _NUM_UNTOUCHED_FRAMES, _NUM_REPETITIONS, _NUM_PLACES, _NUM_TRIALS = 50, 8, 40, 8
-# Loads at which Weber's ratio is measured, relative to the given load; distances between the centres of two discs,
-# relative to the given diameter; diameters of discs under the same pressure, relative to the given diameter.
+# Loads at which Weber's ratio is measured, relative to the usual load; distances between the centres of two discs,
+# relative to the usual diameter; diameters of discs under the same pressure, relative to the usual diameter.
 _RELATIVE_LOADS = np.geomspace(0.25, 4.0, 7)
 _RELATIVE_SEPARATIONS = np.array([1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0])
 _RELATIVE_DIAMETERS = np.array([1.0, 1.5, 2.0, 3.0, 4.0])
@@ -240,16 +241,16 @@ def touch_attributes(
 ) -> TouchAttributes:
     """Measure the resolution of a real or simulated skin: its five attributes of touch.
 
-    Discs press on the skin, most of them with the usual diameter and load, some with a quarter to four times the load,
-    or with up to four times the diameter under the same pressure.
+    Discs press on the skin. Most have the usual diameter and load; some have a quarter to four times the load, others
+    up to four times the diameter under the same pressure.
 
     **Arguments:**
 
-    - `key`: random key that draws places and directions.
+    - `key`: random key from which places and directions are drawn.
     - `press`: function that presses discs on the skin: it commands a robot, or simulates a skin. Its argument is a list
       of n touches, each a list of simultaneous discs, empty for an untouched skin. It returns their frames (n, M),
       volts, of M channels.
-    - `linear`: linear reconstruction that computes images of the changes of frames.
+    - `linear`: linear reconstruction that computes an image from the change of a frame.
     - `finder`: finder that finds the contacts in these images.
     - `middle`: middle (x, y) of the region of the touches, metres.
     - `within`: radius of this region, metres.
@@ -258,8 +259,8 @@ def touch_attributes(
     - `recording`: times (T,), seconds, and frames (T, M), volts, of a touch that begins and ends abruptly.
     - `progress`: function that is called with the name of each measurement, such as "two points", when it begins.
 
-    Raises `ValueError` for an invalid key, `linear` or `finder`, sizes and loads that are not positive, frames of
-    another shape, and a skin on which no touch is found.
+    Raises `ValueError` for an invalid key, `linear` or `finder`, sizes and loads that are not positive, frames of the
+    wrong shape, and a skin on which no touch is detected.
 
     **Example:**
 

@@ -68,29 +68,31 @@ def outline_of_cells(points: Float[np.ndarray, "n d"], cells: Int[np.ndarray, "c
 
 
 class CellFinder(AbstractFinder):
-    """Finds contacts in images on a mesh: every peak, with the cells around it that exceed a share of its height.
+    """Finds contacts in images on a mesh: each contact is a peak, with the cells around it that exceed a share of its
+    height.
 
     In the centroid of a contact, cells are weighted by their excess above this share of the peak. The excess is zero at
     the contact's edge, so that the centroid does not jump when a cell joins or leaves the contact. Peaks that are weak,
-    or rise little above the saddle to a higher peak, are artefacts or shoulders, and are left out.
+    or rise little above the saddle between them and a higher peak, are taken for artefacts or shoulders, and left out.
 
     The default arguments give the smallest error of places on simulated skins (`python -m benchmarks contacts`).
 
     **Arguments:**
 
     - `mesh`: mesh of the images: a flat sheet, or a surface in space; on a surface, centroids are points (3,) on it.
-    - `smoothing`: standard deviation of the Gaussian that smooths images first, metres; by default 3 % of the square
-      root of the mesh's area.
+    - `smoothing`: standard deviation of the Gaussian that smooths images before contacts are found, metres; by default
+      3 % of the square root of the mesh's area.
     - `level`: share of the peak's height that cells of a contact exceed.
     - `least_peak`: minimum height of a peak, as a share of the strongest peak.
-    - `least_prominence`: minimum rise of a peak above the saddle to a higher peak, as a share of its own height.
+    - `least_prominence`: minimum rise of a peak above the saddle between it and a higher peak, as a share of the lower
+      peak's height.
     - `floor`: number of standard deviations of the noise that a cell must exceed to belong to a contact.
     - `sign`: 1 if touched skin conducts better, -1 if it conducts worse.
 
     **Fields**: `level`, `least_peak`, `least_prominence`, `floor`, `sign`: as given; `smoothing` (m, m): matrix that
     smooths images of m cells; `cells` (m, 3), `points` (n, d): cells and n nodes of the mesh; `centres` (m, d), `areas`
-    (m,): centroids and areas of the cells; `shared` (m, 3): numbers of the facets that each cell shares with another;
-    `surface`: the surface of a mesh in space, otherwise None.
+    (m,): centroids and areas of the cells; `shared` (m, 3): numbers of the facets that each cell shares with another
+    cell; `surface`: the surface of a mesh in space, otherwise None.
 
     **Example:**
 

@@ -1,4 +1,4 @@
-"""Find contacts in images that are stronger than the noise of images of the untouched skin: standard deviations and
+"""Common interface of finders of contacts, and the noise of images, which contacts must exceed: standard deviations and
 covariance of the cells."""
 
 from abc import abstractmethod
@@ -44,7 +44,8 @@ class ImageNoise(Module):
     def __check_init__(self):
         """Check the fields.
 
-        Raises `ValueError` for deviations that are negative or not finite, and a factor for another number of cells.
+        Raises `ValueError` for deviations that are negative or not finite, and a factor with a different number of
+        cells.
         """
         requirement = "an array (m,), one number a cell, zero or more and finite, in the unit of the image"
         check_kind("deviation", self.deviation, (np.ndarray, jax.Array), requirement)
@@ -61,9 +62,9 @@ class ImageNoise(Module):
     def of_frames(cls, reconstruction: LinearReconstruction, frames: Float[np.ndarray, "n M"]) -> "ImageNoise":
         """Estimate the noise from at least ten repeated frames (n, M), volts, of the untouched skin.
 
-        Images are computed of the deviations of the frames from their mean. The noise includes drift only if the frames
-        span as long a time as later readings. Raises `ValueError` for fewer than ten frames, a number of channels other
-        than M of the reconstruction, NaN, and frames that are all the same.
+        The noise is that of images reconstructed from the deviations of the frames from their mean. The noise includes
+        drift only if the frames span as long a time as later readings. Raises `ValueError` for fewer than ten frames, a
+        number of channels that is not that of the reconstruction, NaN, and frames that are all the same.
         """
         check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
         frames = real_array("frames", frames, "voltages (n, M)")
@@ -96,7 +97,7 @@ class ImageNoise(Module):
         """Compute the noise from the standard deviations of independent channels, (M,) or one number for all, volts.
 
         The difference of two frames has √2 times the standard deviation of one frame. Raises `ValueError` for
-        deviations that are negative, not finite, all zero, or for another number of channels.
+        deviations that are negative, not finite, all zero, or for a different number of channels.
         """
         check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
         num_channels = reconstruction.num_measurements
@@ -112,9 +113,9 @@ class ImageNoise(Module):
         """Estimate the noise from an image (m,) alone, with or without contacts, by sigma clipping.
 
         Cells more than three standard deviations from the median are removed, repeatedly. The standard deviation of the
-        remaining cells is taken as that of every cell. Artefacts of a contact all over the image, and ringing, count as
-        noise, so that weak contacts beside strong ones are missed. Cells that are noisier than most are mistaken for
-        contacts. Raises `ValueError` for an image that is not (m,), finite and real.
+        remaining cells is taken as that of every cell. Ringing, and artefacts of a contact all over the image, count as
+        noise; weak contacts beside strong contacts are therefore missed. Cells that are noisier than most are mistaken
+        for contacts. Raises `ValueError` for an image that is not (m,), finite and real.
         """
         values = np.asarray(image)
         if values.ndim != 1 or not values.size or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
@@ -136,7 +137,7 @@ class ImageNoise(Module):
         return float(np.linalg.norm(self.factor @ slope))
 
     def smoothed(self, smoothing: sparse.csr_array) -> Float[np.ndarray, " m"]:
-        """Standard deviation (m,) of the image after smoothing by a matrix (m, m).
+        """Compute the standard deviation (m,) of every cell of an image after smoothing by a matrix (m, m).
 
         If the covariance of the cells is unknown, the result is an upper bound.
         """
@@ -146,9 +147,9 @@ class ImageNoise(Module):
 
 
 def _clipped_deviation(values: Float[np.ndarray, " m"]) -> float:
-    """Standard deviation of the values (m,) without outliers, those beyond three standard deviations of the median.
+    """Compute the standard deviation of values (m,) without outliers, beyond three standard deviations of the median.
 
-    To decide which values are outliers, the standard deviation is estimated from the median distance from the median.
+    To identify outliers, the standard deviation is estimated from the median absolute deviation.
     """
     remaining_values = values
     for _ in range(_MAX_ROUNDS):
@@ -166,10 +167,10 @@ class Contact(Module):
 
     **Fields**: `centroid`: (x, y), or (x, y, z) on a surface in space, metres; `area`: area of the region, m²; `peak`:
     strongest change in the region, with its sign, in the unit of the image; `integral`: integral of the change over the
-    region, in the unit of the image times m²; `contour` (k, d): k points of the region's outline, metres, of which the
-    first is not repeated at the end; `deviation`: root mean square displacement of the centroid by noise of the image
-    (see `ImageNoise`), to first order, metres. The deviation includes neither the blur of the image nor systematic
-    errors.
+    region, in the unit of the image times m²; `contour` (k, d): k points of the region's outline, metres, without
+    repetition of the first point at the end; `deviation`: root mean square displacement of the centroid by noise of the
+    image (see `ImageNoise`), to first order, metres. The deviation includes neither the blur of the image nor
+    systematic errors.
 
     **Example:**
 
@@ -190,9 +191,9 @@ class Contact(Module):
 class AbstractFinder(Module):
     """Finds contacts in images on one mesh; everything that does not depend on the image is computed in advance.
 
-    **Fields**: `smoothing` (m, m): matrix that smooths images first; `sign`: 1 if touched skin conducts better, -1 if
-    it conducts worse; `floor`: number of standard deviations of the noise that a cell must exceed to belong to a
-    contact.
+    **Fields**: `smoothing` (m, m): matrix that smooths an image before contacts are found; `sign`: 1 if touched skin
+    conducts better, -1 if it conducts worse; `floor`: number of standard deviations of the noise that a cell must
+    exceed to belong to a contact.
     """
 
     smoothing: eqx.AbstractVar[sparse.csr_array]
@@ -213,7 +214,7 @@ class AbstractFinder(Module):
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Return the smoothed image of changes (m,), and a copy of this image that is zero below the noise floor."""
         change = self.smoothing @ change
-        # Upper bound of the standard deviation of a cell of the smoothed image, however cells are correlated.
+        # Upper bound of the standard deviation of a cell of the smoothed image, for any correlation of the cells.
         return change, np.where(change > self.floor * (self.smoothing @ noise.deviation), change, 0.0)
 
 
@@ -228,7 +229,7 @@ def find_contacts(
     - `image`: change of conductivity (m,) in every cell, S (3-D: S/m), as `LinearReconstruction.image` computes it.
     - `noise`: noise of images on this mesh, by default estimated from the image itself (see `ImageNoise.of_image`).
 
-    Raises `ValueError` for an image or noise of another mesh than the finder's, and for NaN.
+    Raises `ValueError` for an image or noise whose mesh is not the finder's, and for NaN.
 
     **Example:**
 
@@ -243,7 +244,8 @@ def find_contacts(
 
 
 def restore_sign(finder: AbstractFinder, contacts: list[Contact]) -> list[Contact]:
-    """Give contacts found in a sign-changed image the sign of the original image; sort them, strongest first."""
+    """Multiply the peaks and integrals of contacts by the finder's sign; return the contacts sorted, strongest
+    first."""
     if finder.sign < 0:
         contacts = [
             eqx.tree_at(lambda contact: (contact.peak, contact.integral), contact, (-contact.peak, -contact.integral))
@@ -253,7 +255,7 @@ def restore_sign(finder: AbstractFinder, contacts: list[Contact]) -> list[Contac
 
 
 def noise_or_estimate(change: Float[np.ndarray, " m"], noise: ImageNoise | None) -> ImageNoise:
-    """Return the noise of an image `change` (m,): `noise` as given, or estimated from the image if it is None.
+    """Return the noise of an image `change` (m,): `noise` itself, or an estimate from the image if `noise` is None.
 
     Raises `ValueError` unless `noise` is None or an `ImageNoise` of as many cells as the image.
     """

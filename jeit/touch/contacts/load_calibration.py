@@ -6,8 +6,8 @@ peak = s exp(b ρ² + c ρ⁴) F / (F + F½),
 
 where s, b, c and F½ are fitted, and ρ is the distance of the contact from the middle of the skin, divided by the skin's
 radius. The peak rises with the load and saturates, as conductivity under pressure does, and is larger near the
-electrodes. A calibration is valid for one indenter, or similar indenters: a wider contact under the same load has
-a different peak.
+electrodes. A calibration is valid for the indenter with which it was recorded, and for similar indenters: a wider
+contact under the same load has a different peak.
 """
 
 from __future__ import annotations
@@ -25,9 +25,11 @@ from jeit_solvers.module import Module
 
 # Minimum number of contacts: one for each parameter s, b, c and F½, and four degrees of freedom for the scatter.
 _MIN_NUM_CONTACTS = 8
-# Maximum ratio of a peak to the saturated peak; near saturation, the load is undetermined.
+# Maximum ratio of a peak to the saturated peak s exp(b ρ² + c ρ⁴); closer to saturation, the peak does not determine
+# the load.
 _MAX_SATURATION = 0.98
-# Divided by the skin's radius: maximum distance of a contact from the middle; minimum width of the widest contact.
+# Maximum distance of a contact from the middle of the skin, and minimum width of the widest contact, both divided by
+# the skin's radius.
 _MAX_RELATIVE_DISTANCE, _MIN_RELATIVE_WIDTH = 10.0, 1e-3
 
 
@@ -48,7 +50,7 @@ class LoadCalibration(Module):
     F½ in peak = s exp(b ρ² + c ρ⁴) F / (F + F½), for a load F at ρ radii from the centre; `covariance` (4, 4):
     covariance of the parameters; `sign`: sign of the peaks, 1 or -1; `scatter`: standard deviation of the logarithm of
     a peak about the curve; `loads`: minimum and maximum load of the calibrated contacts, newtons; `farthest`: maximum ρ
-    of these contacts; `highest`: their maximum ratio of a peak to the saturated peak.
+    of these contacts; `highest`: maximum ratio of their fitted peaks to the saturated peak s exp(b ρ² + c ρ⁴).
 
     **Example:**
 
@@ -110,8 +112,8 @@ class LoadCalibration(Module):
         def residuals(parameters):
             return _log_peak(parameters, distances, loads) - log_peaks
 
-        # Weak priors, each with the weight of a thousandth of a reading, for parameters that places or loads do not
-        # determine.
+        # Weak priors, each with the weight of a thousandth of a reading, for parameters that the places or loads of the
+        # contacts do not determine.
         prior_weights = np.sqrt(1e-3) * np.array([0.0, 0.3, 0.3, 0.3])
         optimum = least_squares(
             lambda parameters: np.concatenate(
@@ -134,7 +136,7 @@ class LoadCalibration(Module):
         """Estimate the load of a contact, newtons, and its standard deviation.
 
         The standard deviation includes the uncertainty of the parameters and the scatter of peaks about the curve, but
-        no change of the skin since calibration: if all gains are g times as large, the peaks are g times as large too.
+        no change of the skin since calibration. If all gains become g times as large, for example, so do the peaks.
         Raises `ValueError` for a peak above the calibrated peaks, where the curve does not determine the load, for a
         peak of the opposite sign, and for a contact farther from the centre than the calibrated contacts.
         """
@@ -168,6 +170,7 @@ class LoadCalibration(Module):
 
 
 def _log_peak(parameters, distance, loads):
-    """Logarithms of the peaks of contacts at the relative distances ρ = `distance` under `loads`, newtons."""
+    """Compute the logarithms of the peaks of contacts at the relative distances ρ = `distance` under `loads`,
+    newtons."""
     log_scale, quadratic, quartic, log_half_load = parameters
     return log_scale + quadratic * distance**2 + quartic * distance**4 + np.log(loads / (loads + np.exp(log_half_load)))

@@ -1,9 +1,9 @@
 """Find contacts on a raster with OpenCV: region of interest, grey levels, threshold, opening, contours, centroids.
 
 The steps are those of Chen et al., "New flexible tactile sensor based on electrical impedance tomography",
-Micromachines 13 (2022) 185. The paper does not state the sizes of its steps. The sizes used here give smaller errors on
-simulated skins than a constant of 10 grey levels, an opening of 5 pixels and no smoothing (`python -m benchmarks
-contacts`).
+Micromachines 13 (2022) 185. The paper does not state the parameters of these steps. The defaults of `RasterFinder` give
+smaller errors on simulated skins than a constant of 10 grey levels, an opening of 5 pixels and no smoothing (`python -m
+benchmarks contacts`).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _MAX_PIXELS = 4096
 class RasterStages(Module):
     """Results of the steps by which `RasterFinder` finds contacts; arrays are (rows, columns), with row 0 at the top.
 
-    **Fields**: `region`: change on the pixels of the skin, NaN beside the skin; `grey`: grey levels, 0 to 255;
+    **Fields**: `region`: change on the pixels of the skin, NaN outside the skin; `grey`: grey levels, 0 to 255;
     `threshold`: whether each pixel is above the adaptive threshold; `opened`: whether the pixel remains after opening;
     `contacts`: the contacts found; `extent`: (x_min, x_max, y_min, y_max), metres.
     """
@@ -58,20 +58,21 @@ class RasterFinder(AbstractFinder):
     """Finds contacts by an adaptive threshold on a raster.
 
     Grey levels are proportional to the change, up to 255 for the image's maximum; pixels below the noise floor are
-    black. Pixels are kept if they exceed the Gaussian mean of the block of pixels around them by `constant` grey
-    levels. A morphological opening with an ellipse then removes small spots. Each external contour is a contact, whose
-    centroid is that of the enclosed pixels.
+    black. A pixel is above the threshold if it exceeds the Gaussian mean of the block of pixels around it by `constant`
+    grey levels. A morphological opening with an ellipse then removes small spots. Each external contour of the
+    remaining pixels is the outline of a contact; the contact's centroid is that of the enclosed pixels.
 
     **Arguments:**
 
     - `mesh`: mesh of the images.
     - `pixels`: number of pixels along a side of the raster.
-    - `smoothing`: standard deviation of the Gaussian that smooths images first, metres; see `CellFinder`.
-    - `block`: width of the block with whose mean a pixel is compared, an odd number of pixels.
-    - `constant`: number of grey levels by which a kept pixel exceeds the mean of its block.
+    - `smoothing`: standard deviation of the Gaussian that smooths images before the other steps, metres; see
+      `CellFinder`.
+    - `block`: width of the block of pixels around a pixel, an odd number of pixels.
+    - `constant`: number of grey levels by which a pixel must exceed the mean of its block.
     - `opening`: width of the ellipse of the opening, an odd number of pixels.
     - `floor`: number of standard deviations of the noise that a cell must exceed to belong to a contact; without a
-      floor, contacts would be found in images without any.
+      floor, noise would be detected as contacts.
     - `sign`: 1 if touched skin conducts better, -1 if it conducts worse.
 
     **Fields**: `block`, `constant`, `opening`, `floor`, `sign`: as given; `raster`: raster of the mesh; `smoothing` (m,
@@ -152,8 +153,8 @@ class RasterFinder(AbstractFinder):
         )
         max_change = clear_change.max()
         grey = np.rint(255 * clear_change / (max_change or 1.0)).astype(np.uint8)
-        # OpenCV keeps pixels above the local mean minus its constant, so that a negative constant is passed. Pixels
-        # beside the skin are set to the mean of the skin's pixels nearby: if they were black, the whole rim of the skin
+        # OpenCV selects pixels above the local mean minus its constant, so that a negative constant is passed. Pixels
+        # outside the skin are set to the local mean of the skin's pixels: if they were black, the whole rim of the skin
         # would exceed the local mean.
         block_size = (self.block, self.block)
         skin_weights = np.maximum(opencv.GaussianBlur(is_on_skin * 1.0, block_size, 0), 1e-12)
@@ -198,14 +199,14 @@ class RasterFinder(AbstractFinder):
         pixel_centres = self.raster.pixel_centres()
         centroid, area = pixel_centres[is_inside].mean(axis=0), float(self.raster.pixel_area * is_inside.sum())
         (value_slopes, independent_deviations), block_size = membership_noise, (self.block, self.block)
-        # Cells join and leave a contact only at its edge: everything inside the contour counts, whatever its grey
-        # level.
+        # Cells join and leave a contact only at its edge: all pixels inside the contour belong to the contact, whatever
+        # their grey levels.
         ellipse = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (_EDGE_WIDTH, _EDGE_WIDTH))
         is_edge = (opencv.dilate(filled_contour, ellipse) > opencv.erode(filled_contour, ellipse)) & np.isfinite(region)
         cell_indices = np.asarray(self.raster.cell)
         centroid_shifts = np.where(is_edge[..., None], (pixel_centres - centroid) * self.raster.pixel_area / area, 0.0)
         dependent_shifts = np.where(is_edge, value_slopes[cell_indices], 0.0)[..., None] * centroid_shifts
-        # Noise moves the threshold too, through the local mean of the pixels.
+        # Noise also shifts the threshold, which depends on the local mean of the pixels.
         mean_shifts = opencv.GaussianBlur(
             (dependent_shifts / skin_weights[..., None]).astype(np.float32), block_size, 0
         )
@@ -233,13 +234,14 @@ class RasterFinder(AbstractFinder):
     def _membership_noise(
         self, cell_indices: np.ndarray, excess: np.ndarray, noise: ImageNoise
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Uncertainty of whether cells belong to a contact: slope (m,) against the cell's value, independent part (m,).
+        """Compute the uncertainty of cells' membership in a contact: slope (m,) against the cell's value, and standard
+        deviation (m,) of the independent part.
 
-        A cell is wholly inside or outside a contact (membership 1 or 0). A cell whose smoothed value exceeds the
-        threshold by `excess` on average, with standard deviation σ, is inside with probability p = Φ(z), z = excess /
-        σ, where Φ and φ are the normal distribution and its density. On average, its membership changes with its value
-        at the rate φ(z) / σ; the remaining part of the membership has the standard deviation √(p (1 − p) − φ(z)²),
-        independently for each cell.
+        A cell is wholly inside or outside a contact (membership 1 or 0). Suppose that the smoothed value of a cell
+        exceeds the threshold by `excess` on average, with standard deviation σ. The cell is then inside with
+        probability p = Φ(z), z = excess / σ, where Φ and φ are the normal distribution and its density. On average, the
+        cell's membership changes with its value at the rate φ(z) / σ. The remaining part of the membership has the
+        standard deviation √(p (1 − p) − φ(z)²), independently for each cell.
         """
         num_pixels = np.bincount(cell_indices, minlength=self.num_cells)
         mean_excess = np.bincount(cell_indices, excess, minlength=self.num_cells) / np.maximum(num_pixels, 1)

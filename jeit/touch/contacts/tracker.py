@@ -12,10 +12,10 @@ from jeit.arguments import check_kind, check_metres, describe, is_number, real_a
 from jeit.touch.contacts.finder import Contact
 from jeit_solvers.module import Module
 
-# Share of the error of a touch's predicted velocity by which the velocity is corrected: one half averages the noise of
-# two frames.
+# Fraction of the error of a touch's velocity that is corrected in each frame: one half averages the noise of two
+# frames.
 _VELOCITY_GAIN = 0.5
-# Number of times the duration `gap` for which a touch is kept while it is hidden by another touch's contact.
+# Maximum time for which a touch may be hidden by the contact of another touch, as a multiple of `gap`.
 _HIDDEN_GAPS = 4
 
 
@@ -23,8 +23,8 @@ class TouchPath(Module):
     """Path of one touch over the skin.
 
     **Fields**: `number`: rank of the touch in order of onset, from 0; `times` (T,): times of the T frames in which the
-    touch was seen, seconds; `position` (T, 2): centroids, metres; `peak` (T,): peaks, in the unit of the images; `area`
-    (T,): areas, m².
+    touch was detected, seconds; `position` (T, 2): centroids, metres; `peak` (T,): peaks, in the unit of the images;
+    `area` (T,): areas, m².
     """
 
     number: int
@@ -79,16 +79,16 @@ class ContactTracker(Module):
     """State of the tracking of touches from frame to frame.
 
     `tracker.follow(time, contacts)` returns the state after the next frame; `tracker` is not changed. Contacts are
-    assigned to the touches whose predicted positions (position + velocity · time) are nearest, with the minimum sum of
-    distances. A contact may be at most `reach` metres, which allows for noise of positions, plus the distance that a
-    touch of the maximum speed `fastest`, m/s, covers between two frames, from the predicted position of its touch. A
-    touch without a contact is kept for `gap` seconds from the first frame without a contact. If the touch may be hidden
-    in another touch's contact, as when two fingers cross, the touch is assumed to continue with its velocity, for 4
-    `gap` at most.
+    assigned to touches such that the sum of the distances between contacts and predicted positions (position + velocity
+    · time) is minimal. The distance of a contact from the predicted position of its touch is at most the sum of two
+    lengths: `reach`, metres, which allows for noise of positions, and the distance that a touch covers between two
+    frames at the maximum speed `fastest`, m/s. A touch ends `gap` seconds after the first frame without a contact. A
+    touch that may be hidden in another touch's contact, as when two fingers cross, is assumed to continue at its
+    velocity for at most 4 `gap`.
 
-    **Fields**: `gap`, `reach`, `fastest`: as above; `least`: minimum number of frames of a touch, shorter touches are
-    not reported; `time`: time of the last frame, -inf before the first; `open`, `closed`: current touches, and touches
-    that have ended; `number`: number of touches that have begun.
+    **Fields**: `gap`, `reach`, `fastest`: as above; `least`: minimum number of frames of a touch that is reported;
+    `time`: time of the last frame, -inf before the first; `open`, `closed`: current touches, and touches that have
+    ended; `number`: number of touches that have begun.
 
     **Example:**
 
@@ -145,8 +145,8 @@ class ContactTracker(Module):
         contact_positions = np.array([contact.centroid for contact in contacts])
         distances = np.linalg.norm(predicted_positions.reshape(-1, 1, 2) - contact_positions.reshape(1, -1, 2), axis=-1)
         max_distance = self.reach + self.fastest * interval if current_touches else 0.0
-        # Pairs of a touch and a contact beyond the maximum distance all cost the same, so that no nearer pair is given
-        # up for them.
+        # Every pair of a touch and a contact beyond the maximum distance has the same large cost, so that pairs within
+        # this distance are preferred.
         rows, columns = linear_sum_assignment(np.where(distances <= max_distance, distances, 1e3 * max_distance))
         # Index of the contact that is assigned to each touch, by the index of the touch.
         assigned_contacts = {
@@ -196,7 +196,7 @@ class ContactTracker(Module):
 def track_contacts(
     times: Float[np.ndarray, " F"], contacts: Sequence[Sequence[Contact]], tracker: ContactTracker | None = None
 ) -> list[TouchPath]:
-    """Track touches: join the contacts in the frames of a recording to the paths of touches.
+    """Track touches: assign the contacts in the frames of a recording to touches, and return the paths of the touches.
 
     **Arguments:**
 
@@ -230,7 +230,7 @@ def track_contacts(
 
 
 def without_side_lobes(touches: list[TouchPath], weakest: float) -> list[TouchPath]:
-    """Leave out touches whose maximum peak is less than `weakest` times that of another touch at the same time.
+    """Return the touches whose maximum peak is at least `weakest` times that of every touch at the same time.
 
     A linear image of a contact has side lobes, which look like weaker contacts.
     """
@@ -243,7 +243,7 @@ def without_side_lobes(touches: list[TouchPath], weakest: float) -> list[TouchPa
 
 
 def _update_touch(touch: _TrackedTouch, time: float, contact: Contact) -> _TrackedTouch:
-    """Return the state of a touch after a frame in which it is seen as this contact."""
+    """Return the state of a touch after a frame in which `contact` is assigned to it."""
     velocity_error = (contact.centroid - touch.predicted_position(time)) / (time - touch.time)
     velocity = touch.velocity + _VELOCITY_GAIN * velocity_error
     return _TrackedTouch(touch.number, time, contact.centroid, velocity, (*touch.observations, (time, contact)))

@@ -29,7 +29,8 @@ _FURTHER_FEATURES = (
     "roughness", "pauses", "centre of gravity", "breadth",
 )  # fmt: skip
 COURSE_FEATURES = (*FEATURES, *_FURTHER_FEATURES, *(f"course {instant + 1}" for instant in range(_NUM_INSTANTS)))
-"""Names of the features of `course_features`: the seven, further ones of the time course, and samples of P."""
+"""Names of the features of `course_features`: the seven features, further features of the time course, and samples of
+P."""
 
 NUM_SEQUENCE_INSTANTS = 32
 SEQUENCE_VALUES = ("change", "share", "mean", "area", "half", "speed", "distance", "along")
@@ -61,7 +62,7 @@ def touch_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Touc
     """Compute the seven features of n touches by Silvera Tawil et al. (2011), table II and section IV-A.
 
     Let x_e be the change of conductivity of mesh element e, P(t) = max_e x_e the maximum change at time t, and t* the
-    time at which P is largest. The features, in the order of `FEATURES`, are: P at t*; minimum of x_e over all elements
+    time of the maximum of P. The features, in the order of `FEATURES`, are: P at t*; minimum of x_e over all elements
     and frames of the touch; fraction of the elements with x_e ≥ P / 2 at t*; mean of x_e at t* over the elements above
     the touch level; duration from the first to the last frame above the level, s; mean of |dP/dt|, 0 for a single
     frame; distance between the first and the last centroid, m.
@@ -145,7 +146,7 @@ def _seven_features(course: ChangeCourse) -> list[float]:
 
 
 def _further_features(course: ChangeCourse) -> list[float]:
-    """Compute the features of one touch in `COURSE_FEATURES` after the first seven, in the order of that list."""
+    """Compute the features of one touch that follow the first seven in `COURSE_FEATURES`, in this order."""
     has_centroid = np.isfinite(course.centroid[:, 0])  # a frame below the level has no centroid
     centroids, seconds = course.centroid[has_centroid], course.seconds[has_centroid]
     steps = np.linalg.norm(np.diff(centroids, axis=0), axis=1)

@@ -1,4 +1,4 @@
-"""Classifiers of gestures: functions that fit them, listed by name, and their cross-validation."""
+"""Classifiers of gestures: functions that fit classifiers, by name, and cross-validation of classifiers."""
 
 from __future__ import annotations
 
@@ -40,14 +40,16 @@ GESTURE_CLASSIFIERS: dict[str, Callable[..., Any]] = {
     **CLASSIFIERS,
     "temporal-network": fit_temporal_network,
 }
-"""Functions that fit classifiers, by name: LogitBoost, the nine of learnt skins, and a network for the time course."""
+"""Functions that fit classifiers, by name: LogitBoost, the nine classifiers of learnt skins, and a network for the time
+course."""
 
 FEATURE_FORMS: dict[str, Callable[..., Any]] = {
     "seven": touch_features,
     "course": course_features,
     "sequence": sequence_features,
 }
-"""Functions that compute features of touches, by name: the seven, those with more of the time course, and all."""
+"""Functions that compute features of touches, by name: the seven features; these and features of the time course; both
+and the sampled time course."""
 
 
 def feature_forms(method: str) -> tuple[str, ...]:
@@ -88,8 +90,8 @@ def held_out_odds(
 
     The touches of each fold are classified by the classifier `method`, fitted to all other folds. `features` (n, k): k
     features of each touch; `true_classes` (n,): true classes, 0 … C − 1; `folds` (n,): number of the fold of each
-    touch. The log-odds are those of `log_odds`; a class that occurs in no other fold has −1000. Raises `ValueError` if
-    the other folds contain only one class.
+    touch. The log-odds are computed by `log_odds`; they are −1000 for a class that occurs in no other fold. Raises
+    `ValueError` if the other folds contain only one class.
     """
     odds = np.full((len(true_classes), true_classes.max() + 1), -1e3)
 

@@ -48,7 +48,7 @@ def learn_gestures(
     form: str = "auto",
     progress: Callable[[str], None] | None = None,
 ) -> LearntGestures:
-    """Train a gesture classifier on recordings of a described skin, of which the longest touch each is used.
+    """Train a gesture classifier on the longest touch in each recording of a described skin.
 
     **Arguments:**
 

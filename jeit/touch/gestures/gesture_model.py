@@ -29,7 +29,7 @@ from jeit.touch.learnt.extras import apply_in_parts
 from jeit.touch.learnt.file import read_plain, write_plain
 from jeit.touch.learnt.methods import fit_sharpness, log_odds, probabilities
 
-# Two skins whose conductivities differ by this factor or more are considered different, or given in different units.
+# Minimum ratio of the conductivities of two skins that are considered different, or to have different units.
 _MIN_CONDUCTIVITY_RATIO = 5.0
 
 
@@ -64,7 +64,7 @@ class Reading:
             raise ValueError(f"num_channels must be a positive number; it is {describe(self.num_channels)}.")
 
     def check_same_skin(self, num_channels: int, protocol: str, background: float) -> None:
-        """Check that frames are from a skin like the one that gestures were learnt on.
+        """Check that frames are from a skin like the one on which gestures were learnt.
 
         Raises `ValueError` if the number of channels or the protocol differs, or if the untouched skin's conductivity
         `background`, S, differs by a factor of 5 or more.
@@ -123,7 +123,7 @@ class GestureModel:
     """Classifier that predicts the gesture of a touch, such as "stroke".
 
     **Fields**: `names` (C,): names of the gestures; `method`: name of the classifier; `form`: name of its features,
-    "seven" (`touch_features`), "course" (these, and more of the time course) or "sequence" (these, and the sampled time
+    "seven" (`touch_features`), "course" (also features of the time course) or "sequence" (also the sampled time
     course); `scale`: transform of the features; `model`: fitted classifier; `sharpness`: factor by which the
     classifier's log-odds are multiplied before they become probabilities; `known` (N, k): scaled course features of the
     N touches of the training set; `known_scale`: transform of these features; `farthest`: distance from the nearest
@@ -167,14 +167,14 @@ class GestureModel:
     ) -> "GestureModel":
         """Fit a classifier to touches and their `labels` (n,), the names of gestures.
 
-        `people` (n,): names or numbers of the people who made the touches. `method`: one of `METHODS`; `form`: "seven",
-        "course", "sequence" (only for `method` "temporal-network") or "auto". "auto" chooses the classifier and
-        features that are most accurate on held-out people: each person in turn, or a tenth of the people if there are
-        more than ten. Without `people`, or with only one person, touches are held out at random, which does not measure
-        the accuracy for other people. `reading` and `notes` are stored in the model. `progress` is called with the
-        names of each classifier and its features, before they are tried. Raises `ValueError` if the numbers of labels,
-        people and touches differ, for empty labels, fewer than two gestures, gestures with fewer than two touches, and
-        unknown names of methods and forms; `ImportError` without the extra `learn`.
+        `people` (n,): names or numbers of the people who touched the skin. `method`: one of `METHODS`; `form`: "seven",
+        "course", "sequence" (only for `method` "temporal-network") or "auto". "auto" selects the classifier and
+        features that are most accurate on held-out people. Each person is held out in turn, or a tenth of the people if
+        there are more than ten. Without `people`, or with only one person, touches are held out at random, which does
+        not measure the accuracy for other people. `reading` and `notes` are stored in the model. `progress` is called
+        with the names of each classifier and its features, before they are tried. Raises `ValueError` if the numbers of
+        labels, people and touches differ, for empty labels, fewer than two gestures, gestures with fewer than two
+        touches, and unknown names of methods and forms; `ImportError` without the extra `learn`.
         """
         need_extra("learn", "learning gestures")
         check_name("method", method, METHODS)

@@ -29,9 +29,9 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
     (J − 1) / J (f_j − mean f), multiplied by the learning rate, and p becomes the softmax of F. Friedman, Hastie and
     Tibshirani, Annals of Statistics 28 (2000) 337, algorithm 6; weights as in WEKA's LogitBoost.
 
-    A small step increases the likelihood of the training set, but a full step may be too long, although clipping makes
-    this rare. A step is therefore halved until the likelihood is not less than before the step. For two classes, the
-    method equals the two-class LogitBoost of Friedman et al.
+    A small step increases the likelihood of the training set; a full step may be too long and decrease it, but clipping
+    makes this rare. A step is therefore halved until the likelihood is not less than before the step. For two classes,
+    the method equals the two-class LogitBoost of Friedman et al.
 
     **Arguments:**
 
@@ -40,9 +40,9 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
 
     **Fields** after `fit`: `classes_` (J,): the classes; `feature_` (rounds, J): feature that each stump compares with
     its threshold; `threshold_` (rounds, J): these thresholds; `below_`, `above_` (rounds, J): values of each stump at
-    or below the threshold and above it, multiplied by the step and by (J − 1) / J, before their mean over the classes
-    is subtracted; `step_` (rounds,): factor of the full step of each round; `log_likelihood_` (rounds + 1,): mean
-    log-likelihood of a sample before the first round and after each round.
+    or below the threshold, and above the threshold, multiplied by the step and by (J − 1) / J, without subtraction of
+    their mean over the classes; `step_` (rounds,): factor of the full step of each round; `log_likelihood_` (rounds +
+    1,): mean log-likelihood of a sample before the first round and after each round.
 
     **Example:**
 

@@ -45,7 +45,7 @@ class ChangeCourse(Module):
         return len(self.seconds)
 
     def select(self, frames: slice | np.ndarray) -> "ChangeCourse":
-        """Return the time course of the frames that a slice or an array of indices selects."""
+        """Return the time course of the frames that are selected by a slice or an array of indices."""
         return ChangeCourse(*(getattr(self, name)[frames] for name in _FIELD_NAMES))
 
     @classmethod
@@ -102,7 +102,7 @@ class TouchLevel(Module):
 
         The level is five standard deviations above the mean of the maxima of the images; images with NaN are left out.
         The level allows for drift only if the images span as long a time as later recordings. Raises `ValueError` for
-        fewer than ten images, images of another mesh, and images that are all the same.
+        fewer than ten images, images on a different mesh, and images that are all the same.
         """
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
         images = check_images(images, mesh.num_cells)
@@ -118,7 +118,8 @@ class TouchLevel(Module):
     def course(self, seconds: Float[np.ndarray, " F"], images: Float[np.ndarray, "F m"]) -> ChangeCourse:
         """Compute the time course of images (F, m) at times `seconds` (F,).
 
-        Raises `ValueError` for images of another mesh, values that are not finite, and more or fewer times than images.
+        Raises `ValueError` for images on a different mesh, values that are not finite, and more or fewer times than
+        images.
         """
         images = check_images(images, len(self.areas))
         seconds = check_seconds(seconds, len(images))
@@ -142,7 +143,7 @@ class TouchLevel(Module):
 
 
 def check_images(images: Float[np.ndarray, "F m"], num_elements: int) -> Float[np.ndarray, "F m"]:
-    """Convert images on a mesh of `num_elements` elements to an array (F, m). Raises `ValueError` for another shape."""
+    """Convert images on a mesh of `num_elements` elements to an array (F, m). Raises `ValueError` for other shapes."""
     images = real_array("images", images, f"images of change (F, {num_elements}), a row a frame")
     if images.ndim != 2 or images.shape[1] != num_elements:
         raise ValueError(
@@ -154,7 +155,7 @@ def check_images(images: Float[np.ndarray, "F m"], num_elements: int) -> Float[n
 def check_seconds(seconds: Float[np.ndarray, " F"], num_frames: int) -> Float[np.ndarray, " F"]:
     """Convert the times of `num_frames` frames to an array (F,).
 
-    Raises `ValueError` if the times are not `num_frames`, decrease, or are not finite.
+    Raises `ValueError` if the number of times is not `num_frames`, or if times decrease or are not finite.
     """
     seconds = real_array("seconds", seconds, f"times ({num_frames},) of the frames")
     if seconds.shape != (num_frames,):
@@ -173,8 +174,9 @@ class StreamTouch(Module):
     """One touch in a stream of images.
 
     **Fields**: `course`: time course of the touch, from the first to the last frame above the touch level; `lost`:
-    number of unusable frames between these frames; `begun_before`, `cut_off`: whether the touch is present in the
-    first, or the last, frame of an uninterrupted part of the stream, so that its true onset, or end, is unknown.
+    number of unusable frames between these frames; `begun_before`: whether the touch is present in the first frame of
+    an uninterrupted part of the stream, so that its onset is unknown; `cut_off`: whether it is present in the last
+    frame of such a part, so that its end is unknown.
 
     **Example:**
 
@@ -249,7 +251,7 @@ class TouchStream(Module):
     def follow(self, second: float, image: Float[np.ndarray, " m"]) -> "TouchStream":
         """Return the state of the segmentation after an image (m,) at time `second`, seconds.
 
-        Raises `ValueError` for a time before the last frame's, and an image of another mesh.
+        Raises `ValueError` for a time before that of the last frame, and an image on a different mesh.
         """
         if not (is_number(second) and second >= self.second):
             raise ValueError(f"second must not be before the last frame, {self.second:g} s; it is {describe(second)}.")
@@ -301,7 +303,7 @@ def find_touches(
     - `gap`: minimum untouched time between two touches, seconds.
     - `least`: minimum number of frames of a touch.
 
-    Raises `ValueError` for times that decrease or are not finite, images of another mesh, and images whose median
+    Raises `ValueError` for times that decrease or are not finite, images on a different mesh, and images whose median
     interval is not below `gap`.
 
     **Example:**

@@ -25,7 +25,7 @@ from jeit.mesh import Mesh
 from jeit.touch.contacts import CellFinder, Contact, ImageNoise, find_contacts, track_contacts
 from jeit.touch.contacts.tracker import TouchPath, without_side_lobes
 
-# Minimum number of frames of the untouched skin that are needed, and from which the noise of images is estimated.
+# Minimum number of frames of the untouched skin for imaging, and for an estimate of the noise of images.
 _MIN_UNTOUCHED_FRAMES, _MIN_NOISE_FRAMES = 3, 10
 
 TOUCH_IMAGES = StreamSettings(solver=OneStep(), prior="noser")
@@ -110,7 +110,8 @@ class TouchImages:
 def untouched_frames(
     recording: FrameRecording, seconds: Float[np.ndarray, " F"], span: float
 ) -> Float[np.ndarray, "u M"]:
-    """Return frames (u, M), volts, of the untouched skin: the recording's `reference`, otherwise its first seconds.
+    """Return frames (u, M), volts, of the untouched skin: the recording's `reference`, otherwise the frames of its
+    first `span` seconds.
 
     **Arguments:**
 
@@ -118,7 +119,7 @@ def untouched_frames(
     - `seconds`: times (F,) of its frames, seconds.
     - `span`: time from the beginning of the recording in which the skin is untouched, seconds.
 
-    Of the first seconds, frames without any reading are left out. Raises `ValueError` if fewer than three remain.
+    Of the latter, frames without any reading are left out. Raises `ValueError` if fewer than three frames remain.
 
     **Example:**
 
@@ -193,7 +194,8 @@ def find_recorded_contacts(
     - `images`: imager of the skin.
     - `frames`: frames (F, M), volts.
     - `seconds`: increasing times (F,) of the frames, seconds.
-    - `untouched`: frames (u, M) of the untouched skin, volts, which give the noise of images if there are ten or more.
+    - `untouched`: frames (u, M) of the untouched skin, volts, from which the noise of images is estimated if there are
+      ten or more.
     - `sign`: 1 if touched skin conducts better, -1 if worse.
     - `weakest`: minimum peak of a contact, relative to that of the strongest contact in its frame. A linear image of a
       contact has side lobes of up to a third of its peak.

@@ -1,9 +1,9 @@
 """Classify touches of a live skin as they end.
 
-A touch is classified at the first frame below the touch level, as early as it may have ended; it has ended for good
-when the skin has been untouched for the time `gap`. While the skin is untouched, the reference frame follows its drift,
-so that drift is not detected as a touch. A touch that lasts longer than the time `patience` is reported as held, and
-becomes part of the reference.
+A touch is classified at the first frame below the touch level, the earliest at which it may have ended. It has ended
+for good when the skin has been untouched for the time `gap`. While the skin is untouched, the reference frame follows
+its drift, so that drift is not detected as a touch. A touch that lasts longer than the time `patience` is reported as
+held, and becomes part of the reference.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from jeit.touch.gestures import GestureModel, StreamTouch, TouchLevel, TouchStre
 from jeit.touch.gestures.touch_images import TouchImages
 
 # Minimum untouched time between two touches, in seconds and in frames, of which the longer applies; untouched time
-# after which the reference frame follows the skin's drift, seconds; time constant with which it follows, seconds.
+# after which the reference frame follows the skin's drift, and time constant of this adaptation, both in seconds.
 _MIN_GAP, _MIN_GAP_FRAMES, _SETTLING_TIME, _DRIFT_TIME_CONSTANT = 0.1, 2.5, 0.5, 2.0
 # Maximum fraction of the initial untouched frames that may exceed the touch level of the model.
 _MAX_FRACTION_ABOVE_LEVEL = 0.1
-# A change opposite to a touch shows that the skin was touched when its reference was recorded: minimum ratio of this
-# change to the touch level; minimum time, seconds, for which it lasts.
+# A change of the sign opposite to a touch shows that the skin was touched when its reference was recorded: minimum
+# ratio of this change to the touch level; minimum duration of this change, seconds.
 _MIN_OPPOSITE_RATIO, _MIN_OPPOSITE_TIME = 3.0, 0.5
 
 
@@ -62,12 +62,12 @@ class NamedTouch:
 
 @dataclass(frozen=True)
 class WatchedFrame:
-    """What a `TouchWatch` finds in one frame: whether the skin is touched, and which touches have ended.
+    """Result of a `TouchWatch` for one frame: whether the skin is touched, and which touches have ended.
 
     **Fields**: `second`: time of the frame, seconds; `image`: image of the frame, None in the result after the last
     frame; `peak`: maximum change, S, NaN if the frame was refused; `touched`: whether the skin is touched; `named`:
-    touch that was classified at this frame, which may still continue, or None; `ended`: touches that have ended for
-    good; `latency`: time from the frame to the result, seconds; `note`: remark on the frame, or an empty string.
+    touch that was classified at this frame but may still continue, or None; `ended`: touches that have ended for good;
+    `latency`: time from the frame to the result, seconds; `note`: remark on the frame, or an empty string.
 
     **Example:**
 
@@ -125,8 +125,8 @@ class TouchWatch:
 
         `untouched` (u, M): first frames of the skin, untouched, volts. The touch level is that stored in `model`; if
         more than a tenth of the untouched frames exceed this level, a higher level is estimated from these frames.
-        Raises `ValueError` for a model that was learnt on another skin or does not say on which, for untouched frames
-        from which no level can be estimated, and for rates and patience that are not positive.
+        Raises `ValueError` for a model that was trained on a different skin, or does not store on which, for untouched
+        frames from which no level can be estimated, and for rates and patience that are not positive.
         """
         check_kind("images", images, TouchImages, "TouchImages, as of TouchImages.prepare(description, untouched)")
         check_kind("model", model, GestureModel, "a GestureModel, as of GestureModel.read(path)")
@@ -237,7 +237,7 @@ class _Session:
         )
 
     def _is_lifted(self, image: FrameImage, change: np.ndarray) -> bool:
-        """Whether a touch that was present when the reference was recorded has been lifted for good."""
+        """Return whether a touch that was present when the reference was recorded has ended for good."""
         if not image.imaged or -change.min() <= max(change.max(), _MIN_OPPOSITE_RATIO * self.watch.level.level):
             self.opposite_start = None
         elif self.opposite_start is None:
@@ -273,8 +273,8 @@ class _Session:
         )
 
     def _ended_touch(self, touch: StreamTouch) -> NamedTouch:
-        """Return an ended touch with the prediction that was made at its end, or with a new prediction if that was not
-        made for the whole touch."""
+        """Return an ended touch with the prediction that was made at its end, or with a new prediction if the earlier
+        prediction was not for the whole touch."""
         named_touch, self.last_named_touch = self.last_named_touch, None
         if named_touch is None or len(named_touch.touch.course) != len(touch.course):
             named_touch = self._classify(touch)

@@ -3,8 +3,8 @@
 Across a cut, a sheet conducts as if it were longer by some added length, which is very large if the sheet is cut
 through; along the cut, the sheet conducts as before. The loss of conductivity is spread over a band about as wide as
 two edges of the mesh; the mesh is refined where images show a loss. The unknowns are the ends of the path, its bend,
-and the added length; the voltages are computed exactly in every step of the fit. A round spot, as a press makes, is
-fitted too: the better fit determines whether a cut or a press caused the change.
+and the added length; the voltages are computed exactly in every step of the fit. A round spot, such as a press causes,
+is fitted too: the better fit determines whether a cut or a press caused the change.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ _REFINED_RADIUS, _EDGE_LENGTH = 0.22, 0.0125
 # beyond the ends of a path.
 _BAND_HALF_WIDTH, _END_NARROWING = 1.5, 2.0
 # Spot of changed conductivity: initial and maximum radius, divided by the skin's side; extent, in radii; initial and
-# maximum depth, where depth is minus the logarithm of the fraction of conductivity left at the centre.
+# maximum depth, where depth is minus the logarithm of the fraction of conductivity that remains at the centre.
 _INITIAL_SPOT_RADIUS, _MAX_SPOT_RADIUS, _SPOT_EXTENT, _SPOT_DEPTHS, _MAX_SPOT_DEPTH = 0.05, 0.1, 3.0, (0.5, -0.5), 6.0
 # Initial offset of a bend from the middle of a straight path, divided by the length of the path.
 _BEND_OFFSET = 0.2
-# Maximum ratio of misfits for accepting a bent path in place of a straight path, and a partial cut in place of a cut
-# through the whole depth.
+# Maximum ratio of the misfit of a bent path to that of a straight path, for the bent path to be accepted; the same for
+# a partial cut and a cut through the whole depth.
 _MAX_BEND_RATIO, _MAX_PARTIAL_RATIO = 0.7, 0.4
-# Misfit below which a cut through the whole depth is certain; ratio of misfits above which the other depth of the cut
-# is excluded; maximum standard deviation of an end of the path, in mesh edges.
+# Misfit below which a cut through the whole depth is certain; ratio of misfits above which the worse of the fits of a
+# complete and a partial cut is excluded; maximum standard deviation of an end of the path, in mesh edges.
 _CERTAIN_MISFIT, _DISTINCT_RATIO, _MAX_END_DEVIATION = 0.01, 4.0, 10.0
 # Model error, relative to a channel's change and to the root mean square of all changes; standard deviation of a
 # relative change common to all voltages.
@@ -91,8 +91,8 @@ class LossFit:
         noise: Float[np.ndarray, " K"],
         centre: Float[np.ndarray, " 2"],
     ):
-        """Prepare the fit. `conductivity`: that before the change, S/m (2-D: S); `noise` (channels,): noise of the
-        change, volts."""
+        """Prepare the fit. `conductivity`: conductivity before the change, S/m (2-D: S); `noise` (channels,): noise of
+        the change, volts."""
         cell_centres = np.asarray(centroids(model.mesh))[:, :2]
         self.lower_corner, self.upper_corner = cell_centres.min(axis=0), cell_centres.max(axis=0)
         self.skin_size = float((self.upper_corner - self.lower_corner).max())
@@ -120,8 +120,8 @@ class LossFit:
         rms_change = np.sqrt(np.mean(change**2))
         self.weights = 1 / np.hypot(noise, _MODEL_ERROR * np.hypot(change, rms_change))
         self.change = change
-        # Direction of the voltage change by a uniform change of conductivity, which is projected out of voltage
-        # changes.
+        # Direction of the voltage change due to a uniform change of conductivity; this component is removed from
+        # voltage changes.
         uniform_change = self.weights * self.rest_voltages
         self.drift_direction = uniform_change / np.linalg.norm(uniform_change)
         self.energy = float(np.sum(self._weight_residual(change) ** 2))
@@ -203,7 +203,8 @@ class LossFit:
         return _FittedUnknowns(all_unknowns(optimum.x), 2 * optimum.cost / self.energy)
 
     def _bounds(self, num_unknowns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Lower bounds, upper bounds and scales of the unknowns of a cut or a spot, each an array (num_unknowns,)."""
+        """Return lower bounds, upper bounds and scales of the unknowns of a cut or a spot, each an array
+        (num_unknowns,)."""
         if num_unknowns == 5:  # a spot
             lower_bounds, upper_bounds = (
                 [*self.lower_corner, np.log(self.band_half_width / self.skin_size), -_MAX_SPOT_DEPTH],
@@ -218,8 +219,8 @@ class LossFit:
         return np.array([*lower_bounds, -0.5]), np.array([*upper_bounds, 0.5]), np.array([*scales, _FACTOR_DEVIATION])
 
     def _deviation(self, fitted: _FittedUnknowns) -> float:
-        """Standard deviation of the length of a cut, metres, from the standard deviations of both ends, each combined
-        with half an edge of the mesh."""
+        """Estimate the standard deviation of the length of a cut, metres, from those of both ends and half an edge of
+        the mesh at each end."""
         min_energy = fitted.misfit * self.energy
         residual_variance = min_energy / max(len(self.change) - len(fitted.unknowns), 1)
         path = fitted.unknowns[:-2].reshape(-1, 2)
@@ -247,7 +248,7 @@ class LossFit:
         return float(np.sum(self._residual(unknowns) ** 2))
 
     def _channel_voltages(self, impedance: np.ndarray) -> np.ndarray:
-        """Voltages of the channels, computed from a transfer impedance matrix (electrodes, electrodes)."""
+        """Compute the voltages of the channels from a transfer impedance matrix (electrodes, electrodes)."""
         return np.einsum("kl,kl->k", self.measurement_weights @ impedance, self.drive_currents)
 
     def _predicted_change(self, unknowns: np.ndarray) -> np.ndarray:
@@ -258,7 +259,8 @@ class LossFit:
         return np.append(self._weight_residual(unexplained_change), unknowns[-1] / _FACTOR_DEVIATION)
 
     def _jacobian(self, unknowns: np.ndarray) -> np.ndarray:
-        """Derivatives (residuals, unknowns) of the weighted residuals of the fit with respect to the unknowns."""
+        """Compute the derivatives (residuals, unknowns) of the weighted residuals of the fit with respect to the
+        unknowns."""
         change = self._conductivity_change(unknowns)
         steps = np.full(len(unknowns) - 1, _DERIVATIVE_STEP)
         steps[: 2 if len(unknowns) == 5 else -1] *= self.skin_size
@@ -280,8 +282,8 @@ class LossFit:
         return np.concatenate([self._weight_residual(columns), last_row[None]])
 
     def _conductivity_change(self, unknowns: np.ndarray) -> np.ndarray:
-        """Change of conductivity in the cells of the region: scalars for a spot, tensors (cells, d, d) in d dimensions
-        for a cut."""
+        """Compute the change of conductivity in the cells of the region: scalars for a spot, tensors (cells, d, d) in d
+        dimensions for a cut."""
         if len(unknowns) == 5:
             return self.conductivity * np.expm1(self._log_spot(unknowns))
         fractions, normals = self._fraction_across_path(unknowns)
@@ -292,15 +294,15 @@ class LossFit:
         return change
 
     def _log_spot(self, unknowns: np.ndarray) -> np.ndarray:
-        """Logarithm of the fraction of conductivity that is left in each cell of the region with a spot."""
+        """Compute the logarithm of the fraction of each cell's conductivity that remains in a spot."""
         squared_distances = (
             np.sum((self.centres - unknowns[:2]) ** 2, axis=1) / (np.exp(unknowns[2]) * self.skin_size) ** 2
         )
         return -unknowns[3] * np.where(squared_distances < _SPOT_EXTENT**2, np.exp(-squared_distances / 2), 0.0)
 
     def _fraction_across_path(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Fraction of each cell's conductivity that is left across the nearest segment of a path, and the direction
-        across the segment (cells, 2)."""
+        """Compute the fraction of each cell's conductivity that remains across the nearest segment of a path, and the
+        direction (cells, 2) across the segment."""
         path = unknowns[:-2].reshape(-1, 2)
         segment_starts, directions = path[:-1], np.diff(path, axis=0)
         lengths = np.maximum(np.linalg.norm(directions, axis=1), 1e-9)
@@ -326,7 +328,8 @@ class LossFit:
         return 1 / (1 + np.exp(unknowns[-2]) * self.skin_size * profile), normals[nearest_segments]
 
     def _conductivity_on_mesh(self, unknowns: np.ndarray) -> np.ndarray:
-        """Conductivity with the fitted loss on the mesh of the model before refinement, one value for each cell."""
+        """Compute the conductivity with the fitted loss on the mesh of the model before refinement, one value for each
+        cell."""
         # Conductivity is lost across a path, not along the path: the geometric mean of both directions is used.
         log_fractions = (
             self._log_spot(unknowns) if len(unknowns) == 5 else 0.5 * np.log(self._fraction_across_path(unknowns)[0])

@@ -2,8 +2,8 @@
 
 A lasting step of the voltages is detected in frames with touches, noise and drift by comparing the medians of two
 consecutive windows of frames. A touch is shorter than half a window, so it hardly affects the window's median. Drift
-within a window is as large as drift between two windows, whereas a step occurs at one time. The size of a step is
-relative to the change between windows of healthy frames, channel by channel.
+also changes the voltages within a window, whereas a step occurs at one time. In every channel, the size of a step is
+relative to the usual change between windows of healthy frames.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ class EventKind(StrEnum):
     CUT = "cut"
     """Conductivity is permanently lost along a path."""
     DEAD = "dead electrode"
-    """The channels of an electrode have changed by far more than its contact explains."""
+    """The channels of an electrode have changed by far more than a change of its contact explains."""
     TORN = "torn wire"
-    """The channels of an electrode read almost nothing, or all the same constant; a dead electrode may look the
-    same."""
+    """The channels of an electrode read almost nothing, or all the same constant; a dead electrode may have the same
+    effect."""
     LOOSE = "loose electrode"
     """The contact of an electrode has become worse, and fluctuates."""
     NOISY = "noisy channel"
@@ -44,7 +44,7 @@ class EventStatus(StrEnum):
     """How certain an event in the state of a skin is. Each member equals its string value."""
 
     HELD = "held, or a void"
-    """The change looks like a touch that is held: only time or the user can distinguish the two."""
+    """The change may be damage or a touch that is held: only its duration or the user can distinguish the two."""
     LASTING = "lasting"
     """The change has lasted longer than any touch, or is unlike any touch."""
     CONFIRMED = "confirmed"
@@ -99,14 +99,14 @@ class HealthEvent(Module):
         return not is_closed and self.kind != EventKind.REPAIRED
 
 
-# Sharpness: minimum fraction of a step that occurs between the quarter of a window before the step and the quarter
-# after it; for a constant slope, the fraction is a quarter.
+# Minimum sharpness of a step: difference of the medians over a quarter of a window after and before the step, as a
+# fraction of the step; for a constant slope, it is a quarter.
 _MIN_SHARPNESS = 0.55
 # Fraction of a step that the median of each third of the frames after the step must exceed; fraction that the median of
 # no third of the frames before the step may exceed.
 _MIN_FRACTION_AFTER, _MAX_FRACTION_BEFORE = 0.5, 0.5
-# Fraction of a step below which the level of a frame counts as that before the step; maximum fraction of frames with
-# the level of the wrong side, because of touches of the opposite sign.
+# Fraction of a step below which the level of a frame counts as the level before the step; maximum fraction of frames on
+# one side of the step with the level of the other side, which touches of the opposite sign may cause.
 _BEFORE_LEVEL, _MAX_OUTLIER_FRACTION = 0.3, 0.1
 # Exponent of the power mean over channels, large enough to detect a change of a single channel among many.
 _POWER_MEAN_EXPONENT = 4
@@ -126,14 +126,14 @@ class Step:
 
 
 def window_change(frames: Float[np.ndarray, "2w M"]) -> Float[np.ndarray, " M"]:
-    """Change of each channel from the median of the first half of frames to that of the second; NaN if a half has no
-    reading."""
+    """Compute the change of each channel from the median of the first half of frames to that of the second half; NaN if
+    a half has no reading."""
     half = len(frames) // 2
     return channel_medians(frames[half:]) - channel_medians(frames[:half])
 
 
 def channel_medians(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]:
-    """Median of every channel over the frames with a reading; NaN for channels without readings."""
+    """Compute the median of every channel over the frames with a reading; NaN for channels without readings."""
     if not np.isnan(frames).any():
         return np.median(frames, axis=0)
     has_readings = ~np.isnan(frames).all(axis=0)
@@ -143,8 +143,8 @@ def channel_medians(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]
 
 
 def change_size(scaled_changes: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "..."]:
-    """Size of voltage changes that are divided by the usual healthy change: a power mean over the channels with a
-    reading."""
+    """Compute the size of voltage changes that are divided by the usual healthy changes: a power mean over the channels
+    with a reading."""
     powers = np.minimum(np.abs(scaled_changes), 1e9) ** _POWER_MEAN_EXPONENT
     has_reading = np.isfinite(powers)
     mean_powers = np.sum(np.where(has_reading, powers, 0.0), axis=-1) / np.maximum(has_reading.sum(axis=-1), 1)
@@ -184,13 +184,13 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
         or not is_distinct(projections, first_frame)
     ):
         return None
-    # The step may be at another frame than the boundary between the windows.
+    # The step need not be at the boundary between the windows.
     return Step(channel_medians(frames[first_frame:]) - channel_medians(frames[:first_frame]), size, first_frame)
 
 
 def is_distinct(projections: Float[np.ndarray, " n"], first: int) -> bool:
-    """Whether the levels of frames are 0 before index `first` and 1 from this index on, apart from noise and a few
-    exceptions.
+    """Return whether the levels of frames are 0 before index `first` and 1 from this index on, apart from noise and a
+    few exceptions.
 
     A lasting step is distinct from two touches, between which the level returns to 0.
     """

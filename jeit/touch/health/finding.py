@@ -98,7 +98,7 @@ class ImagedSkin:
         return cls(model, values, values, gain, noise, int(sign))
 
     def linear_reconstruction(self, usable: Bool[np.ndarray, " M"]) -> LinearReconstruction:
-        """One-step reconstruction from voltages of the `usable` channels, linearised at the present conductivity of the
+        """Return the one-step reconstruction from the `usable` channels, linearised at the present conductivity of the
         skin."""
         noise = np.where(np.isfinite(self.noise), self.noise / np.abs(self.gain), 1.0)
         return one_step(self.model, self.conductivity, noise=as_array(noise), mask=as_array(usable))
@@ -107,7 +107,8 @@ class ImagedSkin:
         """Reconstruct conductivity changes (frames, cells), S/m (2-D: S), from voltage changes (frames, channels),
         volts.
 
-        Missing readings are NaN; the image of a frame without any reading is NaN. `usable`: channels that are used.
+        Missing readings are NaN; the image of a frame without any reading is NaN. `usable`: whether each channel is
+        used.
         """
         has_reading = np.isfinite(changes) & usable
         volts = np.where(has_reading, changes / self.gain, 0.0)
@@ -122,10 +123,10 @@ class ImagedSkin:
     def fit_cut(
         self, change: Float[np.ndarray, " M"], usable: Bool[np.ndarray, " M"], noise: Float[np.ndarray, " M"]
     ) -> FittedLoss | None:
-        """Fit a cut to a voltage change, volts; returns None if no cut explains the change, or a press explains the
-        change as well.
+        """Fit a cut to a voltage change, volts; return None if no cut explains the change, or a press explains it about
+        as well.
 
-        `usable`: channels that are used; `noise`: noise of each channel's change, volts.
+        `usable`: whether each channel is used; `noise`: noise of each channel's change, volts.
         """
         is_used = usable & np.isfinite(change)
         volts = np.where(is_used, change / self.gain, 0.0)
@@ -230,8 +231,8 @@ def kind_of_fault(
     return EventKind.DEAD
 
 
-# Maximum fraction of a change in an electrode's channels, as a sum of squares, that a fitted cut leaves unexplained if
-# the change is by a cut beside the electrode; for a failing contact, the fraction is larger.
+# Maximum misfit of a fitted cut, as a fraction of the change's sum of squares, for a change of only one electrode's
+# channels to be attributed to a cut beside the electrode. For a failing contact, the misfit is larger.
 _MAX_CUT_MISFIT = 0.1
 
 
@@ -309,5 +310,5 @@ def classify_change(
 
 
 def _loss_is_opposite_to_touch(skin: ImagedSkin | None) -> bool:
-    """Whether touches raise the skin's conductivity, so that a loss of conductivity cannot be a touch."""
+    """Return whether touches raise the skin's conductivity, so that a loss of conductivity cannot be a touch."""
     return skin is not None and skin.sign > 0

@@ -31,8 +31,8 @@ def learn_health(
 
     **Arguments:**
 
-    - `healthy`: the recording of the healthy skin. Frames have the recording's times, or come at `rate`; otherwise,
-      times are frame numbers.
+    - `healthy`: the recording of the healthy skin. The times of its frames are recorded, or computed from `rate`;
+      without either, times are frame numbers.
     - `description`: description of the skin. If the description has a protocol, failing electrodes are identified. If
       the description also has geometry and electrodes, a model is calibrated on the untouched frames to locate cuts.
     - `sign`: as in `SkinHealth.fit`, -1 for skins that conduct worse where touched.
@@ -66,8 +66,8 @@ def learn_health(
 
 
 def seconds_of(recording: FrameRecording, rate: float | None) -> Float[np.ndarray, " F"] | None:
-    """Times of a recording's frames, seconds: those recorded, or computed from `rate`, frames/s; None if neither is
-    known."""
+    """Return the times of a recording's frames, seconds: those recorded, or computed from `rate`, frames/s; None if
+    neither is known."""
     if recording.seconds is None:
         return None if rate is None else np.arange(len(recording.frames)) / rate
     return recording.seconds

@@ -1,10 +1,10 @@
 """The healthy state of a skin: principal directions of its touches, usual changes, and steadiness of its channels.
 
 Frames are averaged to steps in time. Single channels that are noisy, jump, or are stuck are detected from their changes
-from step to step. Two measures of variation are computed for every channel in a window of steps: the mean of the
-smaller half of the magnitudes of these changes, which touches hardly affect, and the mean of all magnitudes, which
-responds to jumps. Both measures, in two consecutive windows, are compared with those of healthy windows and of the
-other channels. If many channels exceed the limits of their measures at once, the cause is a touch, not faulty channels.
+from step to step. Two measures of variation are computed for every channel in a window of steps. The mean of the
+smaller half of the magnitudes of these changes is hardly affected by touches; the mean of all magnitudes responds to
+jumps. Both measures, in two consecutive windows, are compared with the measures of healthy windows and of the other
+channels. If many channels exceed the limits of their measures at once, the cause is a touch, not faulty channels.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from jaxtyping import Bool, Float
 
 from jeit.touch.health.event import change_size, channel_medians, lasting_step, window_change
 
-# Fraction of a window's changes, the smallest changes, that measure noise; minimum fraction of changes that have
-# readings.
+# Fraction of a window's changes, those of smallest magnitude, from which noise is estimated; minimum fraction of
+# changes that have readings.
 _SMALL_FRACTION, _MIN_READ_FRACTION = 0.5, 0.5
 # Limit of a variation measure: minimum, as a multiple of the usual value; multiple of the maximum among healthy
 # windows; increase of the second multiple, to be divided by the number of windows.
 _MIN_LIMIT_RATIO, _UNSTEADY_FACTOR, _UNSTEADY_INCREASE = 3.0, 2.0, 12.0
-# Minimum fraction of steps in which a healthy channel must change for the channel ever to count as stuck.
+# Minimum fraction of steps in which a healthy channel changes; a channel that changes less often never counts as stuck.
 _MIN_MOVING_FRACTION = 0.6
 # Maximum fraction of channels that may be noisy or stuck at once.
 _MAX_UNSTEADY_FRACTION = 0.1
@@ -67,7 +67,8 @@ class Steadiness:
     def noisy_channels(
         self, steps: Float[np.ndarray, "2w M"], trusted: Bool[np.ndarray, " M"]
     ) -> Bool[np.ndarray, " M"]:
-        """Whether each channel is noisy, or jumps, in both of two windows, far more than nearly all other channels.
+        """Return whether each channel is noisy, or jumps, in both of two windows, far more than nearly all other
+        channels.
 
         `steps` (steps, channels): averaged frames of both windows, volts; `trusted`: whether each channel may be used.
         """
@@ -80,7 +81,7 @@ class Steadiness:
     def stuck_channels(
         self, steps: Float[np.ndarray, "2w M"], trusted: Bool[np.ndarray, " M"]
     ) -> Bool[np.ndarray, " M"]:
-        """Whether each channel is constant in both of two windows while other channels change; arguments as for
+        """Return whether each channel is constant in both of two windows while other channels change; arguments: see
         `noisy_channels`."""
         half = len(steps) // 2
         return self._exclude_common_changes(
@@ -106,8 +107,8 @@ class Steadiness:
 
 
 def _relative_to_others(ratios: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "... M"]:
-    """Divide the ratios of variation measures to their usual values by a high quantile of the ratios over the channels,
-    if the quantile is above 1: a change of nearly all channels is then not attributed to single channels."""
+    """Divide the ratios of variation measures to their usual values by a high quantile over the channels, if it is
+    above 1. A change of nearly all channels is then not attributed to single channels."""
     num_excluded = max(1, int(_MAX_UNSTEADY_FRACTION * ratios.shape[-1]))
     if num_excluded >= ratios.shape[-1]:
         return ratios
@@ -131,8 +132,8 @@ def _variation_measures(window_steps: Float[np.ndarray, "w M"]) -> Float[np.ndar
 
 
 def _usual_variation(measures: Float[np.ndarray, "n 2 M"], noise: Float[np.ndarray, " M"]) -> Float[np.ndarray, "2 M"]:
-    """Mean of the variation measures (windows, 2, channels) over healthy windows, but at least a tenth of the `noise`:
-    a coarse analogue-to-digital converter hides noise."""
+    """Compute the mean of the variation measures (windows, 2, channels) over healthy windows, but at least a tenth of
+    the `noise`, since a coarse analogue-to-digital converter hides noise."""
     usual_values = np.nan_to_num(measures).mean(axis=0)
     return np.where(
         np.isfinite(noise), np.maximum(usual_values, 0.1 * np.where(np.isfinite(noise), noise, 1.0)), np.inf
@@ -144,8 +145,7 @@ def _usual_variation(measures: Float[np.ndarray, "n 2 M"], noise: Float[np.ndarr
 _MAX_WINDOW_STEPS, _MIN_WINDOW_STEPS, _MIN_NUM_WINDOWS = 48, 5, 8
 # Minimum and maximum length of windows, in frames, for a healthy recording without a quiet interval.
 _MIN_WINDOW_FRAMES, _MAX_WINDOW_FRAMES = 12, 64
-# If the length of a window is not given: the length as a multiple of the longest touch; its minimum as a fraction of
-# the recording.
+# Default length of a window: the length as a multiple of the longest touch; its minimum as a fraction of the recording.
 _WINDOW_PER_TOUCH, _MIN_WINDOW_FRACTION = 3.0, 1 / 40
 # Limit of a change between windows: multiple of the maximum among healthy windows; minimum, in standard deviations of
 # healthy changes; increase of the multiple, to be divided by the number of windows.
@@ -153,10 +153,10 @@ _CHANGE_FACTOR, _MIN_CHANGE_SIZE, _CHANGE_INCREASE = 2.0, 4.0, 20.0
 # Factor by which windows may be shorter than touches require; if windows are even shorter, touches appear to last, and
 # limits of changes are multiplied by the second factor.
 _SHORT_WINDOW_FACTOR, _BRIEF_LIMIT_FACTOR = 1.5, 2.0
-# Minimum fraction of a lasting step of the voltages that is left one window later.
+# Minimum fraction of a lasting step of the voltages that remains one window later.
 _MIN_REMAINING_FRACTION = 0.4
-# Limit of the change of voltages from the healthy to another recording, as a multiple of the maximum between healthy
-# windows.
+# Limit of the change of voltages from the healthy recording to another recording, as a multiple of the maximum between
+# healthy windows.
 _LEVEL_FACTOR = 3.0
 # Minimum ratio of the change in a touched frame to the change in quiet frames; quantile of the changes of all frames
 # that estimates the change in quiet frames.
@@ -167,8 +167,8 @@ _MAX_NUM_DIRECTIONS, _EXPLAINED_FRACTION = 40, 0.98
 # healthy touches; minimum energy of the healthy touches, relative to that of a strong touch.
 _OUTSIDE_QUANTILE, _MIN_STRONG_ENERGY = 0.99, 0.2
 _MIN_NUM_FRAMES = 20
-# Fraction of the changes from frame to frame, the smallest changes, that touches do not affect; mean magnitude of the
-# same fraction of a standard normal variable.
+# Fraction of the changes from frame to frame, those of smallest magnitude, that touches do not affect; mean magnitude
+# of the same fraction of the values of a standard normal variable.
 _UNTOUCHED_FRACTION, _NORMAL_MEAN_MAGNITUDE = 0.8, 0.5586
 # Ratio of the standard deviation of a normal variable to its mean magnitude.
 _DEVIATION_PER_MEAN_MAGNITUDE = float(np.sqrt(np.pi / 2))
@@ -178,16 +178,17 @@ _DEVIATION_PER_MEAN_MAGNITUDE = float(np.sqrt(np.pi / 2))
 class HealthyState:
     """Healthy state of a skin and its usual variation, learnt from a recording.
 
-    **Fields**, of each channel where not said otherwise: `reference`: voltage of the untouched skin, volts; `used`:
-    whether the channel has readings; `noise`: noise from frame to frame, volts; `span` (2, channels): minimum and
-    maximum change in the recording, volts; `stride`: number of frames averaged to a step in time; `window`: number of
-    steps of a window; `scale`: usual change between consecutive windows, volts; `limit`: limit of the change between
-    windows (`change_size`) for a change that lasts; `sudden_limit`: limit for a change that may be a touch;
-    `level_scale`: usual change between any two windows, volts; `level_limit`: limit for a change from the healthy to
-    another recording; `touch_directions` (channels, directions): principal directions of touches, orthonormal in units
-    of noise; `max_fraction_outside`: maximum fraction of the energy of touches outside of these directions;
-    `steadiness`: steadiness of single channels; `period`: seconds between frames, or 1; `is_brief`: whether the
-    recording was too short for its touches, so that limits are twice as high.
+    **Fields**, where arrays without a stated shape contain one value for each channel: `reference`: voltage of the
+    untouched skin, volts; `used`: whether the channel has readings; `noise`: noise from frame to frame, volts; `span`
+    (2, channels): minimum and maximum change in the recording, volts; `stride`: number of frames averaged to a step in
+    time; `window`: number of steps of a window; `scale`: usual change between consecutive windows, volts; `limit`:
+    limit of the change between windows (`change_size`) for a change that lasts; `sudden_limit`: limit, not exceeded by
+    touches either, above which a change may be reported at once; `level_scale`: usual change between any two windows,
+    volts; `level_limit`: limit for a change from the healthy recording to another recording; `touch_directions`
+    (channels, directions): principal directions of touches, orthonormal in units of noise; `max_fraction_outside`:
+    maximum fraction of the energy of touches outside of these directions; `steadiness`: steadiness of single channels;
+    `period`: seconds between frames, or 1; `is_brief`: whether the recording was too short for its touches, so that
+    limits are twice as high.
     """
 
     reference: Float[np.ndarray, " M"]
@@ -267,8 +268,8 @@ class HealthyState:
         )
 
     def fraction_outside(self, change: Float[np.ndarray, " M"]) -> float:
-        """Fraction of a voltage change's sum of squares, in units of noise, that is outside of the directions of
-        touches."""
+        """Compute the fraction of a voltage change's sum of squares, in units of noise, that is outside of the
+        directions of touches."""
         return float(_fraction_outside((np.nan_to_num(change) / self.noise)[None], self.touch_directions)[0])
 
 
@@ -285,7 +286,7 @@ def average_frames(frames: Float[np.ndarray, "F M"], stride: int) -> Float[np.nd
 
 
 def _estimate_noise(frames: np.ndarray) -> np.ndarray:
-    """Standard deviation of every channel's noise from frame to frame, estimated from the smaller changes."""
+    """Estimate the standard deviation of every channel's noise from frame to frame from the smaller changes."""
     steps = np.diff(frames, axis=0)
     has_steps = np.isfinite(steps).any(axis=0)
     deviations, trimmed_deviations, total_deviations = np.zeros((3, frames.shape[1]))
@@ -309,7 +310,8 @@ def _estimate_noise(frames: np.ndarray) -> np.ndarray:
 
 
 def _window_length(frames: np.ndarray, noise: np.ndarray, period: float, longest: float | None) -> tuple[int, float]:
-    """Length of a window in frames, and the length that a sufficiently long recording would allow."""
+    """Return the length of a window, and the length that touches require, for which the recording may be too short;
+    both in frames."""
     max_length = max(_MIN_WINDOW_STEPS, len(frames) // _MIN_NUM_WINDOWS)
     if longest is not None:
         return int(np.clip(np.ceil(longest / period), _MIN_WINDOW_STEPS, max_length)), longest / period
@@ -326,20 +328,20 @@ def _window_length(frames: np.ndarray, noise: np.ndarray, period: float, longest
 
 
 def _median_noise(noise: np.ndarray, num_frames: int) -> np.ndarray:
-    """Standard deviation of each channel's difference between the medians of two windows of frames that contain only
-    noise."""
+    """Compute the standard deviation of each channel's difference between the medians of two windows of frames that
+    contain only noise."""
     return noise * np.sqrt(np.pi / max(num_frames, 2))
 
 
 def _window_triples(steps: np.ndarray, window: int) -> np.ndarray:
-    """Triples of consecutive windows throughout a recording (triples, 3 `window`, channels), `window` steps in each
-    window."""
+    """Return the triples of consecutive windows in a recording (triples, 3 `window`, channels), with `window` steps in
+    each window."""
     starts = range(0, max(1, len(steps) - 3 * window + 1), max(1, window // 4))
     return np.array([steps[start : start + 3 * window] for start in starts])
 
 
 def _window_levels(steps: np.ndarray, window: int) -> np.ndarray:
-    """Differences (windows, channels) of the medians of windows from the median of the whole recording."""
+    """Compute the differences (windows, channels) of the medians of windows from the median of the whole recording."""
     starts = range(0, max(1, len(steps) - window + 1), max(1, window // 2))
     return np.array([channel_medians(steps[start : start + window]) for start in starts]) - channel_medians(steps)
 
@@ -378,8 +380,8 @@ def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[n
 
 
 def _level_limit(changes: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, float]:
-    """Estimate the scale of each channel and the limit of the differences between windows and the whole recording; the
-    differences in each half are relative to the scale of the other half."""
+    """Estimate the scale of each channel's differences between windows and the whole recording, and the limit of these
+    differences. Differences in each half of the recording are divided by the scale of the other half."""
     changes = np.nan_to_num(changes)
     half_index = len(changes) // 2
     sizes = [
@@ -393,7 +395,7 @@ def _level_limit(changes: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, fl
 
 
 def _deviation_of_changes(changes: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """Standard deviation of each channel's changes, estimated from their mean magnitude as for a normal variable."""
+    """Estimate the standard deviation of each channel's changes from their mean magnitude, as for a normal variable."""
     deviations = (
         _DEVIATION_PER_MEAN_MAGNITUDE * np.mean(np.abs(changes), axis=0) if len(changes) else np.zeros(changes.shape[1])
     )
@@ -403,8 +405,8 @@ def _deviation_of_changes(changes: np.ndarray, floor: np.ndarray) -> np.ndarray:
 
 
 def _touch_directions(frames: np.ndarray, noise: np.ndarray, window: int) -> tuple[np.ndarray, float]:
-    """Principal directions (channels, directions) of healthy touches, in units of noise, and the 99 % quantile of the
-    fraction of energy outside of these directions."""
+    """Compute the principal directions (channels, directions) of healthy touches, in units of noise, and the 99 %
+    quantile of the fraction of touches' energy outside of these directions."""
     readings = np.where(np.isfinite(frames), frames, channel_medians(frames))
     centres = np.concatenate(
         [
@@ -431,7 +433,8 @@ def _touch_directions(frames: np.ndarray, noise: np.ndarray, window: int) -> tup
 
 
 def _principal_directions(frames: np.ndarray) -> np.ndarray:
-    """Leading principal directions (channels, directions) of frames, which explain up to 98 % of the frames' energy."""
+    """Compute the leading principal directions (channels, directions) of frames, which explain up to 98 % of the
+    frames' energy."""
     _, singular_values, rows = np.linalg.svd(frames, full_matrices=False)
     fractions = np.cumsum(singular_values**2) / max(np.sum(singular_values**2), 1e-300)
     num_directions = min(
@@ -441,7 +444,8 @@ def _principal_directions(frames: np.ndarray) -> np.ndarray:
 
 
 def _fraction_outside(scaled_changes: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Fraction of the energy (sum of squares) of each voltage change that is outside of the `directions`."""
+    """Compute the fraction of the energy (sum of squares) of each voltage change that is outside of the
+    `directions`."""
     energies = np.sum(scaled_changes**2, axis=1)
     energies_outside = energies - np.sum((scaled_changes @ directions) ** 2, axis=1)
     return np.clip(energies_outside / np.maximum(energies, 1e-300), 0.0, 1.0)

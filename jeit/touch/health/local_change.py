@@ -1,8 +1,8 @@
 """Voltages after a local change of conductivity, computed by low-rank updates on a locally refined mesh.
 
-To refine a flat mesh locally, triangles are halved across their longest edge. Rivara's closure: a triangle with any
-halved edge has its longest edge halved too, so that no triangle becomes thinner than half of the original triangle, and
-there are no hanging nodes.
+To refine a flat mesh locally, triangles are halved across their longest edge. By Rivara's closure, the longest edge of
+every triangle with a halved edge is halved too. As a result, there are no hanging nodes, and no triangle becomes
+thinner than half of the original triangle.
 
 If the conductivity changes in one region only, voltages are computed by dense low-rank updates of the solution before
 the change. With the grounded matrix A of stiffness and contact mass, the loads B (`jeit.forward.transfer`) and a change
@@ -130,7 +130,7 @@ _SHRINKAGE_FACTOR = 0.85
 class LocalChange:
     """Voltages of a `model` whose conductivity changes only within about `radius` metres of a `centre` (x, y).
 
-    `conductivity` (cells,): conductivity before the change, S/m (2-D: S). The attribute `cells` holds the indices of
+    `conductivity` (cells,): conductivity before the change, S/m (2-D: S). The attribute `cells` contains the indices of
     the cells in the region, whose conductivity may change.
     """
 
@@ -158,15 +158,15 @@ class LocalChange:
         self.inverse = _inverse_between(matrix, nodes)
 
     def impedance(self, change: Float[np.ndarray, "c ..."]) -> Float[np.ndarray, "L L"]:
-        """Transfer impedance matrix (electrodes, electrodes), ohms, after a `change` of the conductivity in the
-        region's cells: scalars (cells,) or tensors (cells, d, d) in d dimensions."""
+        """Compute the transfer impedance matrix (electrodes, electrodes), ohms, after a `change` of the conductivity in
+        the region's cells: scalars (cells,) or tensors (cells, d, d) in d dimensions."""
         return self._impedance(self._solve_change(change)[1])
 
     def derivatives(
         self, change: Float[np.ndarray, "c ..."], directions: list[Float[np.ndarray, "c ..."]]
     ) -> tuple[Float[np.ndarray, "L L"], list[Float[np.ndarray, "L L"]]]:
-        """Transfer impedance matrix (electrodes, electrodes), ohms, after a `change` of conductivity in the region, and
-        its derivatives along the changes in `directions`."""
+        """Compute the transfer impedance matrix (electrodes, electrodes), ohms, after a `change` of conductivity in the
+        region, and its derivatives along the changes in `directions`."""
         cells, product, solution = self._solve_change(change)
         fields: Any = unit_fields(solution, product, self.resistance)[0]  # pyright: ignore[reportArgumentType]
         node_fields = np.zeros((self.solution.shape[0], fields.shape[1]))
@@ -218,8 +218,8 @@ class LocalChange:
 
 
 def _inverse_between(matrix, nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t t"]:
-    """Inverse of a sparse symmetric matrix, restricted to some nodes: inverse of the Schur complement without the other
-    nodes."""
+    """Compute the inverse of a sparse symmetric matrix, restricted to `nodes`: the inverse of the Schur complement
+    after elimination of all other nodes."""
     others = np.setdiff1d(np.arange(matrix.shape[0]), nodes)
     schur_complement = matrix[nodes][:, nodes].toarray()
     if len(others):

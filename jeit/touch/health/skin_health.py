@@ -27,7 +27,7 @@ from jeit.touch.health.event import (
 from jeit.touch.health.finding import Finding, ImagedSkin, LastingChange, classify_change
 from jeit.touch.health.healthy import HealthyState, average_frames
 
-# Time longer than any touch is held (patience): seconds; number of windows if frames have no times.
+# Patience, a time longer than any touch is held: in seconds; as a number of windows for frames without times.
 PATIENCE, _PATIENCE_WINDOWS = 30.0, 3
 # Ratio of the patience to the length of a window of frames.
 _PATIENCE_PER_WINDOW = 3.0
@@ -54,14 +54,14 @@ class WatchStatus(StrEnum):
 
     WATCHED = "watched"
     PARTIAL = "partial"
-    """Processed, but some of its channels are not trusted."""
+    """Processed, but some of its channels are not usable."""
     REFUSED = "refused"
     """Not processed: it has too few readings, or its time is not after that of the last frame."""
 
 
 @dataclass(frozen=True)
 class _PendingChange:
-    """A change that looks like a touch; the change is pending until it disappears or has lasted."""
+    """A change that a touch may also cause; it is pending until it disappears or has lasted longer than any touch."""
 
     change: LastingChange
     finding: Finding
@@ -74,14 +74,15 @@ class SkinHealth:
     `health.follow(time, frame)` returns the state after the next frame; `health` is not changed. Every quarter of a
     window of frames, the medians of the last two windows are compared. A step of the voltages between the windows is a
     change of the skin if the step is larger than any in the healthy frames, sharp, and lasting. A change unlike any
-    healthy touch is reported at once. A change that touches can make too may be a held press, and is reported when it
-    has lasted for `patience` seconds. The reference voltages follow drift.
+    healthy touch is reported at once. A change that a touch may also cause is reported when it has lasted for
+    `patience` seconds, because it may be a held press. The reference voltages follow drift.
 
     **Fields**: `healthy`: healthy state; `reference`: present voltages of the untouched skin, volts; `trusted`: whether
-    each channel may be used; `patience`: time longer than any touch is held, seconds; `skin`: model of the skin, or
-    None; `touching` (electrodes, channels): whether each channel uses each electrode, or None; `events`: events so far;
-    `time`: time of the last frame; `frames`: number of frames given; `status`: status of the last frame; `usable`:
-    whether each channel is usable in this frame; `reason`: a sentence that explains the status.
+    each channel has readings and no open event excludes it; `patience`: time longer than any touch is held, seconds;
+    `skin`: model of the skin, or None; `touching` (electrodes, channels): whether each channel uses each electrode, or
+    None; `events`: events so far; `time`: time of the last frame; `frames`: number of frames so far, with refused
+    frames; `status`: status of the last frame; `usable`: whether each channel is trusted and has a plausible reading in
+    the last frame; `reason`: a sentence that explains the status.
 
     Create a state with `SkinHealth.fit`.
 
@@ -123,13 +124,15 @@ class SkinHealth:
         conductivity: ArrayLike | None = None,
         sign: int = 1,
     ) -> "SkinHealth":
-        """Learn the healthy state from frames (frames, channels) of voltages or voltage changes, best with touches.
+        """Learn the healthy state from frames (frames, channels) of voltages or voltage changes, which should include
+        touches.
 
         `times`: times of the frames, seconds; if None, frames are counted. `patience`: time longer than any touch is
-        held, seconds (frames), by default 30 s, or three windows. `protocol`: measurement protocol, to identify failing
-        electrodes. `model`, `conductivity`, `sign`: forward model of the skin, its conductivity, S/m (2-D: S), and 1 if
-        touched skin conducts better, -1 if worse; with these, cuts are located. Raises `ValueError` for frames of
-        another skin, fewer than 20 frames, times that do not rise, and a patience that is not positive.
+        held, by default 30 s; without `times`, in frames, by default three windows. `protocol`: measurement protocol,
+        to identify failing electrodes. `model`, `conductivity`, `sign`: forward model of the skin, its conductivity,
+        S/m (2-D: S), and 1 if touched skin conducts better, -1 if worse; with these, cuts are located. Raises
+        `ValueError` for frames whose channels are not those of the protocol, fewer than 20 frames, times that do not
+        rise, and a patience that is not positive.
         """
         frames = _check_frames("healthy", healthy)
         period = 1.0
@@ -203,7 +206,8 @@ class SkinHealth:
     def deny(self, event: HealthEvent) -> "SkinHealth":
         """Return the state after the user has denied an event because it was a held press, not damage.
 
-        The reference voltages are reset to those before the event. Raises `ValueError` for an event of another skin.
+        The reference voltages are reset to those before the event. Raises `ValueError` for an event of a different
+        skin.
         """
         if self._pending is not None and self.held is not None and event.number == self.held.number:
             return replace(self, _pending=None)
@@ -214,9 +218,10 @@ class SkinHealth:
     def repaired(self, frames: ArrayLike) -> "SkinHealth":
         """Return the state after the user has repaired the skin; the status of all open events becomes "mended".
 
-        The median of the `frames` of the repaired, untouched skin, volts, is the new reference. Before the first frame
-        of a later day, untouched frames of that day replace the reference likewise: changes since, such as of gains,
-        are then no event. Raises `ValueError` for another number of channels, or readings in fewer than half of them.
+        The median of the `frames` of the repaired, untouched skin, volts, is the new reference. The method may also be
+        called before the first frame of a later day, with untouched frames of that day: changes in the meantime, such
+        as of gains, are then not reported as events. Raises `ValueError` for a different number of channels, or
+        readings in fewer than half of them.
         """
         checked_frames = _check_frames("frames", np.atleast_2d(real_array("frames", frames, "(n, M) volts")))
         if checked_frames.shape[1] != self.reference.size:
@@ -258,7 +263,7 @@ class SkinHealth:
         """Reconstruct conductivity changes (frames, cells), S/m (2-D: S), relative to the present skin with its cuts.
 
         Only trusted channels are used; the image of a frame without a reading is NaN. Raises `ValueError` without a
-        forward model, and for frames with another number of channels.
+        forward model, and for frames with a different number of channels.
         """
         if self.skin is None:
             raise ValueError("images need a forward model: give model and conductivity to SkinHealth.fit.")
@@ -269,7 +274,8 @@ class SkinHealth:
 
     @property
     def held(self) -> HealthEvent | None:
-        """Pending event that may be a held touch or damage, until time or the user decides, or None."""
+        """Pending event, which may be a held touch or damage until its duration or the user decides; None if no event
+        is pending."""
         if self._pending is None:
             return None
         return self._create_event(self._pending.change, self._pending.finding, EventStatus.HELD, len(self.events))
@@ -490,7 +496,8 @@ class SkinHealth:
         )
 
     def _with_status(self, event: HealthEvent, status: EventStatus) -> "SkinHealth":
-        """Return the state after setting the status of an event. Raises `ValueError` for an event of another skin."""
+        """Return the state after setting the status of an event. Raises `ValueError` for an event of a different
+        skin."""
         check_kind("event", event, HealthEvent, "one of health.events, or health.held")
         if not event.number < len(self.events):
             raise ValueError(f"event {event.number} does not belong to this skin, which has {len(self.events)} events.")
@@ -506,7 +513,7 @@ class SkinHealth:
         return self.skin if self.skin is None or has_cut else self.skin.without_cuts()
 
     def _trusted_channels(self) -> Bool[np.ndarray, " M"]:
-        """Whether each channel is trusted: the channel has readings, and no open event excludes it or its
+        """Return whether each channel is trusted: the channel has readings, and no open event excludes it or its
         electrodes."""
         trusted = self.healthy.used.copy()
         for event in self.open_events:

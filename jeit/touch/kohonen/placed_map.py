@@ -20,9 +20,9 @@ from jeit.arguments.extras import optional
 from jeit.files import need, npz_arrays, written_whole
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
-# Number of neurons from which the place of a frame is estimated, and regularisation of the neurons' shares, relative to
-# the mean square deviation of the neurons' frames from their mean: first for the neurons nearest to the frame, then for
-# the 5 by 5 neurons on the grid around the nearest neuron.
+# Number of neurons from which the place of a frame is estimated, and regularisation of the neurons' shares. The
+# regularisation is relative to the mean square deviation of the neurons' frames from their mean. The first line is for
+# the neurons nearest to the frame, the second for the 5 by 5 neurons on the grid around the nearest neuron.
 _NUM_NEAREST, _REGULARISATION = 9, 0.05
 _NUM_ON_GRID, _REGULARISATION_ON_GRID = 25, 0.005
 # Weight of the mean place of a neuron's presses in the least-squares fit of the neuron's place, relative to one press.
@@ -43,7 +43,8 @@ class PlacedMap:
     - `learnt`: the map.
     - `places` (rows, columns, coordinates): mean place of the presses whose frames are nearest to each neuron, metres;
       NaN without such presses.
-    - `widening`: root mean square error of the places of held-out presses, divided by that of the estimated spread.
+    - `widening`: root mean square error of the places of held-out presses, divided by their root mean square estimated
+      spread.
     - `missed`: root mean square residual of a channel if the frames of presses are approximated by combinations of
       their nearest neurons, in the unit of frames.
     - `fitted` (rows, columns, coordinates): neurons' places by least squares over the presses, metres, used if a frame
@@ -68,11 +69,11 @@ class PlacedMap:
     def learn(cls, learnt: SelfOrganisingMap, frames: ArrayLike, positions: ArrayLike) -> "PlacedMap":
         """Learn places of a map's neurons from the frames of presses (presses, channels) and their `positions`, metres.
 
-        The frames may be those that the map was learnt from, or others. With few presses, a frame is located best by
-        the neurons with the nearest frames; with many presses, by neighbours of the nearest neuron on the grid, whose
-        places are fitted by least squares. The method with the smaller error on held-out presses is chosen. Raises
-        `ValueError` if `learnt` is no map, for fewer than ten presses, and for positions that are not finite, not one
-        for each frame, or all the same.
+        The frames may, but need not, be those that the map was learnt from. With few presses, a frame is located best
+        by the neurons with the nearest frames; with many presses, by neighbours of the nearest neuron on the grid,
+        whose places are fitted by least squares. The method with the smaller error on held-out presses is chosen.
+        Raises `ValueError` if `learnt` is no map, for fewer than ten presses, and for positions that are not finite,
+        not one for each frame, or all the same.
         """
         check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")
         frames = learnt.checked(frames)
@@ -146,11 +147,11 @@ class PlacedMap:
         metres.
 
         A frame is approximated by a combination of the frames of several neurons, with shares of sum 1 by least squares
-        (Roweis and Saul 2000). The touch's place is the combination of the neurons' places with the same shares. The
-        neurons are those whose frames are nearest to the given frame; or, if there are `fitted` places, the nearest
-        neuron and its neighbours on the grid. The place's distance from the mean of the neurons' places, or, on the
-        grid, from the place of the nearest neuron, is limited to that of the farthest neuron's place. Raises
-        `ValueError` for frames with another number of channels than the map, and for NaN.
+        (Roweis and Saul 2000). The touch's place is the combination of the neurons' places with the same shares. If
+        there are `fitted` places, the neurons are the nearest neuron and its neighbours on the grid; otherwise, the
+        neurons with the nearest frames. The estimated place is no farther from the mean of the neurons' places (with
+        `fitted` places: from the place of the nearest neuron) than the farthest neuron's place is. Raises `ValueError`
+        for frames whose number of channels is not that of the map, and for NaN.
         """
         placed = self._estimate_places(self.learnt.checked(frames))
         return placed.places, self.widening * placed.spread
@@ -166,7 +167,7 @@ class PlacedMap:
         return _Estimate(places, np.sqrt(np.mean((neuron_places - places[:, None]) ** 2, axis=1)), residuals)
 
     def _locating_neurons(self, frames: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the neurons from which frames are located, and their shares in the frames.
+        """Find the neurons from which the places of frames are estimated, and their shares in the frames.
 
         Returns the indices of these neurons among the neurons with places, and their shares, both (frames, neurons),
         and the residuals of the frames (frames, channels).
@@ -231,10 +232,10 @@ class _Estimate(NamedTuple):
 def _fit_combination_shares(
     neuron_frames: Float[np.ndarray, "n q M"], frames: Float[np.ndarray, "n M"], regularisation: float
 ):
-    """Compute the shares of neurons (frames, neurons), of sum 1, by which their frames combine to approximate given
-    frames.
+    """Compute shares (frames, neurons), of sum 1, with which the frames of neurons are combined to approximate
+    `frames`.
 
-    Also returns the residuals of the given frames (frames, channels).
+    Also returns the residuals of the approximation (frames, channels).
     """
     num_neurons = neuron_frames.shape[1]
     mean_frames = neuron_frames.mean(axis=1, keepdims=True)
@@ -283,7 +284,7 @@ def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2
 
 
 def neighbours(shape: tuple[int, int]) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " e"]]:
-    """Return the indices, counted row by row, of the neurons at both ends of every edge of a grid of this shape."""
+    """Return the indices, counted row by row, of the neurons at both ends of every edge of a grid of this `shape`."""
     indices = np.arange(shape[0] * shape[1]).reshape(shape)
     first_ends = np.concatenate([indices[:-1].ravel(), indices[:, :-1].ravel()])
     return first_ends, np.concatenate([indices[1:].ravel(), indices[:, 1:].ravel()])

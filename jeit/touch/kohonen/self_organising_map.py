@@ -48,8 +48,8 @@ class SelfOrganisingMap:
     scale: float
 
     def __post_init__(self):
-        """Raises `ValueError` for weights that are not finite or not (rows, columns, channels), and for a scale that is
-        not positive."""
+        """Check the fields. Raises `ValueError` for weights that are not finite or not (rows, columns, channels), and
+        for a scale that is not positive."""
         weights = real_array("weights", self.weights, "an array (R, C, M), a frame for every neuron")
         if weights.ndim != 3 or not weights.size or not np.isfinite(weights).all():
             raise ValueError(f"weights must be finite, (R, C, M), a frame for every neuron; they are {weights.shape}.")
@@ -69,7 +69,7 @@ class SelfOrganisingMap:
         """Train a map on frames (frames, channels) of voltages or voltage changes, all in one unit.
 
         `key` (`jax.random.key`): determines the initial weights, which are small and random, and the order of the
-        frames: all frames are shown once, then again in another order, until the `schedule` ends. `shape`: rows and
+        frames: all frames are shown once, then again in a different order, until the `schedule` ends. `shape`: rows and
         columns of the grid. `scale`: see the field of this name; by default the median distance of the frames from
         their nearest neurons. Raises `ValueError` for frames that are not numbers, contain NaN, are fewer than three or
         all the same, and for an invalid key, shape, schedule or scale.
@@ -86,15 +86,15 @@ class SelfOrganisingMap:
         """Compute the Euclidean distances (frames, rows, columns) of frames (frames, channels) from every neuron's
         frame.
 
-        Distances are in the unit of the frames. Raises `ValueError` for frames with another number of channels than the
-        map, and for NaN.
+        Distances are in the unit of the frames. Raises `ValueError` for frames whose number of channels is not that of
+        the map, and for NaN.
         """
         return np.sqrt(self._squared_distances(self.checked(frames))).reshape(-1, *self.shape)
 
     def activity(self, frames: ArrayLike) -> Float[np.ndarray, "n R C"]:
         """Compute the activity (frames, rows, columns) of every neuron for frames (frames, channels).
 
-        The activity is 1 / (1 + distance / scale), which is 1 if the given frame is the neuron's own frame. Raises
+        The activity is 1 / (1 + distance / scale), which is 1 if the frame is the neuron's own frame. Raises
         `ValueError` as `distances` does.
         """
         return 1 / (1 + self.distances(frames) / self.scale)
@@ -108,9 +108,9 @@ class SelfOrganisingMap:
         return np.stack(np.unravel_index(nearest, self.shape), axis=1)
 
     def nearest(self, frames: Float[np.ndarray, "n M"], count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Find the `count` neurons nearest to each frame, the nearest first; frames must be checked before.
+        """Find the `count` neurons nearest to each frame, the nearest first; `frames` must be an array from `checked`.
 
-        Returns the indices of the neurons, counted row by row of the grid, and their distances, both (frames, count).
+        Returns the indices of the neurons, counted row by row on the grid, and their distances, both (frames, count).
         """
         squared_distances = self._squared_distances(frames)
         candidates = np.argpartition(squared_distances, count - 1, axis=1)[:, :count]
@@ -121,7 +121,7 @@ class SelfOrganisingMap:
         )
 
     def checked(self, frames: ArrayLike) -> Float[np.ndarray, "n M"]:
-        """Convert frames to an array (frames, channels). Raises `ValueError` for frames of another shape, and for
+        """Convert frames to an array (frames, channels). Raises `ValueError` for frames of a different shape, and for
         NaN."""
         return checked_frames(frames, self.weights.shape[2])
 
@@ -199,7 +199,8 @@ def learn_weights(
 def checked_frames(values, num_channels: int | None = None) -> Float[np.ndarray, "n M"]:
     """Convert frames, or one frame (channels,), to an array (frames, channels).
 
-    Raises `ValueError` for frames of another shape, for another number of channels than `num_channels`, and for NaN.
+    Raises `ValueError` for frames of a different shape, for a number of channels other than `num_channels`, and for
+    NaN.
     """
     frames = real_array("frames", values, "numbers (n, channels)")
     frames = frames[None] if frames.ndim == 1 else frames
@@ -286,10 +287,10 @@ def map_quality(learnt: SelfOrganisingMap, frames: ArrayLike) -> MapQuality:
     **Arguments:**
 
     - `learnt`: the self-organising map.
-    - `frames`: frames (frames, channels), those that the map was learnt from, or others in the same unit.
+    - `frames`: frames (frames, channels), such as those that the map was learnt from, in the same unit as these.
 
-    Raises `ValueError` if `learnt` is no map, and for fewer than 25 frames, frames with another number of channels than
-    the map, and NaN.
+    Raises `ValueError` if `learnt` is no map, and for fewer than 25 frames, frames whose number of channels is not that
+    of the map, and NaN.
 
     **Example:**
 
@@ -333,7 +334,8 @@ def learning_curves(
 
 
 def time_constant(curve: ArrayLike) -> float:
-    """Number of steps after which a learning curve (steps,) has risen from zero to 1 − 1/e of its final value.
+    """Compute the number of steps after which a learning curve (steps,) has risen from zero to 1 − 1/e of its final
+    value.
 
     The final value is the mean of the last tenth of the curve. Raises `ValueError` for a curve that is not
     one-dimensional, not finite, or shorter than ten steps.

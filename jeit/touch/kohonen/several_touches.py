@@ -14,8 +14,8 @@ from jeit.touch.kohonen.placed_map import PlacedMap
 # Minimum strength of a touch, relative to the strongest touch; minimum distance between touches, relative to the extent
 # of the places of a map's neurons.
 _MIN_STRENGTH, _RELATIVE_SEPARATION = 0.08, 0.1
-# Minimum decrease of the residual sum of squares by each further touch, in variances of the map's residual; maximum
-# number of touches in a frame.
+# Minimum decrease of the residual sum of squares by each further touch, divided by the residual variance of a channel;
+# maximum number of touches in a frame.
 _MIN_RESIDUAL_DECREASE, _MAX_TOUCHES = 25.0, 6
 
 
@@ -35,11 +35,11 @@ class MapTouch:
 def neuron_shares(placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "R C"]:
     """Compute the share (rows, columns) of each neuron of a map in a frame by non-negative least squares.
 
-    The frame's change from the `reference`, the frame of the untouched skin, is approximated by the sum of the changes
-    of the neurons' frames from the reference, times their shares; neurons without a place have share 0. Changes of
-    small touches add up, and touches have one sign, so few of the non-negative shares differ from 0 (Lawson and Hanson
-    1974). Raises `ValueError` if `placed` is no map with places, and for more than one frame, another number of
-    channels than the map, and NaN.
+    The frame's change from the `reference`, the frame of the untouched skin, is approximated by a weighted sum of the
+    changes of the neurons' frames from the reference. The weights are the shares; neurons without a place have share 0.
+    Changes of small touches add up, and touches have one sign, so few of the non-negative shares differ from 0 (Lawson
+    and Hanson 1974). Raises `ValueError` if `placed` is no map with places, and for more than one frame, a number of
+    channels that is not that of the map, and NaN.
     """
     touch_sum = _TouchSum.from_frame(placed, frame, reference)
     shares = np.zeros(placed.learnt.shape)
@@ -58,8 +58,8 @@ def touches_reported(
     """Detect the touches in a frame by a self-organising map: at most six, the strongest first.
 
     Neurons with a share in the frame (`neuron_shares`) are grouped into possible touches. Touches are added one after
-    another, as long as each touch reduces the residual sum of squares by the square of five standard deviations of the
-    map's own residual.
+    another, as long as each reduces the residual sum of squares by at least 25 times the residual variance of a
+    channel, the larger of the residual variances of the frame and the map.
 
     **Arguments:**
 

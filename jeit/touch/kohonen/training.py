@@ -15,8 +15,8 @@ s = ε h of the way to x, the squared distance of the new weights w′ from any 
 
     |w′ − y|² = (1 − s) |w − y|² + s |x − y|² − s (1 − s) |w − x|²
 
-(Stewart's theorem). So the weights are multiplied with several frames at once, and moved once after these frames; in
-between, only the squared distances are updated, in the tuning phase only those of the winner.
+(Stewart's theorem). So the products of the weights with several frames are computed at once, and the weights are moved
+once after these frames. In between, only squared distances are updated; in the tuning phase, only those of the winner.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class MapSchedule(Module):
     radius: tuple[float, float] | None = None
 
     def __check_init__(self):
-        """Raises `ValueError` for invalid numbers of frames, learning rates and radii."""
+        """Check the fields. Raises `ValueError` for invalid numbers of frames, learning rates and radii."""
         for name in ("ordering", "tuning"):
             value = getattr(self, name)
             if not (is_number(value) and int(value) == value and value >= 0):
@@ -103,7 +103,7 @@ def train(
 
     def train_phase(phase, weight_rows, block_size, order, rates, *radii):
         num_padding = -len(order) % block_size
-        # Frames are added to fill the last part; with a learning rate of 0, they change no weights.
+        # Frames are appended to fill the last block; their learning rate is 0, so they change no weights.
         order_rates = [jnp.pad(values, (0, num_padding)) for values in (order, rates)]
         blocks = *order_rates, *(jnp.pad(values, (0, num_padding), "edge") for values in radii)
 

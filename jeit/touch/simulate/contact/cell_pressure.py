@@ -15,15 +15,15 @@ from jeit.touch.simulate.contact.indenters import DiscIndenter
 from jeit.touch.simulate.contact.press import AbstractSupport, Press
 from jeit.touch.simulate.contact.samples import Samples
 
-# Fineness of the lattice of samples in each cell for contacts on few samples; number of samples below which it is used;
-# width that it resolves, as a share of the radius of a cell.
+# Fineness of the finer lattice of samples for contacts on few samples; number of samples below which this lattice is
+# used; width that it resolves, as a share of the radius of a cell.
 _FINE_LATTICE, _MIN_NUM_SAMPLES, _RESOLVED_FRACTION = 11, 6, 1 / 6
 # Number of presses computed at once, so that the arrays fit in the cache.
 _PRESSES_AT_ONCE = 16
 # Factor by which the reach of a contact grows if about half its area is off the skin; 2^(1/4) for a ball on a Winkler
 # foundation.
 _REACH_MARGIN = 1.25
-# Minimum fraction of skin in the area within reach of a press; below it, the pressure may extend farther.
+# Minimum fraction of skin in the area within reach of a press; below this fraction, the pressure may extend farther.
 _MIN_SKIN_FRACTION = 0.6
 
 
@@ -45,8 +45,8 @@ def pressed_cells(
 ) -> PressedCells:
     """Compute the cells under touches and the pressure on them; the pressures of all presses of a touch are added.
 
-    Parts of an indenter beyond the edge of the skin carry no load. `progress` is called with the number of presses that
-    are computed. Raises `ValueError` for presses off the skin, and as `pressure` of the support does.
+    Parts of an indenter beyond the edge of the skin carry no load. `progress` is called with a message on the number of
+    presses computed so far. Raises `ValueError` for presses off the skin, and as `pressure` of the support does.
     """
     presses = [press for touch in touches for press in touch]
     if not presses:
@@ -113,7 +113,7 @@ def _pressed_cells(
 
 
 def _indenter_numbers(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
-    """Number of the indenter of each press (n,); equal indenters have the same number."""
+    """Return the number of the indenter of each press (n,); equal indenters have the same number."""
     numbers: dict = {}
     numbers_by_id: dict[int, int] = {}
     for press in presses:
@@ -125,7 +125,7 @@ def _indenter_numbers(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
 
 
 def _reach_bounds(support: AbstractSupport, presses: Sequence[Press], indenter_numbers) -> Float[np.ndarray, " n"]:
-    """Upper bound of the distance from the origin at which each press exerts pressure, metres.
+    """Compute an upper bound (n,) of the distance from the origin at which each press exerts pressure, metres.
 
     The bound is the reach of the pressure under the load rounded up to a power of two newtons, times `_REACH_MARGIN`,
     which allows for presses at the edge of the skin.

@@ -1,10 +1,11 @@
 """Elastic half-space: support of a skin that is thick compared with the contact.
 
-The surface also sinks around the load: its displacement is w = K p, where K is the convolution with Boussinesq's (1 −
-ν²) / (π E r). The pressure p ≥ 0 of a rigid indenter under a load W satisfies w + gap = approach where p > 0, w + gap ≥
-approach elsewhere, and ∫ p = W. The pressure is found by conjugate gradients over the pixels in contact; pixels leave
-the contact where the pressure would be negative, and enter it where the bodies overlap (Polonsky and Keer, Wear 231,
-1999, 206-219). K is evaluated by FFT on a raster padded to twice its size, which avoids periodic images.
+The surface also sinks around the load: its displacement is w = K p, where K is the convolution with Boussinesq's
+solution (1 − ν²) / (π E r). The pressure p ≥ 0 of a rigid indenter under a load W satisfies w + gap = approach where
+p > 0, w + gap ≥ approach elsewhere, and ∫ p = W. The pressure is found by conjugate gradients over the pixels in
+contact; pixels leave the contact where the pressure would be negative, and enter it where the bodies overlap
+(Polonsky and Keer, Wear 231, 1999, 206-219). K is evaluated by FFT on a raster padded to twice its size, which avoids
+periodic images.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from jeit.touch.simulate.contact.press import (
 
 # Number of pixels along a side of the raster on which the contact area is located.
 _NUM_COARSE_PIXELS = 24
-# Minimum fraction of the load of a contact that must lie on the skin, since the pressure is not determined otherwise;
-# fraction of the load carried by sample points above which this check is skipped.
+# Minimum fraction of the load of a contact that must lie on the skin, so that the load determines the pressure;
+# fraction of the load carried by sample points above which this minimum is not checked.
 _MIN_LOAD_FRACTION, _CHECKED_LOAD_FRACTION = 0.2, 0.5
 # Share of the load that a step moves between pixels, below which the iteration stops; maximum number of steps.
 _TOLERANCE, _MAX_STEPS = 1e-8, 2000
@@ -88,7 +89,7 @@ class HalfSpace(AbstractSupport):
         """Compute pressures (n, q) at the q points of each of n loads, scaled so that the points carry the load.
 
         At an edge of the skin, the points on the skin also carry the part of the load beyond the edge. Raises
-        `ValueError` as `pressure`, for a curved skin, and if less than a fifth of the load lies on the skin.
+        `ValueError` as `pressure` does, for a curved skin, and if less than a fifth of the load lies on the skin.
         """
         if fall is not None:
             raise ValueError("support: a HalfSpace is flat, and the skin is curved; take a Foundation.")
@@ -118,7 +119,8 @@ class HalfSpace(AbstractSupport):
 
 
 def _check_on_skin(pressure: PressureRaster, points, areas) -> None:
-    """Raise `ValueError` if less than a fifth of a load lies on the skin, which is given by points and their areas."""
+    """Raise `ValueError` if less than a fifth of a load lies on the skin, which `points` (q, 2) with `areas` (q,)
+    represent."""
     is_on_skin = areas > 0
     pixel_centres, pixel = raster(pressure.pixel * len(pressure.values) / 2, len(pressure.values))
     distances, nearest = KDTree(points[is_on_skin]).query(pixel_centres[pressure.values > 0])

@@ -16,9 +16,9 @@ from jeit.design.skin.voltage_changes import RestingSkin
 from jeit.design.study.contents import Contents
 from jeit.touch.simulate.contact.indents import IndentDraws, depth_maps, relative_changes, resting_skin
 
-# Version of the simulation, to be increased when its results change.
+# Version of the simulation, which must be increased if a change of the code changes the results.
 _VERSION = 2
-# Lock with which only one thread of a worker computes the data shared by all chunks.
+# Lock that lets only one thread of a worker compute the data shared by all chunks.
 _RESTING_SKIN_LOCK = Lock()
 _UNITS_AND_MEANINGS = {
     "change": ("1", "change of each channel's voltage, relative to the skin at rest"),
@@ -30,7 +30,7 @@ class IndentSet:
     """A set of `number` random touches drawn from `draws`, with the noise-free voltages of a `skin`.
 
     `seed`: random seed, which determines the touches. `shape`: (rows, columns) of the maps of indentation depth over
-    the skin. `chunk`: number of touches that are simulated and written at once; it also affects the random numbers.
+    the skin. `chunk`: number of touches that are simulated and written at once, which also affects the random numbers.
     """
 
     def __init__(
@@ -76,8 +76,8 @@ class IndentSet:
         return _digest(arrays, str(settings))
 
     def solve(self, chunk: int) -> dict[str, np.ndarray]:
-        """Simulate a chunk of k touches: relative changes of voltages (k, M) and depth maps (k, rows, columns), by the
-        names of their arrays in the store."""
+        """Simulate a chunk of k touches; return relative changes of voltages (k, M) and depth maps (k, rows, columns),
+        by the names of their arrays in the store."""
         key = jax.random.fold_in(jax.random.key(self.seed), chunk)
         touches = self.draws.draw(key, len(self.chunks[chunk]))
         depths = depth_maps(touches, self.places) / float(self.skin.thickness)
@@ -130,12 +130,13 @@ class _SkinAndDepth:
 
 @lru_cache(maxsize=1)
 def _shared_resting_skin(skin_and_depth: _SkinAndDepth) -> RestingSkin | None:
-    """Return the data of a skin at rest that all its chunks and sets share; about a gigabyte for a 3-D layer."""
+    """Return the data of a skin at rest that all chunks and sets of the skin share; about a gigabyte for a 3-D
+    layer."""
     return resting_skin(skin_and_depth.skin, skin_and_depth.depth)
 
 
 def _digest(arrays: Any, text: str) -> str:
-    """SHA-256 hash of a tree of arrays and a text."""
+    """Compute the SHA-256 hash of a tree of arrays and a text."""
     leaves, structure = jax.tree.flatten(arrays)
     hasher = hashlib.sha256(f"{text} {structure}".encode())
     for leaf in leaves:
@@ -144,15 +145,15 @@ def _digest(arrays: Any, text: str) -> str:
 
 
 def image_places(skin: Skin, columns: int, rows: int) -> np.ndarray:
-    """Centres (rows, columns, 2) of the pixels of a grid over the bounding box of a skin, metres; row 0 is at the
-    minimum y."""
+    """Return the centres (rows, columns, 2) of the pixels of a grid over the bounding box of a skin, metres; row 0 is
+    at the minimum y."""
     low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
     return pixel_places((low_x, high_x, low_y, high_y), (rows, columns))
 
 
 def pixel_places(extent: tuple[float, float, float, float], shape: tuple[int, int]) -> np.ndarray:
-    """Centres (rows, columns, 2) of the pixels of a grid over a box (x_min, x_max, y_min, y_max), metres; row 0 is at
-    the minimum y."""
+    """Return the centres (rows, columns, 2) of the pixels of a grid over a box (x_min, x_max, y_min, y_max), metres;
+    row 0 is at the minimum y."""
     (low_x, high_x, low_y, high_y), (rows, columns) = extent, shape
     x = low_x + (high_x - low_x) * (np.arange(columns) + 0.5) / columns
     y = low_y + (high_y - low_y) * (np.arange(rows) + 0.5) / rows

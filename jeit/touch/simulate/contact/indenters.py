@@ -21,7 +21,8 @@ class AbstractIndenter(Module):
 
     @abc.abstractmethod
     def gap(self, points: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "..."]:
-        """Return the height of the surface above its lowest point at `points` (…, 2), metres; infinite beside it."""
+        """Return the height of the surface above its lowest point at `points` (…, 2), metres; infinite beside the
+        body."""
 
     @property
     @abc.abstractmethod
@@ -186,7 +187,8 @@ class RevolvedIndenter(AbstractIndenter):
         self.indentation = indentation
 
     def gap(self, points):
-        """Return the depth of the profile in its middle minus its depth at the points; infinity beyond its reach."""
+        """Return the depth of the profile in its middle minus its depth at `points`; infinity beyond the reach of the
+        indenter."""
         distances = _distance_from_origin(points)
         max_depth = float(self.indentation.depth_at(host.zeros(())))
         gaps = max_depth - np.asarray(self.indentation.depth_at(distances))
@@ -219,7 +221,7 @@ def ball_indenter(diameter: float) -> RevolvedIndenter:
 
 
 class DepthMapIndenter(AbstractIndenter):
-    """An indenter given by an image of its surface heights, centred at the origin and interpolated linearly.
+    """An indenter whose surface heights are an image, centred at the origin and interpolated linearly.
 
     **Fields**: `height`: (rows, columns), height of the surface towards the skin in metres, NaN where there is no
     surface; row 0 is at the minimum y; `pixel`: side of a pixel in metres.
@@ -248,7 +250,8 @@ class DepthMapIndenter(AbstractIndenter):
         self.height, self.pixel = height, float(pixel)
 
     def gap(self, points):
-        """Return the maximum height of the surface minus its height at the points; infinity where it is missing."""
+        """Return the maximum height of the surface minus its height at the points; infinity where there is no
+        surface."""
         centre_pixel = (np.array(self.height.shape) - 1) / 2
         pixel_coordinates = np.moveaxis(np.asarray(points)[..., ::-1] / self.pixel + centre_pixel, -1, 0)
         flat_heights = map_coordinates(self.height, pixel_coordinates.reshape(2, -1), order=1, cval=np.nan)

@@ -24,7 +24,7 @@ from jeit.touch.simulate.contact.samples import lattice
 from jeit_solvers.engines import as_array
 from jeit_solvers.module import Module
 
-# Number of random places drawn at once for each place needed; places off the skin are left out.
+# Number of random places drawn at once for each press; places off the skin are left out.
 _TRIES_PER_PLACE = 20
 
 
@@ -65,7 +65,7 @@ class PressDraws(Module):
         at_once: int = 1,
     ):
         """Create the distribution. Raises `ValueError` without indenters, for invalid arguments, for loads that are not
-        positive and in order, and for a `margin` that leaves no place on the skin."""
+        positive or not in ascending order, and for a `margin` that leaves no place on the skin."""
         check_kind("indenters", indenters, (list, tuple), "a list of them, such as [ball_indenter(0.015)]")
         indenters = tuple(indenters)
         if not indenters:
@@ -196,7 +196,7 @@ class IndentDraws(Module):
         margin: float = 0.0,
         at_once: int = 1,
     ):
-        """Create the distribution. Raises `ValueError` as `PressDraws`, and for invalid depths."""
+        """Create the distribution. Raises `ValueError` as `PressDraws` does, and for invalid depths."""
         for depth_limit in depth:
             check_metres("depth", depth_limit, 0.1, "any skin is thick")
         # The presses hold depths in metres in place of loads in newtons.
@@ -245,7 +245,7 @@ def indented_cells(skin: Skin, touches: Sequence[Sequence[Indent]]) -> TouchedCe
     conduct (Park et al. 2022, text S4).
 
     The conductivity of a cell decreases by the indented share of its volume in a 3-D layer, and by the indented share
-    of its thickness in a 2-D sheet. Raises `ValueError` for indents as deep as the skin.
+    of its thickness in a 2-D sheet. Raises `ValueError` for indents at least as deep as the skin is thick.
     """
     check_kind("skin", skin, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
     mesh, thickness = skin.model.mesh, float(skin.thickness)
@@ -289,7 +289,7 @@ def relative_changes(
     - `touches`: the touches, each a sequence of indents.
     - `resting`: data of the same skin at rest, from `resting_skin`, which several calls can share.
 
-    The changes are divided by the voltages at rest, as in `relative_to`. Raises `ValueError` as `indented_cells`.
+    The changes are divided by the voltages at rest, as in `relative_to`. Raises `ValueError` as `indented_cells` does.
 
     **Example:**
 

@@ -7,11 +7,11 @@ conductivity:
 
 where u is the potential of the lower sheet, which has the electrodes, w that of the upper sheet, whose edge is
 insulated, and g(x, y) the conductance between the sheets per area. If g = 0, the upper sheet carries no current; if
-√(σ/g) is small compared with the contact, both sheets carry current. Sheets in contact everywhere conduct like σ₁ + σ₂
-at most, and so does a contact if the upper sheet is only as large as the contact. For a contact on a larger upper
-sheet, which also leads current around the contact, the limit is σ₁ + 2σ₂: if u = w on a disc in an unbounded sheet, the
-dipole is σ₂/(σ₁ + σ₂), that of a disc of this conductivity. A `Material` with `saturation` σ₂/σ₁, or 2σ₂/σ₁ for a
-larger upper sheet, approximates this model.
+√(σ/g) is small compared with the contact, both sheets carry current. Sheets in contact everywhere conduct like one
+sheet of at most σ₁ + σ₂, and so does a contact if the upper sheet is only as large as the contact. For a contact on a
+larger upper sheet, which also conducts current around the contact, the limit is σ₁ + 2σ₂: if u = w on a disc in
+unbounded sheets, the contact acts as a dipole of relative strength σ₂/(σ₁ + σ₂), like a disc of conductivity σ₁ + 2σ₂
+in the lower sheet. A `Material` with `saturation` σ₂/σ₁, or 2σ₂/σ₁ for a larger upper sheet, approximates this model.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise,
 from jeit_solvers.engines import host, on_host
 from jeit_solvers.module import Module
 
-# Minimum conductance between the sheets, relative to σ₂ divided by the area of the skin, which fixes the potential of
-# an upper sheet without contact.
+# Minimum conductance per area between the sheets, relative to σ₂ divided by the area of the skin. It determines the
+# potential of an upper sheet without contact.
 _MIN_RELATIVE_CONDUCTANCE = 1e-9
 
 
@@ -163,7 +163,7 @@ class JoinedIndenters(AbstractIndenter):
 
     **Arguments:**
 
-    - `parts`: the indenters; those beside the origin are given as `PlacedIndenter`.
+    - `parts`: the indenters; an indenter that is not at the origin is a `PlacedIndenter`.
 
     **Example:**
 

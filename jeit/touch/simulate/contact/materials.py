@@ -20,14 +20,14 @@ from jeit.touch.simulate.contact.press import (
 )
 from jeit_solvers.module import Module
 
-# Number of pixels along a side: of the raster on which the contact is located; of the raster on which the approach is
-# found that balances the load.
+# Number of pixels along a side of the raster on which the contact is located, and of the raster on which the approach
+# that balances the load is computed.
 _NUM_COARSE_PIXELS, _NUM_FINE_PIXELS = 24, 96
 
 
 class FoundationPressure(AbstractPressure):
-    """Pressure max(k (approach − gap), 0) on a Winkler foundation with `stiffness` k in Pa/m, evaluated without a
-    raster at any point, at which the indenter's surface is `gap` above its lowest point."""
+    """Pressure max(k (approach − gap), 0) on a Winkler foundation with `stiffness` k in Pa/m, evaluated at any point
+    without a raster. The gap is the height of the indenter's surface at the point above its lowest point."""
 
     indenter: AbstractIndenter
     stiffness: float
@@ -115,7 +115,8 @@ class Foundation(AbstractSupport):
 def water_level(
     gap: Float[np.ndarray, "*n q"], area: Float[np.ndarray, "*n q"], volume: Float[np.ndarray, "*n"] | float
 ) -> Float[np.ndarray, "*n"]:
-    """Compute the level δ at which Σ area · max(δ − gap, 0) equals `volume`: that of water over ground of height `gap`.
+    """Compute the level δ at which Σ area · max(δ − gap, 0) equals `volume`, as that of water over ground of height
+    `gap`.
 
     The level is 0 if every gap is infinite. If the m lowest points are under water, δ = (volume + Σ area · gap) / Σ
     area over these points. This is exact for the smallest m for which the next point is not under water.
@@ -149,7 +150,8 @@ class Material(Module):
     - `conductivity`, `thickness`: conductivity, S/m, and thickness, metres, of the conductor at rest.
     - `support`: mechanical support that carries the load.
     - `saturation`, `half_pressure`: c and p½ (pascals) of the conductivity σ = σ₀ (1 + c q / (q + p½)) under an
-      effective pressure q: c is the limit of the relative change, and p½ the pressure at which half of it is reached.
+      effective pressure q: c is the limit of the relative change at high pressure, and p½ the pressure at half this
+      change.
     - `hysteresis`: maximum difference of q between unloading and loading, divided by the maximum pressure.
     - `creep`: pairs of the share of q that responds with delay, and the time constant of this response, seconds.
     - `conductivity_trend`, `contact_trend`: relative drift of the conductivity and of the contact impedance of each
@@ -293,7 +295,7 @@ def material(name: str) -> Material:
 
     - `name`: "velostat", "conductive fabric" or "hydrogel".
 
-    Raises `ValueError` for another name.
+    Raises `ValueError` for other names.
 
     **Example:**
 

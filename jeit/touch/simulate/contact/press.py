@@ -58,7 +58,7 @@ class AbstractSupport(Module):
         - `fall`: (n, q), for curved skins: distance of the skin below the plane z = 0 of the frame at the points,
           metres.
 
-        Raises `ValueError` as `pressure`, and for a curved skin if the support requires a flat one.
+        Raises `ValueError` as `pressure` does, and for a curved skin if the support requires a flat skin.
         """
 
 
@@ -96,8 +96,8 @@ def contact_window(is_pressed, reach: float, num_pixels: int) -> Float[np.ndarra
 
     `is_pressed(half_widths, num_pixels)`: function that returns an array (N, N): whether each pixel of a raster over a
     rectangle is in contact. Starting from `reach`, the rectangle shrinks until the contact fills more than half of both
-    its sides, since a light load on a ball touches only a small part of it. If the contact covers the centre of no
-    pixel, the last rectangle is returned.
+    its sides, since a ball under a light load touches only a small part of its rectangle. If the contact covers the
+    centre of no pixel, the last rectangle is returned.
     """
     half_widths = np.full(2, reach)
     while True:
@@ -118,7 +118,7 @@ def check_load(load) -> None:
 
 
 def check_resolved(contact: Bool[np.ndarray, "N N"], pixel) -> None:
-    """Raise `ValueError` unless a contact, (N, N) pixels of a raster, covers at least one; `pixel`: sides of a pixel,
+    """Raise `ValueError` unless a contact (N, N) on a raster covers at least one pixel; `pixel`: sides of a pixel,
     metres."""
     if not contact.any():
         raise ValueError(
@@ -136,8 +136,8 @@ class Press(Module):
     """An indenter that presses on a skin with a load.
 
     On a curved skin, the position is (x, y, z) on the touched face, and the indenter moves along the inward normal.
-    With angle 0, seen from outside, the indenter's x axis points to the right and its y axis up: along the projection
-    of the z axis onto the surface, or of the y axis where the surface is nearly horizontal.
+    With angle 0, seen from outside, the indenter's x axis points to the right, and its y axis up. Up is the projection
+    of the z axis onto the surface or, where the surface is nearly horizontal, of the y axis.
 
     **Fields**: `indenter`: the indenter; `load`: load, newtons; `position`: position (x, y) of the indenter's origin,
     metres; `angle`: angle by which the indenter is rotated, radians.
@@ -166,7 +166,7 @@ class Press(Module):
 class MovingPress(Module):
     """An indenter that moves over a skin: its load, position and angle in each of T frames.
 
-    Constant values may be given once.
+    A load, position or angle that is constant may be a single value.
 
     **Fields**: `indenter`: the indenter; `load` (T,): load, newtons, 0 while lifted; `position` (T, 2), or (T, 3) on a
     curved skin: position of the indenter's origin, metres; `angle` (T,): angle by which the indenter is rotated,
@@ -235,7 +235,8 @@ def touches_of(presses) -> list[tuple[Press, ...]]:
 
 
 def motions_of(motions, num_frames: int) -> list[MovingPress]:
-    """Return the moving presses of a recording as a list; `motions` is one or a list, empty for an untouched skin.
+    """Return the moving presses of a recording as a list; `motions`: a moving press or a list, empty for an untouched
+    skin.
 
     Raises `ValueError` for anything but moving presses, for a number of frames other than `num_frames`, and for motions
     without any load.

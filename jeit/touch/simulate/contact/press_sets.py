@@ -1,7 +1,7 @@
 """Sets of random touches and their frames, larger than memory: simulated in chunks and written to a Zarr store.
 
-The simulation runs on this machine or on a cluster. The store and its chunks are as in the studies of `jeit.design`.
-Needs the extra `cluster`.
+The simulation runs on this machine or on a cluster. The store and its chunks have the same form as those of the studies
+in `jeit.design`. Needs the extra `cluster`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from jeit.touch.simulate.contact.indents import PressDraws
 from jeit.touch.simulate.contact.press import Press
 from jeit.touch.simulate.contact.pressed_skin import PressedSkin, check_seconds
 
-# Version of the simulation, to be increased when its results change.
+# Version of the simulation, which must be increased if a change of the code changes the results.
 _VERSION = 1
 _UNITS_AND_MEANINGS = {
     "voltages": ("V", "what the channels read"),
@@ -68,7 +68,7 @@ class PressSet:
         chunk: int = 1000,
     ):
         """Create a set of touches. Raises `ValueError` for invalid arguments, and if the middle of the skin cannot
-        carry the maximum load of each indenter; at the edge, indenters go deeper, which is not checked."""
+        carry the maximum load on every indenter. At the edge, indenters go deeper, which is not checked."""
         check_kind("skin", skin, PressedSkin, "a PressedSkin")
         check_kind(
             "draws",
@@ -105,8 +105,8 @@ class PressSet:
         return hasher.hexdigest()
 
     def solve(self, chunk: int) -> dict[str, np.ndarray]:
-        """Simulate a chunk of k touches: arrays (k, …), by their names in the store, of voltages and of the presses;
-        NaN where a touch has fewer presses than `draws.at_once`."""
+        """Simulate a chunk of k touches; return arrays (k, …) of voltages and of the parameters of presses, by their
+        names in the store. Parameters are NaN where a touch has fewer presses than `draws.at_once`."""
         draw_key, frame_key = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), chunk))
         touches = self.draws.draw(draw_key, len(self.chunks[chunk]))
         results = {name: np.full((len(touches), *shape), np.nan) for name, (shape, _) in self._shapes().items()}
@@ -167,7 +167,7 @@ def simulate_presses(
     client: Any = None,
     progress: Callable[[Progress], None] | None = None,
 ):
-    """Simulate the unfinished chunks of a set of presses or indents, and return the set as `open_presses`.
+    """Simulate the unfinished chunks of a set of presses or indents, and return all its data as `open_presses` does.
 
     An interrupted simulation resumes after the last finished chunk when it is run again with the same store.
 
@@ -178,8 +178,8 @@ def simulate_presses(
     - `client`, `progress`: client of a Dask cluster, and function that is called with the progress, as in
       `jeit.design.run_study`.
 
-    Raises `ValueError` for a path to the store of another set, for a store in use by another process, and as
-    `PressedSkin.frames`; `ImportError` without the extra `cluster`; `OSError` if the store cannot be written.
+    Raises `ValueError` for a path to the store of a different set, for a store in use by another process, and as
+    `PressedSkin.frames` does; `ImportError` without the extra `cluster`; `OSError` if the store cannot be written.
 
     **Example:**
 
@@ -211,7 +211,7 @@ def open_presses(presses: PressSet | IndentSet, path: str | Path):
     - `presses`: the set.
     - `path`: path of the Zarr store in which `simulate_presses` wrote the data.
 
-    Raises as `jeit.design.study.store.Store`.
+    Raises the errors of `jeit.design.study.store.Store`.
 
     **Example:**
 
@@ -230,7 +230,7 @@ def open_presses(presses: PressSet | IndentSet, path: str | Path):
 
 
 def solve_presses(presses: PressSet | IndentSet, chunk: int) -> dict[str, np.ndarray]:
-    """Simulate one chunk of a set by its method `solve`; a function can be sent to workers of a cluster."""
+    """Simulate one chunk of a set by its method `solve`, as a function that can be sent to the workers of a cluster."""
     return presses.solve(chunk)
 
 

@@ -53,8 +53,8 @@ def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..
 def random_walk(
     key: Array, seconds: Float[np.ndarray, " T"], trend: float, deviation: float, count: int
 ) -> Float[np.ndarray, "T k"]:
-    """Draw logarithms (T, k) of k = `count` drifting quantities, 0 at time 0: a common `trend` per second, and for each
-    an independent random walk of standard `deviation` per √s. `seconds`: times (T,), in ascending order."""
+    """Draw logarithms (T, k) of k = `count` drifting quantities, 0 at time 0: a common `trend` per second plus
+    independent random walks of standard `deviation` per √s. `seconds`: times (T,), in ascending order."""
     time_steps = np.diff(seconds, prepend=0.0)
     normal_draws = standard_normal(key, (len(time_steps), count))
     return trend * np.asarray(seconds)[:, None] + deviation * np.cumsum(
@@ -88,8 +88,8 @@ def unloaded_state(material: Material, num_points: int) -> MaterialState:
 def advance_state(
     material: Material, state: MaterialState, pressure: Float[np.ndarray, " m"], seconds: float
 ) -> tuple[MaterialState, Float[np.ndarray, " m"]]:
-    """Advance a material's `state` by a time step of `seconds`, at whose end it bears `pressure` (m,); return the new
-    state and the effective pressure (m,), pascals."""
+    """Advance a material's `state` by a time step of `seconds`, at the end of which the material bears `pressure` (m,);
+    return the new state and the effective pressure (m,), pascals."""
     output = np.maximum(pressure, np.minimum(state.hysteresis_output, pressure / (1 - material.hysteresis)))
     shares, times = _branches(material)
     branch_states = state.branch_states
@@ -103,7 +103,8 @@ def advance_state(
 
 
 def held_pressure(material: Material, pressure: Float[np.ndarray, "..."], seconds: float) -> Float[np.ndarray, "..."]:
-    """Compute the effective pressure (…), pascals, under a first `pressure` applied suddenly and held for `seconds`."""
+    """Compute the effective pressure (…), pascals, under the first `pressure` on a material, applied suddenly and
+    constant for `seconds`."""
     shares, times = _branches(material)
     return np.asarray(pressure) * (1 - np.sum(shares * np.exp(-seconds / times)))
 
@@ -114,7 +115,7 @@ def _branches(material: Material) -> tuple[np.ndarray, np.ndarray]:
     return pairs[:, :1], pairs[:, 1:]
 
 
-# Number of touches processed at once; limits between groups of touches, numbers of cells; ratio of the extent of a
+# Number of touches processed at once; limits between groups of touches, in numbers of cells; ratio of the extent of a
 # touch to the square root of its area above which the touch is assumed to consist of separate contacts.
 _TOUCHES_AT_ONCE, _GROUP_NUM_CELLS, _MIN_SEPARATION = 1024, (128, 512, 2048), 3.0
 # Changes below this share of the maximum change of a touch are neglected.
@@ -125,7 +126,8 @@ class PressedSkin(Module):
     """Simulated skin, a sheet or a layer of a material, whose voltages under presses are computed.
 
     Voltages are computed exactly, by low-rank updates of one factorisation. The sheet may be a surface in space, and
-    the layer a shell. Presses are then at (x, y, z), and the support of the material must be a `Foundation`.
+    the layer a shell. On such a curved skin, presses are at (x, y, z), and the support of the material must be a
+    `Foundation`.
 
     **Arguments:**
 
@@ -133,7 +135,7 @@ class PressedSkin(Module):
     - `model`: forward model of a sheet, or of a layer with its top at the maximum z.
     - `material`: the material.
     - `conductivity`: conductivity at rest, S/m (2-D: S), by default that of the material; may be tensors, which presses
-      scale.
+      multiply by a scalar.
     - `face`: pressed face of a curved layer, "outer" or "inner".
 
     **Fields**: the arguments except `key`, and `gain` (M,): gain of each channel.
@@ -177,7 +179,7 @@ class PressedSkin(Module):
         self.gain = draw_gains(key, material.gain_spread, model.protocol.num_measurements)
 
     def rest(self) -> Float[np.ndarray, " M"]:
-        """Voltages (M,) of the untouched skin with gains, but without drift and noise."""
+        """Return the voltages (M,) of the untouched skin with gains, but without drift and noise."""
         return self.gain * self._rest_voltages
 
     def frames(
@@ -209,8 +211,8 @@ class PressedSkin(Module):
         held: float = 1.0,
         progress: Callable[[str], None] | None = None,
     ) -> TouchedCells:
-        """Compute which cells change their conductivity under n touches, and by which share. Arguments and errors: see
-        `frames`."""
+        """Compute which cells change their conductivity under n touches, and their relative changes. Arguments and
+        errors: see `frames`."""
         touches = touches_of(presses)
         pressed = pressed_cells(Samples.from_mesh(self.model.mesh, self.face), self.material.support, touches, progress)
         changes = self.material.change(held_pressure(self.material, pressed.pressure, held)).mean(axis=-1)
@@ -230,7 +232,7 @@ class PressedSkin(Module):
         `motions`: a `MovingPress`, a list of simultaneous moving presses, or `[]` for an untouched skin. The skin has
         had no load before the first frame, and drifts from time 0. `progress` is called with a description of the
         progress. Raises `ValueError` for times that are negative or decrease, for motions with more or fewer frames
-        than times, and as `frames`.
+        than times, and as `frames` does.
         """
         check_key(key)
         seconds = _check_times(seconds)
@@ -249,7 +251,7 @@ class PressedSkin(Module):
         """Simulate the voltages (T, M) of several recordings, given as pairs of motions and times as in `record`.
 
         Each recording begins with a skin without earlier load. Many recordings are processed together, which is much
-        faster than one by one. Raises `ValueError` for elements that are not pairs, and as `record`.
+        faster than one by one. Raises `ValueError` for elements that are not pairs, and as `record` does.
         """
         check_key(key)
         requirement = "a list of pairs of motions and seconds, one for each recording"
@@ -283,8 +285,8 @@ class PressedSkin(Module):
         *,
         progress: Callable[[str], None] | None = None,
     ) -> TouchedCells:
-        """Compute which cells change their conductivity in each of T frames, also due to earlier loads, and by which
-        share. The arguments are those of `record`, and it raises the same errors."""
+        """Compute which cells change their conductivity in each of T frames, also due to earlier loads, and their
+        relative changes. Arguments and errors: see `record`."""
         seconds = _check_times(seconds)
         motions = motions_of(motions, len(seconds))
         presses_of_frames = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
@@ -309,7 +311,8 @@ class PressedSkin(Module):
     ) -> Float[np.ndarray, "n M"]:
         """Compute the voltages (n, M) of the model under n touches, without gains, drift and noise.
 
-        `progress` is called with the number of touches that are computed. Raises as `touch_changes`.
+        `progress` is called with a message on the number of touches computed so far. Raises the errors of
+        `touch_changes`.
         """
         num_done = 0
         voltages = np.tile(self._rest_voltages, (len(touched.places), 1))
@@ -368,8 +371,8 @@ class PressedSkin(Module):
 
     @cached_property
     def _contact_derivative(self) -> Float[np.ndarray, "L M"]:
-        """Derivative ∂v/∂log z (L, M), volts, of the M voltages at rest by the logarithms of the contact impedances of
-        the L electrodes; zero for point electrodes."""
+        """Derivative ∂v/∂log z (L, M), volts, of the M voltages at rest with respect to the logarithms of the contact
+        impedances of the L electrodes; zero for point electrodes."""
         electrodes, protocol = self.model.electrodes, self.model.protocol
         if electrodes.is_point:
             return np.zeros((electrodes.num_electrodes, protocol.num_measurements))

@@ -18,9 +18,9 @@ from jeit.touch.simulate.contact.press import Press
 # Fineness n of the lattice of samples in a cell: barycentric coordinates are (i + 1/k) / (n + 1) with integers i of sum
 # n, for a cell with k corners.
 _LATTICE_FINENESS = 2
-# Minimum cosine of the angle between the normals of a curved skin at a cell and at the place pressed, for the cell to
-# be beneath the indenter. On a ball, the distance of a point from the place pressed is then at most 1 / cos(60° / 2)
-# times its distance from the axis of the press.
+# Minimum cosine of the angle between the normals of a curved skin at a cell beneath the indenter and at the place
+# pressed. On a ball, the distance of a point from the place pressed is then at most 1 / cos(60° / 2) times the distance
+# of the point from the axis of the press.
 _MIN_NORMAL_COSINE, _MAX_CHORD_RATIO = 0.5, 1.2
 # Minimum z component of a normal, above which "up" in the tangent plane of a curved skin is along y.
 _MIN_VERTICAL_COMPONENT = 0.866
@@ -88,14 +88,15 @@ class Samples(NamedTuple):
         )
 
     def lattice_points(self, cells: Int[np.ndarray, " c"], fineness: int) -> Float[np.ndarray, "c s d"]:
-        """Return sample points (c, s, d) in the given cells, on a lattice whose points increase with `fineness`."""
+        """Return sample points (c, s, d) in `cells`, on a lattice with s points per cell; s increases with
+        `fineness`."""
         if self.curved is None:
             return lattice(self.corners[cells], fineness)
         return _curved_lattice(self.corners[cells], self.curved.corners[cells], fineness)
 
     def check(self, presses: Sequence[Press]) -> None:
-        """Raise `ValueError` for presses whose positions have another number of coordinates than the sample points, and
-        for positions off a curved skin."""
+        """Raise `ValueError` for presses whose positions do not have as many coordinates as the sample points, and for
+        positions off a curved skin."""
         dimension, skin_kind = self.points.shape[-1], "flat" if self.curved is None else "curved"
         for press in presses:
             if len(press.position) != dimension:
@@ -117,8 +118,8 @@ class Samples(NamedTuple):
             )
 
     def facing_cells(self, presses: Sequence[Press], cells: Sequence) -> list[Int[np.ndarray, " c"]]:
-        """Select, from the `cells` near each press, those whose normals point towards the indenter, so that cells on
-        the opposite side of a tube are left out."""
+        """Select, from the `cells` near each press, the cells whose normals point towards the indenter. Cells on the
+        opposite side of a tube are thus left out."""
         arrays = [np.asarray(indices, int) for indices in cells]
         if self.curved is None:
             return arrays
@@ -130,8 +131,8 @@ class Samples(NamedTuple):
 
     @property
     def chord(self) -> float:
-        """Maximum ratio of the distance of a point from the place pressed to its distance from the axis of the
-        press."""
+        """Maximum ratio of the distance of a point from the place pressed to the distance of the point from the axis of
+        the press."""
         return 1.0 if self.curved is None else _MAX_CHORD_RATIO
 
     def to_indenter_frames(
@@ -167,7 +168,8 @@ def _barycentric_weights(num_corners: int, fineness: int) -> Float[np.ndarray, "
 
 
 def _curved_lattice(corners, normals, fineness: int) -> Float[np.ndarray, "m s 3"]:
-    """Return the points of `lattice`, moved from flat triangles onto the curved surface that these approximate."""
+    """Return the points of `lattice`, moved from the flat triangles onto the curved surface that the triangles
+    approximate."""
     weights = _barycentric_weights(corners.shape[1], fineness)
     return project_to_curved_surface(
         np.einsum("sk,mkd->msd", weights, corners), weights, corners[:, None], normals[:, None]
@@ -178,9 +180,9 @@ def project_to_curved_surface(points, weights, corners, normals) -> Float[np.nda
     """Move points (…, 3) of flat triangles onto the curved surface with unit `normals` (…, k, 3) at the `corners`
     (…, k, 3); `weights`: (…, k), barycentric coordinates of the points.
 
-    Each point is projected onto the tangent planes at the corners. It is moved half of the way to the interpolated
-    projections, which is exact to second order (Boubekeur and Alexa, Phong tessellation, ACM Transactions on Graphics
-    27(5), 2008, at 1/2).
+    Each point is projected onto the tangent planes at the corners. It is moved halfway to the interpolated projections,
+    which is exact to second order (Boubekeur and Alexa, Phong tessellation, ACM Transactions on Graphics 27(5), 2008,
+    at 1/2).
     """
     plane_distances = np.sum((corners - points[..., None, :]) * normals, axis=-1)
     return points + np.einsum("...k,...k,...kd->...d", weights / 2, plane_distances, normals)

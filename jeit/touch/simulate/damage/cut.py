@@ -77,10 +77,11 @@ class Cut(Module):
         return np.concatenate([segment_points[:-1] for segment_points in segments_points] + [self.path[-1:]])
 
     def cells(self, mesh: Mesh) -> Int[np.ndarray, " c"]:
-        """Return the numbers of the cells of a mesh that the cut crosses; in a layer, down to the depth of the cut.
+        """Return the numbers of the cells of a mesh that the cut crosses; in a layer, only cells whose centroid is
+        above the bottom of the cut.
 
-        Cells are those crossed as seen from above. Raises `ValueError` for an argument that is not a flat mesh, and for
-        a cut that crosses no cell.
+        A cell is crossed if the path crosses one of its edges, as seen from above. Raises `ValueError` for an argument
+        that is not a flat mesh, and for a cut that crosses no cell.
         """
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the skin")
         check_flat(mesh, "cuts")
@@ -101,11 +102,11 @@ class Cut(Module):
     def conductivity(
         self, mesh: Mesh, conductivity: ArrayLike, thickness: float | None = None
     ) -> Float[np.ndarray, " m"]:
-        """Compute the conductivity (m,) of the cut skin, S/m (2-D: S), from the `conductivity` of the whole skin.
+        """Compute the conductivity (m,) of the cut skin, S/m (2-D: S), from the `conductivity` of the intact skin.
 
         The conductivities of the cells that the cut crosses are multiplied by `residual`. In a sheet of `thickness` h
-        metres that is cut in part, with a remaining thickness r, the resistance across the cut is that of a sheet
-        longer by (4h/π) ln csc(πr/2h), as for a diaphragm in a channel (Lamb, Hydrodynamics, 6th edition, §306). Raises
+        metres that is partly cut, with a remaining thickness r, the resistance across the cut is that of a sheet longer
+        by (4h/π) ln csc(πr/2h), as for a diaphragm in a channel (Lamb, Hydrodynamics, 6th edition, §306). Raises
         `ValueError` for an invalid conductivity, and for a partial cut of a sheet without its thickness.
         """
         values = np.asarray(check_conductivity(mesh, conductivity))
@@ -141,7 +142,7 @@ def draw_cut(
 
     - `key`: random key.
     - `outline`: outline of the skin.
-    - `length`: minimum and maximum length, metres, between which the length is uniform.
+    - `length`: minimum and maximum of the length, metres, which is uniformly distributed.
     - `depth`: depth of the cut as a share of the skin's thickness, 1 for a cut through the skin.
     - `bent`: probability that the cut has one bend of 20 to 70 degrees.
     - `margin`: minimum distance of the cut from the edge of the skin, metres.
@@ -187,7 +188,7 @@ def draw_cut(
 
 
 def _segments_cross(start, end, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Whether the segments from `first` to `second` (m, 2) cross the segment from `start` to `end`."""
+    """Return whether the segments from `first` to `second` (m, 2) cross the segment from `start` to `end`."""
     direction, second_direction = end - start, second - first
     first_orientation, second_orientation = (
         _orientation(direction, first - start),
@@ -222,7 +223,7 @@ def mend_cut(
     - `material`: material of the skin.
     - `share`: factor by which the conductivity of the repaired cells is multiplied, about 0.9 to 1.1.
 
-    Raises `ValueError` for invalid arguments, and as `Cut.cells`.
+    Raises `ValueError` for invalid arguments, and as `Cut.cells` does.
 
     **Example:**
 

@@ -35,10 +35,10 @@ class ElectrodeFault(Module):
     **Fields**
 
     - `electrode`: number of the electrode, from 0.
-    - `kind`: "dead": the contact impedance is multiplied by 10⁷, the source is limited to five times its maximum
-      voltage at rest, and measurements on the electrode read only noise. "loose": the factor of the contact impedance
-      fluctuates between 10 and 1,000, with a time constant of half a second. "torn": the electrode is disconnected;
-      channels with this electrode read noise, or the constant `rail`.
+    - `kind`: "dead": the contact impedance is multiplied by 10⁷, and the voltage of the current source limited to five
+      times its maximum at rest; measurements on the electrode read only noise. "loose": the factor of the contact
+      impedance fluctuates between 10 and 1,000, with a time constant of half a second. "torn": the electrode is
+      disconnected; channels with this electrode read noise, or the constant `rail`.
     - `rail`: constant reading of the channels of a torn electrode, volts, or None.
 
     **Example:**
@@ -121,8 +121,8 @@ class ElectrodeFault(Module):
         return voltages * relative_currents[np.asarray(model.protocol.drive_index)]
 
     def _loose_contact_voltages(self, key: Array, model: ForwardModel, conductivity, seconds: np.ndarray) -> np.ndarray:
-        """Compute voltages (T, M) for a fluctuating contact impedance, interpolated between those at a few levels of
-        the impedance's logarithm."""
+        """Compute voltages (T, M) for a fluctuating contact impedance, interpolated between the voltages at a few
+        levels of the impedance's logarithm."""
         log_min, log_max = np.log(_LOOSE_CONTACT_FACTORS)
         levels = np.linspace(log_min, log_max, _NUM_LEVELS)
         level_voltages = [
@@ -195,12 +195,12 @@ def record_damage(
 
     - `key`: random key.
     - `skin`: the skin before the first event.
-    - `motions`: a moving press, or a list of simultaneous ones; `[]` for none.
+    - `motions`: a moving press, or a list of simultaneous moving presses, `[]` for none.
     - `seconds`: times (T,) of the frames, seconds.
     - `events`: the events, in order of time.
 
-    Raises `ValueError` for invalid events, for an event whose skin has other channels, and as
-    `PressedSkin.touched_in_time`.
+    Raises `ValueError` for invalid events, for an event whose skin has a different number of channels, and as
+    `PressedSkin.touched_in_time` does.
 
     **Example:**
 
@@ -247,7 +247,8 @@ def exact_record(
     selected_frames: np.ndarray,
 ) -> Float[np.ndarray, "T M"]:
     """Compute voltages (T, M) of a skin without drift and noise in the frames that the mask `selected_frames` (T,)
-    selects; other frames have the voltages at rest. Raises `ValueError` as `PressedSkin.touched_in_time`."""
+    selects; in all other frames, the voltages are those at rest. Raises `ValueError` as `PressedSkin.touched_in_time`
+    does."""
     voltages = np.tile(np.asarray(skin.model.voltages(skin.conductivity)), (len(seconds), 1))
     if not np.any([np.any(motion.load) for motion in ([motions] if isinstance(motions, MovingPress) else motions)]):
         return voltages

@@ -1,11 +1,12 @@
 """Simulated people who make gestures on a skin: parameters of the gestures, and motion of the hand.
 
 Table I of Silvera Tawil et al. (2011) describes how six gestures are usually made, in words for area, intensity,
-displacement and duration. The numbers for these words are assumptions from everyday touch, and the same for all
-gestures: the contact of a fingertip has a radius of 7 mm, that of a flat hand through foam about 20 mm; typing takes 1
-N, resting fingers 2 N, a firm push 10 N; a knock lasts 0.15 s, a caress about 1 s. Words for a range, such as small to
-large, have a larger spread among people. Of displacement in the plane, the table only says whether there is any: here
-fingers stroke at about 0.1 m/s over the length of a hand, and scratch back and forth, faster and over a shorter path.
+displacement and duration. The numbers for these words are assumptions from everyday touch, and each word has the same
+number for all gestures: the contact of a fingertip has a radius of 7 mm, that of a flat hand through foam about 20 mm;
+typing takes 1 N, resting fingers 2 N, a firm push 10 N; a knock lasts 0.15 s, a caress about 1 s. Words for a range,
+such as small to large, have a larger spread among people. For displacement in the plane, the table states only whether
+there is any. Here, fingers stroke at about 0.1 m/s over the length of a hand, and scratch back and forth, faster and
+over a shorter path.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from jeit_solvers.module import Module
 
 TRAITS = ("force", "radius", "duration", "speed", "path")
 """Parameters of a touch: force, N; radius of a disc with the area of the contact, m; duration, s; and, for moving
-touches, speed, m/s, and length of the path of a sweep, m."""
+touches, speed, m/s, and length of one sweep of the path, m."""
 
 # Median of a parameter, and standard deviation of its logarithm among people, for each word of Table I. Units: m, N and
 # s.
@@ -174,8 +175,8 @@ _MIN_SKIN_SIDE = 0.06
 class Person(Module):
     """A simulated person, who makes gestures with a force, contact size, duration and speed of their own.
 
-    **Fields**: `medians` (6, 5): median, over the touches of this person, of force, radius of the contact, duration,
-    speed and path (columns) for each of the six gestures (rows), in SI units.
+    **Fields**: `medians` (6, 5): medians over the touches of this person, in SI units: force, radius of the contact,
+    duration, speed and path (columns) for each of the six gestures (rows).
 
     **Example:**
 
@@ -188,7 +189,7 @@ class Person(Module):
     medians: Float[np.ndarray, "6 5"]
 
     def __check_init__(self):
-        """Check the medians. Raises `ValueError` for another shape, and for negative or infinite values."""
+        """Check the medians. Raises `ValueError` for other shapes, and for negative or infinite values."""
         check_kind("medians", self.medians, np.ndarray, "an array (6, 5), such as of Person.draw(key)")
         if self.medians.shape != (len(GESTURES), len(TRAITS)):
             raise ValueError(f"medians have shape {self.medians.shape}; give ({len(GESTURES)}, {len(TRAITS)}).")
@@ -210,9 +211,9 @@ class Person(Module):
     ) -> tuple[MovingPress, Float[np.ndarray, " T"]]:
         """Simulate a gesture of this person at a random place on a skin with this `outline`.
 
-        Returns the moving press and the times (T,) of its frames, seconds, at `rate` frames/s, which begin before and
-        end after the touch. Force, radius, duration, speed and path are log-normally distributed about the medians of
-        the person. Raises `ValueError` for invalid arguments, and for a skin too small for a hand.
+        Returns the moving press and the times (T,) of its frames, seconds, at `rate` frames/s. The frames begin before
+        the touch and end after it. Force, radius, duration, speed and path are log-normally distributed about the
+        medians of the person. Raises `ValueError` for invalid arguments, and for a skin too small for a hand.
         """
         check_key(key)
         check_name("gesture", gesture, GESTURES)

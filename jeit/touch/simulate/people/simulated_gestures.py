@@ -18,7 +18,7 @@ from jeit.touch.simulate.people.person import GESTURES, Person
 
 # Maximum time since the reference frame, during which the skin drifts, in seconds; number of frames of which the
 # reference is the mean; number of recordings of the untouched skin, each with its own drift; number of frames of each
-# of them.
+# such recording.
 _MAX_DRIFT_TIME, _NUM_REFERENCE_FRAMES, _NUM_UNTOUCHED_RECORDINGS, _NUM_UNTOUCHED_FRAMES = 60.0, 60, 40, 16
 # Number of recordings simulated at once.
 _RECORDINGS_AT_ONCE = 120
@@ -50,7 +50,7 @@ def simulate_gestures(
     - `rate`: frame rate, frames/s.
     - `progress`: function that is called with a description of the progress.
 
-    Raises `ValueError` for invalid arguments, and as `Person.touch` and `PressedSkin.record`.
+    Raises `ValueError` for invalid arguments, and as `Person.touch` and `PressedSkin.record` do.
 
     **Example:**
 
@@ -156,7 +156,7 @@ def simulate_gesture_stream(
     - `pause`: minimum time between gestures, seconds.
     - `rate`: frame rate, frames/s.
 
-    Raises `ValueError` for invalid arguments, and as `Person.touch` and `PressedSkin.record`.
+    Raises `ValueError` for invalid arguments, and as `Person.touch` and `PressedSkin.record` do.
 
     **Example:**
 
