@@ -40,9 +40,9 @@ def time_folds(
     If the training set of a fold would lack places (`positions`) or classes (`kinds`: one class for each press, or true
     and false for each key), because places or classes were pressed one after the other, the presses are cut into more
     and shorter intervals, which are assigned to the folds in turn. All presses of a `group` are in one fold; groups are
-    ordered by their mean time. Presses with the same frame are in one fold, and so are presses at the same place if
-    places of two or three coordinates are repeated: otherwise the training set would contain copies of held-out
-    presses.
+    ordered by their mean time. Presses with equal frames are in one fold. If places of two or three coordinates are
+    repeated, presses at the same place are also in one fold. Otherwise, the training set would contain copies of
+    held-out presses.
     """
     num_presses = len(frames)
     order = np.arange(num_presses) if time is None else np.argsort(time, kind="stable")
@@ -108,7 +108,7 @@ def _assign_by_class(rank: np.ndarray, kinds: np.ndarray, num_folds: int) -> Int
 
 
 def _training_sets_cover(fold: np.ndarray, positions: np.ndarray | None, kinds: np.ndarray | None) -> bool:
-    """Whether the training set of each fold contains the classes of its held-out presses, or places near theirs."""
+    """Whether each fold's training set contains the classes of its held-out presses, or presses near them."""
     if kinds is not None and kinds.ndim == 2:
         return all(_training_sets_cover(fold, None, column) for column in kinds.T)
     if kinds is not None:

@@ -6,8 +6,8 @@ rate of 10 kHz, a frame consists of 128 samples under a Hann window, and begins 
 bins 1 to 64 of its Fourier transform are the 64 bands.
 
 At any other sampling rate, frames have the same duration, and bins are assigned to bands by their frequency; sound is
-not resampled. The bands end at the frequency `highest`. If it is at most 5 kHz, all bands are as wide as a bin, 78 Hz;
-otherwise, the lowest band has this width, and each band is wider than the band below it by the same factor.
+not resampled. The bands end at the frequency `highest`. If `highest` is at most 5 kHz, all bands are as wide as a bin,
+78 Hz; otherwise, the lowest band has this width, and each band is wider than the band below it by the same factor.
 """
 
 from __future__ import annotations

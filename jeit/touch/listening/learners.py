@@ -1,8 +1,8 @@
 """Classifiers of sound windows: a network, boosted trees on hand-made features, and linear discriminants.
 
-The discriminants use the hand-made features alone, or with the spectrum in all bands. The method `learn` of each
-learner returns a classifier. Its `log_odds` are those of the classes 0 … C − 1; its `to_stored` returns arrays to store
-in a file.
+One discriminant uses the hand-made features alone, another also the spectrum in all bands. The method `learn` of each
+learner returns a classifier. The classifier's method `log_odds` returns the log-odds of the classes 0 … C − 1; its
+method `to_stored` returns a header and arrays to store in a file.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class NetworkLearner:
     def learn(self, training_set: TrainingSet) -> NetworkListener:
         """Train a network with early stopping, by the loss on held-out groups.
 
-        One in six groups of clips of each class is held out, and one of a class with three to five groups.
+        Of the groups of clips of each class, one in six is held out; of three to five groups, one is held out.
         """
         is_held_out = stopping_rows(training_set.labels, training_set.groups)
         levels = Levels.from_images(training_set.images[~is_held_out])
@@ -243,7 +243,7 @@ class LinearLearner:
         weights = np.zeros((len(mean), len(model.coef_)))
         weights[is_variable] = model.coef_.T
         offset = model.intercept_ - (log_priors if len(log_priors) > 2 else log_priors[1] - log_priors[0])
-        if weights.shape[1] == 1:  # two classes: only the log-odds of the second are given
+        if weights.shape[1] == 1:  # with two classes, scikit-learn stores only the log-odds of the second
             weights, offset = np.hstack([-weights, weights]) / 2, np.concatenate([-offset, offset]) / 2
         return LinearListener(self.features, mean, deviation, weights, offset)
 

@@ -1,10 +1,11 @@
 """The network of Park et al. (2022) that classifies touch by its sound: trained with equinox and optax, run in NumPy.
 
 The network has two layers, each a convolution without padding, batch normalisation, rectification and max-pooling. The
-convolutions are 5 × 5 to 32 channels, then 3 × 3 to 64 channels. A dense layer and softmax follow. Training uses Adam
-with a learning rate of 2e-4, divided by ten after every five epochs, and batches of 64; the held-out loss is evaluated
-every 50 batches, and training ends after 20 evaluations without a decrease. This library's own choices are the size of
-the second convolution and of the pools, 3 × 3 and 2 × 2, and the noise added to images.
+convolutions have 32 kernels of 5 × 5 pixels, then 64 kernels of 3 × 3 pixels. A dense layer and softmax follow.
+Training uses Adam with a learning rate of 2e-4, divided by ten after every five epochs, and batches of 64; the held-out
+loss is evaluated every 50 batches, and training ends after 20 evaluations without a decrease. Chosen here, not taken
+from the paper, are the kernel size of the second convolution, the sizes of the pools, 3 × 3 and 2 × 2, and the noise
+added to images.
 """
 
 from __future__ import annotations
@@ -132,7 +133,8 @@ class NetworkAnswers:
 
     def __init__(self, network: ModalityNetwork):
         host_network = jax.tree.map(np.asarray, network)
-        # Batch normalisation is a factor and an offset for each channel; the factor is merged into the kernels.
+        # Batch normalisation multiplies each channel by a factor and adds an offset; the factor is merged into the
+        # kernels.
         factors = [
             gain / np.sqrt(variance + _VARIANCE_FLOOR)
             for gain, variance in zip(host_network.gain, host_network.variance, strict=True)
@@ -208,8 +210,8 @@ def train_network(
     """Train a network on images with the classes `labels`, until its loss on held-out images no longer decreases.
 
     `held_out`: the held-out images and their classes; `plan`: training schedule, as from `library_plan`; `noise`:
-    standard deviation of the noise added to images; `checkpoint` and `progress`: see `jeit.touch.fit_network`, whose
-    errors are raised. The same `key` gives identical results.
+    standard deviation of the noise added to images; `checkpoint` and `progress`: as for `jeit.touch.fit_network`.
+    Raises the errors of that function. The same `key` gives identical results.
     """
     draw_key, training_key = jax.random.split(key)
     network = ModalityNetwork.draw(draw_key, images.shape[1], images.shape[2], classes)

@@ -136,9 +136,9 @@ class ImageNetwork:
         """State why each depth map is unreliable; an empty string if there is no evidence against the map.
 
         `change`: relative voltage changes; `share`: relative depth maps, as of `share(change)`. A map is unreliable if
-        it is much deeper than the skin is thick. A map is also unreliable if it bulges outwards more than it is
-        indented, and its indentation does not explain the voltage change by the forward model, which only the design
-        "unrolled" has.
+        it is much deeper than the skin is thick. For the design "unrolled", which contains a forward model, a map is
+        also unreliable if it bulges outwards more than it is indented, and the voltages that the model predicts for its
+        indentation do not explain the change.
         """
         reasons = ["" for _ in share]
         change_norms = np.linalg.norm(change, axis=1)
@@ -217,8 +217,8 @@ class ImageNetwork:
         return lambda change: run_network(arrays, jnp.asarray(change))
 
     def check_protocol(self, protocol: Protocol, name: str = "the data") -> None:
-        """Raise `ValueError`, which states the difference, if the network was trained for another protocol than the
-        given; currents may differ."""
+        """Raise `ValueError`, which states the difference, if the network was trained for a protocol other than
+        `protocol`; currents may differ."""
         check_same(name, self.made_for, _describe_protocol(protocol))
 
 
@@ -275,7 +275,7 @@ def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
     - `path`: path of the file or folder.
     - `skin`: the skin to be imaged, which is compared with the skin that the network was trained for.
 
-    Raises `FileNotFoundError` if the path does not exist, and `ValueError` if the file is not that of a network or the
+    Raises `FileNotFoundError` if the path does not exist, and `ValueError` if the file contains no image network or the
     network was trained for another skin.
 
     **Example:**

@@ -39,7 +39,8 @@ def plot_contacts(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw an image with the outline of every contact, a cross at its centroid, and the centroid in millimetres.
+    """Draw an image with the outline of every contact, a cross at its centroid, and the coordinates of the centroid in
+    millimetres.
 
     **Arguments:**
 

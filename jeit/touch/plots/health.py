@@ -123,7 +123,7 @@ def plot_health_course(
     """Draw the change of frames relative to the healthy skin over time, and a line at the time of every event.
 
     The change is given in multiples of the limit above which a lasting change counts as damage. Touches may cause
-    changes as large as damage, but only for a time.
+    changes as large as those of damage, but these changes do not last.
 
     **Arguments:**
 

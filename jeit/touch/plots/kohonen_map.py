@@ -13,7 +13,7 @@ from jeit.arguments import check_kind, real_array
 from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, draw_colour_bar, draw_scale_bar, extent_of, hide_axes
 from jeit.touch.kohonen import MapTouch
 
-# Area of a neuron's marker, points², in a map of as many neurons as the second number says.
+# Area of a neuron's marker, points², in a map of the reference size; number of neurons of a map of this size.
 _MARKER_AREA, _REFERENCE_NEURONS = 26.0, 1024
 
 

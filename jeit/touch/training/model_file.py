@@ -61,10 +61,11 @@ def read_model(
 ) -> tuple[dict[str, Any], Any]:
     """Read the head and the model of a file that `write_model` wrote.
 
-    `make`: function that returns, for a head, a model of the same architecture; only the model's shapes are evaluated,
-    so that no head can cause large use of memory. Nothing in the file is executed: before an array is read, its shape
-    and dtype must be those of the architecture. Raises `FileNotFoundError` if the file does not exist, and `ValueError`
-    if the file is of another kind or version, is cut short or too long, or has arrays of another architecture.
+    `make`: function that returns a model of the architecture that a head describes; only the shapes of the model's
+    arrays are evaluated, so that no head can cause large use of memory. Nothing in the file is executed: before an
+    array is read, its shape and dtype must be those of the architecture. Raises `FileNotFoundError` if the file does
+    not exist, and `ValueError` if the file is of another kind or version, is cut short or too long, or has arrays of
+    another architecture.
     """
     with _open_file(Path(path), kind) as file:
         head = _read_header(file, kind, version)
@@ -90,7 +91,7 @@ def read_model(
 def check_same(path: str | Path, made_for: dict[str, Any], expected: dict[str, Any]) -> None:
     """Check that a model is used for what the model was trained for, such as the same skin and protocol.
 
-    `made_for`, `expected`: descriptions of what the model was trained for and of its use, as dictionaries of JSON
+    `made_for`, `expected`: descriptions of the skin and protocol in training and in use, as dictionaries of JSON
     values, in which numbers may differ by a millionth. Raises `ValueError`, which states the first difference.
     """
     for name in expected:
