@@ -1,5 +1,5 @@
-"""Conversion of the bytes that a device sends to lines, and of the numbers in a line to volts, as in the readers of
-files."""
+"""Conversion of the bytes that a device sends to lines, and of the numbers in a line to the volts that a reader of
+files would return."""
 
 from __future__ import annotations
 
@@ -216,6 +216,6 @@ def _num_channels(loaded_description: Description | None, reference: Measurement
         return None
     try:
         protocol = loaded_description.protocol("line.txt")
-    except ValueError:  # for example, a current that only the name of a file states
+    except ValueError:  # for example, if only the name of a file states the current
         return None
     return None if protocol is None else protocol.num_measurements

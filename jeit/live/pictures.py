@@ -135,5 +135,5 @@ class AbstractView(abc.ABC):
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
         """Take the mean of `frames` (frames, channels) of the undisturbed sensor, in volts, as the new reference.
 
-        Raises `ValueError` for frames that cannot be a reference; the old reference is then kept.
+        Raises `ValueError` for frames that cannot be a reference; the view then continues with the old reference.
         """

@@ -31,8 +31,8 @@ REFERENCE, DESCRIPTION = "reference.npz", "description.toml"
 # Maximum memory in bytes of frames that wait for a slow or full disk. Times in seconds: between attempts to write to a
 # full disk, between synchronisations of the files with the disk, and maximum duration of ending a recording.
 _MAX_WAITING_BYTES, _RETRY_PERIOD, _SYNC_PERIOD, _END_TIMEOUT = 64_000_000, 1.0, 2.0, 10.0
-# Maximum size in bytes of a file of frames. Readers need memory of eight times the file size, which is limited to a
-# gigabyte.
+# Maximum size in bytes of a file of frames. Readers need memory of eight times the file size, which this limit keeps
+# below a gigabyte.
 _MAX_FILE_SIZE = 100_000_000
 # Prefix of the names of files of frames; number of successive frames with another number of channels after which a new
 # file is begun.

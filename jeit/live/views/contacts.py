@@ -148,7 +148,7 @@ class GestureView(AbstractView):
     - `still`: frames (frames, channels) of the untouched skin, volts.
     - `rate`: frames/s; by default the frame rate of the training data.
     - `patience`: time in seconds after which a lasting touch becomes part of the reference.
-    - `progress`: called with the name of each step when it begins.
+    - `progress`: function that is called with the name of each step when the step begins.
 
     Raises `ValueError` if `jeit.touch.TouchImages.prepare` or `jeit.touch.TouchWatch.create` does.
 
