@@ -23,7 +23,7 @@ _LINE_ENDS = re.compile(rb"[\r\n]")
 # Some OpenEIT devices send no line ends, so a frame begins at the word "magnitudes".
 _FRAME_WORD = re.compile(rb"magnitudes\s{0,40}:", re.IGNORECASE)
 _COMMENTS = ("#", "%", "//")
-# Maximum number of characters that are kept of a line that is not a frame.
+# Maximum number of characters that are stored of a line that is not a frame.
 _MAX_TEXT_LENGTH = 400
 # Maximum relative difference from the reference for which a number is considered complete, and for which a frame is
 # used to determine the factors from numbers to volts; maximum number of frames from which the factors are determined.

@@ -148,10 +148,10 @@ def first_frames(
     """Read the frames of the first `seconds` of a source; return these frames and a source of the frames that follow.
 
     Lines that were sent before the program could read them arrive all at once. The number of returned frames is
-    therefore `seconds` times the frame rate: `rate`, in frames/s, or else the rate of the frames that arrive one after
-    the other. Frames that are not numbers, or whose length differs from that of most frames, are left out. If the
-    source is a recording, the returned source plays the recording from its beginning. `report` is called with the name
-    of the task, and with the reason of any wait for the device. Raises `ValueError` if fewer than three frames remain.
+    therefore `seconds` times the frame rate: `rate`, in frames/s, or else the rate of the frames that arrive later, one
+    by one. Frames that are not numbers, or whose length differs from that of most frames, are left out. If the source
+    is a recording, the returned source plays the recording from its beginning. `report` is called with the name of the
+    task, and with the reason of any wait for the device. Raises `ValueError` if fewer than three frames remain.
     """
     if isinstance(source, PlayedRecording):
         return _frames_of_usual_length(list(source.frames[source.seconds <= seconds]), seconds), source
@@ -235,7 +235,7 @@ def _frames_of_usual_length(rows: list[np.ndarray], seconds: float) -> Float[np.
 
 
 class _ContinuedSource(AbstractSource):
-    """A source of which some frames have been read already. `remaining`: iterator over the frames that follow."""
+    """A source whose first frames have already been read. `remaining`: iterator over the frames that follow."""
 
     def __init__(self, source: AbstractSource, remaining: Iterator[LiveFrame]):
         self._source, self._remaining = source, remaining

@@ -23,8 +23,8 @@ _NUM_MEDIANS = 40
 # electrodes. An electrode drifts if the median relative difference of its readings exceeds `_DRIFT_DIFFERENCE`, and
 # also `_DRIFT_RATIO` times the median difference of all other readings.
 _LOST_DIFFERENCE, _DEAD_SHARE, _DRIFT_DIFFERENCE, _DRIFT_RATIO = 0.5, 0.7, 0.05, 3.0
-# The frames of a reference are divided into parts, whose means are compared: number of parts, minimum number of frames
-# of a part, and ratio of the deviation of the means to the deviation expected from noise above which the sensor is
+# The frames of a reference are divided into parts, whose means are compared. Number of parts; minimum number of frames
+# of a part; ratio of the deviation of the means to the deviation expected from noise, above which the sensor is
 # considered disturbed.
 _NUM_PARTS, _MIN_PART_FRAMES, _DISTURBANCE_RATIO = 4, 2, 4.0
 # Factor by which the frame rate must change for a report, and number of successive calls for which the change must
@@ -92,7 +92,7 @@ class QualityWatch:
             self._medians.clear()
 
     def add(self, frame: LiveFrame) -> None:
-        """Add a frame to the latest frames. Text, and frames with another number of channels, are left out."""
+        """Add a frame to the latest frames. Text, and frames with a different number of channels, are left out."""
         values = frame.values
         if isinstance(values, str) or values.ndim != 1 or values.dtype.kind not in "iuf":
             return

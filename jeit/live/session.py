@@ -29,7 +29,7 @@ _NUMBER_PATTERN = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 # Number of frames over which the latency is computed; time in seconds over which the frame rate is measured; period in
 # seconds with which the quality of the frames is computed.
 _NUM_LATENCIES, _RATE_SPAN, _QUALITY_PERIOD = 600, 2.0, 0.5
-# Number of successive frames with another number of channels after which the change is reported; maximum number of
+# Number of successive frames with a different number of channels after which the change is reported; maximum number of
 # frames of a reference.
 _NUM_OTHER_LENGTHS, _MAX_REFERENCE_FRAMES = 3, 10_000
 # Maximum length of the name of an event; time in seconds for which the events of skipped frames are stored for a busy

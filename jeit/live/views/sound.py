@@ -35,8 +35,8 @@ class SoundView(AbstractView):
     - `floor`: noise power (microphones,) that was subtracted from the intensities.
     - `freedom`: degrees of freedom of the noise power, as in `jeit.acoustic.Intensities`.
 
-    Raises `ValueError` for another method, for a `floor` with another number of microphones, and for fewer than three
-    usable microphones.
+    Raises `ValueError` for any other method, for a `floor` with a different number of microphones, and for fewer than
+    three usable microphones.
 
     **Example:**
 

@@ -37,9 +37,9 @@ def time_folds(
     text.
 
     The presses, ordered by `time` or else as recorded, are cut into `num_folds` intervals of time, one for each fold.
-    If the training set of a fold would lack places (`positions`) or classes (`kinds`: one class for each press, or true
-    and false for each key), because places or classes were pressed one after the other, the presses are cut into more
-    and shorter intervals, which are assigned to the folds in turn. All presses of a `group` are in one fold; groups are
+    The training set of a fold may lack places (`positions`) or classes (`kinds`: one class for each press, or true and
+    false for each key) if these were pressed one after the other. In this case, the presses are cut into more and
+    shorter intervals, which are assigned to the folds in turn. All presses of a `group` are in one fold; groups are
     ordered by their mean time. Presses with equal frames are in one fold. If places of two or three coordinates are
     repeated, presses at the same place are also in one fold. Otherwise, the training set would contain copies of
     held-out presses.
@@ -86,8 +86,8 @@ def time_folds(
 
 
 def _assign_to_folds(unit: np.ndarray, rank: np.ndarray, num_folds: int, num_intervals: int) -> Int[np.ndarray, " N"]:
-    """Assign presses to folds: the presses in order of their `rank` in time are cut into `num_intervals` intervals,
-    which are assigned to the folds in turn; presses with the same `unit` are in one fold."""
+    """Assign presses to folds: `num_intervals` intervals of presses, in order of their `rank` in time, are assigned to
+    the folds in turn; presses with the same `unit` are in one fold."""
     sizes = np.bincount(unit)
     unit_order = np.argsort(np.bincount(unit, rank) / sizes, kind="stable")
     middle_ranks = np.cumsum(sizes[unit_order]) - sizes[unit_order] / 2

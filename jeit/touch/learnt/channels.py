@@ -8,9 +8,9 @@ its residual, the deviation from the prediction by the other channels, exceeds a
 presses. The reading of a dead channel is predicted from the covariance of all channels, which represents relations that
 the patterns omit: for example, reciprocal channels have the same reading.
 
-The novelty of a frame includes its distance from all presses of the training set: the frame of two simultaneous
-touches, or of a touch of the opposite sign, consists of the same patterns as the recorded presses, but is unlike any of
-them.
+The novelty of a frame includes its distance from the nearest press of the training set: the frame of two simultaneous
+touches, or of a touch of the opposite sign, consists of the same patterns as the recorded presses, but is unlike each
+press.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ _NOISE_VARIANCE_FRACTION, _MAX_PATTERNS, _PRESSES_PER_PATTERN = 1e-3, 60, 4
 # A channel is dead if its residual exceeds this factor times this quantile of the residuals of training presses.
 _RESIDUAL_FACTOR, _RESIDUAL_QUANTILE = 2.0, 0.999
 # Maximum distance of a working channel's reading from the range of its training readings, relative to the width of the
-# range; if more than this fraction of channels exceed the maximum, the frame counts as unusual and the channels as
+# range. If more than this fraction of channels exceed the maximum, the frame counts as unusual and the channels as
 # alive.
 _MAX_RANGE_EXCESS, _MAX_EXCEEDING_FRACTION = 2.0, 0.1
 # Variation of a channel below this fraction of the largest change counts as rounding error.
@@ -182,10 +182,10 @@ class Channels:
     def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Replace the voltage changes of dead or missing channels by their prediction from the other channels.
 
-        Returns the changes (frames, channels) of the used channels; whether each channel is alive in each frame
-        (frames, channels); the novelty of each frame, 1 for a frame that is as far from the training set as the
-        farthest training press; and the standard deviation of the reading errors (frames, channels) in excess of those
-        of the training set, in the unit of the changes.
+        Returns the completed changes (frames, channels) of the used channels; whether each channel is alive in each
+        frame (frames, channels); the novelty of each frame, about 1 for the farthest training presses; and the standard
+        deviation of the reading errors (frames, channels) in excess of those of the training set, in the unit of the
+        changes.
         """
         completed_changes = changes[:, self.used] / self.scale
         has_reading, out_of_range = (

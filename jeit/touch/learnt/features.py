@@ -122,8 +122,8 @@ class ImageFeatures:
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
         """Return the unit by which each feature is divided.
 
-        For the contact and the logarithm, the unit is a fraction of the feature's standard deviation; for all cells of
-        the image, the unit is the root mean square of their standard deviations.
+        For the contact and the logarithm, the unit is a fraction of the feature's standard deviation. For the cells of
+        the image, the unit is the root mean square of the standard deviations of all cells.
         """
         num_other_features = values.shape[1] - len(self.imaged.sizes)
         deviations = values.std(axis=0)

@@ -68,7 +68,7 @@ def learn_labels(
     `reference`: reference voltages of the changes; `imaged`: optional reconstruction of images, which are then used as
     features too; `method`: one of the nine classifiers, or "auto" for the classifier with the lowest error. All methods
     use the form of features for which the linear discriminant has the lowest error. Also returns the results of
-    cross-validation on `folds` in order of increasing error, for "auto" of all methods.
+    `method`, or of all methods for "auto", in cross-validation on `folds`, in order of increasing error.
     """
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference

@@ -35,8 +35,8 @@ from jeit.touch.learnt.presses import (
     standardise_sessions,
 )
 
-# A frame is unlike the training set above this novelty (1 for the farthest training frame), or below this fraction of
-# alive channels.
+# A frame is unlike the training set above this novelty (about 1 for the farthest training frames), or below this
+# fraction of alive channels.
 _MAX_NOVELTY, _MIN_ALIVE = 2.0, 0.66
 _CHUNK_SIZE = 256
 # To propagate errors of readings to predictions: number of principal directions of the error of readings predicted for
@@ -106,8 +106,8 @@ class LearntSkin:
         `num_channels`: number of channels to use, of which the most informative are selected; by default all.
         `per_session`: standardise the changes of each `group` separately, against drift. `progress`: function that is
         called with a description of each step. Raises `ValueError` for an unknown method, a method that can learn no
-        quantity of the presses, presses from which nothing can be learnt, and a model with other channels than the
-        frames.
+        quantity of the presses, presses from which nothing can be learnt, and a model whose number of channels differs
+        from that of the frames.
         """
         _check_fit(presses, method, model, num_channels, per_session)
         with one_thread():
@@ -167,8 +167,8 @@ class LearntSkin:
 
         `reference`, one frame or one for each frame, is required if the training presses had a reference; `group` is
         the session of each frame, if the skin was learnt `per_session`. Dead channels are detected, and their readings
-        replaced; frames unlike the training set are marked, and have no predicted touch. Raises `ValueError` if frames
-        have another number of channels than the skin, or the reference is missing, superfluous, or of another skin.
+        replaced; frames unlike the training set are marked, and have no predicted touch. Raises `ValueError` if the
+        number of channels differs from that of the skin, or the reference is missing, superfluous, or of another skin.
         """
         frames = self._check_frames(frames)
         reference = self._check_reference(frames, reference)

@@ -16,10 +16,11 @@ from jeit.touch.learnt.features import Features, Forms, ImageReconstruction
 from jeit.touch.learnt.methods import CHANNEL_METHODS, QUICK_METHODS, REGRESSORS
 
 _NUM_SIMILAR, _TARGET_COVERAGES = 40, ((1.0, 0.6827), (1.96, 0.95))
-# Number of similar presses from which the variance of a prediction is estimated; pairs of a multiple of the standard
-# deviation and the share of normally distributed errors within this multiple. Weight of the logarithm of the size of
-# the changes, relative to the predicted values, in the distance between presses; weight of the mean squared error of
-# all presses in an estimated variance. The remaining weight is that of the mean squared error of similar presses.
+# Number of similar presses from which the variance of a prediction is estimated; for calibration, pairs of a multiple
+# of the standard deviation and the share of normally distributed errors within this multiple. Weight of the logarithm
+# of the size of the changes, relative to the predicted values, in the distance between presses; weight of the mean
+# squared error of all presses in an estimated variance. The remaining weight is that of the mean squared error of
+# similar presses.
 _SIZE_WEIGHT, _GLOBAL_FRACTION = 0.3, 0.15
 # Minimum number of presses from which the coverage of standard deviations is estimated.
 _MIN_CALIBRATION_PRESSES = 30
@@ -185,8 +186,8 @@ def learn_numbers(
     `reference`: reference voltages of the changes; `imaged`: optional reconstruction of images, which are then used as
     features too; `method`: one of `METHODS`; "auto" chooses the best method, or a blend of methods if its error is
     lower. Quick methods are tried with all forms of features, other methods only with the one or two forms for which a
-    quick method has the lowest error. Also returns the results of cross-validation on `folds` in order of increasing
-    error, after that of a chosen blend; for a single `method`, only its own results.
+    quick method has the lowest error. Also returns the results of cross-validation on `folds`, in order of increasing
+    error, but with a chosen blend first; for a single `method`, only the results of this method.
     """
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference

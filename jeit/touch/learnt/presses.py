@@ -422,8 +422,8 @@ class Touches:
       `force_std`; `label`, text, with its `probability`; `touched` (frames, keys), whether each key is pressed, with
       `key_probability`. In frames unlike the training set, these numbers are NaN, labels "" and keys false. In frames
       of the untouched skin, positions are NaN, forces 0, labels "none" and keys false.
-    - `unlike`: whether a frame is unlike the training set; `novelty`: distance of a frame from the training set, 1 for
-      the farthest training frame.
+    - `unlike`: whether a frame is unlike the training set; `novelty`: distance of a frame from the training set, about
+      1 for the farthest training frames.
     - `alive` (frames, channels): whether the channel is alive, so that its reading was used.
     - `notes`: corrections made to the frames, as text.
 

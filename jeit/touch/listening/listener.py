@@ -41,7 +41,7 @@ _KIND, _VERSION = "a jeit listener", 2
 
 @dataclass(frozen=True)
 class Listener:
-    """A trained classifier of sounds, such as of touches of a skin with microphones.
+    """A trained classifier of sounds, such as the sounds of touches of a skin with microphones.
 
     **Fields**: `names` (C,): names of the classes; `method`: name of the method; `model`: trained classifier;
     `channels`: number of microphones, 1 if they are mixed; `highest`: maximum frequency of sound that is used, Hz;
@@ -345,7 +345,8 @@ def _held_out_odds(
 
 
 def _is_loudness_useful(windows: Windows, clip_folds: np.ndarray, key: Array, report) -> bool:
-    """Determine whether loudness as a feature improves a linear discriminant by more than one standard deviation.
+    """Determine whether loudness as a feature increases the number of clips that a linear discriminant classifies
+    correctly, by more than one standard deviation.
 
     If no clip can be held out, loudness is used if there are several microphones, which share one gain.
     """

@@ -209,9 +209,9 @@ def train_network(
 ) -> TrainingResult:
     """Train a network on images with the classes `labels`, until its loss on held-out images no longer decreases.
 
-    `held_out`: the held-out images and their classes; `plan`: training schedule, as from `library_plan`; `noise`:
-    standard deviation of the noise added to images; `checkpoint` and `progress`: as for `jeit.touch.fit_network`.
-    Raises the errors of that function. The same `key` gives identical results.
+    `held_out`: the held-out images and their classes; `plan`: training schedule, as returned by `library_plan`;
+    `noise`: standard deviation of the noise added to images; `checkpoint` and `progress`: as for
+    `jeit.touch.fit_network`. Raises the errors of that function. The same `key` gives identical results.
     """
     draw_key, training_key = jax.random.split(key)
     network = ModalityNetwork.draw(draw_key, images.shape[1], images.shape[2], classes)

@@ -84,7 +84,7 @@ def sound_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
 
     **Arguments:**
 
-    - `images`: feature images of the windows, as from `sound_images`.
+    - `images`: feature images of the windows, as returned by `sound_images`.
 
     **Example:**
 

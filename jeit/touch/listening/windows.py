@@ -1,6 +1,6 @@
 """Windows of labelled clips of sound, and cross-validation folds of groups of clips.
 
-A long recording, such as of many taps one after the other, is cut into pieces where it is quiet; each piece counts as a
+A long recording, for example of many successive taps, is cut into pieces at its quiet parts; each piece counts as a
 clip.
 """
 

@@ -56,8 +56,8 @@ class Convolution(Module):
     def apply_to_repeated(self, image: Float[Array, "b r c i"]) -> Float[Array, "b s d o"]:
         """Compute the convolution of the enlarged image `repeat_pixels(image)` with four ninths of the multiplications.
 
-        Of the three rows of the enlarged image that contribute to a pixel, two are equal, so the weights of both rows
-        are added before the multiplication; likewise for columns.
+        Of the three rows of the enlarged image that contribute to a pixel, two are equal, so the weights of these two
+        rows are added before the multiplication. Columns are treated in the same way.
         """
         num_images, rows, columns, _ = image.shape
         row_weights = jnp.stack([self.weight.at[1].add(self.weight[2])[:2], self.weight.at[1].add(self.weight[0])[1:]])

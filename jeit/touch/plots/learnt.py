@@ -121,7 +121,7 @@ def plot_depth_map(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a map of indentation depth, such as from `ImageNetwork.depth`.
+    """Draw a map of indentation depth, such as the result of `ImageNetwork.depth`.
 
     **Arguments:**
 

@@ -133,8 +133,8 @@ def fit_network(
     - `progress`: function that is called with a description of the progress after every evaluation of the held-out
       rows.
 
-    Raises `ValueError` for arguments that do not fit together, a checkpoint of another training, and losses of held-out
-    rows that are not finite from the first evaluation on; `ImportError` without the extra `learn`.
+    Raises `ValueError` for arguments that are inconsistent, a checkpoint of a different training, and losses of
+    held-out rows that are not finite from the first evaluation on; `ImportError` without the extra `learn`.
 
     **Example:**
 

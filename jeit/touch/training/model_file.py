@@ -64,8 +64,8 @@ def read_model(
     `make`: function that returns a model of the architecture that a head describes; only the shapes of the model's
     arrays are evaluated, so that no head can cause large use of memory. Nothing in the file is executed: before an
     array is read, its shape and dtype must be those of the architecture. Raises `FileNotFoundError` if the file does
-    not exist, and `ValueError` if the file is of another kind or version, is cut short or too long, or has arrays of
-    another architecture.
+    not exist, and `ValueError` if the file is of another kind or version, is cut short or too long, or has arrays of a
+    different architecture.
     """
     with _open_file(Path(path), kind) as file:
         head = _read_header(file, kind, version)
@@ -223,7 +223,7 @@ class Checkpoint:
     def read(self, initial_state: State) -> State:
         """Read the state of the training; without a file, return `initial_state`, the state before the first batch.
 
-        Raises `ValueError`, which states the first difference, if the file is of another training.
+        Raises `ValueError`, which states the first difference, if the file belongs to a different training.
         """
         if not self.path.exists():
             return initial_state
