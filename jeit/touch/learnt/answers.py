@@ -108,7 +108,7 @@ def _assign_by_class(rank: np.ndarray, kinds: np.ndarray, num_folds: int) -> Int
 
 
 def _training_sets_cover(fold: np.ndarray, positions: np.ndarray | None, kinds: np.ndarray | None) -> bool:
-    """Whether each fold's training set contains the classes of its held-out presses, or presses near them."""
+    """Whether each fold's training set contains the classes of the held-out presses, or places near theirs."""
     if kinds is not None and kinds.ndim == 2:
         return all(_training_sets_cover(fold, None, column) for column in kinds.T)
     if kinds is not None:
@@ -120,8 +120,8 @@ def _training_sets_cover(fold: np.ndarray, positions: np.ndarray | None, kinds: 
 
 
 def _largest_distance(positions: np.ndarray, fold: np.ndarray) -> float:
-    """Compute the mean distance of the presses of a fold from the nearest press of another fold; returns the maximum
-    over the folds."""
+    """Compute, for each fold, the mean distance of its presses from the nearest press of the other folds; returns the
+    maximum over the folds."""
     unit = positions.std(axis=0).max() or 1.0
     return max(
         KDTree(positions[fold != fold_index]).query(positions[fold == fold_index])[0].mean() + 1e-3 * unit
@@ -146,7 +146,7 @@ METHODS = tuple(dict.fromkeys((*number_methods.METHODS, *label_methods.METHODS))
 
 @dataclass(frozen=True)
 class Standing:
-    """Accuracy with which a quantity of presses was learnt, in the unit of the quantity.
+    """Accuracy of a learnt model of one quantity on held-out presses, in the unit of the quantity.
 
     **Fields**
 

@@ -9,7 +9,7 @@ presses. The reading of a dead channel is predicted from the covariance of all c
 the patterns omit: for example, reciprocal channels have the same reading.
 
 The novelty of a frame includes its distance from the nearest press of the training set: the frame of two simultaneous
-touches, or of a touch of the opposite sign, consists of the same patterns as the recorded presses, but is unlike each
+touches, or of a touch of the opposite sign, consists of the same patterns as the recorded presses, but is unlike every
 press.
 """
 

@@ -329,8 +329,8 @@ class Forms:
     def available(
         cls, answers: Float[np.ndarray, "N d"], imaged: ImageReconstruction | None, *, has_reference: bool
     ) -> "Forms":
-        """Return the forms of features that can be computed with or without reference voltages, repeated targets and
-        images."""
+        """Return the forms of features that the data allow: reference voltages, if `has_reference`, repeated targets in
+        `answers`, and images."""
         makers: dict[str, Maker] = {"whitened": WhitenedChanges.learn} if are_repeated(answers) else {}
         if imaged is not None:
             makers |= {"contacts": lambda changes, answers: ContactFeatures(imaged)}

@@ -314,8 +314,8 @@ _CHANNEL_METHODS = {"discriminant": _fit_discriminant, "trees": _fit_trees}
 
 
 def _select_features(values: np.ndarray, is_pressed: np.ndarray) -> np.ndarray:
-    """Select the features whose means differ most between pressed and released, relative to the spread within each
-    class."""
+    """Select the features whose means differ most between presses with and without the key, relative to the spread
+    within each class."""
     pressed_values, released_values = values[is_pressed == 1], values[is_pressed == 0]
     deviation = np.sqrt(
         (pressed_values.var(axis=0) * len(pressed_values) + released_values.var(axis=0) * len(released_values))

@@ -148,7 +148,7 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class LearntNumbers:
-    """The average of several regressors of places or forces, with standard deviations of the predictions.
+    """The average of one or several regressors of places or forces, with standard deviations of the predictions.
 
     `members`: pairs of features and a regressor of standardised targets; a prediction is `mean` + `scale` × the average
     of the members' predictions. `spread`: model of the standard deviations of predictions.

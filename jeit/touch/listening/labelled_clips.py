@@ -36,7 +36,7 @@ class _RecordingFiles(Sequence):
 
 @dataclass(frozen=True)
 class LabelledClips:
-    """Clips of sound with the classes to which they belong, created by `LabelledClips.from_recordings`.
+    """Clips of sound, each with its class, created by `LabelledClips.from_recordings`.
 
     **Fields**
 

@@ -118,7 +118,7 @@ class NetworkLearner:
 
     @staticmethod
     def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of those in a file with the header `head`."""
+        """Create arrays with the shapes of the arrays in a file with the header `head`."""
         return ModalityNetwork.draw(jax.random.key(0), rows, 41, classes)
 
     @staticmethod
@@ -167,7 +167,7 @@ class TreesListener:
 
     @staticmethod
     def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of those in a file with the header `head`."""
+        """Create arrays with the shapes of the arrays in a file with the header `head`."""
         node_shape = (int(head["trees"]), int(head["nodes"]))
         shapes = [(node_shape, np.int32)] * 3 + [
             (node_shape, np.float32),
@@ -231,7 +231,8 @@ class LinearLearner:
     features: Callable[[SoundImages], Float[np.ndarray, "W k"]]
 
     def learn(self, training_set: TrainingSet) -> LinearListener:
-        """Fit the discriminant to a training set; all classes have the same prior probability, however many windows."""
+        """Fit the discriminant to a training set; all classes have the same prior probability, whatever their numbers
+        of windows."""
         features = self.features(training_set.images)
         mean, deviation = features.mean(axis=0), features.std(axis=0)
         # Features that are constant except for rounding errors carry no information, and would make the covariance
@@ -248,7 +249,7 @@ class LinearLearner:
         return LinearListener(self.features, mean, deviation, weights, offset)
 
     def stored_shapes(self, head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of those in a file with the header `head`."""
+        """Create arrays with the shapes of the arrays in a file with the header `head`."""
         num_inputs = self.features(_NO_WINDOWS).shape[1]
         return [
             jax.numpy.zeros(shape, np.float32)

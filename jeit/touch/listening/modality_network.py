@@ -129,7 +129,7 @@ def _max_pool(values, pool_size: int, namespace):
 
 
 class NetworkAnswers:
-    """A trained network that is evaluated in NumPy: a few milliseconds for one window, without compilation."""
+    """A trained network that is evaluated in NumPy, without compilation, in a few milliseconds for one window."""
 
     def __init__(self, network: ModalityNetwork):
         host_network = jax.tree.map(np.asarray, network)
@@ -172,7 +172,7 @@ def paper_plan(windows: int, *, batches: int, batch: int = 64) -> TrainingPlan:
 
     Training has at most `batches` batches of `batch` windows, but at least one pass through the windows. Noise is drawn
     anew in every batch, so that no image is repeated; `NUM_COPIES` passes through the windows correspond to one epoch
-    of noisy copies.
+    of the paper, which contains as many noisy copies.
     """
     batch_size = min(batch, windows)
     return TrainingPlan(

@@ -69,7 +69,7 @@ _MAX_PIECES, _MAX_PIECE_GROUPS = 60, 6
 
 @dataclass(frozen=True)
 class Windows:
-    """W windows of sound of a training set, and the clips to which they belong.
+    """W sound windows of a training set, and the clips to which the windows belong.
 
     `images`: feature images of the windows; `clip` (W,): index of the clip, or piece of a longer clip, of each window;
     `labels` (W,): class of each window, an index of `names`; `names`: names of the classes; `clip_labels`,
@@ -86,7 +86,7 @@ class Windows:
 
     @classmethod
     def from_clips(cls, clips: LabelledClips, report: Callable[[str], None]) -> "Windows":
-        """Select the loud windows of each clip, at most 20 dB below its loudest frame.
+        """Select the windows of each clip that are at most 20 dB below its loudest frame.
 
         Raises `ValueError` for clips without finite samples.
         """

@@ -55,7 +55,8 @@ class SimulatedTouches(Protocol):
     """
 
     def rows(self, *names: str) -> Rows:
-        """Return the float32 arrays "change" or "depth" in the order of `names`; the array itself for one name."""
+        """Return the float32 arrays "change" or "depth" in the order of `names`; for a single name, the array
+        itself."""
         ...
 
 
@@ -176,7 +177,8 @@ class TrainingRuns(NamedTuple):
 def train_three_stages(
     training: SimulatedTouches, validation: TouchExamples, noise: float, runs: TrainingRuns
 ) -> TrainedNetwork:
-    """Train the design of Park et al. 2022: autoencoders of voltage changes and depth maps, a projection between them.
+    """Train the design of Park et al. 2022: autoencoders of voltage changes and of depth maps, and a projection between
+    their codes.
 
     Both autoencoders are fixed while the projection is trained. `noise`: standard deviation of the noise of relative
     voltage changes.

@@ -90,7 +90,7 @@ class Chain(Module):
 
     @classmethod
     def dense(cls, widths: Sequence[int], *, key: Array, dropout: float = 0.0) -> "Chain":
-        """Create dense layers in sequence, from each number of values in `widths` to the next."""
+        """Create dense layers in sequence, whose numbers of inputs and outputs are successive elements of `widths`."""
         keys = jax.random.split(key, len(widths) - 1)
         return cls(
             tuple(Dense(i, o, key=layer_key) for (i, o), layer_key in zip(pairwise(widths), keys, strict=True)), dropout

@@ -140,7 +140,7 @@ class Unrolled(Module):
 
     def covariance(self, pixel_positions: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "M M"]:
         """Compute the covariance (channels, channels) of the relative voltage changes due to touches that are
-        distributed as the prior; `pixel_positions` (rows, columns, 2): positions of the pixels, metres."""
+        distributed according to the prior; `pixel_positions` (rows, columns, 2): positions of the pixels, metres."""
         rows, columns = self.shape[0] // 2, self.shape[1] // 2
         operator = np.asarray(self.operator, float).reshape(-1, rows, 2, columns, 2).sum(axis=(2, 4))
         operator = operator.reshape(len(operator), -1)

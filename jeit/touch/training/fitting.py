@@ -229,7 +229,7 @@ class _CompiledTraining:
         self.optimiser = adam.init(eqx.filter(eqx.partition(network, trained)[0], eqx.is_inexact_array))
 
     def combine(self, arrays) -> Any:
-        """Return the network with its fixed parts and the given arrays."""
+        """Combine the given arrays with the fixed parts of the network."""
         return eqx.combine(arrays, self.fixed)
 
     def initial_state(self) -> State:

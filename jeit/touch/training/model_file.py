@@ -22,8 +22,8 @@ _MAGIC, _MAX_HEADER_SIZE, _MAX_ARRAY_SIZE = b"jeit model\n", 2**20, 2**31
 
 
 def write_model(path: str | Path, kind: str, version: int, head: dict[str, Any], model: Any) -> None:
-    """Write the arrays of a `model`, any tree of arrays, to a file; an earlier file is replaced only when all is
-    written.
+    """Write the arrays of a `model`, any tree of arrays, to a file; an earlier file is replaced only when the new file
+    is complete.
 
     `kind` and `version`: type of the file, such as "a jeit network of images", which `read_model` checks; `head`: all
     other data that are needed to create the model again and to know the model's purpose, as JSON values. Raises
@@ -89,7 +89,7 @@ def read_model(
 
 
 def check_same(path: str | Path, made_for: dict[str, Any], expected: dict[str, Any]) -> None:
-    """Check that a model is used for what the model was trained for, such as the same skin and protocol.
+    """Check that a model is used under the conditions of its training, such as for the same skin and protocol.
 
     `made_for`, `expected`: descriptions of the skin and protocol in training and in use, as dictionaries of JSON
     values, in which numbers may differ by a millionth. Raises `ValueError`, which states the first difference.
@@ -216,7 +216,7 @@ class Checkpoint:
         self.path, self.fingerprint = Path(path), fingerprint
 
     def write(self, state: State) -> None:
-        """Write the state of the training; an earlier file is replaced only when all is written."""
+        """Write the state of the training; an earlier file is replaced only when the new file is complete."""
         head = {"training": self.fingerprint, "step": state.step, "course": list(state.course)}
         write_model(self.path, _CHECKPOINT_KIND, _CHECKPOINT_VERSION, head, state[2:])
 
