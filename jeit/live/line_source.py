@@ -1,5 +1,5 @@
-"""Sources of frames from lines that arrive on a connection (standard input, a serial device, or a TCP server), which is
-made again if it is lost; and another source that is read ahead in a separate thread."""
+"""Source of the frames in lines that arrive on a connection (standard input, a serial device, or a TCP server), which
+is opened again after a loss; and a source that reads another source ahead in a separate thread."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ class LineSource(AbstractSource):
 
     A line that is not a frame is delivered as text, which views refuse. Incomplete lines are also delivered as text: a
     line that the loss of the connection cut off, and a line that the device began before the connection was made.
-    `rate`: maximum number of frames/s, for lines that have all arrived already.
+    `rate`: maximum frame rate, frames/s, at which lines that have all arrived already are delivered.
     """
 
     def __init__(self, name: str, connection: AbstractConnection, reading: LineReading, rate: float | None = None):
@@ -329,7 +329,7 @@ class ReadAhead(AbstractSource):
                 report_loss()
                 num_lost = 0
                 self._queue.put(frame)
-        except Exception as error:  # raised where the frames are read
+        except Exception as error:  # raised again in the thread that iterates over the frames
             self._queue.put(error)
         report_loss()
         self._queue.put(None)

@@ -1,5 +1,5 @@
-"""Conversion of the bytes that a device sends to lines, and of the numbers in a line to volts, as in the readers of
-files."""
+"""Conversion of the bytes that a device sends to lines, and of the numbers in a line to the volts that a reader of
+files would return."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LINE_ENDS = re.compile(rb"[\r\n]")
 # Some OpenEIT devices send no line ends, so a frame begins at the word "magnitudes".
 _FRAME_WORD = re.compile(rb"magnitudes\s{0,40}:", re.IGNORECASE)
 _COMMENTS = ("#", "%", "//")
-# Maximum number of characters that are kept of a line that is not a frame.
+# Maximum number of characters that are stored of a line that is not a frame.
 _MAX_TEXT_LENGTH = 400
 # Maximum relative difference from the reference for which a number is considered complete, and for which a frame is
 # used to determine the factors from numbers to volts; maximum number of frames from which the factors are determined.
@@ -216,6 +216,6 @@ def _num_channels(loaded_description: Description | None, reference: Measurement
         return None
     try:
         protocol = loaded_description.protocol("line.txt")
-    except ValueError:  # for example, a current that only the name of a file states
+    except ValueError:  # for example, if only the name of a file states the current
         return None
     return None if protocol is None else protocol.num_measurements

@@ -37,7 +37,7 @@ class LiveFrame:
 
 @dataclass(frozen=True)
 class Marker:
-    """A position that a view estimates, such as that of a contact, a touch or a sound.
+    """A position that a view estimates, for example of a contact, a touch or a sound.
 
     **Fields**: `x`, `y`: metres; `label`: text beside the marker, such as "2.1 N" or "stroke 93 %"; `radius`: radius of
     the region that contains the position with a probability of 68 %, metres, NaN if unknown; `track`: number of the
@@ -135,5 +135,5 @@ class AbstractView(abc.ABC):
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
         """Take the mean of `frames` (frames, channels) of the undisturbed sensor, in volts, as the new reference.
 
-        Raises `ValueError` for frames that cannot be a reference; the old reference is then kept.
+        Raises `ValueError` for frames that cannot be a reference; the view then continues with the old reference.
         """

@@ -25,8 +25,8 @@ from jeit.live.views.conductivity import ConductivityView
 _NETWORK_FILE, _SKIN_FILE, _GESTURES_FILE = "network.jeit", "skin.skops", "gestures.skops"
 # Minimum and maximum number of frames of the undisturbed sensor from which a reference is computed.
 _MIN_FRAMES, _MAX_FRAMES = 3, 10_000
-# Period in seconds with which the connection of a source is checked; time in seconds within which lines arrive that
-# were sent before they could be read.
+# Period in seconds with which the connection of a source is checked; time in seconds, from the arrival of the first
+# frame, in which frames are attributed to lines that were sent before the program could read them.
 _POLL_PERIOD, _BURST_TIME = 0.3, 0.05
 
 
@@ -79,12 +79,14 @@ def prepare(
     - `calibration`: file written by `jeit calibrate-microphones`. The view shows loss maps and positions of sounds
       (`SoundView`).
     - `contacts`: whether to find the contacts in the change of conductivity (`ContactsView`).
-    - `settings`: how changes of conductivity are imaged.
+    - `settings`: settings of the reconstruction of conductivity changes.
     - `rate`: frames/s of a recording, or of the frames from which gestures are classified.
-    - `untouched`: time from the beginning, in seconds, whose frames are the reference if no `reference` is given.
-    - `progress`: called with the name of each step when it begins.
+    - `untouched`: duration of the initial interval, in seconds, whose frames are the reference if no `reference` is
+      given.
+    - `progress`: function that is called with the name of each step when the step begins.
 
-    Raises `ValueError` if an argument is missing or does not match the other arguments, and if a view or reader does.
+    Raises `ValueError` if an argument is missing or does not match the other arguments, and if a view or a reader of
+    files raises it.
 
     **Example:**
 
@@ -127,7 +129,8 @@ def prepare(
 
 @contextmanager
 def _closed_on_failure(source: AbstractSource) -> Iterator[None]:
-    """Context that closes a source, which may be read by a thread of its own, if an error is raised in the context."""
+    """Context that closes a source, and so ends a thread that reads the source, if an error is raised in the
+    context."""
     try:
         yield
     except BaseException:
@@ -145,10 +148,10 @@ def first_frames(
     """Read the frames of the first `seconds` of a source; return these frames and a source of the frames that follow.
 
     Lines that were sent before the program could read them arrive all at once. The number of returned frames is
-    therefore `seconds` times the frame rate: `rate`, in frames/s, or else the rate of the frames that arrive one after
-    the other. Frames that are not numbers, or whose length differs from that of most frames, are left out. The returned
-    source plays a recording from its beginning. `report` is called with the name of the task, and with the reason of
-    any wait for the device. Raises `ValueError` if fewer than three frames remain.
+    therefore `seconds` times the frame rate: `rate`, in frames/s, or else the rate of the frames that arrive later, one
+    by one. Frames that are not numbers, or whose length differs from that of most frames, are left out. If the source
+    is a recording, the returned source plays the recording from its beginning. `report` is called with the name of the
+    task, and with the reason of any wait for the device. Raises `ValueError` if fewer than three frames remain.
     """
     if isinstance(source, PlayedRecording):
         return _frames_of_usual_length(list(source.frames[source.seconds <= seconds]), seconds), source
@@ -232,7 +235,7 @@ def _frames_of_usual_length(rows: list[np.ndarray], seconds: float) -> Float[np.
 
 
 class _ContinuedSource(AbstractSource):
-    """A source of which some frames have been read already. `remaining`: iterator over the frames that follow."""
+    """A source whose first frames have already been read. `remaining`: iterator over the frames that follow."""
 
     def __init__(self, source: AbstractSource, remaining: Iterator[LiveFrame]):
         self._source, self._remaining = source, remaining

@@ -16,15 +16,15 @@ from jeit.live.pictures import LiveFrame
 
 # Number of latest frames from which the quality is computed, and minimum number of frames.
 _NUM_FRAMES, _MIN_FRAMES = 32, 8
-# Number of successive medians over the latest frames that are kept to detect drift.
+# Number of successive medians over the latest frames that are stored to detect drift.
 _NUM_MEDIANS = 40
-# A reading is lost if it is missing, or if its relative difference from the reference exceeds the first number. An
+# A reading is lost if it is missing, or if its relative difference from the reference exceeds `_LOST_DIFFERENCE`. An
 # electrode is dead if at least the fraction `_DEAD_SHARE` of its readings is lost, not counting readings on other dead
-# electrodes. An electrode drifts if the median relative difference of its readings exceeds the third number, and also
-# the fourth number times the median difference of all other readings.
+# electrodes. An electrode drifts if the median relative difference of its readings exceeds `_DRIFT_DIFFERENCE`, and
+# also `_DRIFT_RATIO` times the median difference of all other readings.
 _LOST_DIFFERENCE, _DEAD_SHARE, _DRIFT_DIFFERENCE, _DRIFT_RATIO = 0.5, 0.7, 0.05, 3.0
-# The frames of a reference are divided into parts, whose means are compared: number of parts, minimum number of frames
-# of a part, and ratio of the deviation of the means to the deviation expected from noise above which the sensor is
+# The frames of a reference are divided into parts, whose means are compared. Number of parts; minimum number of frames
+# of a part; ratio of the deviation of the means to the deviation expected from noise, above which the sensor is
 # considered disturbed.
 _NUM_PARTS, _MIN_PART_FRAMES, _DISTURBANCE_RATIO = 4, 2, 4.0
 # Factor by which the frame rate must change for a report, and number of successive calls for which the change must
@@ -48,8 +48,8 @@ class Quality:
 def change_during(frames: Float[np.ndarray, "N M"]) -> float | None:
     """Relative change of a sensor during `frames` (frames, channels): the largest norm of the difference between the
     mean of a quarter of the frames and the mean of all frames, divided by the norm of the mean of all frames. None for
-    fewer than eight frames, and if the change is explained by noise, which is estimated from successive frames, or is
-    not larger than the noise of a single frame."""
+    fewer than eight frames, for a change that noise explains, and for a change no larger than the noise of a single
+    frame. The noise is estimated from successive frames."""
     frames = np.asarray(frames, float)[:, np.isfinite(frames).all(axis=0)]
     if len(frames) < _NUM_PARTS * _MIN_PART_FRAMES or not frames.size:
         return None
@@ -92,7 +92,7 @@ class QualityWatch:
             self._medians.clear()
 
     def add(self, frame: LiveFrame) -> None:
-        """Add a frame to the latest frames. Text, and frames with another number of channels, are left out."""
+        """Add a frame to the latest frames. Text, and frames with a different number of channels, are left out."""
         values = frame.values
         if isinstance(values, str) or values.ndim != 1 or values.dtype.kind not in "iuf":
             return
@@ -179,7 +179,7 @@ def _find_dead(
     is_lost: Bool[np.ndarray, " M"], is_readable: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
 ) -> list[int]:
     """Find the electrodes most of whose readings are lost. The electrode with the largest fraction of lost readings is
-    found first; its channels are left out in the search for the next dead electrode."""
+    detected first; its channels are left out in the search for the next dead electrode."""
     dead_electrodes: list[int] = []
     is_remaining = is_readable.copy()
     while is_remaining.any():
@@ -199,7 +199,7 @@ def _find_dead(
 def _find_drifting(
     drift: Float[np.ndarray, " M"], has_drift_data: Bool[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
 ) -> list[int]:
-    """Find the electrodes whose readings have changed for a long time, and much more than the readings of other
+    """Find the electrodes whose readings have a large `drift`, much larger than that of the readings of other
     electrodes."""
     drifting_electrodes: list[int] = []
     is_remaining = has_drift_data.copy()

@@ -31,11 +31,11 @@ REFERENCE, DESCRIPTION = "reference.npz", "description.toml"
 # Maximum memory in bytes of frames that wait for a slow or full disk. Times in seconds: between attempts to write to a
 # full disk, between synchronisations of the files with the disk, and maximum duration of ending a recording.
 _MAX_WAITING_BYTES, _RETRY_PERIOD, _SYNC_PERIOD, _END_TIMEOUT = 64_000_000, 1.0, 2.0, 10.0
-# Maximum size in bytes of a file of frames. Readers need memory of eight times the file size, which is limited to a
-# gigabyte.
+# Maximum size in bytes of a file of frames. Readers need memory of eight times the file size, which this limit keeps
+# below a gigabyte.
 _MAX_FILE_SIZE = 100_000_000
-# Prefix of the names of files of frames; number of successive frames with another number of channels after which a new
-# file is begun.
+# Prefix of the names of files of frames; number of successive frames with a different number of channels after which a
+# new file is begun.
 _FRAMES_PREFIX, _NUM_OTHER_LENGTHS = "frames", 3
 _BINARY = getattr(os, "O_BINARY", 0)  # prevents Windows from changing line ends
 
@@ -134,7 +134,7 @@ class Recorder:
 
     def _has_usual_length(self, values: np.ndarray) -> bool:
         """Whether a frame has as many channels as the other recorded frames. If the number of channels of the sensor is
-        unknown, a new file is begun after three successive frames with another number of channels."""
+        unknown, a new file is begun after three successive frames with a different number of channels."""
         if values.dtype.kind not in "iuf":
             return False
         if self._frame_length is None:

@@ -22,17 +22,17 @@ from jeit.live.sources import ENDED, MAX_MESSAGES, AbstractSource
 
 # Maximum time in seconds for which frames wait to be imaged. Older frames are not imaged.
 _MAX_WAIT = 0.05
-# Maximum memory in bytes of the pictures that are kept; maximum number of waiting frames; maximum number of different
-# reasons of refused frames that are counted.
+# Maximum memory in bytes of the stored results; maximum number of waiting frames; maximum number of different reasons
+# for refusing frames that are counted separately.
 _MAX_BYTES, _MAX_WAITING, _MAX_REASONS = 128_000_000, 256, 30
 _NUMBER_PATTERN = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 # Number of frames over which the latency is computed; time in seconds over which the frame rate is measured; period in
 # seconds with which the quality of the frames is computed.
 _NUM_LATENCIES, _RATE_SPAN, _QUALITY_PERIOD = 600, 2.0, 0.5
-# Number of successive frames with another number of channels after which the change is reported; maximum number of
+# Number of successive frames with a different number of channels after which the change is reported; maximum number of
 # frames of a reference.
 _NUM_OTHER_LENGTHS, _MAX_REFERENCE_FRAMES = 3, 10_000
-# Maximum length of the name of an event; time in seconds for which the events of skipped frames are kept for a busy
+# Maximum length of the name of an event; time in seconds for which the events of skipped frames are stored for a busy
 # program.
 _MAX_LABEL_LENGTH, _EVENT_HISTORY = 200, 30.0
 
@@ -60,15 +60,15 @@ class Result:
 class Session:
     """Live session: records the frames of a source and images them by a view, until the source ends or `stop`.
 
-    One thread reads the frames, and another thread images them. If imaging is slower than the source, frames are not
-    imaged, but always recorded. Use the session as a context manager, or call `start` and `stop`.
+    One thread reads the frames, and another thread images them. If imaging is slower than the source, some frames are
+    not imaged, but all are recorded. Use the session as a context manager, or call `start` and `stop`.
 
     **Arguments:**
 
     - `source`: source of the frames.
     - `view`: view that computes a picture from each frame.
     - `recorder`: recorder that records the frames after `record(True)` is called.
-    - `history`: time in seconds for which results are kept, with at most 128 MB of memory.
+    - `history`: time in seconds for which results are stored, in at most 128 MB of memory.
     - `reference`: a measurement of the undisturbed sensor, with which frames are compared to assess their quality; by
       default the reference of the recorder.
 
@@ -168,7 +168,7 @@ class Session:
             return self._results[-1]
 
     def result(self, number: int) -> Result | None:
-        """Return the last kept result whose frame number is at most `number`; None if there is no such result."""
+        """Return the last stored result whose frame number is at most `number`; None if there is no such result."""
         with self._changed:
             for result in reversed(self._results):
                 if result.frame.number <= number:
@@ -176,7 +176,7 @@ class Session:
         return None
 
     def with_events(self, result: Result, after: int) -> Result:
-        """Add to `result` the events of earlier kept results whose frame number is above `after`."""
+        """Add to `result` the events of earlier stored results whose frame number is above `after`."""
         with self._changed:
             skipped_results = [
                 skipped_result
@@ -319,7 +319,7 @@ class Session:
                 self.say(sentence)
 
     def _collect_reference_frame(self, frame: LiveFrame) -> None:
-        """Keep a frame for the new reference, if a new reference was requested."""
+        """Store a frame for the new reference if a new reference was requested."""
         if not self._num_requested or isinstance(frame.values, str):
             return
         if self._num_channels is not None and frame.values.shape != (self._num_channels,):

@@ -147,7 +147,7 @@ def simulated_tank(rate: float = 60.0, *, limit: int | None = None, seed: int = 
 
 def simulated_skin(rate: float = 60.0, *, limit: int | None = None, seed: int = 0) -> SimulatedSensor:
     """Create a simulated round skin of diameter 100 mm (`jeit.data.RoundSkin`), over which a finger strokes 60 mm every
-    1.2 s, each time in another direction.
+    1.2 s, each time in a different direction.
 
     **Arguments:**
 

@@ -1,5 +1,5 @@
-"""Sources of frames: the base class, recordings, files that an instrument writes into a folder, and opening of a source
-by a text such as `serial:/dev/ttyACM0@115200`."""
+"""Sources of frames: the base class, recordings, files that an instrument writes into a folder, and a function that
+opens the source named by a text such as `serial:/dev/ttyACM0@115200`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from jeit.imaging.stream_preparation import frames_of
 from jeit.live.pictures import LiveFrame
 
 ENDED, CONNECTED = "ended", "connected"
-# Maximum number of messages that are kept, and maximum number of characters of a message.
+# Maximum number of stored messages, and maximum number of characters of a message.
 MAX_MESSAGES, _MAX_MESSAGE_LENGTH = 50, 300
 # Frame rate of a recording without times, in frames/s.
 _DEFAULT_RATE = 10.0
@@ -31,7 +31,7 @@ _MIN_PAUSE, _PAUSE_FACTOR, _READ_TIMEOUT = 0.02, 4.0, 2.0
 
 
 class AbstractSource(abc.ABC):
-    """Base class of sources of frames. A source is iterated once, by one thread; `close` may be called by any thread.
+    """Base class of sources of frames. One thread iterates over a source, once; any thread may call `close`.
 
     **Arguments:**
 
@@ -117,8 +117,8 @@ class WatchedFolder(AbstractSource):
     left out, unless a `rate` in frames/s is given.
 
     A file is read when its size is the same in two successive listings of the folder. `description`, `reference`: as
-    `description` and `like` of `jeit.data.read`. A file that cannot be read becomes a frame that holds the
-    error message in place of values; views refuse such frames.
+    `description` and `like` of `jeit.data.read`. For a file that cannot be read, the source yields a frame with the
+    error message instead of values, which views refuse.
     """
 
     def __init__(

@@ -140,7 +140,7 @@ def live(
     _check_folder(output)
     with Steps(console, quiet=quiet) as step, naming_options(_ARGUMENT_OPTIONS):
         step("read")
-        # The reference of a model is a file of plain frames, as `jeit touch predict` reads it.
+        # With a model, the reference is a file of frames without a protocol, as `jeit touch predict` reads it.
         reference_input = reference
         if reference is not None and model is None:
             reference_input = read_file("--reference", reference, format, description, key=reference_key)

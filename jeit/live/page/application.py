@@ -36,7 +36,7 @@ from jeit.live.page.wire import (
 )
 
 _TOKEN_PATHS = ("/", "/socket")
-"""Paths that require the token. The other files are the same in every installation."""
+"""Paths that require the token. The other files need no protection, since they are the same in every installation."""
 
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -84,8 +84,8 @@ def host_allowed(header: str, listening: str) -> bool:
     """Whether the host that a request names in its `header` is a name or address of the server at `listening`.
 
     The domain name of another site can resolve to this machine, and the scripts of that site then reach this server
-    under this domain name (DNS rebinding). The domain name is neither an address nor the name of this machine, so the
-    request is refused. Any port is allowed, so that a tunnel works.
+    under this domain name (DNS rebinding). Such a domain name is neither an address nor the name of this machine, so
+    the request is refused. Any port is allowed, so that a tunnel works.
     """
     name = _host_name(header)
     if is_loopback(name) or name == listening.lower():
@@ -97,7 +97,8 @@ def host_allowed(header: str, listening: str) -> bool:
 
 
 class Guard:
-    """Middleware that refuses requests for another host, WebSockets from another origin, and pages without the token.
+    """Middleware that refuses requests for another host, WebSockets from another origin, and requests without the
+    token.
 
     `host`: address that the server listens on. `token`: value of `?token=…` that the address must contain, or None.
     """

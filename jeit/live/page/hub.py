@@ -1,5 +1,5 @@
-"""Distribution of the pictures of a live session to open pages. Each page receives the newest picture, as fast as the
-page draws."""
+"""Distribution of the pictures of a live session to open pages. Each page receives the newest picture, as often as the
+page can draw."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ class Viewer:
         return self.following and number > self._last_sent and len(self._in_flight) < _MAX_IN_FLIGHT
 
     def note_sent(self, number: int, arrived: float) -> None:
-        """Record that the picture with the frame number `number`, which arrived at the time `arrived`, was sent to the
-        page."""
+        """Record that the picture with the frame number `number`, whose frame arrived at the time `arrived`, was sent
+        to the page."""
         self._last_sent = number
         self._in_flight.append((number, arrived))
 
     def note_drawn(self, number: int, *, hidden: bool) -> None:
-        """Record that the page has drawn the picture with the frame number `number`, and has skipped pictures that were
-        sent before."""
+        """Record that the page has drawn the picture with the frame number `number`; earlier pictures that were sent
+        and not reported as drawn were skipped."""
         now = time.monotonic()
         while self._in_flight and self._in_flight[0][0] <= number:
             sent_number, arrived = self._in_flight.popleft()
@@ -113,7 +113,8 @@ class Hub:
         self._thread.join(5.0)
 
     def newest(self) -> tuple[Result, bytes] | None:
-        """Return the newest picture and its message to pages as bytes, which is computed once for all pages."""
+        """Return the newest picture and the bytes of its message to pages; the message is computed once for all
+        pages."""
         result = self._newest
         if result is None:
             return None
@@ -154,8 +155,7 @@ class Hub:
                 self._closing.wait(0.1)
 
     def _wake_pages(self, *, state: bool = False) -> None:
-        """Wake the pages in the event loop. Several pictures that arrive before the pages are awake wake them only
-        once."""
+        """Wake the pages in the event loop, only once for several pictures that arrive before the pages are awake."""
         if self._loop is None or (self._is_woken and not state):
             return
         self._is_woken = True

@@ -27,8 +27,8 @@ from jeit.touch import (
 
 # Minimum number of frames of the reference from which the noise of images is estimated.
 _MIN_FRAMES = 10
-# Time in seconds by which a frame is delayed if it has the same time as the previous frame; time in seconds for which
-# the name of a gesture is shown on the image.
+# Minimum difference in seconds of the times of successive frames in tracking, since frames may have equal times; time
+# in seconds for which the name of a gesture is shown on the image.
 _MIN_TIME_STEP, _LABEL_TIME = 1e-6, 1.5
 
 Item = TypeVar("Item")
@@ -148,7 +148,7 @@ class GestureView(AbstractView):
     - `still`: frames (frames, channels) of the untouched skin, volts.
     - `rate`: frames/s; by default the frame rate of the training data.
     - `patience`: time in seconds after which a lasting touch becomes part of the reference.
-    - `progress`: called with the name of each step when it begins.
+    - `progress`: function that is called with the name of each step when the step begins.
 
     Raises `ValueError` if `jeit.touch.TouchImages.prepare` or `jeit.touch.TouchWatch.create` does.
 

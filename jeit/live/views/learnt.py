@@ -113,7 +113,7 @@ class DepthView(AbstractView):
     - `still`: frames (frames, channels) of the untouched skin, volts.
     - `title`: title of the page.
 
-    Raises `ValueError` if the number of channels differs from that of the network.
+    Raises `ValueError` if the number of channels of `still` differs from that of the network.
 
     **Example:**
 
@@ -161,7 +161,7 @@ class DepthView(AbstractView):
         """Take the mean of `frames` (frames, channels) as the new reference."""
         reference_frames = np.atleast_2d(np.asarray(frames, float))
         mean_reference = resting_frame(reference_frames)
-        self.network.changes(mean_reference, mean_reference)  # raises ValueError for another number of channels
+        self.network.changes(mean_reference, mean_reference)  # raises ValueError for a different number of channels
         self._estimate_depth: StepwiseGenerator[np.ndarray, FrameDepth] = StepwiseGenerator(
             lambda frame_iterator: stream_depths(self.network, frame_iterator, mean_reference)
         )

@@ -23,10 +23,10 @@ _LIKELIHOOD = "likelihood"
 class SoundView(AbstractView):
     """View of the loss map and the position of a touch, from frames with the intensity of each microphone.
 
-    Positions are estimated by `jeit.acoustic.locate` with fixed gains, because changes of gains are estimated from all
-    touches of a recording. With the method "likelihood", pixels are distances from the most likely position in standard
-    deviations, √(2 (loss − minimum loss)), where the loss is the negative log-likelihood; with "consistency", pixels
-    are the loss of Park et al. (2022).
+    Positions are estimated by `jeit.acoustic.locate` with fixed gains, because changes of gains can be estimated only
+    from all touches of a recording. With the method "likelihood", pixels are distances from the most likely position in
+    standard deviations, √(2 (loss − minimum loss)), where the loss is the negative log-likelihood; with "consistency",
+    pixels are the loss of Park et al. (2022).
 
     **Arguments:**
 
@@ -35,8 +35,8 @@ class SoundView(AbstractView):
     - `floor`: noise power (microphones,) that was subtracted from the intensities.
     - `freedom`: degrees of freedom of the noise power, as in `jeit.acoustic.Intensities`.
 
-    Raises `ValueError` for another method, for a `floor` with another number of microphones, and for fewer than three
-    usable microphones.
+    Raises `ValueError` for any other method, for a `floor` with a different number of microphones, and for fewer than
+    three usable microphones.
 
     **Example:**
 

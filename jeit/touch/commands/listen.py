@@ -18,7 +18,7 @@ _LOUDNESS_CHOICES = {"auto": None, "counts": True, "ignored": False}
 
 
 class _GroupNamedCommand(TyperCommand):
-    """Command that help texts and error messages call by the name of its group of commands: `jeit listen`."""
+    """Command whose name in help texts and error messages is that of its command group, `jeit listen`."""
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
         return super().make_context(parent.info_name, args, parent=parent.parent, **extra)

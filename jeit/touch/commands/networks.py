@@ -46,8 +46,8 @@ def image_by_network(
     the skin that the network was trained for, or of a measurement. A table with one frame in each row needs neither
     format nor description. `frame`: number of the frame to image, by default the first; if `streamed`, all frames are
     imaged. `unused_options`: values of command-line options that do not apply to networks, None if not given. Raises
-    `ValueError` if such an option was given, without a model or a reference, if `method` is not "network", for data of
-    another skin or protocol, and if no frame could be imaged.
+    `ValueError` if such an option was given, if there is no model or no reference, if `method` is not "network", for
+    data of another skin or protocol, and if no frame could be imaged.
     """
     import numpy as np
 
@@ -137,9 +137,9 @@ def _read_frame_file(
 ) -> _FrameFile:
     """Read all frames of a file, or only the frame with the number `frame`.
 
-    A table without a description has one frame in each row, with its channels in the order of the network; so has every
-    file if `is_table`. The units and columns of the table are those of the file `same_format_as`, if that file has a
-    description.
+    A table without a description, or any file if `is_table`, has one frame in each row, with its channels in the order
+    of the network. Its units and columns are those of the file `same_format_as` if that file has a description, unless
+    `is_table`.
     """
     import numpy as np
 

@@ -21,9 +21,9 @@ touch.command()(watch)
 touch.command()(health)
 
 
-# Number of nodes of the mesh for images; contacts are located more finely than the mesh's cells.
+# Number of nodes of the mesh for images. Contacts are located more precisely than the size of the mesh's cells.
 _NUM_NODES = 400
-# Frame rate of a recording without times, in frames/s.
+# Assumed frame rate of a recording without times, frames/s.
 _USUAL_RATE = 10.0
 # Maximum number of touches that are printed.
 _MOST_TOUCHES = 30

@@ -37,12 +37,12 @@ def time_folds(
     text.
 
     The presses, ordered by `time` or else as recorded, are cut into `num_folds` intervals of time, one for each fold.
-    If the training set of a fold would lack places (`positions`) or classes (`kinds`: one class for each press, or true
-    and false for each key), because places or classes were pressed one after the other, the presses are cut into more
-    and shorter intervals, which are assigned to the folds in turn. All presses of a `group` are in one fold; groups are
-    ordered by their mean time. Presses with the same frame are in one fold, and so are presses at the same place if
-    places of two or three coordinates are repeated: otherwise the training set would contain copies of held-out
-    presses.
+    The training set of a fold may lack places (`positions`) or classes (`kinds`: one class for each press, or true and
+    false for each key) if these were pressed one after the other. In this case, the presses are cut into more and
+    shorter intervals, which are assigned to the folds in turn. All presses of a `group` are in one fold; groups are
+    ordered by their mean time. Presses with equal frames are in one fold. If places of two or three coordinates are
+    repeated, presses at the same place are also in one fold. Otherwise, the training set would contain copies of
+    held-out presses.
     """
     num_presses = len(frames)
     order = np.arange(num_presses) if time is None else np.argsort(time, kind="stable")
@@ -86,8 +86,8 @@ def time_folds(
 
 
 def _assign_to_folds(unit: np.ndarray, rank: np.ndarray, num_folds: int, num_intervals: int) -> Int[np.ndarray, " N"]:
-    """Assign presses to folds: the presses in order of their `rank` in time are cut into `num_intervals` intervals,
-    which are assigned to the folds in turn; presses with the same `unit` are in one fold."""
+    """Assign presses to folds: `num_intervals` intervals of presses, in order of their `rank` in time, are assigned to
+    the folds in turn; presses with the same `unit` are in one fold."""
     sizes = np.bincount(unit)
     unit_order = np.argsort(np.bincount(unit, rank) / sizes, kind="stable")
     middle_ranks = np.cumsum(sizes[unit_order]) - sizes[unit_order] / 2
@@ -108,7 +108,7 @@ def _assign_by_class(rank: np.ndarray, kinds: np.ndarray, num_folds: int) -> Int
 
 
 def _training_sets_cover(fold: np.ndarray, positions: np.ndarray | None, kinds: np.ndarray | None) -> bool:
-    """Whether the training set of each fold contains the classes of its held-out presses, or places near theirs."""
+    """Whether each fold's training set contains the classes of the held-out presses, or places near theirs."""
     if kinds is not None and kinds.ndim == 2:
         return all(_training_sets_cover(fold, None, column) for column in kinds.T)
     if kinds is not None:
@@ -120,8 +120,8 @@ def _training_sets_cover(fold: np.ndarray, positions: np.ndarray | None, kinds: 
 
 
 def _largest_distance(positions: np.ndarray, fold: np.ndarray) -> float:
-    """Compute the mean distance of the presses of a fold from the nearest press of another fold; returns the maximum
-    over the folds."""
+    """Compute, for each fold, the mean distance of its presses from the nearest press of the other folds; returns the
+    maximum over the folds."""
     unit = positions.std(axis=0).max() or 1.0
     return max(
         KDTree(positions[fold != fold_index]).query(positions[fold == fold_index])[0].mean() + 1e-3 * unit
@@ -146,7 +146,7 @@ METHODS = tuple(dict.fromkeys((*number_methods.METHODS, *label_methods.METHODS))
 
 @dataclass(frozen=True)
 class Standing:
-    """Accuracy with which a quantity of presses was learnt, in the unit of the quantity.
+    """Accuracy of a learnt model of one quantity on held-out presses, in the unit of the quantity.
 
     **Fields**
 

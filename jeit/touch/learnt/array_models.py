@@ -27,8 +27,8 @@ class Forest:
     `feature` and `threshold` (trees, nodes): index of the feature that each node tests, and the threshold with which
     the feature is compared; `left` and `right` (trees, nodes): index of the next node if the feature is at most the
     threshold, and if it is greater; for leaves, the leaf's own index. `value` (trees, nodes, targets): values of the
-    leaves; a prediction is the sum of one leaf of each tree plus `start` (targets,). `depth`: maximum number of steps
-    to a leaf. `classes_`: for classifiers, the class of each target.
+    leaves; a prediction is the sum of the values of one leaf of each tree, plus `start` (targets,). `depth`: maximum
+    number of steps to a leaf. `classes_`: for classifiers, the class of each target.
     """
 
     feature: Int[np.ndarray, "T n"]
@@ -87,7 +87,8 @@ class Forest:
     def from_boosted_classifier(cls, model: Any) -> "Forest":
         """Convert scikit-learn's histogram gradient boosting classifier to a forest that predicts log-odds.
 
-        With two classes, the score of the second is half of the model's log-odds, and that of the first its negative.
+        With two classes, the score of the second class is half of the model's log-odds; the score of the first is its
+        negative.
         """
         trees, num_classes = [], len(model.classes_)
         for round_trees in model._predictors:
@@ -117,8 +118,8 @@ class Forest:
     def from_classification_trees(
         cls, models: list[Any], weights: np.ndarray, classes: np.ndarray, *, votes: bool
     ) -> "Forest":
-        """Convert scikit-learn's classification trees to a forest that predicts the weighted sum of the trees' class
-        shares.
+        """Convert scikit-learn's classification trees to a forest that predicts the weighted sum of the class shares in
+        the trees' leaves.
 
         If `votes`, each tree instead gives one weighted vote to the most frequent class of the leaf.
         """
@@ -296,8 +297,8 @@ class SupportVectorMachine:
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Count the pairwise decisions that each class wins (frames, classes).
 
-        A term below 1/2, computed from the distances to the decision boundaries, is added and orders classes with equal
-        counts.
+        The score includes a term below 1/2, computed from the distances to the decision boundaries, that orders classes
+        with equal counts.
         """
         distances, side_signs = self._boundary_distances(features)
         votes = (distances > 0) @ (side_signs > 0).astype(float) + (distances <= 0) @ (side_signs < 0).astype(float)

@@ -3,14 +3,14 @@ unlike the training set a frame is.
 
 The voltage changes d of a skin's channels are modelled as d = s (V z + n), with the scale s of each channel, a few
 patterns V (principal directions of the channels), the scores z of the patterns, and noise n; z and n are normally
-distributed. For a frame with missing channels, the most likely scores are computed. A channel is dead if its residual,
-the deviation from the prediction by the other channels, exceeds a multiple of the residuals of training presses. The
-reading of a dead channel is predicted from the covariance of all channels, which contains more than the patterns do:
-for example, that reciprocal channels have the same reading.
+distributed. The scores of a frame with missing channels are estimated by their most likely values. A channel is dead if
+its residual, the deviation from the prediction by the other channels, exceeds a multiple of the residuals of training
+presses. The reading of a dead channel is predicted from the covariance of all channels, which represents relations that
+the patterns omit: for example, reciprocal channels have the same reading.
 
-The novelty of a frame includes its distance from all presses of the training set: the frame of two simultaneous
-touches, or of a touch of the opposite sign, consists of the same patterns as the recorded presses, but is unlike any of
-them.
+The novelty of a frame includes its distance from the nearest press of the training set: the frame of two simultaneous
+touches, or of a touch of the opposite sign, consists of the same patterns as the recorded presses, but is unlike every
+press.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Neighbourhood:
 
     @classmethod
     def learn(cls, scores: Float[np.ndarray, "N K"]) -> "Neighbourhood":
-        """Fit the distances to the scores (presses, patterns) of the training presses."""
+        """Determine the median norm and the usual distance of the scores (presses, patterns) of training presses."""
         stored_scores = scores[:: -(-len(scores) // _MAX_STORED_PRESSES), :_NUM_SCORES]
         size = float(np.median(np.linalg.norm(stored_scores, axis=1))) or 1.0
         unscaled_neighbourhood = cls(stored_scores, size, 1.0)
@@ -71,7 +71,7 @@ _NOISE_VARIANCE_FRACTION, _MAX_PATTERNS, _PRESSES_PER_PATTERN = 1e-3, 60, 4
 # A channel is dead if its residual exceeds this factor times this quantile of the residuals of training presses.
 _RESIDUAL_FACTOR, _RESIDUAL_QUANTILE = 2.0, 0.999
 # Maximum distance of a working channel's reading from the range of its training readings, relative to the width of the
-# range; if more than this fraction of channels exceed the maximum, the frame counts as unusual and the channels as
+# range. If more than this fraction of channels exceed the maximum, the frame counts as unusual and the channels as
 # alive.
 _MAX_RANGE_EXCESS, _MAX_EXCEEDING_FRACTION = 2.0, 0.1
 # Variation of a channel below this fraction of the largest change counts as rounding error.
@@ -83,7 +83,7 @@ _MAX_DEAD_FRACTION = 0.34
 # Number of consecutive frames with a unique set of dead channels after which frames are processed one by one.
 _MAX_UNIQUE_FRAMES = 8
 # A frame has excess errors if the mean square of its residuals exceeds 1 by this number of standard deviations of the
-# mean square of normal residuals.
+# mean square of normally distributed residuals.
 _EXCESS_STANDARD_DEVIATIONS = 2.0
 # Novelty of a frame whose distance from the nearest press is the usual distance between presses.
 _NOVELTY_AT_USUAL_DISTANCE = 2 / 1.75
@@ -99,8 +99,9 @@ class Channels:
     standard deviation of the score of each pattern; `noise`: standard deviation of the part of each channel that the
     patterns do not explain. `farthest`: maximum residual of a working channel, relative to its noise. `directions`
     (channels, directions): principal directions of the changes; `weight`: variance along each direction, divided by the
-    same variance plus a constant; `unpredicted`: variance of each channel that the others do not predict. `usual`: 99 %
-    quantile of the novelty of the presses; `neighbourhood`: distances of frames from presses.
+    same variance plus a constant; `unpredicted`: mean squared error of the prediction of each channel by the others,
+    times one minus the channel's weight in its own prediction. `usual`: 99 % quantile of the novelty of the presses;
+    `neighbourhood`: distances of frames from presses.
     """
 
     used: Bool[np.ndarray, " M"]
@@ -181,10 +182,10 @@ class Channels:
     def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Replace the voltage changes of dead or missing channels by their prediction from the other channels.
 
-        Returns the changes (frames, channels) of the used channels; whether each channel is alive in each frame
-        (frames, channels); the novelty of each frame, 1 for a frame that is as far from the training set as the
-        farthest training press; and the standard deviation of the reading errors (frames, channels), in the unit of the
-        changes, as far as a frame's residuals exceed those of the training set.
+        Returns the completed changes (frames, channels) of the used channels; whether each channel is alive in each
+        frame (frames, channels); the novelty of each frame, about 1 for the farthest training presses; and the standard
+        deviation of the reading errors (frames, channels) in excess of those of the training set, in the unit of the
+        changes.
         """
         completed_changes = changes[:, self.used] / self.scale
         has_reading, out_of_range = (
@@ -276,8 +277,9 @@ class Channels:
     def prediction_errors(self, alive: Bool[np.ndarray, "n m"], max_errors: int) -> Float[np.ndarray, "q n m"]:
         """Compute the errors of the readings that are predicted for the dead channels of frames.
 
-        `alive` (frames, channels): the channels that are not dead. Returns the largest independent errors (errors,
-        frames, channels), at most `max_errors`, each of one standard deviation, in the unit of the changes.
+        `alive` (frames, channels): the channels that are not dead. Returns the largest independent components of the
+        errors (components, frames, channels), at most `max_errors`, each of one standard deviation, in the unit of the
+        changes.
         """
         errors = np.zeros((min(max_errors, int((~alive).sum(axis=1).max(initial=0))), *alive.shape))
         patterns, pattern_indices = np.unique(alive, axis=0, return_inverse=True)
@@ -401,9 +403,9 @@ def choose_channels(
     """Select channels by simultaneous orthogonal matching pursuit (Tropp et al. 2006), in decreasing order of
     information.
 
-    Each selected channel explains, by least squares, more than any other channel of the part of the `targets` that the
-    previously selected channels leave unexplained. Products of the targets are explained too, since places are not
-    linear functions of voltages.
+    Each step selects the channel that explains most, by least squares, of the part of the `targets` that the previously
+    selected channels leave unexplained. Products of targets count as further targets, since places are not linear
+    functions of voltages.
     """
     products = [targets[:, i] * targets[:, j] for i in range(targets.shape[1]) for j in range(i + 1)]
     unexplained_targets = np.column_stack([targets, *(product - product.mean() for product in products[:20])])

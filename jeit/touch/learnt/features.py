@@ -1,5 +1,6 @@
 """Features of frames for learning: several forms of the voltage changes, standardised, and their principal components.
-Some are images, computed by linear reconstruction with a model of the skin, and the strongest contact in each image."""
+Some features are images, computed by linear reconstruction with a model of the skin, and properties of the strongest
+contact in each image."""
 
 from __future__ import annotations
 
@@ -47,7 +48,7 @@ class ImageReconstruction:
     ) -> tuple["ImageReconstruction", list[str]]:
         """Create a one-step linear reconstruction from the channels that are `used`.
 
-        If a `reference` frame is given, the forward model is calibrated on this frame. The sign of touches in images is
+        If a `reference` frame is given, the forward model is calibrated on this frame. The sign of the images is
         determined from the voltage `changes` of presses. Also returns notes on the calibration as text.
         """
         notes, conductivity, mask = [], 1.0, as_array(used)
@@ -121,8 +122,8 @@ class ImageFeatures:
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
         """Return the unit by which each feature is divided.
 
-        For the contact and the logarithm, the unit is a fraction of the feature's standard deviation; for all cells of
-        the image, the unit is the root mean square of their standard deviations.
+        For the contact and the logarithm, the unit is a fraction of the feature's standard deviation. For the cells of
+        the image, the unit is the root mean square of the standard deviations of all cells.
         """
         num_other_features = values.shape[1] - len(self.imaged.sizes)
         deviations = values.std(axis=0)
@@ -249,8 +250,8 @@ class Features:
     """Features of voltage changes in one `form`, standardised, and optionally reduced to principal components.
 
     `mean` and `deviation` standardise each feature; `components` (features, components): the principal components, or
-    None. `made`: computes the features of a learnt form, None for other forms; `unit`: unit of each channel for the
-    forms that are not learnt.
+    None. `made`: function that computes the features of a learnt form, None for other forms; `unit`: unit of each
+    channel for the forms that are not learnt.
     """
 
     form: str
@@ -296,9 +297,9 @@ class Features:
 def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, ...]:
     """Compute features of a `form` from voltage changes (presses, channels), and their mean and standard deviation.
 
-    Returns the unit of each channel, which is its median absolute change, or the mean if the median is 0; the features
-    (presses, features); the mean of each feature; and the standard deviation of each feature, infinite for a constant
-    feature.
+    Returns the unit of each channel, which is its median absolute change, or its mean absolute change if the median is
+    0; the features (presses, features); the mean of each feature; and the standard deviation of each feature, infinite
+    for a constant feature.
     """
     size = np.abs(changes)
     unit = np.median(size, axis=0)
@@ -328,8 +329,8 @@ class Forms:
     def available(
         cls, answers: Float[np.ndarray, "N d"], imaged: ImageReconstruction | None, *, has_reference: bool
     ) -> "Forms":
-        """Return the forms of features that can be computed with or without reference voltages, repeated targets and
-        images."""
+        """Return the forms of features that the data allow: reference voltages, if `has_reference`, repeated targets in
+        `answers`, and images."""
         makers: dict[str, Maker] = {"whitened": WhitenedChanges.learn} if are_repeated(answers) else {}
         if imaged is not None:
             makers |= {"contacts": lambda changes, answers: ContactFeatures(imaged)}

@@ -1,9 +1,9 @@
-"""Read and write learnt skins as files in the format of skops, with arrays and estimators of scikit-learn, never a
-pickle.
+"""Read and write learnt skins as files in the format of the package skops, which stores arrays and scikit-learn
+estimators without pickle.
 
-A file is a ZIP archive with the same bytes for the same content: skops numbers objects by their address in memory and
-stores the time of writing, whereas here objects are numbered in order of appearance, without dates. A checksum, the
-seal, detects files that were changed after jeit wrote them. The seal contains no secret, so it is no signature.
+A file is a ZIP archive. Equal content gives equal bytes: the objects, which skops numbers by their memory addresses,
+are renumbered in order of appearance, and the time of writing is not stored. A checksum, the seal, detects files that
+were changed after jeit wrote them. The seal is computed without a secret key, so it does not prove who wrote the file.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def write_skin(skin: LearntSkin, path: str | Path) -> None:
 
 
 def read_skin(path: str | Path) -> LearntSkin:
-    """Read a learnt skin from a file, or from the folder that `jeit touch fit` made.
+    """Read a learnt skin from a file, or from the folder that `jeit touch fit` wrote.
 
     Nothing in the file is executed: the file may contain only numbers and estimators of scikit-learn.
 
@@ -133,8 +133,8 @@ def read_skin(path: str | Path) -> LearntSkin:
 
     - `path`: path of the file or folder.
 
-    Raises `FileNotFoundError` if the path does not exist, and `ValueError` if the file is not that of a learnt skin or
-    contains other objects than numbers and estimators.
+    Raises `FileNotFoundError` if the path does not exist, and `ValueError` if the file does not describe a learnt skin
+    or contains objects other than numbers and estimators.
 
     **Example:**
 
@@ -206,7 +206,7 @@ def _to_plain(value):
 
 
 def _from_plain(value):
-    """Convert dictionaries of fields, as of `_to_plain`, back to objects of jeit's classes, recursively."""
+    """Convert dictionaries of fields, which `_to_plain` returned, back to objects of jeit's classes, recursively."""
     if isinstance(value, dict):
         restored_values = {_OLD_FIELDS.get(key, key): _from_plain(item) for key, item in value.items() if key != "jeit"}
         return _STORED_CLASSES[value["jeit"]](**restored_values) if "jeit" in value else restored_values

@@ -22,8 +22,8 @@ _QUICK_METHOD = "linear-discriminant"
 class LabelMethodResult:
     """Cross-validation result of a classification `method` with one `form` of features.
 
-    `held_out`: index of the predicted label of each press; `odds` (presses, classes): predicted log-odds of the
-    classes; `error`: share of wrong labels.
+    `held_out`: index of the label predicted for each press when held out; `odds` (presses, classes): predicted log-odds
+    of the classes; `error`: share of wrong labels.
     """
 
     method: str
@@ -66,9 +66,9 @@ def learn_labels(
     """Learn a classifier of labels from voltage changes of presses (presses, channels).
 
     `reference`: reference voltages of the changes; `imaged`: optional reconstruction of images, which are then used as
-    features too; `method`: one of the nine classifiers, or "auto" for the classifier with the lowest error. Also
-    returns the results of all methods that were tried, in order of their errors in cross-validation on `folds`. All
-    methods use the form of features with which the linear discriminant has the lowest error.
+    features too; `method`: one of the nine classifiers, or "auto" for the classifier with the lowest error. All methods
+    use the form of features for which the linear discriminant has the lowest error. Also returns the results of
+    `method`, or of all methods for "auto", in cross-validation on `folds`, in order of increasing error.
     """
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference
@@ -314,8 +314,8 @@ _CHANNEL_METHODS = {"discriminant": _fit_discriminant, "trees": _fit_trees}
 
 
 def _select_features(values: np.ndarray, is_pressed: np.ndarray) -> np.ndarray:
-    """Select the features whose means differ most between pressed and released, relative to the spread within each
-    class."""
+    """Select the features whose means differ most between presses with and without the key, relative to the spread
+    within each class."""
     pressed_values, released_values = values[is_pressed == 1], values[is_pressed == 0]
     deviation = np.sqrt(
         (pressed_values.var(axis=0) * len(pressed_values) + released_values.var(axis=0) * len(released_values))

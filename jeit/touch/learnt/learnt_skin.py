@@ -35,8 +35,8 @@ from jeit.touch.learnt.presses import (
     standardise_sessions,
 )
 
-# A frame is unlike the training set above this novelty (1 for the farthest training frame), or below this fraction of
-# alive channels.
+# A frame is unlike the training set above this novelty (about 1 for the farthest training frames), or below this
+# fraction of alive channels.
 _MAX_NOVELTY, _MIN_ALIVE = 2.0, 0.66
 _CHUNK_SIZE = 256
 # To propagate errors of readings to predictions: number of principal directions of the error of readings predicted for
@@ -44,8 +44,8 @@ _CHUNK_SIZE = 256
 _MAX_ERROR_DIRECTIONS, _NUM_DRAWS = 4, 4
 # Minimum number of touched frames for the detection of stuck channels.
 _MIN_TOUCHED_FRAMES = 20
-# Minimum cosine similarity of a reference frame to that of the training set; maximum ratio of their norms. Beyond these
-# limits, the reference is taken for that of another skin.
+# Minimum cosine similarity of a reference frame to that of the training set; maximum ratio of their norms. A reference
+# beyond either limit is rejected as that of another skin.
 _MIN_COSINE_SIMILARITY, _MAX_NORM_RATIO = 0.8, 5.0
 
 
@@ -58,7 +58,8 @@ class LearntSkin:
     - `channels`: joint model of the readings of the measurement channels.
     - `mean_reference` (channels,): mean reference frame of the training set.
     - `place`, `force`, `label`, `keys`: model that predicts each quantity of a touch.
-    - `quiet`: root mean square of the changes, in standard deviations of the channels, below which a skin is untouched.
+    - `quiet`: root mean square of the changes, in standard deviations of the channels, below which a skin counts as
+      untouched.
     - `lag`: number of rows by which frames of the training set lagged behind their presses.
     - `per_session`: whether voltage changes are standardised separately for each session.
     - `name`: name of the training presses.
@@ -100,12 +101,13 @@ class LearntSkin:
         """Fit models of place, force, label and keys to recorded presses.
 
         `method`: one of `METHODS`, used for the quantities that the method can learn; "auto" chooses the method with
-        the lowest error on presses held out in intervals of time. `model`: optional forward model of the skin, with
-        some hundred nodes; images reconstructed with the model, and the contacts in the images, are additional
-        features. `num_channels`: number of channels to use, the most informative; by default all. `per_session`:
-        standardise the changes of each `group` separately, against drift. `progress`: is called with a description of
-        each step. Raises `ValueError` for an unknown method, a method that can learn no quantity of the presses,
-        presses from which nothing can be learnt, and a model with other channels than the frames.
+        the lowest error on presses held out in intervals of time. `model`: optional forward model of the skin, with a
+        few hundred nodes; images reconstructed with the model, and the contacts in the images, are additional features.
+        `num_channels`: number of channels to use, of which the most informative are selected; by default all.
+        `per_session`: standardise the changes of each `group` separately, against drift. `progress`: function that is
+        called with a description of each step. Raises `ValueError` for an unknown method, a method that can learn no
+        quantity of the presses, presses from which nothing can be learnt, and a model whose number of channels differs
+        from that of the frames.
         """
         _check_fit(presses, method, model, num_channels, per_session)
         with one_thread():
@@ -165,8 +167,8 @@ class LearntSkin:
 
         `reference`, one frame or one for each frame, is required if the training presses had a reference; `group` is
         the session of each frame, if the skin was learnt `per_session`. Dead channels are detected, and their readings
-        replaced; frames unlike the training set are marked, and have no predicted touch. Raises `ValueError` if frames
-        have another number of channels than the skin, or the reference is missing, superfluous, or of another skin.
+        replaced; frames unlike the training set are marked, and have no predicted touch. Raises `ValueError` if the
+        number of channels differs from that of the skin, or the reference is missing, superfluous, or of another skin.
         """
         frames = self._check_frames(frames)
         reference = self._check_reference(frames, reference)
@@ -199,7 +201,8 @@ class LearntSkin:
         """Predict the learnt fields of `Touches`, by name, from the voltage changes of frames."""
         completed_changes, alive, novelty, excess = self.channels.complete(changes)
         is_touched = np.sqrt(np.mean((completed_changes / self.channels.scale) ** 2, axis=1)) > self.quiet
-        # Frames with small changes are of the untouched skin; frames with too many missing channels are always unlike.
+        # Frames with small changes count as untouched, not as unlike; frames with too many missing channels are always
+        # unlike.
         is_unlike = (novelty > _MAX_NOVELTY) & is_touched | (alive.mean(axis=1) < _MIN_ALIVE)
         predictions = {"novelty": novelty, "unlike": is_unlike, "alive": np.zeros(changes.shape, bool)}
         predictions["alive"][:, self.channels.used] = alive
@@ -235,8 +238,8 @@ class LearntSkin:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Predict places or forces (frames, targets) and their standard deviations.
 
-        The standard deviations include the errors of readings predicted for dead channels, and errors of all readings
-        in frames that deviate more from the patterns of the training set than training presses do.
+        The standard deviations include the errors of the readings that are predicted for dead channels. If a frame
+        deviates more from the channel patterns than training presses do, they also include errors of all its readings.
         """
         noisy_rows = np.flatnonzero(excess.any(axis=1))
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (_NUM_DRAWS, 1, changes.shape[1]))
@@ -402,7 +405,8 @@ def _standardised_targets(presses: Presses) -> np.ndarray:
 def _quiet_threshold(scaled: np.ndarray, presses: Presses) -> float:
     """Compute the threshold of the root mean square change that separates untouched from touched frames.
 
-    With fewer than five untouched frames, the threshold is half of the 1 % quantile over the touched frames.
+    With fewer than five untouched frames, the threshold is half of the 1 % quantile of the root mean square change of
+    touched frames.
     """
     is_untouched = np.zeros(len(scaled), bool)
     if presses.positions is not None:

@@ -146,8 +146,8 @@ def fit_extra_trees(features, targets) -> Any:
 
 
 def fit_self_organising_map(features, targets) -> Any:
-    """Fit a self-organising map, which interpolates between the neurons' targets; a neuron's target is the mean over
-    the presses nearest to the neuron."""
+    """Fit a self-organising map, which interpolates between the neurons' targets; a neuron's target is the mean target
+    of the presses nearest to the neuron."""
     import jax
 
     num_steps = min(MapSchedule().ordering, _MAX_PRESENTATIONS * len(features))

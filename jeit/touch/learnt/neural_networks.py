@@ -1,8 +1,8 @@
 """Two small neural networks, trained with equinox and optax, and evaluated in NumPy: `Network` is fully connected, and
 `TemporalNetwork` is convolutional and classifies touches from time courses and from features of the whole touch.
 
-`Network` takes microseconds per frame. For `TemporalNetwork`, a few networks with different initial weights are trained
-at once, and their probabilities are averaged. It takes a fraction of a millisecond per touch.
+Evaluating `Network` takes microseconds per frame. For `TemporalNetwork`, a few networks with different initial weights
+are trained at once, and their probabilities are averaged. Evaluating them takes a fraction of a millisecond per touch.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 _BATCH_SIZE = 64
-# Settings of `Network`, which takes frames.
+# Settings of `Network`, whose inputs are features of single frames.
 _FRAME_HIDDEN_SIZE, _NUM_FRAME_EPOCHS = 64, 150
 _FRAME_LEARNING_RATE, _FRAME_WEIGHT_DECAY = 3e-3, 1e-2
 # Standard deviation of the noise added to features in each batch, relative to their scale.
 _FRAME_FEATURE_NOISE = 0.1
-# Settings of `TemporalNetwork`, which takes time courses.
+# Settings of `TemporalNetwork`, whose inputs are time courses of features.
 _COURSE_HIDDEN_SIZE, _DENSE_SIZE, _KERNEL_SIZE = 24, 32, 5
 _NUM_NETWORKS, _NUM_COURSE_EPOCHS = 2, 45
 _COURSE_LEARNING_RATE, _COURSE_WEIGHT_DECAY = 3e-3, 2e-2
@@ -116,7 +116,7 @@ class TemporalNetwork:
     """An ensemble of s convolutional networks that classify touches from time courses.
 
     Each row of the features (touches, features) contains `whole` features of the whole touch, then c values for each
-    time step, step by step.
+    time step, in order of time.
 
     **Fields**: `first` (s, h, 5 c) and `second` (s, h, 5 h): weights of the two convolutions over five time steps with
     h outputs; `dense` (s, d, whole + 2 h) and `last` (s, classes, d): weights of the fully connected layers;

@@ -16,10 +16,11 @@ from jeit.touch.learnt.features import Features, Forms, ImageReconstruction
 from jeit.touch.learnt.methods import CHANNEL_METHODS, QUICK_METHODS, REGRESSORS
 
 _NUM_SIMILAR, _TARGET_COVERAGES = 40, ((1.0, 0.6827), (1.96, 0.95))
-# Number of similar presses from which the variance of a prediction is estimated; pairs of a multiple of the standard
-# deviation and the share of normally distributed errors within this multiple. Weight of the logarithm of the size of
-# the changes, relative to the predicted values, in the distance between presses; weight of the mean squared error of
-# all presses in an estimated variance, where the rest is that of similar presses.
+# Number of similar presses from which the variance of a prediction is estimated; for calibration, pairs of a multiple
+# of the standard deviation and the share of normally distributed errors within this multiple. Weight of the logarithm
+# of the size of the changes, relative to the predicted values, in the distance between presses; weight of the mean
+# squared error of all presses in an estimated variance. The remaining weight is that of the mean squared error of
+# similar presses.
 _SIZE_WEIGHT, _GLOBAL_FRACTION = 0.3, 0.15
 # Minimum number of presses from which the coverage of standard deviations is estimated.
 _MIN_CALIBRATION_PRESSES = 30
@@ -31,9 +32,10 @@ _MIN_RELATIVE_DEVIATION = 1e-4
 class DeviationModel:
     """Model that estimates the standard deviations of predictions from the errors of similar held-out presses.
 
-    `where` (presses, targets + 1): predicted targets of the held-out presses, and the logarithm of the size of their
-    voltage changes, minus `low` and divided by `unit` (targets + 1,); `squares` (presses, targets): squared errors of
-    these predictions; `factor`: calibration factor of the standard deviation of each target.
+    `where` (presses, targets + 1): predicted targets of the held-out presses and logarithm of the root mean square of
+    their voltage changes, after subtraction of `low` and division by `unit` (targets + 1,); `squares` (presses,
+    targets): squared errors of these predictions; `factor`: calibration factor of the standard deviation of each
+    target.
     """
 
     where: Float[np.ndarray, "N e"]
@@ -49,9 +51,9 @@ class DeviationModel:
         """Fit to predictions for held-out presses, the voltage changes of these presses, and the errors of the
         predictions.
 
-        `last_presses`: whether a press was recorded before or after all presses that its prediction was learnt from.
-        Standard deviations are calibrated on these presses alone if there are enough, since future presses are
-        predicted likewise.
+        `last_presses`: whether each press was recorded before or after all presses from which its prediction was
+        learnt. If there are enough such presses, standard deviations are calibrated on them alone, since future
+        presses, too, are recorded after the training set.
         """
         where = np.column_stack([predictions, _log_size(changes)])
         low, unit = where.mean(axis=0), where.std(axis=0)
@@ -78,8 +80,8 @@ class DeviationModel:
         return self.factor * self._local_deviations(where)
 
     def held_out(self, predictions: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "N d"]:
-        """Compute the standard deviations of the predictions for held-out presses, each without the press's own
-        error."""
+        """Compute the standard deviations of the predictions for held-out presses, each estimated without the press's
+        own error."""
         where = (np.column_stack([predictions, _log_size(changes)]) - self.low) / self.unit
         return self.factor * self._local_deviations(where, leave_one_out=True)
 
@@ -108,7 +110,7 @@ def _log_size(changes: np.ndarray) -> np.ndarray:
 def _calibration_factor(ratios: np.ndarray) -> float:
     """Compute the calibration factor of standard deviations from the ratios of errors to standard deviations.
 
-    With the calibration factor, the shares of errors within 1 and 1.96 standard deviations are nearest to those of a
+    The factor is chosen such that the shares of errors within 1 and 1.96 standard deviations are closest to those of a
     normal distribution.
     """
     candidates = np.geomspace(0.2, 5, 200)
@@ -121,7 +123,8 @@ def _calibration_factor(ratios: np.ndarray) -> float:
 
 BLEND = "blend"
 METHODS = ("auto", *REGRESSORS, BLEND)
-# Maximum number of methods in a blend; maximum error of a chosen blend, relative to that of the best single method.
+# Maximum number of methods in a blend, which averages their predictions; maximum error of a chosen blend, relative to
+# the error of the best single method.
 _MAX_BLENDED_METHODS, _MAX_BLEND_ERROR_RATIO = 3, 0.98
 
 
@@ -145,7 +148,7 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class LearntNumbers:
-    """The average of several regressors of places or forces, with standard deviations of the predictions.
+    """The average of one or several regressors of places or forces, with standard deviations of the predictions.
 
     `members`: pairs of features and a regressor of standardised targets; a prediction is `mean` + `scale` × the average
     of the members' predictions. `spread`: model of the standard deviations of predictions.
@@ -182,9 +185,9 @@ def learn_numbers(
 
     `reference`: reference voltages of the changes; `imaged`: optional reconstruction of images, which are then used as
     features too; `method`: one of `METHODS`; "auto" chooses the best method, or a blend of methods if its error is
-    lower. Also returns the results of all methods that were tried, in order of their mean errors in cross-validation on
-    `folds`. Quick methods are tried with all forms of features, other methods with the one or two forms with the lowest
-    error of a quick method.
+    lower. Quick methods are tried with all forms of features, other methods only with the one or two forms for which a
+    quick method has the lowest error. Also returns the results of cross-validation on `folds`, in order of increasing
+    error, but with a chosen blend first; for a single `method`, only the results of this method.
     """
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference

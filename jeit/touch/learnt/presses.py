@@ -1,4 +1,5 @@
-"""Recorded presses: frames with known places and forces, changes from the untouched skin, and the lag of frames."""
+"""Recorded presses: frames with known places and forces, changes from the untouched skin, and the lag of frames behind
+their presses."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ def changes_from_reference(frames: Float[np.ndarray, "n M"], reference: np.ndarr
 
 
 def standardise_sessions(changes: np.ndarray, group) -> np.ndarray:
-    """Standardise changes: subtract each channel's median over a session, and divide by the standard deviation.
+    """Standardise voltage changes: subtract each channel's median over a session, and divide by its standard deviation.
 
     `group` (frames,): the session of each frame; None if all frames are of one session. Raises `ValueError` for
     sessions of fewer than 20 frames, and for a `group` that is not of shape (frames,).
@@ -85,7 +86,8 @@ class Presses:
     **Fields**
 
     - `frames`: (presses, channels), readings in any unit; NaN where a reading is missing.
-    - `reference`: (presses, channels), the frame of the untouched skin for each frame; None if `frames` are changes.
+    - `reference`: (presses, channels), the frame of the untouched skin for each frame; None if `frames` are voltage
+      changes.
     - `positions`: (presses, 2) or (presses, 3), metres, NaN where nothing touched; `force`: newtons; `label`: text,
       "none" where nothing touched; `touched`: (presses, keys), whether each key was pressed.
     - `group`: session or person of each press; cross-validation never splits a group. `time`: time of each press,
@@ -201,7 +203,7 @@ def read_frames(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def _read_arrays(path: str | Path, *keys: str) -> dict[str, np.ndarray]:
-    """Read the arrays named `keys` from an NPZ file: `frames`, which is required, and the others if present."""
+    """Read the arrays named `keys` from an NPZ file: `frames`, which is required, and the other arrays if present."""
     if Path(path).is_dir():
         raise ValueError("it is a folder; give an NPZ file.")
     if not Path(path).is_file():
@@ -223,7 +225,7 @@ def _with_file_name(path: str | Path) -> Iterator[None]:
 def check_frames(name: str, values) -> Float[np.ndarray, "N M"]:
     """Convert frames (frames, channels) to floats; readings that are infinite or impossibly large become NaN.
 
-    Raises `ValueError` if frames are no two-dimensional array of real numbers.
+    Raises `ValueError` if `values` are not a two-dimensional array of real numbers.
     """
     try:
         frames = np.asarray(values)
@@ -359,9 +361,9 @@ def _one_dimensional(name: str, values: ArrayLike) -> np.ndarray:
 # Maximum lag of frames, in rows; number of similar frames whose places are averaged; number of principal components by
 # which frames are compared.
 _MAX_LAG, _NUM_NEIGHBOURS, _NUM_COMPONENTS = 2, 8, 12
-# A lag is clear if the mean error of places estimated with the lag is below this fraction of the error of guessing the
-# mean place, the mean error without lag is above this fraction, and the mean error with any other lag is larger by more
-# than this number of standard errors.
+# A lag is clear under three conditions: the mean error of places estimated with the lag is below this fraction of the
+# error of guessing the mean place; the mean error without lag is above this fraction; and with any other lag, the mean
+# error is larger by more than this number of standard errors.
 _MAX_GUESS_ERROR_RATIO, _MIN_STANDARD_ERRORS = 0.95, 4.0
 
 
@@ -386,13 +388,13 @@ def estimate_lag(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) 
 
 
 def aligned_slices(num_rows: int, lag: int) -> tuple[slice, slice]:
-    """Return the slices of frames and of the corresponding presses, for a recording with a `lag` of frames in rows."""
+    """Return slices of the frames and of the corresponding presses of a recording in which frames lag by `lag` rows."""
     return slice(max(lag, 0), num_rows + min(lag, 0)), slice(max(-lag, 0), num_rows - max(lag, 0))
 
 
 def _place_errors(scores: np.ndarray, positions: np.ndarray, folds: np.ndarray, lag: int) -> np.ndarray:
-    """Compute errors of places that are estimated from the frames with the most similar scores in other folds,
-    metres."""
+    """Compute the errors, metres, of places estimated as the mean place of the frames with the most similar `scores` in
+    other folds."""
     frames, presses = aligned_slices(len(scores), lag)
     scores, positions, folds = scores[frames], positions[presses], folds[presses]
     errors = np.empty(len(scores))
@@ -420,9 +422,9 @@ class Touches:
       `force_std`; `label`, text, with its `probability`; `touched` (frames, keys), whether each key is pressed, with
       `key_probability`. In frames unlike the training set, these numbers are NaN, labels "" and keys false. In frames
       of the untouched skin, positions are NaN, forces 0, labels "none" and keys false.
-    - `unlike`: whether a frame is unlike the training set; `novelty`: distance of a frame from the training set, 1 for
-      the farthest training frame.
-    - `alive` (frames, channels): whether the reading was used, because the channel is alive.
+    - `unlike`: whether a frame is unlike the training set; `novelty`: distance of a frame from the training set, about
+      1 for the farthest training frames.
+    - `alive` (frames, channels): whether the channel is alive, so that its reading was used.
     - `notes`: corrections made to the frames, as text.
 
     **Example:**

@@ -1,13 +1,13 @@
 """Feature images of sound: intensity of every microphone over time, above the spectrogram of the loudest microphone.
 
 The images are those of Park et al. (2022): a window of 0.5 s has 41 frames, 12 ms apart; an image has M rows of
-intensity, one for each microphone, and 64 rows of the spectrogram, so that 25 microphones give 89 × 41. At a sampling
-rate of 10 kHz, a frame consists of 128 samples under a Hann window, and begins 120 samples after the previous frame;
-bins 1 to 64 of its Fourier transform are the 64 bands.
+intensity, one for each microphone, and 64 rows of the spectrogram, so that 25 microphones give images of 89 × 41
+values. At a sampling rate of 10 kHz, a frame consists of 128 samples under a Hann window, and begins 120 samples after
+the previous frame; bins 1 to 64 of its Fourier transform are the 64 bands.
 
 At any other sampling rate, frames have the same duration, and bins are assigned to bands by their frequency; sound is
-not resampled. The bands end at the frequency `highest`. If it is at most 5 kHz, all bands are as wide as a bin, 78 Hz;
-otherwise, the lowest band has this width, and each band is wider than the band below it by the same factor.
+not resampled. The bands end at the frequency `highest`. If `highest` is at most 5 kHz, all bands are as wide as a bin,
+78 Hz; otherwise, the lowest band has this width, and the width increases from band to band by a constant factor.
 """
 
 from __future__ import annotations

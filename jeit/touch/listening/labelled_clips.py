@@ -15,7 +15,7 @@ from jeit.acoustic import Intensities, Recording, read_recording
 from jeit.arguments import check_kind, counted
 from jeit.touch.listening.feature_images import MIN_HIGHEST
 
-# Maximum number of files that could not be read and are described in a note.
+# Maximum number of unreadable files that are described in a note.
 _MAX_DESCRIBED = 4
 # Relative difference of sampling rates below which they are considered equal.
 _RATE_TOLERANCE = 1e-3
@@ -36,13 +36,14 @@ class _RecordingFiles(Sequence):
 
 @dataclass(frozen=True)
 class LabelledClips:
-    """Clips of sound with the classes to which they belong, created by `LabelledClips.from_recordings`.
+    """Clips of sound, each with its class, created by `LabelledClips.from_recordings`.
 
     **Fields**
 
     - `recordings`: sequence of n clips, each a `jeit.acoustic.Recording`.
     - `labels` (n,): class of each clip.
-    - `groups` (n,): name of each clip's group, such as a person or thing; clips of a group are held out together.
+    - `groups` (n,): name of each clip's group, such as the person or object that makes the sound; clips of a group are
+      held out together.
     - `channels`: number of channels of all clips, 1 if they are mixed.
     - `highest`: frequency up to which all clips have sound, Hz.
     - `notes`: remarks on the clips.
@@ -137,10 +138,10 @@ class LabelledClips:
 def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = None) -> LabelledClips:
     """Read labelled clips of sound: every sub-folder of a folder is a class, and every file in it a clip of the class.
 
-    Files are WAV, NPZ, or any format that `soundfile` reads if it is installed. Clips in a folder within the folder of
-    a class, such as of one person or day, are one group, together with the clips of other classes in a folder of the
-    same name; a file directly in the folder of a class is a group of its own. Files that cannot be read are left out
-    and listed in `notes`; hidden files are ignored.
+    Files are WAV, NPZ, or any format that `soundfile` reads if it is installed. The clips in a folder within the folder
+    of a class, for example those of one person or day, form one group, to which the clips of other classes in folders
+    of the same name also belong. A file directly in the folder of a class is a group of its own. Files that cannot be
+    read are left out and listed in `notes`; hidden files are ignored.
 
     **Arguments:**
 
@@ -200,8 +201,7 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
 
 
 def _describe_unread(failures: list[tuple[str, str]]) -> str:
-    """Describe how many files could not be read, and for which reasons. The reasons begin with one file of each
-    format."""
+    """Describe how many files could not be read, and for which reasons. One file of each format is described first."""
     num_previous: dict[str, int] = {}
     entries = []
     for index, (suffix, reason) in enumerate(failures):

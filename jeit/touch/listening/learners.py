@@ -1,8 +1,8 @@
 """Classifiers of sound windows: a network, boosted trees on hand-made features, and linear discriminants.
 
-The discriminants use the hand-made features alone, or with the spectrum in all bands. The method `learn` of each
-learner returns a classifier. Its `log_odds` are those of the classes 0 … C − 1; its `to_stored` returns arrays to store
-in a file.
+One discriminant uses the hand-made features alone, another also the spectrum in all bands. The method `learn` of each
+learner returns a classifier. The classifier's method `log_odds` returns the log-odds of the classes 0 … C − 1; its
+method `to_stored` returns a header and arrays to store in a file.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class NetworkLearner:
     def learn(self, training_set: TrainingSet) -> NetworkListener:
         """Train a network with early stopping, by the loss on held-out groups.
 
-        One in six groups of clips of each class is held out, and one of a class with three to five groups.
+        Of the groups of clips of each class, one in six is held out; of three to five groups, one is held out.
         """
         is_held_out = stopping_rows(training_set.labels, training_set.groups)
         levels = Levels.from_images(training_set.images[~is_held_out])
@@ -118,7 +118,7 @@ class NetworkLearner:
 
     @staticmethod
     def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of those in a file with the header `head`."""
+        """Create arrays with the shapes of the arrays in a file with the header `head`."""
         return ModalityNetwork.draw(jax.random.key(0), rows, 41, classes)
 
     @staticmethod
@@ -167,7 +167,7 @@ class TreesListener:
 
     @staticmethod
     def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of those in a file with the header `head`."""
+        """Create arrays with the shapes of the arrays in a file with the header `head`."""
         node_shape = (int(head["trees"]), int(head["nodes"]))
         shapes = [(node_shape, np.int32)] * 3 + [
             (node_shape, np.float32),
@@ -231,7 +231,8 @@ class LinearLearner:
     features: Callable[[SoundImages], Float[np.ndarray, "W k"]]
 
     def learn(self, training_set: TrainingSet) -> LinearListener:
-        """Fit the discriminant to a training set; all classes have the same prior probability, however many windows."""
+        """Fit the discriminant to a training set; all classes have the same prior probability, whatever their numbers
+        of windows."""
         features = self.features(training_set.images)
         mean, deviation = features.mean(axis=0), features.std(axis=0)
         # Features that are constant except for rounding errors carry no information, and would make the covariance
@@ -243,12 +244,12 @@ class LinearLearner:
         weights = np.zeros((len(mean), len(model.coef_)))
         weights[is_variable] = model.coef_.T
         offset = model.intercept_ - (log_priors if len(log_priors) > 2 else log_priors[1] - log_priors[0])
-        if weights.shape[1] == 1:  # two classes: only the log-odds of the second are given
+        if weights.shape[1] == 1:  # with two classes, scikit-learn stores only the log-odds of the second
             weights, offset = np.hstack([-weights, weights]) / 2, np.concatenate([-offset, offset]) / 2
         return LinearListener(self.features, mean, deviation, weights, offset)
 
     def stored_shapes(self, head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Create arrays with the shapes of those in a file with the header `head`."""
+        """Create arrays with the shapes of the arrays in a file with the header `head`."""
         num_inputs = self.features(_NO_WINDOWS).shape[1]
         return [
             jax.numpy.zeros(shape, np.float32)

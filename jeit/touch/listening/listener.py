@@ -31,8 +31,8 @@ _AUTO_METHODS = tuple(name for name in LEARNERS if name != "paper-network")
 # Maximum number of folds in which clips are held out; power below which a window counts as quiet, relative to the power
 # of the quietest training window.
 _MAX_FOLDS, _QUIET_RATIO = 3, 0.25
-# Minimum loudness that a recording is assumed to have because its gain is lower, relative to the loudness of the
-# softest training clip; minimum number of windows for which a network is tried.
+# Minimum ratio of a recording's loudness to that of the softest training clip that is attributed to a lower gain;
+# minimum number of windows for which a network is tried.
 _MIN_GAIN, _MIN_NETWORK_WINDOWS = 1 / 16, 3000
 # Number of samples within which the readings of a working microphone change.
 _MAX_CHECKED_SAMPLES = 100_000
@@ -41,7 +41,7 @@ _KIND, _VERSION = "a jeit listener", 2
 
 @dataclass(frozen=True)
 class Listener:
-    """A trained classifier of sounds, such as of touches of a skin with microphones.
+    """A trained classifier of sounds, such as the sounds of touches of a skin with microphones.
 
     **Fields**: `names` (C,): names of the classes; `method`: name of the method; `model`: trained classifier;
     `channels`: number of microphones, 1 if they are mixed; `highest`: maximum frequency of sound that is used, Hz;
@@ -88,15 +88,16 @@ class Listener:
     ) -> "Listener":
         """Train a classifier of sounds on labelled clips.
 
-        `method`: one of `METHODS`; "auto" chooses the method that classifies most held-out clips correctly, each as a
-        whole. Clips are held out in three folds, together with all clips of their group. The training windows of a clip
-        are those at most 20 dB below its loudest frame, since the label does not describe the rest; in clips longer
-        than 4 s, every single sound counts as a clip. "auto" does not try the network if there are few windows.
-        `loudness`: whether loudness is used as a feature; by default, it is used if a linear discriminant then
-        classifies more held-out clips correctly, by more than chance. `key`: random key that draws the initial weights
-        of the networks, each trained for at most `batches`; `folder`: folder for checkpoints, from which an interrupted
-        training can resume; `progress`: function that is called with a description of the progress. Raises `ValueError`
-        for invalid clips, key or method; `ImportError` without the extra `learn`.
+        `method`: one of `METHODS`; "auto" chooses the method that classifies the most held-out clips correctly, where
+        the windows of a clip are classified together. Clips are held out in three folds, together with all clips of
+        their group. The training windows of a clip are those at most 20 dB below its loudest frame, since the label
+        does not describe the rest; in clips longer than 4 s, every single sound counts as a clip. "auto" does not try
+        the network if there are few windows. `loudness`: whether loudness is used as a feature; by default, it is used
+        if it increases the number of held-out clips that a linear discriminant classifies correctly by more than
+        chance. `key`: random key that draws the initial weights of the networks, each trained on at most `batches`
+        batches; `folder`: folder for checkpoints, from which an interrupted training can resume; `progress`: function
+        that is called with a description of the progress. Raises `ValueError` for invalid clips, key or method;
+        `ImportError` without the extra `learn`.
         """
         need_extra("learn", "learning to classify sounds")
         check_kind("clips", clips, LabelledClips, "clips as of read_clips(folder)")
@@ -180,8 +181,8 @@ class Listener:
 
         A recording shorter than a window is padded with silence. With a `calibration` of the microphones, the places of
         touches are estimated too, by `locate_touches`. If the listener has one channel, the channels of the recording
-        are mixed. Raises `ValueError` if `recording` is not a `Recording`, has another number of microphones, or no
-        sound up to the frequency `highest`, and as `locate_touches` does.
+        are mixed. Raises `ValueError` if `recording` is not a `Recording`, differs from the training clips in the
+        number of microphones, or has no sound up to the frequency `highest`, and as `locate_touches` does.
         """
         check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
         notes = []
@@ -246,7 +247,8 @@ class Listener:
         )
 
     def _quiet_threshold(self, loudest: float) -> float:
-        """Compute the loudness below which windows count as quiet; `loudest`: that of the recording's loudest window.
+        """Compute the loudness below which windows count as quiet; `loudest`: loudness of the recording's loudest
+        window.
 
         If loudness is not a feature, the recording's gain may differ from that of the training clips: up to 12 dB
         lower, or any amount higher.
@@ -343,7 +345,8 @@ def _held_out_odds(
 
 
 def _is_loudness_useful(windows: Windows, clip_folds: np.ndarray, key: Array, report) -> bool:
-    """Determine whether loudness as a feature improves a linear discriminant by more than one standard deviation.
+    """Determine whether loudness as a feature increases the number of clips that a linear discriminant classifies
+    correctly, by more than one standard deviation.
 
     If no clip can be held out, loudness is used if there are several microphones, which share one gain.
     """
@@ -368,8 +371,8 @@ def _estimate_positions(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the touched position in each of W windows, (W, d), and its standard deviations (W, d), metres.
 
-    Both are means over those frames of the smoothed track at most 0.05 s from the middle of the window; NaN without
-    such frames.
+    Positions and standard deviations are means over the frames of the smoothed track that are at most 0.05 s from the
+    middle of the window; NaN without such frames.
     """
     located = locate_touches(recording, calibration)
     positions, deviations = located.track.position, np.sqrt(np.diagonal(located.track.covariance, axis1=1, axis2=2))

@@ -1,10 +1,11 @@
 """The network of Park et al. (2022) that classifies touch by its sound: trained with equinox and optax, run in NumPy.
 
 The network has two layers, each a convolution without padding, batch normalisation, rectification and max-pooling. The
-convolutions are 5 × 5 to 32 channels, then 3 × 3 to 64 channels. A dense layer and softmax follow. Training uses Adam
-with a learning rate of 2e-4, divided by ten after every five epochs, and batches of 64; the held-out loss is evaluated
-every 50 batches, and training ends after 20 evaluations without a decrease. This library's own choices are the size of
-the second convolution and of the pools, 3 × 3 and 2 × 2, and the noise added to images.
+convolutions have 32 kernels of 5 × 5 pixels, then 64 kernels of 3 × 3 pixels. A dense layer and softmax follow.
+Training uses Adam with a learning rate of 2e-4, divided by ten after every five epochs, and batches of 64; the held-out
+loss is evaluated every 50 batches, and training ends after 20 evaluations without a decrease. Chosen here, not taken
+from the paper, are the kernel size of the second convolution, the sizes of the pools, 3 × 3 and 2 × 2, and the noise
+added to images.
 """
 
 from __future__ import annotations
@@ -128,11 +129,12 @@ def _max_pool(values, pool_size: int, namespace):
 
 
 class NetworkAnswers:
-    """A trained network that is evaluated in NumPy: a few milliseconds for one window, without compilation."""
+    """A trained network that is evaluated in NumPy, without compilation, in a few milliseconds for one window."""
 
     def __init__(self, network: ModalityNetwork):
         host_network = jax.tree.map(np.asarray, network)
-        # Batch normalisation is a factor and an offset for each channel; the factor is merged into the kernels.
+        # Batch normalisation multiplies each channel by a factor and adds an offset; the factor is merged into the
+        # kernels.
         factors = [
             gain / np.sqrt(variance + _VARIANCE_FLOOR)
             for gain, variance in zip(host_network.gain, host_network.variance, strict=True)
@@ -170,7 +172,7 @@ def paper_plan(windows: int, *, batches: int, batch: int = 64) -> TrainingPlan:
 
     Training has at most `batches` batches of `batch` windows, but at least one pass through the windows. Noise is drawn
     anew in every batch, so that no image is repeated; `NUM_COPIES` passes through the windows correspond to one epoch
-    of noisy copies.
+    of the paper, which contains as many noisy copies.
     """
     batch_size = min(batch, windows)
     return TrainingPlan(
@@ -207,9 +209,9 @@ def train_network(
 ) -> TrainingResult:
     """Train a network on images with the classes `labels`, until its loss on held-out images no longer decreases.
 
-    `held_out`: the held-out images and their classes; `plan`: training schedule, as from `library_plan`; `noise`:
-    standard deviation of the noise added to images; `checkpoint` and `progress`: see `jeit.touch.fit_network`, whose
-    errors are raised. The same `key` gives identical results.
+    `held_out`: the held-out images and their classes; `plan`: training schedule, as returned by `library_plan`;
+    `noise`: standard deviation of the noise added to images; `checkpoint` and `progress`: as for
+    `jeit.touch.fit_network`. Raises the errors of that function. The same `key` gives identical results.
     """
     draw_key, training_key = jax.random.split(key)
     network = ModalityNetwork.draw(draw_key, images.shape[1], images.shape[2], classes)

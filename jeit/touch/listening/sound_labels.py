@@ -1,4 +1,4 @@
-"""The classified sounds of a recording: a class every 0.1 s, and events: runs of windows of the same class."""
+"""The classes of the sounds in a recording, every 0.1 s, and events, which are runs of windows of the same class."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from jeit.touch.listening.feature_images import WINDOW_INTERVAL
 class Event:
     """A sound from `start` to `end`, seconds.
 
-    `name`: class of the sound, "" for quiet; `probability`: mean over the windows of the sound of the probability of
-    their class; `place` (2,) or (3,), metres: mean of the places estimated in these windows, None without any.
+    `name`: class of the sound, "" for quiet; `probability`: probability of the most likely class, averaged over the
+    windows of the sound; `place` (2,) or (3,), metres: mean of the places estimated in these windows, None without any.
     """
 
     start: float
@@ -37,7 +37,8 @@ class SoundLabels:
       are not meaningful.
     - `known` (W,): whether more than half of a window's samples are finite.
     - `strongest` (W,): index of the loudest microphone.
-    - `loud` (W,): whether a window is at most 20 dB below the loudest window of the recording; `whole` uses these.
+    - `loud` (W,): whether a window is at most 20 dB below the loudest window of the recording; `whole` uses only loud
+      windows.
     - `name`: name of the recording.
     - `notes`: remarks on the recording.
     - `position` (W, d), `position_std` (W, d): estimated place of the touch and its standard deviations, metres, NaN in
@@ -82,7 +83,7 @@ class SoundLabels:
     def whole(self) -> tuple[str, float]:
         """Most likely class of the whole recording, from its loud windows together, and the probability of this class.
 
-        The probability is the geometric mean over the windows, so that overlapping windows are not counted as
+        The probability is the normalised geometric mean over the windows, so that overlapping windows do not count as
         independent; the class is "" if all windows are quiet.
         """
         is_used = self.loud & self.known & ~self.quiet

@@ -18,9 +18,9 @@ _LEVEL_RANGE, _LOUDEST_QUANTILE = 60.0, 0.999
 class Levels:
     """Conversion of the powers in feature images to standardised levels in decibels.
 
-    Levels are clipped at 60 dB below `loudest` (2,), the 99.9 % quantile of the training set, then standardised by
-    their `mean` (2,) and `deviation` (2,). The first value of each field is for intensities, the second for
-    spectrograms. All rows of an image are converted alike, so that a louder window has larger values.
+    Levels are clipped at 60 dB below `loudest` (2,), the level of the 99.9 % quantile of the powers in the training
+    set, then standardised by their `mean` (2,) and `deviation` (2,). The first value of each field is for intensities,
+    the second for spectrograms. All rows of an image are converted alike, so that a louder window has larger values.
     """
 
     loudest: Float[np.ndarray, " 2"]
@@ -49,8 +49,8 @@ class Levels:
     def __call__(self, images: SoundImages) -> Float[np.ndarray, "W rows 41"]:
         """Convert feature images to levels (W, M + 64, 41): M rows of intensity, then 64 rows of the spectrogram.
 
-        Microphones are sorted by their loudness in the window, the loudest first, so that a touch looks the same
-        wherever it is. Park et al. do not state the order of microphones. Levels are in single precision.
+        Microphones are sorted by their loudness in the window, the loudest first, so that a touch gives the same image
+        at any place. Park et al. do not state the order of microphones. Levels are in single precision.
         """
         order = np.argsort(-images.intensity.sum(axis=2), axis=1, kind="stable")
         intensity = np.take_along_axis(images.intensity, order[..., None], axis=1)
@@ -84,7 +84,7 @@ def sound_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
 
     **Arguments:**
 
-    - `images`: feature images of the windows, as from `sound_images`.
+    - `images`: feature images of the windows, as returned by `sound_images`.
 
     **Example:**
 
@@ -185,8 +185,8 @@ def _loudness_features(level: Float[np.ndarray, "W 41"]) -> np.ndarray:
 def _loudness_peaks(level: np.ndarray) -> np.ndarray:
     """Find peaks of the loudness over time: whether each frame (W, 41) is a peak.
 
-    A peak is the loudest of five frames, and at least 6 dB above the minimum of the ten frames before it, and above
-    that of the ten frames after it.
+    A peak is the loudest of five frames, and at least 6 dB above both the minimum of the ten frames before it and the
+    minimum of the ten frames after it.
     """
     padded = np.pad(level, ((0, 0), (10, 10)), mode="edge")
     neighbourhoods = np.lib.stride_tricks.sliding_window_view(padded, 21, axis=1)

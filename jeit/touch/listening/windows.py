@@ -1,6 +1,6 @@
 """Windows of labelled clips of sound, and cross-validation folds of groups of clips.
 
-A long recording, such as of many taps one after the other, is cut into pieces where it is quiet; each piece counts as a
+A long recording, for example of many successive taps, is cut into pieces at its quiet parts; each piece counts as a
 clip.
 """
 
@@ -25,8 +25,8 @@ def held_out_folds(
     """Return the cross-validation fold (N,) in which each of N clips is held out, with all clips of its group.
 
     `clip_classes`, `groups`: class and group of each clip. The fold is -1 for clips that are always in the training
-    set, since no other group has clips of their class. Groups are assigned to at most `max_folds` folds in turn, class
-    by class, the largest first, so that every training set contains all classes.
+    set, since no other group has clips of their class. The groups of each class, the largest groups first, are assigned
+    in turn to at most `max_folds` folds, so that every training set contains all classes.
     """
     fold = np.full(len(clip_classes), -1)
     fold_of_group: dict[int, int] = {}
@@ -69,7 +69,7 @@ _MAX_PIECES, _MAX_PIECE_GROUPS = 60, 6
 
 @dataclass(frozen=True)
 class Windows:
-    """W windows of sound of a training set, and the clips to which they belong.
+    """W sound windows of a training set, and the clips to which the windows belong.
 
     `images`: feature images of the windows; `clip` (W,): index of the clip, or piece of a longer clip, of each window;
     `labels` (W,): class of each window, an index of `names`; `names`: names of the classes; `clip_labels`,
@@ -86,7 +86,7 @@ class Windows:
 
     @classmethod
     def from_clips(cls, clips: LabelledClips, report: Callable[[str], None]) -> "Windows":
-        """Select the loud windows of each clip, at most 20 dB below its loudest frame.
+        """Select the windows of each clip that are at most 20 dB below its loudest frame.
 
         Raises `ValueError` for clips without finite samples.
         """
@@ -164,7 +164,8 @@ class Windows:
         return TrainingSet(self.images[rows], self.labels[rows], groups, self.classes, key, batches, checkpoint, report)
 
     def predict_clips(self, odds: Float[np.ndarray, "W C"]) -> tuple[np.ndarray, np.ndarray]:
-        """Predict the class of each held-out clip from the log-odds of its windows; return it and the true class."""
+        """Predict the class of each held-out clip from the log-odds of its windows; returns the predicted and true
+        classes."""
         is_held_out = np.isfinite(odds).all(axis=1)
         log_probabilities = odds[is_held_out] - np.logaddexp.reduce(odds[is_held_out], axis=1, keepdims=True)
         clips, clip_rows = np.unique(self.clip[is_held_out], return_inverse=True)
@@ -184,10 +185,11 @@ class Windows:
 
 
 def _split_pieces(times: Float[np.ndarray, " n"]) -> list[np.ndarray]:
-    """Split the loud windows of a clip, at `times`, seconds, into pieces that share no samples: indices of each.
+    """Split the loud windows of a clip into pieces that share no samples; returns the indices of the windows of each
+    piece.
 
-    Windows belong to one sound if no gap between them exceeds the length of a window. A longer sound is cut every 2 s;
-    windows that extend over a cut are left out.
+    `times`: middles of the windows, seconds. Consecutive windows belong to one sound if the time between them does not
+    exceed the duration of a window. A long sound is cut every 2 s; windows that extend over a cut are left out.
     """
     pieces, period = [], _PIECE_DURATION + WINDOW_DURATION
     for sound in np.split(np.arange(len(times)), np.flatnonzero(np.diff(times) > WINDOW_DURATION) + 1):

@@ -38,9 +38,9 @@ NETWORK_FILE = "network.jeit"
 # program for each power of two up to this number.
 _MAX_BATCH_SIZE = 64
 # Thresholds for unreliable depth maps: fraction of the squared voltage change that the map does not explain; minimum
-# size of a change that is tested, as a multiple of the noise; depth, divided by the skin's thickness; outward bulge, as
-# a multiple of the noise floor. A large unexplained fraction alone is no evidence, since a network that has learnt
-# little misses many touches: the map must also bulge outwards more than it is indented.
+# size of a change that is tested, as a multiple of the noise; maximum depth, divided by the skin's thickness; minimum
+# outward bulge, as a multiple of the noise floor. A large unexplained fraction alone is no evidence, since a network
+# that has learnt little misses many touches: the map must also bulge outwards more than it is indented.
 _MAX_UNEXPLAINED_FRACTION, _MIN_CHANGE_TO_NOISE, _MAX_RELATIVE_DEPTH, _MIN_BULGE_TO_FLOOR = 0.6, 3.0, 1.2, 3.0
 # Maximum fraction of channels without a reading with which a frame is still imaged.
 MAX_MISSING_FRACTION = 0.5
@@ -91,8 +91,8 @@ class ImageNetwork:
 
         `reference`: frame of the untouched skin, volts. Channels without a reading are NaN; the "unrolled" design
         replaces missing channels by their expected values given the other channels. The network returns a map for any
-        input: `doubts` states which maps are unreliable. Raises `ValueError` for another number of channels than in
-        training, and as `changes` does.
+        input: `doubts` states which maps are unreliable. Raises `ValueError` if the number of channels differs from
+        that in training, and as `changes` does.
         """
         change = self.changes(voltages, reference)
         maps = self.thickness * self.share(change)
@@ -135,10 +135,10 @@ class ImageNetwork:
     def doubts(self, change: Float[np.ndarray, "n M"], share: Float[np.ndarray, "n rows columns"]) -> list[str]:
         """State why each depth map is unreliable; an empty string if there is no evidence against the map.
 
-        `change`: relative voltage changes; `share`: relative depth maps, as of `share(change)`. A map is unreliable if
-        it is much deeper than the skin is thick. A map is also unreliable if it bulges outwards more than it is
-        indented, and its indentation does not explain the voltage change by the forward model, which only the design
-        "unrolled" has.
+        `change`: relative voltage changes; `share`: relative depth maps, as returned by `share(change)`. A map is
+        unreliable if it is much deeper than the skin is thick. For the design "unrolled", which contains a forward
+        model, a map is also unreliable if it bulges outwards more than it is indented, and the voltages that the model
+        predicts for its indentation do not explain the change.
         """
         reasons = ["" for _ in share]
         change_norms = np.linalg.norm(change, axis=1)
@@ -217,8 +217,8 @@ class ImageNetwork:
         return lambda change: run_network(arrays, jnp.asarray(change))
 
     def check_protocol(self, protocol: Protocol, name: str = "the data") -> None:
-        """Raise `ValueError`, which states the difference, if the network was trained for another protocol than the
-        given; currents may differ."""
+        """Raise `ValueError`, which states the difference, if the network was trained for a protocol other than
+        `protocol`; currents may differ."""
         check_same(name, self.made_for, _describe_protocol(protocol))
 
 
@@ -275,7 +275,7 @@ def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
     - `path`: path of the file or folder.
     - `skin`: the skin to be imaged, which is compared with the skin that the network was trained for.
 
-    Raises `FileNotFoundError` if the path does not exist, and `ValueError` if the file is not that of a network or the
+    Raises `FileNotFoundError` if the path does not exist, and `ValueError` if the file contains no image network or the
     network was trained for another skin.
 
     **Example:**

@@ -1,4 +1,4 @@
-"""Learn a network that images touches in three steps: simulation of touches, training, evaluation."""
+"""Learn a network that images touches: simulate touches, train the network, and evaluate the network."""
 
 from __future__ import annotations
 
@@ -43,7 +43,8 @@ from jeit.touch.training import (
     fit_network,
 )
 
-# Maximum number of simulated touches in memory, and shuffled, at once: 120 MB for 94 channels and 48 × 48 maps.
+# Maximum number of simulated touches that are in memory, and shuffled, together: 120 MB for 94 channels and 48 × 48
+# maps.
 _MAX_TOUCHES_IN_MEMORY = 12_000
 
 
@@ -54,7 +55,8 @@ class SimulatedTouches(Protocol):
     """
 
     def rows(self, *names: str) -> Rows:
-        """Return the float32 arrays "change" or "depth" in the order of `names`; the array itself for one name."""
+        """Return the float32 arrays "change" or "depth" in the order of `names`; for a single name, the array
+        itself."""
         ...
 
 
@@ -77,7 +79,7 @@ class TouchExamples(NamedTuple):
 class StoredTouches:
     """Simulated touches of a finished set of `simulate_presses`, read from the set's store on access.
 
-    Chunks of the store are read together in larger chunks of about `max_chunk_size` touches, or fewer.
+    Several chunks of the store are read together as one larger chunk of about `max_chunk_size` touches or fewer.
     """
 
     def __init__(self, indents: IndentSet, path: str | Path, max_chunk_size: int = _MAX_TOUCHES_IN_MEMORY):
@@ -131,9 +133,9 @@ class StoredRows:
         return arrays[0] if len(arrays) == 1 else arrays
 
 
-# Training of the unrolled network. Weights in the loss, relative to that of the last step's map: maps of the other
-# steps; voltage misfit. Model error, relative to the voltage changes; maximum standard deviation of the drift of log
-# contact impedances; maximum noise, as a multiple of the given noise.
+# Training of the unrolled network. Weights of the maps of the other steps and of the voltage misfit in the loss,
+# relative to the weight of the last step's map. Model error, relative to the voltage changes; maximum standard
+# deviation of the drift of log contact impedances; maximum noise, as a multiple of the given noise.
 _EARLY_MAP_WEIGHT, _MISFIT_WEIGHT, _MODEL_ERROR, _MAX_CONTACT_DRIFT, _MAX_NOISE_FACTOR = 0.3, 0.05, 0.1, 0.1, 6.0
 # Squared depths are divided by this scale, so that losses are about one before training.
 _LOSS_SCALE = 0.002
@@ -175,9 +177,11 @@ class TrainingRuns(NamedTuple):
 def train_three_stages(
     training: SimulatedTouches, validation: TouchExamples, noise: float, runs: TrainingRuns
 ) -> TrainedNetwork:
-    """Train the design of Park et al. 2022: autoencoders of voltage changes and depth maps, a projection between them.
+    """Train the design of Park et al. 2022: autoencoders of voltage changes and of depth maps, and a projection between
+    their codes.
 
-    Both autoencoders are fixed while the projection is trained. `noise`: standard deviation of relative changes.
+    Both autoencoders are fixed while the projection is trained. `noise`: standard deviation of the noise of relative
+    voltage changes.
     """
     shape = validation.depth.shape[1:]
     initial_network = ThreeStages(validation.change.shape[1], shape, key=runs.key)
@@ -248,8 +252,8 @@ def train_unrolled(
 ) -> TrainedNetwork:
     """Train an unrolled network, already adapted to a skin, to minimise errors of its depth maps and of their voltages.
 
-    The voltages of maps are computed by the skin's forward model. In training, voltage changes have the relative
-    `noise` and drifting contact impedances.
+    The voltages of maps are computed by the skin's forward model. In training, relative noise of one to six times
+    `noise` and the effect of drifting contact impedances are added to the voltage changes.
     """
     contacts = jnp.asarray(channels.contacts, jnp.float32)
 
@@ -323,7 +327,8 @@ class NetworkPreset:
     """Numbers of simulated touches and training plans for learning an image network.
 
     **Fields**: `number`: number of training touches; `held_out`: number of held-out touches, and of test touches;
-    `plan`: settings of every training; `three_stages`: those for the design "three-stages" if they differ, else None.
+    `plan`: settings of every training; `three_stages`: settings for the design "three-stages" if they differ from
+    `plan`, else None.
 
     **Example:**
 
@@ -410,10 +415,10 @@ def learn_images(
     - `touches`: number of simulated training touches, by default that of the preset, limited only by the disk.
     - `seed`: random seed.
     - `client`: client of a dask cluster that simulates the touches, or None.
-    - `progress`: called with a description of the progress.
+    - `progress`: function that is called with a description of the progress.
 
-    Raises `ValueError` for curved skins, unknown names, an invalid number of touches, and a folder with work on another
-    skin; `ImportError` without the extras `learn` and `cluster`.
+    Raises `ValueError` for curved skins, unknown names, an invalid number of touches, and a folder with results for
+    another skin; `ImportError` without the extras `learn` and `cluster`.
 
     **Example:**
 

@@ -115,7 +115,8 @@ def detection_noise(skin: Skin, limit: float = _DETECTION_LIMIT) -> float:
     return float(f"{np.median(np.abs(change).max(axis=1)) / _DETECTION_DEVIATIONS:.4g}")
 
 
-# Number of points along a side of each mesh cell that assign the cell to pixels, which are smaller than cells.
+# Number of points along a side of each mesh cell by which the cell's response is distributed over pixels, which are
+# smaller than cells.
 _POINTS_PER_SIDE = 6
 # Maximum relative depth for the nonlinear formula of strength, which is continued linearly for larger depths.
 _MAX_DEPTH = 0.9
@@ -173,7 +174,7 @@ class LinearChannels(NamedTuple):
 def round_relative(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Round values to a millionth of their maximum, or finer, to remove effects of the order of summation.
 
-    After rounding, the same random key gives the same training wherever NumPy's arrays are in memory.
+    After rounding, the same random key gives the same training, whatever the memory addresses of NumPy's arrays.
     """
     unit = 2.0 ** (np.floor(np.log2(max(float(np.abs(values).max()), 1e-300))) - 20)
     return np.round(values / unit) * unit
@@ -184,8 +185,8 @@ def strength(depth):
 
     The relative `depth` δ is the depth divided by the skin's thickness.
 
-    A patch of lower conductivity has a larger effect than in proportion to the change of conductivity, since current
-    flows around the patch. In two dimensions, patches with e^s and e^−s times the conductivity change voltages
+    The effect of a patch of lower conductivity is more than proportional to the change of its conductivity, since
+    current flows around the patch. In two dimensions, patches with e^s and e^−s times the conductivity change voltages
     oppositely, to first order in their size (Keller's duality). The strength 2 sinh(s / 2), with log(1 − δ) = −s,
     changes its sign with s, as these changes do.
     """

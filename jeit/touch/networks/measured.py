@@ -99,15 +99,15 @@ def _check_extent(network: ImageNetwork, measurement: Measurement) -> None:
 def stream_depths(network: ImageNetwork, frames: Iterable, rest: Float[np.ndarray, " M"]) -> Iterator[FrameDepth]:
     """Estimate the depth map of each frame in turn, relative to a frame of the untouched skin, by a network.
 
-    The network is compiled before the first frame is requested. A frame is refused, and the stream continues, if it has
-    another number of channels than the network, if too many of its channels are missing, or if its map is unreliable
-    (see `ImageNetwork.doubts`).
+    The network is compiled before the first frame is requested. A frame is refused, and the stream continues, if its
+    number of channels differs from that of the network, if too many of its channels are missing, or if its map is
+    unreliable (see `ImageNetwork.doubts`).
 
     **Arguments:**
 
     - `network`: the trained image network.
     - `frames`: an iterable of frames (channels,), volts.
-    - `rest`: frame (channels,) of the untouched skin, volts, as from `resting_frame`.
+    - `rest`: frame (channels,) of the untouched skin, volts, as returned by `resting_frame`.
 
     Raises `ValueError` if `frames` is not iterable.
 

@@ -56,8 +56,8 @@ class Convolution(Module):
     def apply_to_repeated(self, image: Float[Array, "b r c i"]) -> Float[Array, "b s d o"]:
         """Compute the convolution of the enlarged image `repeat_pixels(image)` with four ninths of the multiplications.
 
-        Of the three rows of the enlarged image that contribute to a pixel, two are equal, so the weights of both rows
-        are added before the multiplication; likewise for columns.
+        Of the three rows of the enlarged image that contribute to a pixel, two are equal, so the weights of these two
+        rows are added before the multiplication. Columns are treated in the same way.
         """
         num_images, rows, columns, _ = image.shape
         row_weights = jnp.stack([self.weight.at[1].add(self.weight[2])[:2], self.weight.at[1].add(self.weight[0])[1:]])
@@ -90,7 +90,7 @@ class Chain(Module):
 
     @classmethod
     def dense(cls, widths: Sequence[int], *, key: Array, dropout: float = 0.0) -> "Chain":
-        """Create dense layers in sequence, from each number of values in `widths` to the next."""
+        """Create dense layers in sequence, whose numbers of inputs and outputs are successive elements of `widths`."""
         keys = jax.random.split(key, len(widths) - 1)
         return cls(
             tuple(Dense(i, o, key=layer_key) for (i, o), layer_key in zip(pairwise(widths), keys, strict=True)), dropout

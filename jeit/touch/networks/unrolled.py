@@ -1,9 +1,9 @@
 """An unrolled network with the skin's forward model: linear images of residual voltages, refined by convolutions.
 
 Every step of the network computes linear images of the residual voltage changes by matrices of the forward model: one
-Gauss-Newton step with a Gaussian prior. One image allows for noise alone, another image also for drift of the contact
-impedances. A small convolutional network, the same all over the skin, then computes a correction of the depth map from
-the images. The training loss includes the misfit of the voltages that the forward model predicts for the maps.
+Gauss-Newton step with a Gaussian prior. Two images allow for noise alone, a third also for drift of the contact
+impedances. A small convolutional network then computes a correction of the depth map from the images. The training loss
+includes the misfit of the voltages that the forward model predicts for the maps.
 """
 
 from __future__ import annotations
@@ -68,9 +68,10 @@ class Unrolled(Module):
     """Network that computes depth maps, divided by the skin's thickness, from relative voltage changes.
 
     **Fields**: `operator` (channels, pixels): response of the channels to indentation of each pixel; `imagers`
-    (channels, pixels, images): transposed matrices of the linear images, on pixels twice as wide; `constant_images`
-    (rows / 2, columns / 2, images): constant images that describe the skin; `steps`: networks that correct the depth
-    map; `shape`: (rows, columns) of the maps. Only `steps` are trained; the other fields depend on the skin.
+    (channels, pixels, images): transposed matrices that map voltage changes to linear images with pixels twice as wide;
+    `constant_images` (rows / 2, columns / 2, images): relative distance from the nearest electrode and standardised log
+    response of each pixel; `steps`: networks that correct the depth map; `shape`: (rows, columns) of the maps. Only
+    `steps` are trained; the other fields depend on the skin.
     """
 
     operator: Float[Array, "M P"]
@@ -139,7 +140,7 @@ class Unrolled(Module):
 
     def covariance(self, pixel_positions: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "M M"]:
         """Compute the covariance (channels, channels) of the relative voltage changes due to touches that are
-        distributed as the prior; `pixel_positions` (rows, columns, 2): positions of the pixels, metres."""
+        distributed according to the prior; `pixel_positions` (rows, columns, 2): positions of the pixels, metres."""
         rows, columns = self.shape[0] // 2, self.shape[1] // 2
         operator = np.asarray(self.operator, float).reshape(-1, rows, 2, columns, 2).sum(axis=(2, 4))
         operator = operator.reshape(len(operator), -1)

@@ -39,13 +39,14 @@ def plot_contacts(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw an image with the outline of every contact, a cross at its centroid, and the centroid in millimetres.
+    """Draw an image with the outline of every contact, a cross at its centroid, and the coordinates of the centroid in
+    millimetres.
 
     **Arguments:**
 
     - `mesh`: mesh of the image.
     - `image`: change of conductivity (m,) in every cell, S (3-D: S/m).
-    - `contacts`: contacts, as from `find_contacts`.
+    - `contacts`: contacts, as returned by `find_contacts`.
     - `electrodes`: electrodes to be drawn.
     - `scale`: mapping from values of the image to colours.
     - `title`: title of the plot.
@@ -116,7 +117,7 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     - `unit`: unit of the image.
     - `axes`: six axes to draw on; by default those of a new figure.
 
-    Raises `ValueError` if `stages` is not a result of `RasterFinder.stages`, and for another number of axes than six.
+    Raises `ValueError` if `stages` is not a result of `RasterFinder.stages`, and for a number of axes other than six.
 
     **Example:**
 

@@ -45,7 +45,7 @@ def plot_health(
     **Arguments:**
 
     - `health`: health of the monitored skin, with a model of the skin.
-    - `image`: image (m,) that is drawn below the damage, as from `SkinHealth.images`, S (3-D: S/m).
+    - `image`: image (m,) that is drawn below the damage, as returned by `SkinHealth.images`, S (3-D: S/m).
     - `scale`: mapping from values of the image to colours.
     - `title`: title of the plot.
     - `ax`: axes to draw into; by default new axes.
@@ -123,11 +123,11 @@ def plot_health_course(
     """Draw the change of frames relative to the healthy skin over time, and a line at the time of every event.
 
     The change is given in multiples of the limit above which a lasting change counts as damage. Touches may cause
-    changes as large as damage, but only for a time.
+    changes as large as those of damage, but these changes do not last.
 
     **Arguments:**
 
-    - `health`: health of the skin after these frames, as from `watch`.
+    - `health`: health of the skin after these frames, as returned by `watch`.
     - `times`: times (F,) of the frames, seconds.
     - `frames`: frames (F, M), volts.
     - `title`: title of the plot.

@@ -13,7 +13,7 @@ from jeit.arguments import check_kind, real_array
 from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, draw_colour_bar, draw_scale_bar, extent_of, hide_axes
 from jeit.touch.kohonen import MapTouch
 
-# Area of a neuron's marker, points², in a map of as many neurons as the second number says.
+# Area of a neuron's marker, points², in a map of the reference size; number of neurons of a map of this size.
 _MARKER_AREA, _REFERENCE_NEURONS = 26.0, 1024
 
 
@@ -33,11 +33,11 @@ def plot_map(
 
     **Arguments:**
 
-    - `places`: places (R, C, 2) of the neurons, metres, such as `PlacedMap.places`, or, with `on_skin=False`, in any
-      unit, such as from `drawn_map`.
+    - `places`: places (R, C, 2) of the neurons, metres, such as `PlacedMap.places`; with `on_skin=False`, in any unit,
+      such as the result of `drawn_map`.
     - `values`: values (R, C) of the neurons, such as the activity in a frame, drawn in colour.
     - `label`: name of the values, for the colour bar.
-    - `touches`: touches, as from `touches_reported`, each drawn as a cross.
+    - `touches`: touches, as returned by `touches_reported`, each drawn as a cross.
     - `on_skin`: whether places are on the skin, in metres; a scale bar is then drawn.
     - `title`: title of the plot.
     - `ax`: axes to draw into; by default new axes.

@@ -1,5 +1,5 @@
-"""Plots of what a skin has learnt: touches that it predicts, its errors on held-out presses (places, forces, labels and
-keys), maps of indentation depth, and losses during training."""
+"""Plots of learnt skins and networks: predicted touches, errors on held-out presses (places, forces, labels and keys),
+maps of indentation depth, and losses during training."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def plot_depth_map(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a map of indentation depth, such as from `ImageNetwork.depth`.
+    """Draw a map of indentation depth, such as the result of `ImageNetwork.depth`.
 
     **Arguments:**
 
@@ -165,7 +165,8 @@ def plot_depth_map(
 
 
 def plot_losses(courses: Mapping[str, TrainingResult], *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw a network's loss on held-out touches during each training, relative to the first, and mark its minimum.
+    """Draw a network's loss on held-out touches during each training, relative to its first value, and mark its
+    minimum.
 
     `courses`: results of `jeit.touch.fit_network`, by the names of the trainings. Raises `ValueError` for anything but
     such results.
@@ -241,7 +242,7 @@ def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None
 
     **Arguments:**
 
-    - `label`: true labels of held-out presses, and those that the classifier predicts.
+    - `label`: true labels of held-out presses, and the labels that the classifier predicts for them.
     - `title`: title of the plot.
     - `ax`: axes to draw into; by default new axes.
 
@@ -295,7 +296,7 @@ def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None
 
 
 def plot_tried(label: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the accuracy of each classifier that was tried, on held-out presses, in per cent, the best at the top."""
+    """Draw the accuracy, in per cent, of each tried classifier on held-out presses, the best at the top."""
     ax = axes_or_new(ax)
     names, percentages = [name for name, _ in label.tried], [100 * (1 - error) for _, error in label.tried]
     colours = [SERIES_COLOURS[0] if name == label.method else "#c9d3de" for name in names]

@@ -30,8 +30,9 @@ from jeit.touch.gestures.touch_watch import NamedTouch
 from jeit.touch.listening import SoundLabels
 from jeit.touch.listening.feature_images import WINDOW_INTERVAL
 
-# Gap between frames, as a multiple of the median interval, at which a curve is interrupted; maximum number of points of
-# a curve; minimum length of a touch's bar, as a share of the whole time; maximum number of touches with numbers.
+# Minimum gap between frames at which a curve is interrupted, as a multiple of the median interval; maximum number of
+# points of a curve; minimum length of a touch's bar, as a share of the whole time; maximum number of touches with
+# numbers.
 _MIN_GAP_RATIO, _MAX_POINTS, _MIN_BAR_SHARE, _MAX_NUMBERED = 10.0, 3000, 0.003, 60
 _UNLIKE_COLOUR = "#b9bdc4"
 
@@ -77,7 +78,7 @@ def plot_timeline(
 
     **Arguments:**
 
-    - `touches`: the classified touches, as from `TouchWatch.follow`.
+    - `touches`: the classified touches, as returned by `TouchWatch.follow`.
     - `names`: names (C,) of the gestures.
     - `title`: title of the plot.
     - `ax`: axes to draw into; by default new axes.
@@ -153,7 +154,7 @@ def plot_touch_paths(
     **Arguments:**
 
     - `mesh`: mesh of the images of the skin.
-    - `touches`: the classified touches, as from `TouchWatch.follow`.
+    - `touches`: the classified touches, as returned by `TouchWatch.follow`.
     - `names`: names (C,) of the gestures.
     - `electrodes`: electrodes to be drawn.
     - `title`: title of the plot.
@@ -246,7 +247,7 @@ def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes
 
     **Arguments:**
 
-    - `labels`: the classified recording, as from `Listener.classify`.
+    - `labels`: the classified recording, as returned by `Listener.classify`.
     - `title`: title of the plot.
     - `ax`: axes to draw into; by default new axes.
 

@@ -29,7 +29,8 @@ _MAX_LISTED_FRAMES = 1000
 
 
 def write_learnt_images(learnt: LearntImages, folder: str | Path) -> None:
-    """Write the accuracy and trainings of a network to `report.json` and the picture `learning.png` in its folder.
+    """Write the accuracy and training histories of a network to `report.json` and the picture `learning.png` in its
+    folder.
 
     `folder`: folder to which `learn_images` wrote the network. Raises `ValueError` if `folder` cannot be a folder.
     """
@@ -132,14 +133,14 @@ def write_depths(
 ) -> WrittenDepths:
     """Write the depth maps that a network estimated from the frames of a recording to a folder.
 
-    `frames.csv` gets a line for each frame as it comes: `x_m`, `y_m`, the centroid of the indentation, and `depth_m`,
-    its maximum depth. At the end, `depth.npz` with all maps, `depth.png` and `report.json` are written. The number of
-    frames is not limited: maps are kept on disk, not in memory.
+    As each frame arrives, a line is written to `frames.csv`: `x_m`, `y_m`, the centroid of the indentation, and
+    `depth_m`, its maximum depth. At the end, `depth.npz` with all maps, `depth.png` and `report.json` are written. The
+    number of frames is not limited by memory, since maps are stored on disk.
 
     `frame_depths`: the frames that `stream_depths` yields; `name`: name of the recording. Maps of refused frames are
     NaN; if no depth exceeds the noise floor, the centroid is left empty. `progress` is called with every frame;
-    `drawing` is called with the name of each step at the end, as by `write_stream`. Each file is written completely or
-    not at all. Raises `ValueError` if `folder` cannot be a folder, and if no frame was imaged, in which case no file
+    `drawing` is called with the name of each step at the end, as `write_stream` does. Each file is written completely
+    or not at all. Raises `ValueError` if `folder` cannot be a folder, and if no frame was imaged, in which case no file
     remains; `OSError` on a full disk.
     """
     result_folder = results_folder(folder, DEPTH_FILES)

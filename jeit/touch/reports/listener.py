@@ -51,7 +51,7 @@ def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -
 
     **Arguments:**
 
-    - `labels`: the classified recording, as from `Listener.classify`.
+    - `labels`: the classified recording, as returned by `Listener.classify`.
     - `folder`: the folder, which is created if needed.
     - `model`: name of the listener, for the report.
 

@@ -72,7 +72,7 @@ class ArrayRows:
 
 
 class MappedRows:
-    """Training data computed from other `rows` by a `function` of each chunk, which must keep the number of rows.
+    """Training data computed from other `rows` by a `function` of each chunk, which must not change the number of rows.
 
     `name`: description of the function and of everything that the function depends on, except the rows.
     """

@@ -34,7 +34,7 @@ class TrainingObjective(NamedTuple):
       is minimised, and the network, in which leaves that are not trained, such as running means, may have changed.
     - `held_out`: function of a network and a batch of held-out rows, which returns the loss of each row, (rows,).
     - `trained`: selects the leaves (arrays) of the network that are trained: a function of a leaf that returns true or
-      false, or a tree of booleans like the network, as in `equinox.filter`.
+      false, or a tree of booleans with the structure of the network, as in `equinox.filter`.
 
     **Example:**
 
@@ -58,7 +58,7 @@ class TrainingPlan:
     **Fields**: `rate`: learning rate of Adam, which is multiplied by `decay` after every `decay_epochs` epochs;
     `batch`: number of rows in a batch; `epochs`: maximum number of epochs; `look_every`: number of batches between
     evaluations of the held-out rows, by default an epoch; `patience`: number of consecutive evaluations without
-    improvement after which training stops; `seconds`: time between checkpoints, which may be exceeded by some dozen
+    improvement after which training stops; `seconds`: time between checkpoints, which may be exceeded by a few dozen
     batches.
 
     **Example:**
@@ -130,10 +130,11 @@ def fit_network(
     - `key`: random key.
     - `checkpoint`: path of a file; if the training is killed at any moment, the same call resumes from this file, with
       results identical to those of an uninterrupted training; the file remains after the training.
-    - `progress`: called with a description of the progress after every evaluation of the held-out rows.
+    - `progress`: function that is called with a description of the progress after every evaluation of the held-out
+      rows.
 
-    Raises `ValueError` for arguments that do not fit together, a checkpoint of another training, and losses of held-out
-    rows that are not finite from the first evaluation on; `ImportError` without the extra `learn`.
+    Raises `ValueError` for arguments that are inconsistent, a checkpoint of a different training, and losses of
+    held-out rows that are not finite from the first evaluation on; `ImportError` without the extra `learn`.
 
     **Example:**
 
@@ -228,7 +229,7 @@ class _CompiledTraining:
         self.optimiser = adam.init(eqx.filter(eqx.partition(network, trained)[0], eqx.is_inexact_array))
 
     def combine(self, arrays) -> Any:
-        """Return the network with its fixed parts and the given arrays."""
+        """Combine the given arrays with the fixed parts of the network."""
         return eqx.combine(arrays, self.fixed)
 
     def initial_state(self) -> State:

@@ -22,8 +22,8 @@ _MAGIC, _MAX_HEADER_SIZE, _MAX_ARRAY_SIZE = b"jeit model\n", 2**20, 2**31
 
 
 def write_model(path: str | Path, kind: str, version: int, head: dict[str, Any], model: Any) -> None:
-    """Write the arrays of a `model`, any tree of arrays, to a file; an earlier file is replaced only when all is
-    written.
+    """Write the arrays of a `model`, any tree of arrays, to a file; an earlier file is replaced only when the new file
+    is complete.
 
     `kind` and `version`: type of the file, such as "a jeit network of images", which `read_model` checks; `head`: all
     other data that are needed to create the model again and to know the model's purpose, as JSON values. Raises
@@ -61,10 +61,11 @@ def read_model(
 ) -> tuple[dict[str, Any], Any]:
     """Read the head and the model of a file that `write_model` wrote.
 
-    `make`: function that returns, for a head, a model of the same architecture; only the model's shapes are evaluated,
-    so that no head can cause large use of memory. Nothing in the file is executed: before an array is read, its shape
-    and dtype must be those of the architecture. Raises `FileNotFoundError` if the file does not exist, and `ValueError`
-    if the file is of another kind or version, is cut short or too long, or has arrays of another architecture.
+    `make`: function that returns a model of the architecture that a head describes; only the shapes of the model's
+    arrays are evaluated, so that no head can cause large use of memory. Nothing in the file is executed: before an
+    array is read, its shape and dtype must be those of the architecture. Raises `FileNotFoundError` if the file does
+    not exist, and `ValueError` if the file is of another kind or version, is cut short or too long, or has arrays of a
+    different architecture.
     """
     with _open_file(Path(path), kind) as file:
         head = _read_header(file, kind, version)
@@ -88,9 +89,9 @@ def read_model(
 
 
 def check_same(path: str | Path, made_for: dict[str, Any], expected: dict[str, Any]) -> None:
-    """Check that a model is used for what the model was trained for, such as the same skin and protocol.
+    """Check that a model is used under the conditions of its training, such as for the same skin and protocol.
 
-    `made_for`, `expected`: descriptions of what the model was trained for and of its use, as dictionaries of JSON
+    `made_for`, `expected`: descriptions of the skin and protocol in training and in use, as dictionaries of JSON
     values, in which numbers may differ by a millionth. Raises `ValueError`, which states the first difference.
     """
     for name in expected:
@@ -215,14 +216,14 @@ class Checkpoint:
         self.path, self.fingerprint = Path(path), fingerprint
 
     def write(self, state: State) -> None:
-        """Write the state of the training; an earlier file is replaced only when all is written."""
+        """Write the state of the training; an earlier file is replaced only when the new file is complete."""
         head = {"training": self.fingerprint, "step": state.step, "course": list(state.course)}
         write_model(self.path, _CHECKPOINT_KIND, _CHECKPOINT_VERSION, head, state[2:])
 
     def read(self, initial_state: State) -> State:
         """Read the state of the training; without a file, return `initial_state`, the state before the first batch.
 
-        Raises `ValueError`, which states the first difference, if the file is of another training.
+        Raises `ValueError`, which states the first difference, if the file belongs to a different training.
         """
         if not self.path.exists():
             return initial_state

@@ -1,10 +1,10 @@
-// Colour maps as straight lines in OKLab, a colour space in which equal steps look equal: neighbouring values differ as
-// much at one end as at the other. Blue against orange, and lightness against darkness, stay apart for colour-blind
-// people. https://bottosson.github.io/posts/oklab/
+// Colour maps that are straight lines in OKLab, a colour space in which equal distances look equally different, so that
+// equal differences of values look equal on the whole scale. Colour-blind people can tell blue from orange, and light
+// from dark. https://bottosson.github.io/posts/oklab/
 
 const STEPS = 256;
 
-// Lightness and the axes green to red and blue to yellow.
+// Lightness, green-red coordinate and blue-yellow coordinate of each colour.
 const BLUE_ORANGE = {
   light: [[0.42, -0.04, -0.14], [0.975, 0, 0], [0.52, 0.1, 0.11]],
   dark: [[0.82, -0.05, -0.12], [0.24, 0, -0.01], [0.82, 0.07, 0.135]],
@@ -31,7 +31,7 @@ function rgb([lightness, greenRed, blueYellow]) {
   });
 }
 
-// The colours of a map, as bytes red, green, blue, for 256 values from the lowest to the highest.
+// Compute the colours of a map, as bytes red, green, blue, for 256 values from the lowest to the highest.
 export function colourMap(diverging, theme) {
   const stops = diverging ? BLUE_ORANGE[theme] : BLUE_YELLOW;
   const table = new Uint8Array(3 * STEPS);

@@ -1,9 +1,9 @@
-// The connection to the session: messages become objects, and a lost connection is made again.
+// The connection to the session: messages are converted to objects, and a lost connection is opened again.
 
 const NO_PIXEL = -32768;
 const LONGEST_WAIT = 5000;
 
-// A picture from its bytes; the server's wire.py says how they are laid out.
+// Decode a picture from its bytes; the server's wire.py describes their layout.
 export function readPicture(bytes) {
   const length = new DataView(bytes).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(bytes, 4, length)));
@@ -16,7 +16,8 @@ export function readPicture(bytes) {
   return picture;
 }
 
-// `handle`: functions by kind of message: scene, state, answer, picture, and lost, which is given a text.
+// `handle`: functions that are called for each kind of message (scene, state, answer, picture), and when the connection
+// is found or lost; `lost` is called with the reason.
 export class Connection {
   constructor(handle) {
     this.handle = handle;

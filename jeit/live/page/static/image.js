@@ -33,7 +33,7 @@ export class ImageView {
   setScene(scene) {
     this.scene = scene;
     this.box = bounds([...scene.outline, ...scene.electrodes], scene.extent);
-    // A scale that the user chose outlives a lost connection.
+    // A colour scale that the user chose remains when the connection is opened again.
     if (this.scale?.diverging !== scene.diverging || this.unit !== scene.unit) this.scale = new ColourScale(scene.diverging);
     this.unit = scene.unit;
     this.shown = this.picture = null;
@@ -78,14 +78,14 @@ export class ImageView {
 
   toBody = (x, y) => [(x - this.origin[0]) / this.metre, (this.origin[1] - y) / this.metre];
 
-  // Electrodes that are dead or drift, by name.
+  // Mark the electrodes that are dead or drift, given by name.
   setHealth(dead, drifting) {
     if (String(dead) === String(this.dead) && String(drifting) === String(this.drifting)) return;
     Object.assign(this, { dead, drifting });
     if (this.scene) this.drawFixed();
   }
 
-  // Take a picture to be drawn; `past`: one of the last minute, which belongs to no path.
+  // Store a picture to be drawn. A `past` picture, of the last minute, is not added to the paths of contacts.
   take(picture) {
     this.picture = picture;
     if (picture.pixels) {
@@ -105,7 +105,7 @@ export class ImageView {
     }
   }
 
-  // Value of the picture shown at a place of the body, or NaN.
+  // Value of the displayed picture at a position on the body, or NaN.
   valueAt([x, y]) {
     const { shown, scene } = this;
     if (!shown?.pixels) return NaN;
@@ -115,7 +115,7 @@ export class ImageView {
     return column >= 0 && column < columns && row >= 0 && row < rows ? shown.pixels[row * columns + column] : NaN;
   }
 
-  // Label of the marker shown at a place of the body, or "".
+  // Label of the displayed marker near a position on the body, or "".
   labelAt(place) {
     const [left, top] = this.toCanvas(place);
     const near = ([x, y]) => Math.hypot(this.toCanvas([x, y])[0] - left, this.toCanvas([x, y])[1] - top) < 12;
@@ -172,12 +172,12 @@ export class ImageView {
     pen.restore();
   }
 
-  // Whether the image shown is older than the newest frame, which was refused.
+  // Whether the displayed image is older than the newest frame, because the newest frame was refused.
   stale() {
     return Boolean(this.picture && !this.picture.pixels && this.picture.second - this.shown?.second > STALE_SECONDS);
   }
 
-  // Outline, electrodes, scale bar and colour bar, which are the same from picture to picture.
+  // Draw the outline, electrodes, scale bar and colour bar, which most pictures share.
   drawFixed() {
     const pen = this.fixed.getContext("2d");
     const { scene, inks, box } = this;
@@ -228,7 +228,7 @@ export class ImageView {
     const drifts = this.drifting.includes(name);
     const points = curve.map(this.toCanvas);
     const middle = [0, 1].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
-    // Discs lie on the image, whose colours may be dark or light: they get a light or dark rim.
+    // Discs lie on the image, so that a rim in the colour of the background separates them from the image's colours.
     const disc = Math.hypot(points[0][0] - points.at(-1)[0], points[0][1] - points.at(-1)[1]) < 2;
     for (const [ink, line] of [[this.inks.paper, disc ? 8 : 0], [dead || drifts ? this.inks.warn : this.inks.ink, 5]]) {
       if (!line) continue;
@@ -347,7 +347,7 @@ export class ImageView {
     }
   }
 
-  // The colour bar; its ticks are those of the scale, which changes seldom.
+  // Draw the colour bar with ticks at round values of the colour scale.
   drawBar(pen) {
     const { bar, scale, inks, scene } = this;
     const { factor, unit } = unitFor(Math.max(Math.abs(scale.highest), Math.abs(scale.lowest)), scene.unit);

@@ -1,4 +1,5 @@
-// The page: what comes from the session is drawn, and what the user asks for is done or sent.
+// The page: it draws the pictures and states of the session, and executes the user's commands or sends them to the
+// session.
 
 import { LINES } from "./colours.js";
 import { Connection } from "./connection.js";
@@ -12,7 +13,7 @@ import { Traces } from "./traces.js";
 const TRACE_PERIOD = 80;
 const MINUTE = 60;
 const MOST_CHANNELS = 5;
-// How the session's answers to Record begin when nothing is recorded.
+// Beginnings of the session's messages that a recording could not begin.
 const FAILED = ["The recording cannot begin", "There is nowhere to record to"];
 
 const view = new ImageView(element("image"));
@@ -20,7 +21,7 @@ const traces = { regions: new Traces(element("regions-trace")), channels: new Tr
 const page = { paused: false, newest: null, latest: null, shown: null, rate: 0, hidden: false, tracedAt: 0, said: "", failures: null };
 const channels = [];
 
-// ---- drawing: the newest picture once a screen, and then its number reported ----
+// ---- drawing: the newest picture at each refresh of the screen; its number is then reported to the session ----
 
 const painted = new MessageChannel();
 painted.port1.onmessage = ({ data }) => {
@@ -76,7 +77,7 @@ function showBanner() {
   }
 }
 
-// A sentence over the image for some seconds.
+// Show a sentence over the image for some seconds.
 function note(text, seconds = 4) {
   page.note = text;
   page.noteUntil = performance.now() + 1000 * seconds;
@@ -84,7 +85,7 @@ function note(text, seconds = 4) {
   setTimeout(showBanner, 1000 * seconds + 100);
 }
 
-// Why a recording could not begin, once; `failures` is null until the messages of before are known.
+// Show once why a recording could not begin; `failures` is null until the earlier messages are known.
 function noteFailure(messages) {
   const failed = messages.filter(({ text }) => FAILED.some((beginning) => text.startsWith(beginning)));
   const newest = failed.at(-1)?.second ?? -Infinity;
@@ -97,7 +98,7 @@ document.addEventListener("visibilitychange", () => {
   redraw();
 });
 
-// ---- what comes from the session ----
+// ---- messages from the session ----
 
 function takePicture(picture) {
   if (picture.past) {
@@ -348,7 +349,7 @@ drawWith(view, {
   },
 });
 
-// The value under the mouse or the cross.
+// Show the value under the mouse or the cross.
 function showValue() {
   if (!page.place || !view.scene) {
     write("readout", "Drag on the image to follow a region; point to read a value.");

@@ -3,7 +3,7 @@
 const PREFIXES = new Map([[-9, "n"], [-6, "µ"], [-3, "m"], [0, ""], [3, "k"], [6, "M"]]);
 const PREFIXED = new Set(["S/m", "S", "m", "N", "V", "A", "Pa", "Ω", "ohm"]);
 
-// A factor and a unit in which a size is a number from 1 to 1000: 0.004 S/m is 4 mS/m.
+// Choose a factor and a prefixed unit that make a size a number from 1 to 1000: 0.004 S/m is 4 mS/m.
 export function unitFor(size, unit) {
   if (!(size > 0) || !Number.isFinite(size)) return { factor: 1, unit };
   const power = 3 * Math.floor(Math.log10(size) / 3 + 1e-9);
@@ -14,7 +14,7 @@ export function unitFor(size, unit) {
   return { factor: 10 ** -power, unit: `10${digits}${unit ? " " + unit : ""}` };
 }
 
-// With the true minus sign, and no plus in an exponent.
+// Replace hyphens by minus signs, and remove the plus sign of an exponent.
 const signed = (text) => text.replace("e+", "e").replaceAll("-", "−");
 
 export function short(value, digits = 3) {
@@ -44,7 +44,7 @@ export function round125(size) {
 // A round number as text, such as a tick of an axis.
 export const round = (value) => signed(String(Number(value.toPrecision(3))));
 
-// At most `most` round numbers from the lowest to the highest.
+// Round numbers from the lowest to the highest, with at most `most` equal steps between them.
 export function ticks(lowest, highest, most = 5) {
   const span = highest - lowest;
   if (!(span > 0) || !Number.isFinite(span)) return [lowest];

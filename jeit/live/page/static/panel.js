@@ -1,4 +1,4 @@
-// What the session reports, as text: rates, quality, reasons, events and the recording.
+// The state of the session as text: rates, quality, reasons for refused frames, events and the recording.
 
 import { bytes, milliseconds, percent, short } from "./numbers.js";
 
@@ -10,10 +10,10 @@ export function write(id, text) {
   return target;
 }
 
-// A number and its percent sign stay on one line.
+// Keep each number and its percent sign on one line.
 const unbroken = (text) => text.replaceAll(" %", "\u00a0%");
 
-// Replace the lines of a list, if they are others than before.
+// Replace the lines of a list if they have changed.
 export function list(id, lines, make = null) {
   const target = element(id);
   const key = JSON.stringify(lines);

@@ -1,6 +1,6 @@
-// From an image's values to colours: smoothing, threshold, and the edge of the body.
+// Conversion of an image's values to colours: smoothing, threshold, and the edge of the body.
 
-// Values smoothed by a Gaussian of a width in pixels; pixels outside the body are NaN and have no part in it.
+// Smooth values by a Gaussian of standard deviation `sigma`, pixels; pixels outside the body, NaN, are left out.
 export function smooth(values, [height, width], sigma) {
   if (!(sigma > 0)) return values;
   const reach = Math.ceil(2.5 * sigma);
@@ -28,8 +28,8 @@ export function smooth(values, [height, width], sigma) {
   return along(along(values, width, height, 1, width), height, width, width, 1);
 }
 
-// Values with pixels just outside the body set to the mean of their neighbours, so that drawing between pixels does not
-// fade at the outline, which cuts them off.
+// Set the pixels just outside the body to the mean of their neighbours, so that interpolation between pixels does not
+// fade the image at the outline, at which the image is clipped.
 export function widen(values, [height, width]) {
   let wide = values;
   for (let pass = 0; pass < 2; pass += 1) {
@@ -56,7 +56,8 @@ export function widen(values, [height, width]) {
   return wide;
 }
 
-// Whether the colour scale hides a value: those below a part of its reach, from zero or from its lowest value.
+// Whether the colour scale hides a value, because its distance from zero (diverging scale) or from the lowest value is
+// less than the fraction `threshold` of the scale.
 export function hides(value, { lowest, highest, diverging, threshold }) {
   if (!(threshold > 0)) return false;
   return diverging ? Math.abs(value) < threshold * highest : value - lowest < threshold * (highest - lowest);
@@ -90,8 +91,8 @@ function rounded(size) {
   return power * [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10].find((step) => step * power >= size * (1 - 1e-9));
 }
 
-// A colour scale that follows the pictures calmly: it grows at once, and shrinks when less than 60 % of it has been in
-// use for some seconds.
+// A colour scale that adapts to the pictures: it grows at once, but shrinks only when less than 60 % of it has been
+// used for some seconds.
 export class ColourScale {
   constructor(diverging) {
     Object.assign(this, { diverging, fitted: true, threshold: 0, lowest: diverging ? -1 : 0, highest: 1 });
@@ -134,7 +135,7 @@ export class ColourScale {
     }
   }
 
-  // Keep the scale at a largest value, and a lowest one where colours are not centred on zero.
+  // Fix the highest value of the scale and, unless the colours are centred on zero, the lowest value.
   keep(highest, lowest = this.lowest) {
     const from = this.diverging ? -highest : lowest;
     if (!Number.isFinite(highest) || !Number.isFinite(from) || !(highest > from)) return false;

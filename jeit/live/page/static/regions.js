@@ -1,8 +1,8 @@
-// Regions drawn on the image with mouse, finger or keyboard, and the mean of a picture over each.
+// Regions drawn on the image with mouse, finger or keyboard, and the mean of a picture over each region.
 
 export const MOST_REGIONS = 5;
 const LEAST_DRAG = 8;
-// A drag that encloses less than this part of the square of its length is taken for the diagonal of a rectangle.
+// A drag counts as the diagonal of a rectangle if it encloses less than this fraction of the square of its length.
 const STRAIGHT = 0.05;
 
 function inside(points, x, y) {
@@ -55,14 +55,15 @@ function area(points) {
   }, 0));
 }
 
-// The rectangle between two places, no side shorter than `least`.
+// The rectangle with two given opposite corners, but with no side shorter than `least`.
 function rectangle([ax, ay], [bx, by], least) {
   const [x, y] = [(ax + bx) / 2, (ay + by) / 2];
   const [right, up] = [Math.max(least, Math.abs(bx - ax)) / 2, Math.max(least, Math.abs(by - ay)) / 2];
   return [[x - right, y - up], [x + right, y - up], [x + right, y + up], [x - right, y + up]];
 }
 
-// Let the user draw regions on the image. `add` is given the points of a region; `point` a place, or null.
+// Let the user draw regions on the image. `add` is called with the points of a new region, `point` with the position of
+// the pointer or of the cross, or null.
 export function drawWith(view, { add, point, redraw }) {
   const { canvas } = view;
   let start = null;

@@ -1,4 +1,4 @@
-// Pictures and films of the image, made in the browser and saved as downloads: the server writes nothing for them.
+// Pictures and films of the image, which the browser creates and saves as downloads, without the server.
 
 const LONGEST_FILM = 10 * 60 * 1000;
 const TYPES = ["video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm", "video/mp4"];
@@ -17,12 +17,13 @@ function download(blob, ending) {
   return link.download;
 }
 
-// `done` is given the name of the saved picture, or null where the browser makes none.
+// `done` is called with the name of the saved picture, or null if the browser creates none.
 export function savePicture(canvas, done) {
   canvas.toBlob((blob) => done(blob && download(blob, "png")), "image/png");
 }
 
-// A film of the canvas, at most ten minutes; `changed` is given whether one is being made, and the name of a saved one.
+// A film of the canvas, of at most ten minutes. `changed` is called with whether a film is being recorded, and with the
+// name of a saved film or null.
 export class Film {
   constructor(canvas, changed) {
     Object.assign(this, { canvas, changed, recorder: null });

@@ -1,11 +1,11 @@
-// Values over time as lines: the last half minute, in a canvas.
+// Lines of values over the last half minute, drawn in a canvas.
 
 import { LINES } from "./colours.js";
 import { round, ticks } from "./numbers.js";
 
 const SPAN = 30;
 const KEPT = 60;
-// Seconds without a value, as during a pause, after which a line begins anew.
+// Seconds without a value, as during a pause, after which a line is interrupted.
 const GAP = 1;
 
 export class Traces {
@@ -17,7 +17,7 @@ export class Traces {
     this.newest = 0;
   }
 
-  // Add a value to the line of a key; `colour`: its index among the colours of lines.
+  // Add a value to the line named `key`; `colour`: index of the line's colour in `LINES`.
   add(key, colour, second, value) {
     if (!this.series.has(key)) this.series.set(key, { colour, points: [] });
     const { points } = this.series.get(key);
@@ -83,7 +83,7 @@ export class Traces {
     pen.restore();
   }
 
-  // Lowest and highest value drawn, with some room; at least a hundred-thousandth apart.
+  // Lowest and highest drawn value, extended by a margin that is never zero.
   range(first, factor) {
     let [lowest, highest] = [Infinity, -Infinity];
     for (const { points } of this.series.values()) {
@@ -98,7 +98,7 @@ export class Traces {
     return [lowest - room, highest + room];
   }
 
-  // Of the points of a pixel's column, the least and the largest; NaN is a gap.
+  // Reduce the points to the minimum and the maximum of each column of pixels; NaN is a gap.
   thinned(points, first, toX) {
     const kept = [];
     let column = null;
