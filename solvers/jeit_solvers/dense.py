@@ -142,10 +142,10 @@ def _inverse_square_root(pivot: Inexact[Array, "batch 1"]) -> Inexact[Array, "ba
 
 
 def _inverse_cholesky_recursive(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """Inverse Cholesky factors, as from `inverse_cholesky`, by recursion on two by two blocks. Nearly all work is in
-    matrix products, which are three to four times faster than LAPACK's inverse of a triangle. The smallest blocks use
-    unrolled code in large batches, and in small batches a loop over short vectors; blocks are larger for fewer
-    matrices."""
+    """Inverse Cholesky factors, as from `inverse_cholesky`, by recursion on two by two blocks. Nearly all operations
+    are matrix products, which are three to four times faster than LAPACK's inverse of a triangular matrix. The smallest
+    blocks are inverted by unrolled code in large batches, and by a loop over short vectors in small batches; blocks are
+    larger for fewer matrices."""
     batch, size, _ = matrices.shape
     is_numpy = isinstance(matrices, np.ndarray)
     uses_lapack = is_numpy and not np.iscomplexobj(matrices)
@@ -238,8 +238,8 @@ def ridge_model(
     covariance: Float[Array, "M M"],
     precision: Float[Array, "M M"],
 ) -> QuadraticModel:
-    """Quadratic model for `Descent` of the cost ½ rᵀ C⁻¹ r + ½ ‖c‖² with the residual r: the cost at a point c, and the
-    function `step`.
+    """Quadratic model, for `Descent`, of the cost ½ rᵀ C⁻¹ r + ½ ‖c‖² with the residual r: returns the cost at a point
+    c, and the function `step`.
 
     **Arguments:**
 
@@ -280,8 +280,8 @@ def ridge_step(
 ) -> Float[Array, " n"]:
     """Solve (JᵀC⁻¹J + ridge · 1) δ = -(JᵀC⁻¹r + c) for δ, by a linear system of min(M, n) unknowns.
 
-    With fewer data than unknowns, δ = -c / ridge - Jᵀ (JJᵀ + ridge · C)⁻¹ (r - J c / ridge) by Woodbury's identity, in
-    a form without cancellation of large terms, however small the ridge is relative to J.
+    With fewer data than unknowns, δ = -c / ridge - Jᵀ (JJᵀ + ridge · C)⁻¹ (r - J c / ridge) by Woodbury's identity. The
+    formula is evaluated without cancellation of large terms, even if the ridge is small relative to J.
 
     **Arguments:**
 
