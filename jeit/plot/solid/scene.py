@@ -27,7 +27,8 @@ _MIN_BRIGHTNESS = 0.66
 
 @dataclass(frozen=True)
 class Camera:
-    """Direction of view of a parallel projection, in which lengths perpendicular to the view are true to scale.
+    """Direction of view of a parallel projection, in which lengths perpendicular to the direction of view are true to
+    scale.
 
     **Fields**: `azimuth`: angle of the viewer around the z axis, in degrees from the x axis towards y; `elevation`:
     angle of the viewer above the plane z = 0, in degrees. Azimuth −90 with elevation 0 is the view of the front, along

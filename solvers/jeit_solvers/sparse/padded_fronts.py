@@ -238,9 +238,7 @@ def analyse(pattern: SparsityPattern, coordinates: Any = None) -> FactorisationP
     - `pattern`: sparsity pattern of n unknowns.
     - `coordinates` (n, d): coordinates of the unknowns, which give a better order than the pattern alone.
 
-    Raises `ValueError` if the coordinates have another shape or are not finite.
-
-    **Example:**
+    X
 
     ```python
     plan = analyse(pattern, coordinates)
@@ -250,7 +248,7 @@ def analyse(pattern: SparsityPattern, coordinates: Any = None) -> FactorisationP
 
 
 def checked_coordinates(pattern: SparsityPattern, coordinates: Any) -> np.ndarray | None:
-    """Coordinates (n, d) of the unknowns as an array, or None. Raises `ValueError` if the coordinates have another
+    """Coordinates (n, d) of the unknowns as an array, or None. Raises `ValueError` if the coordinates have a wrong
     shape or are not finite."""
     if coordinates is None:
         return None

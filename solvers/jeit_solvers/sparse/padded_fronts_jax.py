@@ -182,7 +182,7 @@ def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Arr
     - `factor`: from `factorise`.
     - `right_hand_sides` (n,) or (n, k): b, one or several vectors.
 
-    Raises `ValueError` for other shapes.
+    Raises `ValueError` for wrong shapes.
 
     **Example:**
 
@@ -230,7 +230,7 @@ def half_solve(
 
     - `plan`, `factor`, `right_hand_sides` (n, k): as for `solve`.
 
-    Raises `ValueError` for other shapes.
+    Raises `ValueError` for wrong shapes.
 
     **Example:**
 
