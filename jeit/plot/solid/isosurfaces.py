@@ -89,7 +89,7 @@ def plot_isosurfaces(
       one sign are left out if their maximum is less than 0.3 times the maximum of the opposite sign. For absolute
       images (see `ColourScale.difference`), levels are fractions of the range from minimum to maximum.
     - `inclusions`: inclusions, drawn as their sign and the outline of their form, or of a ball of the same volume if
-        they have no form.
+      they have no form.
     - `camera`: direction of view.
     - `scale`: colour scale; default: for changes of conductivity in S/m.
     - `ax`: axes to draw in; default: new axes.

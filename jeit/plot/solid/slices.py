@@ -50,7 +50,7 @@ def plot_slice(
     - `plane`: the plane.
     - `electrodes`: electrodes, which are drawn where the plane intersects them.
     - `inclusions`: inclusions, drawn as the section of their form, or of a ball of the same volume if they have no
-        form.
+      form.
     - `scale`, `ax`: as for `plot_isosurfaces`.
 
     Raises `ValueError` for a plane that misses the body, values of a wrong shape, and arguments of a wrong type.

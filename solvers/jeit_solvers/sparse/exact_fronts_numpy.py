@@ -153,7 +153,8 @@ def factorise_fronts(fronts: Fronts, values: Inexact[np.ndarray, " nnz"]) -> Fro
         **Arguments:**
 
         - `fronts`: from `find_fronts`.
-        - `values` (nnz,): entries of the matrix, in the order of the pattern from which the fronts were computed.
+    - `values` (nnz,): entries of the matrix, in the order of the pattern from which the fronts were computed.
+
     Raises `ValueError` for values of a wrong shape.
 
         **Example:**

@@ -238,7 +238,9 @@ def analyse(pattern: SparsityPattern, coordinates: Any = None) -> FactorisationP
     - `pattern`: sparsity pattern of n unknowns.
     - `coordinates` (n, d): coordinates of the unknowns, which give a better order than the pattern alone.
 
-    X
+    Raises `ValueError` if the coordinates have a wrong shape or are not finite.
+
+    **Example:**
 
     ```python
     plan = analyse(pattern, coordinates)
