@@ -150,19 +150,19 @@ class FrontalFactor(NamedTuple):
 def factorise_fronts(fronts: Fronts, values: Inexact[np.ndarray, " nnz"]) -> FrontalFactor:
     """Factorise a sparse symmetric matrix in NumPy.
 
-        **Arguments:**
+    **Arguments:**
 
-        - `fronts`: from `find_fronts`.
+    - `fronts`: from `find_fronts`.
     - `values` (nnz,): entries of the matrix, in the order of the pattern from which the fronts were computed.
 
     Raises `ValueError` for values of a wrong shape.
 
-        **Example:**
+    **Example:**
 
-        ```python
-        factor = factorise_fronts(find_fronts(pattern), values)
-        factor.solve(np.eye(50)[:, :2])
-        ```
+    ```python
+    factor = factorise_fronts(find_fronts(pattern), values)
+    factor.solve(np.eye(50)[:, :2])
+    ```
     """
     if np.shape(values) != (fronts.num_entries,):
         raise ValueError(
