@@ -67,7 +67,7 @@ def npz_arrays(
                         arrays[name] = _read_array(member)
         except TooLarge:
             raise
-        except (*FAULTS, OSError) as error:  # a member may claim to lie before the start of the file
+        except (*FAULTS, OSError) as error:  # the archive may place a member before the start of the file
             raise _unreadable_error("NPZ file of plain arrays", error) from None
     return {"": np.array([*members], dtype=str), **arrays}
 
