@@ -150,8 +150,8 @@ _MAX_KEY_PARTS = 32
 
 
 def read_text(path: str | Path, *, encoding: str = "utf-8", max_bytes: int | None = None) -> str:
-    """Read the text of a file of at most `max_bytes` bytes; without `max_bytes`, the memory limit of `check_memory`
-    applies.
+    """Read the text of a file of at most `max_bytes` bytes, whose content must not exceed the memory limit
+    (`check_memory`).
 
     The errors state the file's name: `ValueError` if the file is larger, `UnicodeError` (a `ValueError`) if it is not
     text, and `OSError` if it does not exist.
@@ -166,7 +166,7 @@ def read_text(path: str | Path, *, encoding: str = "utf-8", max_bytes: int | Non
 
 
 def check_size(path: Path, max_bytes: int | None = None) -> None:
-    """Raise `ValueError` for a file of more than `max_bytes` bytes, or whose content exceeds the memory limit
+    """Raise `ValueError` if a file has more than `max_bytes` bytes, or if its content exceeds the memory limit
     (`check_memory`)."""
     size = path.stat().st_size
     if max_bytes is not None and size > max_bytes:

@@ -1,6 +1,6 @@
 """Derivatives of voltages with respect to conductivity changes in a few cells, and to contact impedances.
 
-At fixed fields F (`ForwardModel.fields`) the energy in the contact of electrode l, with contact impedance z_l, is
+For the fields F (`ForwardModel.fields`) and the contact impedance z_l, the energy in the contact of electrode l is
 E_l(F, F) = (1/z_l) ∫_l (F - Z_l)², where Z is the transfer impedance. As F is stationary (`jeit.forward.transfer`), the
 derivative of the transfer impedance with respect to the contact impedance needs no further solve:
 

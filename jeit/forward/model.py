@@ -87,8 +87,8 @@ class ForwardModel(Module):
     """Electrode voltages of a body of given conductivity σ: solves ∇·(σ∇u) = 0 with the complete (or point) electrode
     model.
 
-    Every method takes a conductivity: a scalar, one value per cell (m,), one value per node (n,), or a symmetric tensor
-    per cell (m, d, d), in siemens per metre (2-D: sheet conductivity in siemens); complex values are admittivities. A
+    Every method takes a conductivity in siemens per metre (2-D: sheet conductivity in siemens): a scalar, one value per
+    cell (m,), one value per node (n,), or a symmetric tensor per cell (m, d, d). Complex values are admittivities. A
     conductivity that has a different shape, or is not positive or not finite, raises `ValueError`. A method that is
     called directly runs in NumPy. Inside `jax.jit`, as in `jax.jit(model.voltages)`, `jax.vmap` or a derivative, the
     method is compiled at the first call, and is two to four times as fast afterwards. All methods are differentiable
@@ -363,9 +363,9 @@ def _blocks_of_cells(mesh: Mesh, protocol: Protocol) -> list[slice]:
 def jacobian_blocks(
     mesh: Mesh, protocol: Protocol, fields: Inexact[Array, "n L"]
 ) -> Iterator[tuple[slice, Inexact[Array, "M b"]]]:
-    """Jacobian of the channels with respect to the conductivity of cells, in V m/S (2-D: V/S), as blocks (M, b) of
-    consecutive cells, because the whole Jacobian of a solid does not fit in memory. Computed in NumPy from the `fields`
-    (n, L) of `fields_of`, in ohms."""
+    """Jacobian of the channels with respect to the conductivity of cells, in V m/S (2-D: V/S). It is computed in blocks
+    (M, b) of consecutive cells, because the whole Jacobian of a solid does not fit in memory. Computed in NumPy from
+    the `fields` (n, L) of `fields_of`, in ohms."""
     gradient = field_gradients(mesh, fields)
     for cells in _blocks_of_cells(mesh, protocol):
         yield cells, _jacobian_of_cells(protocol, gradient[:, cells])

@@ -51,10 +51,10 @@ def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
 def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
     """Convert `conductivity` to an array, and raise `ValueError` if the array has the wrong shape or is not positive.
 
-    Accepts a scalar (converted to shape (m,)), values per cell (m,) or per node (n,), or symmetric tensors (m, s, s),
-    where s is the dimension of space; in siemens per metre (in a 2-D sheet, siemens). Of tensors (m, 3, 3) on a surface
-    in space, only the components in the plane of each triangle are used. A complex admittivity needs a positive real
-    part. Values of traced arrays are not checked.
+    Accepts a scalar (converted to shape (m,)), values per cell (m,) or per node (n,), or symmetric tensors (m, s, s) in
+    space of dimension s; in siemens per metre (in a 2-D sheet, siemens). Of tensors (m, 3, 3) on a surface in space,
+    only the components in the plane of each triangle are used. A complex admittivity needs a positive real part. Values
+    of traced arrays are not checked.
     """
     conductivity = np.asarray(conductivity) if has_values(conductivity) else jnp.asarray(conductivity)
     # All equivalent inputs get the same type and shape, because JAX compiles again for Python's "weakly typed" numbers.

@@ -137,7 +137,7 @@ class SolvedSystem(NamedTuple):
     def fields(self) -> tuple[Inexact[Array, "n L"], Inexact[Array, "L L"]]:
         """Potentials F (n, L) of the nodes and U (L, L) of the electrodes for a unit current into each electrode that
         leaves through all electrodes in equal parts. All potentials are relative to the same reference potential near
-        the body, whatever the contact impedances."""
+        the body, which does not depend on the contact impedances."""
         return unit_fields(self.solution, self.product, self.resistance)
 
 
@@ -204,10 +204,10 @@ def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
     each terminal that leaves through a reference terminal.
 
     Eliminating the nodal potentials from the system leaves (D - BᵀA⁻¹B) U = I, with the symbols of
-    `electrode_impedance`. The columns of the matrix D - BᵀA⁻¹B sum to zero, so its diagonal is computed as the sum of
-    the other entries, which avoids the cancellation in D - BᵀA⁻¹B at small contact impedance. The reference terminal is
-    the terminal with the largest conductance to the others. Rows and columns are scaled by their diagonals, because the
-    contact impedances may differ by orders of magnitude.
+    `electrode_impedance`. The columns of the matrix D - BᵀA⁻¹B sum to zero, so its diagonal is computed from the sum of
+    the off-diagonal entries. This avoids the cancellation in D - BᵀA⁻¹B at small contact impedance. The reference
+    terminal is the terminal with the largest conductance to the others. Rows and columns are scaled by their diagonals,
+    because the contact impedances may differ by orders of magnitude.
     """
     xp = namespace(product)
     coupling = (product + product.T) / 2 * (1 - np.eye(len(product)))

@@ -158,13 +158,13 @@ class ColourScale(Module):
 
     **Fields**
 
-    - `difference`: whether values are changes, drawn with a diverging colour map centred at zero; otherwise, they are
+    - `difference`: whether values are changes, drawn with a diverging colour map centred at zero. Other values are
       drawn with a perceptually uniform sequential colour map from the minimum to the maximum.
     - `quantity`: label of the colour bar; default: conductivity or its change.
     - `unit`: unit of the values, "" for none; default: the unit of conductivity ("S" for a sheet, "S/m" for a body).
       The colour bar adds an SI prefix.
     - `limit`: value at the end of the colour bar, in `unit`; default: the maximum magnitude.
-    - `colour_map`: name of a matplotlib colour map to use instead of these colour maps.
+    - `colour_map`: name of a matplotlib colour map that replaces the default colour maps.
     - `bar`: whether to draw the colour bar.
     - `logarithmic`: whether the values are log₁₀ of factors; the colour bar then states the factors.
 

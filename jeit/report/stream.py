@@ -1,5 +1,5 @@
-"""Files of a stream: a table and images, written frame by frame, and pictures at the end; and the files that grow with
-a stream of any length, written with constant memory."""
+"""Files of a stream: a table and images, written frame by frame, and pictures at the end. Files can grow to any length
+with constant memory."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ def discarded_damaged(warning: str) -> bool:
     """Whether a warning is JAX's message that a cached program could not be read; if so, delete all cached files with
     the program's name.
 
-    If they stayed, JAX, which does not overwrite cached files, would compile the program again and repeat the warning in
+    JAX does not overwrite cached files. If they stayed, it would compile the program again and repeat the warning in
     every later process.
     """
     match = re.match(r"Error reading persistent compilation cache entry for '([\w<>.-]+)'", warning)

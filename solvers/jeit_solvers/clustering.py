@@ -2,8 +2,8 @@
 
 Lloyd's algorithm is run from several greedy k-means++ starts. For k clusters of n points in d dimensions, the main cost
 of an iteration is the product of a matrix (k, d) with a matrix (d, n). The product is smaller once some centres no
-longer move. The mean of the points is subtracted first, so that the squared distances ‖x‖² - 2 x·c + ‖c‖² of points x
-from centres c are accurate even if the points lie far from the origin.
+longer move. The mean of the points is subtracted first: the squared distance ‖x‖² - 2 x·c + ‖c‖² of a point x from a
+centre c would be inaccurate far from the origin.
 """
 
 from __future__ import annotations
@@ -150,9 +150,9 @@ def _num_candidates(num_clusters: int) -> int:
 
 
 def _kmeans_plus_plus(points, squares, draws: Float[Array, "k trials"]) -> Float[Array, "k d"]:
-    """Greedy k-means++: a few points are drawn with weights equal to their squared distance to the nearest centre, and
-    the next centre is the drawn point that lowers the sum of these squares most. `draws`: random numbers from 0 to
-    1."""
+    """Greedy k-means++: a few points are drawn with probabilities proportional to their squared distance to the nearest
+    centre. The next centre is the drawn point that lowers the sum of the squared distances most. `draws`: random
+    numbers from 0 to 1."""
     last_index = len(points) - 1
 
     def squared_distances(index):

@@ -1,7 +1,7 @@
 """Distribution of many equal parts of a computation over the cores of a machine.
 
 XLA spreads a product of large matrices over all cores, but runs gathers, sums and small products of a compiled loop on
-one core; two loops in separate threads use two cores. NumPy likewise runs on one core, except for products, which its
+one core. Two loops in separate threads use two cores. NumPy likewise runs on one core, except for products, which its
 BLAS spreads over all cores. While several threads work in NumPy, the BLAS is limited to one thread, because the threads
 of BLAS would compete with these threads.
 """
@@ -27,7 +27,7 @@ from jaxtyping import Array, Int
 # Maximum number of threads that work in NumPy at once: each thread needs its own memory, and all share the memory
 # bandwidth.
 _MAX_THREADS = 4
-# Prefix of the names of the threads of `on_cores`, by which calls from inside a part are recognised.
+# Prefix of the names of the threads of `on_cores`. A call from a thread with this prefix comes from inside a part.
 _THREAD_NAME = "jeit-core"
 
 
@@ -85,8 +85,8 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
     """Apply `function` to each part, in NumPy, in parallel on several cores; the function stores its results itself.
 
     The parts are processed in the calling thread if there is only one part, if the call comes from inside another part,
-    or while another thread uses the cores: parts may wait for compiled programs, which call NumPy from other threads.
-    Floating-point warnings are suppressed, because NaN is reported elsewhere.
+    or while another thread uses the cores. The reason is that parts may wait for compiled programs, which call NumPy
+    from other threads. Floating-point warnings are suppressed, because NaN is reported elsewhere.
 
     **Arguments:**
 

@@ -1,9 +1,9 @@
 """Two engines for the same formula, NumPy and JAX, and batching rules for `jax.vmap`.
 
 JAX traces and compiles a program before it runs, which takes seconds; NumPy runs at once, and is as fast on large
-arrays. Therefore functions run in NumPy if all values are known, and in a compiled program if arrays are traced,
-batched or differentiated. A formula works in NumPy and in JAX if it uses only the functions below and the functions
-common to `numpy` and `jax.numpy`.
+arrays. Therefore functions run in NumPy if the values of all arrays are known, and in a compiled program if arrays are
+traced, batched or differentiated. A formula works in NumPy and in JAX if it uses only the functions below and the
+functions common to `numpy` and `jax.numpy`.
 
 Under `jax.vmap` on a CPU, matrices are factorised one after the other, and the systems are solved for all right-hand
 sides at once. If all matrices of a batch were factorised together, the whole batch would move through memory at every
@@ -34,8 +34,8 @@ from jaxtyping import Array, Inexact, Int, Shaped
 def in_turn(function: Callable[..., Any]) -> Callable[..., Any]:
     """Make `jax.vmap` on a CPU call a function of arrays for the elements of the batch one after the other.
 
-    On accelerators, and without `vmap`, the function is not changed. This is useful for functions, such as those with a
-    factorisation, whose whole batch would not fit in the cache.
+    On accelerators, and without `vmap`, the function is not changed. This is useful for functions such as
+    factorisations, if the whole batch would not fit in the cache.
 
     **Arguments:**
 
@@ -54,7 +54,8 @@ def differentiable_batches(function: Callable[..., Any], batch_rule: Callable[..
     """Give `function` the behaviour `batch_rule` under `jax.vmap`, and keep its usual derivatives.
 
     `batch_rule(batchable, plain, axis_size, batched, *arguments)` returns outputs that all have the batch as leading
-    axis. `batchable` is the function with the batch rule, for nested batches; `plain` is the function without the rule.
+    axis. `batchable` is the function with the batch rule, for nested batches; `plain` is the function without the batch
+    rule.
     """
 
     @custom_vmap
@@ -364,7 +365,7 @@ def replace_at(values: Shaped[Array, " n"], index: Any, value: Any) -> Shaped[Ar
 
 
 def sum_into(shape: tuple[int, ...], index: Any, values: Inexact[Array, "*i"]) -> Inexact[Array, "*n"]:
-    """An array of zeros of the given shape, to which `values` are added at `index`; repeated indices accumulate."""
+    """Add `values` at `index` to an array of zeros of the specified shape; repeated indices accumulate."""
     return add_at(namespace(values).zeros(shape, values.dtype), index, values)
 
 
@@ -395,8 +396,8 @@ def call_numpy(function: Callable[..., Any], shape: jax.ShapeDtypeStruct, *argum
     NumPy.
 
     The function gets views of the program's memory. `jax.pure_callback` would copy the arguments into JAX arrays, which
-    needs a free thread of XLA: if as many programs call at once as XLA has threads, all of them wait for ever. Under
-    `jax.vmap` the function is called for the elements of the batch one after the other. The function is not
+    needs a free thread of XLA. If as many programs called at once as XLA has threads, all of them would wait for ever.
+    Under `jax.vmap` the function is called for the elements of the batch one after the other. The function is not
     differentiated.
     """
     return _numpy_call.bind(*arguments, function=function, shape=tuple(shape.shape), kind=np.dtype(shape.dtype))

@@ -189,8 +189,9 @@ def arc_transfer_impedance(
 
 
 def disc_contact_resistance(conductivity: complex, radius: float, contact_impedance: complex) -> complex:
-    """Contact resistance of a disc electrode: the electrode potential U minus the sheet's potential u at the edge of
-    the disc, in volts per ampere fed into the disc: λ I_0(b/λ) / (2πσb I_1(b/λ)) with the transfer length λ = √(σz).
+    """Contact resistance λ I_0(b/λ) / (2πσb I_1(b/λ)) of a disc electrode, with the transfer length λ = √(σz): the
+    potential of the electrode minus the potential of the sheet at the edge of the disc, in volts per ampere fed into
+    the disc.
 
     Sheet `conductivity` σ in siemens, `radius` b in metres, `contact_impedance` z in ohm·m². For b/λ → 0 the result
     tends to z/(πb²), the resistance of a contact with uniform current density; for b/λ → ∞ it tends to the resistance

@@ -92,7 +92,7 @@ def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
 
 def draw_inclusions(inclusions: Sequence[Inclusion], *, ax: Axes | None = None) -> Axes:
     """Mark every inclusion by its sign at its centroid and a dashed circle of its area. In 3-D, the circle has the
-    radius of a ball of the inclusion's volume, whatever the height of the slice."""
+    radius of a ball of the inclusion's volume, for every height of the slice."""
     ax = axes_or_new(ax)
     halo = [withStroke(linewidth=3, foreground="white")]
     for inclusion in inclusions:
@@ -194,9 +194,9 @@ def draw_numbers(
 ) -> None:
     """Draw the numbers of electrodes at `positions`, beginning with `first`: on the electrode, or `beside` it.
 
-    "Beside" means, for an electrode on the edge of a sheet, outside along the normal, or inside if a notch is too
-    narrow; for an electrode within a sheet, above it; and for a solid seen from above, away from the middle. Electrodes
-    above each other share one text.
+    The number beside an electrode on the edge of a sheet is outside along the normal, or inside if a notch is too
+    narrow. Beside an electrode within a sheet it is above the electrode, and on a solid seen from above it is away from
+    the middle. Electrodes above each other share one text.
     """
     corners = np.asarray(mesh.points)[:, :2]
     number_distance = _NUMBER_DISTANCE * np.ptp(corners, axis=0).max()

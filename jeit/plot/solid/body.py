@@ -42,7 +42,7 @@ def add_hull(scene: Scene, mesh: Mesh) -> None:
 
 def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarray:
     """Edges (s, 2) of a surface to draw as lines, as seen from the direction `toward`: sharp edges, edges of an open
-    boundary, and the outline, where the surface turns away from the viewer."""
+    boundary, and the outline, at which the surface turns away from the viewer."""
     normal = np.cross(
         points[triangles[:, 1]] - points[triangles[:, 0]], points[triangles[:, 2]] - points[triangles[:, 0]]
     )

@@ -1,5 +1,5 @@
-"""Plots of slices through a solid image: one slice by any plane, a grid of slices along an axis, or an overview with
-three slices through the strongest change beside isosurfaces in space."""
+"""Plots of slices through a solid image: one slice by any plane, a grid of slices along an axis, or an overview of
+isosurfaces in space and three slices through the strongest change."""
 
 from __future__ import annotations
 
@@ -262,9 +262,9 @@ def plot_solid(
     scale: ColourScale = CHANGE,
     figure: Figure | None = None,
 ) -> Figure:
-    """Draw a solid image as isosurfaces in space, beside three perpendicular slices through its strongest change: the
-    centroid of the first of `inclusions`, or else the cell that differs most from the median. The outlines of the
-    slices are drawn in space, too.
+    """Draw a solid image as isosurfaces in space, beside three perpendicular slices through its strongest change. The
+    slices pass through the centroid of the first of `inclusions`, or else of the cell whose value differs most from the
+    median. The outlines of the slices are drawn in space, too.
 
     **Arguments:**
 

@@ -1,8 +1,8 @@
 """Minimisation by descent, without or with bounds, and the status with which a minimisation ends.
 
 `Descent` is a solver for optimistix with a line search. Its Gauss-Newton or Levenberg-Marquardt steps lead to the
-minimum of a quadratic model of the cost, which the caller provides: the cheapest way to find this minimum depends on
-the structure of the problem, which a general least-squares solver does not know.
+minimum of a quadratic model of the cost. The caller provides this minimum, because the cheapest way to find it depends
+on the structure of the problem, which a general least-squares solver does not know.
 
 Problems with bounds are solved by jaxopt, which is no longer developed. It is imported only in this module, so that it
 can be replaced in one place.
@@ -273,10 +273,10 @@ class Descent(optx.AbstractLeastSquaresSolver):
     caller provides.
 
     The solver is used in `optimistix.least_squares(residual, Descent(), c, arguments, options={"expand": expand})`,
-    where `expand(c, arguments)` returns the cost at c and a function `step(damping)`. This function returns the
-    direction to the minimum of the model at c, and the slope and curvature of the model along the direction: cost(c +
-    s·direction) ≈ cost + s·slope + s²·curvature / 2. The penalty of the model is weighted with 1 + `damping`, see
-    `ridge_step`.
+    where `expand(c, arguments)` returns the cost at c and a function `step(damping)`. The function `step` returns the
+    direction to the minimum of the model at c, and the slope and curvature of the model along this direction, with
+    cost(c + s·direction) ≈ cost + s·slope + s²·curvature / 2. The penalty of the model is weighted with 1 + `damping`,
+    see `ridge_step`.
 
     **Arguments:**
 
@@ -300,8 +300,8 @@ class Descent(optx.AbstractLeastSquaresSolver):
     norm: Callable[..., Any] = optx.two_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """Return the initial state, whose first trial point is the start. Raises `ValueError` if the options lack
-        `expand`."""
+        """Return the initial state; the first trial point is the start. Raises `ValueError` if `options` does not
+        contain `expand`."""
         if "expand" not in options:
             raise ValueError("Descent needs options={'expand': function}; see its documentation.")
         xp = namespace(y)

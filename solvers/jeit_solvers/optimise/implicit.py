@@ -49,7 +49,7 @@ def as_minimum(
 
     - `point` (n,): point near the minimum, the result of a solver.
     - `problem`: a pytree; the minimum is differentiated with respect to its arrays.
-    - `gradient`: function of (x, problem) that returns the gradient (n,) of the cost, zero at the minimum; its
+    - `gradient`: function of (x, problem) that returns the gradient (n,) of the cost, which is zero at the minimum. Its
       derivative with respect to x, the Hessian, must be symmetric and positive definite at the minimum.
     - `precondition`: function of (x, problem) that returns a function; this function multiplies a vector by the inverse
       of an approximation of the Hessian.

@@ -24,7 +24,7 @@ from jeit_solvers.module import Module
 Expansion = Callable[[Array, Any], tuple[Array, Array, Array]]
 
 _MAX_DAMPING = 1e12
-# Minimum number of functions for which gathering the unfinished functions saves time.
+# Minimum number of gathered functions; below this number gathering the unfinished functions saves no time.
 _MIN_GATHERED = 32
 # Number of steps that the whole batch takes before the unfinished functions are gathered.
 _WHOLE_BATCH_STEPS = 8
@@ -232,7 +232,7 @@ def minimise_small(
     their start, and functions marked in `skip`, stay there: they have not converged, and their value is infinite.
 
     All functions take eight steps together. The unfinished functions, usually few, are then gathered and continue. In a
-    compiled program, whose arrays have fixed sizes, a quarter of the batch is gathered at a time.
+    compiled program, where arrays have fixed sizes, a quarter of the batch is gathered at a time.
 
     **Arguments:**
 

@@ -24,8 +24,8 @@ _COORDINATE_DECIMALS = 7
 def nested_dissection(graph: csr_array, depth: int, coordinates: np.ndarray | None = None) -> np.ndarray:
     """Split a symmetric graph (n, n) without diagonal into a complete binary tree of `depth` levels of separators.
 
-    Returns the number of the tree node (n,) to which each node of the graph belongs: the root is 0, the children of t
-    are 2 t + 1 and 2 t + 2; leaves contain the nodes that belong to no separator. With `coordinates` (n, d) of the
+    Returns the number (n,) of the tree node to which each node of the graph belongs. The root is 0, and the children of
+    t are 2 t + 1 and 2 t + 2; leaves contain the nodes that belong to no separator. With `coordinates` (n, d) of the
     nodes, each separator lies along a straight line or plane; without `coordinates`, separators are found from graph
     distances.
     """
@@ -93,8 +93,8 @@ def _halve_parts(
 def _splitting_functions(
     graph: csr_array, nodes: np.ndarray, part: np.ndarray, num_parts: int, coordinates
 ) -> list[np.ndarray]:
-    """Functions on `nodes` (k,) by which parts can be split: one half consists of the nodes at which a function is
-    below a value, the other half of the nodes at which it is above."""
+    """Functions on `nodes` (k,) by which parts can be split, into the nodes where a function is below a value and the
+    nodes where the function is above this value."""
     if coordinates is not None:
         return _projected_coordinates(coordinates[nodes], part, num_parts)
     order = np.argsort(part, kind="stable")

@@ -28,7 +28,7 @@ from jeit_solvers.engines import call_numpy, has_values, host
 from jeit_solvers.sparse.exact_fronts import Fronts
 from jeit_solvers.sparse.operator import LastMatrix
 
-# Minimum number of operations for which fronts are distributed over the cores; a product with k vectors takes k
+# Minimum number of operations at which fronts are distributed over the cores. A product with k vectors counts as k
 # operations for each entry of the factor.
 _MIN_PARALLEL_OPERATIONS = 5e9
 # Number of rows of a child front's Schur complement that are added to the parent front together. Each such block
@@ -305,9 +305,9 @@ def eliminate(panel: np.ndarray, schur: np.ndarray) -> bool:
     """Eliminate the pivots of a front (a dense matrix of p pivot rows and b border rows), in place. Returns False if
     the pivot block is not positive definite.
 
-    `panel` (p, p + b): on entry the rows [A, B] of the pivots, of which the upper triangle of A and all of B are read;
-    on return [Lᵀ, L⁻¹ B] with A = L Lᵀ. `schur` (b, b): Schur complement, from whose upper triangle Bᵀ A⁻¹ B is
-    subtracted. Complex matrices are symmetric, and transposes are not conjugated.
+    `panel` (p, p + b): on entry the rows [A, B] of the pivots; only the upper triangle of A is read, and all of B. On
+    return the panel contains [Lᵀ, L⁻¹ B] with A = L Lᵀ. `schur` (b, b): Schur complement; Bᵀ A⁻¹ B is subtracted from
+    its upper triangle. Complex matrices are symmetric, and transposes are not conjugated.
     """
     num_pivots, num_border = len(panel), panel.shape[1] - len(panel)
     routines, stride = _ROUTINES_OF_DTYPE[panel.dtype], _row_stride(panel)

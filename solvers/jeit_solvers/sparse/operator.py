@@ -70,7 +70,8 @@ class SparseSymmetric(lineax.AbstractLinearOperator):
         return jax.ShapeDtypeStruct((self.pattern.size,), self.values.dtype)
 
     def out_structure(self) -> jax.ShapeDtypeStruct:
-        """Shape and data type of a product, which equal those of the vector because the matrix is square."""
+        """Shape and data type of a product; equal to the shape and data type of the vector, because the matrix is
+        square."""
         return self.in_structure()
 
 

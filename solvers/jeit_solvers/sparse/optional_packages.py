@@ -32,7 +32,7 @@ from jeit_solvers.sparse.pattern import SparsityPattern
 # Maximum number of right-hand sides that are iterated together. With more right-hand sides the matrix is read less
 # often; with fewer, they fit in the cache.
 _MAX_COLUMNS = 16
-# Maximum number of unknowns of the coarsest level, whose matrix is inverted.
+# Maximum number of unknowns of the coarsest level; the matrix of this level is inverted.
 _MAX_COARSEST_SIZE = 500
 # The smoother is a Chebyshev polynomial of degree 2, which damps the spectrum of the scaled matrix between an eighth of
 # its upper bound and the bound. These are the reciprocals of the polynomial's roots.
@@ -65,13 +65,13 @@ class Hierarchy(NamedTuple):
 class Multigrid(NumpySolver):
     """Conjugate gradients preconditioned by multigrid, for large real or complex `SparseSymmetric` operators.
 
-    Iteration ends when two conditions hold: the norm of the residual is less than the tolerance times that of the
-    right-hand side, and the norm of the preconditioned residual, which is about the error, is less than the tolerance
-    times that of the preconditioned right-hand side. The second condition is needed because rows with large entries,
-    such as those of electrodes with low contact impedance, dominate the residual. A solution is NaN if it does not
-    converge within the maximum number of steps, or before a step shows that the matrix is not positive definite. The
-    solver runs in NumPy; compiled programs call it. Complex symmetric systems are solved by the conjugate orthogonal
-    variant, preconditioned with the real part of the matrix.
+    Iteration ends when the relative residual and the relative preconditioned residual are both at most the tolerance.
+    The first is the norm of the residual divided by the norm of the right-hand side; the second, which is about the
+    relative error, is the same ratio after preconditioning. The second condition is needed because rows with large
+    entries, such as those of electrodes with low contact impedance, dominate the residual. A solution is NaN if it does
+    not converge within the maximum number of steps, or before a step shows that the matrix is not positive definite.
+    The solver runs in NumPy; compiled programs call it. Complex symmetric systems are solved by the conjugate
+    orthogonal variant, preconditioned with the real part of the matrix.
 
     **Arguments:**
 

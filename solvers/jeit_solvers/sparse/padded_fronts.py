@@ -36,7 +36,8 @@ class EliminationTree:
     - `front`, `place`: (n,) front of each matrix row, and index of the row among the pivots of the front.
     - `parent`, `stage`, `slot`: (fronts,) parent of each front (-1 at the root), stage of each front, and position of
       the front in the stage.
-    - `early`, `late`: (nnz,) the two rows of each matrix entry: the row that is eliminated earlier, and the other row.
+    - `early`, `late`: (nnz,) the two rows of each matrix entry: the row that is eliminated earlier, and the row that is
+      eliminated later.
     - `borders`: for each stage the sorted keys front * n + row of the border rows of its fronts; `batch`, `pivots`,
       `border`: number of fronts of each stage, and padded numbers of pivots and border rows.
     """
@@ -165,8 +166,8 @@ class Stage(NamedTuple):
     `border` rows are updated.
 
     `entries` adds the entries of the matrix, and ones on the diagonal of padded pivots, to the pivot columns of the
-    fronts (batch, pivots + border, pivots). `right_hand_side` (batch, pivots) holds indices of matrix rows, `above`
-    (batch, border) indices of rows in the fronts of the stage `parent`; indices out of range mark padding.
+    fronts (batch, pivots + border, pivots). `right_hand_side` (batch, pivots) contains indices of matrix rows, and
+    `above` (batch, border) indices of rows in the fronts of the stage `parent`; indices out of range mark padding.
     """
 
     batch: int

@@ -76,7 +76,7 @@ class SparsityPattern(Module):
         - `size`: number of nodes, n.
 
         Raises `ValueError` for node numbers out of range, for elements that contain a node twice, and for nodes that
-        belong to no element (the node's row would be empty and the matrix singular).
+        belong to no element (their rows would be empty, and the matrix singular).
         """
         size = _checked_size(size)
         if len(groups) == 0:
@@ -187,10 +187,10 @@ class SparsityPattern(Module):
         """Add up element matrices to the values (nnz,) of the matrix.
 
         The method takes one argument for each group of elements of the pattern, in the order of the groups: symmetric
-        matrices (m, k, k), of which only the lower triangles are read; or the packed lower triangles (k (k + 1) / 2,
-        m), rows in the order of `numpy.tril_indices(k)`; or None for a group that contributes nothing. Values are real
-        or complex. Raises `ValueError` if the number of arguments differs from the number of groups, or if all
-        arguments are None.
+        matrices (m, k, k), of which only the lower triangles are read; packed lower triangles (k (k + 1) / 2, m), with
+        rows in the order of `numpy.tril_indices(k)`; or None for a group that contributes nothing. Values are real or
+        complex. Raises `ValueError` if the number of arguments differs from the number of groups, or if all arguments
+        are None.
         """
         if len(element_matrices) != len(self._assembly):
             raise ValueError(
@@ -296,7 +296,7 @@ class AssemblyMap(NamedTuple):
         return namespace(flat).concatenate([self.diagonal.apply(indices, flat), self.below.apply(indices, flat)])
 
     def read_back(self, indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Inexact[Array, "..."]:
-        """The matrix entry to which each packed value is added; see `SparsityPattern.entries_between`."""
+        """Read the matrix entry to which each packed value is added; see `SparsityPattern.entries_between`."""
         packed = (len(np.tril_indices(self.shape[1])[0]), self.shape[0]) if len(self.shape) > 1 else self.shape
         size = self.diagonal.gather.shape[1]
         into = namespace(values).zeros(math.prod(packed) + 1, values.dtype)
