@@ -1,8 +1,9 @@
 """Derivatives of voltages with respect to conductivity changes in a few cells, and to contact impedances.
 
 For the fields F (`ForwardModel.fields`) and the contact impedance z_l, the energy in the contact of electrode l is
-E_l(F, F) = (1/z_l) ∫_l (F - Z_l)², where Z is the transfer impedance. As F is stationary (`jeit.forward.transfer`), the
-derivative of the transfer impedance with respect to the contact impedance needs no further solve:
+E_l(F, F) = (1/z_l) ∫_l (F - Z_l)², where Z is the transfer impedance. Because F is a stationary point (see
+`jeit.forward.transfer`), the derivative of the transfer impedance with respect to the contact impedance needs no
+further solve:
 
     ∂Z / ∂ log z_l = E_l(F, F).
 """

@@ -2,7 +2,8 @@
 
 Let a_θ(u, w) be the energy form of the electrode model, where θ denotes its parameters (conductivity, contact
 impedance, electrode positions, mesh points). Let F_l be the potential for a unit current into electrode l that leaves
-through all electrodes in equal parts. Then Z_lk = a_θ(F_l, F_k), and, as F is stationary,
+through all electrodes in equal parts. Then Z_lk = a_θ(F_l, F_k), and, because F is a stationary point of 2⟨load, F⟩ -
+a_θ(F, F),
 
     dZ = -∂_θ a_θ(F, F) dθ      at fixed F,
 

@@ -369,7 +369,7 @@ def _evidence_text(body: Star | Ellipsoid) -> str:
 
 
 def _prior_name(settings: ImagingSettings, dimension: int) -> str | None:
-    """Name of the prior of the settings or of the method; None for methods without a prior."""
+    """Name of the prior in the settings, or of the fixed prior of the method; None for methods without a prior."""
     method = METHODS[settings.method]
     if settings.method == "shapes" and dimension == 3:
         return "ellipsoids and columns"

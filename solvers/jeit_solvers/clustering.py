@@ -118,7 +118,8 @@ def _kmeans(points, key, stop: tuple[Any, Any], num_clusters: int, restarts: int
 
 
 class _State(Module):
-    """State of Lloyd's algorithm: `labels` of the nearest centres, at the squared `distance` (n,)."""
+    """State of Lloyd's algorithm. `labels`: nearest centre of each point; `distance` (n,): squared distance from this
+    centre."""
 
     centres: Float[Array, "k d"]
     labels: Int[Array, " n"]

@@ -82,7 +82,8 @@ def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], num_parts: i
 
 
 def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
-    """Apply `function` to each part, in NumPy, in parallel on several cores; the function stores its results itself.
+    """Apply `function` to each part, in NumPy, in parallel on several cores; the function must store its results
+    itself.
 
     The parts are processed in the calling thread if there is only one part, if the call comes from inside another part,
     or while another thread uses the cores. The reason is that parts may wait for compiled programs, which call NumPy

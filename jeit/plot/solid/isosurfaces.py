@@ -78,7 +78,7 @@ def plot_isosurfaces(
     scale: ColourScale = CHANGE,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw isosurfaces of a solid image, at given shares of the maximum change of each sign.
+    """Draw isosurfaces of a solid image, at specified shares of the maximum change of each sign.
 
     **Arguments:**
 

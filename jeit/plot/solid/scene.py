@@ -74,7 +74,7 @@ class Camera:
         return np.stack([points @ self.right, points @ self.up], axis=-1)
 
     def nearness(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-        """Coordinate (…) of points (…, 3) towards the viewer, metres."""
+        """Coordinate (…) of points (…, 3) along the direction towards the viewer, metres."""
         return points @ self.toward
 
     def light(self, normals: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
@@ -258,6 +258,6 @@ def draw_number(
 
 
 def mark_sign(ax: Axes, x: float, y: float, sign: int) -> None:
-    """Draw a plus at a conductive, or a minus at a resistive inclusion."""
+    """Draw a plus at a conductive inclusion, or a minus at a resistive inclusion."""
     marker = "+" if sign > 0 else "_"
     ax.plot(x, y, marker=marker, color=INK, markersize=8, markeredgewidth=1.4, zorder=4, path_effects=_HALO)

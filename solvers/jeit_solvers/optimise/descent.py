@@ -247,7 +247,7 @@ def scipy_lbfgsb(
 # achieve.
 _MIN_SCALE = 2.0**-20
 _SUFFICIENT_DECREASE = 1e-4
-# Rounding error of a cost, which is a sum of many squares, in units of its machine precision.
+# Relative rounding error of a cost, which is a sum of many squares, divided by the machine precision.
 _ROUNDING_FACTOR = 100.0
 
 

@@ -34,7 +34,7 @@ _DIFFERENCE_STEP = 1e-6
 
 class Minimum(Module):
     """Minima of a batch of F functions. **Fields**: `x`: (n, F) positions of the minima; `value`: (F,) values at the
-    minima; `converged`: (F,) whether each minimisation converged; `steps`: largest number of steps of a function.
+    minima; `converged`: (F,) whether each minimisation converged; `steps`: maximum number of steps over all functions.
 
     **Example:**
 

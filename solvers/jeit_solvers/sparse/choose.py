@@ -47,7 +47,7 @@ class ConjugateGradient(MatrixSolver):
 
     - `tolerance`: tolerance of the scaled residual.
     - `max_steps`: maximum number of steps, by default ten per unknown, at most 10,000.
-    - `reason`: why this solver is used, in words.
+    - `reason`: text that explains why this solver is used.
 
     Raises `ValueError` for a tolerance that is not between 0 and 1, and for a maximum of less than one step.
 
@@ -150,7 +150,7 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
     **Arguments:**
 
     - `plan`: from `analyse`.
-    - `reason`: why this solver is used, in words.
+    - `reason`: text that explains why this solver is used.
 
     **Example:**
 
@@ -207,7 +207,7 @@ class FrontalCholesky(MatrixSolver):
     **Arguments:**
 
     - `fronts`: from `find_fronts`.
-    - `reason`: why this solver is used, in words.
+    - `reason`: text that explains why this solver is used.
 
     **Example:**
 

@@ -83,8 +83,8 @@ class FrontalFactor(NamedTuple):
         return half.T @ half
 
     def half_solve(self, right_hand_sides: Inexact[np.ndarray, "n k"]) -> Inexact[np.ndarray, "n k"]:
-        """Half of a solve: Y = L⁻¹ P b for `right_hand_sides` b, with rows in the order of elimination P, so that Yᵀ Y
-        = bᵀ A⁻¹ b. Raises `ValueError` for right-hand sides of a wrong shape."""
+        """Forward half of a solve: Y = L⁻¹ P b for `right_hand_sides` b, where P sorts rows into the order of
+        elimination, so that Yᵀ Y = bᵀ A⁻¹ b. Raises `ValueError` for right-hand sides of a wrong shape."""
         shape, size = np.shape(right_hand_sides), self.fronts.size
         if len(shape) != 2 or shape[0] != size:
             raise ValueError(f"right-hand sides must have shape (n, k) with n = {size}; got {shape}.")

@@ -2,7 +2,7 @@
 
 Passing a pytree to a jitted function costs microseconds for each of its arrays and modules. A plan has dozens of index
 arrays, and a small factorisation takes only half a millisecond. Therefore plans and patterns store all their indices in
-one int32 array, and store the positions of the individual arrays in it in a static, hashable description.
+one int32 array, and a static, hashable description contains the positions of the individual arrays.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ class PaddedSum(NamedTuple):
     """Plan for sums of scattered contributions. Scattering is slow on a CPU, so most contributions are *gathered*.
 
     `gather` (width, sums) contains the indices of up to `width` contributions to each sum, padded with an index out of
-    range. Further contributions are scattered: `overflow_sum` contains the index of the sum and `overflow_source` that
-    of the contribution. These pairs are divided into rounds that end at `rounds`; within a round the indices of the
-    sums are ascending and distinct.
+    range. Further contributions are scattered: `overflow_sum` contains the index of the sum, and `overflow_source` the
+    index of the contribution. These pairs are divided into rounds that end at `rounds`; within a round the indices of
+    the sums are ascending and distinct.
     """
 
     gather: Slot
@@ -79,7 +79,7 @@ class PaddedSum(NamedTuple):
         target, source = target[order], source[order]
         counts = np.bincount(target, minlength=num_sums)
         rank = np.arange(target.size) - np.repeat(np.cumsum(counts) - counts, counts)
-        # Number of contributions left over for each width; the width with the shortest predicted time is chosen.
+        # Number of contributions beyond each width; the width with the shortest predicted time is chosen.
         left_over = target.size - np.concatenate([[0], np.cumsum(np.bincount(rank, minlength=1))])
         width = int(np.argmin(np.arange(left_over.size) * num_sums + _SCATTER_COST * left_over))
         gather = np.full((width, num_sums), num_sources, dtype=np.int32)
@@ -130,8 +130,8 @@ class PaddedSum(NamedTuple):
         self, indices: Int[Array, " total"], sums: Inexact[Array, " sums"], into: Inexact[Array, " sources"]
     ) -> Inexact[Array, " sources"]:
         """Return `into` with the entry of each contribution replaced by the sum to which the contribution is added (by
-        one of them if there are several). `into` must have one more entry than there are contributions; the last entry
-        is overwritten."""
+        one of these sums if there are several). `into` must have one more entry than there are contributions; the last
+        entry is overwritten."""
         for layer in self.gather.read(indices):
             into = set_at(into, layer, sums)
         if self.overflow_sum.shape[0]:

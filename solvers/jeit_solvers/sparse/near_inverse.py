@@ -97,8 +97,8 @@ class Strips(Module):
 
 class NearInverse(Module):
     """Entries of the inverse G = A⁻¹ between places that are at most a few strips apart. **Fields**: `band`: (strips,
-    selected unknowns, columns) blocks G_ij with j ≥ i, because G is symmetric; `left`, `right`: (p, r) factors of a
-    matrix left rightᵀ that is added to G.
+    selected unknowns, columns) blocks G_ij with j ≥ i only, because G is symmetric; `left`, `right`: (p, r) factors of
+    a matrix left rightᵀ that is added to G.
 
     **Example:**
 

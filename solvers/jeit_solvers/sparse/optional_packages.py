@@ -35,7 +35,7 @@ _MAX_COLUMNS = 16
 # Maximum number of unknowns of the coarsest level; the matrix of this level is inverted.
 _MAX_COARSEST_SIZE = 500
 # The smoother is a Chebyshev polynomial of degree 2, which damps the spectrum of the scaled matrix between an eighth of
-# its upper bound and the bound. These are the reciprocals of the polynomial's roots.
+# its upper bound and the bound. `_WEIGHTS` are the reciprocals of the polynomial's roots.
 _MIDDLE, _HALF = (1 + 1 / 8) / 2, (1 - 1 / 8) / 2
 _WEIGHTS = tuple(1 / (_MIDDLE + sign * _HALF * np.sqrt(0.5)) for sign in (1, -1))
 
@@ -77,7 +77,7 @@ class Multigrid(NumpySolver):
 
     - `tolerance`: tolerance of both residuals.
     - `max_steps`: maximum number of steps.
-    - `reason`: why this solver is used, in words.
+    - `reason`: text that explains why this solver is used.
 
     Raises `ValueError` for a tolerance that is not between 0 and 1, and for a maximum of less than one step;
     `ImportError` if PyAMG (the extra `large`) is not installed.
@@ -247,7 +247,7 @@ class Pardiso(NumpySolver):
 
     **Arguments:**
 
-    - `reason`: why this solver is used, in words.
+    - `reason`: text that explains why this solver is used.
 
     Raises `ImportError` if pypardiso (the extra `mkl`) is not installed.
 

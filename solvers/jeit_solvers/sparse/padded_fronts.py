@@ -165,7 +165,7 @@ class Stage(NamedTuple):
     """A stage of a factorisation: a batch of fronts padded to one shape. In each front `pivots` rows are eliminated and
     `border` rows are updated.
 
-    `entries` adds the entries of the matrix, and ones on the diagonal of padded pivots, to the pivot columns of the
+    `entries` adds the entries of the matrix, to which a one for padded pivots is appended, to the pivot columns of the
     fronts (batch, pivots + border, pivots). `right_hand_side` (batch, pivots) contains indices of matrix rows, and
     `above` (batch, border) indices of rows in the fronts of the stage `parent`; indices out of range mark padding.
     """

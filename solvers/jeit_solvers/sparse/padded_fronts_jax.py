@@ -221,10 +221,10 @@ def _solve_batch(batchable, plain, axis_size, batched, indices, factor, vectors)
 def half_solve(
     plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n k"]
 ) -> Inexact[Array, "rows k"]:
-    """Half of a solve: Y = L^-1 P b, with rows in the order of elimination P and rows of zeros for padding, so that Y^T
-    Y = b^T A^-1 b.
+    """Forward half of a solve: Y = L^-1 P b, where P sorts rows into the order of elimination, so that Y^T Y = b^T A^-1
+    b. Padding adds rows of zeros.
 
-    This function takes half the work of `solve`, and suffices for quadratic forms of the inverse.
+    This function takes half the time of `solve`, and is sufficient for quadratic forms of the inverse.
 
     **Arguments:**
 
