@@ -1,4 +1,4 @@
-"""Checks of arguments, and helpers that word error messages and the texts of objects in consoles and notebooks."""
+"""Checks of arguments, and functions that compose error messages and the texts of objects in consoles and notebooks."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import numpy as np
 
 from jeit_solvers.engines import has_values
 
-# Types whose values are shown in error messages, and maximum number of characters of a value; for other types, the name
-# of the type is shown.
+# Types whose values are shown in error messages (of other values, only the type is shown), and maximum number of
+# characters of a value.
 _SHOWN_TYPES, _MAX_TEXT = (str, bytes, int, float, complex, type(None)), 60
 
 
@@ -72,12 +72,12 @@ def real_array(name: str, argument: Any, expected: str) -> np.ndarray:
     return values.astype(float)
 
 
-# Percentage below which only "less than" this percentage is stated.
+# Percentages below this value are stated as "less than" this value.
 _MIN_PERCENT = 0.001
 
 
 def counted(number: int, noun: str) -> str:
-    """A number with its noun: "1 frame", "1,000 frames", "2 touches"."""
+    """Text of a number with its noun, such as "1 frame", "1,000 frames" or "2 touches"."""
     plural_ending = "es" if noun.endswith(("ch", "s", "x")) else "s"
     return f"{number:,} {noun}{'' if number == 1 else plural_ending}"
 
@@ -101,12 +101,13 @@ def signed_percent(change: float) -> str:
 
 
 Interval = tuple[float | None, float | None]
-"""Ends of a credible interval, None where the data leave an end open."""
+"""Lower and upper limit of a credible interval; a limit that the data do not determine is None."""
 
 
 def interval_text(interval: Interval, format_end: Callable[[float], str]) -> str:
-    """Text of an interval, whose ends `format_end` formats. If one end is open, the text is "at least" or "at most" the
-    known end; for a decrease it is "beyond" the known end, because "at most -90 %" might mean a smaller decrease."""
+    """Text of an interval, whose limits `format_end` formats. If only one limit is known, the text is "at least" or "at
+    most" this limit. For a negative upper limit the text is "beyond" this limit, because "at most -90 %" might mean a
+    smaller decrease."""
     lower_end, upper_end = interval
     if lower_end is None:
         if upper_end is None:
@@ -128,8 +129,8 @@ def readings(values: np.ndarray) -> np.ndarray:
 
 
 def check_key(key: Any, name: str = "key") -> None:
-    """Raise `ValueError` with the argument's `name` unless `key` is a single JAX random key, of the new type
-    (`jax.random.key`) or the old type (`jax.random.PRNGKey`)."""
+    """Raise `ValueError` with the argument's `name` unless `key` is a single JAX random key, of the new type (from
+    `jax.random.key`) or the old type (from `jax.random.PRNGKey`)."""
     if isinstance(key, (jax.Array, np.ndarray)):
         is_new_type = jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
         if is_new_type or (key.dtype == np.uint32 and key.ndim == 1):
@@ -194,7 +195,7 @@ def listed(names: Iterable[Any], max_names: int = 8) -> str:
 
 def check_has_values(name: str, tree: Any, purpose: str, instead: str) -> None:
     """Raise `ValueError` with the argument's `name` for a pytree that contains values traced by `jax.jit`, `jax.vmap`
-    or a derivative; `purpose` describes what the values are needed for, and `instead` what the user should give or
+    or a derivative; `purpose` describes what the values are needed for, and `instead` what the user should pass or
     do."""
     if not has_values(tree):
         raise ValueError(

@@ -20,14 +20,14 @@ EXTRAS = {
     "cluster": {"dask": "dask", "distributed": "distributed", "zarr": "zarr", "xarray": "xarray"},
 }
 
-# Maximum number of characters of the reason why a package cannot be imported, which precedes the advice what to
+# Maximum number of characters of the reason why a package cannot be imported. The reason precedes the advice on what to
 # install.
 _MAX_REASON = 120
 
 
 def need_extra(extra: str, task: str) -> None:
-    """Raise `ImportError`, with the command to install it, if a package of `extra` is missing; `task` names what needs
-    the package."""
+    """Raise `ImportError`, with the command to install it, if a package of `extra` is missing; `task` names the task
+    for which the package is needed."""
     missing_packages = [package for module, package in EXTRAS[extra].items() if _is_missing(module)]
     if missing_packages:
         names = " and ".join(", ".join(missing_packages).rsplit(", ", 1))
@@ -35,14 +35,14 @@ def need_extra(extra: str, task: str) -> None:
 
 
 def optional(module: str, task: str, otherwise: str = "") -> ModuleType:
-    """Import a module of an optional package; `task` names what needs the module.
+    """Import a module of an optional package; `task` names the task for which the module is needed.
 
-    Raises `ImportError` if the import fails: the message states the reason, what to install, and the alternative
+    Raises `ImportError` if the import fails. The message states the reason, what to install, and the alternative
     `otherwise`.
     """
     try:
         return importlib.import_module(module)
-    except (ImportError, OSError) as error:  # OSError: a system library that the package loads
+    except (ImportError, OSError) as error:  # OSError: a system library that the package loads is missing
         extra = next(extra for extra, modules in EXTRAS.items() if module.partition(".")[0] in modules)
         package = EXTRAS[extra][module.partition(".")[0]]
         reason = (

@@ -1,5 +1,5 @@
-"""Public names of version 0.2 that have moved. They work until version 1.1, with a `DeprecationWarning` that
-names the new place."""
+"""Public names of version 0.2 that have moved. The old names work until version 1.1, with a `DeprecationWarning` that
+states the new name."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
-# For each package that exported names in version 0.2, the new modules of the names that moved without being renamed.
+# For each package that exported names in version 0.2: the new modules of names that have moved but were not changed.
 _MOVED = {
     "jeit.imaging": {
         "jeit.touch": "LearntGestures NamedTouch TouchImages TouchWatch WatchedFrame doubts_of learn_gestures "
@@ -102,8 +102,8 @@ _MOVED_PAGES = {
 
 
 def with_moved_names(page: str, find: Callable[[str], Any] | None = None) -> Callable[[str], Any]:
-    """The `__getattr__` of a package from which names have moved; `find` is the `__getattr__` for the names that the
-    package still has.
+    """Create the `__getattr__` of a package from which names have moved; `find` is the `__getattr__` for the names that
+    the package still contains.
 
     Modules of the package that have moved can still be imported under their old names.
     """

@@ -80,8 +80,8 @@ def _print_version_or_help(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command `jeit` with `arguments` (default: the arguments of the process), and return the exit status.
 
-    Exit status: 0 for success, 1 for an error in the data or in given values, 2 for wrong usage of the command, 130 if
-    stopped. Errors are reported in one line on standard error; JEIT_DEBUG=1 shows the traceback instead.
+    Exit status: 0 for success, 1 for an error in the data or in values of options, 2 for wrong usage of the command,
+    130 if stopped. Errors are reported in one line on standard error; JEIT_DEBUG=1 shows the traceback instead.
     """
     for output in (sys.stdout, sys.stderr):
         if isinstance(output, io.TextIOWrapper):
@@ -184,9 +184,9 @@ def _create_warning_printer() -> Callable[..., None]:
 
 
 def _set_up_process(*, compile_quickly: bool) -> None:
-    """Set the process up for a command: compiler flags, warnings and garbage collection. `compile_quickly`: whether to
-    compile with few optimisations, for commands that spend most of their time on compilation. XLA_FLAGS set by the user
-    take precedence."""
+    """Configure the process for a command: compiler flags, warnings and garbage collection. `compile_quickly`: whether
+    to compile with few optimisations, for commands that spend most of their time on compilation. XLA_FLAGS set by the
+    user take precedence."""
     if compile_quickly:
         os.environ.setdefault("XLA_FLAGS", quick_compilation())
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # hides messages about fonts and unwritable folders

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 _MAX_TABLE_WIDTH = 80
 # Minimum duration of a step, in seconds, for which the elapsed time is shown.
 _MIN_SHOWN_SECONDS = 2.0
-# Pattern of a progress text such as "12 of 60" (completed parts of a step), and minimum completed fraction for an
-# estimate of the remaining time. Texts such as "12 of at most 60" do not match.
+# Pattern of a progress text such as "12 of 60" (completed parts of a step), and minimum completed fraction at which the
+# remaining time is estimated. Texts such as "12 of at most 60" do not match.
 _PROGRESS, _MIN_SHARE = re.compile(r"(\d[\d,]*) of (\d[\d,]*)"), 0.05
 _PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
@@ -90,8 +90,8 @@ class Steps:
 
 @dataclass(frozen=True)
 class _StepLine:
-    """Line beside the spinner: the step, the seconds since its `start` after the first seconds, and, if `num_done` of
-    its `num_parts` parts are done, an estimate of the remaining time."""
+    """Line beside the spinner: the step, the time since its `start`, unless it is short, and, if `num_done` of its
+    `num_parts` parts are completed, an estimate of the remaining time."""
 
     step: str
     start: float
@@ -167,10 +167,10 @@ def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, *, background:
 
 def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Table:
     """Create a table of fitted bodies with 68 % intervals of their size, change of conductivity and strength, and the
-    68 % radius of their place.
+    radius of the 68 % region of their position.
 
-    `background`: conductivity of the reference, S/m (2-D: S). If the data determine only one end of an interval, only
-    this end is given.
+    `background`: conductivity of the reference, S/m (2-D: S). If the data determine only one limit of an interval, only
+    this limit is shown.
     """
     noun, unit, _ = _size_format(inclusions)
     rows = []
@@ -191,12 +191,13 @@ def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Tabl
 
 
 def _three_digits(value: float, sign: str = "") -> str:
-    """A number with three significant digits, and no exponent below a million."""
+    """Format a number with three significant digits, and without an exponent below a million."""
     return f"{float(f'{value:.3g}'):{sign}g}"
 
 
 def with_interval(value: float | None, interval: Interval | None, format_value: Callable[[float], str]) -> str:
-    """Text of a value with its interval on the next line; only the interval if one of its ends is open."""
+    """Text of a value with its interval on the next line; only the interval if the data do not determine both of its
+    limits."""
     if value is None or interval is None:
         return "not known" if value is None else format_value(value)
     text = interval_text(interval, format_value)

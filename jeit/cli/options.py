@@ -130,8 +130,8 @@ def read_file(
     like: "Measurement | None" = None,
     key: str | None = None,
 ) -> "Measurement":
-    """Read the measured file at `path`. Error messages name the `option` by which the user gave it, "DATA" or
-    "--reference"."""
+    """Read the measured file at `path`. Error messages name the `option` by which the user specified the file, "DATA"
+    or "--reference"."""
     from jeit.data import read
 
     with naming_options({"path": option, "key": "--reference-key" if option == "--reference" else "--key"}):
@@ -171,10 +171,11 @@ def reference_of_frames(measurement: "Measurement", frames: str) -> "Measurement
 
 
 def in_options(message: str, options: dict[str, str]) -> str:
-    """Replace names of Python arguments by names of options in an error message, at its beginning or where written as
-    `name=`.
+    """Replace names of Python arguments in an error message by names of options. Names are replaced at the beginning of
+    the message, and where they are written as `name=`.
 
-    For options in millimetres, whose names end in "-mm", the question whether lengths were given in metres is removed.
+    For options in millimetres, whose names end in "-mm", the question whether the user confused millimetres and metres
+    is removed.
     """
     from jeit.arguments import IN_MILLIMETRES
 

@@ -1,6 +1,6 @@
-"""Streams on the command line: frames from standard input, with their times from a given frame rate or from the clock;
-and the handling of Ctrl-C and SIGTERM, on which the frames received so far are written, and the exit status is that of
-the signal."""
+"""Streams on the command line: frames from standard input, with times from a specified frame rate or from the clock;
+and the handling of Ctrl-C and SIGTERM. On these signals the frames received so far are written, and the exit status is
+128 plus the number of the signal."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from jeit.arguments import counted
 from jeit.cli.console import Steps
 from jeit.cli.options import remove_empty_folders
 
-# Minimum waiting time for a frame to count as live, as a fraction of the usual interval between frames; number of
-# consecutive live frames after which all earlier frames are considered read; and maximum time for reading earlier
-# frames, in seconds.
+# Minimum waiting time after which a frame counts as live, as a fraction of the usual interval between frames; number of
+# consecutive live frames after which no earlier frames are assumed to remain; and maximum time in seconds for reading
+# earlier frames.
 _MIN_WAIT_SHARE, _NUM_LIVE_FRAMES, _MAX_CATCH_UP_SECONDS = 0.4, 3, 5.0
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _END_OF_FRAMES = object()
@@ -34,8 +34,8 @@ class LiveFrames:
     """Iterator of pairs (time in seconds, frame) over `lines`, the frames that `parse_frames` returns.
 
     With a `rate`, in frames/s, all frames are used. Without a `rate`, times come from the clock, and frames that
-    arrived before reading began are skipped and counted in `left_out`. If all frames have already arrived, e.g. from a
-    file, no frame is skipped, and times follow from the `usual_rate`.
+    arrived before reading began are skipped and counted in `left_out`. If the input ends among these frames, as for a
+    file, no frame is skipped, and times are computed from the `usual_rate`.
     """
 
     def __init__(self, lines: Iterator[object], rate: float | None, usual_rate: float):
@@ -46,7 +46,8 @@ class LiveFrames:
 
     @property
     def rate_seen(self) -> float:
-        """Frame rate in frames/s: the given rate, else the mean rate of the frames read, else the usual rate."""
+        """Frame rate in frames/s: the specified rate, else the mean rate of the frames read so far, else the usual
+        rate."""
         if self.rate is not None:
             return self.rate
         seconds = [second for second, _ in self.read_frames]
@@ -75,8 +76,8 @@ class LiveFrames:
             yield self._second(), frame
 
     def _catch_up(self) -> None:
-        """Skip frames that arrived before reading began. If the input ends with these frames, keep them, with times
-        from the usual rate."""
+        """Skip frames that arrived before reading began. If the input ends among these frames, none is skipped, and
+        their times are computed from the usual rate."""
         if not self.by_clock:
             return
         skipped_frames, num_consecutive, start = [], 0, time.monotonic()
@@ -145,7 +146,8 @@ class Stopping:
             self._waiting = False
 
     def before(self, pictures: Sequence[str], step: Steps) -> Callable[[str], None]:
-        """Create a function that reports writing and drawing as steps, and skips drawing after a signal."""
+        """Create a function that reports writing and drawing as steps, and raises `_StoppedError` before drawing if a
+        signal has arrived."""
 
         def report(task: str) -> None:
             step_name = "draw" if task.partition(":")[0] in pictures else "write"
@@ -159,8 +161,8 @@ class Stopping:
 
     @contextmanager
     def ending(self, frame_counter: "FrameCounter", *files: str) -> Iterator[None]:
-        """Context manager that exits the command at its end if a signal has arrived, and prints the number of frames
-        received and the `files` that contain them."""
+        """Context manager that, if a signal has arrived, prints the number of frames received and the `files` that
+        contain them, and exits the command."""
         try:
             yield
             hint = f"; {' and '.join(files)} have them"

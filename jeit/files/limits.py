@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 MOST_ELECTRODES = 1024
-"""Maximum number of electrodes that a file may describe: the number of channels of a protocol grows with its square."""
+"""Maximum number of electrodes that a file may describe: the number of channels of a protocol grows with the square of
+the number of electrodes."""
 
 _LIMIT_VARIABLE, _DEFAULT_GIGABYTES = "JEIT_FILE_GB", 1.0
 
@@ -23,8 +24,8 @@ class TooLarge(ValueError):
 
 
 def check_memory(name: str, size: float) -> None:
-    """Raise `TooLarge`, a `ValueError`, if `size`, the memory in bytes for the content of the file `name`, exceeds the
-    limit.
+    """Raise `TooLarge`, a `ValueError`, if the content of the file `name` needs more memory than the limit; `size`:
+    memory that the content needs, in bytes.
 
     The limit is a gigabyte, or the value of the environment variable JEIT_FILE_GB, in gigabytes.
     """
@@ -66,7 +67,7 @@ def _max_gigabytes() -> float:
 
 KEY = 40
 """Maximum number of characters of a key in a message."""
-# Maximum number of characters of a message, of faults that are described in sentences, and of further faults that are
+# Maximum number of characters of a message; of faults that are described in sentences; and of further faults that are
 # listed by their keys.
 _MAX_MESSAGE, _MAX_SENTENCES, _MAX_KEYS = 390, 4, 10
 ALL = "; there are "
@@ -74,8 +75,8 @@ ALL = "; there are "
 
 
 def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) -> str:
-    """Combine several faults in the file `origin` into one error message. It contains the first of the `sentences`,
-    further sentences as far as there is room, and the `keys` of up to ten of the remaining faults."""
+    """Combine several faults in the file `origin` into one error message. It contains the first of the `sentences`, as
+    many of the following sentences as fit, and the `keys` of up to ten of the remaining faults."""
     first_sentence = cut(f"{cut(origin, 2 * KEY)}: {sentences[0]}", _MAX_MESSAGE - 20)
     num_shown = 1
     for num_sentences in range(min(len(sentences), _MAX_SENTENCES), 0, -1):
@@ -111,7 +112,7 @@ def _further_faults(keys: Sequence[str], num_faults: int, max_keys: int) -> list
 
 
 def cut(text: str, max_length: int) -> str:
-    """Shorten a text to `max_length` characters, with an ellipsis at its end."""
+    """Shorten a text to at most `max_length` characters; a shortened text ends with an ellipsis."""
     return text if len(text) <= max_length else f"{text[: max_length - 1]}…"
 
 
@@ -124,13 +125,13 @@ def read_as(message: str) -> Iterator[None]:
     `message`, such as "not a readable WAV file", and the reason in brackets. Errors about a missing file or missing
     permission are raised unchanged.
 
-    Warnings of the packages are suppressed, because a file that can be read counts as valid.
+    Warnings of these packages are suppressed, because a file that can be read counts as valid.
     """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
-    except Exception as error:  # of any type, since the readers of other packages do not check content
+    except Exception as error:  # of any type, since the readers of other packages do not check the content
         if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError):
             raise
         raise ValueError(f"{message} ({reason(error)}).") from None
@@ -142,18 +143,18 @@ def reason(error: Exception) -> str:
     return text if len(text) <= _MAX_REASON else f"{text[: _MAX_REASON - 1]}…"
 
 
-# Maximum size in bytes of a hand-written TOML file; bytes of memory per byte of text.
+# Maximum size in bytes of a hand-written TOML file; and bytes of memory per byte of text.
 _MAX_TOML_BYTES, _BYTES_PER_CHARACTER = 2**22, 4
 # Maximum number of parts of a dotted key.
 _MAX_KEY_PARTS = 32
 
 
 def read_text(path: str | Path, *, encoding: str = "utf-8", max_bytes: int | None = None) -> str:
-    """Read the text of a file of at most `max_bytes` bytes; without `max_bytes`, the memory limit of `check_memory`
-    applies.
+    """Read the text of a file of at most `max_bytes` bytes, whose content must not exceed the memory limit
+    (`check_memory`).
 
-    Raises `ValueError`, with the file's name, if the file is larger, `UnicodeError` (a `ValueError`) if it is not text,
-    and `OSError` if it does not exist.
+    The errors state the file's name: `ValueError` if the file is larger, `UnicodeError` (a `ValueError`) if it is not
+    text, and `OSError` if it does not exist.
     """
     path = Path(path)
     check_size(path, max_bytes)
@@ -165,7 +166,7 @@ def read_text(path: str | Path, *, encoding: str = "utf-8", max_bytes: int | Non
 
 
 def check_size(path: Path, max_bytes: int | None = None) -> None:
-    """Raise `ValueError` for a file of more than `max_bytes` bytes, or whose content exceeds the memory limit
+    """Raise `ValueError` if a file has more than `max_bytes` bytes, or if its content exceeds the memory limit
     (`check_memory`)."""
     size = path.stat().st_size
     if max_bytes is not None and size > max_bytes:

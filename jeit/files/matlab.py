@@ -19,18 +19,18 @@ import scipy.io
 from jeit.arguments import listed
 from jeit.files.limits import check_memory, read_as
 
-# Length in bytes of the file header, and of the beginning of an element, which contains flags, shape and name; type
-# numbers of elements.
+# Length in bytes of the file header, and of the beginning of an element, which contains flags, shape and name; then the
+# type numbers of array elements and of compressed elements.
 _HEADER_BYTES, _PREFIX_BYTES = 128, 4096
 _MATRIX_TYPE, _COMPRESSED_TYPE = 14, 15
-# Numbers that identify classes of arrays in the file: the number of sparse arrays, and the NumPy types of numeric
-# arrays by number.
+# Numbers that identify classes of arrays in the file: the class number of sparse arrays, and, for each class number of
+# numeric arrays, the NumPy type.
 _SPARSE_CLASS = 5
 _NUMERIC_CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
-# NumPy types of stored numbers by their type number in the file; flag of complex arrays.
+# For each type number of stored numbers in the file, the NumPy type; and the flag of complex arrays.
 _STORED_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _COMPLEX_FLAG = 0x800
-# Maximum number of bytes of one number in memory, and of the parts of an element other than its numbers.
+# Maximum size in bytes of one number in memory, and of the parts of an element other than its numbers.
 _MAX_NUMBER_BYTES, _MAX_OTHER_BYTES = 16, 2**16
 
 
@@ -78,7 +78,7 @@ def load(path: Path, *names: str) -> dict[str, np.ndarray]:
     Raises `ValueError` if the file cannot be read, and if the variables would not fit in memory (`check_memory`).
     """
     if _is_format_4(path):
-        with read_as(_unreadable_message(path)):  # format 4 is never compressed, so it holds fewer numbers than bytes
+        with read_as(_unreadable_message(path)):  # format 4 is never compressed, so a file has fewer numbers than bytes
             content = scipy.io.loadmat(str(path), variable_names=list(names), spmatrix=False)
         return {"": np.array(sorted(variable_names(path)), dtype=str)} | _dense_arrays(content, names)
     variables = _variables(path)
@@ -158,8 +158,8 @@ def _elements(content: bytes) -> Iterator[_Variable]:
 
 
 def _header(prefix: bytes, order: str) -> tuple[str, tuple[int, ...], int, bool, int]:
-    """Name, shape, class number, whether the array is complex, and offset of its numbers in bytes; read from the first
-    three sub-elements of an array in a .mat file."""
+    """Read the name, the shape, the class number, whether the array is complex, and the offset of its numbers in bytes,
+    from the first three sub-elements of an array in a .mat file."""
     _, flags, offset = _sub_element(prefix, 0, order)
     _, shape, offset = _sub_element(prefix, offset, order)
     _, name, offset = _sub_element(prefix, offset, order)

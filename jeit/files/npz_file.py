@@ -67,7 +67,7 @@ def npz_arrays(
                         arrays[name] = _read_array(member)
         except TooLarge:
             raise
-        except (*FAULTS, OSError) as error:  # a member may claim to lie before the start of the file
+        except (*FAULTS, OSError) as error:  # the archive may place a member before the start of the file
             raise _unreadable_error("NPZ file of plain arrays", error) from None
     return {"": np.array([*members], dtype=str), **arrays}
 
@@ -91,9 +91,8 @@ def npy_array(path: Path) -> np.ndarray:
 
 
 def check_archive(path: Path) -> None:
-    """Raise `ValueError` for a file that is not a readable ZIP archive, for an archive of arrays and text whose content
-    exceeds the memory limit (`check_memory`), and for an archive with an array that is smaller than its header
-    declares."""
+    """Check an archive of arrays and text. Raises `ValueError` if the file is not a readable ZIP archive, if its
+    content exceeds the memory limit (`check_memory`), and if an array is smaller than its header declares."""
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()

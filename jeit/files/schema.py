@@ -46,16 +46,17 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True, defer_build=True)
 
     subject: ClassVar[str] = "the file"
-    """Name in messages of the thing that the table describes, such as "a study"."""
+    """Name, in messages, of the object that the table describes, such as "a study"."""
     hints: ClassVar[dict[str, str]] = {}
-    """What to write for a missing key whose value is often not known; continues the sentence "give it"."""
+    """For each key whose value users often do not know: advice on what to write if the key is missing, which continues
+    the sentence "give it"."""
 
     @model_validator(mode="wrap")
     @classmethod
     def _word_faults(cls, value: Any, validate: Callable[[Any], Any]) -> Any:
         """Validate a table of a file, and convert each fault to a sentence that begins with the faulty key."""
         if isinstance(value, Mapping) and len(value) > len(cls.model_fields) + _MAX_UNKNOWN_KEYS:
-            # Otherwise each of possibly a million unknown keys would be reported.
+            # Without this limit, each unknown key would be reported, possibly a million.
             unknown = itertools.islice((key for key in value if key not in cls.model_fields), _MAX_UNKNOWN_KEYS)
             value = {key: value[key] for key in [*(key for key in cls.model_fields if key in value), *unknown]}
         try:
@@ -138,8 +139,8 @@ def _allowed_words(annotation: Any) -> list[str]:
 
 
 def fault(message: str, key: str = "") -> PydanticCustomError:
-    """Error that the checks of a table raise: a `message` about the `key` in the table, or about the whole table if
-    `key` is empty. The name of the key or table is put before the message."""
+    """Create the error that the checks of a table raise: a `message` about the `key` in the table, or about the whole
+    table if `key` is empty. The reported message begins with the name of the key or table."""
     return PydanticCustomError("fault", "{said}", {"said": message, "key": key})
 
 
@@ -147,8 +148,8 @@ def fault(message: str, key: str = "") -> PydanticCustomError:
 class Number:
     """Annotation of a key whose value is a number from `low` to `high`, an integer if the key has type int.
 
-    If the type is a list, the key can be swept: its value is a number, or a list of distinct numbers. `beyond`: error
-    message for numbers that are too large.
+    If the key's type is a list, the key can be swept: its value is a number, or a list of distinct numbers. `beyond`:
+    error message for numbers that are too large.
     """
 
     low: float
@@ -170,7 +171,7 @@ class Number:
         return core_schema.no_info_plain_validator_function(read)
 
     def read(self, value: Any, is_integer: bool = False, otherwise: str = "") -> float:
-        """Check a value and convert it to a number. Raises the error `fault` for invalid values."""
+        """Check a value and convert it to a number. Raises an error created by `fault` for invalid values."""
         if not _is_number(value, is_integer):
             expected = "a whole number" if is_integer else "a number"
             raise fault(f"must be {expected}{otherwise}, {self.span}; it is {describe(value)}.")
@@ -300,12 +301,12 @@ Several = Annotated[list[Item], FailFast(), Swept()]
 
 
 class OneOf:
-    """Annotation of a key whose value is one of several kinds of table; the word under `key` in the value selects the
-    kind.
+    """Annotation of a key whose value is a table of one of several kinds; the word that the table contains under `key`
+    selects the kind.
 
     If `key` is missing, the kind with a default for `key` is selected. If `alternative_key` is present, the kind
-    `alternative_table` is selected. `synonyms`: other words that users may write, and the valid word that each probably
-    means.
+    `alternative_table` is selected. `synonyms`: for each wrong word that users may write, the valid word that is
+    probably meant.
     """
 
     def __init__(
@@ -355,8 +356,8 @@ class OneOf:
 
 def validated(table: type[T], content: Any, origin: str) -> T:
     """Validate the `content` of a file and return it as a `table`. Raises one `ValueError` of at most 400 characters,
-    which begins with `origin`, the file's name, and has a sentence about each faulty key, or about as many keys as
-    there is room for."""
+    which begins with `origin`, the file's name. It contains a sentence about each faulty key, or about as many keys as
+    fit."""
     try:
         return table.model_validate(content)
     except ValidationError as error:

@@ -40,8 +40,8 @@ _UNFINISHED_NAME = re.compile(r"\.jeit-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.part")
 
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[BinaryIO]:
-    """Context that yields a temporary file to write to, which replaces `path` once it is completely on the disk. If the
-    process is killed earlier, the old file remains.
+    """Context that yields a temporary file to write to; the temporary file replaces `path` once it is completely on the
+    disk. If the process is killed earlier, the old file remains.
 
     A link at `path` is replaced, not followed. Raises `OSError` if the file cannot be written.
     """
@@ -60,7 +60,7 @@ def written_whole(path: str | Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def whole_files(folder: Path) -> Iterator[Path]:
-    """Context that yields a temporary folder to write several files to; the files are moved to `folder` once all of
+    """Context that yields a temporary folder to write several files to; its files are moved to `folder` once all of
     them are written.
 
     Links in `folder` with the same names are replaced, not followed. Raises `OSError` if the files cannot be written.
@@ -93,5 +93,6 @@ def _unfinished_name() -> str:
 
 
 def _machine_hash() -> str:
-    """Hash of the current boot of this machine, eight characters; processes of other machines cannot be checked."""
+    """Hash of the current boot of this machine, eight characters; used because processes of other machines cannot be
+    checked."""
     return f"{zlib.crc32(boot_identifier().encode()):08x}"

@@ -1,8 +1,9 @@
 """Derivatives of voltages with respect to conductivity changes in a few cells, and to contact impedances.
 
-At fixed fields F (`ForwardModel.fields`) the energy in the contact of electrode l, with contact impedance z_l, is
-E_l(F, F) = (1/z_l) ∫_l (F - Z_l)², where Z is the transfer impedance. As F is stationary (`jeit.forward.transfer`), the
-derivative of the transfer impedance with respect to the contact impedance needs no further solve:
+For the fields F (`ForwardModel.fields`) and the contact impedance z_l, the energy in the contact of electrode l is
+E_l(F, F) = (1/z_l) ∫_l (F - Z_l)², where Z is the transfer impedance. Because F is a stationary point (see
+`jeit.forward.transfer`), the derivative of the transfer impedance with respect to the contact impedance needs no
+further solve:
 
     ∂Z / ∂ log z_l = E_l(F, F).
 """
@@ -31,16 +32,18 @@ _CELLS_AT_ONCE = 256
 
 
 class ConductivityChange(NamedTuple):
-    """Change of conductivity that is linear in q coefficients. **Fields**: `cells`: (k,) the cells that change, or None
-    for all cells; `slope`: (k, q) change of conductivity of each cell per unit coefficient, in S/m (2-D: S)."""
+    """Change of conductivity that is linear in q coefficients. **Fields**: `cells`: (k,) indices of the cells that
+    change, or None for all cells; `slope`: (k, q) change of conductivity of each cell per unit coefficient, in S/m
+    (2-D: S)."""
 
     cells: Any
     slope: Float[np.ndarray, "k q"]
 
 
 class SolvedFields(NamedTuple):
-    """Solution of a forward model, in NumPy. **Fields**: `mesh`, `protocol`: those of the model; `fields`: F (n, L) of
-    `ForwardModel.fields` in ohms; `impedance`: impedance of the electrodes in ohms."""
+    """Solution of a forward model, in NumPy. **Fields**: `mesh`, `protocol`: mesh and protocol of the model; `fields`:
+    potentials F (n, L) as defined in `ForwardModel.fields`, in ohms; `impedance`: impedance of the electrodes in
+    ohms."""
 
     mesh: Mesh
     protocol: Protocol
@@ -54,13 +57,14 @@ class SolvedFields(NamedTuple):
 
     def derivatives(self, changes: Sequence[ConductivityChange]) -> Float[np.ndarray, "M n"]:
         """Derivatives of the voltages with respect to the coefficients of all `changes`: -∫ dσ ∇u_drive · ∇u_measure.
-        Computed from integrals for pairs of electrodes."""
+        They are computed from integrals for pairs of electrodes."""
         energies = np.concatenate([self._energy(*change) for change in changes])
         return np.stack([-select_channels(self.protocol, impedance_change) for impedance_change in energies], axis=1)  # pyright: ignore
 
     def _energy(self, cells, slope) -> Float[np.ndarray, "q L L"]:
-        """Integrals ∫ dσ ∇F_k · ∇F_l for pairs of electrodes k, l and every coefficient of a change dσ: from the
-        stiffness matrix if all cells change, else from the gradients in the cells that change."""
+        """Integrals ∫ dσ ∇F_k · ∇F_l for pairs of electrodes k, l and every coefficient of a change dσ. They are
+        computed from the stiffness matrix if all cells change, otherwise from the gradients in the cells that
+        change."""
         fields: Any = self.fields
         if cells is None:
             return np.stack([self._energy_everywhere(cell_change) for cell_change in slope.T])
@@ -82,7 +86,7 @@ class SolvedFields(NamedTuple):
 
 
 def solved_fields(model: ForwardModel, conductivity: Float[np.ndarray, " m"]) -> SolvedFields:
-    """The fields of a model for a `conductivity` per cell, in S/m (2-D: S), which is not checked."""
+    """Compute the fields of a model for a `conductivity` per cell, in S/m (2-D: S), which is not checked."""
     fields, impedance = evaluate(model, fields_and_impedance_of, conductivity)
     return SolvedFields(*on_host((model.mesh, model.protocol, fields, impedance)))
 
@@ -98,7 +102,8 @@ def _field_energies(gradient, slope) -> Float[np.ndarray, "q L L"]:
     return energy.reshape(-1, num_fields, num_fields)
 
 
-# Contact impedance in ohm·m² above which an electrode carries no current, compared with one of unit impedance.
+# Contact impedance in ohm·m² of an electrode that carries no current, compared with an electrode of unit contact
+# impedance.
 _OPEN_CONTACT = 1e30
 
 
@@ -108,7 +113,7 @@ class _ContactMass(NamedTuple):
 
 
 def _contact_masses_of(mesh: Mesh, electrodes: AbstractElectrodes, electrode: int) -> list[_ContactMass]:
-    """Contact mass matrices of one electrode, for unit contact impedance, where electrodes share facets or cells."""
+    """Contact mass matrices of one electrode, for unit contact impedance, if electrodes share facets or cells."""
     contact_impedance = np.where(np.arange(electrodes.num_electrodes) == electrode, 1.0, _OPEN_CONTACT)
     contact = on_host(electrodes.with_contact_impedance(contact_impedance)).contact(mesh)
     pieces = []
@@ -120,7 +125,7 @@ def _contact_masses_of(mesh: Mesh, electrodes: AbstractElectrodes, electrode: in
 
 class ContactSensitivity:
     """Derivative ∂Z/∂ log z of the transfer impedance Z with respect to each contact impedance z, on one mesh.
-    `electrodes`: electrodes of the complete electrode model, at fixed positions and with fixed sizes."""
+    `electrodes`: electrodes of the complete electrode model, whose positions and sizes are fixed."""
 
     def __init__(self, mesh: Mesh, electrodes: AbstractElectrodes):
         mesh, num_electrodes = on_host(mesh), electrodes.num_electrodes
@@ -142,8 +147,8 @@ class ContactSensitivity:
     def __call__(
         self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"], contact_impedance
     ) -> Float[np.ndarray, "L L L"]:
-        """Derivatives ∂Z/∂ log z_l of the transfer impedance, (L, L, L) in ohms, from the `fields` F and `impedance` Z
-        at this `contact_impedance` (L,)."""
+        """Compute the derivatives ∂Z/∂ log z_l of the transfer impedance, (L, L, L) in ohms, from the `fields` F and
+        the `impedance` Z for the same `contact_impedance` (L,)."""
         return (
             np.stack([self._energy(electrode, fields, impedance) for electrode in range(len(impedance))])
             / (np.asarray(contact_impedance)[:, None, None])
@@ -164,9 +169,9 @@ _DIFFERENCE_SHIFT = 1e-4
 
 
 class PlacementSensitivity:
-    """Derivatives of the transfer impedance Z with respect to shifts of the electrodes, along the directions in which
-    they can move, and to the logarithm of each contact impedance z. Computed by central differences of the contact
-    energy at fixed fields. `electrodes` must be movable."""
+    """Derivatives of the transfer impedance Z with respect to shifts of the electrodes along the directions in which
+    they can move, and with respect to the logarithm of each contact impedance z. They are central differences of the
+    contact energy at fixed fields. `electrodes` must be movable."""
 
     def __init__(self, mesh: Mesh, electrodes: AbstractMovableElectrodes):
         mesh = on_host(mesh)

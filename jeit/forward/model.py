@@ -45,8 +45,8 @@ _CELLS_AT_ONCE = 4000
 
 
 class _BoundMethod(Module):
-    """Bound method of a model that `jax.jit` accepts. JAX needs a hash of the function that it compiles. Arrays cannot
-    be hashed, so the hash is computed from the identity of the model."""
+    """Bound method of a model that `jax.jit` accepts. JAX needs a hash of the function that it compiles. The arrays of
+    the model cannot be hashed, so the hash is computed from the identity of the model object."""
 
     __func__: Callable[..., Any] = eqx.field(static=True)
     __self__: eqx.Module
@@ -87,17 +87,17 @@ class ForwardModel(Module):
     """Electrode voltages of a body of given conductivity σ: solves ∇·(σ∇u) = 0 with the complete (or point) electrode
     model.
 
-    Every method takes a conductivity: a scalar, one value per cell (m,), one value per node (n,), or a symmetric tensor
-    per cell (m, d, d), in siemens per metre (2-D: sheet conductivity in siemens); complex values are admittivities. A
-    conductivity of another shape, or one that is not positive or not finite, raises `ValueError`. A method that is
+    Every method takes a conductivity in siemens per metre (2-D: sheet conductivity in siemens): a scalar, one value per
+    cell (m,), one value per node (n,), or a symmetric tensor per cell (m, d, d). Complex values are admittivities. A
+    conductivity that has a different shape, or is not positive or not finite, raises `ValueError`. A method that is
     called directly runs in NumPy. Inside `jax.jit`, as in `jax.jit(model.voltages)`, `jax.vmap` or a derivative, the
-    method is compiled once, and is two to four times as fast afterwards. All methods are differentiable with respect to
-    the conductivity and every field of the model (`model.electrodes.position`, `.contact_impedance`,
+    method is compiled at the first call, and is two to four times as fast afterwards. All methods are differentiable
+    with respect to the conductivity and every field of the model (`model.electrodes.position`, `.contact_impedance`,
     `model.mesh.points`, …).
 
     **Arguments:**
 
-    - `mesh`, `electrodes`, `protocol`: the body, its electrodes, and what is driven and measured.
+    - `mesh`, `electrodes`, `protocol`: the body, its electrodes, and the drive and measurement patterns.
     - `solver`: "auto" (chosen by size; `model.system.solver` states which solver and why), "cholesky", "cg", or any
       lineax solver. With "auto", `jeit_solvers.Multigrid` or `jeit_solvers.Pardiso`, methods run in NumPy where
       possible; with other solvers they are always compiled.
@@ -127,13 +127,13 @@ class ForwardModel(Module):
         *,
         solver: str | lx.AbstractLinearSolver = "auto",
     ):
-        """Arguments as for the class. Raises `ValueError` if electrodes do not lie on the mesh or differ in number from
-        those of the protocol."""
+        """Arguments as for the class. Raises `ValueError` if electrodes do not lie on the mesh, or if the protocol has
+        a different number of electrodes."""
         _check_model_parts(mesh, electrodes, protocol)
         self.mesh = mesh
         self.electrodes = electrodes
         self.protocol = protocol
-        with jax.ensure_compile_time_eval():  # a model may be made inside jit, with a known mesh
+        with jax.ensure_compile_time_eval():  # a model may be created inside jit, with a known mesh
             self.system = System.create(mesh, electrodes, solver)
         self.at_once = self.system.at_once
 
@@ -147,8 +147,8 @@ class ForwardModel(Module):
         )
 
     def with_electrodes(self, electrodes: AbstractElectrodes) -> "ForwardModel":
-        """Copy of the model with other electrodes of the same kind and number; works under `jax.jit`. Raises
-        `ValueError` for electrodes of another kind or number, and for electrodes that do not fit the mesh."""
+        """Copy of the model with different electrodes of the same kind and number; works under `jax.jit`. Raises
+        `ValueError` for electrodes of a different kind or number, and for electrodes that do not fit the mesh."""
         if type(electrodes) is not type(self.electrodes):
             raise ValueError(
                 f"with_electrodes needs {type(self.electrodes).__name__}, not {type(electrodes).__name__}; make a new "
@@ -158,7 +158,7 @@ class ForwardModel(Module):
         return eqx.tree_at(lambda model: model.electrodes, self, electrodes)
 
     def with_protocol(self, protocol: Protocol) -> "ForwardModel":
-        """Copy of the model with another protocol. Raises `ValueError` unless the protocol has the same number of
+        """Copy of the model with a different protocol. Raises `ValueError` unless the protocol has the same number of
         electrodes."""
         _check_model_parts(self.mesh, self.electrodes, protocol)
         return eqx.tree_at(lambda model: model.protocol, self, protocol)
@@ -181,8 +181,8 @@ class ForwardModel(Module):
 
     @compilable
     def fields(self, conductivity: ArrayLike) -> tuple[Inexact[Array, "n L"], Inexact[Array, "L L"]]:
-        """Potentials F (n, L) of the nodes, in ohms, for a unit current into each electrode that leaves through all
-        electrodes in equal parts; and the transfer impedance Z (L, L).
+        """Potentials F (n, L) of the nodes per unit current, in ohms, for a current into each electrode that leaves
+        through all electrodes in equal parts; and the transfer impedance Z (L, L).
 
         `conductivity` in S/m (2-D: S). Raises `ValueError` for an invalid conductivity.
         """
@@ -200,8 +200,8 @@ class ForwardModel(Module):
     def jacobian(self, conductivity: ArrayLike) -> Inexact[Array, "M m"]:
         """Jacobian ∂(voltage)/∂(conductivity), in volts per siemens per metre (2-D: volts per siemens).
 
-        Its shape is (M, m), with respect to the cells, or (M, n), with respect to the nodes, if `conductivity` is given
-        per node. Raises `ValueError` for a conductivity that is not valid, and for tensors.
+        Its shape is (M, m), with respect to the cells, or, for a conductivity per node, (M, n), with respect to the
+        nodes. Raises `ValueError` for an invalid conductivity, and for tensors.
         """
         return self.voltages_and_jacobian(conductivity)[1]
 
@@ -260,7 +260,7 @@ def _check_model_parts(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Pro
             f"There are {electrodes.num_electrodes} electrodes, and protocol '{protocol.name}' is for "
             f"{protocol.num_electrodes}; make both for the same number."
         )
-    with jax.ensure_compile_time_eval():  # a model may be made inside jit, with known values
+    with jax.ensure_compile_time_eval():  # a model may be created inside jit, with known values
         electrodes.check(mesh)
 
 
@@ -280,8 +280,8 @@ def select_channels(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
 
 
 def channel_voltages(protocol: Protocol, impedance: ElectrodeImpedance) -> Inexact[Array, " M"]:
-    """Voltages (M,) of the channels of a protocol for given impedances of the electrodes. The contribution of a contact
-    impedance is added only to channels that measure an electrode carrying current."""
+    """Voltages (M,) of the channels of a protocol for given impedances of the electrodes. Contact impedances contribute
+    only to channels that measure an electrode that carries current."""
     contact_voltages = select_channels(protocol, namespace(impedance.contact).diag(impedance.contact))
     return select_channels(protocol, impedance.body) + contact_voltages
 
@@ -304,8 +304,8 @@ def fields_of(model: ForwardModel | IntegratedModel, conductivity):
 
 
 def fields_and_impedance_of(model: ForwardModel | IntegratedModel, conductivity):
-    """Fields F (n, L) of `ForwardModel.fields` in ohms, relative to a reference potential near the body, and the
-    `ElectrodeImpedance`, for a `conductivity` in S/m (2-D: S); a quantity for `evaluate`."""
+    """Fields F (n, L) as defined in `ForwardModel.fields`, in ohms, but relative to a reference potential near the
+    body; and the `ElectrodeImpedance`, for a `conductivity` in S/m (2-D: S); a quantity for `evaluate`."""
     solved = solved_system_of(model, conductivity)
     return solved.fields()[0], solved.impedance()
 
@@ -363,18 +363,18 @@ def _blocks_of_cells(mesh: Mesh, protocol: Protocol) -> list[slice]:
 def jacobian_blocks(
     mesh: Mesh, protocol: Protocol, fields: Inexact[Array, "n L"]
 ) -> Iterator[tuple[slice, Inexact[Array, "M b"]]]:
-    """Jacobian of the channels with respect to the conductivity of cells, in V m/S (2-D: V/S), as blocks (M, b) of
-    consecutive cells, because the whole Jacobian of a solid does not fit in memory. Computed in NumPy from the `fields`
-    (n, L) of `fields_of`, in ohms."""
+    """Jacobian of the channels with respect to the conductivity of cells, in V m/S (2-D: V/S). It is computed in blocks
+    (M, b) of consecutive cells, because the whole Jacobian of a solid does not fit in memory. Computed in NumPy from
+    the `fields` (n, L) of `fields_of`, in ohms."""
     gradient = field_gradients(mesh, fields)
     for cells in _blocks_of_cells(mesh, protocol):
         yield cells, _jacobian_of_cells(protocol, gradient[:, cells])
 
 
 def field_products(mesh: Mesh, fields: Inexact[Array, "n L"]) -> Iterator[tuple[slice, Inexact[np.ndarray, "f b"]]]:
-    """Integrals ∫_e ∇u_a · ∇u_b over each cell e of the fields u_a, u_b of electrodes a ≤ b, with rows in the order of
-    `np.triu_indices`, as blocks of consecutive cells. The Jacobian of any channel is a weighted sum of these integrals.
-    Computed in NumPy from the `fields` (n, L) of `fields_of`, in ohms."""
+    """Integrals ∫_e ∇u_a · ∇u_b over each cell e, where u_a and u_b are the fields of electrodes a ≤ b, as blocks of
+    consecutive cells. Rows are in the order of `np.triu_indices`. The Jacobian of any channel is a weighted sum of
+    these integrals. Computed in NumPy from the `fields` (n, L) of `fields_of`, in ohms."""
     gradient: Any = field_gradients(mesh, fields)
     count = gradient.shape[-1]
     starts = np.cumsum([0, *range(count, 0, -1)])
@@ -415,8 +415,8 @@ _COMPILED_QUANTITIES = {
 
 
 class IntegratedModel(NamedTuple):
-    """Parts of a forward model, with integrals of the basis functions over the electrodes in place of the
-    electrodes."""
+    """Parts of a forward model, in which the electrodes are replaced by the integrals of the basis functions over
+    them."""
 
     mesh: Mesh
     electrodes: IntegratedElectrodes
@@ -442,4 +442,4 @@ def _integrate_on_host(
 integrated_model = Recent(_integrate_electrodes)
 """The `IntegratedModel` of a mesh, electrodes, a protocol and a system whose values are all known."""
 host_model = Recent(_integrate_on_host)
-"""The same in NumPy, for calls outside compiled code, which then do not wait for a compiler."""
+"""The same as `integrated_model`, but in NumPy, for calls outside compiled code, which then need no compilation."""

@@ -51,10 +51,10 @@ def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
 def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
     """Convert `conductivity` to an array, and raise `ValueError` if the array has the wrong shape or is not positive.
 
-    Accepts a scalar (converted to shape (m,)), values per cell (m,) or per node (n,), or symmetric tensors (m, s, s),
-    where s is the dimension of space; in siemens per metre (in a 2-D sheet, siemens). For tensors (m, 3, 3) on a
-    surface in space, only the part in the plane of each triangle matters. A complex admittivity needs a positive real
-    part. Values of traced arrays are not checked.
+    Accepts a scalar (converted to shape (m,)), values per cell (m,) or per node (n,), or symmetric tensors (m, s, s) in
+    space of dimension s; in siemens per metre (in a 2-D sheet, siemens). Of tensors (m, 3, 3) on a surface in space,
+    only the components in the plane of each triangle are used. A complex admittivity needs a positive real part. Values
+    of traced arrays are not checked.
     """
     conductivity = np.asarray(conductivity) if has_values(conductivity) else jnp.asarray(conductivity)
     # All equivalent inputs get the same type and shape, because JAX compiles again for Python's "weakly typed" numbers.
@@ -102,7 +102,7 @@ def _check_values(conductivity: Any, normal: Any) -> None:
 
 def _cached_geometry(mesh: Mesh) -> tuple[Inexact[Array, "m k s"], Inexact[Array, " m"]]:
     """Gradients (m, d + 1, s) of the basis functions in m cells of dimension d in s-dimensional space, and measures
-    (m,) of the cells. In NumPy, the results for the last mesh are kept."""
+    (m,) of the cells. In NumPy, the results for the last mesh are cached."""
     return _last_geometry(mesh) if namespace(mesh) is np else _gradients_and_measures(mesh)
 
 
@@ -130,7 +130,7 @@ def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Arra
 
 
 def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array, "d m p"]:
-    """Gradients (d, m, p) of p nodal fields in every cell, one layer per axis, multiplied by the square root of the
+    """Gradients (d, m, p) of p nodal fields in each of m cells along d axes, multiplied by the square root of the
     cell's measure.
 
     With this weight the product of the gradients of two fields u, w is the integral ∫_e ∇u·∇w over the cell e.
@@ -150,8 +150,8 @@ def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array,
 class System(Module):
     """Sparsity pattern of the system matrix, and the solvers of systems with this pattern.
 
-    A system is made once for a mesh and a kind of electrode (`System.create`). It holds no physical quantities, so it
-    serves every conductivity, contact impedance, electrode position and size.
+    A system is created once for a mesh and a kind of electrode (`System.create`). It contains no physical quantities,
+    so it is valid for every conductivity, contact impedance, electrode position and size.
 
     **Fields**: `pattern`: sparsity pattern; `solver`: lineax solver used in compiled programs; `fronts`: plan by which
     matrices with known values are factorised in NumPy, None if only `solver` is used.
@@ -168,10 +168,10 @@ class System(Module):
 
     @classmethod
     def create(cls, mesh: Mesh, electrodes: AbstractElectrodes, solver: str | lx.AbstractLinearSolver = "auto"):
-        """Make the system for a mesh and electrodes. `solver`: "auto" (chosen by predicted memory and time),
+        """Create the system for a mesh and electrodes. `solver`: "auto" (chosen by predicted memory and time),
         "cholesky", "cg", or any lineax solver.
 
-        Raises `ValueError` for another name of a solver.
+        Raises `ValueError` for an unknown name of a solver.
         """
         groups = [np.asarray(nodes) for nodes in (mesh.cells, *electrodes.contact_nodes(mesh))]
         pattern = SparsityPattern.from_elements(groups, size=mesh.num_points)
@@ -191,9 +191,9 @@ class System(Module):
     def grounded(
         self, mesh: Mesh, conductivity, electrodes: AbstractElectrodes, contact: Contact
     ) -> tuple[SparseSymmetric, Inexact[Array, "n c"]]:
-        """The symmetric positive-definite system matrix A, (n, n) in siemens, the sum of stiffness, contact mass and
-        ground; and the loads (right-hand sides) of L electrodes, (n, L) for point electrodes, otherwise (n, L + 1) with
-        the load of the ground.
+        """Return the system matrix A and the loads (right-hand sides). A, (n, n) in siemens, is symmetric positive
+        definite, and the sum of stiffness, contact mass and ground. The loads of L electrodes are (n, L) for point
+        electrodes, otherwise (n, L + 1) with the load of the ground.
 
         `conductivity` per cell, in S/m (2-D: S).
         """
@@ -219,7 +219,7 @@ class System(Module):
         constant = jax.lax.stop_gradient(operator)  # derivatives come from A X = B, not from the factor of A
         state: Any = self.solver.init(constant, {})
         solver = self.solver
-        if isinstance(solver, ColumnSolver):  # all columns at once; other lineax solvers take one column at a time
+        if isinstance(solver, ColumnSolver):  # all columns at once; other lineax solvers solve for one column at a time
 
             def solve_columns(_, columns):
                 return solver.solve_columns(state, columns)
@@ -247,8 +247,8 @@ class System(Module):
 
 
 def ground_conductance(stiffness: Inexact[Array, " n"], load: Inexact[Array, "n L"]) -> Inexact[Array, " n"]:
-    """Conductances (n,) from the nodes to ground: zero except at one node under an electrode, there of the order of the
-    `stiffness` (n,).
+    """Conductances (n,) from the nodes to ground: zero except at one node under an electrode, where the conductance
+    equals the `stiffness` (n,).
 
     If the electrode currents sum to zero, no current flows to ground, so the ground does not change the solution. The
     ground fixes the constant part of the potential, which is undetermined with point electrodes, and nearly so with

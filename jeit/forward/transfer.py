@@ -1,8 +1,9 @@
 """Transfer impedance of the electrodes as a function of the conductivity, with its derivative rule.
 
-Let a_θ(u, w) be the energy form of the electrode model, where θ stands for all parameters of the form (conductivity,
-contact impedance, electrode positions, mesh points), and F_l the potential for a unit current into electrode l that
-leaves through all electrodes in equal parts. Then Z_lk = a_θ(F_l, F_k), and, as F is stationary,
+Let a_θ(u, w) be the energy form of the electrode model, where θ denotes its parameters (conductivity, contact
+impedance, electrode positions, mesh points). Let F_l be the potential for a unit current into electrode l that leaves
+through all electrodes in equal parts. Then Z_lk = a_θ(F_l, F_k), and, because F is a stationary point of 2⟨load, F⟩ -
+a_θ(F, F),
 
     dZ = -∂_θ a_θ(F, F) dθ      at fixed F,
 
@@ -31,8 +32,8 @@ from jeit_solvers.engines import namespace, undifferentiated
 
 class ElectrodeImpedance(NamedTuple):
     """Transfer impedance of the electrodes in two parts, up to terms that cancel for currents that sum to zero. The
-    parts are kept separate because the resistance of a nearly open contact is so large that the sum would lose the
-    digits of the body's part.
+    parts are stored separately, because the resistance of a nearly open contact is so large that their sum would lose
+    the digits of the part from the body.
 
     **Fields**: `body`: (L, L) mean potentials under the electrodes for unit currents; `contact`: (L,) voltage drop at
     each contact per unit current, z / |e| with the contact impedance z and the electrode's area |e|, zero for point
@@ -137,7 +138,7 @@ class SolvedSystem(NamedTuple):
     def fields(self) -> tuple[Inexact[Array, "n L"], Inexact[Array, "L L"]]:
         """Potentials F (n, L) of the nodes and U (L, L) of the electrodes for a unit current into each electrode that
         leaves through all electrodes in equal parts. All potentials are relative to the same reference potential near
-        the body, whatever the contact impedances."""
+        the body, which does not depend on the contact impedances."""
         return unit_fields(self.solution, self.product, self.resistance)
 
 
@@ -167,9 +168,9 @@ def fields_and_inverse(
     """Potentials F (`SolvedSystem.fields`) of the nodes in the order of `strips`, and the entries of K⁻¹ between nodes
     up to `max_distance` strips apart, in ohms.
 
-    K is the matrix of the electrode model with the ground and all electrodes but one floating. An entry of K⁻¹ is the
-    potential of one node for a unit current into another node. The choice of the electrode that is not floating does
-    not affect the derivatives with respect to conductivity.
+    K is the matrix of the electrode model in which the ground and all electrodes but one are floating. An entry of K⁻¹
+    is the potential of one node for a unit current into another node. The choice of the electrode that is not floating
+    does not affect the derivatives with respect to conductivity.
     """
     fields, solution = strips.spread(solved.fields()[0]), strips.spread(solved.solution)
     inverse = near_inverse(strips, solved.operator, max_distance)
@@ -188,9 +189,10 @@ def electrode_impedance(product: Inexact[Array, "c c"], resistance: Inexact[Arra
     """Impedance of the electrodes from the product loadᵀ A⁻¹ load, with A and the loads of `System.grounded`, and from
     the resistances of the contacts.
 
-    With the electrodes' loads B, the contacts' resistances D⁻¹, nodal potentials u, electrode potentials U and currents
-    I, the mean potentials under complete electrodes are D⁻¹ Bᵀ u = D⁻¹ BᵀA⁻¹B U. The remainder of U, the voltage drop
-    D⁻¹ I at the contacts, is kept separate, so no digits are lost at large contact impedance.
+    Let B be the loads of the electrodes, D⁻¹ the resistances of the contacts, u the nodal potentials, U the potentials
+    of the electrodes and I their currents. The mean potentials under complete electrodes are D⁻¹ Bᵀ u = D⁻¹ BᵀA⁻¹B U.
+    The remainder of U, the voltage drop D⁻¹ I at the contacts, is stored separately, so no digits are lost at large
+    contact impedance.
     """
     if resistance is None:
         return ElectrodeImpedance((product + product.T) / 2, namespace(product).zeros_like(product[0]))
@@ -202,10 +204,11 @@ def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
     """Impedance matrix of the terminals (electrodes and ground): potentials of all terminals for a unit current into
     each terminal that leaves through a reference terminal.
 
-    Eliminating the nodes from the system leaves (D - BᵀA⁻¹B) U = I. The columns of the matrix D - BᵀA⁻¹B sum to zero,
-    so its diagonal is computed as the sum of the other entries, which avoids the cancellation in D - BᵀA⁻¹B at small
-    contact impedance. The reference terminal is the terminal that is best connected to the others. Rows and columns are
-    scaled by their diagonals, because the contact impedances may differ by orders of magnitude.
+    Eliminating the nodal potentials from the system leaves (D - BᵀA⁻¹B) U = I, with the symbols of
+    `electrode_impedance`. The columns of the matrix D - BᵀA⁻¹B sum to zero, so its diagonal is computed from the sum of
+    the off-diagonal entries. This avoids the cancellation in D - BᵀA⁻¹B at small contact impedance. The reference
+    terminal is the terminal with the largest conductance to the others. Rows and columns are scaled by their diagonals,
+    because the contact impedances may differ by orders of magnitude.
     """
     xp = namespace(product)
     coupling = (product + product.T) / 2 * (1 - np.eye(len(product)))
@@ -222,12 +225,12 @@ def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
 def _mean_current_correction(
     others: Inexact[Array, "c c"], impedance: Inexact[Array, "c c"], current: Inexact[Array, "c c"]
 ):
-    """Correction of the impedance of terminals by one step of iterative refinement, for pairs of terminals that
-    short-circuit each other.
+    """Correction of the impedance of terminals by one step of iterative refinement; needed if two terminals are nearly
+    short-circuited.
 
-    The current between two terminals is computed from the difference of their potentials, so that, whatever the
-    rounding, the current that leaves one terminal enters the other. The residual is `current` minus all these currents.
-    The residual therefore keeps the digits that couple a short-circuited pair to the other terminals.
+    The current between two terminals is computed from the difference of their potentials. The current that leaves one
+    terminal therefore equals the current that enters the other, even with rounding errors. The residual is `current`
+    minus all these currents; it retains the digits that couple a short-circuited pair to the other terminals.
     """
     xp = namespace(others)
     if xp is np:

@@ -36,14 +36,13 @@ def axes_or_new(ax: Axes | None, size: tuple[float, float] = (6.4, 5.6)) -> Axes
 
 # Distance of numbers from a body, and width of a digit in a small picture, divided by the size of the body.
 _TEXT_DISTANCE, _LETTER_WIDTH = 0.04, 0.021
-# Minimum distance of the ticks of a colour bar of factors, as a share of its limit.
+# Minimum distance between the ticks of a colour bar of factors, as a share of its limit.
 _MIN_TICK_SPACING = 0.2
 
 
 def hide_axes(ax: Axes, extent: tuple[float, float, float, float], *, numbered: bool = True) -> None:
-    """Set equal scales of both axes, and remove frame and ticks. Around the `extent` (metres), space is left for a
-    scale bar and, if electrodes are `numbered`, for their numbers, as much as the longest text beside the body
-    needs."""
+    """Set equal scales of the x and y axes, and remove frame and ticks. Around the `extent` (metres), space is left for
+    a scale bar and, if electrodes are `numbered`, for the longest number beside the body."""
     x_min, x_max, y_min, y_max = extent
     size = max(x_max - x_min, y_max - y_min)
     margin = (0.12 if numbered else 0.06) * size
@@ -159,13 +158,13 @@ class ColourScale(Module):
 
     **Fields**
 
-    - `difference`: whether values are changes, drawn with a diverging colour map centred at zero; otherwise, they are
+    - `difference`: whether values are changes, drawn with a diverging colour map centred at zero. Other values are
       drawn with a perceptually uniform sequential colour map from the minimum to the maximum.
     - `quantity`: label of the colour bar; default: conductivity or its change.
     - `unit`: unit of the values, "" for none; default: the unit of conductivity ("S" for a sheet, "S/m" for a body).
       The colour bar adds an SI prefix.
     - `limit`: value at the end of the colour bar, in `unit`; default: the maximum magnitude.
-    - `colour_map`: name of a matplotlib colour map to use instead of these colour maps.
+    - `colour_map`: name of a matplotlib colour map that replaces the default colour maps.
     - `bar`: whether to draw the colour bar.
     - `logarithmic`: whether the values are log₁₀ of factors; the colour bar then states the factors.
 

@@ -25,7 +25,7 @@ from jeit.report.folder import (
     write_json,
 )
 
-# Number of mesh nodes for the comparison of wirings.
+# Number of nodes of the mesh on which wirings are compared.
 _MAX_MESH_NODES = 1000
 
 
@@ -65,7 +65,7 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
 
 
 def _describe_wiring(measurement: Measurement) -> str | None:
-    """Description of the estimated wiring, in words, from the frame named "reference", or else the first frame; None if
+    """Describe in words the wiring estimated from the frame named "reference", or else from the first frame; None if
     the body or the places of the electrodes are not known."""
     domain, electrodes = measurement.domain, measurement.electrodes
     if domain is None or electrodes is None:
@@ -142,7 +142,7 @@ def draw_choice(result: ComparedRules):
 
 
 def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
-    """Draw the image of one rule with a colour scale of its own, with inclusions marked unless there are more than
+    """Draw the image of one rule with its own colour scale; inclusions are marked unless there are more than
     `_MAX_MARKED`."""
     from jeit.plot import ColourScale, plot_image
     from jeit.plot.axes import INK

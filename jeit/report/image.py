@@ -92,8 +92,8 @@ def _arrays(result: ImagedDifference) -> dict[str, Any]:
 
 
 def _drawn_values(result: ImagedDifference) -> np.ndarray:
-    """Values per cell for the picture: the change of conductivity, or, for iterative images, which range from 0.01 to
-    100 times the background, the change of its logarithm to base 10."""
+    """Values per cell for the picture: the change of conductivity, or, for iterative images, the change of its
+    logarithm to base 10, because their conductivity ranges from 0.01 to 100 times the background."""
     return np.asarray(result.departure) / (math.log(10) if result.iterative else 1)
 
 
@@ -228,7 +228,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
 
 
 def _uncertainty_report(uncertainty: Uncertainty, mesh: Mesh) -> dict[str, Any]:
-    """Report of the uncertainty of the description, on which intervals are based."""
+    """Report of the uncertainty of the description of the measurement, on which intervals are based."""
     return {
         "position": uncertainty.position_on(mesh),
         "position_unit": "m",
@@ -292,8 +292,8 @@ def _inclusion_report(result: ImagedDifference, inclusion: Inclusion) -> dict[st
 
 
 def _interval_report(inclusion: Inclusion) -> dict[str, Any]:
-    """68 % radius of the place of a body, and 68 % intervals of its properties, None at an open end; empty if no
-    intervals were estimated."""
+    """Radius of the 68 % region of a body's position, and 68 % intervals of its properties; a limit that the data do
+    not determine is None. Empty if no intervals were estimated."""
     if inclusion.contrast_interval is None:
         return {}
     return {
@@ -316,7 +316,7 @@ def _size_report(inclusion: Inclusion) -> dict[str, Any]:
 
 
 def _shapes_report(result: ImagedDifference) -> dict[str, Any] | None:
-    """Report of fitted bodies with their outlines, and of bodies left out as artefacts; None if no bodies were
+    """Report of fitted bodies with their outlines, and of bodies rejected as artefacts; None if no bodies were
     fitted."""
     if result.shapes is None:
         return None
@@ -369,7 +369,7 @@ def _evidence_text(body: Star | Ellipsoid) -> str:
 
 
 def _prior_name(settings: ImagingSettings, dimension: int) -> str | None:
-    """Name of the prior of the settings or of the method; None for methods without a prior."""
+    """Name of the prior in the settings, or of the fixed prior of the method; None for methods without a prior."""
     method = METHODS[settings.method]
     if settings.method == "shapes" and dimension == 3:
         return "ellipsoids and columns"

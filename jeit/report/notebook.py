@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from jeit.report.image import draw_image
 from jeit_solvers.engines import has_values
 
-# Dots per inch, and frames of a measurement that are drawn.
+# Dots per inch of pictures, and maximum number of frames of a measurement that are drawn.
 _DPI, _MAX_FRAMES = 90, 12
 
 

@@ -121,8 +121,8 @@ def saved_extras(
 def read_image(path: str | Path) -> SavedImage:
     """Read an `image.npz` written by `jeit reconstruct` or `write_image`.
 
-    Files of earlier versions lack electrodes and inclusions. Raises `ValueError` for files of another kind and for
-    arrays that do not fit together, and `OSError` if the file does not exist.
+    Files of earlier versions lack electrodes and inclusions. Raises `ValueError` for files that are not saved images
+    and for arrays that do not fit together, and `OSError` if the file does not exist.
 
     **Arguments:**
 
@@ -148,7 +148,7 @@ def read_image(path: str | Path) -> SavedImage:
         need(arrays, *_REQUIRED_ARRAYS)
         if arrays["points"].dtype.kind not in "fiu":
             raise ValueError(f"'points' is {describe(arrays['points'])}; real numbers are wanted, metres.")
-        with size_checked():  # the size of the mesh was checked by the command that wrote it
+        with size_checked():  # the command that wrote the file checked the size of the mesh
             mesh = Mesh.create(arrays["points"], arrays["cells"])
         return _to_saved_image(mesh, arrays)
     except ValueError as error:
@@ -208,7 +208,7 @@ def _read_electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShap
     are_integers = all(array.dtype.kind in "iu" and array.ndim == 1 for array in (sizes, numbers))
     if not (are_integers and len(sizes) == len(numbers) > 0 and sizes.min() > 0 and sizes.sum() == len(corners)):
         raise ValueError("'electrode_sizes' does not say whose corners 'electrode_corners' are; write it again.")
-    # Every electrode needs a polygon, as otherwise its place is unknown.
+    # Every electrode needs a polygon; without a polygon its place is unknown.
     if not np.array_equal(np.unique(numbers), np.arange(numbers.max() + 1)):
         raise ValueError("'electrode_numbers' leave electrodes out; write it again.")
     return ElectrodeShapes(corners.astype(float), sizes, numbers)
@@ -269,12 +269,12 @@ def write_views(
     """Write pictures of an image to a folder, and return their names.
 
     - For a solid: `overview.png`; `isosurfaces.png`, isosurfaces, seen from the `camera`, from the opposite side, from
-      the front and from above; `slices.png`, evenly spaced slices; and `planes.png`, sections by planes, if any are
-      given.
+      the front and from above; `slices.png`, evenly spaced slices; and `planes.png`, sections by the `planes`, if there
+      are any.
     - For a surface in space: `surface.png`, seen from the same sides.
     - For a sheet: `image.png`.
 
-    For complex images, the real part is drawn. Raises `ValueError` if `planes` are given for a body that is not a
+    For complex images, the real part is drawn. Raises `ValueError` if there are `planes` for a body that is not a
     solid, for a path that cannot be a folder, and in the same cases as `jeit.plot.plot_solid`.
 
     **Arguments:**

@@ -18,7 +18,7 @@ from jeit.report.folder import as_plain_values, describe_measurement, results, w
 FILMS = (".gif", ".mp4")
 FILM_FRAMES = 120
 """Maximum number of frames of a film."""
-# Frames per second of a film: the maximum, and the default if the rate of the stream is not known.
+# Maximum number of frames per second of a film, and default number if the rate of the stream is not known.
 _MAX_RATE, _DEFAULT_RATE = 25.0, 10.0
 
 
@@ -54,8 +54,8 @@ def write_film(
     - `mesh`, `electrodes`: as in `jeit.plot.plot_image`.
     - `changes`, `titles`: as in `jeit.plot.plot_frames`; refused frames are shown as refused.
     - `limit`: end of the colour scale, S (3-D: S/m); default: the maximum over all frames.
-    - `rate`: frames per second of the stream. The film then lasts as long as the stream, but has at most 25 frames per
-      second. Default: a film of 10 frames per second.
+    - `rate`: frames per second of the stream; the film lasts as long as the stream, but has at most 25 frames per
+      second. Default: the film has 10 frames per second.
     - `progress`: called with the number of frames drawn.
 
     For longer streams, 120 evenly spaced frames are drawn. Raises `ValueError` for an unknown suffix, for .mp4 if

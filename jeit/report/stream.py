@@ -1,5 +1,5 @@
-"""Files of a stream: a table and images, written frame by frame, and pictures at the end; and the files that grow with
-a stream of any length, written with constant memory."""
+"""Files of a stream: a table and images, written frame by frame, and pictures at the end. Files can grow to any length
+with constant memory."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ PICTURES = ("contact sheet", "film")
 
 _COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")
 _WITHOUT_IMAGE = (FrameStatus.REFUSED, FrameStatus.UNCHANGED)
-# End of the colour scale of streams without changes, as a share of the background, so that noise is not visible.
+# End of the colour scale of streams without changes, as a share of the background; large enough that noise is not
+# visible.
 _MIN_SCALE_SHARE = 0.01
 # Maximum number of refused frames named below the contact sheet.
 _MAX_NAMED = 8
@@ -85,9 +86,9 @@ def write_stream(
     `frames.csv` has the place in metres and the value, S (3-D: S/m), of the maximum change of each image; both are
     empty for unchanged frames. `images.npz` has `conductivity` (frames, cells), NaN for refused frames, `background`,
     `points` and `cells`. Pictures show evenly spaced frames and mark refused frames; no pictures are drawn if all
-    frames were refused. Images and pictures of an earlier stream are deleted first; each file is written completely or
-    not at all. Raises `ValueError` for a stream without frames and for values that cannot be a folder, a film or a
-    rate, and `OSError` if the disk is full.
+    frames were refused. Images and pictures of an earlier stream are deleted first. Each of these files is written
+    completely or not at all. Raises `ValueError` for a stream without frames and for values that cannot be a folder, a
+    film or a rate, and `OSError` if the disk is full.
 
     **Example:**
 
@@ -103,7 +104,7 @@ def write_stream(
     file_names = ("frames.csv", "images.npz", "frames.png", *([] if film is None else [film]))
     folder = results_folder(folder, file_names)
     for earlier_name in file_names[1:]:
-        (folder / earlier_name).unlink(missing_ok=True)  # it belongs to an earlier stream
+        (folder / earlier_name).unlink(missing_ok=True)  # the file belongs to an earlier stream
     clear_unfinished(folder)
     report = drawing or (lambda task: None)
     mesh, summary = calibration.model.mesh, _StreamSummary(calibration)
@@ -131,7 +132,7 @@ def write_stream(
 
 
 class _StreamSummary:
-    """Statistics of the frames of a stream, of constant size for any number of frames."""
+    """Statistics of the frames of a stream, which take the same memory for any number of frames."""
 
     def __init__(self, calibration: Calibration):
         self.calibration = calibration
@@ -302,8 +303,8 @@ class GrowingRows:
     def write_npz(
         self, path: Path, name: str, others: Mapping[str, ArrayLike], progress: Callable[[str], None] | None = None
     ) -> None:
-        """Write an NPZ file, completely or not at all, with all rows as array `name`, and with the arrays `others`. The
-        rows are copied block by block; for large files, `progress` is called with the percentage written."""
+        """Write an NPZ file, completely or not at all, with all rows as the array `name`, and with the arrays `others`.
+        The rows are copied block by block; for large files, `progress` is called with the percentage written."""
         header = {"descr": "<f4", "fortran_order": False, "shape": (self.number, *self.shape)}
         with written_whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -317,7 +318,8 @@ class GrowingRows:
                     np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
 
     def _blocks(self) -> Iterator[tuple[float, bytes]]:
-        """Yield the file of rows in blocks, each with the share of the file that has been read up to its end."""
+        """Yield the file of rows in blocks, each with the share of the file that has been read at the end of the
+        block."""
         size = self._file.seek(0, os.SEEK_END)
         self._file.seek(0)
         while block := self._file.read(_BLOCK_BYTES):
@@ -327,14 +329,14 @@ class GrowingRows:
         return self
 
     def __exit__(self, *_) -> None:
-        with contextlib.suppress(OSError):  # data not yet written are not needed any more
+        with contextlib.suppress(OSError):  # data that have not been written are no longer needed
             self._file.close()
 
 
 @contextlib.contextmanager
 def reporting_partial_results(rows: GrowingRows) -> Iterator[None]:
-    """Context manager that adds to the message of an `OSError`, such as for a full disk, which frames have been
-    written, and raises this `OSError`."""
+    """Context manager that adds to the message of an `OSError`, for example for a full disk, how many frames have been
+    written, and raises a new `OSError`."""
     try:
         yield
     except OSError as error:
@@ -345,7 +347,7 @@ def reporting_partial_results(rows: GrowingRows) -> Iterator[None]:
 
 class Sample:
     """Evenly spaced sample of a series of numbers of any length: every number of a series of up to 65,536 numbers,
-    every second number of a longer series, then every fourth, and so on, so that 32,768 to 65,536 numbers are
+    every second number of a longer series, then every fourth, and so on. Of a long series, 32,768 to 65,536 numbers are
     stored."""
 
     def __init__(self) -> None:

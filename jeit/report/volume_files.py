@@ -18,7 +18,7 @@ from jeit.mesh import Mesh, write
 from jeit.mesh.mesh import facet_measures
 from jeit.report.folder import results_folder
 
-# Minimum share of the surface around a node that an electrode must cover for the node to count as under the electrode.
+# A node counts as under an electrode if the electrode covers at least this share of the surface around the node.
 _MIN_COVERED_SHARE = 0.1
 
 
@@ -42,7 +42,7 @@ def write_vtu(
     - `electrodes`: written as the array "electrode", the number of the electrode at each node, from 1, and 0 for other
       nodes.
 
-    Raises `ValueError` for another suffix, values of another length, and a path that cannot be written to.
+    Raises `ValueError` for a suffix other than .vtu, values of a wrong length, and a path that cannot be written to.
 
     **Example:**
 
@@ -65,7 +65,8 @@ def draft_vtu(
     point_data: Mapping[str, ArrayLike] | None = None,
     electrodes: AbstractElectrodes | None = None,
 ) -> None:
-    """Write a VTU file as `write_vtu`, but directly to `path`, such as in the temporary folder of `results`."""
+    """Write a VTU file as `write_vtu` does, but directly to `path`, for example in the temporary folder of
+    `results`."""
     node_data = dict(point_data or {})
     if electrodes is not None:
         node_data["electrode"] = electrode_of_nodes(mesh, electrodes)
@@ -84,7 +85,7 @@ def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: 
     - `times` (F,): seconds.
     - `cell_data`: values per frame and cell (F, m), by name.
 
-    Raises `ValueError` for another suffix, and for arrays that do not fit together.
+    Raises `ValueError` for a suffix other than .pvd, and for arrays that do not fit together.
 
     **Example:**
 

@@ -18,12 +18,12 @@ import jax
 
 
 def take_double_precision() -> None:
-    """Set JAX to double precision: a light touch changes voltages by 1e-4, for which single precision is not accurate
-    enough. A value of JAX_ENABLE_X64 that the user has set takes precedence; single precision then raises a warning
-    about the accuracy that it costs (docs/explanation/numerics.md).
+    """Set JAX to double precision, because single precision is not accurate enough for the change of the voltages by a
+    light touch, 1e-4. A value of JAX_ENABLE_X64 that the user has set takes precedence; for single precision a warning
+    states the loss of accuracy (docs/explanation/numerics.md).
 
-    Products of single-precision matrices keep all 24 bits: on graphics processors, JAX would by default round the
-    factors to 11 bits. A value of JAX_DEFAULT_MATMUL_PRECISION that the user has set takes precedence.
+    Products of single-precision matrices use all 24 bits of the factors, which JAX would by default round to 11 bits on
+    graphics processors. A value of JAX_DEFAULT_MATMUL_PRECISION that the user has set takes precedence.
     """
     if jax.config.jax_default_matmul_precision is None:  # pyright: ignore[reportAttributeAccessIssue]
         jax.config.update("jax_default_matmul_precision", "highest")
@@ -66,7 +66,7 @@ def _refuse_in_child() -> None:
     if _refuses_compilation or not _has_started():
         return
     _refuses_compilation = True
-    jax.clear_caches()  # programs compiled before the fork are dropped, and new ones are refused
+    jax.clear_caches()  # programs compiled before the fork are deleted, and compilation of new programs is refused
     jax.monitoring.register_event_duration_secs_listener(_raise_at_compilation)
 
 
@@ -77,7 +77,7 @@ def _has_started() -> bool:
 
 
 def _raise_at_compilation(event: str, duration_secs: float, **_: str | int) -> None:
-    """Listener to JAX's monitoring events that raises `RuntimeError` after tracing, before a program is compiled."""
+    """Listener to JAX's monitoring events: raises `RuntimeError` after tracing, before a program is compiled."""
     del duration_secs
     if event.startswith("/jax/core/compile"):
         raise RuntimeError(
@@ -91,10 +91,10 @@ _MAX_BYTES, _MAX_FILES = 256 * 2**20, 5000
 
 
 def keep_compiled_code() -> None:
-    """Keep compiled programs in the user's cache folder, so that a program is compiled once per machine instead of once
-    per process.
+    """Store compiled programs in the user's cache folder, so that a program is compiled once per machine instead of
+    once per process.
 
-    Does nothing if the user has set a cache folder for JAX (`JAX_COMPILATION_CACHE_DIR`, or
+    Nothing is changed if the user has set a cache folder for JAX (`JAX_COMPILATION_CACHE_DIR`, or
     `jax_compilation_cache_dir`), if `JEIT_COMPILATION_CACHE` is "off", or if the folder cannot be written to. JAX
     identifies programs by their text and by the versions of JAX and of the compiler. The least recently used programs
     are deleted when there are more than 5,000 files or 256 MiB.
@@ -117,10 +117,10 @@ def keep_compiled_code() -> None:
 
 
 def discarded_damaged(warning: str) -> bool:
-    """Whether a warning is JAX's message that it could not read a cached program; if so, all cached files with the
-    program's name are deleted.
+    """Whether a warning is JAX's message that a cached program could not be read; if so, delete all cached files with
+    the program's name.
 
-    Otherwise JAX, which does not overwrite cached files, would compile the program again and repeat the warning in
+    JAX does not overwrite cached files. If they stayed, it would compile the program again and repeat the warning in
     every later process.
     """
     match = re.match(r"Error reading persistent compilation cache entry for '([\w<>.-]+)'", warning)
@@ -134,8 +134,8 @@ def discarded_damaged(warning: str) -> bool:
 
 
 def _processor() -> str:
-    """Identifier of the type of processor, because code compiled for one type must not run on another where home
-    folders are shared."""
+    """Identifier of the type of processor. Machines with different processors may share a home folder, and must not run
+    each other's compiled code."""
     description = platform.machine() + platform.processor()
     with contextlib.suppress(OSError), open("/proc/cpuinfo") as lines:
         description += next((line for line in lines if line.startswith(("flags", "Features"))), "")
@@ -143,8 +143,8 @@ def _processor() -> str:
 
 
 def _discard_oldest(folder: Path) -> None:
-    """Delete the least recently used cached programs beyond the limits on number and size, and empty files: a full disk
-    leaves them, and JAX cannot read them."""
+    """Delete the least recently used cached programs beyond the limits on number and size. Also delete empty files,
+    which a full disk leaves behind, and which JAX cannot read."""
     files = sorted(_file_usage(folder), reverse=True)
     total_bytes = 0
     for file_index, (_, num_bytes, path) in enumerate(files):

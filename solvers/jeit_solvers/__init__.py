@@ -1,8 +1,8 @@
 """Numerical methods, independent of the physics, in JAX and NumPy.
 
-- `sparse`: symmetric sparse systems, solved directly (nested dissection, multifrontal Cholesky factorisation in batches
-  of dense fronts) or by conjugate gradients, for `SparseSymmetric` operators and through `lineax.linear_solve`; and the
-  underlying functions `analyse`, `factorise`, `solve`, for calls with the least overhead;
+- `sparse`: symmetric sparse systems of `SparseSymmetric` operators, solved through `lineax.linear_solve`, either
+  directly (nested dissection, multifrontal Cholesky factorisation in batches of dense fronts) or by conjugate
+  gradients; the underlying functions `analyse`, `factorise` and `solve` have less overhead;
 - `dense`: small dense systems in batches;
 - `optimise`: descent along quadratic models, many small problems at once, problems with bounds, derivatives of a
   minimum, and `Status`;

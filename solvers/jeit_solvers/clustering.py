@@ -1,8 +1,9 @@
 """k-means clustering by matrix products.
 
-Lloyd's algorithm is run from several greedy k-means++ starts. With k clusters of n points in d dimensions, an iteration
-costs a product of (k, d) with (d, n), less once clusters no longer move; all other costs are small. Points are centred
-first, so that the distances ‖x‖² - 2 x·c + ‖c‖² stay accurate however far the points lie from the origin.
+Lloyd's algorithm is run from several greedy k-means++ starts. For k clusters of n points in d dimensions, the main cost
+of an iteration is the product of a matrix (k, d) with a matrix (d, n). The product is smaller once some centres no
+longer move. The mean of the points is subtracted first: the squared distance ‖x‖² - 2 x·c + ‖c‖² of a point x from a
+centre c would be inaccurate far from the origin.
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ def kmeans(
 
     Lloyd's algorithm (IEEE Trans. Inf. Theory 28, 1982) is run from greedy k-means++ starts (Arthur and Vassilvitskii
     2007). Clusters that lose all points receive the points farthest from their centres; a cluster can remain empty only
-    if fewer than k points differ. Batches of point sets are supported through `jax.vmap`. Centres and inertia are
-    differentiable, with the labels held constant.
+    if fewer than k points differ. Batches of point sets are supported through `jax.vmap`. Derivatives of the centres
+    and of the inertia treat the labels as constant.
 
     **Arguments:**
 
@@ -103,7 +104,7 @@ def _check_count(name: str, count: int) -> None:
 
 @partial(jax.jit, static_argnums=(3, 4))
 def _kmeans(points, key, stop: tuple[Any, Any], num_clusters: int, restarts: int) -> KMeans:
-    # Labels have no derivative. Means for constant labels have a derivative, which needs no loop.
+    # Labels have no derivative. The derivative of the means for constant labels needs no loop.
     find_best = in_turn(partial(_best_restart, num_clusters, restarts))
     best_state = find_best(jax.lax.stop_gradient(points), key, stop)
     centres = _cluster_means(points, best_state.labels, best_state.centres)
@@ -117,7 +118,8 @@ def _kmeans(points, key, stop: tuple[Any, Any], num_clusters: int, restarts: int
 
 
 class _State(Module):
-    """State of Lloyd's algorithm: `labels` of the nearest centres, at the squared `distance` (n,)."""
+    """State of Lloyd's algorithm. `labels`: nearest centre of each point; `distance` (n,): squared distance from this
+    centre."""
 
     centres: Float[Array, "k d"]
     labels: Int[Array, " n"]
@@ -132,9 +134,9 @@ def _best_restart(num_clusters: int, restarts: int, points, key, stop) -> _State
     mean = jnp.mean(points, axis=0)
     centred = points - mean
     squares = jnp.sum(centred**2, axis=1)
-    # Choosing centres takes the same number of steps for all starts, so the starts run side by side and share each read
-    # of the points. The number of Lloyd iterations differs, so these run one start after the other, and none waits for
-    # the slowest.
+    # The choice of initial centres takes the same number of steps for all starts, so all starts run in parallel and
+    # share each read of the points. The number of Lloyd iterations differs between starts, so the iterations run one
+    # start after the other, and no start waits for the slowest.
     draws = jax.random.uniform(key, (restarts, num_clusters, _num_candidates(num_clusters)), points.dtype)
     starts = jax.vmap(lambda draws: _kmeans_plus_plus(centred, squares, draws))(draws)
     descend = in_turn(_lloyd)
@@ -149,9 +151,9 @@ def _num_candidates(num_clusters: int) -> int:
 
 
 def _kmeans_plus_plus(points, squares, draws: Float[Array, "k trials"]) -> Float[Array, "k d"]:
-    """Greedy k-means++: a few points are drawn with weights equal to their squared distance to the nearest centre, and
-    the next centre is the drawn point that lowers the sum of these squares most. `draws`: random numbers from 0 to
-    1."""
+    """Greedy k-means++: a few points are drawn with probabilities proportional to their squared distance to the nearest
+    centre. The next centre is the drawn point that lowers the sum of the squared distances most. `draws`: random
+    numbers from 0 to 1."""
     last_index = len(points) - 1
 
     def squared_distances(index):
@@ -184,8 +186,8 @@ def _lloyd(start, points, squares, stop) -> _State:
         return jnp.sum(centres**2, axis=1)[:, None] - 2 * centres @ points.T
 
     def score_moved(scores, centres, moved):
-        """Update the scores of the centres that moved; all other centres keep their scores, as most do after a few
-        steps."""
+        """Update the scores of the centres that moved. After a few steps most centres do not move, and their scores do
+        not change."""
 
         def score_some():
             index = jnp.nonzero(moved, size=max_moved, fill_value=num_clusters)[0]
@@ -194,8 +196,8 @@ def _lloyd(start, points, squares, stop) -> _State:
         return jax.lax.cond(jnp.sum(moved) <= max_moved, score_some, lambda: score(centres))
 
     def assign(scores):
-        """Labels, distances and inertia for the nearest centres, the first where several are equally near. Computed
-        with a minimum, which is many times faster than jnp.argmin on a CPU."""
+        """Labels, distances and inertia for the nearest centres; of several equally near centres the first is used.
+        Computed with a minimum, which is many times faster than jnp.argmin on a CPU."""
         min_scores = jnp.min(scores, axis=0)
         rows = jnp.arange(num_clusters)[:, None]
         labels = jnp.min(jnp.where(scores == min_scores, rows, num_clusters - 1), axis=0)
@@ -225,7 +227,7 @@ def _lloyd(start, points, squares, stop) -> _State:
 
 
 def _fill_empty_clusters(labels, distance, counts) -> Int[Array, " n"]:
-    """Labels after moving the points farthest from their centres, farthest first, to the empty clusters in order."""
+    """Assign the points that lie farthest from their centres to the empty clusters, and return the new labels."""
     is_empty = counts == 0
     spare_distances = jnp.where(counts[labels] > 1, distance, -1)
     farthest = jax.lax.top_k(spare_distances, len(counts))[1]

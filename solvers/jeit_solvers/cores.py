@@ -1,9 +1,9 @@
 """Distribution of many equal parts of a computation over the cores of a machine.
 
 XLA spreads a product of large matrices over all cores, but runs gathers, sums and small products of a compiled loop on
-one core; two loops, each on its own thread, keep two cores busy. NumPy likewise runs on one core, except for products,
-which its BLAS spreads over all cores. While several threads work in NumPy, the BLAS is limited to one thread, because
-the threads of BLAS would compete with these threads.
+one core. Two loops in separate threads use two cores. NumPy likewise runs on one core, except for products, which its
+BLAS spreads over all cores. While several threads work in NumPy, the BLAS is limited to one thread, because the threads
+of BLAS would compete with these threads.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from jaxtyping import Array, Int
 # Maximum number of threads that work in NumPy at once: each thread needs its own memory, and all share the memory
 # bandwidth.
 _MAX_THREADS = 4
-# Prefix of the names of the threads of `on_cores`, by which calls from inside a part are recognised.
+# Prefix of the names of the threads of `on_cores`. A call from a thread with this prefix comes from inside a part.
 _THREAD_NAME = "jeit-core"
 
 
@@ -53,8 +53,7 @@ def memory_of_machine() -> float:
 
 def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], num_parts: int, group_size: int) -> Array:
     """Compute a function for the parts 0 … `num_parts` - 1 of a computation on all cores, and concatenate the rows that
-    the function returns. If `num_parts` is not divisible into equal groups, the rows of the last part are repeated at
-    the end.
+    the function returns. If the parts do not fill all groups, the rows of the last part are repeated at the end.
 
     The function is compiled once, because every core processes the same number c of groups. The results of a group must
     not depend on other groups; the results then do not depend on the number of cores.
@@ -83,11 +82,12 @@ def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], num_parts: i
 
 
 def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
-    """Apply `function` to each part, in NumPy, in parallel on several cores; the function stores its results itself.
+    """Apply `function` to each part, in NumPy, in parallel on several cores; the function must store its results
+    itself.
 
-    A single part, a call from inside another part, and a call while another thread uses the cores are processed in the
-    calling thread, because parts may wait for compiled programs, which call NumPy from threads of their own.
-    Floating-point warnings are suppressed, because NaN is reported elsewhere.
+    The parts are processed in the calling thread if there is only one part, if the call comes from inside another part,
+    or while another thread uses the cores. The reason is that parts may wait for compiled programs, which call NumPy
+    from other threads. Floating-point warnings are suppressed, because NaN is reported elsewhere.
 
     **Arguments:**
 
@@ -126,7 +126,7 @@ def parts_for_cores(number: int) -> list[slice]:
 
 @functools.cache
 def _thread_pool(process: int) -> ThreadPoolExecutor:
-    """Thread pool of a process (a forked process needs a new pool). The pool is kept, because memory that new threads
+    """Thread pool of a process (a forked process needs a new pool). The pool is reused, because memory that new threads
     allocate and free, about a hundred megabytes, is not returned to the system."""
     return ThreadPoolExecutor(min(number_of_cores(), _MAX_THREADS), _THREAD_NAME)
 
@@ -139,7 +139,7 @@ def _pool_lock(process: int) -> threading.Lock:
 
 @functools.cache
 def blas() -> threadpoolctl.ThreadpoolController:
-    """Controller of the numbers of threads of two BLAS libraries, that of NumPy and that of SciPy."""
+    """Controller of the number of threads of the two BLAS libraries that NumPy and SciPy load."""
     importlib.import_module("scipy.linalg.cython_blas")  # loads SciPy's BLAS
     return threadpoolctl.ThreadpoolController().select(user_api="blas")
 
@@ -169,7 +169,7 @@ def one_thread_of_blas() -> Iterator[None]:
     finally:
         with _limits_lock:
             limit = _active_limits.pop()
-            if limit is not None:  # the first context holds the original limits, and is the last to be removed
+            if limit is not None:  # the first context stores the original limits, and is removed last
                 _take_control()
                 limit.restore_original_limits()
                 _take_control()

@@ -115,7 +115,7 @@ def _symmetric_inverse_jvp(primals, tangents):
 
 
 def _inverse_cholesky_lapack(matrices: Any) -> Any:
-    """Inverse Cholesky factors, as from `inverse_cholesky`, of NumPy arrays, by LAPACK."""
+    """Inverse Cholesky factors of NumPy arrays, as defined in `inverse_cholesky`, computed by LAPACK."""
     # Scale the diagonal to order one by powers of two: LAPACK's inverse is less accurate for rows of different orders
     # of magnitude.
     diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
@@ -142,10 +142,10 @@ def _inverse_square_root(pivot: Inexact[Array, "batch 1"]) -> Inexact[Array, "ba
 
 
 def _inverse_cholesky_recursive(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """Inverse Cholesky factors, as from `inverse_cholesky`, by recursion on two by two blocks. Nearly all work is in
-    matrix products, which are three to four times faster than LAPACK's inverse of a triangle. The smallest blocks use
-    unrolled code in large batches, and in small batches a loop over short vectors; blocks are larger for fewer
-    matrices."""
+    """Inverse Cholesky factors, as defined in `inverse_cholesky`, computed by recursion on two by two blocks. Nearly
+    all operations are matrix products, which are three to four times faster than LAPACK's inverse of a triangular
+    matrix. The smallest blocks are inverted by unrolled code in large batches, and by a loop over short vectors in
+    small batches; blocks are larger for fewer matrices."""
     batch, size, _ = matrices.shape
     is_numpy = isinstance(matrices, np.ndarray)
     uses_lapack = is_numpy and not np.iscomplexobj(matrices)
@@ -202,9 +202,9 @@ def _inverse_cholesky_by_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[
 
 
 def _inverse_cholesky_by_block_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """Inverse Cholesky factor W, as from `inverse_cholesky`, by a loop over blocks of rows k of W. With G = A_k W^T,
-    the new diagonal block satisfies A_kk - G G^T = (W_kk^T W_kk)^-1, and the new rows are W_kk (E_k - G W). The
-    compiled loop body does not depend on the size."""
+    """Inverse Cholesky factor W, as defined in `inverse_cholesky`, computed by a loop over blocks k of rows of W. Let
+    A_k and E_k be the rows k of A and of the identity, and G = A_k W^T. The new diagonal block satisfies A_kk - G G^T =
+    (W_kk^T W_kk)^-1, and the new rows are W_kk (E_k - G W). The compiled loop body does not depend on the size."""
     size, dtype = matrices.shape[-1], matrices.dtype
     block = 32 if size <= 256 else 64
     padding = -size % block
@@ -238,8 +238,8 @@ def ridge_model(
     covariance: Float[Array, "M M"],
     precision: Float[Array, "M M"],
 ) -> QuadraticModel:
-    """Quadratic model for `Descent` of the cost ½ rᵀ C⁻¹ r + ½ ‖c‖² with the residual r: the cost at a point c, and the
-    function `step`.
+    """Quadratic model, for `Descent`, of the cost ½ rᵀ C⁻¹ r + ½ ‖c‖² with the residual r: returns the cost at a point
+    c, and the function `step`.
 
     **Arguments:**
 
@@ -280,8 +280,8 @@ def ridge_step(
 ) -> Float[Array, " n"]:
     """Solve (JᵀC⁻¹J + ridge · 1) δ = -(JᵀC⁻¹r + c) for δ, by a linear system of min(M, n) unknowns.
 
-    With fewer data than unknowns, δ = -c / ridge - Jᵀ (JJᵀ + ridge · C)⁻¹ (r - J c / ridge) by Woodbury's identity, in
-    a form without cancellation of large terms, however small the ridge is relative to J.
+    With fewer data than unknowns, δ = -c / ridge - Jᵀ (JJᵀ + ridge · C)⁻¹ (r - J c / ridge) by Woodbury's identity. The
+    formula is evaluated without cancellation of large terms, even if the ridge is small relative to J.
 
     **Arguments:**
 

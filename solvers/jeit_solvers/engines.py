@@ -1,13 +1,14 @@
 """Two engines for the same formula, NumPy and JAX, and batching rules for `jax.vmap`.
 
 JAX traces and compiles a program before it runs, which takes seconds; NumPy runs at once, and is as fast on large
-arrays. Therefore functions run in NumPy if all values are known, and in a compiled program if arrays are traced,
-batched or differentiated. A formula that uses only the functions below and those common to `numpy` and `jax.numpy`
-works in both.
+arrays. Therefore functions run in NumPy if the values of all arrays are known, and in a compiled program if arrays are
+traced, batched or differentiated. A formula works in NumPy and in JAX if it uses only the functions below and the
+functions common to `numpy` and `jax.numpy`.
 
-Under `jax.vmap` on a CPU, matrices are factorised one after the other, and right-hand sides are solved all at once. A
-batch of factorisations side by side moves the whole batch through memory at every stage, and takes more than twice as
-long per matrix as a single one that stays in the cache. Accelerators process the whole batch at once.
+Under `jax.vmap` on a CPU, matrices are factorised one after the other, and the systems are solved for all right-hand
+sides at once. If all matrices of a batch were factorised together, the whole batch would move through memory at every
+stage. A factorisation would take more than twice as long as that of a single matrix, which stays in the cache.
+Accelerators process the whole batch at once.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ from jaxtyping import Array, Inexact, Int, Shaped
 
 
 def in_turn(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Make `jax.vmap` on a CPU call a function of arrays for one element of the batch after the other.
+    """Make `jax.vmap` on a CPU call a function of arrays for the elements of the batch one after the other.
 
-    On accelerators, and without `vmap`, the function is not changed. This is useful for functions, such as those with a
-    factorisation, whose whole batch would not fit in the cache.
+    On accelerators, and without `vmap`, the function is not changed. This is useful for functions such as
+    factorisations, if the whole batch would not fit in the cache.
 
     **Arguments:**
 
@@ -53,7 +54,8 @@ def differentiable_batches(function: Callable[..., Any], batch_rule: Callable[..
     """Give `function` the behaviour `batch_rule` under `jax.vmap`, and keep its usual derivatives.
 
     `batch_rule(batchable, plain, axis_size, batched, *arguments)` returns outputs that all have the batch as leading
-    axis. `batchable` is the function with the batch rule, for nested batches; `plain` is the function without the rule.
+    axis. `batchable` is the function with the batch rule, for nested batches; `plain` is the function without the batch
+    rule.
     """
 
     @custom_vmap
@@ -94,7 +96,7 @@ def _is_zero_tangent(tangent: Any) -> bool:
 def one_by_one(
     batchable: Callable[..., Any], plain: Callable[..., Any], axis_size: int, batched: Any, *arguments: Any
 ) -> Any:
-    """Call a function for each element of a batch: one after the other on a CPU, side by side on accelerators."""
+    """Call a function for each element of a batch: one after the other on a CPU, all at once on accelerators."""
     del axis_size
     leaves, structure = jax.tree.flatten(arguments)
     flags = jax.tree.leaves(batched)
@@ -124,11 +126,11 @@ _COMPLEX_STEP = 1e-100
 
 
 host: Any = np
-"""NumPy, typed as Any, for arrays that are used where JAX's are declared."""
+"""NumPy with the type Any, for NumPy arrays in places where JAX arrays are declared."""
 
 
 def namespace(*trees: Any) -> Any:
-    """Return `numpy` if these pytrees hold no JAX array, else `jax.numpy`."""
+    """Return `numpy` if these pytrees contain no JAX array, else `jax.numpy`."""
     return jnp if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(trees)) else np
 
 
@@ -246,8 +248,8 @@ def values_at_once(function: _Function) -> _Function:
 
 
 class Recent:
-    """Cache of the last few results of a function of immutable pytrees. A result is found by the identity of the
-    arguments, or of the arrays in the arguments."""
+    """Cache of the last few results of a function of immutable pytrees. A result is reused if the arguments, or the
+    arrays in them, are the same objects as before."""
 
     def __init__(self, make: Callable[..., Any], size: int = 4):
         self._make, self._size = make, size
@@ -278,7 +280,8 @@ def undifferentiated(values: Any) -> Any:
 
 
 def kept(values: Any) -> Any:
-    """Return a pytree of arrays that XLA computes only once, not again wherever the arrays are used."""
+    """Return the same arrays, which XLA then computes only once, instead of again in every place where they are
+    used."""
     return values if namespace(values) is np else jax.lax.optimization_barrier(values)
 
 
@@ -362,7 +365,7 @@ def replace_at(values: Shaped[Array, " n"], index: Any, value: Any) -> Shaped[Ar
 
 
 def sum_into(shape: tuple[int, ...], index: Any, values: Inexact[Array, "*i"]) -> Inexact[Array, "*n"]:
-    """An array of zeros of the given shape, to which `values` are added at `index`; repeated indices accumulate."""
+    """Add `values` at `index` to an array of zeros of the specified shape; repeated indices accumulate."""
     return add_at(namespace(values).zeros(shape, values.dtype), index, values)
 
 
@@ -393,8 +396,9 @@ def call_numpy(function: Callable[..., Any], shape: jax.ShapeDtypeStruct, *argum
     NumPy.
 
     The function gets views of the program's memory. `jax.pure_callback` would copy the arguments into JAX arrays, which
-    needs a free thread of XLA: if as many programs call at once as XLA has threads, all of them wait for ever. Under
-    `jax.vmap` the function is called for one element of the batch after the other. The function is not differentiated.
+    needs a free thread of XLA. If as many programs called at once as XLA has threads, all of them would wait for ever.
+    Under `jax.vmap` the function is called for the elements of the batch one after the other. The function is not
+    differentiated.
     """
     return _numpy_call.bind(*arguments, function=function, shape=tuple(shape.shape), kind=np.dtype(shape.dtype))
 

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 
-# Attributes of the bound methods that Equinox has made, without the bound object, by function.
+# For each function: attributes of the bound method that Equinox created, without the bound object.
 _BOUND: dict[Any, tuple[type, dict[str, Any]]] = {}
 
 
 class Module(eqx.Module):
     """An `equinox.Module` with the same methods, fields and pytree, but with quickly bound methods.
 
-    Equinox turns a bound method into a module each time it is looked up, so that the method can pass through
-    transformations of JAX, and checks this module as every new module. This takes 40 microseconds, more than the method
-    itself takes for a few numbers in NumPy. Here Equinox binds each method once; later bound methods are copies with
-    another object, in 1.5 microseconds.
+    Each time a bound method is looked up, Equinox turns it into a module, so that it can pass through transformations
+    of JAX, and checks this module. This takes 40 microseconds, more than the method itself takes for a few numbers in
+    NumPy. Here Equinox binds each method once. Later bound methods are copies of the first with a different object,
+    which takes 1.5 microseconds.
     """
 
     if not TYPE_CHECKING:

@@ -158,8 +158,8 @@ def _naming_sizes() -> Iterator[None]:
 
 
 def _value_or_prompt(option: str, value: Any, question: str, example: str) -> Any:
-    """The `value` of an option; if it is missing, the user is asked on a terminal. Raises `ValueError` without a value
-    and without a terminal."""
+    """Return the `value` of an option; if the value is missing, ask the user on the terminal. Raises `ValueError` if
+    the value is missing and there is no terminal."""
     if value is not None:
         return value
     if not sys.stdin.isatty():

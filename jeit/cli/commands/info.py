@@ -9,8 +9,8 @@ import typer
 
 from jeit.cli.options import Description, Format, Key, read_file
 
-# For each outline, the name of the upright solid over it, and the keys of a description for the solid's sizes if they
-# differ.
+# For each outline, the name of the upright solid with this outline as its base, and the keys of the solid's sizes in a
+# description if they differ from those of the outline.
 _SOLIDS = {
     "rectangle": ("box", {"height": "depth", "thickness": "height"}),
     "disk": ("cylinder", {"thickness": "height"}),

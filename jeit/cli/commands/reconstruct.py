@@ -241,7 +241,7 @@ def show(console, result: "ImagedDifference", *, frame_given: bool = False) -> N
 
 
 def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
-    """Text on the bodies that were fitted as shapes: outlines in a sheet (`dimension` 2), surfaces in a solid."""
+    """Text about the bodies whose shapes were fitted: outlines in a sheet (`dimension` 2), surfaces in a solid."""
     from jeit.arguments import counted, percent
     from jeit.inverse.shapes import Ellipsoid
 

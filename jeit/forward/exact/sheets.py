@@ -29,14 +29,15 @@ integrated exactly:
 = 2/((m−n)(m+n+1)) for m + n odd, DLMF 14.17). All other integrands are smooth and are integrated by Gauss-Legendre
 quadrature.
 
-**Disc electrodes on a conducting sheet that is itself a disk with an insulated rim.** Under a disc of radius b and
-contact impedance z the contact takes current from the sheet everywhere, σ Δu = (u − U)/z, so that with the transfer
-length λ = √(σz) the potential under the disc is U + Σ_n A_n I_n(r/λ) cos n(φ − φ_n); outside the discs u is harmonic.
+**Disc electrodes on a conducting sheet that is itself a disk with an insulated rim.** Under a disc of radius b, contact
+impedance z and potential U, current flows between the sheet and the disc at every point: σ Δu = (u − U)/z. With the
+transfer length λ = √(σz) the potential of the sheet under the disc is U + Σ_n A_n I_n(r/λ) cos n(φ − φ_n); outside the
+discs u is harmonic.
 
 For a single disc in the middle and all current leaving through the rim, only n = 0 occurs, and the solution has a
-closed form. For several discs at any places, the field about each disc is expanded in the multipoles (b/r)^n of the
-disc and in the regular harmonics (r/b)^n that the other discs and the mirror images in the rim produce there;
-continuity of potential and flux at r = b gives
+closed form. For several discs at any places, the field around each disc is expanded in the multipoles (b/r)^n of the
+disc, and in the regular harmonics (r/b)^n of the field of the other discs and of the mirror images in the rim.
+Continuity of potential and flux at r = b gives
 
     multipole_n = regular_n (n − q_n)/(n + q_n),    q_n = (b/λ) I_n'(b/λ) / I_n(b/λ),
 
@@ -55,8 +56,8 @@ z'|/R,
 
     1/(2πσ) Σ_n e^{−ns} cos(nφ) / n = −1/(4πσ) log(1 − 2 e^{−s} cos φ + e^{−2s}),
 
-and insulated ends at z = 0 and z = H mirror the source repeatedly, to 2kH ± z'. The term n = 0 is that of a rod with a
-source and a uniform sink: 1/(2πRσ) [(z² + z'²)/2H − max(z, z')].
+and insulated ends at z = 0 and z = H mirror the source repeatedly, to 2kH ± z'. The term n = 0 is the potential of a
+rod with a source and a uniform sink: 1/(2πRσ) [(z² + z'²)/2H − max(z, z')].
 """
 
 from __future__ import annotations
@@ -188,11 +189,13 @@ def arc_transfer_impedance(
 
 
 def disc_contact_resistance(conductivity: complex, radius: float, contact_impedance: complex) -> complex:
-    """Contact resistance of a disc electrode: the electrode potential U minus the sheet's potential u at the edge of
-    the disc, in volts per ampere fed into the disc: λ I_0(b/λ) / (2πσb I_1(b/λ)) with the transfer length λ = √(σz).
+    """Contact resistance λ I_0(b/λ) / (2πσb I_1(b/λ)) of a disc electrode, with the transfer length λ = √(σz): the
+    potential of the electrode minus the potential of the sheet at the edge of the disc, in volts per ampere fed into
+    the disc.
 
     Sheet `conductivity` σ in siemens, `radius` b in metres, `contact_impedance` z in ohm·m². For b/λ → 0 the result
-    tends to z/(πb²), a uniformly fed contact; for b/λ → ∞ it tends to the resistance of a ring of width λ.
+    tends to z/(πb²), the resistance of a contact with uniform current density; for b/λ → ∞ it tends to the resistance
+    of a ring of width λ.
     """
     transfer_length = np.sqrt(conductivity * contact_impedance)
     argument = radius / transfer_length

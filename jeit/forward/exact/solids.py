@@ -8,12 +8,13 @@ F(r) cos nφ cos kz, k = mπ/H, with
 
 and a current density j in this mode raises the potential of the wall by j F(R₂) / (σ F'(R₂)). A patch of half-angle α
 and height h at (φ_l, z_l) that carries one ampere has the density Σ ε_n ε_m w_nm cos n(φ − φ_l) cos kz / (2πR₂H), with
-w_nm = sin(nα)/(nα) · sin(kh/2)/(kh/2) · cos kz_l, where ε_0 = 1 and all other ε are 2; its mean potential weights the
-modes in the same way. Ratios of Bessel functions are computed from recurrences in their stable directions: downwards
-for I_n, upwards for K_n.
+w_nm = sin(nα)/(nα) · sin(kh/2)/(kh/2) · cos kz_l, where ε_0 = 1 and all other ε are 2; the mean potential over the
+patch weights the modes in the same way. Ratios of Bessel functions are computed from recurrences in their stable
+directions: downwards for I_n, upwards for K_n.
 
 An electrode whose contact impedance z is large compared with its size divided by σ carries a uniform current density.
-Such an electrode measures the mean potential beneath it plus the voltage z I / area across its contact.
+Such an electrode measures the mean potential beneath it, plus the voltage z I / area across its contact for a current
+I.
 
 **A solid or hollow ball** is fed through caps of its surface, with a current that is uniform over each cap (the gap
 model). With an insulated inner surface at R₁, potentials are sums of F(r) P_n(cos γ), F = r^n + n/(n+1) R₁^{2n+1}
@@ -22,8 +23,8 @@ the angle from the centre of the cap, with
 
     w_n = (P_{n−1}(cos α) − P_{n+1}(cos α)) / ((2n+1)(1 − cos α)),
 
-the mean of P_n over the cap. By the addition theorem the mean of P_n(cos γ) over another cap is w_n P_n of the angle
-between the caps. Contact impedances act as in the cylinder.
+the mean of P_n over the cap. By the addition theorem the mean of P_n(cos γ) over a different cap of the same size is
+w_n P_n(cos β), where β is the angle between the centres of the caps. Contact impedances act as in the cylinder.
 """
 
 from __future__ import annotations
@@ -52,16 +53,15 @@ def face_patch_impedance(
     num_modes: tuple[int, int] = (300, 300),
 ) -> np.ndarray:
     """Mean potential (V) under each of L patches on the lower and upper face of a box, for one ampere into each patch,
-    with a uniform current density (the gap model). The result (L, L) is exact up to terms that cancel for currents that
-    sum to zero.
+    with a uniform current density (the gap model); (L, L), up to terms that cancel for currents that sum to zero.
 
     `size`: lengths (a, b, c) of the sides of the box, which fills 0 ≤ x ≤ a, 0 ≤ y ≤ b, 0 ≤ z ≤ c; `positions`: (L, 3)
     centres of the patches, with z = 0 or c; `patch`: widths of the patches along x and y; all in metres. `conductivity`
     in S/m.
 
     The mode cos(pπx/a) cos(qπy/b), of wave number κ, has the potential coth(κc)/κ on the face through which it is fed
-    and 1/(κ sinh κc) on the opposite face. The mode p = q = 0 is that of a rod with a uniform sink, with a difference
-    of c/2 between its ends.
+    and 1/(κ sinh κc) on the opposite face. The mode p = q = 0 is the potential of a rod with a uniform sink, whose ends
+    differ by c/2.
     """
     a, b, c = size
     wave = [np.arange(number) * np.pi / side for number, side in zip(num_modes, (a, b), strict=True)]

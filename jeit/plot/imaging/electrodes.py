@@ -48,7 +48,7 @@ def draw_labels(labels: ArrayLike, extent: tuple[float, float, float, float], *,
 
 def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
     """Draw the outlines of bodies in a sheet, see `jeit.inverse.shapes`, on axes in metres; outlines of resistive
-    bodies are dashed. Beside each body stands the 68 % interval of its change of conductivity, if this interval is
+    bodies are dashed. Beside each body the 68 % interval of its change of conductivity is written, if the interval is
     known."""
     ax = axes_or_new(ax)
     for sign, _, style, name in _STYLES:
@@ -60,8 +60,8 @@ def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
 
 
 def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
-    """Write the 68 % interval of each body's change of conductivity on the side of its outline that faces the middle of
-    the axes, where no electrodes are; on the other side if another label is there."""
+    """Write the 68 % interval of each body's change of conductivity on the side of the outline that faces the middle of
+    the axes, where no electrodes are; or on the opposite side if the first side already has a label."""
     (x_min, y_min), (x_max, y_max) = ax.dataLim.get_points()
     min_distances, used_positions = 0.3 * np.array([x_max - x_min, 0.2 * (y_max - y_min)]), []
     for star in stars:
@@ -92,7 +92,7 @@ def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
 
 def draw_inclusions(inclusions: Sequence[Inclusion], *, ax: Axes | None = None) -> Axes:
     """Mark every inclusion by its sign at its centroid and a dashed circle of its area. In 3-D, the circle has the
-    radius of a ball of the inclusion's volume, whatever the height of the slice."""
+    radius of a ball of the inclusion's volume, for every height of the slice."""
     ax = axes_or_new(ax)
     halo = [withStroke(linewidth=3, foreground="white")]
     for inclusion in inclusions:
@@ -134,7 +134,7 @@ def draw_electrodes(
 
 
 def draw_shapes(mesh: Mesh, shapes: ElectrodeShapes, *, ax: Axes) -> None:
-    """Draw electrodes of a plane mesh given as polygons, with their numbers from 1. Polygons of two corners are lines
+    """Draw electrodes of a plane mesh from their polygons, with their numbers from 1. Polygons of two corners are lines
     along the edge, and polygons of one corner dots."""
     for corners in shapes.polygons():
         if len(corners) == 2:
@@ -148,8 +148,8 @@ def draw_shapes(mesh: Mesh, shapes: ElectrodeShapes, *, ax: Axes) -> None:
 
 
 class _MatplotlibPen:
-    """Collector of electrodes to draw, by kind, with the centre of each electrode and whether the number of the
-    electrode stands beside it."""
+    """Collects the electrodes to draw, by kind, with the centre of each electrode and whether its number is drawn
+    beside it."""
 
     def __init__(self):
         self.arcs: list[np.ndarray] = []
@@ -179,13 +179,13 @@ class _MatplotlibPen:
         self._number(middle, beside=True)
 
 
-# Distance of a number from its electrode, and maximum distance of an electrode from the edge for it to lie on the edge,
-# both divided by the size of the body.
+# Distance of a number from its electrode, and maximum distance from the edge of an electrode that counts as lying on
+# the edge, both divided by the size of the body.
 _NUMBER_DISTANCE, _EDGE_TOLERANCE = 0.058, 0.02
 # Factor of the distance of a number from its electrode for texts that are not centred.
 _ALIGNED_FACTOR = 0.7
-# Minimum free distance outside the outline, divided by the distance of a number from its electrode, for the number to
-# be outside.
+# A number is drawn outside the outline if the free distance there is at least this factor times the distance of the
+# number from its electrode.
 _MIN_FREE_DISTANCE = 1.6
 
 
@@ -194,9 +194,9 @@ def draw_numbers(
 ) -> None:
     """Draw the numbers of electrodes at `positions`, beginning with `first`: on the electrode, or `beside` it.
 
-    "Beside" means, for an electrode on the edge of a sheet, outside along the normal, or inside if a notch is too
-    narrow; for an electrode within a sheet, above it; and for a solid seen from above, away from the middle. Electrodes
-    above each other share one text.
+    The number beside an electrode on the edge of a sheet is outside along the normal, or inside if a notch is too
+    narrow. Beside an electrode within a sheet it is above the electrode, and on a solid seen from above it is away from
+    the middle. Electrodes above each other share one text.
     """
     corners = np.asarray(mesh.points)[:, :2]
     number_distance = _NUMBER_DISTANCE * np.ptp(corners, axis=0).max()
@@ -227,8 +227,8 @@ def _alignment(shift: Float[np.ndarray, " 2"]) -> str:
 
 
 def group_coincident(positions: Float[np.ndarray, "L 2"], tolerance: float) -> list[list[int]]:
-    """Group electrodes within a distance `tolerance` of each other, such as those of several rings of a tank seen from
-    above."""
+    """Group electrodes within a distance `tolerance` of each other, for example electrodes above each other in several
+    rings of a tank seen from above."""
     groups: list[list[int]] = []
     for k, position in enumerate(positions):
         for group in groups:

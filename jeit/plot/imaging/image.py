@@ -45,7 +45,7 @@ def plot_mesh(
     - `title`: title of the plot.
     - `ax`: axes to draw in; default: new axes.
 
-    Raises `ValueError` for arguments of another type, and for a surface in space.
+    Raises `ValueError` for arguments of a wrong type, and for a surface in space.
 
     **Example:**
 
@@ -70,7 +70,7 @@ def plot_mesh(
 
 
 def check_body(mesh: Mesh, electrodes: AbstractElectrodes | None) -> None:
-    """Check a mesh and, if given, electrodes. Raises `ValueError` for objects of another type, and for a surface in
+    """Check a mesh and, if given, electrodes. Raises `ValueError` for objects of a wrong type, and for a surface in
     space."""
     check_kind("mesh", mesh, Mesh, "a Mesh, such as Disk(0.05).mesh()")
     check_flat(mesh, "pictures seen from above")
@@ -130,8 +130,8 @@ def plot_image(
     - `title`: title of the plot.
     - `ax`: axes to draw in; default: new axes.
 
-    Raises `ValueError` for values that have another shape, are complex or not finite, for a height outside the mesh,
-    and for arguments of another type.
+    Raises `ValueError` for values that have a wrong shape, are complex or not finite, for a height outside the mesh,
+    and for arguments of a wrong type.
 
     **Example:**
 
@@ -190,7 +190,7 @@ def plot_raster(
 
     `extent`: (x_min, x_max, y_min, y_max) in metres. `mesh`: the mesh of the raster, for its outline and the
     `electrodes`. Raises `ValueError` for a raster without finite values, for electrodes without a mesh, and for
-    arguments of another type.
+    arguments of a wrong type.
     """
     check_scale(scale)
     if mesh is not None:
@@ -279,8 +279,8 @@ def plot_admittivity(
 def plot_sensitivity(
     model: ForwardModel, conductivity, *, title: str | None = None, height: float | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw the sensitivity ‖∂v/∂σ_e‖ / |e| of every cell e, with the norm over all channels, relative to the maximum
-    and in decibels.
+    """Draw the sensitivity ‖∂v/∂σ_e‖ / |e| of every cell e, with the norm over all channels, in decibels relative to
+    the value exceeded in 1 % of the cells.
 
     The division by the area (3-D: volume) |e| makes the sensitivity independent of the mesh. `conductivity`: as in
     `model.voltages`, scalar or per cell, in S (3-D: S/m); `height` as in `plot_image`. Raises `ValueError` for a

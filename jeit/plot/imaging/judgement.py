@@ -1,5 +1,5 @@
-"""Plots from which an image and its model are judged: the choice of a hyperparameter, with the curves of the rules;
-figures of merit; and measured beside modelled voltages."""
+"""Plots to assess an image and its model: the choice of a hyperparameter, with the curves of the rules; figures of
+merit; and measured and modelled voltages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from jeit.plot.axes import (
 )
 from jeit.protocol import Protocol
 
-# Colour of each rule for λ; given numbers and other rules are drawn in the colour `INK`.
+# Colour of each rule for λ; other rules, and values of λ specified as numbers, are drawn in the colour `INK`.
 COLOURS = {
     "gcv": "#d1495b",
     "l-curve": "#1f6fb4",
@@ -52,19 +52,19 @@ MODELLED = "#d1495b"
 def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the curves used in choosing a hyperparameter λ, and the chosen λ on them.
 
-    For one choice, the L-curve is drawn for "l-curve", ‖residual‖ against ‖image‖ with the corner marked, and the
-    criterion against λ for other rules. For several choices, the L-curve with all choices is drawn, if λ was chosen
-    from data, and the criterion of each choice; these plots are insets of the returned axes. A choice at the edge of
-    its grid of λ is drawn hollow.
+    For one choice by the rule "l-curve", the L-curve is drawn: ‖residual‖ against ‖image‖ with the corner marked. For
+    other rules, the criterion is drawn against λ. For several choices, the criterion of each choice is drawn, and, if λ
+    was chosen from data, the L-curve with all choices; these plots are insets of the returned axes. A choice at the
+    edge of its grid of λ is drawn as a hollow marker.
 
     **Arguments:**
 
-    - `choices`: a `jeit.inverse.Choice`, or several by name, as from `jeit.inverse.compare_rules`.
+    - `choices`: a `jeit.inverse.Choice`, or a dictionary of choices by name, as from `jeit.inverse.compare_rules`.
     - `title`: title of the plot.
     - `ax`: axes to draw in; default: new axes.
 
-    Raises `ValueError` for hyperparameters that were given as numbers, which have no curve, and for objects that are
-    not choices.
+    Raises `ValueError` for hyperparameters that were specified as numbers, which have no curve, and for objects that
+    are not choices.
 
     **Example:**
 
@@ -98,7 +98,7 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
     left_edge = 0.0
     if with_data:
         left_edge = 0.54
-        # Every choice has the whole L-curve; the choice with the most candidates has the finest one.
+        # Every choice contains the whole L-curve; the choice with the most candidates has the finest L-curve.
         most_detailed = max(with_data, key=lambda choice: choice.candidates.size)
         _draw_l_curve(ax.inset_axes((0, 0, 0.46, 1)), most_detailed, all_choices)
     height = 1 / len(rules)
@@ -207,7 +207,8 @@ def _style_axes(ax: Axes, ticks: int = 6) -> None:
             axis.set_major_locator(MaxNLocator(max_ticks))
 
 
-# For each figure of merit: field, title, unit on the axis, factor to that unit, and value for a perfect image, or None.
+# For each figure of merit: field, title, unit on the axis, factor that converts to this unit, and value for a perfect
+# image, or None.
 _PANELS = (
     ("amplitude_response", "Amplitude response", "image / truth", 1.0, 1.0),
     ("position_error", "Position error", "mm (+ is towards the centre)", 1e3, 0.0),

@@ -36,7 +36,7 @@ from jeit_solvers.engines import as_array
 # Number of pixels along a side of an image, and colour of a body without an image.
 _NUM_PIXELS, _BODY_COLOUR = 160, "#dfe2e6"
 SHEET_FRAMES = 12
-"""Default of the maximum number of frames of a contact sheet."""
+"""Default maximum number of frames on a contact sheet."""
 SERIES_FRAMES, _FRAMES_PER_ROW = 12, 6
 """Number of frames at the beginning of the picture of a series."""
 # Maximum number of refused frames named below a contact sheet.
@@ -58,11 +58,11 @@ def select_frames(num_frames: int, max_frames: int) -> list[int]:
 
 
 class FramePicture:
-    """Picture of one frame of a stream at a time on `ax`; `show` replaces the image by that of another frame.
+    """Picture on `ax` of one frame of a stream at a time; `show` replaces it by the image of a different frame.
 
-    `fitted`: colour scale of all frames; `number`: whether electrodes are numbered; `bar`: whether a scale bar is
-    drawn. Images are sampled on a raster, in a solid at the `height` z in metres, by default half the height of the
-    solid.
+    `fitted`: colour scale of all frames; `show_numbers`: whether electrodes are numbered; `show_scale_bar`: whether a
+    scale bar is drawn. Images are sampled on a raster; for a solid, the raster lies at z = `height` in metres, by
+    default at half the height of the solid.
     """
 
     def __init__(
@@ -135,8 +135,8 @@ def plot_frames(
     - `most`: maximum number of frames on the sheet.
     - `count`: counts of all frames, if `changes` has only some of them.
 
-    The colour scale is fitted to all frames, not only those drawn. Raises `ValueError` for changes of another shape,
-    another number of titles, and if every frame was refused.
+    The colour scale is fitted to all frames, not only those drawn. Raises `ValueError` for changes of a wrong shape,
+    for a wrong number of titles, and if every frame was refused.
 
     **Example:**
 
@@ -184,7 +184,7 @@ def _count_text(count: FrameCount, num_drawn: int, mesh: Mesh) -> str:
     return "; ".join([*sentences, *filter(None, [slice_text(mesh, subject="slices")])])
 
 
-# Minimum amplitude for the phase to be drawn: as a share of the maximum amplitude, and as a multiple of the noise of
+# Minimum amplitude at which the phase is drawn: as a share of the maximum amplitude, and as a multiple of the noise of
 # the amplitude.
 _MIN_PHASE_SHARE, _MIN_PHASE_SNR = 0.15, 3.0
 # Minimum number of frames for a spectrum, as for `jeit.image.oscillation`.

@@ -18,8 +18,8 @@ from jeit.plot.solid.scene import BODY, Scene, draw_number
 _HULL_OPACITY = 0.1
 # Cosine of the angle between the normals of two facets, below which their common edge is drawn as an edge of the body.
 _EDGE_COSINE = 0.85
-# Divided by the size of the body: distance by which electrodes are drawn nearer to the viewer than the surface under
-# them, and distance of numbers from electrodes.
+# Distance by which electrodes are drawn nearer to the viewer than the surface under them, and distance of numbers from
+# electrodes, both divided by the size of the body.
 _ELECTRODE_OFFSET, _NUMBER_DISTANCE = 0.06, 0.045
 # Minimum distance between numbers, so that they are readable, divided by the size of the body.
 _MIN_NUMBER_DISTANCE = 0.03
@@ -42,7 +42,7 @@ def add_hull(scene: Scene, mesh: Mesh) -> None:
 
 def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarray:
     """Edges (s, 2) of a surface to draw as lines, as seen from the direction `toward`: sharp edges, edges of an open
-    boundary, and the outline, where the surface turns away from the viewer."""
+    boundary, and the outline, at which the surface turns away from the viewer."""
     normal = np.cross(
         points[triangles[:, 1]] - points[triangles[:, 0]], points[triangles[:, 2]] - points[triangles[:, 0]]
     )
@@ -67,10 +67,10 @@ def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarr
 def add_electrodes(
     scene: Scene, points, triangles, shapes: ElectrodeShapes, *, translucent_in_front: bool = False
 ) -> None:
-    """Add electrodes on a surface to a scene: in front of the surface on the side facing the viewer, behind it on the
-    other side.
+    """Add electrodes on a surface to a scene: in front of the surface on the side of the body that faces the viewer,
+    behind it on the opposite side.
 
-    `translucent_in_front`: whether the electrodes in front become translucent if they would hide much of the body.
+    `translucent_in_front`: whether the electrodes in front are drawn translucent if they would hide much of the body.
     """
     surface, size = ProjectionSurface(points, triangles), float(np.ptp(points, axis=0).max())
     polygons = shapes.polygons()
@@ -106,7 +106,7 @@ def _visible_area(scene: Scene, corners: Float[np.ndarray, "*m k 3"]) -> float:
 
 def _rims(polygons, electrode, offset: float) -> list[np.ndarray]:
     """Whether each edge of each polygon is on the rim of its electrode, i.e. no other polygon of the electrode shares
-    the edge. Corners closer than `offset` are taken as equal."""
+    the edge. Corners closer than `offset` count as equal."""
     keys = []
     for corners, electrode_index in zip(polygons, electrode.tolist(), strict=True):
         rounded_corners = [tuple(corner) for corner in np.round(corners / offset).astype(np.int64).tolist()]
@@ -119,8 +119,8 @@ def _rims(polygons, electrode, offset: float) -> list[np.ndarray]:
 def number_electrodes(
     ax: Axes, scene: Scene, points, triangles, shapes: ElectrodeShapes, *, number_hidden: bool = True
 ) -> None:
-    """Draw the numbers of electrodes, from 1, outwards of each electrode. Numbers on the side of the body facing away
-    from the viewer are faint, or are left out unless `number_hidden`.
+    """Draw the number of each electrode, from 1, outside the body beside the electrode. Numbers on the side of the body
+    facing away from the viewer are faint, or are left out unless `number_hidden`.
 
     Electrodes seen close to each other share one text.
     """
@@ -136,7 +136,7 @@ def number_electrodes(
         electrode_indices = np.flatnonzero(is_faint == draws_faint)
         for group in group_coincident(positions[electrode_indices], min_distance):
             position = positions[electrode_indices[group]].mean(axis=0)
-            # Numbers of electrodes behind are left out where they would overlap a number in front.
+            # Numbers of electrodes behind the body are left out where they would overlap a number in front.
             if (
                 draws_faint
                 and len(front_positions)

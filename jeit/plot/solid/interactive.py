@@ -84,7 +84,7 @@ def view_solid(
         plotter.add_mesh(shell, scalars="value", opacity=opacity, **options, **colour_options)
     grid = pv.UnstructuredGrid({pv.CellType.TETRA: np.asarray(mesh.cells)}, points)
     grid.cell_data["value"] = fitted_scale.factor * cell_values(mesh, values)
-    # The label has two lines, since VTK cuts off text wider than the bar, such as the unit.
+    # The label has two lines, since VTK cuts off text that is wider than the bar.
     quantity, bracket, unit = fitted_scale.label.rpartition(" (")
     bar = {
         "title": f"{quantity}\n{bracket.strip()}{unit}",
@@ -123,8 +123,8 @@ def can_view() -> str:
 
 
 def _display_responds(display: str) -> bool:
-    """Whether an X server listens at a display of this machine; True, without a check, for displays of other machines
-    and for texts that do not name a display."""
+    """Whether an X server listens at a display of this machine; displays of other machines, and texts that do not name
+    a display, are not checked and yield True."""
     host, _, display_number = display.rpartition(":")
     server_number = display_number.partition(".")[0]
     if host not in ("", "unix", "localhost") or not server_number.isdecimal() or len(server_number) > 4:

@@ -62,8 +62,8 @@ def _draw_round(ax: Axes, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray,
 
 HALF = (0.5,)
 OUTER = 0.3
-# Minimum of the largest change of one sign for isosurfaces of this sign to be drawn, relative to the maximum change of
-# either sign.
+# Isosurfaces of changes of one sign are drawn if the maximum change of this sign is at least this fraction of the
+# maximum change of either sign.
 _MIN_PEAK = 0.3
 
 
@@ -78,23 +78,24 @@ def plot_isosurfaces(
     scale: ColourScale = CHANGE,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw isosurfaces of a solid image, at given shares of the maximum change of each sign.
+    """Draw isosurfaces of a solid image, at specified shares of the maximum change of each sign.
 
     **Arguments:**
 
     - `mesh`: a mesh of tetrahedra.
     - `values`: values per cell (m,) or per node (n,); changes of conductivity in S/m, or as described by `scale`.
     - `electrodes`: electrodes, which are drawn on the body and numbered.
-    - `levels`: shares between 0 and 1. The surface of the highest level is opaque, others are translucent. A sign whose
-      maximum change is less than 0.3 of that of the opposite sign is left out. For absolute images (see
-      `ColourScale.difference`), levels are fractions of the range from minimum to maximum.
-    - `inclusions`: inclusions, drawn as their sign and the outline of their form, or of a ball of their volume.
+    - `levels`: shares between 0 and 1. The surface of the highest level is opaque, others are translucent. Changes of
+      one sign are left out if their maximum is less than 0.3 times the maximum of the opposite sign. For absolute
+      images (see `ColourScale.difference`), levels are fractions of the range from minimum to maximum.
+    - `inclusions`: inclusions, drawn as their sign and the outline of their form, or of a ball of the same volume if
+      they have no form.
     - `camera`: direction of view.
     - `scale`: colour scale; default: for changes of conductivity in S/m.
     - `ax`: axes to draw in; default: new axes.
 
-    Raises `ValueError` for values of another shape, levels out of range, a mesh that is not a solid, and arguments of
-    another type.
+    Raises `ValueError` for values of a wrong shape, levels out of range, a mesh that is not a solid, and arguments of
+    a wrong type.
 
     **Example:**
 
@@ -192,7 +193,7 @@ def check_levels(levels: Sequence[float]) -> list[float]:
 
 
 def check_drawn(mesh: Mesh, electrodes, scale: ColourScale) -> None:
-    """Check a solid mesh, electrodes and a colour scale. Raises `ValueError` for arguments of another type, and for a
+    """Check a solid mesh, electrodes and a colour scale. Raises `ValueError` for arguments of a wrong type, and for a
     mesh that is not a solid."""
     check_solid(mesh)
     check_scale(scale)

@@ -27,7 +27,8 @@ _MIN_BRIGHTNESS = 0.66
 
 @dataclass(frozen=True)
 class Camera:
-    """Direction of view of a parallel projection, in which lengths perpendicular to the view are true to scale.
+    """Direction of view of a parallel projection, in which lengths perpendicular to the direction of view are true to
+    scale.
 
     **Fields**: `azimuth`: angle of the viewer around the z axis, in degrees from the x axis towards y; `elevation`:
     angle of the viewer above the plane z = 0, in degrees. Azimuth −90 with elevation 0 is the view of the front, along
@@ -73,7 +74,7 @@ class Camera:
         return np.stack([points @ self.right, points @ self.up], axis=-1)
 
     def nearness(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-        """Coordinate (…) of points (…, 3) towards the viewer, metres."""
+        """Coordinate (…) of points (…, 3) along the direction towards the viewer, metres."""
         return points @ self.toward
 
     def light(self, normals: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
@@ -257,6 +258,6 @@ def draw_number(
 
 
 def mark_sign(ax: Axes, x: float, y: float, sign: int) -> None:
-    """Draw a plus at a conductive, or a minus at a resistive inclusion."""
+    """Draw a plus at a conductive inclusion, or a minus at a resistive inclusion."""
     marker = "+" if sign > 0 else "_"
     ax.plot(x, y, marker=marker, color=INK, markersize=8, markeredgewidth=1.4, zorder=4, path_effects=_HALO)

@@ -1,5 +1,5 @@
-"""Plots of slices through a solid image: one slice by any plane, a grid of slices along an axis, or an overview with
-three slices through the strongest change beside isosurfaces in space."""
+"""Plots of slices through a solid image: one slice by any plane, a grid of slices along an axis, or an overview of
+isosurfaces in space and three slices through the strongest change."""
 
 from __future__ import annotations
 
@@ -49,10 +49,11 @@ def plot_slice(
       in S/m, or as described by `scale`. The colour scale is fitted to the whole body.
     - `plane`: the plane.
     - `electrodes`: electrodes, which are drawn where the plane intersects them.
-    - `inclusions`: inclusions, drawn as the section of their form, or of a ball of their volume.
+    - `inclusions`: inclusions, drawn as the section of their form, or of a ball of the same volume if they have no
+      form.
     - `scale`, `ax`: as for `plot_isosurfaces`.
 
-    Raises `ValueError` for a plane that misses the body, values of another shape, and arguments of another type.
+    Raises `ValueError` for a plane that misses the body, values of a wrong shape, and arguments of a wrong type.
 
     **Example:**
 
@@ -127,8 +128,9 @@ def plot_slices(
 
 
 def planes_along(mesh: Mesh, axis: str, at: Sequence[float] | int) -> list[Plane]:
-    """Planes perpendicular to an axis. `at`: number of planes, evenly spaced with half a spacing at both ends, or their
-    coordinates in metres. Raises `ValueError` for an unknown axis, and for too many or no planes."""
+    """Planes perpendicular to an axis. `at`: coordinates of the planes in metres, or their number; a number of planes
+    are evenly spaced, with half a spacing at both ends. Raises `ValueError` for an unknown axis, and for too many or no
+    planes."""
     if axis not in AXES:
         raise ValueError(f"axis must be 'x', 'y' or 'z'; it is {describe(axis)}.")
     coordinates = np.asarray(mesh.points)[:, AXES.index(axis)]
@@ -196,7 +198,7 @@ def window_of(ax: Axes) -> tuple[float, float, float, float]:
 
 
 def cell_values(mesh: Mesh, values: ArrayLike) -> np.ndarray:
-    """Values per cell (m,); values per node are averaged in each cell. Raises `ValueError` for another shape and for
+    """Values per cell (m,); values per node are averaged in each cell. Raises `ValueError` for a wrong shape and for
     complex values."""
     image = np.asarray(values)
     if image.shape not in ((mesh.num_cells,), (mesh.num_points,)):
@@ -216,7 +218,8 @@ def _electrode_shapes(mesh: Mesh, electrodes) -> ElectrodeShapes | None:
 
 
 def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, distance: float, section_centre) -> None:
-    """Draw a thick line where a plane intersects an electrode, and the number of the electrode outwards of it."""
+    """Draw a thick line where a plane intersects an electrode, and the number of the electrode outside the body beside
+    the line."""
     lines_by_electrode: dict[int, list[np.ndarray]] = {}
     for corners, electrode_index in zip(shapes.polygons(), shapes.electrode, strict=True):
         distances = plane.distance(corners)
@@ -243,7 +246,7 @@ def _num_columns(num_panels: int, aspect_ratio: float) -> int:
     """Number of columns of a grid of `num_panels` panels on a landscape page; `aspect_ratio`: ratio of height to width
     of a panel."""
     preferred = max(1, round(float(np.sqrt(1.6 * num_panels * aspect_ratio))))
-    # Among similar numbers of columns, the number with the fewest empty places is chosen.
+    # Of several similar numbers of columns, the number that leaves the fewest panels empty is chosen.
     candidates = range(max(1, preferred - 1), preferred + 2)
     return min(num_panels, min(candidates, key=lambda columns: (-num_panels % columns, abs(columns - preferred))))
 
@@ -259,9 +262,9 @@ def plot_solid(
     scale: ColourScale = CHANGE,
     figure: Figure | None = None,
 ) -> Figure:
-    """Draw a solid image as isosurfaces in space, beside three perpendicular slices through its strongest change: the
-    centroid of the first of `inclusions`, or else the cell that differs most from the median. The outlines of the
-    slices are drawn in space, too.
+    """Draw a solid image as isosurfaces in space, beside three perpendicular slices through its strongest change. The
+    slices pass through the centroid of the first of `inclusions`, or else of the cell whose value differs most from the
+    median. The outlines of the slices are drawn in space, too.
 
     **Arguments:**
 

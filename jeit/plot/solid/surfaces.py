@@ -23,7 +23,7 @@ from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import add_electrodes, number_electrodes, size_of
 from jeit.plot.solid.scene import BODY, CORNER_VIEW, Camera, Scene, hide_axes_in_space
 
-# Tolerance for marks being hidden by the surface on which they lie: distance divided by the size of the skin.
+# Distance, divided by the size of the skin, by which a surface must be in front of a mark to hide it.
 _MARK_OFFSET = 0.02
 
 
@@ -51,7 +51,7 @@ def plot_surface(
     - `title`: title of the plot.
     - `ax`: axes to draw in; default: new axes.
 
-    Raises `ValueError` for arrays of other shapes, values that are not finite, and arguments of another type.
+    Raises `ValueError` for arrays of wrong shapes, values that are not finite, and arguments of a wrong type.
 
     **Example:**
 
@@ -91,7 +91,7 @@ def plot_surface(
 
 
 def checked_surface(points: ArrayLike, triangles: ArrayLike) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
-    """Check the points and triangles of a surface, and return them as arrays. Raises `ValueError` for other shapes,
+    """Check the points and triangles of a surface, and return them as arrays. Raises `ValueError` for wrong shapes,
     points that are not finite, and indices out of range."""
     point_array, triangle_array = np.asarray(points), np.asarray(triangles)
     if point_array.ndim != 2 or point_array.shape[1] != 3 or not np.issubdtype(point_array.dtype, np.number):
@@ -117,7 +117,7 @@ def checked_surface(points: ArrayLike, triangles: ArrayLike) -> tuple[Float[np.n
 
 def checked_values(values: ArrayLike, num_points: int, num_triangles: int) -> Float[np.ndarray, " k"]:
     """Check the values of a surface per triangle or per point, and return them as an array. Raises `ValueError` for
-    another shape and for complex values."""
+    a wrong shape and for complex values."""
     image = np.asarray(values)
     if image.shape not in ((num_triangles,), (num_points,)):
         raise ValueError(
@@ -165,7 +165,7 @@ def plot_curved_skin(
     - `scale`: colour scale; default: for changes of sheet conductivity in S.
     - `title`, `ax`: as for `plot_image`.
 
-    Raises `ValueError` for values that have another shape or are not finite, and for arguments of another type.
+    Raises `ValueError` for values that have a wrong shape or are not finite, and for arguments of a wrong type.
 
     **Example:**
 

@@ -1,12 +1,11 @@
 """Minimisation by descent, without or with bounds, and the status with which a minimisation ends.
 
-`Descent` steps to the minima of local quadratic models, with a line search, behind the interface of optimistix. A
-Gauss-Newton or Levenberg-Marquardt step leads to the minimum of a quadratic model of the cost. The cheapest way to find
-this minimum depends on the structure of the problem, which the caller knows and a general least-squares solver does
-not.
+`Descent` is a solver for optimistix with a line search. Its Gauss-Newton or Levenberg-Marquardt steps lead to the
+minimum of a quadratic model of the cost. The caller provides this minimum, because the cheapest way to find it depends
+on the structure of the problem, which a general least-squares solver does not know.
 
-jaxopt, which is used for problems with bounds, is no longer developed. The package is imported only in this module, so
-that it can be replaced in one place.
+Problems with bounds are solved by jaxopt, which is no longer developed. It is imported only in this module, so that it
+can be replaced in one place.
 """
 
 from __future__ import annotations
@@ -30,8 +29,8 @@ from jeit_solvers.module import Module
 
 
 class Status(StrEnum):
-    """Status with which a minimisation ended. Each member equals a word, so `status == "converged"` works; details such
-    as the number of steps are reported in a separate sentence.
+    """Status with which a minimisation ended. Each member equals its string, so `status == "converged"` works; details
+    such as the number of steps are reported in a separate sentence.
 
     **Example:**
 
@@ -53,8 +52,8 @@ class Status(StrEnum):
 
     @property
     def number(self) -> int:
-        """Integer that represents the status in arrays, because JAX has no arrays of strings: its position in
-        `list(Status)`."""
+        """Position of the status in `list(Status)`, which represents it in arrays, because JAX has no arrays of
+        strings."""
         return list(Status).index(self)
 
     @classmethod
@@ -171,7 +170,8 @@ def projected_gradient(
     max_steps: int,
     tolerance: float,
 ) -> BoundedMinimum:
-    """Minimise a function with bounds by accelerated projected gradients, with more but cheaper steps than `lbfgsb`.
+    """Minimise a function with bounds by accelerated projected gradients, which take more but cheaper steps than
+    `lbfgsb`.
 
     **Arguments:**
 
@@ -247,7 +247,7 @@ def scipy_lbfgsb(
 # achieve.
 _MIN_SCALE = 2.0**-20
 _SUFFICIENT_DECREASE = 1e-4
-# Rounding error of a cost, which is a sum of many squares, in units of its machine precision.
+# Relative rounding error of a cost, which is a sum of many squares, divided by the machine precision.
 _ROUNDING_FACTOR = 100.0
 
 
@@ -273,10 +273,10 @@ class Descent(optx.AbstractLeastSquaresSolver):
     caller provides.
 
     The solver is used in `optimistix.least_squares(residual, Descent(), c, arguments, options={"expand": expand})`,
-    where `expand(c, arguments)` returns the cost at c and a function `step(damping)`. This function returns the
-    direction to the minimum of the model at c, and the slope and curvature of the model along the direction: cost(c +
-    s·direction) ≈ cost + s·slope + s²·curvature / 2. The penalty of the model is weighted with 1 + `damping`, see
-    `ridge_step`.
+    where `expand(c, arguments)` returns the cost at c and a function `step(damping)`. The function `step` returns the
+    direction to the minimum of the model at c, and the slope and curvature of the model along this direction, with
+    cost(c + s·direction) ≈ cost + s·slope + s²·curvature / 2. The penalty of the model is weighted with 1 + `damping`,
+    see `ridge_step`.
 
     **Arguments:**
 
@@ -300,8 +300,8 @@ class Descent(optx.AbstractLeastSquaresSolver):
     norm: Callable[..., Any] = optx.two_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """Return the initial state, whose first trial point is the start. Raises `ValueError` if the options lack
-        `expand`."""
+        """Return the initial state; the first trial point is the start. Raises `ValueError` if `options` does not
+        contain `expand`."""
         if "expand" not in options:
             raise ValueError("Descent needs options={'expand': function}; see its documentation.")
         xp = namespace(y)
@@ -327,8 +327,7 @@ class Descent(optx.AbstractLeastSquaresSolver):
         xp = namespace(y)
         cost, step = options["expand"](state.trial, args)
         predicted_decrease = -(state.scale * state.slope + 0.5 * state.scale**2 * state.curvature)
-        # Close to the minimum, steps change the cost by less than its rounding error, but still lead nearer to the
-        # minimum.
+        # Close to the minimum, steps change the cost by less than its rounding error, but still approach the minimum.
         rounding_error = _ROUNDING_FACTOR * np.finfo(y.dtype).eps * state.cost
         is_accepted = xp.isfinite(cost) & (
             cost <= state.cost + rounding_error - _SUFFICIENT_DECREASE * predicted_decrease

@@ -24,8 +24,9 @@ from jeit_solvers.engines import undifferentiated
 # Relative tolerance of the linear system, and maximum number of conjugate-gradient steps; with a good preconditioner
 # about a dozen steps are taken.
 _TOLERANCE, _MAX_STEPS = 1e-11, 500
-# Length, measured as the square root of the decrease of the cost, below which a Newton step to the minimum is the last
-# step, because the remaining error is of the order of its square. And the maximum number of Newton steps.
+# The Newton step to the minimum is the last if its length, measured as the square root of the decrease of the cost, is
+# below the first value, because the remaining error is of the order of the squared length. The second value is the
+# maximum number of Newton steps.
 _LAST_STEP_LENGTH, _MAX_NEWTON_STEPS = 1e-6, 8
 
 Gradient = Callable[[Float[Array, " n"], Any], Float[Array, " n"]]
@@ -36,22 +37,22 @@ Preconditioner = Callable[[Float[Array, " n"], Any], LinearMap]
 def as_minimum(
     point: Float[Array, " n"], problem: Any, gradient: Gradient, precondition: Preconditioner
 ) -> Float[Array, " n"]:
-    """Give a minimum found by a solver its derivatives with respect to the problem. Returns `point` with unchanged
-    values.
+    """Return `point`, a minimum found by a solver, with unchanged values and with derivatives with respect to the
+    problem.
 
-    The computation of `point` is not differentiated. Derivatives are evaluated at the minimum itself, found by a few
-    Newton steps from `point`, so the derivatives are as accurate as the gradient even if the solver stopped early; if
-    the Newton steps fail, derivatives are evaluated at `point`. The result is differentiable any number of times, in
-    forward and reverse mode, and under `jax.vmap`.
+    The computation of `point` is not differentiated. Derivatives are evaluated at the minimum itself, which is found by
+    a few Newton steps from `point`. The derivatives are therefore as accurate as the gradient even if the solver
+    stopped early. If the Newton steps fail, derivatives are evaluated at `point`. The result is differentiable any
+    number of times, in forward and reverse mode, and under `jax.vmap`.
 
     **Arguments:**
 
     - `point` (n,): point near the minimum, the result of a solver.
-    - `problem`: a pytree, with respect to whose arrays the minimum is differentiated.
-    - `gradient`: function of (x, problem) that returns the gradient (n,) of the cost, zero at the minimum; its
+    - `problem`: a pytree; the minimum is differentiated with respect to its arrays.
+    - `gradient`: function of (x, problem) that returns the gradient (n,) of the cost, which is zero at the minimum. Its
       derivative with respect to x, the Hessian, must be symmetric and positive definite at the minimum.
-    - `precondition`: function of (x, problem) that returns a function of a vector, which applies the inverse of an
-      approximation of the Hessian.
+    - `precondition`: function of (x, problem) that returns a function; this function multiplies a vector by the inverse
+      of an approximation of the Hessian.
 
     **Example:**
 

@@ -19,22 +19,22 @@ from jaxtyping import Array, Bool, Float, Int
 from jeit_solvers.engines import complex_slope, host, namespace, set_at, slopes, while_loop
 from jeit_solvers.module import Module
 
-# Signature of a function of x (n, F), and of data whose last axis is F, that returns the value (F,), the gradient (n,
-# F), and a positive definite model (n, n, F) of the Hessian, for instance the Gauss-Newton or Fisher matrix.
+# Signature of a function of x (n, F) and of data whose last axis is F. It returns the values (F,), the gradients (n,
+# F), and positive definite approximations (n, n, F) of the Hessians, for instance Gauss-Newton or Fisher matrices.
 Expansion = Callable[[Array, Any], tuple[Array, Array, Array]]
 
 _MAX_DAMPING = 1e12
-# Minimum number of functions for which gathering the unfinished functions saves time.
+# Minimum number of gathered functions; below this number gathering the unfinished functions saves no time.
 _MIN_GATHERED = 32
 # Number of steps that the whole batch takes before the unfinished functions are gathered.
 _WHOLE_BATCH_STEPS = 8
-# Distance between points for the finite differences of slopes that give a Hessian.
+# Distance between the points in the finite differences of derivatives that approximate a Hessian.
 _DIFFERENCE_STEP = 1e-6
 
 
 class Minimum(Module):
     """Minima of a batch of F functions. **Fields**: `x`: (n, F) positions of the minima; `value`: (F,) values at the
-    minima; `converged`: (F,) whether each minimisation converged; `steps`: largest number of steps of a function.
+    minima; `converged`: (F,) whether each minimisation converged; `steps`: maximum number of steps over all functions.
 
     **Example:**
 
@@ -227,12 +227,12 @@ def minimise_small(
 ) -> Minimum:
     """Minimise F functions of n unknowns with bounds by projected, damped Newton steps (Bertsekas 1982).
 
-    An unknown at a bound is held there if the function decreases outwards; all other unknowns take a step. Steps are
-    damped as in the Levenberg-Marquardt method, scaled by the Hessian's diagonal. Functions that are not finite at
-    their start stay there, not converged, with an infinite value; the same holds for functions marked in `skip`.
+    An unknown at a bound stays there if the function decreases outwards; all other unknowns change in each step. Steps
+    are damped as in the Levenberg-Marquardt method, scaled by the Hessian's diagonal. Functions that are not finite at
+    their start, and functions marked in `skip`, stay there: they have not converged, and their value is infinite.
 
     All functions take eight steps together. The unfinished functions, usually few, are then gathered and continue. In a
-    compiled program, whose arrays have fixed sizes, a quarter of the batch is gathered at a time.
+    compiled program, where arrays have fixed sizes, a quarter of the batch is gathered at a time.
 
     **Arguments:**
 
@@ -325,8 +325,8 @@ def _take_steps(state: _State, data, steps: int, expand: Expansion, limits: _Lim
         trial, predicted_decrease = _next_step(state, limits)
         value, gradient, matrix = expand(trial, data)
         is_lower = (value <= state.value) & ~state.is_done
-        # A step that is cut off at a bound may lead uphill; then a more damped step, closer to the negative gradient,
-        # is tried.
+        # A step that is clipped at a bound may increase the value; then a more damped step, closer to the negative
+        # gradient, is tried.
         is_settled = (
             (predicted_decrease >= 0) & (predicted_decrease <= limits.tolerance * (1 + xp.abs(state.value))) & ~is_start
         )

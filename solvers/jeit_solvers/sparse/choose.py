@@ -24,8 +24,9 @@ from jeit_solvers.sparse.pattern import SparsityPattern
 # CPU, compiling a longer factorisation takes more time than it saves; on an accelerator, the padded index maps must fit
 # in memory.
 _MAX_COMPILED_OPERATIONS_CPU, _MAX_COMPILED_OPERATIONS = 5e7, 2e10
-# Floating-point operations of a factorisation per second; time in seconds and memory in bytes that multigrid takes for
-# 32 right-hand sides, per entry of the matrix. Measured on two cores with solids of 50,000 to 1,000,000 nodes.
+# Floating-point operations of a factorisation per second; then the time in seconds and the memory in bytes, per entry
+# of the matrix, that multigrid takes for 32 right-hand sides. Measured on two cores with solids of 50,000 to 1,000,000
+# nodes.
 _OPERATIONS_PER_SECOND = 4e10
 _MULTIGRID_SECONDS, _MULTIGRID_BYTES = 5e-6, 400.0
 # A factorisation is chosen if it takes no longer than this factor times the time of multigrid, which is less accurate.
@@ -36,17 +37,17 @@ class ConjugateGradient(MatrixSolver):
     """Conjugate gradient solver, preconditioned with the diagonal of the matrix, for `SparseSymmetric` operators.
 
     Iteration stops when |M^-1 (b - A x)| <= tolerance |M^-1 b|, where M is the diagonal of A. The criterion is scaled
-    by M because rows with large entries, such as those of good contacts, may dominate the right-hand side b, and a
-    residual that is small relative to these rows may be large elsewhere. The result is `RESULTS.max_steps_reached`
-    after `max_steps` steps, and `RESULTS.breakdown` for a direction p with p^T A p <= 0, which does not exist for a
-    positive definite matrix. Complex symmetric systems are solved by the conjugate orthogonal variant, with p^T in
-    place of p^* (van der Vorst and Melissen, IEEE Trans. Magn. 26, 1990).
+    by M because rows with large entries, such as those of electrodes with low contact impedance, may dominate the
+    right-hand side b. A residual that is small relative to these rows may be large for other rows. The result is
+    `RESULTS.max_steps_reached` after `max_steps` steps, and `RESULTS.breakdown` for a direction p with p^T A p <= 0,
+    which does not exist for a positive definite matrix. Complex symmetric systems are solved by the conjugate
+    orthogonal variant, with p^T in place of p^* (van der Vorst and Melissen, IEEE Trans. Magn. 26, 1990).
 
     **Arguments:**
 
     - `tolerance`: tolerance of the scaled residual.
     - `max_steps`: maximum number of steps, by default ten per unknown, at most 10,000.
-    - `reason`: why this solver is used, in words.
+    - `reason`: text that explains why this solver is used.
 
     Raises `ValueError` for a tolerance that is not between 0 and 1, and for a maximum of less than one step.
 
@@ -87,7 +88,7 @@ class ConjugateGradient(MatrixSolver):
 class Iterate(NamedTuple):
     """State of a conjugate gradient iteration for A x = b. **Fields**: `solution`: x; `residual`: r = b - A x;
     `direction`: search direction p; `weight`: r^T M^-1 r with the preconditioner M; `step`: number of steps;
-    `converged`, `broken_down`: why the iteration ends."""
+    `converged`, `broken_down`: whether the iteration ended because it converged, or because of a breakdown."""
 
     solution: Inexact[Array, " n"]
     residual: Inexact[Array, " n"]
@@ -101,7 +102,8 @@ class Iterate(NamedTuple):
 def conjugate_gradient(
     operator: SparseSymmetric, vector: Inexact[Array, " n"], tolerance: float, max_steps: int
 ) -> Iterate:
-    """Last iterate of conjugate gradients, started at x = 0 and preconditioned with the diagonal M of the matrix."""
+    """Run conjugate gradients, started at x = 0 and preconditioned with the diagonal M of the matrix, and return the
+    last iterate."""
     inverse_diagonal = 1 / operator.pattern.diagonal(operator.values)
     direction = inverse_diagonal * vector
     target = tolerance * jnp.linalg.norm(direction)
@@ -139,16 +141,16 @@ def conjugate_gradient(
 
 
 class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
-    """Direct solver for `SparseSymmetric` operators, with the plan that `analyse` makes for the operators' pattern.
+    """Direct solver for `SparseSymmetric` operators, with the plan that `analyse` computes from the operators' pattern.
 
-    `init` factorises the matrix and `compute` solves. The same factor serves the adjoint system, so
-    `lineax.linear_solve` is differentiated without another factorisation. A matrix that is not positive definite gives
+    `init` factorises the matrix and `compute` solves. The same factor also solves the adjoint system, so derivatives of
+    `lineax.linear_solve` need no further factorisation. A matrix that is not positive definite gives
     `RESULTS.singular`.
 
     **Arguments:**
 
     - `plan`: from `analyse`.
-    - `reason`: why this solver is used, in words.
+    - `reason`: text that explains why this solver is used.
 
     **Example:**
 
@@ -161,7 +163,7 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
     reason: str = eqx.field(static=True, default="chosen by the user")
 
     def init(self, operator: lineax.AbstractLinearOperator, options: dict[str, Any]) -> Factor:
-        """Factorise the operator's matrix. Raises `ValueError` if the matrix has another pattern than the plan."""
+        """Factorise the operator's matrix. Raises `ValueError` if the matrix and the plan have different patterns."""
         del options
         operator = require_sparse_symmetric(operator, "SparseCholesky")
         if (operator.pattern.size, operator.pattern.num_entries) != (self.plan.size, self.plan.num_entries):
@@ -205,7 +207,7 @@ class FrontalCholesky(MatrixSolver):
     **Arguments:**
 
     - `fronts`: from `find_fronts`.
-    - `reason`: why this solver is used, in words.
+    - `reason`: text that explains why this solver is used.
 
     **Example:**
 
@@ -219,7 +221,7 @@ class FrontalCholesky(MatrixSolver):
 
     def init(self, operator: lineax.AbstractLinearOperator, options: dict[str, Any]) -> SparseSymmetric:
         """Return the matrix itself, which is factorised when a solution is needed. Raises `ValueError` if the matrix
-        has another pattern than the fronts."""
+        and the fronts have different patterns."""
         del options
         operator = require_sparse_symmetric(operator, "FrontalCholesky")
         if (operator.pattern.size, operator.pattern.num_entries) != (self.fronts.size, self.fronts.num_entries):
@@ -247,7 +249,7 @@ DirectSolver = SparseCholesky | FrontalCholesky
 """The solvers that factorise."""
 
 ColumnSolver = DirectSolver | NumpySolver
-"""The solvers that solve for several right-hand sides at once, by `solve_columns`."""
+"""The solvers for several right-hand sides at once, which have the method `solve_columns`."""
 
 
 def choose_solver(

@@ -5,9 +5,9 @@ connects the two halves. Eliminating halves before separators keeps fill low: O(
 for a planar mesh (George, SIAM J. Numer. Anal. 10, 1973).
 
 If coordinates of the nodes are given, a part is halved by a straight line (in three dimensions by a plane). Otherwise
-the halves of a part are the nodes nearer, in graph distance, to either of two nodes that lie far apart. The smallest
-possible separator is found by a maximum matching of the edges between the halves (König's theorem; Pothen and Fan, ACM
-Trans. Math. Softw. 16, 1990).
+two nodes that lie far apart are chosen, and each half consists of the nodes that are nearer, in graph distance, to one
+of the two. The smallest separator of two halves is computed from a maximum matching of the edges between them (König's
+theorem; Pothen and Fan, ACM Trans. Math. Softw. 16, 1990).
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_bipartite_matching
 
-# Coordinates are rounded to this number of decimals of their extent, so that the elimination order does not depend on
-# rounding errors.
+# Coordinates, relative to their extent, are rounded to this number of decimals, so that the elimination order does not
+# depend on rounding errors.
 _COORDINATE_DECIMALS = 7
 
 
 def nested_dissection(graph: csr_array, depth: int, coordinates: np.ndarray | None = None) -> np.ndarray:
     """Split a symmetric graph (n, n) without diagonal into a complete binary tree of `depth` levels of separators.
 
-    Returns the tree node (n,) to which each node of the graph belongs: the root is 0, the children of t are 2 t + 1 and
-    2 t + 2; leaves hold the nodes that belong to no separator. With `coordinates` (n, d) of the nodes, each separator
-    lies along a straight line or plane; without `coordinates`, separators are found from graph distances.
+    Returns the number (n,) of the tree node to which each node of the graph belongs. The root is 0, and the children of
+    t are 2 t + 1 and 2 t + 2; leaves contain the nodes that belong to no separator. With `coordinates` (n, d) of the
+    nodes, each separator lies along a straight line or plane; without `coordinates`, separators are found from graph
+    distances.
     """
     size = _num_nodes(graph)
     owner, halving = np.zeros(size, dtype=np.int64), np.arange(size)
@@ -92,8 +93,8 @@ def _halve_parts(
 def _splitting_functions(
     graph: csr_array, nodes: np.ndarray, part: np.ndarray, num_parts: int, coordinates
 ) -> list[np.ndarray]:
-    """Functions on `nodes` (k,), by which parts can be split: each part is split into the nodes at which a function is
-    below or above a value."""
+    """Functions on `nodes` (k,) by which parts can be split, into the nodes where a function is below a value and the
+    nodes where the function is above this value."""
     if coordinates is not None:
         return _projected_coordinates(coordinates[nodes], part, num_parts)
     order = np.argsort(part, kind="stable")
@@ -105,7 +106,7 @@ def _splitting_functions(
 
 
 def _projected_coordinates(coordinates: np.ndarray, part: np.ndarray, num_parts: int) -> list[np.ndarray]:
-    """Coordinates of the nodes along the long axis of their part, and along two directions on either side of this axis,
+    """Coordinates of the nodes along the long axis of their part, and along two directions at an angle to this axis,
     because nearly square parts have no clear long axis."""
     dimension = coordinates.shape[1]
 
@@ -124,8 +125,7 @@ def _projected_coordinates(coordinates: np.ndarray, part: np.ndarray, num_parts:
 
 
 def _distance_function(graph: csr_array) -> np.ndarray:
-    """Function on the nodes of one part of a graph, computed from graph distances, by whose values the part is
-    split."""
+    """Compute from graph distances a function on the nodes of one part of a graph; the part is split by its values."""
     size = _num_nodes(graph)
     if size == 1:
         return np.zeros(1)
@@ -174,8 +174,8 @@ def _graph_distances(graph: csr_array, start: int) -> np.ndarray:
 
 
 def _minimum_vertex_cover(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Smallest set of nodes that contains an end of every edge (lower[i], upper[i]). By König's theorem this set has as
-    many nodes as a maximum matching has edges."""
+    """Smallest set of nodes that contains at least one end of every edge (lower[i], upper[i]). By König's theorem this
+    set has as many nodes as a maximum matching has edges."""
     if lower.size == 0:
         return np.empty(0, dtype=np.int64)
     left_nodes, left_local = np.unique(lower, return_inverse=True)

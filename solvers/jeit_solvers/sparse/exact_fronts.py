@@ -3,8 +3,8 @@
 
 A *front* is a small dense matrix: its *pivots* are rows that are eliminated together, and its *border* consists of the
 later rows that their elimination changes (multifrontal method; Duff and Reid, ACM Trans. Math. Softw. 9, 1983). Rows
-are numbered in the order of elimination; the pivots of a front are consecutive. Subtrees of the elimination tree that
-do not depend on each other come first, one after the other, and then the fronts above them, level by level.
+are numbered in the order of elimination; the pivots of a front are consecutive. The order starts with independent
+subtrees of the elimination tree, one after the other, followed by the fronts above them, level by level.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from jeit_solvers.sparse.pattern import SparsityPattern
 _LEAF_SIZE = 128
 # Number of levels of the elimination tree above the subtrees that are eliminated in parallel.
 _LEVELS_ABOVE_SUBTREES = 3
-# Number of bits to which coordinates are rounded for the order of rows along a space-filling curve.
+# Number of bits to which coordinates are rounded before rows are ordered along a space-filling curve.
 _CURVE_BITS = 10
 
 
@@ -58,10 +58,10 @@ class Fronts:
     orders are equal.
 
     **Fields**: `size`, `num_entries`: rows and entries of the pattern; `order`: (n,) matrix rows in the order of
-    elimination; `entry_order`: (nnz,) entries of the matrix in the order of the fronts that hold them; `fronts`: all
-    fronts; `steps`: for each step of the elimination the slices of fronts that can be eliminated in parallel: first the
-    subtrees, then the fronts of each level above the subtrees; `top`: number of the first row that a front above the
-    subtrees eliminates; `key`: digest of the pattern and the order, by which objects are compared.
+    elimination; `entry_order`: (nnz,) indices of the matrix entries in the order of the fronts to which they belong;
+    `fronts`: all fronts; `steps`: for each step of the elimination the slices of fronts that can be eliminated in
+    parallel: first the subtrees, then the fronts of each level above the subtrees; `top`: number of the first row that
+    a front above the subtrees eliminates; `key`: digest of the pattern and the order, by which objects are compared.
 
     **Example:**
 
@@ -101,8 +101,8 @@ class Fronts:
 
     @property
     def num_waiting_entries(self) -> int:
-        """Greatest number of entries of Schur complements that wait for their parents, if fronts are eliminated one
-        after the other."""
+        """Maximum number of entries of Schur complements that are stored until their parents are eliminated, if fronts
+        are eliminated one after the other."""
         waiting = max_waiting = 0
         for front in self.fronts:
             max_waiting = max(max_waiting, waiting + front.border**2)
@@ -121,7 +121,7 @@ def find_fronts(pattern: SparsityPattern, coordinates: Any = None) -> Fronts:
 
     - `pattern`, `coordinates`: as for `analyse`.
 
-    Raises `ValueError` if the coordinates have another shape or are not finite.
+    Raises `ValueError` if the coordinates have a wrong shape or are not finite.
 
     **Example:**
 
@@ -140,7 +140,7 @@ def find_fronts(pattern: SparsityPattern, coordinates: Any = None) -> Fronts:
     return fronts
 
 
-# Fronts in use, shared by models that are created again on the same mesh.
+# Existing fronts, reused by further models on the same mesh.
 _CACHED_FRONTS: WeakValueDictionary[bytes, Fronts] = WeakValueDictionary()
 
 
@@ -180,8 +180,8 @@ def _post_order_positions(nodes: np.ndarray, level: np.ndarray, depth: int) -> n
 
 
 class _EliminationTree:
-    """Elimination tree of fronts that are numbered in the order of elimination. For each front it has the number of
-    `pivots`, the number of `border` rows, the index of its `parent` and its `level` (0 at the root). `order`,
+    """Elimination tree of fronts that are numbered in the order of elimination. For each front the tree stores the
+    number of `pivots`, the number of `border` rows, the index of the `parent` and the `level` (0 at the root). `order`,
     `entry_order`: as in `Fronts`."""
 
     def __init__(self, size: int, rows, columns, front_of_row, level, coordinates):
@@ -204,8 +204,9 @@ class _EliminationTree:
         self.entry_order = np.argsort(holder, kind="stable")
 
     def _find_borders(self, count: int) -> None:
-        """Find the border rows of each front, i.e. the later rows of the front's entries and the borders of its
-        children without its own pivots; and the parent of each front, which eliminates the first of these rows."""
+        """Find the border rows of each front and its parent. The border rows are the later rows of the front's entries,
+        and the border rows of its children that are not its pivots. The parent is the front that eliminates the first
+        border row."""
         size, front = self.size, self.front
         first, second = front[self.early], front[self.late]
         pending = np.unique((first * size + self.late)[first != second])
@@ -223,7 +224,7 @@ class _EliminationTree:
         self.border_front, self.border_row = np.divmod(self.keys, size)
 
     def _local_indices(self, fronts: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Index of each matrix row within the given front, which lists its pivots first and then its border."""
+        """Index of each matrix row within the given front, in which the pivots come first and then the border."""
         in_border = np.searchsorted(self.keys, fronts * self.size + rows) - self.border_first[fronts]
         is_pivot = self.front[rows] == fronts
         return np.where(is_pivot, rows - self.first[fronts], self.pivots[fronts] + in_border)

@@ -3,8 +3,8 @@
 Matrices are real, or complex symmetric. Fronts that do not depend on each other are distributed over the cores.
 
 Each front is eliminated by BLAS and LAPACK, in place. SciPy exports its BLAS for other compiled code. Here BLAS is
-called through ctypes, which lets other threads run and copies nothing: a matrix may be a part of the rows of a larger
-array. Arrays are in C order, in which a Fortran routine sees the transpose: a lower triangle of BLAS is the upper
+called through ctypes, which lets other threads run and copies nothing: a matrix may consist of some rows of a larger
+array. Arrays are in C order, which a Fortran routine reads as the transpose: a lower triangle for BLAS is the upper
 triangle of the array.
 """
 
@@ -28,7 +28,7 @@ from jeit_solvers.engines import call_numpy, has_values, host
 from jeit_solvers.sparse.exact_fronts import Fronts
 from jeit_solvers.sparse.operator import LastMatrix
 
-# Minimum number of operations for which fronts are distributed over the cores; a product with k vectors takes k
+# Minimum number of operations at which fronts are distributed over the cores. A product with k vectors counts as k
 # operations for each entry of the factor.
 _MIN_PARALLEL_OPERATIONS = 5e9
 # Number of rows of a child front's Schur complement that are added to the parent front together. Each such block
@@ -56,11 +56,11 @@ class FrontalFactor(NamedTuple):
 
     @property
     def positive_definite(self) -> bool:
-        """Whether the matrix was positive definite."""
+        """Whether the matrix is positive definite."""
         return self.panels is not None
 
     def solve(self, right_hand_sides: Inexact[np.ndarray, "n k"]) -> Inexact[np.ndarray, "n k"]:
-        """Solution x of A x = b for `right_hand_sides` b (n, k). Raises `ValueError` for right-hand sides of another
+        """Solution x of A x = b for `right_hand_sides` b (n, k). Raises `ValueError` for right-hand sides of a wrong
         shape."""
         if self._splits_complex(right_hand_sides):
             return self.solve(np.real(right_hand_sides)) + 1j * self.solve(np.imag(right_hand_sides))
@@ -83,8 +83,8 @@ class FrontalFactor(NamedTuple):
         return half.T @ half
 
     def half_solve(self, right_hand_sides: Inexact[np.ndarray, "n k"]) -> Inexact[np.ndarray, "n k"]:
-        """Half of a solve: Y = L⁻¹ P b for `right_hand_sides` b, with rows in the order of elimination P, so that Yᵀ Y
-        = bᵀ A⁻¹ b. Raises `ValueError` for right-hand sides of another shape."""
+        """Forward half of a solve: Y = L⁻¹ P b for `right_hand_sides` b, where P sorts rows into the order of
+        elimination, so that Yᵀ Y = bᵀ A⁻¹ b. Raises `ValueError` for right-hand sides of a wrong shape."""
         shape, size = np.shape(right_hand_sides), self.fronts.size
         if len(shape) != 2 or shape[0] != size:
             raise ValueError(f"right-hand sides must have shape (n, k) with n = {size}; got {shape}.")
@@ -119,9 +119,9 @@ class FrontalFactor(NamedTuple):
         return float(vectors.shape[1] * self.fronts.num_factor_entries)
 
     def _eliminate_forward(self, vectors: np.ndarray, later: np.ndarray, front_slice: slice) -> None:
-        """Forward elimination for the fronts `front_slice`: replace the rows of `vectors` at the pivots by those of L⁻¹
-        P b, and subtract the contributions of the pivots from the rows of the borders. Border rows above the subtrees
-        are in `later`."""
+        """Forward elimination for the fronts `front_slice`: replace the rows of `vectors` at the pivots by the same
+        rows of L⁻¹ P b, and subtract the contributions of the pivots from the rows of the borders. Border rows above
+        the subtrees are in `later`."""
         assert self.panels is not None
         top = self.fronts.top
         for front, panel in zip(self.fronts.fronts[front_slice], self.panels[front_slice], strict=True):
@@ -135,8 +135,8 @@ class FrontalFactor(NamedTuple):
                 later[front.rows[num_inside:] - top] -= contributions[num_inside:]
 
     def _substitute_back(self, vectors: np.ndarray, front_slice: slice) -> None:
-        """Back substitution for the fronts `front_slice`: replace the rows of `vectors` at the pivots by those of the
-        solution. Later rows of the solution are already known."""
+        """Back substitution for the fronts `front_slice`: replace the rows of `vectors` at the pivots by the rows of
+        the solution. Later rows of the solution are already known."""
         assert self.panels is not None
         for front, panel in zip(
             reversed(self.fronts.fronts[front_slice]), reversed(self.panels[front_slice]), strict=True
@@ -153,9 +153,9 @@ def factorise_fronts(fronts: Fronts, values: Inexact[np.ndarray, " nnz"]) -> Fro
     **Arguments:**
 
     - `fronts`: from `find_fronts`.
-    - `values` (nnz,): entries of the matrix, in the order of the pattern for which the fronts were made.
+    - `values` (nnz,): entries of the matrix, in the order of the pattern from which the fronts were computed.
 
-    Raises `ValueError` for values of another shape.
+    Raises `ValueError` for values of a wrong shape.
 
     **Example:**
 
@@ -211,7 +211,7 @@ _LAST_FACTOR = LastMatrix()
 def _eliminate_front(
     fronts: Fronts, ordered_values: np.ndarray, panels: list[Any], schur_complements: list[Any], front_index: int
 ) -> bool:
-    """Assemble and eliminate one front, and store the front's panel and its Schur complement, which is added to the
+    """Assemble and eliminate one front, and store its panel and its Schur complement, which is later added to the
     parent front. Returns False if the front is not positive definite."""
     front = fronts.fronts[front_index]
     num_pivots, num_border = front.pivots, front.border
@@ -297,7 +297,7 @@ def _c_integer(value: int) -> Any:
 
 
 def _row_stride(matrix: np.ndarray) -> Any:
-    """Distance in memory between successive rows of a matrix, counted in numbers."""
+    """Distance in memory between successive rows of a matrix, in elements."""
     return _c_integer(matrix.strides[0] // matrix.itemsize)
 
 
@@ -305,9 +305,9 @@ def eliminate(panel: np.ndarray, schur: np.ndarray) -> bool:
     """Eliminate the pivots of a front (a dense matrix of p pivot rows and b border rows), in place. Returns False if
     the pivot block is not positive definite.
 
-    `panel` (p, p + b): on entry the rows [A, B] of the pivots, of which the upper triangle of A and all of B are read;
-    on return [Lᵀ, L⁻¹ B] with A = L Lᵀ. `schur` (b, b): Schur complement, from whose upper triangle Bᵀ A⁻¹ B is
-    subtracted. Complex matrices are symmetric, and transposes are not conjugated.
+    `panel` (p, p + b): on entry the rows [A, B] of the pivots; only the upper triangle of A is read, and all of B. On
+    return the panel contains [Lᵀ, L⁻¹ B] with A = L Lᵀ. `schur` (b, b): Schur complement; Bᵀ A⁻¹ B is subtracted from
+    its upper triangle. Complex matrices are symmetric, and transposes are not conjugated.
     """
     num_pivots, num_border = len(panel), panel.shape[1] - len(panel)
     routines, stride = _ROUTINES_OF_DTYPE[panel.dtype], _row_stride(panel)

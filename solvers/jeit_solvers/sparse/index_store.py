@@ -2,7 +2,7 @@
 
 Passing a pytree to a jitted function costs microseconds for each of its arrays and modules. A plan has dozens of index
 arrays, and a small factorisation takes only half a millisecond. Therefore plans and patterns store all their indices in
-one int32 array, and the positions of the individual arrays in a static, hashable description.
+one int32 array, and a static, hashable description contains the positions of the individual arrays.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Slot(NamedTuple):
 
 
 class IndexStore:
-    """Collects index arrays while a plan or pattern is made."""
+    """Collects index arrays during the creation of a plan or pattern."""
 
     def __init__(self):
         self._arrays: list[np.ndarray] = []
@@ -58,10 +58,10 @@ class IndexStore:
 class PaddedSum(NamedTuple):
     """Plan for sums of scattered contributions. Scattering is slow on a CPU, so most contributions are *gathered*.
 
-    `gather` (width, sums) holds the indices of the contributions to each sum, with an index out of range where a sum
-    has fewer than `width`. `overflow_sum` and `overflow_source` hold pairs of a sum and a contribution beyond `width`,
-    which are scattered. The pairs are ordered in rounds that end at `rounds`; in each round the sums ascend and none
-    occurs twice.
+    `gather` (width, sums) contains the indices of up to `width` contributions to each sum, padded with an index out of
+    range. Further contributions are scattered: `overflow_sum` contains the index of the sum, and `overflow_source` the
+    index of the contribution. These pairs are divided into rounds that end at `rounds`; within a round the indices of
+    the sums are ascending and distinct.
     """
 
     gather: Slot
@@ -79,7 +79,7 @@ class PaddedSum(NamedTuple):
         target, source = target[order], source[order]
         counts = np.bincount(target, minlength=num_sums)
         rank = np.arange(target.size) - np.repeat(np.cumsum(counts) - counts, counts)
-        # Number of contributions left over for each width; the width with the shortest predicted time is chosen.
+        # Number of contributions beyond each width; the width with the shortest predicted time is chosen.
         left_over = target.size - np.concatenate([[0], np.cumsum(np.bincount(rank, minlength=1))])
         width = int(np.argmin(np.arange(left_over.size) * num_sums + _SCATTER_COST * left_over))
         gather = np.full((width, num_sums), num_sources, dtype=np.int32)
@@ -129,9 +129,9 @@ class PaddedSum(NamedTuple):
     def read_back(
         self, indices: Int[Array, " total"], sums: Inexact[Array, " sums"], into: Inexact[Array, " sources"]
     ) -> Inexact[Array, " sources"]:
-        """Array `into` with the entry of each contribution replaced by the sum to which it is added (by one of the sums
-        if there are several). `into` must have one entry more than there are contributions; this last entry is
-        overwritten."""
+        """Return `into` with the entry of each contribution replaced by the sum to which the contribution is added (by
+        one of these sums if there are several). `into` must have one more entry than there are contributions; the last
+        entry is overwritten."""
         for layer in self.gather.read(indices):
             into = set_at(into, layer, sums)
         if self.overflow_sum.shape[0]:

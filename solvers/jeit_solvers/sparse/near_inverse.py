@@ -1,4 +1,4 @@
-"""Entries of A⁻¹ between nearby unknowns of a sparse matrix A, by block elimination of a block tridiagonal matrix.
+"""Entries of A⁻¹ between nearby unknowns of a sparse symmetric matrix A, by elimination of a block tridiagonal matrix.
 
 The unknowns are partitioned into blocks, called *strips*, such that A couples each strip only to the strips before and
 after it. The strips are the levels of a breadth-first search that starts at one side of the body. With the diagonal
@@ -34,9 +34,10 @@ class Strips(Module):
     """Partition of the unknowns of a matrix into strips, each coupled only to its two neighbours, for `near_inverse`.
     The selected unknowns, between which the inverse is computed, come first in each strip.
 
-    **Fields**: `position`: (n,) strip · `strip_size` + index within the strip; `num_strips`: number of strips;
-    `strip_size`: maximum number of unknowns in a strip; `selected_per_strip`: maximum number of selected unknowns in a
-    strip, rounded up. The `place` of a selected unknown is strip · `selected_per_strip` + index within the strip.
+    **Fields**: `position`: (n,) position of each unknown, which is strip · `strip_size` + index within the strip;
+    `num_strips`: number of strips; `strip_size`: maximum number of unknowns in a strip; `selected_per_strip`: maximum
+    number of selected unknowns in a strip, rounded up. The `place` of a selected unknown is its strip ·
+    `selected_per_strip` + its index within the strip.
 
     **Example:**
 
@@ -59,7 +60,7 @@ class Strips(Module):
         `selected` (n,): the unknowns between which the inverse is needed."""
         longest, *other_axes = coordinates.T[np.argsort(-np.ptp(coordinates, axis=0))]
         strip = _breadth_first_levels(pattern, longest)
-        # Unknowns that are neighbours in a strip are neighbours in memory.
+        # Sort the unknowns of a strip by their other coordinates, so that neighbours in space are neighbours in memory.
         order = np.lexsort((*other_axes[::-1], ~selected, strip))
         counts = np.bincount(strip)
         index_in_strip = np.empty(len(strip), int)
@@ -96,8 +97,8 @@ class Strips(Module):
 
 class NearInverse(Module):
     """Entries of the inverse G = A⁻¹ between places that are at most a few strips apart. **Fields**: `band`: (strips,
-    selected unknowns, columns) blocks G_ij with j ≥ i, because G is symmetric; `left`, `right`: (p, r) factors of a
-    matrix left rightᵀ that is added to G.
+    selected unknowns, columns) blocks G_ij with j ≥ i only, because G is symmetric; `left`, `right`: (p, r) factors of
+    a matrix left rightᵀ that is added to G.
 
     **Example:**
 
@@ -123,7 +124,8 @@ class NearInverse(Module):
         return self.band.reshape(-1).at[index].get(mode="promise_in_bounds") + added
 
     def add(self, left: Inexact[Array, "p r"], right: Inexact[Array, "p r"]) -> "NearInverse":
-        """The sum G + left rightᵀ, which must be symmetric. Both factors have rows in the order of places."""
+        """Return the sum G + left rightᵀ, which must be symmetric. The rows of `left` and `right` are in the order of
+        places."""
         factors = (jnp.concatenate(factor_pair, axis=1) for factor_pair in ((self.left, left), (self.right, right)))
         return NearInverse(self.band, *factors)
 

@@ -23,7 +23,7 @@ class SparseSymmetric(lineax.AbstractLinearOperator):
 
     Real matrices are assumed to be positive definite, as the solvers of this package require. Complex matrices are
     symmetric, not Hermitian. Products and solutions are differentiable with respect to the values. Raises `ValueError`
-    for values of another shape than that of the pattern, and for values that are not floating point.
+    if the shape of the values does not match the pattern, and for values that are not floating point.
 
     **Arguments:**
 
@@ -70,7 +70,8 @@ class SparseSymmetric(lineax.AbstractLinearOperator):
         return jax.ShapeDtypeStruct((self.pattern.size,), self.values.dtype)
 
     def out_structure(self) -> jax.ShapeDtypeStruct:
-        """Shape and data type of a product, which equal those of the vector because the matrix is square."""
+        """Shape and data type of a product; equal to the shape and data type of the vector, because the matrix is
+        square."""
         return self.in_structure()
 
 
@@ -133,7 +134,7 @@ class MatrixSolver(lineax.AbstractLinearSolver[SparseSymmetric]):
     """Base of linear solvers whose state is the matrix itself."""
 
     def init(self, operator: lineax.AbstractLinearOperator, options: dict[str, Any]) -> SparseSymmetric:
-        """Return the matrix itself. Raises `ValueError` for another kind of operator."""
+        """Return the matrix itself. Raises `ValueError` for an operator that is not a `SparseSymmetric`."""
         del options
         return require_sparse_symmetric(operator, type(self).__name__)
 
@@ -175,7 +176,7 @@ class NumpySolver(MatrixSolver):
             solutions = self.solve_in_numpy(pattern, np.asarray(values), np.asarray(columns))
             return solutions.astype(dtype, copy=False)
 
-        if has_values(pattern):  # constants, kept out of the compiled program because they are large
+        if has_values(pattern):  # constants, not stored in the compiled program because they are large
             host_pattern = on_host(pattern)
             if has_values(state, columns):
                 return host.asarray(solve_with(host_pattern, state.values, columns))

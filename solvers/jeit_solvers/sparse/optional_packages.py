@@ -2,7 +2,7 @@
 
 `Multigrid`: conjugate gradients for several right-hand sides at once, preconditioned by smoothed-aggregation multigrid,
 in NumPy. Time and memory grow in proportion to the number of unknowns, so multigrid suits systems that are too large to
-factorise. PyAMG makes the levels from the matrix alone (Vanek, Mandel and Brezina, Computing 56, 1996). A multigrid
+factorise. PyAMG computes the levels from the matrix alone (Vanek, Mandel and Brezina, Computing 56, 1996). A multigrid
 cycle works on several right-hand sides at once and in single precision, which halves the memory traffic; the conjugate
 gradients are computed in double precision. The smoother is a Chebyshev polynomial of the matrix, scaled by the sums of
 the absolute values of its rows, which bound the spectrum (Baker, Falgout, Kolev and Yang, SIAM J. Sci. Comput. 33,
@@ -10,7 +10,7 @@ the absolute values of its rows, which bound the spectrum (Baker, Falgout, Kolev
 
 `Pardiso`: the direct solver of Intel's oneMKL, on a CPU. Users select PARDISO where jeit's own factorisation takes too
 much memory or time (Schenk and Gärtner, Future Gener. Comput. Syst. 20, 2004). Complex symmetric systems are solved as
-real symmetric systems of twice the size, because the binding, pypardiso, passes real matrices only.
+real symmetric systems of twice the size, because the Python interface, pypardiso, supports only real matrices.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from jeit_solvers.cores import number_of_cores, on_cores
 from jeit_solvers.sparse.operator import LastMatrix, NumpySolver, pattern_key
 from jeit_solvers.sparse.pattern import SparsityPattern
 
-# Maximum number of right-hand sides that are iterated together. More right-hand sides share each read of the matrix;
-# fewer right-hand sides fit in the cache.
+# Maximum number of right-hand sides that are iterated together. With more right-hand sides the matrix is read less
+# often; with fewer, they fit in the cache.
 _MAX_COLUMNS = 16
-# Maximum number of unknowns of the coarsest level, whose matrix is inverted.
+# Maximum number of unknowns of the coarsest level; the matrix of this level is inverted.
 _MAX_COARSEST_SIZE = 500
-# The smoother damps the spectrum of the scaled matrix from an eighth of its bound on, by a Chebyshev polynomial of
-# degree 2, of which these are the inverse roots.
+# The smoother is a Chebyshev polynomial of degree 2, which damps the spectrum of the scaled matrix between an eighth of
+# its upper bound and the bound. `_WEIGHTS` are the reciprocals of the polynomial's roots.
 _MIDDLE, _HALF = (1 + 1 / 8) / 2, (1 - 1 / 8) / 2
 _WEIGHTS = tuple(1 / (_MIDDLE + sign * _HALF * np.sqrt(0.5)) for sign in (1, -1))
 
@@ -65,18 +65,19 @@ class Hierarchy(NamedTuple):
 class Multigrid(NumpySolver):
     """Conjugate gradients preconditioned by multigrid, for large real or complex `SparseSymmetric` operators.
 
-    Iteration ends when the residual is less than the tolerance times the right-hand side, and the preconditioned
-    residual, which is about the error, less than the tolerance times the preconditioned right-hand side. The second
-    condition is needed because rows with large entries, such as those of good contacts, dominate the residual. A
-    solution is NaN if its iteration does not end within the maximum number of steps, or before a step shows that the
-    matrix is not positive definite. The solver runs in NumPy; compiled programs call it. Complex symmetric systems are
-    solved by the conjugate orthogonal variant, preconditioned with the real part of the matrix.
+    Iteration ends when the relative residual and the relative preconditioned residual are both at most the tolerance.
+    The first is the norm of the residual divided by the norm of the right-hand side; the second, which is about the
+    relative error, is the same ratio after preconditioning. The second condition is needed because rows with large
+    entries, such as those of electrodes with low contact impedance, dominate the residual. A solution is NaN if it does
+    not converge within the maximum number of steps, or before a step shows that the matrix is not positive definite.
+    The solver runs in NumPy; compiled programs call it. Complex symmetric systems are solved by the conjugate
+    orthogonal variant, preconditioned with the real part of the matrix.
 
     **Arguments:**
 
     - `tolerance`: tolerance of both residuals.
     - `max_steps`: maximum number of steps.
-    - `reason`: why this solver is used, in words.
+    - `reason`: text that explains why this solver is used.
 
     Raises `ValueError` for a tolerance that is not between 0 and 1, and for a maximum of less than one step;
     `ImportError` if PyAMG (the extra `large`) is not installed.
@@ -149,7 +150,7 @@ def _build_level(pyamg_level: Any) -> Level:
     row_sums = abs(matrix).sum(axis=1).reshape(-1, 1)
     scale = (1 / np.where(row_sums > 0, row_sums, 1)).astype(
         np.float32
-    )  # for rows of zeros, which PyAMG makes of isolated nodes
+    )  # for rows of zeros, which PyAMG creates for isolated nodes
     if not hasattr(pyamg_level, "P"):
         return Level(matrix, scale, inverse=np.linalg.pinv(matrix.toarray(), hermitian=True).astype(np.float32))
     prolongation = csr_array(pyamg_level.P).astype(np.float32)
@@ -233,20 +234,20 @@ def _column_norms(columns: Any) -> np.ndarray:
 _LAST_HIERARCHY = LastMatrix()
 
 
-# Numbers by which oneMKL denotes matrix types: real symmetric positive definite, and real symmetric indefinite.
+# oneMKL's numbers of matrix types: real symmetric positive definite, and real symmetric indefinite.
 _DEFINITE, _INDEFINITE = 2, -2
 
 
 class Pardiso(NumpySolver):
     """Direct solver for real or complex `SparseSymmetric` operators by PARDISO (oneMKL).
 
-    The last factorisation is kept, and used again when the same matrix is solved, for example for derivatives. All
-    solutions are NaN if a real matrix is not positive definite, or if PARDISO fails. PARDISO runs on the CPU; compiled
-    programs call it.
+    The last factorisation is stored, and reused for the next solution with the same matrix, for example for
+    derivatives. All solutions are NaN if a real matrix is not positive definite, or if PARDISO fails. PARDISO runs on
+    the CPU; compiled programs call it.
 
     **Arguments:**
 
-    - `reason`: why this solver is used, in words.
+    - `reason`: text that explains why this solver is used.
 
     Raises `ImportError` if pypardiso (the extra `mkl`) is not installed.
 

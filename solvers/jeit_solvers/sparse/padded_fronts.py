@@ -26,7 +26,7 @@ from jeit_solvers.sparse.pattern import SparsityPattern
 # Size of the fronts at the leaves of the elimination tree: large enough for efficient matrix products, and small enough
 # to be treated as dense.
 _LEAF_SIZE = 24
-# Number of floating-point operations that take about as long as the launch of the operations of a stage.
+# Number of floating-point operations that take as long as the overhead of launching a stage.
 _OPERATIONS_WORTH_A_STAGE = 1e6
 
 
@@ -36,7 +36,8 @@ class EliminationTree:
     - `front`, `place`: (n,) front of each matrix row, and index of the row among the pivots of the front.
     - `parent`, `stage`, `slot`: (fronts,) parent of each front (-1 at the root), stage of each front, and position of
       the front in the stage.
-    - `early`, `late`: (nnz,) the two rows of each matrix entry: the row that is eliminated earlier, and the other row.
+    - `early`, `late`: (nnz,) the two rows of each matrix entry: the row that is eliminated earlier, and the row that is
+      eliminated later.
     - `borders`: for each stage the sorted keys front * n + row of the border rows of its fronts; `batch`, `pivots`,
       `border`: number of fronts of each stage, and padded numbers of pivots and border rows.
     """
@@ -62,8 +63,8 @@ class EliminationTree:
         self.border = [int(rank_within(keys // size).max(initial=-1)) + 1 for keys in self.borders]
 
     def _make_fronts(self, owner: np.ndarray, depth: int) -> None:
-        """Make fronts from the nodes of the dissection: small separators are eliminated together with the separators
-        below them."""
+        """Form the fronts from the nodes of the dissection: small separators are eliminated together with the
+        separators below them."""
         nodes = np.arange(2 ** (depth + 1) - 1)
         level = np.floor(np.log2(nodes + 1)).astype(int)
         max_separators = np.zeros(depth + 1, dtype=int)
@@ -123,8 +124,8 @@ def _merged_levels(largest_separators: np.ndarray) -> list[int]:
     while level >= 0:
         height, pivots = 1, int(largest_separators[level])
         while level > 0:
-            # About half of a front's surroundings are separators of the next levels above, so its border is a few times
-            # as long as these separators.
+            # About half of the boundary of a front's region consists of separators of the next levels above, so its
+            # border is a few times as long as these separators.
             batch, next_separator = 2 ** (level - 1), int(largest_separators[level - 1])
             border = 3 * next_separator
             separate_operations = operations(2 * batch, pivots, border) + operations(batch, next_separator, border)
@@ -137,22 +138,22 @@ def _merged_levels(largest_separators: np.ndarray) -> list[int]:
 
 
 def rank_within(groups: np.ndarray) -> np.ndarray:
-    """Position of every element of a sorted array of small integers among the elements equal to it."""
+    """For every element of a sorted array of small integers: its position among the elements equal to it."""
     counts = np.bincount(groups)
     return np.arange(groups.size) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def graph_of(rows: np.ndarray, columns: np.ndarray, size: int) -> csr_array:
-    """Graph of a sparsity pattern: the entries without the diagonal, in both triangles."""
+    """Graph of a sparsity pattern: its off-diagonal entries, in both triangles."""
     rows, columns = rows[size:], columns[size:]
     coordinates = (np.concatenate([rows, columns]), np.concatenate([columns, rows]))
     return csr_array((np.ones(2 * rows.size, dtype=np.int8), coordinates), shape=(size, size))
 
 
 class Link(NamedTuple):
-    """Transfer of contributions from the fronts of an earlier stage `source` to a stage. **Fields**: `panel`, `corner`:
-    sums of the entries of the flattened Schur complements of `source`; `rows`: sums of the flattened right-hand-side
-    updates of `source`."""
+    """Transfer of contributions from the fronts of an earlier stage, `source`, to the fronts of a later stage.
+    **Fields**: `panel`, `corner`: sums of the entries of the flattened Schur complements of `source`; `rows`: sums of
+    the flattened right-hand-side updates of `source`."""
 
     source: int
     panel: PaddedSum
@@ -162,11 +163,11 @@ class Link(NamedTuple):
 
 class Stage(NamedTuple):
     """A stage of a factorisation: a batch of fronts padded to one shape. In each front `pivots` rows are eliminated and
-    `border` rows updated.
+    `border` rows are updated.
 
-    `entries` adds the values of the matrix, followed by a one for padded pivots, to the first columns of the fronts
-    (batch, pivots + border, pivots). `right_hand_side` (batch, pivots) holds indices of matrix rows, `above` (batch,
-    border) indices of rows in the fronts of the stage `parent`; indices out of range mark padding.
+    `entries` adds the entries of the matrix, to which a one for padded pivots is appended, to the pivot columns of the
+    fronts (batch, pivots + border, pivots). `right_hand_side` (batch, pivots) contains indices of matrix rows, and
+    `above` (batch, border) indices of rows in the fronts of the stage `parent`; indices out of range mark padding.
     """
 
     batch: int
@@ -180,7 +181,7 @@ class Stage(NamedTuple):
 
 
 class FactorisationPlan(Module):
-    """Order of elimination and index maps of a sparsity pattern for `factorise` and `solve`; made by `analyse`.
+    """Order of elimination and index maps of a sparsity pattern for `factorise` and `solve`; computed by `analyse`.
 
     **Fields**: `indices` (total,): all index maps; `layout`: position of each index map in `indices`; `size`: number of
     rows n; `num_entries`: number of entries of the pattern. The index maps are one leaf of the plan's pytree; pass a
@@ -238,7 +239,7 @@ def analyse(pattern: SparsityPattern, coordinates: Any = None) -> FactorisationP
     - `pattern`: sparsity pattern of n unknowns.
     - `coordinates` (n, d): coordinates of the unknowns, which give a better order than the pattern alone.
 
-    Raises `ValueError` if the coordinates have another shape or are not finite.
+    Raises `ValueError` if the coordinates have a wrong shape or are not finite.
 
     **Example:**
 
@@ -250,7 +251,7 @@ def analyse(pattern: SparsityPattern, coordinates: Any = None) -> FactorisationP
 
 
 def checked_coordinates(pattern: SparsityPattern, coordinates: Any) -> np.ndarray | None:
-    """Coordinates (n, d) of the unknowns as an array, or None. Raises `ValueError` if the coordinates have another
+    """Coordinates (n, d) of the unknowns as an array, or None. Raises `ValueError` if the coordinates have a wrong
     shape or are not finite."""
     if coordinates is None:
         return None
@@ -265,8 +266,8 @@ def checked_coordinates(pattern: SparsityPattern, coordinates: Any) -> np.ndarra
 
 
 def _plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> FactorisationPlan:
-    """Make the factorisation plan with all index maps for an elimination tree. If a plan of the same tree is in use,
-    for example by a forward model on whose mesh a prior also needs matrices, the index maps of this plan are shared."""
+    """Compute the factorisation plan with all index maps for an elimination tree. If a plan of the same tree exists,
+    for example in a forward model on the same mesh, its index maps are reused."""
     key = _plan_key(pattern, tree)
     indices, layout = _CACHED_INDICES.get(key), _CACHED_LAYOUTS.get(key)
     if indices is None or layout is None:
@@ -289,8 +290,8 @@ def _plan_key(pattern: SparsityPattern, tree: EliminationTree) -> bytes:
     return digest.digest()
 
 
-# Index maps of plans in use. They are shared, because making a plan for a solid takes seconds and storing it takes
-# hundreds of megabytes.
+# Index maps of existing plans. They are reused, because the plan of a solid takes seconds to compute and hundreds of
+# megabytes to store.
 _CACHED_INDICES: WeakValueDictionary[bytes, Array] = WeakValueDictionary()
 _CACHED_LAYOUTS: WeakValueDictionary[bytes, IndexLayout] = WeakValueDictionary()
 

@@ -23,8 +23,8 @@ from jeit_solvers.module import Module
 from jeit_solvers.sparse.index_store import IndexLayout
 from jeit_solvers.sparse.padded_fronts import FactorisationPlan, Stage
 
-# Minimum number of entries in the fronts of a stage for which threads are used; number of entries in the fronts that
-# are updated together.
+# Minimum number of entries in the fronts of a stage for which threads are used; and number of entries in the fronts
+# that are updated together.
 _MIN_PARALLEL_ENTRIES, _UPDATED_ENTRIES = 200_000, 100_000
 
 
@@ -48,13 +48,13 @@ class Factor(Module):
 
     @property
     def positive_definite(self) -> Bool[Array, ""]:
-        """Whether the matrix was positive definite (for a complex matrix: whether every pivot had a positive real
+        """Whether the matrix is positive definite (for a complex matrix: whether every pivot has a positive real
         part)."""
         diagonals = [jnp.diagonal(inverse, axis1=-2, axis2=-1) for inverse in self.inverses]
         return jnp.all(jnp.stack([jnp.all(jnp.isfinite(diagonal), axis=(-2, -1)) for diagonal in diagonals]), axis=0)
 
     def require_positive_definite(self) -> None:
-        """Raise `ValueError` if the matrix was not positive definite. The check is omitted inside `jax.jit`, `jax.grad`
+        """Raise `ValueError` if the matrix is not positive definite. The check is omitted inside `jax.jit`, `jax.grad`
         or `jax.vmap`, where values are not known yet."""
         verdict = self.positive_definite
         if has_values(verdict) and not verdict.all():
@@ -69,14 +69,14 @@ class Factor(Module):
 def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor:
     """Factorise a sparse symmetric matrix.
 
-    Real values must form a positive definite matrix. Complex values form a complex *symmetric* matrix, whose real part
-    must be positive definite (an admittivity). Otherwise the factor is NaN and `positive_definite` is false. Raises
-    `ValueError` for values of another shape.
+    Real values must form a positive definite matrix. Complex values, for example from admittivities, form a complex
+    *symmetric* matrix, whose real part must be positive definite. Otherwise the factor is NaN and `positive_definite`
+    is false. Raises `ValueError` for values of a wrong shape.
 
     **Arguments:**
 
     - `plan`: from `analyse`.
-    - `values` (nnz,): entries of the matrix, in the order of the pattern for which the plan was made.
+    - `values` (nnz,): entries of the matrix, in the order of the pattern from which the plan was computed.
 
     **Example:**
 
@@ -182,7 +182,7 @@ def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Arr
     - `factor`: from `factorise`.
     - `right_hand_sides` (n,) or (n, k): b, one or several vectors.
 
-    Raises `ValueError` for other shapes.
+    Raises `ValueError` for wrong shapes.
 
     **Example:**
 
@@ -221,16 +221,16 @@ def _solve_batch(batchable, plain, axis_size, batched, indices, factor, vectors)
 def half_solve(
     plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n k"]
 ) -> Inexact[Array, "rows k"]:
-    """Half of a solve: Y = L^-1 P b, with rows in the order of elimination P and rows of zeros for padding, so that Y^T
-    Y = b^T A^-1 b.
+    """Forward half of a solve: Y = L^-1 P b, where P sorts rows into the order of elimination, so that Y^T Y = b^T A^-1
+    b. Padding adds rows of zeros.
 
-    This function takes half the work of `solve`, and suffices for quadratic forms of the inverse.
+    This function takes half the time of `solve`, and is sufficient for quadratic forms of the inverse.
 
     **Arguments:**
 
     - `plan`, `factor`, `right_hand_sides` (n, k): as for `solve`.
 
-    Raises `ValueError` for other shapes.
+    Raises `ValueError` for wrong shapes.
 
     **Example:**
 
@@ -265,8 +265,8 @@ def quadratic_form(
 
 
 def inverse_root(plan: FactorisationPlan, factor: Factor, rows: Inexact[Array, "rows k"]) -> Inexact[Array, "n k"]:
-    """Product of P^T L^-T, a root of A^-1, with vectors whose rows are as returned by `half_solve`. Standard normal
-    vectors are mapped to vectors with covariance A^-1.
+    """Product of P^T L^-T, a root of A^-1, with vectors whose rows are in the order of `half_solve`. Standard normal
+    vectors become vectors with covariance A^-1.
 
     **Arguments:**
 
@@ -274,7 +274,7 @@ def inverse_root(plan: FactorisationPlan, factor: Factor, rows: Inexact[Array, "
     - `factor`: from `factorise`.
     - `rows` (rows, k): the vectors, with `plan.num_pivots` rows.
 
-    Raises `ValueError` for another number of rows.
+    Raises `ValueError` for a different number of rows.
 
     **Example:**
 
@@ -294,8 +294,8 @@ def inverse_entries(plan: FactorisationPlan, factor: Factor) -> Inexact[Array, "
     """Entries (nnz,) of A^-1 at the positions of the pattern of A, in the order of the pattern, diagonal first.
 
     The entries are computed from the factor by a recursion from the root of the elimination tree down, in about the
-    time of a factorisation. All entries of A^-1 would take as many solves as there are rows. Takahashi, Fagan and Chin,
-    Proc. 8th PICA Conf. (1973) 63-69; Erisman and Tinney, Commun. ACM 18 (1975) 177-179.
+    time of a factorisation. Computing all entries of A^-1 would take as many solves as there are rows. Takahashi, Fagan
+    and Chin, Proc. 8th PICA Conf. (1973) 63-69; Erisman and Tinney, Commun. ACM 18 (1975) 177-179.
 
     **Arguments:**
 
@@ -316,12 +316,12 @@ def inverse_entries(plan: FactorisationPlan, factor: Factor) -> Inexact[Array, "
 def _inverse_entries(
     layout: IndexLayout, num_entries: int, indices: Int[Array, " total"], factor: Factor
 ) -> Inexact[Array, " nnz"]:
-    """Entries of the inverse Z = A^-1, computed front by front from the root down. With A = L L^T and the part Z_bb
-    between a front's border rows b taken from the parent front, the parts with the front's pivots p are Z_bp = -Z_bb K
-    and Z_pp = L_pp^-T L_pp^-1 + K^T Z_bb K, where K = L_bp L_pp^-1."""
+    """Entries of the inverse Z = A^-1, computed front by front from the root down. Let A = L L^T, and let p be the
+    pivots and b the border rows of a front. The block Z_bb is read from the parent front; the other blocks are Z_bp =
+    -Z_bb K and Z_pp = L_pp^-T L_pp^-1 + K^T Z_bb K, where K = L_bp L_pp^-1."""
     stages, _ = layout.content
     xp, dtype = namespace(factor), factor.inverses[0].dtype
-    entries = xp.zeros(num_entries + 2, dtype)  # one more for padded pivots, and one for positions outside the pattern
+    entries = xp.zeros(num_entries + 2, dtype)  # one extra for padded pivots, and one for positions outside the pattern
     first_child = {stage.parent: number for number, stage in reversed(list(enumerate(stages))) if stage.border}
     fronts: dict[int, Inexact[Array, "batch height height"]] = {}
     for number in reversed(range(len(stages))):
@@ -342,7 +342,7 @@ def _inverse_entries(
         if number in first_child:
             fronts[number] = front_block
         if stage.border and first_child[stage.parent] == number:
-            del fronts[stage.parent]  # no front further down needs the parent's part
+            del fronts[stage.parent]  # no front further down needs the entries of the parent
     return entries[:num_entries]
 
 
@@ -395,7 +395,7 @@ def _check_columns(
 def _forward_stages(
     layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
 ) -> list[Inexact[Array, "batch pivots k"]]:
-    """Product of L^-1 with the vectors (n, k), stage by stage. The pivot rows of a front gather the updates of its
+    """Product of L^-1 with the vectors (n, k), stage by stage. The pivot rows of a front receive the updates from its
     children."""
     stages, _ = layout.content
     count = vectors.shape[1]
@@ -423,8 +423,8 @@ def _backward_stages(
     factor: Factor,
     reduced: list[Inexact[Array, "batch pivots k"]],
 ) -> Inexact[Array, "rows k"]:
-    """Product of L^-T with the vectors `reduced`, from the root down; returns the rows of the pivots of all stages. The
-    solution at the border of a front is read from the parent front."""
+    """Product of L^-T with the vectors `reduced`, computed from the root down; returns the rows at the pivots of all
+    stages. The solution at the border of a front is read from the parent front."""
     count, xp = reduced[0].shape[-1], namespace(reduced)
     fronts: dict[int, Inexact[Array, "rows k"]] = {}
     pivot_values = []

@@ -76,7 +76,7 @@ class SparsityPattern(Module):
         - `size`: number of nodes, n.
 
         Raises `ValueError` for node numbers out of range, for elements that contain a node twice, and for nodes that
-        belong to no element (the node's row would be empty and the matrix singular).
+        belong to no element (their rows would be empty, and the matrix singular).
         """
         size = _checked_size(size)
         if len(groups) == 0:
@@ -105,10 +105,10 @@ class SparsityPattern(Module):
 
     @classmethod
     def from_entries(cls, rows: Any, columns: Any, size: int) -> Self:
-        """Pattern with the given entries, each named as (row, column) or as (column, row).
+        """Pattern with the given entries, each specified as (row, column) or as (column, row).
 
-        `assemble` then takes one array (entries,) in the order given here; entries named more than once are added up.
-        Raises `ValueError` for indices out of range and for rows without a diagonal entry.
+        `assemble` then takes one array (entries,) in the order of `rows` and `columns`; values of repeated entries are
+        added. Raises `ValueError` for indices out of range and for rows without a diagonal entry.
         """
         size = _checked_size(size)
         rows = _checked_integers(rows, "from_entries: `rows`")
@@ -154,8 +154,8 @@ class SparsityPattern(Module):
 
     @classmethod
     def _from_contributions(cls, row_lists, column_lists, shapes, size, caller, reason) -> Self:
-        """Pattern of the unique entries of all groups of contributions, and for each contribution the index of its
-        entry."""
+        """Pattern of the unique entries of all groups of contributions; it also stores the index of the entry of each
+        contribution."""
         keys = []
         for rows, columns in zip(row_lists, column_lists, strict=True):
             above, below = np.maximum(rows, columns), np.minimum(rows, columns)
@@ -187,9 +187,10 @@ class SparsityPattern(Module):
         """Add up element matrices to the values (nnz,) of the matrix.
 
         The method takes one argument for each group of elements of the pattern, in the order of the groups: symmetric
-        matrices (m, k, k), of which only the lower triangles are read; or the packed lower triangles (k (k + 1) / 2,
-        m), rows in the order of `numpy.tril_indices(k)`; or None for a group that contributes nothing. Values are real
-        or complex. Raises `ValueError` for another number of arguments, or if all are None.
+        matrices (m, k, k), of which only the lower triangles are read; packed lower triangles (k (k + 1) / 2, m), with
+        rows in the order of `numpy.tril_indices(k)`; or None for a group that contributes nothing. Values are real or
+        complex. Raises `ValueError` if the number of arguments differs from the number of groups, or if all arguments
+        are None.
         """
         if len(element_matrices) != len(self._assembly):
             raise ValueError(
@@ -277,7 +278,7 @@ class AssemblyMap(NamedTuple):
     def create(
         cls, store: IndexStore, entry: np.ndarray, size: int, num_entries: int, shape: tuple[int, ...]
     ) -> "AssemblyMap":
-        """Make the map of a group. `entry`: index of the matrix entry of each packed value (pairs, m), row by row, or
+        """Create the map of a group. `entry`: index of the matrix entry of each packed value (pairs, m), row by row, or
         of each value (m,)."""
         source = np.arange(entry.size)
         on_diagonal = entry < size
@@ -295,7 +296,7 @@ class AssemblyMap(NamedTuple):
         return namespace(flat).concatenate([self.diagonal.apply(indices, flat), self.below.apply(indices, flat)])
 
     def read_back(self, indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Inexact[Array, "..."]:
-        """The matrix entry to which each packed value is added; see `SparsityPattern.entries_between`."""
+        """Read the matrix entry to which each packed value is added; see `SparsityPattern.entries_between`."""
         packed = (len(np.tril_indices(self.shape[1])[0]), self.shape[0]) if len(self.shape) > 1 else self.shape
         size = self.diagonal.gather.shape[1]
         into = namespace(values).zeros(math.prod(packed) + 1, values.dtype)
