@@ -196,8 +196,7 @@ class AttenuatedInverseSquare(AbstractDecay):
 
     @classmethod
     def bounds(cls, extent):
-        """Bounds of the logarithms of a, b and l: for a and b those of `InverseSquare`, for l the bounds of
-        `Exponential`."""
+        """Bounds of the logarithms of a, b and l: for a and b as in `InverseSquare`, for l as in `Exponential`."""
         low, high = InverseSquare.bounds(extent), Exponential.bounds(extent)
         return (*low[0], high[0][1]), (*low[1], high[1][1])
 

@@ -192,14 +192,14 @@ class TapFit(Module):
 
     @property
     def free(self) -> Bool[np.ndarray, "P M"]:
-        """Mask of the parameters that are fitted to data: parameters of microphones with usable readings that are not
+        """Mask of the parameters that are fitted to data: those of microphones with usable readings, except parameters
         fixed at a bound."""
         return ~self.at_bound & self.usable.any(axis=1)
 
     @property
     def shared(self) -> Bool[np.ndarray, " M"]:
-        """Mask of the microphones whose own taps do not determine the decay of the response with distance. The prior
-        from the other microphones then determines the decay.
+        """Mask of the microphones whose own readings do not determine the decay of the response with distance. The
+        prior from the other microphones then determines the decay.
 
         If no tap was near a microphone, the data give only an upper bound of the parameter b of the decay model.
         Without the prior, b could be very small, and estimated positions would be drawn to that microphone.
@@ -235,7 +235,8 @@ def fit_taps(
     place_error: float,
 ) -> TapFit:
     """Fit the decay model `kind` to all microphones: first with a shared shape, then with individual shapes and
-    displacements. The arguments are the fields of `TapFit`; `microphones`: given positions."""
+    displacements. `microphones`, `tap_positions`: given positions in metres; the other arguments are fields of
+    `TapFit`."""
     offset = microphones[:, None] - tap_positions
     extent = float(np.linalg.norm(offset, axis=-1).max())
     spacing = float(np.median(KDTree(microphones).query(microphones, k=2)[0][:, 1])) if len(microphones) > 1 else 0.0
@@ -321,8 +322,8 @@ def _alternate_fits(fit: TapFit, iterations: int, *, update_spread: bool = False
 
 
 def _prior_spread(shapes, displacements) -> Float[np.ndarray, " P"]:
-    """Combine the spread of the shape parameters (`shapes`) and of the displacements (`displacements`) to the spread
-    (P,) of all values, infinite for the gain, which has no prior."""
+    """Concatenate the spreads (P,) of all values: of the gain (infinite, since the gain has no prior), of the shape
+    parameters (`shapes`) and of the displacements (`displacements`)."""
     return np.concatenate([[np.inf], shapes, displacements])
 
 
@@ -338,7 +339,7 @@ def _update_spread(fit: TapFit) -> Float[np.ndarray, " P"]:
     deviations = np.abs(shapes - np.median(shapes, axis=1, keepdims=True))
     limited_deviations = np.minimum(deviations, 3 * fit.spread[1:num_parameters, None])
     shape_variance = (limited_deviations**2 + errors[1:num_parameters] ** 2).sum(axis=1) / (has_readings.sum() - 1)
-    # All coordinates of the displacements have one spread, which is at most `place_error`.
+    # All coordinates of the displacements have the same spread, which is at most `place_error`.
     displacement_variance = np.full(
         len(displacements), (displacements**2 + errors[num_parameters:] ** 2).mean() if displacements.size else 0.0
     )

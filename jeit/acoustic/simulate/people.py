@@ -92,7 +92,8 @@ _MIN_BURST_LENGTH = 0.01
 class SoundingPerson(Module):
     """A simulated person, with individual traits of touch.
 
-    **Fields**: `medians`: for each modality of touch, a dictionary of the person's traits by name, in SI units.
+    **Fields**: `medians`: for each modality of touch, a dictionary from the name of each trait to the person's median
+    value, in SI units.
 
     **Example:**
 
@@ -293,7 +294,7 @@ def simulate_sound_clips(
 
     - `key`: random key.
     - `skin`: the simulated skin.
-    - `people`: the people, as from `SoundingPerson.draw`.
+    - `people`: the people, as returned by `SoundingPerson.draw`.
     - `each`: number of clips of each modality by each person.
     - `modalities`: kinds of touch: "pat", "tickle", "stroke", "wind" and "none".
     - `duration`: duration of a clip, seconds.

@@ -34,8 +34,8 @@ class MicrophoneModel(Module):
     **Fields**
 
     - `depth`: depth of the nominal microphone under the surface, in metres.
-    - `reach`, `snr_db`: signal-to-noise ratio in the frequency band, in decibels, at which a nominal microphone
-      receives a steady source of strength 1 at the horizontal distance `reach` in metres, far from all edges. The
+    - `reach`, `snr_db`: a nominal microphone receives a steady source of strength 1 at the horizontal distance `reach`
+      in metres, far from all edges, with the signal-to-noise ratio `snr_db` in the frequency band, in decibels. The
       microphones of Park 2022 sense touches up to "about 5.5 cm" (Fig. S15), interpreted here as the distance for 0 dB.
     - `gain_spread_db`, `noise_spread_db`: standard deviations of gain and noise power, in decibels of power.
     - `depth_spread`: standard deviation of the logarithm of the depth. The values of all three spreads are choices of
