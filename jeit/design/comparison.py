@@ -171,8 +171,8 @@ def compare_layouts(
 
 
 def check_same_outline(first: Layout | SurfaceLayout, second: Layout | SurfaceLayout) -> None:
-    """Raise `ValueError` unless both layouts are on skins of the same size: for flat skins, the bounding boxes of the
-    outlines, up to a shift, and their areas must agree; for curved skins, the areas of the surfaces."""
+    """Raise `ValueError` unless both layouts are on skins of the same size. For flat skins, the areas of the outlines
+    and the sides of their bounding boxes must agree; for curved skins, the areas of the surfaces."""
     if isinstance(first, SurfaceLayout) or isinstance(second, SurfaceLayout):
         areas = [_layout_area(layout) for layout in (first, second)]
         if type(first) is not type(second) or abs(areas[0] - areas[1]) > 1e-2 * areas[0]:

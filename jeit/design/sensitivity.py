@@ -106,7 +106,7 @@ def sensitivity_map(
     - `contrast`: conductivity of the touched part divided by that of the rest of the skin.
     - `linear`: whether to compute linearised instead of exact voltage changes.
 
-    Raises `ValueError` if the model, the grid and the thickness do not fit together, and for invalid values.
+    Raises `ValueError` if the model, the grid and the thickness are not compatible, and for invalid values.
 
     **Example:**
 

@@ -78,9 +78,9 @@ class DesignSpace(Module):
       this distance is 0.
     - `keep_out`: domains of the skin that no electrode may overlap.
     - `symmetry`: symmetry of the layout about the middle of the outline's bounding box. Every half (x or y below or
-      above the middle) or quarter must contain the same number of electrodes. The electrodes of the first part are
-      kept, and the other electrodes are replaced by images of the first. Use several starts, since a symmetric layout
-      has fewer ways to improve.
+      above the middle) or quarter must contain the same number of electrodes. The electrodes of the first half or
+      quarter are optimised, and the other electrodes are replaced by their images. Use several starts, since a
+      symmetric layout has fewer ways to improve.
     - `sizes`: whether the electrodes' diameters are varied too: True for half to twice the given diameters, or two
       limits, metres.
     - `contact_impedance`: two limits, ohm·m², between which the contact impedances are varied; None to keep the

@@ -47,8 +47,7 @@ def is_curved(mesh: Mesh) -> bool:
 
 
 def touched_surface(mesh: Mesh, face: str = "outer") -> Triangles:
-    """The touched surface of a curved skin: the sheet itself, or the face ("outer" or "inner") of a shell that `face`
-    names."""
+    """Return the touched surface of a curved skin: the sheet itself, or the `face` ("outer" or "inner") of a shell."""
     return Triangles.of(mesh, None if mesh.is_surface else face)
 
 
@@ -213,7 +212,7 @@ def touched_cells(
 
 
 def pad_rows(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Join `rows` of integers of different lengths to one array, padded with zeros. Returns this array and a mask of
+    """Join `rows` of integers of different lengths into one array, padded with zeros. Returns this array and a mask of
     the entries that are not padding."""
     lengths = np.array([len(row) for row in rows])
     is_entry = np.arange(max(lengths.max(), 1)) < lengths[:, None]

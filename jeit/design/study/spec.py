@@ -1,4 +1,4 @@
-"""`Study`: a sweep over electrode layouts and skin parameters, read from a TOML file and checked first."""
+"""`Study`: a sweep over electrode layouts and skin parameters, read from a TOML file and checked."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Point:
 
     @property
     def shape(self) -> Shape:
-        """Parameters that determine which points can share a batch: points with the same shape."""
+        """Parameters that the points of a batch have in common."""
         thickness = self.thickness if self.layers else 0.0
         return Shape(self.layout.num_electrodes, self.protocol, self.pairs, self.cell_size, self.layers, thickness)
 
@@ -327,8 +327,8 @@ def _create_indentation(table: StudyTable) -> AbstractIndentation:
 
 
 def _check_touches(table: StudyTable) -> None:
-    """Check that there are enough touches for the scores, that the results fit the disk, and the computation the
-    memory."""
+    """Check that there are enough touches for the scores, and that disk space and memory suffice for the results and
+    the computation."""
     scores, num_touches = table.scores, table.touch.columns * table.touch.rows
     sheet_scores = [score for score in OPTIMALITY if score in scores.wanted]
     num_bytes = 8.0 * table.num_points * num_touches
