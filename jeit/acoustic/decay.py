@@ -21,7 +21,7 @@ _DISTANCE_SMOOTHING = 1e-16
 
 
 class AbstractDecay(Module):
-    """Base class of decay models, which give the responses f_i of M microphones. A new decay model is a subclass."""
+    """Base class of decay models, which compute the responses f_i of M microphones. A new decay model is a subclass."""
 
     name: ClassVar[str]
     parameters: ClassVar[tuple[str, ...]]

@@ -26,7 +26,7 @@ from jeit.arguments import check_kind
 from jeit_solvers.engines import at_once, namespace, scan
 from jeit_solvers.module import Module
 
-# Candidate spectral densities of acceleration in m²/s³, from a finger at rest to one that moves violently.
+# Candidate spectral densities of acceleration in m²/s³, from a finger at rest to a finger that moves violently.
 _DENSITIES = np.geomspace(1e-5, 10.0, 13)
 # Probability that a correct position is rejected as too far from the filter's prediction.
 _FALSE_REJECTION = 1e-4
@@ -107,8 +107,8 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
             np.where(has_position[touch_frames, None, None], locations.covariance[touch_frames], np.eye(dimension))
             * locations.overlap
         )
-        # A minimum variance, that of a standard deviation of a tenth of a micrometre, is added, since covariances on a
-        # curved surface are singular.
+        # A minimum variance, the square of a tenth of a micrometre, is added, since covariances on a curved surface are
+        # singular.
         measured_covariance = measured_covariance + 1e-14 * np.eye(dimension)
         time_steps = np.diff(times[touch_frames], prepend=times[first])
         states, errors, is_accepted = _smooth_touch(

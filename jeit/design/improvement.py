@@ -22,8 +22,8 @@ from jeit.layout.surface_layout import check_layout, flat_layout
 from jeit.protocol import two_terminal
 from jeit_solvers.module import Module
 
-# Ratio of the number of nodes of the mesh for the final scores to that of the mesh used in the optimisation; number of
-# touched positions along a side in the optimisation, and for the final scores.
+# Ratio of the number of nodes of the mesh for the final scores to the number of nodes of the mesh for the optimisation;
+# number of touched positions along a side in the optimisation, and for the final scores.
 _REFINEMENT_RATIO, _NUM_OPTIMISED_POSITIONS, _NUM_SCORED_POSITIONS = 4, 16, 24
 
 

@@ -40,8 +40,9 @@ class Candidates(Module):
     ) -> "Candidates":
         """Create the candidates from the Jacobian and a prior with covariance Γ of the conductivities.
 
-        - `jacobian`: Jacobian J (M, m) of M candidates with respect to m cells, as from `ForwardModel.jacobian`.
-        - `product`: ΓJᵀ (m, M), the `covariance_product` of a prior times the variance of the conductivity.
+        - `jacobian`: Jacobian J (M, m) of M candidates with respect to m cells, as returned by `ForwardModel.jacobian`.
+        - `product`: ΓJᵀ (m, M): result of the `covariance_product` of a prior, multiplied by the variance of the
+          conductivity.
         - `noise`: standard deviation of the noise of each measurement (M,), or one value for all, volts.
         - `weights`: weights (m,) of the cells in criterion "A", all 1 by default; with the areas of the cells as
           weights, the criterion is an integral over the body.

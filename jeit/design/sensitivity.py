@@ -64,8 +64,8 @@ class SensitivityMap(Module):
         return uniformity(self.values)
 
     def blind_spot(self, level) -> Float[Array, ""]:
-        """Fraction of the skin's area that is less sensitive than `level` (volts), such as the lowest sensitivity of
-        another layout.
+        """Fraction of the skin's area that is less sensitive than `level` (volts), such as the lowest sensitivity of a
+        different layout.
 
         Raises `ValueError` if `level` is negative or not a number.
         """

@@ -55,8 +55,8 @@ class CalibrationFit(Module):
       Their decay follows from a prior, which is estimated from the other microphones.
     - `displacement`: (M, d) estimated displacement of each microphone from its given position in metres. The
       `calibration` has the positions after displacement.
-    - `left_out`: name of each decay model with its median localisation error in metres for taps left out of the fit;
-      infinite if the model located no tap. The selected model is first.
+    - `left_out`: pairs of the name of a decay model and its median localisation error in metres for taps left out of
+      the fit; the error is infinite if the model located no tap. The selected model is first.
     """
 
     calibration: Calibration
@@ -124,7 +124,7 @@ def calibrate_microphones(
       gives the median localisation error of each model for left-out taps. Of the models within 5 % of the smallest
       error, the model with the fewest parameters is selected.
     - `place_error`: standard deviation of each coordinate of the given positions of the microphones, metres; the
-      displacements from these positions are estimated too. 0 if the positions are exact.
+      displacements from these positions are also estimated. Use 0 if the positions are exact.
     - `intensity`: band and windows, for taps given as samples.
     - `progress`: function called with the name of each step when the step begins.
 

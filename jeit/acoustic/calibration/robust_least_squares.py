@@ -45,8 +45,8 @@ def relative_errors(
     variance of additive noise. Outliers are excluded.
 
     `received`: expected power. `use`: mask of the residuals to use. `inflation`: factor on squared residuals that
-    corrects for the number of fitted parameters. Each estimate is shrunk towards the median over all microphones, which
-    has the weight of 20 taps, since the excess variance may be zero or negative if there are few taps.
+    corrects for the number of fitted parameters. Since the excess variance may be zero or negative if there are few
+    taps, each estimate is shrunk towards the median over all microphones, with the weight of 20 taps.
     """
     floor, deviation, cross = (np.asarray(x) for x in (noise.floor, noise.deviation, noise.cross))
     num_inliers, excess = np.zeros(len(received)), np.zeros(len(received))
@@ -76,13 +76,13 @@ def relative_errors(
 def additive_deviations(
     power: Float[np.ndarray, "M T"], received: Float[np.ndarray, "M T"], use: Bool[np.ndarray, "M T"], inflation: float
 ) -> Float[np.ndarray, " M"]:
-    """Estimate the additive deviation s of each microphone, the standard deviation of its intensity without a source,
-    if the noise was not measured.
+    """Estimate the additive deviation s of each microphone: the standard deviation of its intensity without a source.
+    The estimate is needed if the noise was not measured.
 
     The relative error and the additive deviation are estimated together by maximum likelihood, on a grid and then on a
-    finer grid near the maximum. The additive deviation is 0 unless the likelihood is clearly higher than without
-    additive noise. The estimate is at least half the median over all microphones, since few taps determine the noise
-    poorly, and underestimated noise causes false detections.
+    finer grid near the maximum. The additive deviation is 0 unless additive noise clearly increases the likelihood. The
+    estimate is at least half the median over all microphones, since few taps determine the noise poorly, and
+    underestimated noise causes false detections.
     """
     deviation = np.zeros(len(received))
     trial_shares = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 18)])
@@ -352,8 +352,8 @@ def _update_noise_and_weights(fit: TapFit) -> TapFit:
     """Re-estimate the microphones' noise, the outlying taps and the weights from the residuals of the fit."""
     expected = fit.expected()
     received = np.maximum(np.exp(expected) - fit.noise.floor[:, None], 0.0)
-    # The residuals are smaller than the errors of the data, since strengths and parameters were fitted; `inflation`
-    # corrects this.
+    # The residuals are smaller than the errors of the data, since strengths and parameters were fitted to the data;
+    # `inflation` corrects for the difference.
     num_readings = fit.use.sum()
     num_fitted = fit.received.sum() + fit.free.sum()
     inflation = num_readings / max(num_readings - num_fitted, 0.1 * num_readings)

@@ -1,6 +1,7 @@
 """Selection of usable microphones, and cross-validation of decay models.
 
-Microphones that received too few taps, or whose levels disagree with their decay model, are left out of a calibration.
+Microphones that received too few taps, or whose levels disagree with their decay model, are excluded from a
+calibration.
 
 Decay models are compared by their localisation errors for taps left out of the fit. The tapped positions are divided
 into four folds, and the taps of each fold are located with models fitted to the other folds. All taps at one position

@@ -50,9 +50,9 @@ _FALSE_CHANGE, _RANK_TOLERANCE = 0.01, 1e-8
 # Fraction of the trace of a frame's Fisher matrix that is added to the diagonal of this matrix, which is singular where
 # few microphones respond.
 _RIDGE = 1e-12
-# Number of the loudest frames that are used; misfit per degree of freedom above which changes of the setup are searched
-# for; value at which the misfit per degree of freedom is clipped; maximum ratio of the misfits after and before an
-# accepted change.
+# Number of the loudest frames, in which changes of the setup are searched for; misfit per degree of freedom above which
+# the search begins; value at which the misfit per degree of freedom is clipped; maximum ratio of the misfits after and
+# before an accepted change.
 _NUM_FRAMES, _LARGE_MISFIT, _MAX_MISFIT, _MAX_MISFIT_RATIO = 24, 3.0, 100.0, 0.7
 # Maximum number of changes of the setup that are searched for.
 _MAX_CHANGES = 4

@@ -117,8 +117,8 @@ class Consistency(Module):
         """Loss (F, P) of all frames at candidate positions, computed by matrix products.
 
         With A = I_k g_k and n microphones in use, the loss is n A² − 2 A Σ I_i g_i + Σ I_i² g_i². For the
-        inverse-square model, g is quadratic in the position, so the loss is a polynomial of degree four, which is
-        computed as the product of its coefficients and the features.
+        inverse-square model, g is quadratic in the position, so the loss is a polynomial of degree four. The polynomial
+        is computed as the product of its coefficients and the features.
         """
         xp = namespace(self, features)
         num_used = xp.sum(self.use, axis=0)
@@ -341,7 +341,7 @@ def _minimise_on_outline(objective, skip) -> tuple[Minimum, Array]:
     )
     side_ends = origin + directions
     in_corner = (minimum.x[0] <= 0) | (minimum.x[0] >= 1)
-    # A position in a corner of the outline cannot move along a side, so its side is given the length zero.
+    # A position in a corner of the outline cannot move along a side, so its side is replaced by a side of length zero.
     side = xp.stack([origin, xp.where(in_corner, origin, side_ends)])
     return Minimum(to_unknowns(minimum.x, origin, directions), minimum.value, minimum.converged, minimum.steps), side
 

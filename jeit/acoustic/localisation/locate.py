@@ -80,7 +80,7 @@ def locate(
       pause.
     - `gain_drift`: standard deviation of the changes of the microphones' gains since the calibration, as a fraction of
       the intensities. The changes are estimated from all touches of the recording, and the covariances of positions
-      include the remaining errors of the gains. 0 if the gains have not changed.
+      include the remaining errors of the gains. Use 0 if the gains have not changed.
     - `compiled`: whether to compile the computation, which takes seconds but then makes the computation several times
       faster; by default True for more than 1,024 frames with a touch. Use True for many successive recordings.
 

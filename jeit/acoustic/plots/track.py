@@ -52,8 +52,8 @@ def plot_track(
 
     **Arguments:**
 
-    - `track`: smoothed positions, as from the function `track`.
-    - `locations`: positions of the frames, as from `locate`.
+    - `track`: smoothed positions, as returned by the function `track`.
+    - `locations`: positions of the frames, as returned by `locate`.
     - `array`: a `Calibration` or `MicrophoneArray`; microphones that are unusable, or not used in any frame of
       `locations`, are drawn as crosses.
     - `overlay`: brightness (rows, columns) from 0 to 1 over the bounding box of the outline, bottom row first, as in

@@ -35,10 +35,10 @@ def short_text(values: np.ndarray) -> str:
 
 
 def real_array_of(value, label: str, axes: str) -> np.ndarray:
-    """Convert `value` to a real array with as many axes as `axes` names, separated by commas.
+    """Convert `value` to a real array with one axis for each of the names in `axes`, which are separated by commas.
 
-    Arrays of float32 keep their type; other types become float64. Raises `ValueError` for values that are not real, a
-    different number of axes, and empty arrays.
+    Arrays of float32 are not converted; other types are converted to float64. Raises `ValueError` for values that are
+    not real, a different number of axes, and empty arrays.
     """
     try:
         array = np.asarray(value)

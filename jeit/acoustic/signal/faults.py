@@ -140,8 +140,8 @@ def _converter_step(samples: np.ndarray) -> float:
 
 
 def _stuck_samples(samples: np.ndarray, rate: float, extent: float) -> Bool[np.ndarray, " S"] | None:
-    """Mask of the samples in long constant stretches, unless the signal also comes to rest elsewhere; None if no sample
-    is stuck. `extent`: difference between the largest and smallest sample."""
+    """Mask of the stuck samples, those in long constant stretches; None if no sample is stuck, or if the signal also
+    comes to rest elsewhere. `extent`: difference between the largest and smallest sample."""
     min_length = max(_STUCK_SAMPLES, round(_STUCK_TIME * rate))
     # A stuck stretch covers at least two whole blocks. Stretches are searched for only if a block is constant, which
     # saves time.

@@ -112,8 +112,8 @@ def band_power(samples: np.ndarray, grid: WindowGrid) -> np.ndarray:
 
 
 def _overlap_trace(grid: WindowGrid, lag: int) -> float:
-    """tr(A_0 A_lag) for the band-power matrices A of two windows `lag` samples apart: half the covariance of the powers
-    in the two windows for white noise of variance 1.
+    """Compute tr(A_0 A_lag) for the band-power matrices A of two windows `lag` samples apart. The trace is half the
+    covariance of the powers in the two windows for white noise of variance 1.
 
     With g(d) = Σ_k W_k cos(2πkd/N), which has the period N, A_nm = w_n w_m g(n - m). The trace is therefore Σ_d g(d)²
     r(d), where r is the autocorrelation of u_n = w_n w_(n+lag) over the overlap of the windows. No N × N matrix has to

@@ -89,8 +89,8 @@ class Intensities(Module):
     - `power`: band power (F, M) minus the noise floor, in the squared unit of the samples. Values may be negative, and
       are NaN only where a window is not usable.
     - `floor`: noise power (M,) that was subtracted from the band power; zero if unknown.
-    - `freedom`: degrees of freedom ν of the power of white noise in a window, whose variance is 2 floor² / ν. Infinite
-      if unknown.
+    - `freedom`: degrees of freedom ν of the power of white noise in a window: the variance of the power is 2 floor² /
+      ν. Infinite if unknown.
     - `overlap`: length of a window divided by the hop between windows; 1 if windows do not overlap.
     - `usable`: mask (F, M) of the windows without a fault; by default where `power` is finite.
     - `faults`: description of the fault of each of the M channels; "" for no fault.

@@ -5,7 +5,7 @@ The sound of a touch on soft rubber is modelled as band-limited random noise, st
 multiplied by an envelope and then filtered. All functions take an explicit random key, and the same key gives the same
 samples.
 
-A touch with envelope e(t) at a fixed position is received with an energy whose mean over random keys is Σ e² times
+The mean over random keys of the energy received from a touch with envelope e(t) at a fixed position is Σ e² times
 `expected_power`, except for sound beyond the ends of the recording.
 """
 

@@ -3,8 +3,8 @@ microphones.
 
 Simulated recordings replace measurements, since no openly licensed recording of a skin with microphones exists. Sound
 is propagated in the frequency domain with spreading, viscoelastic loss, delays and edge echoes. The simulation thus
-differs from the decay model a/(r² + b) that the calibration fits, and is a meaningful test of this model. The setup is
-that of Park et al., Science Robotics 7, eabm7187 (2022). See `jeit.acoustic.simulate.propagation` for the physics, and
+differs from the decay model a/(r² + b) that the calibration fits, and is a meaningful test of this model. The setup
+follows Park et al., Science Robotics 7, eabm7187 (2022). See `jeit.acoustic.simulate.propagation` for the physics, and
 `jeit.acoustic.simulate.touches` for touches.
 """
 
@@ -264,9 +264,9 @@ class SoundingSkin(Module):
     - `spectral_slope`: the power spectral density of a touch is proportional to frequency to the power
       −`spectral_slope` (1 is 3 dB per octave).
 
-    **Fields**: the arguments except `key`, and of each microphone the depth under the surface `microphone_depth` (M,)
-    in metres, the amplitude `gain` (M,), and `noise_factor` (M,), the noise power divided by that of the nominal
-    microphone.
+    **Fields**: the arguments except `key`; and for each microphone `microphone_depth` (M,), the depth under the surface
+    in metres; `gain` (M,), the gain in amplitude; and `noise_factor` (M,), the noise power divided by the noise power
+    of the nominal microphone.
 
     **Example:**
 

@@ -81,12 +81,12 @@ class DesignSpace(Module):
       above the middle) or quarter must contain the same number of electrodes. The electrodes of the first half or
       quarter are optimised, and the other electrodes are replaced by their images. Use several starts, since a
       symmetric layout has fewer ways to improve.
-    - `sizes`: whether the electrodes' diameters are varied too: True for half to twice the given diameters, or two
+    - `sizes`: whether the electrodes' diameters are varied: True for half to twice the initial diameters, or two
       limits, metres.
-    - `contact_impedance`: two limits, ohm·m², between which the contact impedances are varied; None to keep the
-      impedances.
+    - `contact_impedance`: two limits, ohm·m², between which the contact impedances are varied; None if the impedances
+      are not varied.
     - `thickness`: two limits, metres, between which the thickness of the sheet is varied, starting from the thickness
-      of the skin; the sheet conductivity is proportional to the thickness. None to keep the thickness.
+      of the skin; the sheet conductivity is proportional to the thickness. None if the thickness is not varied.
 
     **Example:**
 

@@ -45,8 +45,8 @@ class SheetTouches(Module):
         return SheetTouches(touched, self.slope * depth_ratio, jnp.asarray(thickness), self.depth)
 
     def weights(self, conductivity: Float[Array, " m"]) -> tuple[Float[Array, "n m"], Float[Array, "2 n m"]]:
-        """Change of the conductivity of every cell by every touch (n, m), siemens, and derivatives of the change with
-        respect to the two coordinates of the position (2, n, m), siemens per metre."""
+        """Compute the change (n, m) of the conductivity of every cell due to every touch, siemens, and the derivatives
+        (2, n, m) of the change with respect to the two coordinates of the position, siemens per metre."""
         cells = self.touched.cells
         indices = np.arange(len(cells))[:, None], cells
 

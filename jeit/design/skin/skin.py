@@ -53,7 +53,7 @@ class Skin(Module):
     - `thickness`: thickness of the skin, metres; for a sheet, thickness of the layer that the sheet represents.
     - `conductivity`: conductivity of the material, S/m, one value or one for each cell.
     - `num_layers`: number of layers of mesh cells; 0 for a sheet.
-    - `cell_size`: cell size of the plane mesh, metres; None if no size was given.
+    - `cell_size`: cell size of the plane mesh, metres; None if no size was specified.
 
     Create a skin with `Skin.create`, which checks the arguments and creates the mesh, or from a custom `model` with
     electrodes of class `SheetDiscs` (`SurfaceDiscs` on a curved sheet) or `FaceDiscs`.
@@ -215,8 +215,8 @@ class Skin(Module):
         """Compute the conductivity changes due to single touches at `places` (n, 2), on a curved skin (n, 3), metres.
 
         `indentation`: shape of the touches, by default `Bell()`; `contrast`: as in the function `touched_cells`. Raises
-        `ValueError` for touches as deep as the skin, for a touch that changes no cell, for instance because there are
-        too few layers of cells, and for a contrast of 1, which changes no conductivity.
+        `ValueError` for touches as deep as the skin, for a touch that changes no cell (for instance with too few layers
+        of cells), and for a contrast of 1, which changes no conductivity.
         """
         indentation = Bell() if indentation is None else indentation
         if not self.num_layers:

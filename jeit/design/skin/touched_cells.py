@@ -1,5 +1,7 @@
-"""Cells and nodes of a skin's mesh that a touch changes: the cells within reach of the touch, by distance along the
-surface and depth below the surface (NumPy), and the relative change of each cell's conductivity."""
+"""Cells and nodes of a skin's mesh that a touch changes, and the relative change of each cell's conductivity.
+
+The cells within reach of a touch are found by distance along the surface and depth below the surface.
+"""
 
 from __future__ import annotations
 

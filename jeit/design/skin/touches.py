@@ -1,5 +1,5 @@
-"""Touches of a skin: their indentation, a depth as a function of the distance from the centre; and grids of touched
-positions, the centres of equal rectangles over a skin."""
+"""Shapes of touches (depth of the indentation as a function of the distance from the centre), and grids of touched
+positions (centres of equal rectangles over a skin)."""
 
 from __future__ import annotations
 

@@ -178,8 +178,8 @@ def _impedance_changes(blocks, corners, inverse, fields, weakening_factor):
     assembled from `blocks` (b, c, q, q), siemens, for its c cells with nodes `corners` (b, c, q), indices among the k
     nodes of the touch. G: `inverse` (b, k, k), ohms, the inverse of the system matrix between these nodes. F: `fields`
     (b, k, L), ohms, the potentials of these nodes for unit currents into the electrodes. `weakening_factor` (b,): see
-    `_weakening_factor`. The b systems are solved together, by conjugate gradients, until the last one has converged; R
-    is the residual of Y.
+    `_weakening_factor`. The b systems are solved together, by conjugate gradients, until the last system has converged;
+    R is the residual of Y.
     """
     touch = jnp.arange(len(fields))[:, None, None]
     num_nodes = fields.shape[1]

@@ -6,8 +6,8 @@ written; a chunk that is not in the list counts as unfinished.
 
 The metadata of a store are checked as plain JSON before Zarr opens the store. Zarr looks up codecs by the names in a
 file, and the codec pickle executes code from the file. A store is therefore opened only if it has the form that jeit
-writes: Zarr format 3, the expected arrays and no others, only numbers and text, codecs that only pack bytes, and no
-links to other paths.
+writes: Zarr format 3, the expected arrays and no others, only numbers and text, codecs that only encode or compress
+bytes, and no links to other paths.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ from jeit.design.study.contents import Contents, study_contents
 from jeit.design.study.lock import locked
 from jeit.design.study.spec import Study
 
-# Codecs allowed in a store, which only pack bytes. Sharding is excluded, since it contains further codecs.
+# Codecs allowed in a store, which only encode or compress bytes. Sharding is excluded, since it contains further
+# codecs.
 CODECS = frozenset({"blosc", "bytes", "crc32c", "transpose", "vlen-utf8", "zstd"})
 # Maximum unpacked size of a chunk of text, and maximum overhead of a chunk of numbers, bytes.
 _MAX_TEXT_CHUNK, _MAX_CHUNK_OVERHEAD = 2**24, 2**12
