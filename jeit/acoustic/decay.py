@@ -16,7 +16,7 @@ from jeit.arguments import check_name
 from jeit_solvers.engines import host, namespace
 from jeit_solvers.module import Module
 
-# Constant in m² added to r², since r = √r² has no derivative at r = 0: the square of a hundredth of a micrometre.
+# Constant in m² added to r², the square of a hundredth of a micrometre, since r = √r² has no derivative at r = 0.
 _DISTANCE_SMOOTHING = 1e-16
 
 

@@ -280,7 +280,7 @@ def locate_touches(
     gain_drift: float = GAIN_DRIFT,
     progress: Callable[[str], None] | None = None,
 ) -> LocatedTouches:
-    """Locate every touch in a recording of microphones, like the command `jeit locate`.
+    """Locate every touch in a recording of microphones, as the command `jeit locate` does.
 
     **Arguments:**
 

@@ -127,8 +127,8 @@ def compare_layouts(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> LayoutComparison:
-    """Compute the responses of two skins with different layouts to touches at a grid of positions, like the command
-    `jeit layout compare`.
+    """Compute the responses of two skins with different layouts to touches at a grid of positions, as the command `jeit
+    layout compare` does.
 
     **Arguments:**
 

@@ -68,7 +68,7 @@ def improve_layout(
     **material: Any,
 ) -> ImprovedLayout:
     """Optimise the electrode positions of `layout` to increase the lowest sensitivity and decrease the mean variance,
-    like the command `jeit layout optimise`.
+    as the command `jeit layout optimise` does.
 
     All two-terminal pairs of a sheet are measured, so the order of the electrodes does not matter.
 

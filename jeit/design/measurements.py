@@ -431,8 +431,8 @@ def _information_and_slope(candidates: Candidates, fractions: Float[Array, " M"]
 
 
 def _inverse_root(matrix: Float[Array, "s s"]) -> Float[Array, "s s"]:
-    """Inverse L⁻¹ of the Cholesky factor of I + `matrix`. Only matrix products are used, since matrix products can
-    always be batched, and solvers of LAPACK may not be."""
+    """Inverse L⁻¹ of the Cholesky factor of I + `matrix`. Only matrix products are used, which can always be batched,
+    unlike LAPACK's solvers."""
     return inverse_cholesky(jnp.eye(len(matrix)) + matrix[None])[0]
 
 

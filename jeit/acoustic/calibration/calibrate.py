@@ -25,7 +25,7 @@ from jeit.arguments import check_kind, describe, is_number
 from jeit_solvers.engines import as_array, host, on_device
 from jeit_solvers.module import Module
 
-# Value of `decay` that selects the decay model by cross-validation.
+# Value of the argument `decay` for which the decay model is selected by cross-validation.
 AUTO = "auto"
 # Minimum relative improvement of the localisation error of left-out taps for which a decay model with more parameters
 # is preferred.
@@ -114,7 +114,8 @@ def calibrate_microphones(
     intensity: IntensitySettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> CalibrationFit:
-    """Fit the decay model of each microphone to taps at known positions, like the command `jeit calibrate-microphones`.
+    """Fit the decay model of each microphone to taps at known positions, as the command `jeit calibrate-microphones`
+    does.
 
     **Arguments:**
 

@@ -40,7 +40,7 @@ _NUM_COARSE_PIXELS = 400
 # Maximum number of frames processed together, so that their arrays fit into the processor's cache: with the coarse
 # grid, and with maps.
 _MAX_CHUNK_FRAMES, _MAX_MAP_FRAMES = 1024, 32
-# Minimum relative error of the decay models assumed when a grid of positions is screened.
+# Minimum relative error of the decay models that is assumed when the objective is evaluated on a grid of positions.
 _SCREENING_ERROR = 0.2
 
 
@@ -103,8 +103,8 @@ class Localiser(Module):
 
         `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022. `map_shape`: (rows,
         columns) of the raster on which the objective of each frame is evaluated, (200, 200) in Park 2022; required for
-        `maps`. By default a coarse grid of about 400 positions is used. The best position is refined with and without a
-        raster. `compiled`: whether to compile calls; False is faster for a single call. Raises `ValueError` for an
+        `maps`. By default a coarse grid of about 400 positions is used. In both cases, the best position is then
+        refined. `compiled`: whether to compile calls; False is faster for a single call. Raises `ValueError` for an
         unknown `method` or an invalid `map_shape`.
         """
         check_array(microphone_array)

@@ -73,8 +73,8 @@ def locate(
     - `recording`: samples or intensities of the calibrated microphones.
     - `calibration`: the calibrated array.
     - `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022.
-    - `map_shape`: (rows, columns) of the raster that is searched, (200, 200) in Park 2022; by default a coarse grid.
-      The best position is refined with and without a raster.
+    - `map_shape`: (rows, columns) of the raster that is searched, (200, 200) in Park 2022; by default a coarse grid. In
+      both cases, the best position is then refined.
     - `intensity`: frequency band and windows, for recordings of samples; by default as in the calibration.
     - `silence`: recording of the untouched array, from which the noise floor is estimated; required if touches never
       pause.
@@ -258,7 +258,7 @@ def _fit_two_sources(
 
 def _limit_uncertainty(status: np.ndarray, result: dict[str, np.ndarray], skin_size: float) -> None:
     """Mark touches as ambiguous if the standard deviation of their position exceeds a fourth of the skin's size, and
-    replace covariances that extend beyond the skin. Modifies `status` and `result` in place."""
+    replace covariances whose standard deviation exceeds the skin's size. Modifies `status` and `result` in place."""
     has_position = np.isfinite(result["position"]).all(axis=1)
     is_finite = np.isfinite(result["covariance"]).all(axis=(1, 2))
     deviation = np.zeros(len(status))
@@ -284,8 +284,8 @@ def _gain_note(changes: GainChanges) -> list[str]:
 def _setup_notes(
     status: np.ndarray, intensities: Intensities, use: np.ndarray, microphone_array: MicrophoneArray
 ) -> list[str]:
-    """Notes on changes of the setup since the calibration. Such changes are searched for if one source does not explain
-    many of the frames."""
+    """Notes on changes of the setup since the calibration. Such changes are searched for if there are many frames that
+    one source does not explain."""
     notes = []
     has_touch = ~np.isin(status, [LocationStatus.NO_TOUCH, LocationStatus.UNUSABLE])
     is_unexplained = np.isin(status, [LocationStatus.MISFIT, LocationStatus.OUTSIDE, LocationStatus.TWO_TOUCHES])

@@ -132,7 +132,7 @@ def map_brightness(
 def overlay_images(
     images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3
 ) -> Float[np.ndarray, "F rows columns"]:
-    """Overlay each image with the images before it, which fade as exp(−age / `time_constant`).
+    """Overlay each image with the earlier images, which fade as exp(−age / `time_constant`).
 
     Each pixel of the result (F, rows, columns) is the maximum over the faded images, so that a source at rest does not
     saturate the pixel. The last image shows the whole recording.

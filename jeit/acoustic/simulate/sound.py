@@ -157,9 +157,9 @@ class SimulatedSound(Module):
     """Simulated samples of M channels during a touch, and the true source.
 
     **Fields**: `samples`: (M, S), in the unit of source strength; `rate`: sampling rate in Hz; `position`: positions
-    (N, 2) of the source in metres at `position_times` (N,) in seconds, or, while the source is silent, of its last or
-    first sound (N = 0 without a source); `active`: root mean square (S,) of the source's sound at `times`, without the
-    delay of propagation; `noisy`: whether the samples include noise.
+    (N, 2) of the source in metres at `position_times` (N,) in seconds (a silent source has the position of its last or
+    first sound, and N = 0 without a source); `active`: root mean square (S,) of the source's sound at `times`, without
+    the delay of propagation; `noisy`: whether the samples include noise.
     """
 
     samples: Float[np.ndarray, "M S"]

@@ -39,8 +39,8 @@ class Constraints(Module):
         x_min, x_max, y_min, y_max = self.outline.extent
         min_radius = float(np.min(radii))
         min_distance = max(self.minimum_spacing, 2 * min_radius)
-        # Circles of radius `min_distance` / 2 around the discs' centres do not overlap. They extend by this radius
-        # beyond the region in which the centres may lie.
+        # Circles of radius `min_distance` / 2 around the discs' centres do not overlap. The circles extend by this
+        # radius beyond the region in which the centres may lie.
         available_area = (x_max - x_min - 2 * min_radius + min_distance) * (
             y_max - y_min - 2 * min_radius + min_distance
         )

@@ -160,8 +160,8 @@ def touched_cells(
     multiplied by `contrast`. With an `edge` in metres, the change rises smoothly over a depth of twice `edge`, and is
     differentiable with respect to depth and position.
 
-    **Sheet** (2-D mesh) that represents a layer of `thickness` metres: a fraction depth / thickness of the
-    cross-section has its conductivity multiplied by `contrast`.
+    **Sheet** (2-D mesh) that represents a layer of `thickness` metres: the conductivity of a fraction depth / thickness
+    of the cross-section is multiplied by `contrast`.
 
     **Curved skin** (a surface in space, or a shell on such a surface): as for a sheet or a layer, but distances are
     along the touched surface, which is the `face` of a shell, and depths along the inward normal.

@@ -47,9 +47,9 @@ EXACT_AT_ONCE, _LINEAR_AT_ONCE = 2, 8
 # Multiple to which the number of strips of nodes that a touch spans is padded, since a program is compiled for each
 # number.
 _STRIP_MULTIPLE = 3
-# Number of touches per call of a compiled program, and ratios of successive sizes to which a touch's numbers of nodes
-# and of cells are padded. One program is compiled for each size, and the cost of a touch grows with the square of its
-# number of nodes.
+# Number of touches per call of a compiled program. The numbers of nodes and of cells of a touch are padded to sizes,
+# and these are the ratios of successive sizes. One program is compiled for each size, and the cost of a touch grows
+# with the square of its number of nodes.
 _TOUCHES_PER_CALL, _NODE_SIZE_RATIO, _CELL_SIZE_RATIO = 2 * EXACT_AT_ONCE, 2**0.5, 2.0
 
 

@@ -1,8 +1,8 @@
 """The store of a study: its points and their results in the Zarr format.
 
-A `Store` contains the results of a study, or of another computation in chunks, on disk. Each chunk has separate files.
-A single file lists the finished chunks with their checksums, and is replaced as a whole after the files of a chunk are
-written; a chunk that is not in the list counts as unfinished.
+A `Store` contains the results of a study, or of a different computation in chunks, on disk. Each chunk has separate
+files. A single file lists the finished chunks with their checksums, and is replaced as a whole after the files of a
+chunk are written; a chunk that is not in the list counts as unfinished.
 
 The metadata of a store are checked as plain JSON before Zarr opens the store. Zarr looks up codecs by the names in a
 file, and the codec pickle executes code from the file. A store is therefore opened only if it has the form that jeit
