@@ -16,12 +16,12 @@ from jeit.arguments import check_name
 from jeit_solvers.engines import host, namespace
 from jeit_solvers.module import Module
 
-# Constant in m² added to r², since r = √r² has no derivative at r = 0: the square of a hundredth of a micrometre.
+# Constant in m² added to r², the square of a hundredth of a micrometre, since r = √r² has no derivative at r = 0.
 _DISTANCE_SMOOTHING = 1e-16
 
 
 class AbstractDecay(Module):
-    """Base class of decay models, which give the responses f_i of M microphones. A new decay model is a subclass."""
+    """Base class of decay models, which compute the responses f_i of M microphones. A new decay model is a subclass."""
 
     name: ClassVar[str]
     parameters: ClassVar[tuple[str, ...]]
@@ -196,8 +196,7 @@ class AttenuatedInverseSquare(AbstractDecay):
 
     @classmethod
     def bounds(cls, extent):
-        """Bounds of the logarithms of a, b and l: for a and b those of `InverseSquare`, for l the bounds of
-        `Exponential`."""
+        """Bounds of the logarithms of a, b and l: for a and b as in `InverseSquare`, for l as in `Exponential`."""
         low, high = InverseSquare.bounds(extent), Exponential.bounds(extent)
         return (*low[0], high[0][1]), (*low[1], high[1][1])
 

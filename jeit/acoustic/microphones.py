@@ -9,8 +9,8 @@ the variance
 Here τ is the relative error of the decay model and of the coupling between skin and microphone, s² is the variance of
 the power of noise alone, and κ S is due to the product of signal and noise. For a noise power N and ν degrees of
 freedom of a window, s² = 2 N² / ν and κ = 4 N / ν (noncentral chi-square distribution). Models are fitted to the levels
-y = log(power + N). For S ≫ N, the level is the logarithm of intensity, with the errors of gains; for S ≪ N, the level
-is only an upper bound of the intensity. The level is nearly normally distributed in both cases.
+y = log(power + N). For S ≫ N, the level is the logarithm of the intensity, and its errors are those of the gains; for S
+≪ N, the level gives only an upper bound of the intensity. The level is nearly normally distributed in both cases.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class IntensityNoise(Module):
     ) -> "IntensityNoise":
         """Create the noise parameters from the subtracted noise `floor` and the degrees of freedom ν of a window
         (`freedom`), or from the standard deviation s of the intensity without a source (`deviation`). `relative`:
-        relative error τ. All parameters are numbers or (M,)."""
+        relative error τ. All parameters are numbers or arrays (M,)."""
         arrays = [np.broadcast_to(np.asarray(value, float), (num_microphones,)) for value in (floor, freedom, relative)]
         floors, degrees, errors = arrays
         deviations = floors * np.sqrt(2 / degrees)

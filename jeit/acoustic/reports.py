@@ -175,8 +175,8 @@ def draw_track(located_touches: LocatedTouches):
 
 
 def _overlay_maps(touches: LocatedTouches) -> np.ndarray | None:
-    """Overlay (rows, columns) of the brightness maps of all located frames, in which older frames are fainter; None if
-    no frame is located."""
+    """Overlay (rows, columns) of the brightness maps of all frames with one located touch, in which older frames are
+    fainter; None if there is no such frame."""
     locations, intensities = touches.locations, touches.intensities
     located_frames = np.flatnonzero(locations.has_position & (locations.status != LocationStatus.TWO_TOUCHES))
     if not located_frames.size:

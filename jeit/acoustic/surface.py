@@ -96,10 +96,10 @@ class CurvedSurface(AbstractSurface):
 def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -> AbstractSurface:
     """Create the surface of a skin with the given `outline`.
 
-    A plane surface is given by vertices (K, 2) in metres or an outline such as `Disk`; a curved surface by vertices (K,
-    3) in metres and optionally `points` (T, 3), such as the positions of taps. The curved surface is a smooth surface
-    that passes close to the vertices and points. Raises `ValueError` for invalid outlines, and for surfaces that fold
-    over their best-fitting plane.
+    A plane surface is specified by vertices (K, 2) in metres or an outline such as `Disk`; a curved surface by vertices
+    (K, 3) in metres and optionally `points` (T, 3), such as the positions of taps. The curved surface is a smooth
+    surface that passes close to the vertices and points. Raises `ValueError` for invalid outlines, and for surfaces
+    that fold over their best-fitting plane.
     """
     if isinstance(outline, Domain):
         edge, *holes = outline.loops()

@@ -1,6 +1,5 @@
-"""The touches in a recording: their tracks, and localisation of all touches in one call, from intensities over the
-position in each frame to the tracks. A track holds the positions of consecutive frames, smoothed in time, and the onset
-and offset of each touch.
+"""Tracks of the touches in a recording, and one call that computes intensities, positions and tracks from a recording.
+A track consists of the positions of consecutive frames, smoothed in time, and the onset and offset of each touch.
 
 The motion of a touch is modelled by a random acceleration: white noise of spectral density q in m²/s³. A Kalman filter
 runs forwards over the positions, and a Rauch-Tung-Striebel smoother runs backwards. Frames without a position are
@@ -27,7 +26,7 @@ from jeit.arguments import check_kind
 from jeit_solvers.engines import at_once, namespace, scan
 from jeit_solvers.module import Module
 
-# Candidate spectral densities of acceleration in m²/s³, from a finger at rest to one that moves violently.
+# Candidate spectral densities of acceleration in m²/s³, from a finger at rest to a finger that moves violently.
 _DENSITIES = np.geomspace(1e-5, 10.0, 13)
 # Probability that a correct position is rejected as too far from the filter's prediction.
 _FALSE_REJECTION = 1e-4
@@ -56,7 +55,7 @@ class Track(Module):
 
     **Fields**: `times`: (F,) times of the frames in seconds; `position`: (F, d) smoothed positions in metres;
     `covariance`: (F, d, d) covariances of the positions in m²; `velocity`: (F, d) velocities in m/s; `touches`: the
-    touches in order of time; `rejected`: mask (F,) of frames whose position is too far from the track of its touch.
+    touches in order of time; `rejected`: mask (F,) of frames whose position is too far from the filter's prediction.
     Position, covariance and velocity are NaN outside touches.
     """
 
@@ -76,7 +75,7 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
 
     **Arguments:**
 
-    - `locations`: positions of the frames, as from `locate`.
+    - `locations`: positions of the frames, as returned by `locate`.
     - `gap`: time without a position after which a touch has ended, seconds.
     - `acceleration`: spectral density q of the random acceleration, m²/s³; by default the most likely value in a range.
 
@@ -108,8 +107,8 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
             np.where(has_position[touch_frames, None, None], locations.covariance[touch_frames], np.eye(dimension))
             * locations.overlap
         )
-        # A minimum variance, that of a standard deviation of a tenth of a micrometre, is added, since covariances on a
-        # curved surface are singular.
+        # A minimum variance, the square of a tenth of a micrometre, is added, since covariances on a curved surface are
+        # singular.
         measured_covariance = measured_covariance + 1e-14 * np.eye(dimension)
         time_steps = np.diff(times[touch_frames], prepend=times[first])
         states, errors, is_accepted = _smooth_touch(
@@ -137,8 +136,8 @@ def _touch_intervals(times, has_position, gap: float) -> list[tuple[int, int]]:
 
 
 def _smooth_touch(time_steps, measured, covariances, has_position, densities) -> tuple[np.ndarray, ...]:
-    """Call `_smooth_positions` with NumPy for a touch with few frames, and otherwise compiled, with the number of
-    frames padded to a power of two."""
+    """Call `_smooth_positions` with NumPy for a touch with few frames. Otherwise compile the function, with the number
+    of frames padded to a power of two."""
     num_frames, dimension = measured.shape
     if num_frames <= MAX_NUMPY_FRAMES:
         return at_once(_smooth_positions, time_steps, measured, covariances, has_position, densities)
@@ -172,8 +171,8 @@ def _smooth_positions(time_steps, measured, measured_covariance, has_position, d
         covariance = covariance + gain @ (smoothed_covariance - next_covariance) @ gain.T
         return (mean, covariance), (mean, covariance)
 
-    # The smoother's recursion starts behind the last frame with a state equal to its prediction, so that the last frame
-    # is unchanged.
+    # The smoother's recursion starts after the last frame with a state equal to its prediction, so that the state of
+    # the last frame is unchanged.
     last_prediction = predicted_mean[-1], predicted_covariance[-1]
     next_arrays = (
         xp.concatenate([array[1:], array[-1:]]) for array in (predicted_mean, predicted_covariance, time_steps)
@@ -212,7 +211,7 @@ def _kalman_filter(step, measured, measured_covariance, has_position, densities)
         # A rejected position lowers the likelihood of a density as much as a position at the limit of acceptance.
         score = xp.where(is_measured, -0.5 * (xp.minimum(squared_distance, max_distance) + log_determinant), 0.0)
         new_mean = xp.where(is_accepted[:, None], mean + xp.einsum("qij,qj->qi", gain, innovation), mean)
-        # The Joseph form of the covariance update is accurate also for nearly exact positions, for which the difference
+        # The Joseph form of the covariance update is accurate even for nearly exact positions, for which the difference
         # in the usual form is lost to rounding.
         update_matrix = xp.eye(2 * dimension) - xp.concatenate([gain, xp.zeros_like(gain)], axis=2)
         updated_covariance = update_matrix @ covariance @ xp.swapaxes(
@@ -281,7 +280,7 @@ def locate_touches(
     gain_drift: float = GAIN_DRIFT,
     progress: Callable[[str], None] | None = None,
 ) -> LocatedTouches:
-    """Locate every touch in a recording of microphones, like the command `jeit locate`.
+    """Locate every touch in a recording of microphones, as the command `jeit locate` does.
 
     **Arguments:**
 
@@ -291,14 +290,15 @@ def locate_touches(
       × 200 pixels and then refined.
     - `gap`: time without a position after which a touch has ended, seconds.
     - `intensity`: frequency band and windows, for recordings of samples; by default as in the calibration.
-    - `silence`: recording of the untouched array, from which the noise floor is estimated if touches never pause.
+    - `silence`: recording of the untouched array, from which the noise floor is estimated; required if touches never
+      pause.
     - `gain_drift`: standard deviation of the changes of the microphones' gains since the calibration, as a fraction of
       the intensities; see `locate`.
     - `progress`: function called with the name of each step of the computation when the step begins.
 
-    Raises `ValueError` for a recording with another number of microphones than the calibration, fewer than three usable
-    microphones, frames farther apart than `gap`, `intensity` or `silence` given for a recording of intensities, and
-    values out of range.
+    Raises `ValueError` if the recording and the calibration have different numbers of microphones, if fewer than three
+    microphones are usable, and if frames are farther apart than `gap`. Also raises `ValueError` for `intensity` or
+    `silence` with a recording of intensities, and for values out of range.
 
     **Example:**
 

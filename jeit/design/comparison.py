@@ -127,8 +127,8 @@ def compare_layouts(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> LayoutComparison:
-    """Compute the responses of two skins with different layouts to touches at a grid of positions, like the command
-    `jeit layout compare`.
+    """Compute the responses of two skins with different layouts to touches at a grid of positions, as the command `jeit
+    layout compare` does.
 
     **Arguments:**
 
@@ -171,8 +171,8 @@ def compare_layouts(
 
 
 def check_same_outline(first: Layout | SurfaceLayout, second: Layout | SurfaceLayout) -> None:
-    """Raise `ValueError` unless both layouts are on skins of the same size: for flat skins, the bounding boxes of the
-    outlines, up to a shift, and their areas must agree; for curved skins, the areas of the surfaces."""
+    """Raise `ValueError` unless both layouts are on skins of the same size. For flat skins, the areas of the outlines
+    and the sides of their bounding boxes must agree; for curved skins, the areas of the surfaces."""
     if isinstance(first, SurfaceLayout) or isinstance(second, SurfaceLayout):
         areas = [_layout_area(layout) for layout in (first, second)]
         if type(first) is not type(second) or abs(areas[0] - areas[1]) > 1e-2 * areas[0]:

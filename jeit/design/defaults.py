@@ -20,8 +20,9 @@ CONTACT_IMPEDANCE = 1e-4  # ohm·m²
 PROTOCOL = "two-terminal"
 NUM_PAIRS = 94
 CURRENT = 1e-3  # A
-# Standard deviation of a voltage: 80 dB below the root mean square, 0.18 V, of the voltages between two electrodes of
-# this skin at 1 mA. A good instrument reaches this signal-to-noise ratio; the skins of jeit.simulate have it too.
+# Standard deviation of the noise of a voltage: 80 dB below the root mean square, 0.18 V, of the voltages between two
+# electrodes of this skin at 1 mA. A good instrument reaches this signal-to-noise ratio, which the skins of
+# jeit.simulate have too.
 NOISE = 2e-5  # V
 
 # The touch: the unit deformation of Park et al., or a ball as in their experiments. The indenter is an insulator.
@@ -71,5 +72,6 @@ ScoreName = Literal[
     "largest_variance",
     "localisation_error",
 ]
-# Scores for sheets only, from linearised voltage changes and a prior: see `jeit.design.layout_scores`.
+# Scores that are computed for sheets only, from linearised voltage changes and a prior: see
+# `jeit.design.layout_scores`.
 OPTIMALITY = ("information", "mean_variance", "largest_variance", "localisation_error")

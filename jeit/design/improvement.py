@@ -22,8 +22,8 @@ from jeit.layout.surface_layout import check_layout, flat_layout
 from jeit.protocol import two_terminal
 from jeit_solvers.module import Module
 
-# Ratio of the number of nodes of the mesh for the final scores to that of the mesh used in the optimisation; number of
-# touched positions along a side in the optimisation, and for the final scores.
+# Ratio of the number of nodes of the mesh for the final scores to the number of nodes of the mesh for the optimisation;
+# number of touched positions along a side in the optimisation, and for the final scores.
 _REFINEMENT_RATIO, _NUM_OPTIMISED_POSITIONS, _NUM_SCORED_POSITIONS = 4, 16, 24
 
 
@@ -67,8 +67,8 @@ def improve_layout(
     callback: Callable[[int, np.ndarray], None] | None = None,
     **material: Any,
 ) -> ImprovedLayout:
-    """Optimise the electrode positions of `layout` for the lowest sensitivity and the mean variance, like the command
-    `jeit layout optimise`.
+    """Optimise the electrode positions of `layout` to increase the lowest sensitivity and decrease the mean variance,
+    as the command `jeit layout optimise` does.
 
     All two-terminal pairs of a sheet are measured, so the order of the electrodes does not matter.
 
@@ -78,13 +78,13 @@ def improve_layout(
     - `space`: the allowed layouts; by default all layouts on the skin whose electrodes' centres are at least 8 mm
       apart.
     - `noise`: standard deviation of the noise of a voltage at 1 mA, volts.
-    - `steps`, `starts`, `callback`: as in `optimise_layout`; `seed`: random seed of the starts.
+    - `steps`, `starts`, `callback`: as in `optimise_layout`; `seed`: random seed of the random starts.
     - `num_points`: approximate number of nodes of the mesh used in the optimisation; the final scores are computed on a
       mesh with four times as many nodes.
     - `progress`: function called with the name of each step ("mesh", "optimise", "confirm") as the step begins.
     - `material`: thickness, conductivity and contact impedance, as in `Skin.create`.
 
-    Raises `ValueError` if no layout satisfies the constraints, and as `Skin.create` and `optimise_layout` do.
+    Raises `ValueError` if no layout satisfies the constraints, and in the cases of `Skin.create` and `optimise_layout`.
 
     **Example:**
 

@@ -40,8 +40,9 @@ class Candidates(Module):
     ) -> "Candidates":
         """Create the candidates from the Jacobian and a prior with covariance Γ of the conductivities.
 
-        - `jacobian`: Jacobian J (M, m) of M candidates with respect to m cells, as from `ForwardModel.jacobian`.
-        - `product`: ΓJᵀ (m, M), the `covariance_product` of a prior times the variance of the conductivity.
+        - `jacobian`: Jacobian J (M, m) of M candidates with respect to m cells, as returned by `ForwardModel.jacobian`.
+        - `product`: ΓJᵀ (m, M): result of the `covariance_product` of a prior, multiplied by the variance of the
+          conductivity.
         - `noise`: standard deviation of the noise of each measurement (M,), or one value for all, volts.
         - `weights`: weights (m,) of the cells in criterion "A", all 1 by default; with the areas of the cells as
           weights, the criterion is an integral over the body.
@@ -198,7 +199,7 @@ def select_measurements(
 
 
 def information(candidates: Candidates, chosen, *, criterion: Criterion = "D") -> Float[Array, "..."]:
-    """Information (...,) of sets of candidate measurements, given by N different indices per set, `chosen` (..., N).
+    """Compute the information (...,) of sets of candidate measurements. `chosen` (..., N): N different indices per set.
 
     Raises `ValueError` for invalid indices, and for an unknown criterion.
     """
@@ -263,7 +264,7 @@ def nearest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N"
     the protocol that measures all pairs of L electrodes.
 
     `centres`: positions (L, d) of the electrodes, metres. `lengths`: distances (L, L) between the electrodes, metres,
-    such as those along a surface from `SurfaceLayout.lengths`; by default the straight distances. With the nearest
+    such as distances along a surface from `SurfaceLayout.lengths`; by default the straight distances. With the nearest
     pairs, every position of the skin is measured by electrodes close to it. Pairs of equal distance are taken in the
     order of the channels. Raises `ValueError` if `number` is not from 1 to L(L - 1)/2.
     """
@@ -333,7 +334,7 @@ def _greedy_selection(candidates: Candidates, number: int, criterion: Criterion)
     Cholesky factorisation of I + FFᵀ, where F has the rows f_i, with the best candidate as the next pivot.
 
     Choosing candidate p changes the posterior covariance from C to C - uuᵀ with u = C f_p / √(1 + f_pᵀC f_p). The rows
-    of `directions` are the vectors u found so far.
+    of `directions` are the vectors u of the previous steps.
     """
     rows, weight = candidates.rows, candidates.weight
 
@@ -430,8 +431,8 @@ def _information_and_slope(candidates: Candidates, fractions: Float[Array, " M"]
 
 
 def _inverse_root(matrix: Float[Array, "s s"]) -> Float[Array, "s s"]:
-    """Inverse L⁻¹ of the Cholesky factor of I + `matrix`. Only matrix products are used, since they can always be
-    batched, whereas LAPACK's solvers may not be."""
+    """Inverse L⁻¹ of the Cholesky factor of I + `matrix`. Only matrix products are used, which can always be batched,
+    unlike LAPACK's solvers."""
     return inverse_cholesky(jnp.eye(len(matrix)) + matrix[None])[0]
 
 

@@ -63,7 +63,7 @@ class TouchPrior(Module):
         exp(-d² / 2 correlation²).
 
         `places`: touched positions (n, 2), or (n, 3) on a curved skin, metres. `lengths`: distances (n, n) between the
-        positions, metres, such as those along a curved surface from `Geodesics.between`; by default the straight
+        positions, metres, such as distances along a curved surface from `Geodesics.between`; by default the straight
         distances. Principal components with less than a millionth of the largest variance are omitted. Raises
         `ValueError` if `correlation` or `deviation` is not positive, and for invalid positions.
         """
@@ -157,7 +157,7 @@ def layout_scores(
 
     - `model`: forward model of the sheet.
     - `conductivity`: sheet conductivity, siemens.
-    - `touches`: touches of the sheet, as from `Skin.sheet_touches`.
+    - `touches`: touches of the sheet, as returned by `Skin.sheet_touches`.
     - `prior`: prior of the amplitudes of the touches.
     - `noise`: standard deviation of the noise of each of M channels (M,), or one value for all, volts.
     - `temperature`: temperature T of the smooth minimum of the sensitivity.
@@ -244,7 +244,7 @@ def _localisation_error(
     `amplitude_slope`, `position_slopes`: derivatives of the whitened voltages with respect to the amplitude, and to x
     and y."""
     xp, size = namespace(amplitude_slope), (amplitude_slope**2).sum(axis=1)
-    # Part of the position derivatives that is orthogonal to the amplitude derivative. It may be small, so it is
+    # Part of the position derivatives that is orthogonal to the amplitude derivative. This part may be small, so it is
     # computed before squaring.
     x_slope, y_slope = (
         position_slopes - ((position_slopes * amplitude_slope).sum(axis=2) / size)[..., None] * amplitude_slope

@@ -64,8 +64,8 @@ class SensitivityMap(Module):
         return uniformity(self.values)
 
     def blind_spot(self, level) -> Float[Array, ""]:
-        """Fraction of the skin's area that is less sensitive than `level` (volts), such as the lowest sensitivity of
-        another layout.
+        """Fraction of the skin's area that is less sensitive than `level` (volts), such as the lowest sensitivity of a
+        different layout.
 
         Raises `ValueError` if `level` is negative or not a number.
         """
@@ -106,7 +106,7 @@ def sensitivity_map(
     - `contrast`: conductivity of the touched part divided by that of the rest of the skin.
     - `linear`: whether to compute linearised instead of exact voltage changes.
 
-    Raises `ValueError` if the model, the grid and the thickness do not fit together, and for invalid values.
+    Raises `ValueError` if the model, the grid and the thickness are not compatible, and for invalid values.
 
     **Example:**
 

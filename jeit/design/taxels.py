@@ -19,7 +19,7 @@ from jeit_solvers.module import Module
 
 
 class Taxels(Module):
-    """The k virtual taxels of an electrode layout, from touches at n positions; `find_taxels` creates taxels.
+    """The k virtual taxels of an electrode layout, from touches at n positions, as returned by `find_taxels`.
 
     **Fields**
 
@@ -151,7 +151,7 @@ def find_taxels(
     - `directions`: whether to scale the voltage changes to length 1 before clustering. Without scaling, as in Park et
       al., positions of low sensitivity fall into one cluster, since all their voltage changes are small. With scaling,
       the changes in a cluster have a similar pattern.
-    - `restarts`: number of runs of k-means from random starts, of which the best result is kept.
+    - `restarts`: number of runs of k-means from random starts, of which the best result is used.
 
     Raises `ValueError` for shapes that disagree, voltage changes that are not finite or are all zero, and lengths and
     areas whose units do not fit together.

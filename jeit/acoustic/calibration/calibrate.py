@@ -25,7 +25,7 @@ from jeit.arguments import check_kind, describe, is_number
 from jeit_solvers.engines import as_array, host, on_device
 from jeit_solvers.module import Module
 
-# Value of `decay` that selects the decay model by cross-validation.
+# Value of the argument `decay` for which the decay model is selected by cross-validation.
 AUTO = "auto"
 # Minimum relative improvement of the localisation error of left-out taps for which a decay model with more parameters
 # is preferred.
@@ -33,8 +33,8 @@ _MIN_IMPROVEMENT = 0.05
 # Relative error of the predicted intensities above which the calibration gives a note. On simulated skins with uneven
 # coupling and exact positions, the relative error is 18 to 21 %.
 _LARGE_ERROR = 0.23
-# Minimum fraction of the microphones with enough taps that must agree with the decay model, unless left-out taps are
-# located well. Otherwise the given positions of the microphones are rejected.
+# Of the microphones with enough taps, the minimum fraction that must agree with the decay model, unless left-out taps
+# are located well. If fewer agree, the decay model is rejected.
 _MIN_USABLE_SHARE = 0.5
 # Default standard deviation of each coordinate of the microphones' given positions, in metres.
 PLACE_ERROR = 2e-3
@@ -46,18 +46,17 @@ class CalibrationFit(Module):
     - `calibration`: the fitted calibration.
     - `distance`: (T, M) distance of each tap from the estimated position of each microphone in metres.
     - `power`: (T, M) intensities of the taps minus the noise floor.
-    - `usable`: (T, M) mask of the intensities to which the models were fitted before unusable microphones were
-      excluded.
+    - `usable`: (T, M) mask of the intensities used in the first fit, before unusable microphones were excluded.
     - `strength`: (T,) strengths of the taps; NaN if no microphone received the tap or the tap was excluded.
     - `outlier`: (T,) mask of taps that were excluded because no single source at the given position explains their
       intensities.
     - `explained`: (M,) fraction of the variance of a microphone's levels that its decay model explains.
-    - `shared`: (M,) mask of microphones whose own taps do not determine the decay of the response with distance. The
-      decay is then taken from the other microphones.
+    - `shared`: (M,) mask of microphones whose own intensities do not determine the decay of the response with distance.
+      Their decay follows from a prior, which is estimated from the other microphones.
     - `displacement`: (M, d) estimated displacement of each microphone from its given position in metres. The
       `calibration` has the positions after displacement.
-    - `left_out`: name of each decay model with its median localisation error in metres for taps left out of the fit;
-      infinite if the model located no tap. The selected model is first.
+    - `left_out`: pairs of the name of a decay model and its median localisation error in metres for taps left out of
+      the fit; the error is infinite if the model located no tap. The selected model is first.
     """
 
     calibration: Calibration
@@ -115,23 +114,24 @@ def calibrate_microphones(
     intensity: IntensitySettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> CalibrationFit:
-    """Fit the decay model of each microphone to taps at known positions, like the command `jeit calibrate-microphones`.
+    """Fit the decay model of each microphone to taps at known positions, as the command `jeit calibrate-microphones`
+    does.
 
     **Arguments:**
 
     - `taps`: the taps, with the positions of taps and microphones.
     - `decay`: "inverse-square", a / (r² + b) as in Park 2022; "exponential", a exp(−r / l); "attenuated", a exp(−r / l)
-      / (r² + b); a subclass of `AbstractDecay`; or "auto", which compares the median localisation errors of left-out
-      taps (four-fold cross-validation over the positions) and selects, of the models within 5 % of the smallest error,
-      the one with the fewest parameters.
+      / (r² + b); a subclass of `AbstractDecay`; or "auto". With "auto", four-fold cross-validation over the positions
+      gives the median localisation error of each model for left-out taps. Of the models within 5 % of the smallest
+      error, the model with the fewest parameters is selected.
     - `place_error`: standard deviation of each coordinate of the given positions of the microphones, metres; the
-      displacements from these positions are estimated too. 0 if the positions are exact.
+      displacements from these positions are also estimated. Use 0 if the positions are exact.
     - `intensity`: band and windows, for taps given as samples.
     - `progress`: function called with the name of each step when the step begins.
 
-    Raises `ValueError` if fewer than three microphones can be calibrated, if most microphones disagree with the
-    given positions and left-out taps are located badly, for an unknown `decay`, a `place_error` that is negative or
-    not finite, for `intensity` given with taps that are intensities, and for arguments of the wrong type.
+    Raises `ValueError` if fewer than three microphones can be calibrated, or if most microphones disagree with the
+    decay model and left-out taps are located badly. Also raises `ValueError` for an unknown `decay`, a `place_error`
+    that is negative or not finite, `intensity` with taps given as intensities, and arguments of the wrong type.
 
     **Example:**
 
@@ -168,8 +168,8 @@ def fit_each_decay(
     intensity: IntensitySettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, CalibrationFit], dict[str, str]]:
-    """Fit each of the given decay models, by default all. Returns a dictionary of the fits by the model's name, and a
-    dictionary of the reasons why other models could not be fitted.
+    """Fit each of the given decay models, by default all decay models. Returns a dictionary of the fits, and a
+    dictionary of the reasons why models could not be fitted; the keys are the names of the models.
 
     `progress` is called with the name of each step when the step begins. Raises `ValueError` as `calibrate_microphones`
     does, but not if no decay model can be fitted.
@@ -287,7 +287,7 @@ def _calibration_fit(taps: Taps, fit_input: _FitInput, fitted: _FittedModel, lef
     """Create the `CalibrationFit` of a fitted decay model. `left_out`: name and localisation error of each decay
     model."""
     fit, is_usable = fitted.fit, fitted.usable
-    # Logarithm of the common factor of gains and strengths, which `Calibration` defines.
+    # Logarithm of the factor by which gains are divided and strengths are multiplied; see `Calibration`.
     log_gain = np.log(np.asarray(fit.kind.from_logarithms(host.asarray(fit.logarithms)).gain))[is_usable].mean()
     strength = np.where(fit.received, np.exp(fit.strength + log_gain), np.nan)
     shared, errors = fit.shared & is_usable, standard_errors(fit)[: len(fit.logarithms)]

@@ -43,7 +43,7 @@ _MAX_FLOOR_RATIO = 4.0
 
 
 class Calibration(Module):
-    """A calibrated array of microphones, as from `calibrate_microphones`.
+    """A calibrated array of microphones, such as the `calibration` in the result of `calibrate_microphones`.
 
     **Fields**
 
@@ -55,8 +55,8 @@ class Calibration(Module):
       given as intensities.
     - `name`: name of the calibration taps.
     - `strengths`: strengths of the weakest and the strongest calibration tap; None if unknown.
-    - `widening`: factor by which `locate` multiplies covariances of positions, chosen so that the error ellipses
-      contain taps that were left out of the fit.
+    - `widening`: factor by which `locate` multiplies covariances of positions, chosen so that the 90 % error ellipses
+      contain 90 % of the taps that were left out of the fit; at least 1.
 
     The taps determine the gains of the decay models and the strengths of the taps only up to a common factor. The
     factor is chosen so that the geometric mean of the responses f_i(0) at distance 0 over the usable microphones is 1.
@@ -92,8 +92,8 @@ class Calibration(Module):
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
-        """Read a calibration from a file written by `save`. Raises `ValueError` for a file of another format, version
-        or unit and for invalid values, and `OSError` if the file cannot be opened."""
+        """Read a calibration from a file written by `save`. Raises `ValueError` for a file of a different format,
+        version or unit and for invalid values, and `OSError` if the file cannot be opened."""
         # Imported here, since the import of pydantic takes longer than most operations with a calibration.
         from jeit.acoustic.calibration.calibration_tables import CalibrationTable
         from jeit.files.limits import faults_message
@@ -255,9 +255,9 @@ def calibrated_intensities(
 
     `intensity`: frequency band and windows, by default as in the calibration. `silence`: recording of the untouched
     array at the same gain, from which the noise floor is estimated. A silence is required if touches never pause; by
-    default the floor is estimated from the quietest windows of the recording. Raises `ValueError` for another number of
-    microphones than in the calibration, for a `silence` that is louder than the quietest windows of the recording, and
-    for arguments of the wrong type.
+    default the floor is estimated from the quietest windows of the recording. Raises `ValueError` if the number of
+    microphones differs from that of the calibration, for a `silence` that is louder than the quietest windows of the
+    recording, and for arguments of the wrong type.
     """
     recordings = {"recording": recording} if silence is None else {"recording": recording, "silence": silence}
     for name, value in recordings.items():

@@ -3,10 +3,10 @@
 Microphones are the first axis of arrays, and taps the last. For M microphones with P values (parameters and
 displacements) each, and T taps of one strength each, there are P M + T unknowns. The strengths of the taps are
 eliminated by a Schur complement, which leaves a system with P M unknowns. Since the microphones of an array are usually
-of the same kind, a penalty acts on the deviation of each parameter except the first (the gain) from the parameter's
-common value over the array, relative to a `spread`. The common value is eliminated too: the mean over the array
-minimises the penalty. Microphones may be displaced from their given positions; the displacements are further unknowns,
-with a penalty on their deviation from 0. The code uses NumPy, since a microphone array is calibrated only once.
+of the same kind, a penalty acts on the deviation of each parameter from its mean over the array, relative to a standard
+deviation `spread`. The first parameter, the gain, has no penalty. Microphones may be displaced from their given
+positions; the displacements are further unknowns, with a penalty on their deviation from 0. The code uses NumPy, since
+a microphone array is calibrated only once.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ class DecayProblem(NamedTuple):
     **Fields**: `level`: levels y (M, T), logarithms of received power; `offset`: vectors (M, T, d) from the taps to the
     given positions of the microphones in metres; `weight`: weights (M, T) of the levels, 0 for unused levels; `floor`:
     noise floors N (M,); `decay`: class of the decay model; `spread`: standard deviation (P,) of each value over the
-    microphones in the penalty, infinite for no penalty; `place_error`: unit of the displacements in metres.
+    microphones that the penalty assumes, infinite for values without a penalty; `place_error`: length in metres that is
+    the unit of the displacements.
 
     The values (P, M) of the microphones are the logarithms of the K parameters of each decay model and, for P = K + d,
     the d coordinates of each microphone's displacement divided by `place_error`.
@@ -65,8 +66,8 @@ class DecayProblem(NamedTuple):
         self, values: Float[np.ndarray, "P M"], strength: Float[np.ndarray, " T"]
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"]]:
         """Expected levels m = log(e^s f + N) (M, T), where f is the response and N the noise floor, and the derivatives
-        of m with respect to s, which equal those with respect to log f. `strength` (T,): logarithms s of the taps'
-        strengths."""
+        of m with respect to s, which equal the derivatives with respect to log f. `strength` (T,): logarithms s of the
+        taps' strengths."""
         return self.levels(strength + self.log_response(values))
 
     def levels(

@@ -45,8 +45,8 @@ def relative_errors(
     variance of additive noise. Outliers are excluded.
 
     `received`: expected power. `use`: mask of the residuals to use. `inflation`: factor on squared residuals that
-    corrects for the number of fitted parameters. Each estimate is shrunk towards the median over all microphones, which
-    has the weight of 20 taps, since the excess variance may be zero or negative if there are few taps.
+    corrects for the number of fitted parameters. Since the excess variance may be zero or negative if there are few
+    taps, each estimate is shrunk towards the median over all microphones, with the weight of 20 taps.
     """
     floor, deviation, cross = (np.asarray(x) for x in (noise.floor, noise.deviation, noise.cross))
     num_inliers, excess = np.zeros(len(received)), np.zeros(len(received))
@@ -76,13 +76,13 @@ def relative_errors(
 def additive_deviations(
     power: Float[np.ndarray, "M T"], received: Float[np.ndarray, "M T"], use: Bool[np.ndarray, "M T"], inflation: float
 ) -> Float[np.ndarray, " M"]:
-    """Estimate the additive deviation s of each microphone, the standard deviation of its intensity without a source,
-    if the noise was not measured.
+    """Estimate the additive deviation s of each microphone: the standard deviation of its intensity without a source.
+    The estimate is needed if the noise was not measured.
 
     The relative error and the additive deviation are estimated together by maximum likelihood, on a grid and then on a
-    finer grid near the maximum. The additive deviation is 0 unless the likelihood is clearly higher than without
-    additive noise. The estimate is at least half the median over all microphones, since few taps determine the noise
-    poorly, and underestimated noise causes false detections.
+    finer grid near the maximum. The additive deviation is 0 unless additive noise clearly increases the likelihood. The
+    estimate is at least half the median over all microphones, since few taps determine the noise poorly, and
+    underestimated noise causes false detections.
     """
     deviation = np.zeros(len(received))
     trial_shares = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 18)])
@@ -192,14 +192,14 @@ class TapFit(Module):
 
     @property
     def free(self) -> Bool[np.ndarray, "P M"]:
-        """Mask of the parameters that are fitted to data: parameters of microphones with usable readings that are not
+        """Mask of the parameters that are fitted to data: those of microphones with usable readings, except parameters
         fixed at a bound."""
         return ~self.at_bound & self.usable.any(axis=1)
 
     @property
     def shared(self) -> Bool[np.ndarray, " M"]:
-        """Mask of the microphones whose own taps do not determine the decay of the response with distance. The prior
-        from the other microphones then determines the decay.
+        """Mask of the microphones whose own readings do not determine the decay of the response with distance. The
+        prior from the other microphones then determines the decay.
 
         If no tap was near a microphone, the data give only an upper bound of the parameter b of the decay model.
         Without the prior, b could be very small, and estimated positions would be drawn to that microphone.
@@ -235,7 +235,8 @@ def fit_taps(
     place_error: float,
 ) -> TapFit:
     """Fit the decay model `kind` to all microphones: first with a shared shape, then with individual shapes and
-    displacements. The arguments are the fields of `TapFit`; `microphones`: given positions."""
+    displacements. `microphones`, `tap_positions`: given positions in metres; the other arguments are fields of
+    `TapFit`."""
     offset = microphones[:, None] - tap_positions
     extent = float(np.linalg.norm(offset, axis=-1).max())
     spacing = float(np.median(KDTree(microphones).query(microphones, k=2)[0][:, 1])) if len(microphones) > 1 else 0.0
@@ -321,8 +322,8 @@ def _alternate_fits(fit: TapFit, iterations: int, *, update_spread: bool = False
 
 
 def _prior_spread(shapes, displacements) -> Float[np.ndarray, " P"]:
-    """Combine the spread of the shape parameters (`shapes`) and of the displacements (`displacements`) to the spread
-    (P,) of all values, infinite for the gain, which has no prior."""
+    """Concatenate the spreads (P,) of all values: of the gain (infinite, since the gain has no prior), of the shape
+    parameters (`shapes`) and of the displacements (`displacements`)."""
     return np.concatenate([[np.inf], shapes, displacements])
 
 
@@ -338,7 +339,7 @@ def _update_spread(fit: TapFit) -> Float[np.ndarray, " P"]:
     deviations = np.abs(shapes - np.median(shapes, axis=1, keepdims=True))
     limited_deviations = np.minimum(deviations, 3 * fit.spread[1:num_parameters, None])
     shape_variance = (limited_deviations**2 + errors[1:num_parameters] ** 2).sum(axis=1) / (has_readings.sum() - 1)
-    # All coordinates of the displacements have one spread, which is at most `place_error`.
+    # All coordinates of the displacements have the same spread, which is at most `place_error`.
     displacement_variance = np.full(
         len(displacements), (displacements**2 + errors[num_parameters:] ** 2).mean() if displacements.size else 0.0
     )
@@ -351,8 +352,8 @@ def _update_noise_and_weights(fit: TapFit) -> TapFit:
     """Re-estimate the microphones' noise, the outlying taps and the weights from the residuals of the fit."""
     expected = fit.expected()
     received = np.maximum(np.exp(expected) - fit.noise.floor[:, None], 0.0)
-    # The residuals are smaller than the errors of the data, since strengths and parameters were fitted; `inflation`
-    # corrects this.
+    # The residuals are smaller than the errors of the data, since strengths and parameters were fitted to the data;
+    # `inflation` corrects for the difference.
     num_readings = fit.use.sum()
     num_fitted = fit.received.sum() + fit.free.sum()
     inflation = num_readings / max(num_readings - num_fitted, 0.1 * num_readings)

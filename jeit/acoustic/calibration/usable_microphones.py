@@ -1,6 +1,7 @@
 """Selection of usable microphones, and cross-validation of decay models.
 
-Microphones that received too few taps, or whose levels disagree with their decay model, are left out of a calibration.
+Microphones that received too few taps, or whose levels disagree with their decay model, are excluded from a
+calibration.
 
 Decay models are compared by their localisation errors for taps left out of the fit. The tapped positions are divided
 into four folds, and the taps of each fold are located with models fitted to the other folds. All taps at one position
@@ -41,8 +42,8 @@ _MIN_DECREASE = 0.1
 def check_received(
     decay_class: type[AbstractDecay], distance: Float[np.ndarray, "M T"], power: Float[np.ndarray, "M T"], faults
 ) -> tuple[Bool[np.ndarray, " M"], str]:
-    """Return the mask of the microphones that received taps from enough different distances, and a reason: "", or why
-    no decay model can be fitted if there are fewer than three such microphones."""
+    """Return the mask of the microphones that received taps from enough different distances, and a reason. If there are
+    fewer than three such microphones, the reason says why the decay model cannot be fitted; otherwise it is empty."""
     min_distances = len(decay_class.parameters) + 2
     resolution = 1e-4 * distance.max()
     is_received = np.isfinite(power)
@@ -131,8 +132,8 @@ def _response_decrease(fit: TapFit) -> Float[np.ndarray, " M"]:
 
 # Number of folds in the cross-validation.
 _NUM_FOLDS = 4
-# Minimum relative error of decay models assumed when a raster of positions is screened; maximum number of steps of a
-# minimisation.
+# Minimum relative error of the decay models that is assumed when the likelihood is evaluated on a raster of positions;
+# maximum number of steps of a minimisation.
 _SCREENING_ERROR, _MAX_STEPS = 0.2, 30
 # Minimum number of located taps for an estimate of `widening`; fraction of the taps that the error ellipses must
 # contain; quantile of χ² with two degrees of freedom for this fraction.
@@ -218,9 +219,9 @@ def _microphone_array(fit: TapFit, values, microphones, surface: AbstractSurface
 
 
 def _locate_most_likely(array: MicrophoneArray, raster: Pixels, power, use):
-    """Locate the sources of F frames by Fisher scoring from the best two valleys of a raster, within the bounding box
-    of the outline. Returns positions (F, d) and covariances (F, d, d), for a rectangular outline those of a `Localiser`
-    up to rounding."""
+    """Locate the sources of F frames by Fisher scoring within the bounding box of the outline, starting from the two
+    deepest valleys (local minima) on a raster. For a rectangular outline, the returned positions (F, d) and covariances
+    (F, d, d) equal those of a `Localiser` up to rounding."""
     xp = namespace(array, power)
     screening_array = eqx.tree_at(
         lambda tree: tree.noise.relative, array, xp.maximum(array.noise.relative, _SCREENING_ERROR)

@@ -1,20 +1,20 @@
-"""Changes of the microphones since the calibration, found from the touches of a recording: changed gains, exchanged
+"""Changes of the microphones since the calibration, estimated from the touches of a recording: changed gains, exchanged
 microphones, and microphones whose response has changed.
 
 A change h_i of the logarithm of gain i adds s_i h_i to the level of microphone i in every frame, where s_i = S_i / (S_i
-+ N_i) for the received power S_i and the noise floor N_i. The changes have a normal prior of mean 0 and are the same
-throughout a recording. The changes and the unknowns of all frames f are estimated together, by maximum a posteriori.
-With residuals r of the levels, weights W = 1 / v for the variances v, derivatives J of the levels with respect to the
-unknowns of a frame, and S = diag(s), the normal equations of the changes, from which the unknowns of the frames are
-eliminated, have the matrix
++ N_i) for the received power S_i and the noise floor N_i. The changes have a normal prior of mean 0 and standard
+deviation `deviation`, and are the same throughout a recording. The changes and the unknowns of all frames f are
+estimated together, by maximum a posteriori. Let J be the derivatives of the levels with respect to the unknowns of a
+frame, W = 1 / v the weights of levels with the variances v, and S = diag(s). After elimination of the unknowns of the
+frames, the normal equations of the changes have the matrix
 
     A + 1 / deviation²,    A = Σ_f S (W − W J (Jᵀ W J)⁻¹ Jᵀ W) S.
 
 The inverse of this matrix is the covariance of the changes given the recording. A single touch reduces the covariance
-little; touches all over the skin determine the changes. The changes are applied only if they are significant: b is the
-right-hand side of the equations, and bᵀ A⁺ b must exceed the value that errors of the decay models alone explain.
+little; touches all over the skin determine the changes. The changes are applied only if they are significant: for the
+right-hand side b of the equations, bᵀ A⁺ b must exceed the value that errors of the decay models alone explain.
 
-Exchanged and altered microphones are searched for from the misfit of located touches.
+The search for exchanged and altered microphones compares the misfits of located touches.
 """
 
 from __future__ import annotations
@@ -36,27 +36,28 @@ from jeit_solvers import inverse_small
 from jeit_solvers.engines import as_array, host, on_device, on_host, slopes
 
 # Factors on the prior standard deviation of the changes, which are tried in turn. The first factor is accepted if one
-# source explains half of the frames, the other factors if one source explains nearly all frames: if the gains may have
-# changed much, one source explains some pairs of touches too.
+# source explains half of the frames. The other factors are accepted only if one source explains nearly all frames,
+# since large changes of the gains let one source explain some pairs of touches too.
 _DEVIATION_FACTORS, _MIN_EXPLAINED_FIRST, _MIN_EXPLAINED_LATER = (1.0, 2.0, 4.0), 0.5, 0.9
 # Maximum number of iterations; change of the estimated logarithms below which the iteration ends.
 _MAX_ITERATIONS, _CONVERGED_CHANGE = 4, 0.05
-# Side of the square cells in which all frames together have the weight of one frame, as a fraction of the skin's size,
-# since the errors of a decay model are alike at neighbouring positions.
+# Side of square cells of the skin, as a fraction of the skin's size. All frames with positions in one cell together
+# have the weight of one frame, since the errors of a decay model are similar at neighbouring positions.
 _CELL_SIZE = 0.3
 # Probability that estimated changes are significant although the gains have not changed; relative tolerance of the rank
 # of A.
 _FALSE_CHANGE, _RANK_TOLERANCE = 0.01, 1e-8
-# Fraction of its trace that is added to the diagonal of the Fisher matrix of a frame, which is singular where few
-# microphones respond.
+# Fraction of the trace of a frame's Fisher matrix that is added to the diagonal of this matrix, which is singular where
+# few microphones respond.
 _RIDGE = 1e-12
-# Number of the loudest frames that are used; misfit per degree of freedom above which changes of the setup are searched
-# for; value at which the misfit per degree of freedom is clipped; maximum ratio of the misfits after and before an
-# accepted change.
+# Number of the loudest frames, in which changes of the setup are searched for; misfit per degree of freedom above which
+# the search begins; value at which the misfit per degree of freedom is clipped; maximum ratio of the misfits after and
+# before an accepted change.
 _NUM_FRAMES, _LARGE_MISFIT, _MAX_MISFIT, _MAX_MISFIT_RATIO = 24, 3.0, 100.0, 0.7
 # Maximum number of changes of the setup that are searched for.
 _MAX_CHANGES = 4
-# A single microphone is left out for a test only if more than this number of microphones are not yet changed.
+# Leaving out one microphone is a candidate change only if more than this number of microphones are in no accepted
+# change.
 _MIN_REMAINING = 5
 
 
@@ -71,7 +72,8 @@ class GainChanges(NamedTuple):
     covariance: Float[np.ndarray, "M M"]
 
     def apply(self, microphone_array: MicrophoneArray) -> MicrophoneArray:
-        """Return the array with the changed gains, and with the variances of the changes added to its noise."""
+        """Return the array with the changed gains, and with the variances of the changes added to its squared relative
+        errors."""
         logarithms = on_host(microphone_array.decay).logarithms()
         # The first parameter of a decay model is a factor of the response.
         changed_logarithms = host.concatenate([logarithms[:1] + self.logarithm, logarithms[1:]])
@@ -153,7 +155,7 @@ def _estimate_for_deviation(
 
 
 def _are_significant(matrix: np.ndarray, right_hand_side: np.ndarray) -> bool:
-    """Whether the changes of the gains are larger than noise and errors of the decay models explain."""
+    """Test whether the changes of the gains are larger than noise and errors of the decay models alone explain."""
     eigenvalues, eigenvectors = np.linalg.eigh(matrix)
     is_determined = eigenvalues > _RANK_TOLERANCE * eigenvalues[-1]
     squared_components = (eigenvectors[:, is_determined].T @ right_hand_side) ** 2 / eigenvalues[is_determined]
@@ -170,9 +172,9 @@ def covariance_with_gains(
     """Covariance (F, d, d) in m² of the positions of `sources`, including the effect of errors of the gains; NaN for
     frames without a position.
 
-    `microphone_array`: the array before `GainChanges.apply`. With the Fisher matrix F of a frame for known gains, the
-    derivative of the frame's unknowns with respect to the gain changes is B = F⁻¹ Jᵀ W S, and the covariance of the
-    unknowns in the joint estimate is F⁻¹ + B C Bᵀ for the covariance C of the changes.
+    `microphone_array`: the array before `GainChanges.apply`. Let F be the Fisher matrix of a frame for known gains, and
+    C the covariance of the changes. The derivative of the frame's unknowns with respect to the gain changes is B = F⁻¹
+    Jᵀ W S, and the covariance of the unknowns is F⁻¹ + B C Bᵀ.
     """
     array, unknowns = (
         _with_known_gains(microphone_array, changes),
@@ -190,8 +192,8 @@ def covariance_with_gains(
 
 
 def _with_known_gains(microphone_array: MicrophoneArray, changes: GainChanges) -> MicrophoneArray:
-    """Return the microphone array with the changed gains, in NumPy, without the variances of the changes in its
-    noise."""
+    """Return the microphone array in NumPy arrays, with the changed gains but without the variances of the changes in
+    its noise."""
     return on_host(changes._replace(covariance=np.zeros_like(changes.covariance)).apply(microphone_array))
 
 
@@ -206,8 +208,8 @@ def _unknowns_of_sources(
 def _linearise_levels(
     array: MicrophoneArray, power, use, unknowns
 ) -> tuple[Likelihood, np.ndarray, np.ndarray, np.ndarray]:
-    """Likelihood of the frames, derivatives J (3, M, F) of the levels by the unknowns, shares s = S / (S + N) of the
-    source (M, F), and weights W (M, F)."""
+    """Compute the likelihood of the frames, the derivatives J (3, M, F) of the levels with respect to the unknowns, the
+    shares s = S / (S + N) (M, F) of the source in the power, and the weights W (M, F)."""
     use = use.T & (power.T + array.noise.floor[:, None] > 0)
     likelihood = Likelihood.create(power.T, use, array)
     (mean, variance), derivatives = slopes(array.expected, unknowns)

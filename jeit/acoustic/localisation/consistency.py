@@ -82,7 +82,8 @@ class Consistency(Module):
         return (self.differences(chart) ** 2).sum(axis=0)
 
     def expand(self, chart: Float[Array, "2 F"]) -> tuple[Array, Array, Array]:
-        """Loss (F,), gradient of the loss (2, F) by the chart coordinates, and Gauss-Newton matrix (2, 2, F)."""
+        """Loss (F,), gradient (2, F) of the loss with respect to the chart coordinates, and Gauss-Newton matrix (2, 2,
+        F)."""
         differences, derivatives = kept(slopes(self.differences, chart))
         gradient = 2 * namespace(differences).stack(
             [(differences * derivative).sum(axis=0) for derivative in derivatives]
@@ -116,8 +117,8 @@ class Consistency(Module):
         """Loss (F, P) of all frames at candidate positions, computed by matrix products.
 
         With A = I_k g_k and n microphones in use, the loss is n A² − 2 A Σ I_i g_i + Σ I_i² g_i². For the
-        inverse-square model, g is quadratic in the position, so the loss is a polynomial of degree four, which is
-        computed as the product of its coefficients and the features.
+        inverse-square model, g is quadratic in the position, so the loss is a polynomial of degree four. The polynomial
+        is computed as the product of its coefficients and the features.
         """
         xp = namespace(self, features)
         num_used = xp.sum(self.use, axis=0)
@@ -190,10 +191,10 @@ def find_minima(objective, first, second, try_second):
     """Minimise the objective of each frame from two starting positions, `first` and `second` (2, F).
 
     `try_second`: mask of the frames for which the second start is tried, or None for no frame; a second start is
-    abandoned if it is not promising. Returns the unknowns (n, F) at the minimum; the cost on the outline minus the cost
-    of the minimum beyond the outline; the difference of cost between the two minima; whether the minimisation
-    converged; and the start and end (2, 2, F) of the side of the outline to which the position was moved, NaN for
-    positions inside.
+    abandoned if its cost is still clearly higher after a few steps. Returns the unknowns (n, F) at the minimum; the
+    cost on the outline minus the cost of the minimum beyond the outline; the difference of cost between the two minima;
+    whether the minimisation converged; and the start and end (2, 2, F) of the side of the outline to which the position
+    was moved, NaN for positions inside.
     """
     surface = objective.microphone_array.surface
     first_minimum = _minimise_in_plane(objective, objective.start(first), None)
@@ -287,8 +288,8 @@ def _minimise_in_plane(objective, start, skip, *, max_steps: int | None = None) 
 
 def _expand_exactly(objective, x) -> tuple[Array, Array, Array]:
     """Value, gradient and Hessian of the objective at the unknowns `x`. The Hessian is exact where the exact Hessian is
-    positive definite, so that few steps are needed near a minimum even if the misfit is large; elsewhere the Hessian is
-    approximate."""
+    positive definite, and approximate elsewhere. With the exact Hessian, few steps are needed near a minimum even if
+    the misfit is large."""
     value, gradient, model = objective.expand(x)
     hessian = hessian_small(objective.cost, x)
     return value, gradient, namespace(hessian).where(definite_small(hessian), hessian, model)
@@ -301,8 +302,8 @@ def _minimise_on_outline(objective, skip) -> tuple[Minimum, Array]:
     start, end = outline_sides(objective.microphone_array.surface)
     xp = namespace(objective, start)
     length = xp.linalg.norm(end - start, axis=0)
-    # Candidate positions are equally spaced along the outline. Each is given by a side and a fraction of the side's
-    # length.
+    # Candidate positions are equally spaced along the outline. Each candidate is specified by a side and a fraction of
+    # the side's length.
     arc_lengths = xp.concatenate([xp.zeros(1), xp.cumsum(length)])
     candidate_arc_lengths = arc_lengths[-1] * (xp.arange(_OUTLINE_CANDIDATES) + 0.5) / _OUTLINE_CANDIDATES
     side_indices = xp.clip(xp.searchsorted(arc_lengths, candidate_arc_lengths, side="right") - 1, 0, length.size - 1)
@@ -340,7 +341,7 @@ def _minimise_on_outline(objective, skip) -> tuple[Minimum, Array]:
     )
     side_ends = origin + directions
     in_corner = (minimum.x[0] <= 0) | (minimum.x[0] >= 1)
-    # A position in a corner of the outline cannot move along a side, so its side is given the length zero.
+    # A position in a corner of the outline cannot move along a side, so its side is replaced by a side of length zero.
     side = xp.stack([origin, xp.where(in_corner, origin, side_ends)])
     return Minimum(to_unknowns(minimum.x, origin, directions), minimum.value, minimum.converged, minimum.steps), side
 
@@ -350,7 +351,8 @@ def differentiable_minima(objective, unknowns, side, skin_size):
 
     The result is a Newton step x − H⁻¹ ∇cost from the minimum x, with x and the Hessian H held constant. The step is
     zero, and its derivative −H⁻¹ ∂∇cost is the derivative of the minimum by the implicit function theorem. `side`:
-    start and end of the side of the outline on which the minimum lies, or NaN. `skin_size`: size of the skin in metres.
+    start and end of the side of the outline on which the minimum lies; NaN inside the outline. `skin_size`: size of the
+    skin in metres.
     """
     minimum, xp = undifferentiated(unknowns), namespace(objective, unknowns)
 

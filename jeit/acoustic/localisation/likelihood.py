@@ -69,7 +69,8 @@ class Likelihood(Module):
         return xp.where(self.use, (self.level - mean) / xp.sqrt(variance), 0.0)
 
     def expand(self, unknowns: Float[Array, "n F"]) -> tuple[Array, Array, Array]:
-        """Negative log-likelihood (F,), its gradient (n, F) by the n unknowns, and the Fisher matrix (n, n, F)."""
+        """Negative log-likelihood (F,), its gradient (n, F) with respect to the n unknowns, and the Fisher matrix (n,
+        n, F)."""
         (mean, variance), derivatives = slopes(self.microphone_array.expected, unknowns)
         # `kept` makes the compiler compute these arrays once for all sums below. In the sums, `dv` is the derivative of
         # log v.
@@ -114,7 +115,7 @@ class Likelihood(Module):
     def screen(self, response: Float[Array, "M P"]) -> Float[Array, "F P"]:
         """Half the weighted residual sum of squares (F, P) at candidate positions with responses f and the best-fitting
         strength: ½ (Σ w p² − (Σ w p f)² / Σ w f²), with observed powers p and weights w derived from p. This sum
-        approximates the cost, and takes two matrix products for all frames and positions."""
+        approximates the cost, and requires two matrix products for all frames and positions."""
         weight, xp = self._power_weights(), namespace(self, response)
         weighted_power = weight * self.power
         explained_sum = xp.maximum(weighted_power.T @ response, 0.0) ** 2 / (weight.T @ response**2)

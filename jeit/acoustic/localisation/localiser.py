@@ -40,7 +40,7 @@ _NUM_COARSE_PIXELS = 400
 # Maximum number of frames processed together, so that their arrays fit into the processor's cache: with the coarse
 # grid, and with maps.
 _MAX_CHUNK_FRAMES, _MAX_MAP_FRAMES = 1024, 32
-# Minimum relative error of the decay models assumed when a grid of positions is screened.
+# Minimum relative error of the decay models that is assumed when the objective is evaluated on a grid of positions.
 _SCREENING_ERROR = 0.2
 
 
@@ -51,8 +51,8 @@ class SourceEstimate(Module):
     - `covariance`: (F, d, d) covariance of the position in m².
     - `strength`: (F,) strength in the unit of intensity.
     - `misfit`: (F,) chi-square of the residuals of the levels. `freedom`: (F,) degrees of freedom of the misfit.
-    - `excess`: (F,) decrease of twice the objective (for the likelihood, −2 log-likelihood) at the best position beyond
-      the outline; 0 if no position beyond the outline is better.
+    - `excess`: (F,) decrease of twice the objective (for the likelihood, −2 log-likelihood) from `position` to the best
+      position beyond the outline; 0 if no position beyond the outline is better.
     - `rival`: (F,) difference of twice the objective between the two deepest valleys; ∞ without a second valley.
     - `converged`: (F,) whether the minimisation converged.
     """
@@ -103,8 +103,8 @@ class Localiser(Module):
 
         `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022. `map_shape`: (rows,
         columns) of the raster on which the objective of each frame is evaluated, (200, 200) in Park 2022; required for
-        `maps`. By default a coarse grid of about 400 positions is used. The best position is refined with and without a
-        raster. `compiled`: whether to compile calls; False is faster for a single call. Raises `ValueError` for an
+        `maps`. By default a coarse grid of about 400 positions is used. In both cases, the best position is then
+        refined. `compiled`: whether to compile calls; False is faster for a single call. Raises `ValueError` for an
         unknown `method` or an invalid `map_shape`.
         """
         check_array(microphone_array)
@@ -158,7 +158,7 @@ class Localiser(Module):
                 f"power has shape {power.shape} and use {use.shape}; give (frames, microphones) with "
                 f"{len(self.microphone_array.microphones)} microphones."
             )
-        if not len(power):  # without frames, an unusable frame gives the structure of the output
+        if not len(power):  # for no frames, the result of an unusable frame has the structure of the output
             padded_result = self._call_validated(function, np.full((1, power.shape[1]), np.nan), None)
             return jax.tree.map(lambda array: array[:0], padded_result)
         return (
@@ -211,7 +211,7 @@ def _compute_maps(localiser: Localiser, power, use) -> Array:
 
 def _starting_positions(localiser: Localiser, power, use):
     """Starting positions of the minimisation: positions of the first valley (F, 2) and the second valley (F, 2) of each
-    frame, and the mask (F,) of the frames whose second valley is worth a minimisation."""
+    frame, and the mask (F,) of the frames for which the objective is also minimised from the second valley."""
     constant_array = undifferentiated(localiser.microphone_array)
     pixels, features = _map_raster(localiser, constant_array)
     # The valleys of a very accurate decay model are narrower than the grid spacing, so a minimum relative error is

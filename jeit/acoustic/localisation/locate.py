@@ -43,8 +43,8 @@ _MIN_OUTSIDE_EXCESS, _MAX_AMBIGUOUS_DIFFERENCE = 9.0, 4.0
 # sources to that of one source, and maximum misfit per degree of freedom. Minimum ratio of the strengths of two
 # sources, since errors of the decay models look like a weak second source.
 _MAX_MISFIT_RATIO, _MAX_MISFIT, _MIN_STRENGTH_RATIO = 0.2, 10.0, 0.05
-# Fraction of the frames with a touch that one source on the skin does not explain, above which changes of the setup are
-# searched for.
+# Changes of the setup are searched for if one source on the skin fails to explain more than this fraction of the frames
+# with a touch.
 _MAX_UNEXPLAINED = 0.25
 # Minimum fraction of the frames that one or two sources must explain if the gains have not changed.
 _MIN_EXPLAINED = 0.9
@@ -73,17 +73,18 @@ def locate(
     - `recording`: samples or intensities of the calibrated microphones.
     - `calibration`: the calibrated array.
     - `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022.
-    - `map_shape`: (rows, columns) of the raster that is searched, (200, 200) in Park 2022; by default a coarse grid.
-      The best position is refined with and without a raster.
+    - `map_shape`: (rows, columns) of the raster that is searched, (200, 200) in Park 2022; by default a coarse grid. In
+      both cases, the best position is then refined.
     - `intensity`: frequency band and windows, for recordings of samples; by default as in the calibration.
-    - `silence`: recording of the untouched array, from which the noise floor is estimated if touches never pause.
+    - `silence`: recording of the untouched array, from which the noise floor is estimated; required if touches never
+      pause.
     - `gain_drift`: standard deviation of the changes of the microphones' gains since the calibration, as a fraction of
       the intensities. The changes are estimated from all touches of the recording, and the covariances of positions
-      include the remaining errors of the gains. 0 if the gains have not changed.
+      include the remaining errors of the gains. Use 0 if the gains have not changed.
     - `compiled`: whether to compile the computation, which takes seconds but then makes the computation several times
       faster; by default True for more than 1,024 frames with a touch. Use True for many successive recordings.
 
-    Raises `ValueError` for a recording with another number of microphones than the calibration, a `gain_drift` that is
+    Raises `ValueError` if the recording and the calibration have different numbers of microphones, if `gain_drift` is
     negative or not finite, and if fewer than three microphones can be used.
 
     **Example:**
@@ -166,8 +167,8 @@ def _locate_frames(
 
     def locate_with(changes: GainChanges) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         array = changes.apply(microphone_array)
-        # The status of a frame is always determined from the likelihood, also if the consistency loss locates the
-        # touch.
+        # The status of a frame is always determined from the likelihood, even if the position is estimated from the
+        # consistency loss.
         likelihood_estimate, _ = locate_most_likely(array)
         is_default_method = settings.method == "likelihood" and settings.map_shape is None
         selected_estimate = (
@@ -207,7 +208,7 @@ def _initial_status(most_likely: SourceEstimate, estimate: SourceEstimate) -> np
 
 
 def _exceeds_noise(misfit: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    """Mask (F,) of the frames whose misfit is too large to be due to noise."""
+    """Mask (F,) of the frames whose misfit noise alone does not explain."""
     return (freedom > 0) & (chdtrc(np.maximum(freedom, 1), misfit) < _FALSE_MISFIT)
 
 
@@ -257,7 +258,7 @@ def _fit_two_sources(
 
 def _limit_uncertainty(status: np.ndarray, result: dict[str, np.ndarray], skin_size: float) -> None:
     """Mark touches as ambiguous if the standard deviation of their position exceeds a fourth of the skin's size, and
-    replace covariances that extend beyond the skin. Modifies `status` and `result` in place."""
+    replace covariances whose standard deviation exceeds the skin's size. Modifies `status` and `result` in place."""
     has_position = np.isfinite(result["position"]).all(axis=1)
     is_finite = np.isfinite(result["covariance"]).all(axis=(1, 2))
     deviation = np.zeros(len(status))
@@ -283,8 +284,8 @@ def _gain_note(changes: GainChanges) -> list[str]:
 def _setup_notes(
     status: np.ndarray, intensities: Intensities, use: np.ndarray, microphone_array: MicrophoneArray
 ) -> list[str]:
-    """Notes on changes of the setup since the calibration. Such changes are searched for if one source does not explain
-    many of the frames."""
+    """Notes on changes of the setup since the calibration. Such changes are searched for if there are many frames that
+    one source does not explain."""
     notes = []
     has_touch = ~np.isin(status, [LocationStatus.NO_TOUCH, LocationStatus.UNUSABLE])
     is_unexplained = np.isin(status, [LocationStatus.MISFIT, LocationStatus.OUTSIDE, LocationStatus.TWO_TOUCHES])
@@ -311,7 +312,7 @@ def _setup_notes(
 
 def _unit_note(strength: np.ndarray, intensities: Intensities, use: np.ndarray, calibration: Calibration) -> list[str]:
     """Return a note if the intensities differ by orders of magnitude from the intensities of the calibration, which
-    suggests another gain or unit."""
+    suggests a different gain or unit."""
     question = "do the recording and the taps have the same gain and unit?"
     if np.isfinite(strength).any():
         median_strength = float(np.nanmedian(strength))
@@ -397,7 +398,7 @@ def _detected_frames(intensities: Intensities, noise: IntensityNoise, use: np.nd
 
 def _pad_frames(power: np.ndarray, use: np.ndarray, compiled: bool) -> tuple[np.ndarray, np.ndarray]:
     """Repeat the last frame up to a round number of frames if `compiled`, so that the program is compiled for few
-    numbers of frames."""
+    different numbers of frames."""
     if not compiled:
         return power, use
     num_frames = len(power)

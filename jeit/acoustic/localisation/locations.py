@@ -72,7 +72,7 @@ class Locations(Module):
 
     @property
     def has_position(self) -> Bool[np.ndarray, " F"]:
-        """Mask (F,) of the frames for which a position was found."""
+        """Mask (F,) of the frames for which a position was estimated."""
         return np.asarray(np.isfinite(self.position).all(axis=1))
 
     @property

@@ -12,8 +12,8 @@ from jeit_solvers.engines import as_array, namespace, set_at
 from jeit_solvers.module import Module
 
 # Condition for a minimisation from the second valley of a map: the value at the second valley is less than this factor
-# times the value at the best valley, plus this offset. On rasters with more than this number of pixels, only the best
-# valley is used.
+# times the value at the best valley, plus this offset. On rasters with more than `_MAX_VALLEY_PIXELS` pixels, only the
+# best valley is used.
 _SECOND_VALLEY_FACTOR, _SECOND_VALLEY_OFFSET, _MAX_VALLEY_PIXELS = 1.5, 8.0, 2000
 
 
@@ -45,7 +45,7 @@ def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Ar
     """Find the two lowest local minima (valleys) of each of F maps of P pixels.
 
     Returns the chart coordinates (2, F) of the lowest pixel and of the second lowest local minimum, and the mask (F,)
-    of the frames in which the second minimum is low enough for a minimisation.
+    of the frames in which the second minimum is low enough to start a minimisation there.
     """
     rows, columns = pixels.shape
     inside, xp = pixels.inside.reshape(rows, columns), namespace(maps, pixels)
@@ -94,11 +94,11 @@ def map_brightness(
 
     **Arguments:**
 
-    - `maps`: maps of the objective (F, rows, columns), as from `Localiser.maps`.
+    - `maps`: maps of the objective (F, rows, columns), as returned by `Localiser.maps`.
     - `method`: "likelihood" or "consistency", the method of the localiser.
     - `share`: quantile of the loss, between 0 and 1, for "consistency".
 
-    Raises `ValueError` for another `method`, and for maps of another shape.
+    Raises `ValueError` for an unknown `method`, maps that are not three-dimensional, and a `share` outside (0, 1).
 
     **Example:**
 
@@ -132,7 +132,7 @@ def map_brightness(
 def overlay_images(
     images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3
 ) -> Float[np.ndarray, "F rows columns"]:
-    """Overlay each image with the images before it, which fade as exp(−age / `time_constant`).
+    """Overlay each image with the earlier images, which fade as exp(−age / `time_constant`).
 
     Each pixel of the result (F, rows, columns) is the maximum over the faded images, so that a source at rest does not
     saturate the pixel. The last image shows the whole recording.

@@ -102,7 +102,7 @@ def plot_error_curve(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot localisation errors of one or several methods against another quantity, such as the noise.
+    """Plot localisation errors of one or several methods against a quantity such as the signal-to-noise ratio.
 
     If each value has the errors of several positions, a line shows the `statistic` of the errors, and a band the
     interquartile range. NaN is ignored. The axis of errors is logarithmic.

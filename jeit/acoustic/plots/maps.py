@@ -91,7 +91,7 @@ def plot_loss_map(
     - `colour_bar`: whether to draw a colour bar.
     - `ax`: axes to draw into; by default new axes.
 
-    Raises `ValueError` for another `method`, shapes that disagree, and `marks` that are not `MapMarks`.
+    Raises `ValueError` for an unknown `method`, shapes that disagree, and `marks` that are not `MapMarks`.
 
     **Example:**
 

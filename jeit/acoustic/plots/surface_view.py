@@ -50,8 +50,8 @@ class View(NamedTuple):
         return chart_of(self.surface, points, name)
 
     def chart_point(self, point: ArrayLike, name: str) -> np.ndarray:
-        """Chart coordinates (2,) of one `point` (d,) in metres. Raises `ValueError` for another shape; `name` is the
-        argument's name in the message."""
+        """Chart coordinates (2,) of one `point` (d,) in metres. Raises `ValueError` for a different shape; `name` is
+        the argument's name in the message."""
         coordinates = np.asarray(point, float)
         if coordinates.shape != (self.surface.dimension,):
             raise ValueError(
@@ -62,7 +62,7 @@ class View(NamedTuple):
     def chart_covariance(self, covariance: ArrayLike, point: ArrayLike, name: str = "covariance") -> np.ndarray:
         """Transform a `covariance` (d, d) in m² at `point` (d,) in metres to a covariance (2, 2) in the chart.
 
-        Raises `ValueError` for another shape; `name` is the argument's name in the message.
+        Raises `ValueError` for a different shape; `name` is the argument's name in the message.
         """
         matrix, dimension = np.asarray(covariance, float), self.surface.dimension
         if matrix.shape != (dimension, dimension):

@@ -52,8 +52,8 @@ def plot_track(
 
     **Arguments:**
 
-    - `track`: smoothed positions, as from the function `track`.
-    - `locations`: positions of the frames, as from `locate`.
+    - `track`: smoothed positions, as returned by the function `track`.
+    - `locations`: positions of the frames, as returned by `locate`.
     - `array`: a `Calibration` or `MicrophoneArray`; microphones that are unusable, or not used in any frame of
       `locations`, are drawn as crosses.
     - `overlay`: brightness (rows, columns) from 0 to 1 over the bounding box of the outline, bottom row first, as in
@@ -187,8 +187,8 @@ def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, time_
 def _draw_other_frames(
     ax: Axes, view: View, locations: Locations, positions: np.ndarray, time_colours: ScalarMappable
 ) -> list:
-    """Draw the positions of frames with the status "outside", "misfit", "ambiguous" or "two touches", the last with
-    both touches. Returns the legend entries."""
+    """Draw the positions of frames with the status "outside", "misfit", "ambiguous" or "two touches"; for "two
+    touches", both positions. Returns the legend entries."""
     handles = []
     second = view.chart(locations.second, "locations.second")
     for status, marker in _STATUS_MARKERS.items():

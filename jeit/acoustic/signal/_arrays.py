@@ -19,8 +19,8 @@ _MAX_COORDINATE = 1e9
 
 
 def choose_array(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
-    """Return the name, `first` or `second`, of the one of two alternative arrays that a file contains. Raises
-    `ValueError` if the file contains both arrays or neither."""
+    """Return which of two alternative arrays a file contains: the name `first` or `second`. Raises `ValueError` if the
+    file contains both arrays or neither."""
     if first in arrays and second in arrays:
         raise ValueError(f"it holds both '{first}' and '{second}'; keep the one to use.")
     if second not in arrays and first not in arrays:
@@ -35,10 +35,10 @@ def short_text(values: np.ndarray) -> str:
 
 
 def real_array_of(value, label: str, axes: str) -> np.ndarray:
-    """Convert `value` to a real array with as many axes as `axes` names, separated by commas.
+    """Convert `value` to a real array with one axis for each of the names in `axes`, which are separated by commas.
 
-    Arrays of float32 keep their type; other types become float64. Raises `ValueError` for values that are not real,
-    another number of axes, and empty arrays.
+    Arrays of float32 are not converted; other types are converted to float64. Raises `ValueError` for values that are
+    not real, a different number of axes, and empty arrays.
     """
     try:
         array = np.asarray(value)
@@ -83,8 +83,8 @@ def check_full_scale(value) -> float | None:
 
 
 def check_coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarray:
-    """Return n points as an array (n, d) in metres, where `dimension` is (d,), and d is 2 or 3. Raises `ValueError` for
-    other shapes, and for coordinates that are not finite."""
+    """Convert `value` to an array (n, d) of n points in metres. `dimension`: the required (d,), where d is 2 or 3.
+    Raises `ValueError` for other shapes, and for coordinates that are not finite."""
     points = real_array_of(value, label, "points, 2 or 3").astype(float)
     if points.shape[1] not in (2, 3) or points.shape[1:] != dimension:
         raise ValueError(

@@ -1,9 +1,9 @@
 """Detection of faulty microphones and faulty stretches of sound, from the microphones' samples alone.
 
 Four faults are distinguished: the samples of a channel never change (dead), do not change for a while (stuck), are cut
-off at an end of the channel's range (clipping), or are not finite. Similar signals without a fault are accepted: those
-of a converter that holds each value for several samples, of a quiet channel with an amplitude of a few converter steps,
-and with a single loud peak.
+off at an end of the channel's range (clipping), or are not finite. Three kinds of similar signals are not faults: the
+signal of a converter that holds each value for several samples, the signal of a quiet channel with an amplitude of a
+few converter steps, and a signal with a single loud peak.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ _STUCK_TIME, _STUCK_SAMPLES = 0.02, 64
 # A constant stretch is silence, not a fault, if the signal elsewhere decays to a range of at most this many converter
 # steps, or at most this fraction of the channel's range.
 _REST_STEPS, _REST_RANGE = 3.0, 1e-4
-# Samples are at an end of the range if they are closer to this end than the first fraction of the channel's range, or,
-# where the full scale is known, closer to the full scale than the second fraction of it.
+# Samples are at an end of the range if their distance from this end is at most the first fraction of the channel's
+# range, or, if the full scale is known, their distance from the full scale is at most the second fraction of the full
+# scale.
 _TOP_RANGE, _TOP_FULL_SCALE = 3e-4, 1e-3
 # Minimum number of converted values at the top of a clipped peak, and minimum ratio of the fall beside the peak to the
 # fall of a parabola.
@@ -139,8 +140,8 @@ def _converter_step(samples: np.ndarray) -> float:
 
 
 def _stuck_samples(samples: np.ndarray, rate: float, extent: float) -> Bool[np.ndarray, " S"] | None:
-    """Mask of the samples in long constant stretches, unless the signal also comes to rest elsewhere; None if no sample
-    is stuck. `extent`: difference between the largest and smallest sample."""
+    """Mask of the stuck samples, those in long constant stretches; None if no sample is stuck, or if the signal also
+    comes to rest elsewhere. `extent`: difference between the largest and smallest sample."""
     min_length = max(_STUCK_SAMPLES, round(_STUCK_TIME * rate))
     # A stuck stretch covers at least two whole blocks. Stretches are searched for only if a block is constant, which
     # saves time.

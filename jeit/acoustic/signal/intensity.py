@@ -7,7 +7,7 @@ power is
 
 The weight W_k is the fraction of the frequency interval (k ± 1/2) r / N of bin k, clipped to the range 0 to r/2, that
 lies in the band. A sine of amplitude A well inside the band has P = A²/2 (Parseval). White noise of variance σ² has the
-mean power σ² · (high - low) / (r/2), also if the edges of the band fall between bins. The mean of each window is
+mean power σ² · (high - low) / (r/2), even if the edges of the band fall between bins. The mean of each window is
 subtracted, which does not affect bins from k = 2 on. The relations for sine and noise are therefore exact for low ≥ 1.5
 / window.
 
@@ -89,8 +89,7 @@ def band_power(samples: np.ndarray, grid: WindowGrid) -> np.ndarray:
     """Band power (F, M) of the samples (M, S) of M microphones in F windows."""
     finite = np.isfinite(samples)
     if not finite.all():
-        # Windows that contain samples that are not finite are marked as not usable, so the values set here do not
-        # matter.
+        # The substituted values do not matter, since windows with samples that are not finite are marked as not usable.
         samples = np.where(finite, samples, 0)
     # A large constant offset of the samples would cost precision. The remaining mean of each window is removed below.
     samples = samples - samples.mean(axis=1, keepdims=True, dtype=float)
@@ -113,8 +112,8 @@ def band_power(samples: np.ndarray, grid: WindowGrid) -> np.ndarray:
 
 
 def _overlap_trace(grid: WindowGrid, lag: int) -> float:
-    """tr(A_0 A_lag) for the band-power matrices A of two windows `lag` samples apart: half the covariance of the powers
-    in the two windows for white noise of variance 1.
+    """Compute tr(A_0 A_lag) for the band-power matrices A of two windows `lag` samples apart. The trace is half the
+    covariance of the powers in the two windows for white noise of variance 1.
 
     With g(d) = Σ_k W_k cos(2πkd/N), which has the period N, A_nm = w_n w_m g(n - m). The trace is therefore Σ_d g(d)²
     r(d), where r is the autocorrelation of u_n = w_n w_(n+lag) over the overlap of the windows. No N × N matrix has to
@@ -275,10 +274,10 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     The power of a tap is the mean over the windows in which the tap is audible, the same windows for all microphones.
     The loudness of a window is the sum over microphones of (power − floor) / floor; the tap is audible where the
     loudness is at least half its maximum. A microphone with a fault in one of the audible windows is not usable for the
-    tap, since other windows have another loudness. The noise floor is estimated from the quietest windows of all taps,
-    so the recordings should include some silence before or after the taps. The field `freedom` of the result accounts
-    for the overlap of windows, exactly for white noise, but not for the selection of windows: if a tap is not audible
-    at all, the loudest windows of noise are selected, and the power of the tap is somewhat too high.
+    tap, since other windows have a different loudness. The noise floor is estimated from the quietest windows of all
+    taps, so the recordings should include some silence before or after the taps. The field `freedom` of the result
+    accounts for the overlap of windows (exactly for white noise), but not for the selection of windows. If a tap is not
+    audible at all, the loudest windows of noise are selected, and the power of the tap is somewhat too high.
 
     **Arguments:**
 
@@ -323,7 +322,7 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     positive_floor = np.maximum(floor, max(1e-9 * power.max(), np.finfo(float).tiny))
     loudness = np.where(is_alive, power / positive_floor - floor / positive_floor, 0).sum(axis=-1)
     is_audible = loudness >= _AUDIBLE_SHARE * loudness.max(axis=1, keepdims=True)
-    # The loudest window of a tap is always included, also if no window is above the noise floor.
+    # The loudest window of a tap is always included, even if no window is above the noise floor.
     is_audible |= loudness == loudness.max(axis=1, keepdims=True)
     mean = np.einsum("tf,tfm->tm", is_audible, power) / is_audible.sum(axis=1)[:, None]
     correlation = noise_correlation(grid, num_windows)
@@ -339,11 +338,11 @@ def noise_floor(
 
     `share`: minimum fraction of the windows that are free of touches. `freedom`: degrees of freedom ν of the power of
     noise. The initial estimate is a low quantile of the powers divided by the same quantile of χ²_ν / ν, as in minimum
-    statistics (R. Martin, IEEE Trans. Speech Audio Process. 9, 504-512, 2001). The initial estimate is up to a few
-    tenths too high if most windows are loud, since the actual fraction of quiet windows is unknown. The floor is
-    refined iteratively: the new floor is the mean of the powers below c times the floor, divided by the mean of χ²_ν /
-    ν truncated at c. If ν is infinite, the low quantile itself is returned. The floor of a channel without usable
-    windows is 0.
+    statistics (R. Martin, IEEE Trans. Speech Audio Process. 9, 504-512, 2001). The initial estimate is too high by up
+    to a few tenths of the floor if most windows are loud, since the actual fraction of quiet windows is unknown. The
+    floor is refined iteratively: the new floor is the mean of the powers below c times the floor, divided by the mean
+    of χ²_ν / ν truncated at c. If ν is infinite, the low quantile itself is returned. The floor of a channel without
+    usable windows is 0.
 
     If the noise is not white, its power varies more than ν indicates, and the noise floor is underestimated: by 8 % for
     a spectrum 1/f from 50 to 1000 Hz, and by a third for 1/f².

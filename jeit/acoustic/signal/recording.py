@@ -45,7 +45,7 @@ class Recording(Module):
     **Arguments:**
 
     - `samples`: S samples of each microphone (M, S) in any unit (volts, counts, fractions of full scale). NaN and
-      infinite samples are kept; magnitudes above 1e15 are replaced by infinity.
+      infinite samples are stored unchanged; magnitudes above 1e15 are replaced by infinity.
     - `rate`: sampling rate of each microphone, Hz.
     - `full_scale`: largest magnitude of a sample that the device can return, or None if unknown.
     - `name`: name of the recording, used in messages.
@@ -66,7 +66,7 @@ class Recording(Module):
     def __init__(
         self, samples: ArrayLike, rate: ArrayLike, *, full_scale: ArrayLike | None = None, name: str = "recording"
     ):
-        """Raises `ValueError` for samples that are not real, have another shape than (M, S) or look transposed, and for
+        """Raises `ValueError` for samples that are not real, have a shape other than (M, S) or look transposed, and for
         an implausible sampling rate."""
         array = real_array_of(samples, "samples", "microphones, samples")
         is_too_large = np.abs(array) > _MAX_SAMPLE if array.dtype.kind == "f" else np.zeros(0, bool)
@@ -89,8 +89,8 @@ class Intensities(Module):
     - `power`: band power (F, M) minus the noise floor, in the squared unit of the samples. Values may be negative, and
       are NaN only where a window is not usable.
     - `floor`: noise power (M,) that was subtracted from the band power; zero if unknown.
-    - `freedom`: degrees of freedom ν of the power of white noise in a window, whose variance is 2 floor² / ν. Infinite
-      if unknown.
+    - `freedom`: degrees of freedom ν of the power of white noise in a window: the variance of the power is 2 floor² /
+      ν. Infinite if unknown.
     - `overlap`: length of a window divided by the hop between windows; 1 if windows do not overlap.
     - `usable`: mask (F, M) of the windows without a fault; by default where `power` is finite.
     - `faults`: description of the fault of each of the M channels; "" for no fault.
@@ -258,7 +258,7 @@ class Taps(Module):
 
 def read_recording(path: str | Path) -> Recording | Intensities:
     """Read a recording from a WAV file with any number of channels, from an NPZ file, or, if `soundfile` is installed,
-    from another sound file (FLAC, Ogg, AIFF, …).
+    from a sound file of a different format (FLAC, Ogg, AIFF, …).
 
     An NPZ file contains either `samples` (M, S), `rate` in Hz and optionally `full_scale`; or `intensity` (F, M),
     `times` (F,) in seconds and optionally `floor` (M,), `freedom` and `overlap`, as in `Intensities`. Integer samples

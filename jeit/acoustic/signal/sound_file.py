@@ -91,5 +91,5 @@ def _read_with_soundfile(path: Path) -> tuple[np.ndarray, float, float | None]:
 
 def _full_scale(samples: np.ndarray) -> float | None:
     """Full scale of float samples: 1; or None (unknown) if the magnitude of any sample exceeds 1, since the samples are
-    then in another unit."""
+    then in a different unit."""
     return None if (np.abs(samples[np.isfinite(samples)]) > 1.0).any() else 1.0

@@ -92,7 +92,8 @@ _MIN_BURST_LENGTH = 0.01
 class SoundingPerson(Module):
     """A simulated person, with individual traits of touch.
 
-    **Fields**: `medians`: for each modality of touch, a dictionary of the person's traits by name, in SI units.
+    **Fields**: `medians`: for each modality of touch, a dictionary from the name of each trait to the person's median
+    value, in SI units.
 
     **Example:**
 
@@ -116,8 +117,8 @@ class SoundingPerson(Module):
 
     @classmethod
     def draw(cls, key: Array) -> "SoundingPerson":
-        """Draw a random person. Traits are log-normal about the medians of the population; the trait `slope` is normal.
-        Raises `ValueError` if `key` is not a random key."""
+        """Draw a random person. Traits are log-normally distributed about the medians of the population; the trait
+        `slope` is normally distributed. Raises `ValueError` if `key` is not a random key."""
         check_key(key)
         rng = _numpy_generator(key)
         medians = {}
@@ -134,9 +135,9 @@ class SoundingPerson(Module):
     def touch(self, key: Array, modality: str, skin: SoundingSkin, *, duration: float = 2.9) -> SimulatedSound:
         """Simulate `duration` seconds of a touch of this person at a random position on the skin, without noise.
 
-        `modality`: one of `MODALITIES`. The traits of the touch are log-normal about the person's traits, with a
-        standard deviation of the logarithm of 0.25; the trait `slope` is normal. Raises `ValueError` for invalid
-        arguments.
+        `modality`: one of `MODALITIES`. The traits of the touch are log-normally distributed about the person's traits,
+        and their logarithms have the standard deviation 0.25; the trait `slope` is normally distributed. Raises
+        `ValueError` for invalid arguments.
         """
         check_skin_and_key(skin, key)
         check_name("modality", modality, MODALITIES)
@@ -286,14 +287,14 @@ def simulate_sound_clips(
     """Yield recordings of touches by several people, ordered by person and modality. Recordings (clips) are generated
     one at a time, so that a large set need not fit into memory.
 
-    The noise consists of the microphones' noise and the room's sound, whose level in decibels relative to the
-    microphones' noise is normal with a mean of -6 dB. Every clip has its own random key.
+    The noise consists of the microphones' noise and the room's sound. The level of the room's sound in decibels,
+    relative to the microphones' noise, is normally distributed with a mean of -6 dB. Every clip has its own random key.
 
     **Arguments:**
 
     - `key`: random key.
     - `skin`: the simulated skin.
-    - `people`: the people, as from `SoundingPerson.draw`.
+    - `people`: the people, as returned by `SoundingPerson.draw`.
     - `each`: number of clips of each modality by each person.
     - `modalities`: kinds of touch: "pat", "tickle", "stroke", "wind" and "none".
     - `duration`: duration of a clip, seconds.

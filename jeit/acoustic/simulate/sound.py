@@ -5,7 +5,7 @@ The sound of a touch on soft rubber is modelled as band-limited random noise, st
 multiplied by an envelope and then filtered. All functions take an explicit random key, and the same key gives the same
 samples.
 
-A touch with envelope e(t) at a fixed position is received with an energy whose mean over random keys is Σ e² times
+The mean over random keys of the energy received from a touch with envelope e(t) at a fixed position is Σ e² times
 `expected_power`, except for sound beyond the ends of the recording.
 """
 
@@ -157,9 +157,9 @@ class SimulatedSound(Module):
     """Simulated samples of M channels during a touch, and the true source.
 
     **Fields**: `samples`: (M, S), in the unit of source strength; `rate`: sampling rate in Hz; `position`: positions
-    (N, 2) of the source in metres at `position_times` (N,) in seconds, where N = 0 for `simulate_silence`, and a silent
-    source has the position of its last or first sound; `active`: root mean square (S,) of the source's sound at
-    `times`, without the delay of propagation; `noisy`: whether the samples include noise.
+    (N, 2) of the source in metres at `position_times` (N,) in seconds (a silent source has the position of its last or
+    first sound, and N = 0 without a source); `active`: root mean square (S,) of the source's sound at `times`, without
+    the delay of propagation; `noisy`: whether the samples include noise.
     """
 
     samples: Float[np.ndarray, "M S"]

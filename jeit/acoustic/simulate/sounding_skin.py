@@ -3,8 +3,8 @@ microphones.
 
 Simulated recordings replace measurements, since no openly licensed recording of a skin with microphones exists. Sound
 is propagated in the frequency domain with spreading, viscoelastic loss, delays and edge echoes. The simulation thus
-differs from the decay model a/(r² + b) that the calibration fits, and is a meaningful test of this model. The setup is
-that of Park et al., Science Robotics 7, eabm7187 (2022). See `jeit.acoustic.simulate.propagation` for the physics, and
+differs from the decay model a/(r² + b) that the calibration fits, and is a meaningful test of this model. The setup
+follows Park et al., Science Robotics 7, eabm7187 (2022). See `jeit.acoustic.simulate.propagation` for the physics, and
 `jeit.acoustic.simulate.touches` for touches.
 """
 
@@ -34,8 +34,8 @@ class MicrophoneModel(Module):
     **Fields**
 
     - `depth`: depth of the nominal microphone under the surface, in metres.
-    - `reach`, `snr_db`: signal-to-noise ratio in the frequency band, in decibels, at which a nominal microphone
-      receives a steady source of strength 1 at the horizontal distance `reach` in metres, far from all edges. The
+    - `reach`, `snr_db`: a nominal microphone receives a steady source of strength 1 at the horizontal distance `reach`
+      in metres, far from all edges, with the signal-to-noise ratio `snr_db` in the frequency band, in decibels. The
       microphones of Park 2022 sense touches up to "about 5.5 cm" (Fig. S15), interpreted here as the distance for 0 dB.
     - `gain_spread_db`, `noise_spread_db`: standard deviations of gain and noise power, in decibels of power.
     - `depth_spread`: standard deviation of the logarithm of the depth. The values of all three spreads are choices of
@@ -264,9 +264,9 @@ class SoundingSkin(Module):
     - `spectral_slope`: the power spectral density of a touch is proportional to frequency to the power
       −`spectral_slope` (1 is 3 dB per octave).
 
-    **Fields**: the arguments except `key`, and of each microphone the depth under the surface `microphone_depth` (M,)
-    in metres, the amplitude `gain` (M,), and `noise_factor` (M,), the noise power divided by that of the nominal
-    microphone.
+    **Fields**: the arguments except `key`; and for each microphone `microphone_depth` (M,), the depth under the surface
+    in metres; `gain` (M,), the gain in amplitude; and `noise_factor` (M,), the noise power divided by the noise power
+    of the nominal microphone.
 
     **Example:**
 

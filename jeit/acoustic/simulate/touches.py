@@ -208,7 +208,8 @@ def simulate_stroke(
     - `key`: random key.
     - `path`: vertices (K, 2) of a polyline, metres, traversed at constant speed; or a function that returns positions
       (N, 2) in metres at times (N,) in seconds.
-    - `strength`: root mean square of the sound at 0.1 m/s, which is proportional to the square root of speed.
+    - `strength`: root mean square of the sound at a speed of 0.1 m/s; the sound is proportional to the square root of
+      speed.
     - `duration`: duration of the stroke, seconds.
     - `noise`: whether to add the microphones' noise.
 

@@ -45,8 +45,8 @@ def simulate_wind(
     """Simulate a recording of a steady jet of air on the skin, such as from an air brush.
 
     Eddies act as independent sources at 64 random positions. Since eddies are much smaller than the spacing of the
-    microphones, the microphones receive independent noise, with the total power that each receives from the 64
-    positions.
+    microphones, the noises of the microphones are independent. The power of each noise is the total power that the
+    microphone receives from the 64 positions.
 
     **Arguments:**
 

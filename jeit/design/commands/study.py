@@ -100,8 +100,8 @@ def _read_study_and_path(file: Path, output: Path | None) -> "tuple[Study, Path]
 
 
 def _report_path(file: Path, store: Path, page: Path | None) -> Path:
-    """Path of the HTML report. Raises `ValueError` if the folder of the report does not exist, and if the path is that
-    of the study file or of the store of results."""
+    """Path of the HTML report. Raises `ValueError` if the folder of the report does not exist, and if the path is the
+    path of the study file or of the store of results."""
     report_path = page or file.with_suffix(".html")
     if not report_path.parent.is_dir():
         raise ValueError(f"--page {report_path}: there is no folder {report_path.parent}; make it first.")

@@ -39,8 +39,8 @@ class Constraints(Module):
         x_min, x_max, y_min, y_max = self.outline.extent
         min_radius = float(np.min(radii))
         min_distance = max(self.minimum_spacing, 2 * min_radius)
-        # Circles of radius `min_distance` / 2 around the discs' centres do not overlap. They extend by this radius
-        # beyond the region in which the centres may lie.
+        # Circles of radius `min_distance` / 2 around the discs' centres do not overlap. The circles extend by this
+        # radius beyond the region in which the centres may lie.
         available_area = (x_max - x_min - 2 * min_radius + min_distance) * (
             y_max - y_min - 2 * min_radius + min_distance
         )
@@ -78,15 +78,15 @@ class DesignSpace(Module):
       this distance is 0.
     - `keep_out`: domains of the skin that no electrode may overlap.
     - `symmetry`: symmetry of the layout about the middle of the outline's bounding box. Every half (x or y below or
-      above the middle) or quarter must contain the same number of electrodes. The electrodes of the first part are
-      kept, and the other electrodes are replaced by images of the first. Use several starts, since a symmetric layout
-      has fewer ways to improve.
-    - `sizes`: whether the electrodes' diameters are varied too: True for half to twice the given diameters, or two
+      above the middle) or quarter must contain the same number of electrodes. The electrodes of the first half or
+      quarter are optimised, and the other electrodes are replaced by their images. Use several starts, since a
+      symmetric layout has fewer ways to improve.
+    - `sizes`: whether the electrodes' diameters are varied: True for half to twice the initial diameters, or two
       limits, metres.
-    - `contact_impedance`: two limits, ohm·m², between which the contact impedances are varied; None to keep the
-      impedances.
+    - `contact_impedance`: two limits, ohm·m², between which the contact impedances are varied; None if the impedances
+      are not varied.
     - `thickness`: two limits, metres, between which the thickness of the sheet is varied, starting from the thickness
-      of the skin; the sheet conductivity is proportional to the thickness. None to keep the thickness.
+      of the skin; the sheet conductivity is proportional to the thickness. None if the thickness is not varied.
 
     **Example:**
 

@@ -29,7 +29,7 @@ from jeit_solvers.module import Module
 
 # Stages of the optimisation: weight w of the penalty, and fraction of all steps after which the stage ends.
 _PENALTY_STAGES = ((1e2, 0.5), (1e3, 0.8), (1e4, 1.0))
-# Safety margin of the constraints, metres, which a layout keeps when it is rounded to whole nanometres.
+# Safety margin of the constraints, metres, so that a layout rounded to whole nanometres still satisfies them.
 _CONSTRAINT_MARGIN = 2e-7
 # Maximum distance by which the outline may extend beyond the mesh, relative to the size of the skin.
 _MAX_OVERHANG = 0.01
@@ -102,7 +102,7 @@ def optimise_layout(
       starts.
 
     Raises `ValueError` for a layer instead of a sheet, for arguments that `layout_scores` rejects, if the touches are
-    for a sheet of another thickness, and for constraints that cannot be satisfied.
+    for a sheet of a different thickness, and for constraints that cannot be satisfied.
 
     **Example:**
 
@@ -162,8 +162,8 @@ class _LayoutSearch(Module):
     variables: Variables
 
     def cost(self, variables, penalty_weight):
-        """Penalised cost (S,) and score (S,) of the layout of each start, and the gradient (S, v) of the cost by the v
-        variables."""
+        """Penalised cost (S,) and score (S,) of the layout of each start, and the gradient (S, v) of the cost with
+        respect to the v variables."""
         return _penalised_cost(variables, jnp.asarray(penalty_weight), self)
 
     def run(
@@ -270,8 +270,9 @@ def _make_feasible(variables: Variables, constraints: Constraints, start_variabl
 
 @eqx.filter_jit
 def _penalty_and_gradient(all_variables, variables: Variables, constraints: Constraints):
-    """Penalty (S,) for violated constraints of the layouts of S starts, and its gradient (S, v) by the v variables.
-    Both are scaled by a large factor, so that the minimisation stops only where the penalty is zero."""
+    """Penalty (S,) for violated constraints of the layouts of S starts, and its gradient (S, v) with respect to the v
+    variables. Penalty and gradient are scaled by a large factor, so that the minimisation stops only where the penalty
+    is zero."""
     return jax.vmap(
         jax.value_and_grad(
             lambda start_variables: 1e6 * _penalty(variables, constraints, start_variables, _CONSTRAINT_MARGIN)

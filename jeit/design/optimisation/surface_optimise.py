@@ -142,8 +142,8 @@ def _score_function(skin: Skin, objective: Objective):
 
 
 def _is_feasible(positions, min_distances, surface: Triangles, min_edge_distances) -> bool:
-    """Whether the straight distances between the centres (L, 3) are at least `min_distances` (L, L), and their
-    distances from the edge at least `min_edge_distances` (L,), all in metres."""
+    """Whether the straight distances between the centres (L, 3) are at least `min_distances` (L, L), and the distances
+    of the centres from the edge are at least `min_edge_distances` (L,), all in metres."""
     distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
     return bool(
         (distances >= min_distances).all() and (surface.distance_to_border(positions) >= min_edge_distances).all()

@@ -50,8 +50,8 @@ class Range(Module):
 
     @classmethod
     def create(cls, name: str, limits, initial_values, unit: str) -> "Range":
-        """Create the range of k values between two `limits`, the same for all; `initial_values` (k,) gives the number
-        k. Raises `ValueError` for invalid limits."""
+        """Create the range of k values between two `limits`, which are the same for all values. `initial_values` (k,)
+        only determines the number k. Raises `ValueError` for invalid limits."""
         lower, upper = limits if np.shape(limits) == (2,) else (0.0, 0.0)
         if not 0 < lower < upper < np.inf:
             raise ValueError(f"{name} must be two values in {unit}, the smaller one first; it is {limits!r}.")
@@ -147,8 +147,8 @@ class Variables(Module):
         return cls(low, size, images, order, symmetric_parameters, *ranges, np.concatenate(start), pitch)
 
     def represents(self, varied: Varied) -> bool:
-        """Whether the variables `start` give the parameters `varied` exactly: True if `varied` has the symmetry and
-        lies in the ranges."""
+        """Whether the variables `start` reproduce the parameters `varied`: True if `varied` has the symmetry and lies
+        in the ranges."""
         represented = self.varied(jnp.asarray(self.start))
         are_equal = (
             np.allclose(represented_values, given_values, rtol=1e-6, atol=0)
@@ -223,14 +223,14 @@ def _check_symmetric_counts(num_first: int, num_sectors: int, num_electrodes: in
 
 def balanced_score(scores: Scores) -> Float[Array, ""]:
     """Default score of an `Objective`: log of the smooth minimum of the sensitivity minus log of the mean variance, so
-    that a change of either quantity by one per cent counts the same."""
+    that a change by one per cent has the same effect for both quantities."""
     return jnp.log(scores.soft_worst) - jnp.log(scores.mean_variance)
 
 
 class Objective(Module):
     """Objective of a layout optimisation: the function of a layout's `Scores` that is maximised.
 
-    **Fields**: `touches`: touches of the skin, as from `Skin.sheet_touches`; `prior`, `noise` (volts) and
+    **Fields**: `touches`: touches of the skin, as returned by `Skin.sheet_touches`; `prior`, `noise` (volts) and
     `temperature`: as in `layout_scores`; `score`: function of `Scores` whose values differ by about 1 between layouts,
     such as a logarithm. Raises `ValueError` if `score` is not a function, and for touches or a prior of the wrong type.
 

@@ -1,5 +1,5 @@
-"""Plots of how a skin responds to touches: sensitivity maps and their histograms; and virtual taxels: map of taxels,
-histogram of their areas, and similarity of each position to a taxel."""
+"""Plots of the response of a skin to touches: sensitivity maps and their histograms, maps of virtual taxels, histograms
+of taxel areas, and the similarity of each position to a taxel."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def plot_taxels(
 
     **Arguments:**
 
-    - `taxels`: the taxels, as from `find_taxels`.
+    - `taxels`: the taxels, as returned by `find_taxels`.
     - `colour`: quantity shown by colours: "area", the area of the taxel whose cluster contains the position;
       "coverage", the number of taxels that cover the position; "label", a colour for each cluster.
     - `outlines`: whether to draw the outline of each taxel, along which the similarity equals the threshold.
@@ -200,7 +200,7 @@ def plot_taxel_areas(
     - `title`: title of the plot.
     - `ax`: axes to draw into; by default new axes.
 
-    Raises `ValueError` for taxels of a batch of layouts, and unless there are one to six layouts.
+    Raises `ValueError` for taxels of a batch of layouts, and if the number of layouts is not from one to six.
 
     **Example:**
 
@@ -243,7 +243,7 @@ def plot_similarity(
     taxel's outline.
 
     `electrodes`: positions (L, 2) or (L, 3) of the electrodes to be marked, metres. Raises `ValueError` for an `index`
-    of no taxel, and for taxels of a batch of layouts.
+    that no taxel has, and for taxels of a batch of layouts.
     """
     _check_single(taxels)
     num_taxels = len(taxels.similarity)

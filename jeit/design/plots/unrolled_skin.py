@@ -50,7 +50,7 @@ def plot_unrolled(
 
     **Arguments:**
 
-    - `unrolled`: the surface, as from `jeit.mesh.unroll`.
+    - `unrolled`: the surface, as returned by `jeit.mesh.unroll`.
     - `values`: one value for each triangle of the surface, drawn in a uniform colour, or one for each node,
       interpolated.
     - `electrodes`: disc electrodes, drawn as circles with their numbers or labels.

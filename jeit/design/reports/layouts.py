@@ -194,7 +194,7 @@ def _score_figures(scores: Scores) -> dict[str, Any]:
 
 def _format_region(domain: Domain) -> str | dict[str, Any]:
     """Keep-out region in the format of the option --keep-out, a disc "x,y,radius" or a rectangle "x1,y1,x2,y2" in
-    millimetres. A region of another shape gives a description."""
+    millimetres. For a region of a different shape, a description is returned."""
     if isinstance(domain, Disk):
         numbers = (*domain.centre, domain.radius)
     elif isinstance(domain, Rectangle):

@@ -242,7 +242,7 @@ def _parameter_text(name: str, value) -> str:
 
 
 def _escape_for_matplotlib(text: str) -> str:
-    """Escape a text so that matplotlib shows the text unchanged: dollar signs start no formula, and a leading
+    """Escape a text so that matplotlib shows the text unchanged: dollar signs do not start a formula, and a leading
     underscore does not hide a label."""
     return " " * text.startswith("_") + text.replace("$", r"\$")
 

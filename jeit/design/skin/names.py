@@ -1,5 +1,5 @@
-"""Electrode layouts and measurement protocols of skins by name, on flat skins and curved surfaces, as in the files that
-describe skins and studies."""
+"""Creation of the electrode layouts and measurement protocols that skin files and study files specify by name, for flat
+and curved skins."""
 
 from __future__ import annotations
 
@@ -154,8 +154,8 @@ def skin_protocol(
       a curved skin, distances are along the surface. The default is 94 pairs, as in Park et al. 2022, or all pairs if
       fewer.
 
-    Raises `ValueError` for an unknown name, for more pairs than exist, for `num_pairs` with another protocol than
-    "two-terminal", and as `two_terminal`, `adjacent` and `opposite` do.
+    Raises `ValueError` for an unknown name, for more pairs than exist, for `num_pairs` with a protocol other than
+    "two-terminal", and in the cases of `two_terminal`, `adjacent` and `opposite`.
     """
     check_layout("layout", layout)
     check_name("protocol", name, PROTOCOLS)

@@ -18,8 +18,8 @@ from jeit_solvers.module import Module
 
 
 class SheetTouches(Module):
-    """Touches of a sheet at n positions, from `sheet_touches`, with derivatives of the conductivity changes with
-    respect to the positions.
+    """Touches of a sheet at n positions, as computed by `sheet_touches`, with derivatives of the conductivity changes
+    with respect to the positions.
 
     **Fields**
 
@@ -36,8 +36,8 @@ class SheetTouches(Module):
     depth: float
 
     def at_thickness(self, thickness) -> "SheetTouches":
-        """The same touches of a sheet for a layer of another `thickness`, metres. Conductivity changes are proportional
-        to depth / thickness."""
+        """Return the same touches for a sheet that represents a layer of a different `thickness`, metres. Conductivity
+        changes are proportional to depth / thickness."""
         depth_ratio = self.thickness / thickness
         touched = eqx.tree_at(
             lambda cells_to_change: cells_to_change.change, self.touched, self.touched.change * depth_ratio
@@ -45,8 +45,8 @@ class SheetTouches(Module):
         return SheetTouches(touched, self.slope * depth_ratio, jnp.asarray(thickness), self.depth)
 
     def weights(self, conductivity: Float[Array, " m"]) -> tuple[Float[Array, "n m"], Float[Array, "2 n m"]]:
-        """Change of the conductivity of every cell by every touch (n, m), siemens, and derivatives of the change with
-        respect to the two coordinates of the position (2, n, m), siemens per metre."""
+        """Compute the change (n, m) of the conductivity of every cell due to every touch, siemens, and the derivatives
+        (2, n, m) of the change with respect to the two coordinates of the position, siemens per metre."""
         cells = self.touched.cells
         indices = np.arange(len(cells))[:, None], cells
 
@@ -83,8 +83,9 @@ def sheet_touches(
 
 
 def _flatten_centroids(mesh: Mesh, touched: TouchedCells, reach: float) -> Float[np.ndarray, "n c 2"]:
-    """Map the centroids of touched cells to the tangent plane at the position of their touch, keeping the distance
-    along the surface. Returns coordinates (n, c, 2) relative to the position, metres."""
+    """Map the centroids of touched cells to the tangent plane at the position of their touch. The distance from the
+    position in the plane equals the distance along the surface. Returns coordinates (n, c, 2) relative to the position,
+    metres."""
     surface, places, cells = Triangles.of(mesh), np.asarray(touched.places), np.asarray(touched.cells)
     cell_centroids = np.asarray(centroids(mesh))
     normals = surface.normals_at(surface.nearest(places))

@@ -53,9 +53,9 @@ class Skin(Module):
     - `thickness`: thickness of the skin, metres; for a sheet, thickness of the layer that the sheet represents.
     - `conductivity`: conductivity of the material, S/m, one value or one for each cell.
     - `num_layers`: number of layers of mesh cells; 0 for a sheet.
-    - `cell_size`: cell size of the plane mesh, metres; None if no size was given.
+    - `cell_size`: cell size of the plane mesh, metres; None if no size was specified.
 
-    Create a skin with `Skin.create`, which checks the arguments and makes the mesh, or from a custom `model` with
+    Create a skin with `Skin.create`, which checks the arguments and creates the mesh, or from a custom `model` with
     electrodes of class `SheetDiscs` (`SurfaceDiscs` on a curved sheet) or `FaceDiscs`.
 
     **Example:**
@@ -128,7 +128,7 @@ class Skin(Module):
         num_points: int | None = None,
         protocol: Protocol | None = None,
     ) -> "Skin":
-        """Create a skin with electrodes of `layout`: check the arguments and make the mesh.
+        """Create a skin with electrodes of `layout`: check the arguments and create the mesh.
 
         - `thickness`: thickness of the skin, metres; `conductivity`: conductivity of the material, S/m.
         - `contact_impedance`: contact impedance of the electrodes, ohm·m²; by default that of the layout, or 1e-4 if
@@ -190,8 +190,8 @@ class Skin(Module):
         return model_conductivity(self.conductivity, self.thickness, self.num_layers)
 
     def with_layout(self, layout: Layout | SurfaceLayout, contact_impedance: ArrayLike | None = None) -> "Skin":
-        """The same skin with the electrodes of another `layout` with the same number of electrodes; mesh and protocol
-        are unchanged.
+        """Return the skin with the electrodes of a different `layout`, which has the same number of electrodes; mesh
+        and protocol are unchanged.
 
         `contact_impedance` as in `create`. Raises `ValueError` for electrodes outside the mesh or too small for its
         cells.
@@ -215,8 +215,8 @@ class Skin(Module):
         """Compute the conductivity changes due to single touches at `places` (n, 2), on a curved skin (n, 3), metres.
 
         `indentation`: shape of the touches, by default `Bell()`; `contrast`: as in the function `touched_cells`. Raises
-        `ValueError` for touches as deep as the skin, for a touch that changes no cell, for instance because there are
-        too few layers of cells, and for a contrast of 1, which changes no conductivity.
+        `ValueError` for touches as deep as the skin, for a touch that changes no cell (for instance with too few layers
+        of cells), and for a contrast of 1, which changes no conductivity.
         """
         indentation = Bell() if indentation is None else indentation
         if not self.num_layers:
@@ -254,9 +254,9 @@ class Skin(Module):
 
 
 def skins_of(layouts: Sequence[Layout | SurfaceLayout], protocols: Sequence[Protocol], **options) -> list[Skin]:
-    """Create one skin for each layout and its protocol, with `options` of `Skin.create`, and raise the errors of
-    `Skin.create`. Consecutive layouts with the same outline and number of electrodes share one mesh and the symbolic
-    factorisation of its system matrix."""
+    """Create one skin for each layout and its protocol, with `options` of `Skin.create`. Consecutive layouts with the
+    same outline and number of electrodes share one mesh and the symbolic factorisation of its system matrix. Raises the
+    errors of `Skin.create`."""
     skins: list[Skin] = []
     for layout, protocol in zip(layouts, protocols, strict=True):
         if skins and _can_share_mesh(skins[-1], layout):
@@ -274,7 +274,7 @@ def skins_of(layouts: Sequence[Layout | SurfaceLayout], protocols: Sequence[Prot
 
 
 def _can_share_mesh(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
-    """Whether the mesh of a skin can be used for another `layout` too."""
+    """Whether the mesh of a skin can also be used for `layout`."""
     if isinstance(layout, SurfaceLayout):
         skin_layout = skin.layout
         if (
@@ -295,7 +295,7 @@ def _have_equal_num_electrodes(skin: Skin, layout: Layout | SurfaceLayout) -> bo
 
 
 def check_skin(name: str, skin) -> None:
-    """Raise `ValueError`, about the argument `name`, unless `skin` is a `Skin`."""
+    """Raise `ValueError` unless `skin` is a `Skin`; `name` is the argument's name in the message."""
     check_kind(name, skin, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
 
 

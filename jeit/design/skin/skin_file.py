@@ -40,8 +40,8 @@ class MaterialTable(Table):
 
 
 class LayoutTable(Table):
-    """Table "electrodes": layout, diameter and contact impedance. A diameter or impedance of NaN stands for the value
-    in the layout."""
+    """Table "electrodes": layout, diameter and contact impedance. If a diameter or impedance is NaN, the value of the
+    layout is used."""
 
     subject = "a skin"
     layout: Word
@@ -106,8 +106,8 @@ def read_described_skin(path: str | Path) -> Skin:
     """Read the skin that a TOML file describes.
 
     The file has the tables skin, electrodes, measurement and mesh of a study file, and for a curved skin the table
-    surface. Every key has a single value. Only the key `layout` in the table electrodes is required, the name of a
-    layout or a file in the same folder; all other keys have defaults.
+    surface. Unlike in a study file, every key has a single value. Only the key `layout` in the table electrodes is
+    required: the name of a layout, or of a file in the same folder. All other keys have defaults.
 
     **Arguments:**
 

@@ -23,7 +23,7 @@ class TubeTable(Table):
 
 
 class ForearmTable(Table):
-    """A tapered sleeve: each end is given by a radius, or by the two half widths of an oval."""
+    """Surface of a skin: a tapered sleeve. Each end is specified by a radius, or by the two half widths of an oval."""
 
     subject = "a forearm"
     kind: Literal["forearm"]
@@ -34,7 +34,7 @@ class ForearmTable(Table):
 
 
 class SphereTable(Table):
-    """A sphere."""
+    """Surface of a skin: a sphere."""
 
     subject = "a sphere"
     kind: Literal["sphere"]

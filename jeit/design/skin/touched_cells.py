@@ -1,5 +1,7 @@
-"""Cells and nodes of a skin's mesh that a touch changes: the cells within reach of the touch, by distance along the
-surface and depth below the surface (NumPy), and the relative change of each cell's conductivity."""
+"""Cells and nodes of a skin's mesh that a touch changes, and the relative change of each cell's conductivity.
+
+The cells within reach of a touch are found by distance along the surface and depth below the surface.
+"""
 
 from __future__ import annotations
 
@@ -47,8 +49,7 @@ def is_curved(mesh: Mesh) -> bool:
 
 
 def touched_surface(mesh: Mesh, face: str = "outer") -> Triangles:
-    """The touched surface of a curved skin: the sheet itself, or the face ("outer" or "inner") of a shell that `face`
-    names."""
+    """Return the touched surface of a curved skin: the sheet itself, or the `face` ("outer" or "inner") of a shell."""
     return Triangles.of(mesh, None if mesh.is_surface else face)
 
 
@@ -159,8 +160,8 @@ def touched_cells(
     multiplied by `contrast`. With an `edge` in metres, the change rises smoothly over a depth of twice `edge`, and is
     differentiable with respect to depth and position.
 
-    **Sheet** (2-D mesh) that represents a layer of `thickness` metres: a fraction depth / thickness of the
-    cross-section has its conductivity multiplied by `contrast`.
+    **Sheet** (2-D mesh) that represents a layer of `thickness` metres: the conductivity of a fraction depth / thickness
+    of the cross-section is multiplied by `contrast`.
 
     **Curved skin** (a surface in space, or a shell on such a surface): as for a sheet or a layer, but distances are
     along the touched surface, which is the `face` of a shell, and depths along the inward normal.
@@ -213,7 +214,7 @@ def touched_cells(
 
 
 def pad_rows(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Join `rows` of integers of different lengths to one array, padded with zeros. Returns this array and a mask of
+    """Join `rows` of integers of different lengths into one array, padded with zeros. Returns this array and a mask of
     the entries that are not padding."""
     lengths = np.array([len(row) for row in rows])
     is_entry = np.arange(max(lengths.max(), 1)) < lengths[:, None]

@@ -1,5 +1,5 @@
-"""Touches of a skin: their indentation, a depth as a function of the distance from the centre; and grids of touched
-positions, the centres of equal rectangles over a skin."""
+"""Shapes of touches (depth of the indentation as a function of the distance from the centre), and grids of touched
+positions (centres of equal rectangles over a skin)."""
 
 from __future__ import annotations
 
@@ -189,8 +189,8 @@ class SurfaceGrid(TouchGrid):
 
 
 def touch_grid(outline: Domain | Triangles, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
-    """Create a grid of touched positions: the bounding box of a skin's outline is divided into equal rectangles, whose
-    centres inside the outline are taken.
+    """Create a grid of touched positions: the bounding box of a skin's outline is divided into equal rectangles, and
+    the positions are the centres that lie inside the outline.
 
     The default is 48 × 48 rectangles, as in Park et al. 2022. On a curved skin, whose outline is its surface, rows ×
     columns positions are spread evenly over the surface.

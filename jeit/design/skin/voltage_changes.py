@@ -47,9 +47,9 @@ EXACT_AT_ONCE, _LINEAR_AT_ONCE = 2, 8
 # Multiple to which the number of strips of nodes that a touch spans is padded, since a program is compiled for each
 # number.
 _STRIP_MULTIPLE = 3
-# Number of touches per call of a compiled program, and ratios of successive sizes to which a touch's numbers of nodes
-# and of cells are padded. One program is compiled for each size, and the cost of a touch grows with the square of its
-# number of nodes.
+# Number of touches per call of a compiled program. The numbers of nodes and of cells of a touch are padded to sizes,
+# and these are the ratios of successive sizes. One program is compiled for each size, and the cost of a touch grows
+# with the square of its number of nodes.
 _TOUCHES_PER_CALL, _NODE_SIZE_RATIO, _CELL_SIZE_RATIO = 2 * EXACT_AT_ONCE, 2**0.5, 2.0
 
 
@@ -61,12 +61,12 @@ def touch_changes(
     - `conductivity`: real conductivity as in `ForwardModel.voltages`, S/m (2-D: S). Exact changes allow conductivity
       tensors, which a touch scales.
     - `linear`: if True, the linearised changes J δσ from the Jacobian J, which are differentiable and can be batched
-      with `vmap`. Otherwise the exact changes, which equal those of a separate solve for every touch up to 1e-8 of the
-      largest change.
+      with `vmap`. Otherwise the exact changes, which differ from those of a separate solution for every touch by up to
+      1e-8 of the largest change.
 
-    Raises `ValueError` for touches of another mesh and for exact changes under `jit`, `grad` or `vmap`. Raises
-    `RuntimeError` if the exact changes are not found: for conductors with a contrast above about 1e6, where the
-    voltages no longer depend on the contrast, and if a touch disconnects an electrode.
+    Raises `ValueError` for touches of a different mesh and for exact changes under `jit`, `grad` or `vmap`. Raises
+    `RuntimeError` if the computation of exact changes does not converge: for conductors with a contrast above about
+    1e6, where the voltages no longer depend on the contrast, and if a touch disconnects an electrode.
     """
     check_model(model)
     check_kind("touched", touched, TouchedCells, "TouchedCells, as of skin.touched_cells(places)")
@@ -135,8 +135,9 @@ def cell_stiffness(model: ForwardModel, conductivity) -> Float[Array, "m q q"]:
 def changes_between(protocol: Protocol, element_matrices, fields_and_inverse, touches, index):
     """Compute the exact voltage changes due to the touches with indices `index` (c, s), s touches at a time.
 
-    `element_matrices`: from `cell_stiffness`; `fields_and_inverse`: from `fields_and_inverse`; `touches`: cells and
-    changes of all touches, from `TouchedCells`, and their nodes and corners, from `touched_nodes`."""
+    `element_matrices`: result of `cell_stiffness`; `fields_and_inverse`: result of the function with this name;
+    `touches`: cells and changes of all touches as in `TouchedCells`, and their nodes and corners as in
+    `TouchedNodes`."""
     fields, inverse = fields_and_inverse
     voltages_of = jax.vmap(lambda relative_change: select_channels(protocol, relative_change))
 
@@ -177,8 +178,8 @@ def _impedance_changes(blocks, corners, inverse, fields, weakening_factor):
     assembled from `blocks` (b, c, q, q), siemens, for its c cells with nodes `corners` (b, c, q), indices among the k
     nodes of the touch. G: `inverse` (b, k, k), ohms, the inverse of the system matrix between these nodes. F: `fields`
     (b, k, L), ohms, the potentials of these nodes for unit currents into the electrodes. `weakening_factor` (b,): see
-    `_weakening_factor`. The b systems are solved together, by conjugate gradients, until the last one has converged; R
-    is the residual of Y.
+    `_weakening_factor`. The b systems are solved together, by conjugate gradients, until the last system has converged;
+    R is the residual of Y.
     """
     touch = jnp.arange(len(fields))[:, None, None]
     num_nodes = fields.shape[1]
@@ -230,7 +231,7 @@ def _impedance_changes(blocks, corners, inverse, fields, weakening_factor):
     solution, residual, scaled_residual, *_, energy, _, _ = jax.lax.while_loop(is_unfinished, step, initial_state)
     change = _transpose(solution) @ (right_hand_side + residual) + _transpose(residual) @ scaled_residual
     change -= _transpose(fields) @ right_hand_side
-    # Voltage changes that are so small compared with the load D F consist of the load's rounding errors.
+    # Voltage changes below this limit consist of rounding errors of the load D F.
     is_rounding = jnp.sum(voltages, axis=(1, 2)) < _MIN_RELATIVE_VOLTAGE * jnp.sum(initial_energy, axis=(1, 2))
     converged = jnp.all(energy <= max_energy, axis=(1, 2)) & ~is_rounding
     return jnp.where(converged[:, None, None], (change + _transpose(change)) / 2, jnp.nan)

@@ -37,8 +37,8 @@ class _SharedData(Module):
     """Data shared by all points of a study that have the same shape.
 
     **Fields**: `model`: the forward model; `touched`: the touched cells on a skin of `thickness` metres; `touches`: the
-    same touches with derivatives with respect to the position, and `prior`: the prior of the touches' amplitudes, both
-    None unless a score needs them; `grid`: the touched positions; `key`: random key for k-means.
+    same touches with derivatives with respect to the position; `prior`: prior of the touches' amplitudes (`touches` and
+    `prior` are None unless a score needs them); `grid`: the touched positions; `key`: random key for k-means.
     """
 
     model: ForwardModel
@@ -212,7 +212,7 @@ def _solve_exactly(
 
 
 def _model_and_touched_cells(shared: _SharedData, point_data: _PointData) -> tuple[ForwardModel, TouchedCells]:
-    """The forward model of a point's skin, and the cells that the touches change."""
+    """Return the forward model of a point's skin, and the cells that the touches change."""
     model = shared.model.with_electrodes(point_data.electrodes).with_protocol(point_data.protocol)
     touched = eqx.tree_at(
         # The relative change of a sheet's conductivity is proportional to depth / thickness; layers of one shape have

@@ -40,10 +40,10 @@ class Contents(NamedTuple):
 
     **Fields**
 
-    - `kind`: one word for the contents, such as "study"; `made_by`: the command that creates the contents; both for
-      messages.
+    - `kind`: one word for the contents, such as "study"; `made_by`: the command that creates the contents. Messages
+      contain `kind` and `made_by`.
     - `fingerprint`: hash of everything that determines the results.
-    - `chunks`: for each chunk, the rows of every array that it contains.
+    - `chunks`: for each chunk, the indices of the rows of every array that belong to the chunk.
     - `arrays`: names of the arrays of results; `attributes`: plain values stored with the arrays.
     - `fill`: function that creates all arrays in an empty Zarr group.
     """

@@ -27,7 +27,7 @@ def locked(path: Path, contents: str) -> Iterator[None]:
     """Context in which no other process writes the store of results at `path`. `contents`: one word for the contents of
     the store, for messages.
 
-    The lock is the file `.NAME.lock` beside the store, held by `flock`, which the system releases when the process ends
+    The lock is a `flock` on the file `.NAME.lock` beside the store. The system releases the lock when the process ends
     for any reason. The content of the file names the owner, the process that writes the store. If the owner is on
     another machine, whose processes cannot be checked, the store counts as locked as long as the file exists. Raises
     `ValueError` if another process, or another thread of this process, writes the store, and `OSError` if no file can

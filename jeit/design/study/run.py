@@ -114,9 +114,9 @@ def run_study(
       each exact map.
 
     Only one process at a time may run a study; locks of processes that have ended are ignored. Raises `ValueError`,
-    before any chunk is computed, for meshes too coarse for their electrodes or touches, for the store of another study,
-    and for a store that another process writes. Raises `ImportError` without the extra `cluster`, and `OSError` if the
-    store cannot be written, such as on a full disk; finished chunks are kept.
+    before any chunk is computed, for meshes too coarse for their electrodes or touches, for the store of a different
+    study, and for a store that another process writes. Raises `ImportError` without the extra `cluster`, and `OSError`
+    if the store cannot be written, such as on a full disk; finished chunks are kept.
 
     **Example:**
 
@@ -138,8 +138,8 @@ def run_study(
 
 
 def study_progress(study: Study, path: str | Path) -> Progress:
-    """Progress of a study in a store of results: the numbers of finished points and chunks. Chunks that do not match
-    their checksums count as unfinished.
+    """Count the finished points and chunks of a study in a store of results. Chunks that do not match their checksums
+    count as unfinished.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""`Study`: a sweep over electrode layouts and skin parameters, read from a TOML file and checked first."""
+"""`Study`: a sweep over electrode layouts and skin parameters, read from a TOML file and checked."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Point:
 
     @property
     def shape(self) -> Shape:
-        """Parameters that determine which points can share a batch: points with the same shape."""
+        """Parameters that the points of a batch have in common."""
         thickness = self.thickness if self.layers else 0.0
         return Shape(self.layout.num_electrodes, self.protocol, self.pairs, self.cell_size, self.layers, thickness)
 
@@ -111,7 +111,7 @@ class Study:
 
     - `name`: name of the study; `points`: the skins, in the order of the file's lists, where the last list varies
       fastest.
-    - `outline`: outline of the skins; for curved skins, the surface with the first cell size.
+    - `outline`: outline of the skins; for curved skins, the surface meshed with the first cell size.
     - `indentation`, `contrast`: the touch, as in `touched_cells`; `exact`: whether voltage changes are exact instead of
       linearised; `columns`, `rows`: size of the grid of touched positions.
     - `current`: injected current, amperes; `scores`: names of the scores that are computed.
@@ -219,9 +219,9 @@ def read_study(path: str | Path) -> Study:
     - `path`: path of the file.
 
     Raises `FileNotFoundError` if the file does not exist. Raises `ValueError`, naming the keys and a remedy, for keys
-    that are unknown or have no effect in combination with other keys, values of the wrong type or out of range (such as
-    metres for millimetres), electrodes that overlap, impossible spacings, layouts without the electrodes that a
-    protocol needs, and studies that would take too much memory or disk space.
+    that are unknown or have no effect in combination with other keys, and for values of the wrong type or out of range
+    (such as metres for millimetres). Also raises `ValueError` for electrodes that overlap, impossible spacings, layouts
+    whose number of electrodes does not suit a protocol, and studies that would take too much memory or disk space.
 
     **Example:**
 
@@ -327,8 +327,8 @@ def _create_indentation(table: StudyTable) -> AbstractIndentation:
 
 
 def _check_touches(table: StudyTable) -> None:
-    """Check that there are enough touches for the scores, that the results fit the disk, and the computation the
-    memory."""
+    """Check that there are enough touches for the scores, and that disk space and memory suffice for the results and
+    the computation."""
     scores, num_touches = table.scores, table.touch.columns * table.touch.rows
     sheet_scores = [score for score in OPTIMALITY if score in scores.wanted]
     num_bytes = 8.0 * table.num_points * num_touches
@@ -430,8 +430,8 @@ def _without_rounding(value) -> float:
 def _surface_meshes(
     table: StudyTable, folder: Path
 ) -> tuple[list[float], Rectangle | Triangles, Sequence[LayoutFactory]]:
-    """Returns the cell sizes, metres; the outline, or for curved skins the surface with the first cell size; and the
-    functions that create layouts: a single function for flat skins, one for each cell size for curved skins."""
+    """Returns the cell sizes, metres; the outline, or for curved skins the surface meshed with the first cell size; and
+    the functions that create layouts: a single function for flat skins, one for each cell size for curved skins."""
     from jeit.design.skin.surface_tables import ScanTable  # imported already when the table was read
 
     cell_sizes = [1e-3 * size for size in table.mesh.cell_mm]

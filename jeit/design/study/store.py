@@ -1,13 +1,13 @@
 """The store of a study: its points and their results in the Zarr format.
 
-`Store` holds the results of a study, or of other work in chunks, on disk. Each chunk has separate files. A single file
-lists the finished chunks with their checksums, and is replaced as a whole after the files of a chunk are written; a
-chunk that is not in the list counts as unfinished.
+A `Store` contains the results of a study, or of a different computation in chunks, on disk. Each chunk has separate
+files. A single file lists the finished chunks with their checksums, and is replaced as a whole after the files of a
+chunk are written; a chunk that is not in the list counts as unfinished.
 
 The metadata of a store are checked as plain JSON before Zarr opens the store. Zarr looks up codecs by the names in a
 file, and the codec pickle executes code from the file. A store is therefore opened only if it has the form that jeit
-writes: Zarr format 3, the expected arrays and no others, only numbers and text, codecs that only pack bytes, and no
-links to other paths.
+writes: Zarr format 3, the expected arrays and no others, only numbers and text, codecs that only encode or compress
+bytes, and no links to other paths.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ from jeit.design.study.contents import Contents, study_contents
 from jeit.design.study.lock import locked
 from jeit.design.study.spec import Study
 
-# Codecs allowed in a store, which only pack bytes. Sharding is excluded, since it contains further codecs.
+# Codecs allowed in a store, which only encode or compress bytes. Sharding is excluded, since it contains further
+# codecs.
 CODECS = frozenset({"blosc", "bytes", "crc32c", "transpose", "vlen-utf8", "zstd"})
 # Maximum unpacked size of a chunk of text, and maximum overhead of a chunk of numbers, bytes.
 _MAX_TEXT_CHUNK, _MAX_CHUNK_OVERHEAD = 2**24, 2**12
@@ -47,8 +48,8 @@ _UNREADABLE_METADATA = f"has a {_METADATA_FILE} that is no JSON object, or neste
 
 
 class ArrayShape(NamedTuple):
-    """Size of an array of a store: number of values along each axis, in all and per chunk, and Zarr's name of the data
-    type."""
+    """Size of an array of a store: number of values along each axis, in total and per chunk, and Zarr's name of the
+    data type."""
 
     shape: tuple[int, ...]
     chunks: tuple[int, ...]
@@ -75,8 +76,8 @@ def find_danger(path: Path) -> str | None:
 
 
 def find_damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
-    """Description of the first difference of a store from one with the arrays `expected`, by name; None without a
-    difference. Raises `OSError` for files that cannot be read."""
+    """Describe the first difference between a store and a store with the arrays `expected` (by name); None if there is
+    no difference. Raises `OSError` for files that cannot be read."""
     content = _read_bytes(path / _METADATA_FILE)
     if content is None:
         return _UNREADABLE_METADATA
@@ -197,19 +198,19 @@ _PATH_DESCRIPTION = "that of the store, such as 'results.zarr'"
 
 
 class OtherContents(ValueError):
-    """Raised if a store has other contents than the requested study or work."""
+    """Raised if the contents of a store differ from the requested study or work."""
 
 
 class Store:
     """The store of results of a study, or of other `Contents`, at `path`.
 
-    With `create`, the store is opened for writing and created empty if it does not exist; otherwise it is opened for
-    reading only. Use `writing` to write a store.
+    With `create`, the store is opened for writing, and created empty if it does not exist. Without `create`, the store
+    is opened for reading only. Use `writing` to write a store.
     """
 
     def __init__(self, work: Study | Contents, path: str | Path, *, create: bool = True):
         """Raises `FileNotFoundError` if there is no store and `create` is False. Raises `ValueError` if the path is not
-        a store or is the store of another study, if the store is damaged, or if opening the store might run code.
+        a store or is the store of a different study, if the store is damaged, or if opening the store might run code.
         Raises `ImportError` without the extra `cluster`, and `OSError` if the store cannot be written."""
         zarr = optional("zarr", _TASK)
         self.contents = work if isinstance(work, Contents) else study_contents(work)

@@ -42,8 +42,8 @@ class MaterialSweep(Table):
 
 
 class LayoutSweep(Table):
-    """Table "electrodes": layouts, diameters and contact impedances. A diameter or impedance of NaN stands for the
-    values of the layout."""
+    """Table "electrodes": layouts, diameters and contact impedances. If a diameter or impedance is NaN, the values of
+    the layout are used."""
 
     subject = "a study"
     layouts: Several[Word]
@@ -111,7 +111,7 @@ class StudyTable(Table):
 
     @property
     def num_layouts(self) -> int:
-        """Number of layouts, including the combinations with diameters and contact impedances."""
+        """Number of combinations of layouts, diameters and contact impedances."""
         electrodes = self.electrodes
         return math.prod(map(len, (electrodes.layouts, electrodes.diameter_mm, electrodes.contact_impedance_ohm_m2)))
 
@@ -167,7 +167,7 @@ class StudyTable(Table):
         return self
 
 
-# Keys of a study file that have an effect only if another key has one of the given values.
+# Keys of a study file that have an effect only if a second key has one of the listed values.
 _REQUIRED_VALUES: dict[str, tuple[str, tuple[str, ...]]] = {
     "mesh.layers": ("skin.model", ("layer",)),
     "touch.deviation_mm": ("touch.indentation", ("bell",)),
