@@ -1,5 +1,5 @@
-"""Imaging in one call: `image_difference` images the difference of two frames, `compare_on_data` compares the rules for
-the hyperparameter λ on this difference.
+"""Imaging in one call: `image_difference` images the difference of two frames, `compare_on_data` compares the rules
+that choose the hyperparameter λ on such a difference.
 
 `preparation` checks the data and builds the mesh; `calibration` calibrates the model; `wiring` detects wiring that
 differs from its description; `method` holds the settings and the imaging methods; `automatic` chooses a method;

@@ -91,7 +91,7 @@ def compare_on_data(
     chooses.
 
     The images are computed by one-step imaging. A rule that cannot be applied to the data is listed in `refused`, or
-    raises `ValueError` if it is the only one requested.
+    raises `ValueError` if it is the only rule requested.
 
     **Arguments:**
 
