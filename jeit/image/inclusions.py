@@ -83,7 +83,7 @@ class Inclusion(Module):
     are None if not estimated: `contrast_interval`: 68 % interval of the change relative to the background;
     `area_interval`: 68 % interval of the area, m², or volume, m³; `strength` and `strength_interval`: see
     `jeit.inverse.shapes.Quantities`; `centroid_radius`: radius, metres, of the circle (in a solid, of the ball) about
-    `centroid` that holds the true centroid with a probability of 68 %.
+    `centroid` that contains the true centroid with a probability of 68 %.
 
     **Example:**
 
