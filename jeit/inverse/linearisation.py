@@ -135,8 +135,8 @@ class Linearisation(Module):
         """Change of voltages `difference` (M,) divided by the standard deviations of the channels, for the channels in
         use (K,).
 
-        Raises `ValueError` for another number of channels and, unless traced, for NaN or infinite values in channels in
-        use.
+        Raises `ValueError` for the wrong number of channels and, unless traced, for NaN or infinite values in channels
+        in use.
         """
         if np.shape(difference) != (self.num_channels,):
             raise ValueError(

@@ -13,7 +13,7 @@ residual. Derivatives need no further solve: at fixed fields only the energy of 
 
 Kolehmainen, Vauhkonen, Karjalainen and Kaipio, Physiological Measurement 18 (1997) 289, errors of electrode positions;
 Vilhunen, Kaipio, Vauhkonen, Savolainen and Vauhkonen, Measurement Science and Technology 13 (2002) 1848, contact
-impedances; Darde, Hyvönen, Seppänen and Staboulis, SIAM Journal on Imaging Sciences 6 (2013) 176, both at once.
+impedances; Darde, Hyvönen, Seppänen and Staboulis, SIAM Journal on Imaging Sciences 6 (2013) 176, both together.
 """
 
 from __future__ import annotations
@@ -53,10 +53,11 @@ class Uncertainty:
     """Uncertainty of the description of a sensor, as standard deviations. All but `position` are relative: 0.1 is 10 %.
 
     **Fields**: `position`: standard deviation of electrode positions, metres, in every direction in which electrodes
-    can move; default: 0.0175 of the width of the body, which is 2° on a disk. `drift`: of the logarithm of each contact
-    impedance, between the reference and the frame. `size`: of the lengths of the body. `other`: of all other errors of
-    the model, as a share of the difference of the two frames; if the misfit of the reference is larger, the misfit is
-    used instead. Raises `ValueError` for values that are negative or not finite, and for `size` or `other` above 1.
+    can move; default: 0.0175 of the width of the body, which is 2° on a disk. `drift`: standard deviation of the change
+    of the logarithm of each contact impedance between the reference and the frame. `size`: standard deviation of the
+    lengths of the body. `other`: standard deviation of all other errors of the model, as a share of the difference of
+    the two frames; if the misfit of the reference is larger, the misfit is used instead. Raises `ValueError` for values
+    that are negative or not finite, and for `size` or `other` above 1.
 
     **Example:**
 
@@ -178,7 +179,7 @@ def place_electrodes(
     - `mask` (M,): True for the channels to use.
 
     Raises `ValueError` for electrodes that cannot move, invalid arguments, voltages that have the opposite sign of the
-    model's, and voltages that no positions are found to explain.
+    model's, and voltages for which no explaining positions are found.
 
     **Example:**
 
@@ -242,8 +243,8 @@ class _PlacementProblem:
         )
 
     def at(self, coefficients: Float[np.ndarray, " p"]) -> _LinearisedModel | None:
-        """The model with the parameters that `coefficients` give; None if electrodes would overlap or leave the
-        body."""
+        """Compute the model with the parameters that follow from the `coefficients`; None if electrodes would overlap
+        or leave the body."""
         num_electrodes, num_directions = self.directions.shape[:2]
         parameters = self.spread @ coefficients
         shifts, log_contact = (

@@ -35,8 +35,8 @@ class Spectrum(Module):
     """Eigendecomposition of the data-space system, in the notation of `jeit.inverse.spectrum`.
 
     **Fields**: `basis` (M, k): QU; `eigenvalues` (k,): Λ; `directions` (M, r): D; `reduced` (r, m): G; `images` (m, r):
-    ΓGᵀ; `null_space` (m, p): N; `seen` (M, p): B = JN; `outer` (M, M): JΓJᵀ; `repeated`: number of data components that
-    hold no information because readings are repeated, see `Protocol.repeated_facts`.
+    ΓGᵀ; `null_space` (m, p): N; `seen` (M, p): B = JN; `outer` (M, M): JΓJᵀ; `repeated`: number of data components
+    without information because readings are repeated, see `Protocol.repeated_facts`.
     """
 
     basis: Float[Array, "M k"]
@@ -59,8 +59,8 @@ class Spectrum(Module):
         repeated: int = 0,
     ):
         """Create a spectrum from the whitened Jacobian of all channels, or of their orthonormal combinations
-        `directions`; the `product` of its transpose with the prior covariance; and a basis of the prior's null
-        space."""
+        `directions`; the `product` of the prior covariance with the transpose of this Jacobian; and a basis of the
+        prior's null space."""
         data_basis = host.asarray(np.eye(len(jacobian))) if directions is None else directions
         basis, eigenvalues, null_space_data, data_covariance = _decompose(jacobian, product, null_space, data_basis)
         return cls(

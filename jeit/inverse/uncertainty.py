@@ -12,7 +12,7 @@ and Somersalo, Statistical and Computational Inverse Problems (Springer 2005), c
 
 For total variation, Q is the quadratic form of lagged diffusivity, which touches the energy at ĉ from above (Vogel and
 Oman, SIAM J. Sci. Comput. 17 (1996) 227-238). A jump of height d between cells has a stiffness proportional to 1 / √(d²
-+ β²). Σ is therefore conditional on the edges found: it is the uncertainty if the positions of the edges, and roughly
++ β²). Σ is therefore conditional on the estimated edges: Σ is the covariance if the positions of the edges, and roughly
 their heights, were known. At an edge the energy has a smaller curvature than Q, and an edge at another position may
 explain the data as well, so the true uncertainty is larger at an edge.
 """
@@ -84,7 +84,7 @@ class Posterior(Module):
         )
 
     def region(self, cells: ArrayLike) -> tuple[float | Float[Array, ""], float | Float[Array, ""]]:
-        """Mean conductivity of the given cells, weighted by area (3-D: volume), and its standard deviation, S/m
+        """Mean conductivity of the selected `cells`, weighted by area (3-D: volume), and its standard deviation, S/m
         (2-D: S).
 
         `cells`: booleans (m,) or indices. Raises `ValueError` for an empty selection, invalid indices and traced cells.
@@ -136,10 +136,10 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
 
     With a smooth prior, the standard deviations are as accurate as the noise, the prior and the forward model: with λ =
     1 and the correct prior variance, credible intervals have their nominal coverage; λ = 2 assumes that the image
-    varies half as much as the prior says. With total variation, the standard deviations are conditional on the edges
-    found: they hold if the positions of the edges, and roughly their heights, are known, and are too small at an edge
-    that may lie elsewhere. Raises `ValueError` for bounded solvers, whose posterior is not nearly Gaussian, for a
-    failed reconstruction, and for any other object.
+    varies half as much as the prior says. With total variation, the standard deviations are conditional on the
+    estimated edges: they are valid if the positions of the edges, and roughly their heights, are known, and are too
+    small at an edge that may lie elsewhere. Raises `ValueError` for bounded solvers, whose posterior is not nearly
+    Gaussian, for a failed reconstruction, and for any other object.
 
     **Arguments:**
 

@@ -90,9 +90,9 @@ def blur_radius(
     The blur radius is √(A/A₀) (3-D: the cube root), where A₀ is the area (volume) of the body and A that of the
     half-amplitude set: the cells where the image is at least half of the image's value *at the target*. (With half the
     image's maximum, as in Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179, an image with a narrow peak
-    elsewhere would count as sharp.) A is the expected value for white noise of unit variance in the data: for a target
-    of strength s in cell t with image p = R_λJ_t and noise variance (RRᵀ)_ii, cell i belongs to the set with
-    probability Φ(s (p_i - p_t/2) / √(RRᵀ)_ii).
+    elsewhere would count as sharp.) A is replaced by its expected value for white noise of unit variance in the data:
+    for a target of strength s in cell t with image p = R_λJ_t and noise variance (RRᵀ)_ii, cell i belongs to the set
+    with probability Φ(s (p_i - p_t/2) / √(RRᵀ)_ii).
     """
     cell_areas = np.asarray(measures(mesh))
     eigenvalues, modes = np.asarray(spectrum.eigenvalues), np.asarray(spectrum.modes())
@@ -100,7 +100,7 @@ def blur_radius(
     signal_norms = np.linalg.norm(signals, axis=0)
     strength = signal_to_noise * np.sqrt(len(signals)) / np.maximum(signal_norms, np.finfo(float).tiny)
     components = adjoint(np.asarray(spectrum.basis)) @ signals
-    # Data in the range of the null space are imaged independently of λ.
+    # Data that images in the prior's null space explain are imaged independently of λ.
     null_space_weights = np.asarray(spectrum.null_space) @ np.linalg.pinv(np.asarray(spectrum.seen))
     null_space_images, null_space_variance = null_space_weights @ signals, np.sum(abs(null_space_weights) ** 2, axis=1)
     damping = 1 / (eigenvalues + np.asarray(candidates)[:, None] ** 2)
@@ -275,7 +275,7 @@ def noise_figure(
 
     - `spectrum`: the problem, decomposed; `choose_hyperparameter` gives it to the rule.
     - `data`, `mesh`: not used.
-    - `target`: noise figure that λ shall give.
+    - `target`: requested noise figure.
 
     **Example:**
 
@@ -351,7 +351,7 @@ def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
         squared_components * eigenvalues / (eigenvalues + candidates[:, None] ** 2) ** 2
     )  # the sum is the penalty
     residual_terms = squared_components * filters**2  # its sum is ‖r‖²
-    # The derivatives with respect to t are 4 rest (1 - f) and -4 image f.
+    # The derivatives with respect to t are 4 residual_terms (1 - f) and -4 penalty_terms f.
     residual_derivatives = _second_log_derivative(
         residual_terms, 4 * (1 - filters), 8 * (1 - filters) * (2 - 3 * filters)
     )

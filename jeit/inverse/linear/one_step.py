@@ -163,7 +163,7 @@ class LinearReconstruction:
         """Change of conductivity in every cell, (m,) or (F, m), for one difference of frames (M,) or several (F, M), in
         volts.
 
-        Raises `ValueError` for another number of channels, and for NaN or infinite voltages.
+        Raises `ValueError` for the wrong number of channels, and for NaN or infinite voltages.
         """
         shape = np.shape(difference)
         if len(shape) not in (1, 2) or shape[-1] != self.num_measurements:
@@ -292,7 +292,7 @@ def back_projection(
     lines of every drive.
 
     The relative change of a channel is assigned to the cells whose potential, under the channel's drive, lies between
-    the potentials of its two measuring electrodes. The image of a cell is the mean over the channels that reach it
+    the potentials of its two measuring electrodes. The image of a cell is the mean of the changes assigned to it
     (Barber and Brown, J. Phys. E 17 (1984) 723-733), scaled so that a uniform change of conductivity is imaged exactly.
     A filtered image is sharper but noisier. Its matrix is B F, where B is the unfiltered matrix and F minimises ‖JBFv -
     v‖² + λ²‖JB‖²‖Fv‖², so that the Jacobian J maps the image BFv approximately to the data v.

@@ -361,7 +361,7 @@ def _as_tuple(unknowns) -> tuple[AbstractUnknown, ...]:
 
 
 def as_parametrisation(parametrisation: "Parametrisation | None") -> "Parametrisation":
-    """The given parametrisation, or the default for None. Raises `ValueError` for any other object."""
+    """Return the parametrisation, or the default for None. Raises `ValueError` for any other object."""
     if parametrisation is None:
         return Parametrisation()
     check_kind(
@@ -378,8 +378,8 @@ class Parametrisation(Module):
     - `link`: scale on which the prior acts, `Log()` by default.
     - `bounds`: minimum and maximum conductivity, S/m (2-D: S), satisfied exactly. Bounds require a solver that keeps
       bounds and a prior that has a precision matrix, or total variation.
-    - `regions` (m,): integer label of each cell; cells of the same label share one value, and cells labelled -1 are
-      held at the background. `pixels` creates labels.
+    - `regions` (m,): integer label of each cell; cells of the same label share one value, and cells labelled -1 have
+      the conductivity of the background. `pixels` creates labels.
     - `unknowns`: further parameters to estimate: `ContactImpedance`, `ElectrodePosition`, `Background`, `Scale`.
     - `informative`: minimum signal, in standard deviations of the noise, of a combination of the prior's shapes with an
       amplitude of one prior standard deviation, linearised at the background. Images consist of the combinations with a
@@ -418,7 +418,7 @@ class Parametrisation(Module):
             raise ValueError(f"informative must lie between 0 and 1; it is {self.informative}.")
 
     def check_model(self, model: ForwardModel) -> None:
-        """Raise `ValueError` if an unknown was made for another model."""
+        """Raise `ValueError` if an unknown does not fit the model, for example in its number of electrodes."""
         for unknown in self.unknowns:
             if not unknown.fits(model):
                 name = type(unknown).__name__

@@ -1,4 +1,5 @@
-"""Solvers of the nonlinear least squares problem: objects that hold settings and declare which problems they can solve.
+"""Solvers of the nonlinear least squares problem: objects that contain settings and declare which problems they can
+solve.
 
 `SOLVERS` lists the solvers by name, and `as_solver` converts a name to an object.
 """
@@ -352,7 +353,7 @@ def _least_squares(inversion: Inversion, start, solver, max_steps: int, options:
 
 
 def _descent_for(max_steps: int, rtol: float, damping: float = 0.0) -> Descent:
-    """Descent of at most `max_steps` steps, with a history that also holds the start. `atol` ends the iteration when
+    """Descent of at most `max_steps` steps, with a history that also contains the start. `atol` ends the iteration when
     the objective tends to zero, as for an undisturbed frame, where no change is small relative to the objective."""
     return Descent(rtol=rtol, atol=0.5 * rtol, damping=damping, history=max_steps + 1)
 

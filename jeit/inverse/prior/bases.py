@@ -56,8 +56,8 @@ class AbstractBasis(Module):
 
     @abc.abstractmethod
     def pooled(self, regions: "Regions") -> "AbstractBasis":
-        """Basis in which the rows of S are replaced by their mean over each region, and by zero where the image is held
-        fixed."""
+        """Basis in which the rows of S are replaced by their mean over each region, and by zero in cells that are fixed
+        at the background."""
 
 
 class DiagonalBasis(AbstractBasis):
@@ -213,7 +213,7 @@ class NodalBasis(AbstractBasis):
 class Regions(Module):
     """Regions of cells that share one value, such as pixels of a grid or layers of a skin.
 
-    **Fields**: `label` (m,): number of each cell's region, from 0, or -1 if the cell is held at the background;
+    **Fields**: `label` (m,): number of each cell's region, from 0, or -1 if the cell is fixed at the background;
     `measure` (m,): area (3-D: volume) of the cells; `number`: number of regions.
     """
 
@@ -252,12 +252,12 @@ class Regions(Module):
     def mean(self, values: Float[Array, "m *k"]) -> Float[Array, "p *k"]:
         """Mean of the cells' values over each region, weighted by area (3-D: volume)."""
         xp = namespace(self, values)
-        region_measures = self.spread(self.total(self.measure))  # zero where the image is held fixed
+        region_measures = self.spread(self.total(self.measure))  # zero in cells that are fixed at the background
         weight = xp.where(self.label < 0, 0, self.measure / xp.where(self.label < 0, 1, region_measures))
         return self.total(values * xp.expand_dims(weight, tuple(range(1, values.ndim))))
 
     def spread(self, values: Float[Array, "p *k"]) -> Float[Array, "m *k"]:
-        """Give each cell the value of its region; zero where the image is held fixed."""
+        """Give each cell the value of its region; zero in cells that are fixed at the background."""
         xp = namespace(self, values)
         is_fixed = xp.expand_dims(self.label < 0, tuple(range(1, values.ndim)))
         return xp.where(is_fixed, 0, values[xp.maximum(self.label, 0)])
@@ -296,8 +296,8 @@ def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
 
 
 class RegionBasis(AbstractBasis):
-    """Basis with one coefficient per region; all cells of a region have the value `deviation` (p,) times coefficient of
-    the region."""
+    """Basis with one coefficient per region; all cells of a region have the value `deviation` (p,) times the
+    coefficient of the region."""
 
     regions: Regions
     deviation: Float[Array, " p"]

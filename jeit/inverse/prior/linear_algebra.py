@@ -61,7 +61,7 @@ class NodalSystem(NamedTuple):
 
     @classmethod
     def create(cls, mesh: Mesh) -> "NodalSystem":
-        """Create for a mesh whose arrays are not traced."""
+        """Create the structure for a mesh whose arrays are not traced."""
         mesh = on_host(mesh)
         cells, nodes_per_cell = np.asarray(mesh.cells), mesh.cells.shape[1]
         pattern = SparsityPattern.from_elements([cells], size=mesh.num_points)

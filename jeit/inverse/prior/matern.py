@@ -154,7 +154,8 @@ def _covariance_factor(solve: Solve, mass: Float[np.ndarray, " n"]) -> Float[np.
 
 
 PRIOR = Noser()
-"""Default prior of `one_step` and `reconstruct`: it needs no length and suits bodies of which nothing is known."""
+"""Default prior of `one_step` and `reconstruct`: it needs no correlation length, so it can be used for bodies of which
+nothing is known."""
 MEASURED = "gaussian"
 """Name in `PRIORS` of the default prior for measured data and streams."""
 

@@ -157,8 +157,8 @@ class AbstractNormal(Module):
 
     @abc.abstractmethod
     def variance(self, basis: AbstractBasis) -> Float[Array, " m"]:
-        """Variance of the image in every cell: the diagonal of S Q⁻¹ Sᵀ for the `basis` S, plus the variance it leaves
-        out."""
+        """Variance of the image in every cell: the diagonal of S Q⁻¹ Sᵀ for the `basis` S, plus the variance that the
+        basis leaves out."""
 
     @abc.abstractmethod
     def num_draws(self, num_coefficients: int) -> int:

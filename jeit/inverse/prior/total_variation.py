@@ -114,8 +114,8 @@ class NodalTotalVariation(AbstractPenalty):
         )
 
     def inverse_hessian(self, coefficients, free, columns):
-        """Approximate inverse of the energy's Hessian, times columns. The stiffness is the second derivative along the
-        gradient, which vanishes where the gradient is large."""
+        """Approximate inverse of the energy's Hessian, times columns. The stiffness is the second derivative of the
+        energy along the gradient, which tends to zero where the gradient is large."""
         image, _ = self._split_coefficients(coefficients)
         size = self.pull.shape[0]
         is_free_node = free[:size]
@@ -147,7 +147,7 @@ class NodalTotalVariation(AbstractPenalty):
             gradient = self.pull * image + self._divergence(flux)
             factor = factorise_matrix(self.plan, self.fronts, self._matrix(self._elements(stiffness), self.pull))
             columns = xp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1)
-            # Products with Γ are formed from half solves; the step takes one more full solve.
+            # Products of columns by way of Q⁻¹ are formed from half solves; the step requires one more full solve.
             half_solution = factor.half_solve(columns)
             products = half_solution.T @ half_solution
             unknown_columns = jacobian[:, size:]

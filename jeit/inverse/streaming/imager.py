@@ -2,8 +2,8 @@
 
 Everything that does not depend on the frame is computed once: the independent channels, the prior's basis, the
 hyperparameter, the integrals over electrodes, the matrix of linear images, and the few dozen combinations of the
-prior's shapes that the data can resolve. Shapes of arrays never change, so nothing is compiled again: a masked channel
-keeps its place but gets a variance so large that the channel has no effect.
+prior's shapes that the data can resolve. The sizes of arrays never change, so nothing is compiled again: a masked
+channel remains in the arrays, with a variance so large that the channel has no effect.
 """
 
 from __future__ import annotations
@@ -195,12 +195,12 @@ class Imager(Module):
         )
 
     def with_reference(self, reference: Float[Array | np.ndarray, " M"]) -> "Imager":
-        """Copy of the imager with another reference frame (M,) of the undisturbed body, volts, for example after
+        """Copy of the imager with a new reference frame (M,) of the undisturbed body, volts, for example after
         electrodes were wetted.
 
-        Model, noise, hyperparameter and the channels in use stay, so nothing is compiled again. Raises `ValueError` for
-        a reference of another shape, without a reading of a channel in use, or different from the model's voltages by a
-        factor of ten or in sign.
+        Model, noise, hyperparameter and the channels in use do not change, so nothing is compiled again. Raises
+        `ValueError` for a reference that has the wrong shape, lacks a reading of a channel in use, or differs from the
+        model's voltages by a factor of ten or in sign.
         """
         frame, used = np.asarray(reference, float), np.asarray(self.mask)
         if frame.shape != used.shape:
@@ -240,7 +240,7 @@ class Imager(Module):
         """Image of a frame (M,) in volts, computed by at most `steps` iterations from the coefficients `start`.
 
         With a memory, `start` is also the prior mean, `persistence` times the last image's coefficients. Unused
-        channels must hold finite voltages, preferably those of the last frame.
+        channels must have finite voltages, preferably those of the last frame.
         """
         return _estimate_frame(self, frame, weighing, start)
 

@@ -264,11 +264,11 @@ def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     """Yield the image of each frame as soon as the frame arrives.
 
     Iterative methods start from the last image; an imager with a memory also uses the last image as prior mean.
-    Everything is compiled before the first frame is requested. A frame is refused, and the stream continues, if it has
-    another number of channels, is not real, has fewer than half of the channels usable, reads zero everywhere (the
-    current source has failed), or differs from an undisturbed frame by more than half of the undisturbed voltages.
-    Channels of a dead electrode and saturated channels are left out and named in `reason`. A frame that differs from an
-    undisturbed frame by noise only is imaged with status "unchanged".
+    Everything is compiled before the first frame is requested. A frame is refused, and the stream continues, if the
+    frame has the wrong number of channels, is not real, has fewer than half of the channels usable, reads zero
+    everywhere (the current source has failed), or differs from an undisturbed frame by more than half of the
+    undisturbed voltages. Channels of a dead electrode and saturated channels are left out and named in `reason`. A
+    frame that differs from an undisturbed frame by noise only is imaged with status "unchanged".
 
     **Arguments:**
 
