@@ -154,7 +154,7 @@ def find_inclusions(
     - `least_area`: minimum area (volume) of a region, as a fraction of the mesh; default 0.004 for a sheet and 0.001
       for a solid (0.004 of a solid would be a ball with a fifth of the solid's width).
     - `noise` (m,): standard deviation of the image in every cell, in the unit of the image.
-    - `least_significance`: minimum height of a peak, as a multiple of the `noise` if `noise` is given.
+    - `least_significance`: minimum height of a peak, as a multiple of the `noise`; not used without `noise`.
 
     Raises `ValueError` for an image of the wrong size or with NaN.
 

@@ -1,9 +1,9 @@
 """Sections of solids by planes, and isosurfaces of fields on tetrahedra, by marching simplices.
 
-A field is given by values at the nodes and is linear in every cell. The part of a tetrahedron where the field equals a
-level, or of a triangle where the field exceeds the level, is a triangle or a quadrilateral. Each part is stored as four
-corners, with the last corner repeated for a triangle. Doi and Koide, IEICE Trans. E74 (1991) 214-224, for tetrahedra.
-All cells are processed at once.
+A field is specified by values at the nodes and is linear in every cell. The part of a tetrahedron where the field
+equals a level, or of a triangle where the field exceeds the level, is a triangle or a quadrilateral. Each part is
+stored as four corners, with the last corner repeated for a triangle. Doi and Koide, IEICE Trans. E74 (1991) 214-224,
+for tetrahedra. All cells are processed at once.
 """
 
 from __future__ import annotations
@@ -249,7 +249,7 @@ class Plane:
     @classmethod
     def through(cls, point: ArrayLike, normal: ArrayLike) -> "Plane":
         """The plane through `point` (3,), in metres, perpendicular to `normal` (3,), which points towards the viewer.
-        Raises `ValueError` unless both are three finite numbers and the normal is not zero."""
+        Raises `ValueError` unless point and normal are three finite numbers each and the normal is not zero."""
         point_array, normal_array = (np.asarray(values, dtype=object) for values in (point, normal))
         for name, value in (("point", point_array), ("normal", normal_array)):
             if value.shape != (3,) or not all(is_number(coordinate) for coordinate in value):

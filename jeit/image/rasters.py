@@ -330,8 +330,8 @@ def challenge_score(labels: Int[np.ndarray, "256 256"], truth: Int[np.ndarray, "
     `labels`, `truth`: 256 × 256 pixels with the labels 0 background, 1 resistive and 2 conductive. The means, variances
     and covariance in the SSIM are computed in Gaussian windows with a standard deviation of 80 pixels, cut off at ±160
     pixels and normalised at the border. The constants that stabilise the quotients of the SSIM are c1 = 1e-4 and c2 =
-    9e-4. The score of a class is the mean of the SSIM over all pixels, or 1 if the class is absent from both images.
-    Raises `ValueError` for images of the wrong shape or with other labels. Räsänen et al., KTC2023, doi
+    9e-4. The score of a class is the mean of the SSIM over all pixels, or 1 if neither image contains the class. Raises
+    `ValueError` for images of the wrong shape or with other labels. Räsänen et al., KTC2023, doi
     10.5281/zenodo.8252370.
     """
     labels, truth = np.asarray(labels), np.asarray(truth)

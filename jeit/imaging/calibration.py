@@ -85,8 +85,8 @@ def calibrated_model(
 
 
 def threads_for(mesh: Mesh) -> AbstractContextManager:
-    """Context in which the BLAS has one thread for a sheet: the matrices of a sheet are small, and on a busy machine
-    threads that wait for each other take ten times as long."""
+    """Context in which the BLAS has one thread for a sheet. The matrices of a sheet are small, and several threads that
+    wait for each other on a busy machine take ten times as long."""
     return one_thread_of_blas() if mesh.dimension == 2 else nullcontext()
 
 
@@ -98,8 +98,8 @@ def _with_estimated_positions(
     The described positions are used if they explain the reference, or if the misfit has other causes: for example,
     estimated positions explain little of the misfit of a two-dimensional model of a deep tank. The background is
     estimated together with the positions, from channels weighted by their relative noise. If the background were fitted
-    mainly to the largest voltages, those at the driven electrodes, it would follow the errors of a two-dimensional
-    model there.
+    mainly to the largest voltages, those at the driven electrodes, the background would follow the errors of a
+    two-dimensional model at these electrodes.
     """
     described_misfit = relative_misfit(calibration.voltages, voltages, mask)
     if (

@@ -1,7 +1,7 @@
 """Search for the protocol of a file of voltages that has no description, with the evidence for each protocol.
 
 Protocols of common kinds whose number of channels fits the file are compared: by reciprocity, which needs no model, and
-by the misfit of a uniform body of the given shape (`jeit.imaging.wiring`), in a frame of the empty body.
+by the misfit of a uniform body of the described shape to a frame of the empty body (`jeit.imaging.wiring`).
 """
 
 from __future__ import annotations
@@ -88,9 +88,9 @@ class Candidate:
 
     @property
     def ordered(self) -> bool:
-        """Whether a uniform body would explain the voltages far worse if the channels were in another order: a share
-        √(1 - r²) would be unexplained on average, where r is the squared mean of the voltages divided by their mean
-        square."""
+        """Whether a uniform body would explain the voltages far worse if the channels were in a different order. On
+        average, a share √(1 - r²) would then be unexplained, where r is the squared mean of the voltages divided by
+        their mean square."""
         values = np.asarray(self.measurement.voltages)[np.asarray(self.measurement.mask)]
         mean_ratio = abs(values.mean()) ** 2 / np.mean(np.abs(values) ** 2)
         return bool(_ORDERED * self.unexplained < np.sqrt(1 - mean_ratio**2))
@@ -331,7 +331,7 @@ def _protocols(number: int) -> Iterator[dict[str, Any]]:
 def _fitting(
     numbers: _Numbers, base_numbers: _Numbers, geometry: dict, electrodes: dict, known: dict, current: float
 ) -> Iterator[Candidate]:
-    """Yield candidates whose number of channels fits both files; of equal protocols, only the first."""
+    """Yield candidates whose number of channels fits the file and its reference; of equal protocols, only the first."""
     counts, found_protocols = set(numbers.sizes), set()
     for number in [known["number"]] if "number" in known else range(_FEWEST, _MOST + 1):
         if not any(number * (number - 4) / 4 <= count <= number**2 for count in counts):

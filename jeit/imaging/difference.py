@@ -202,7 +202,7 @@ class ImagedDifference:
     @property
     def departure(self) -> Float[Array, " m"]:
         """Values per cell in which inclusions are found: the change of conductivity, or, for iterative images, the
-        change of its natural logarithm."""
+        change of the natural logarithm of conductivity."""
         if not self.iterative:
             return self.change
         return as_array(np.log1p(np.asarray(self.change) / float(self.calibration.conductivity)))
@@ -320,7 +320,7 @@ def image_difference(
     - `progress`: function called with the name of each step when the step begins.
 
     Raises `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`) or lack the positions of the
-    electrodes, and for arguments of another type, such as the path of a file.
+    electrodes, and for arguments of the wrong type, such as the path of a file.
 
     **Example:**
 

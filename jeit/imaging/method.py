@@ -38,8 +38,8 @@ class ImagingSettings:
 
     **Arguments:**
 
-    - `method`: "auto" or a name in `METHODS`, which has linear methods, iterative methods that solve for conductivity
-      itself, and "shapes", which fits outlines of bodies. "auto" uses one-step imaging if its image is sound, otherwise
+    - `method`: "auto" or a name in `METHODS`: linear methods, iterative methods that solve for conductivity itself, and
+      "shapes", which fits outlines of bodies. "auto" uses one-step imaging if its image is sound, otherwise
       Gauss-Newton imaging with outlines of the bodies; in solids, ellipsoids are fitted wherever the data support them
       (see `jeit.inverse.shapes`).
     - `prior`: a name in `jeit.inverse.prior.matern.PRIORS`, or a quadratic prior; used by one-step, Gauss-Newton and
@@ -49,8 +49,8 @@ class ImagingSettings:
       one-step imaging is used. Defaults: "noise-figure" for one-step imaging, 5 for Gauss-Newton and
       Levenberg-Marquardt, 300 for total variation, which gave good images of measured tanks.
     - `contact`: calibration of the contact impedance: "each" (one value per electrode), "common" (one value) or
-      "fixed". Default: "each" if voltages are measured on driven electrodes, otherwise "fixed", since the data then do
-      not determine the contact impedance.
+      "fixed". Default: "each" if voltages are measured on driven electrodes. Otherwise the data do not determine the
+      contact impedance, and the default is "fixed".
     - `num_points`: approximate number of mesh nodes; default: 2,000 for a sheet, 10,000 for a solid.
     - `raster_shape`: (rows, columns) of the raster.
     - `level`, `least_peak`: see `jeit.image.find_inclusions`.
@@ -225,7 +225,8 @@ def _one_step(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
 def _back_projection(prepared: PreparedDifference, options: MethodOptions, *, filtered: bool) -> Imaged:
     weight = options.hyperparameter
     keywords = {"hyperparameter": weight} if isinstance(weight, (int, float)) else {}
-    # The equipotential lines are those of the real background; real and imaginary voltages are projected separately.
+    # Equipotential lines are computed for the real part of the background; real and imaginary voltages are projected
+    # separately.
     conductivity = np.real(prepared.calibration.conductivity)
     reconstruction = back_projection(prepared.model, conductivity, filtered=filtered, mask=prepared.mask, **keywords)
     return reconstruction, reconstruction.image(prepared.difference)

@@ -126,9 +126,10 @@ class PreparedDifference:
 
     @property
     def unlike_electrodes(self) -> dict[int, float]:
-        """Electrodes, numbered from 0, whose channels in the reference are fitted far worse than those of the other
-        electrodes, each with the ratio of the misfits. Such electrodes may be loose or displaced, or their gain may
-        differ. Channels that measure on these electrodes have less weight."""
+        """Electrodes, numbered from 0, whose channels in the reference the model fits far worse than those of the other
+        electrodes. Each electrode is listed with its misfit, divided by the median misfit of all electrodes. Such
+        electrodes may be loose or displaced, or their gain may differ. Channels that measure on these electrodes have
+        less weight."""
         return {
             int(electrode): float(self._electrode_weights[electrode])
             for electrode in np.flatnonzero(self._electrode_weights > 1)
@@ -311,8 +312,8 @@ def select_frames(
 ) -> tuple[Measurement, Measurement]:
     """Select the frame to image and its reference, one frame each.
 
-    A frame named "reference" in `measurement` is imaged only if requested, and serves as reference if no `reference` is
-    given. A reference measured with other currents is converted to the currents of the measurement if it determines the
+    A frame named "reference" in `measurement` is imaged only if requested, and serves as reference if `reference` is
+    None. A reference measured with other currents is converted to the currents of the measurement if it determines the
     voltages for these currents (see `jeit.data.driven_by`); its notes record the conversion.
 
     **Arguments:**

@@ -220,8 +220,8 @@ def image_frequencies(
 
 
 def frequency_weight(second: Measurement, first: Measurement) -> float | complex:
-    """Weight α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ of the voltages at the first frequency, from the first frame of each measurement
-    and the channels usable in both; complex for complex voltages.
+    """Weight α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ of the voltages at the first frequency, computed from the first frame of each
+    measurement and the channels that are usable in both frames; complex for complex voltages.
 
     **Arguments:**
 

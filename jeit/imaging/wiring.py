@@ -1,10 +1,10 @@
-"""Detection of wiring errors: exchanged wires, channels in another order, and voltages of opposite sign.
+"""Detection of wiring errors: exchanged wires, channels in the wrong order, and voltages of opposite sign.
 
 `exchanges_message` detects drives or measurements that are exchanged in a frame but not in its reference. If each drive
 has all measurements, frame and reference are matrices (drives, measurements), and an exchange of two drives exchanges
-two rows. The exchanges that make the frame most similar to its reference are found.
+two rows. The exchanges that make the frame most similar to its reference are determined.
 
-`find_wiring` finds the wiring that explains a frame of the empty body. A uniform body is known except for its
+`find_wiring` estimates the wiring that explains a frame of the empty body. A uniform body is known except for its
 conductivity and its contacts. Its transfer impedance Z (L, L) is computed for several contact impedances; if electrode
 k is at the place of electrode p(k), the transfer impedance is Z[p, p]. Wirings are compared by their misfit to the
 frame, up to a scale factor.
@@ -166,8 +166,8 @@ class Wiring:
 
 
 def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
-    """Find the wiring that explains the first frame of `measurement`, of the empty body: the described wiring, unless
-    the misfit of another wiring is far smaller.
+    """Find the wiring that explains the first frame of `measurement`, a frame of the empty body. The result is the
+    described wiring unless a different wiring has a far smaller misfit.
 
     Candidates are other orders of the channels, voltages of opposite sign, other first electrodes, the reverse order of
     electrodes, and up to four successive exchanges of two electrodes. Voltages may be magnitudes if all have one sign,
@@ -208,8 +208,8 @@ def _explained(
     num_electrodes = len(described_wiring.places)
 
     def best_of(wirings: Iterable[Wiring], last_best: Wiring) -> Wiring:
-        # Misfits are rounded so that the first of equivalent wirings is taken, such as orders that are the same by
-        # reciprocity.
+        # Misfits are rounded so that the first of equivalent wirings is chosen, for example of orders that are
+        # equivalent by reciprocity.
         best_wiring = min((misfit_of(wiring) for wiring in wirings), key=lambda wiring: round(wiring.misfit, 9))
         return best_wiring if best_wiring.misfit < _MAX_STEP_RATIO * last_best.misfit else last_best
 
@@ -231,8 +231,8 @@ def _explained(
 
 
 def _has_one_sign(model: ForwardModel, measurement: Measurement) -> bool | None:
-    """True if all voltages have one sign; False if all signs equal, or all oppose, those of a uniform body with the
-    described wiring, which are assigned to magnitudes when their file is read; None for other signs."""
+    """True if all voltages have one sign; False if all signs equal, or all oppose, the signs of a uniform body with the
+    described wiring (which are assigned to magnitudes when their file is read); None for other signs."""
     used = np.asarray(measurement.mask)[0]
     signs = np.sign(np.real(np.asarray(measurement.filled())[0]))[used]
     expected = np.sign(select_channels(on_host(model.protocol), _impedances(model)[0]))[used]

@@ -123,7 +123,7 @@ _LARGE_MISFIT = 0.12
 _MIN_VOLTAGE = 1e-30
 # Relative change of the misfit or the parameters that ends a fit: on small meshes, and on large meshes.
 _TOLERANCE, _TOLERANCE_LARGE_MESH = 1e-8, 1e-4
-# Number of cells above which a mesh counts as large. A step of the fit then takes seconds.
+# Number of cells above which a mesh counts as large. A step of the fit on a large mesh takes seconds.
 _LARGE_MESH_CELLS = 30_000
 
 
@@ -217,9 +217,9 @@ def calibrate(
     """Fit background conductivity and contact impedance to a reference frame by least squares.
 
     The parameters are logarithms, so conductivity and impedance stay positive. The fit starts from the model's contact
-    impedance and the conductivity that best scales the prediction for σ = 1 to the data (voltages are proportional to
-    1/σ at fixed z·σ). For complex voltages the background σ + iωε is complex, with the two parts of its logarithm as
-    parameters; contact impedances stay real.
+    impedance and from the conductivity for which the prediction for σ = 1, divided by σ, fits the data best (voltages
+    are proportional to 1/σ at fixed z·σ). For complex voltages the background σ + iωε is complex, with the two parts of
+    its logarithm as parameters; contact impedances stay real.
 
     The function works inside `jax.grad`, `jax.vmap` and `jax.jit`, with respect to the voltages and all fields of the
     model. Derivatives of the minimum follow from the implicit function theorem with the full Hessian.

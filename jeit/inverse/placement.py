@@ -7,13 +7,14 @@ impedances z = z₀ e^ζ and a conductivity σ, the estimate minimises
     ½ ‖(v(σ, t, z) - y) / κn‖² + ½ ‖t / s‖² + ½ ζᵀ Γ⁻¹ ζ,
 
 where v are the predicted voltages, n is the `relative_noise` of the channels, s the prior standard deviation of the
-positions, and Γ the prior covariance of the logarithms ζ, which have a common part. The factor κ is estimated from the
-residual. Derivatives need no further solve: at fixed fields only the energy of electrode l depends on t_l
-(`jeit.forward.changes`).
+positions, and Γ the prior covariance of the logarithms ζ. The errors of these logarithms have a common part. The factor
+κ is estimated from the residual. Derivatives need no further solve: at fixed fields only the energy of electrode l
+depends on t_l (`jeit.forward.changes`).
 
-Kolehmainen, Vauhkonen, Karjalainen and Kaipio, Physiological Measurement 18 (1997) 289, errors of electrode positions;
-Vilhunen, Kaipio, Vauhkonen, Savolainen and Vauhkonen, Measurement Science and Technology 13 (2002) 1848, contact
-impedances; Darde, Hyvönen, Seppänen and Staboulis, SIAM Journal on Imaging Sciences 6 (2013) 176, both together.
+Kolehmainen, Vauhkonen, Karjalainen and Kaipio, Physiological Measurement 18 (1997) 289, on errors of electrode
+positions; Vilhunen, Kaipio, Vauhkonen, Savolainen and Vauhkonen, Measurement Science and Technology 13 (2002) 1848, on
+contact impedances; Darde, Hyvönen, Seppänen and Staboulis, SIAM Journal on Imaging Sciences 6 (2013) 176, on estimating
+both together.
 """
 
 from __future__ import annotations
@@ -179,7 +180,7 @@ def place_electrodes(
     - `mask` (M,): True for the channels to use.
 
     Raises `ValueError` for electrodes that cannot move, invalid arguments, voltages that have the opposite sign of the
-    model's, and voltages for which no explaining positions are found.
+    model's, and if no positions are found that explain the voltages.
 
     **Example:**
 

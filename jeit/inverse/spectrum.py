@@ -11,9 +11,9 @@ and
 
     R_λ = (I - NB⁺J) ΓJᵀQU diag(1/(Λ + λ²)) UᵀQᵀ + NB⁺.
 
-The changes of data that a body can cause often have a far lower dimension r than the number of channels: J = DG with
-orthonormal columns of D (M, r). Only G (r, m) and ΓGᵀ are stored at the size of the image. For complex admittivities J
-and the data are complex and ᵀ denotes the conjugate transpose.
+The space of the changes of data that a body can cause often has a dimension r far below the number of channels: J = DG
+with orthonormal columns of D (M, r). Only G (r, m) and ΓGᵀ are stored at the size of the image. For complex
+admittivities J and the data are complex and ᵀ denotes the conjugate transpose.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from jeit_solvers import symmetric_eigen
 from jeit_solvers.engines import adjoint, either_engine, has_values, host, namespace
 from jeit_solvers.module import Module
 
-# Approximate number of cells over which the mean of an image is taken.
+# Approximate number of cells over which an image is averaged.
 _NUM_MEAN_CELLS = 10_000
 
 

@@ -87,12 +87,12 @@ def blur_radius(
 ) -> Float[np.ndarray, "K T"]:
     """Blur radius of the noisy image of every target cell for every candidate λ, relative to the size of the body.
 
-    The blur radius is √(A/A₀) (3-D: the cube root), where A₀ is the area (volume) of the body and A that of the
-    half-amplitude set: the cells where the image is at least half of the image's value *at the target*. (With half the
-    image's maximum, as in Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179, an image with a narrow peak
-    elsewhere would count as sharp.) A is replaced by its expected value for white noise of unit variance in the data:
-    for a target of strength s in cell t with image p = R_λJ_t and noise variance (RRᵀ)_ii, cell i belongs to the set
-    with probability Φ(s (p_i - p_t/2) / √(RRᵀ)_ii).
+    The blur radius is √(A/A₀) (3-D: the cube root), where A₀ is the area (volume) of the body and A the area of the
+    half-amplitude set: the cells where the image is at least half of its value *at the target*. (With half of the
+    image's maximum instead, as in Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179, an image with a narrow
+    peak elsewhere would count as sharp.) A is replaced by its expected value for white noise of unit variance in the
+    data: for a target of strength s in cell t with image p = R_λJ_t and noise variance (RRᵀ)_ii, cell i belongs to the
+    set with probability Φ(s (p_i - p_t/2) / √(RRᵀ)_ii).
     """
     cell_areas = np.asarray(measures(mesh))
     eigenvalues, modes = np.asarray(spectrum.eigenvalues), np.asarray(spectrum.modes())
@@ -187,7 +187,8 @@ def generalised_cross_validation(spectrum: Spectrum, data: ArrayLike | None, mes
     """
     candidates, data = spectrum.candidates(), _check_data(data, "gcv")
     residual, penalty = spectrum.curves(data, candidates)
-    # Repeated readings have filter 1 but leave no residual, so their number is subtracted from both counts.
+    # Repeated readings have filter 1 but no residual, so their number is subtracted from the number of channels and
+    # from the trace.
     num_independent = len(data) - spectrum.repeated
     score = num_independent * residual**2 / (_filters(spectrum, candidates).sum(axis=1) - spectrum.repeated) ** 2
     return Choice.among("gcv", candidates, int(np.argmin(score)), score, (residual, penalty))

@@ -2,7 +2,7 @@
 size.
 
 Adler et al., "GREIT: a unified approach to 2D linear EIT reconstruction of lung images", Physiol. Meas. 30 (2009)
-S35-S55. The paper treats a disk; here bodies of any outline are allowed, and targets in a solid body are balls.
+S35-S55. The paper considers a disk. Here, bodies may have any outline, and targets in a solid body are balls.
 """
 
 from __future__ import annotations

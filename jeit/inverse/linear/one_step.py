@@ -36,9 +36,9 @@ _NUM_SAMPLED_CELLS = 4000
 class LinearReconstruction:
     """A linear image reconstruction: change of conductivity = matrix · change of voltages.
 
-    Two reciprocal channels (v_b = ratio · v_a) have proportional columns in the matrix. The voltages of both channels
-    are added before the product, which halves the arithmetic. If the rank r of the matrix is lower than the number K of
-    combined channels, the combined channels are first reduced to r combinations.
+    Two reciprocal channels (v_b = ratio · v_a) have proportional columns in the matrix. The voltages of the two
+    channels are added before the product, the second with a weight, which halves the arithmetic. If the rank r of the
+    matrix is lower than the number K of combined channels, the combined channels are first reduced to r combinations.
 
     **Fields**: `mesh`; `first`, `second` (K,): channels added to form each combined channel; `ratio` (K,): weight of
     the second channel; `weights` (K, m): change of conductivity in S/m (2-D: S) per volt of each combined channel, or
@@ -201,7 +201,7 @@ def _combine_channels(difference, first, second, ratio, mixing) -> Any:
 
 def _proportional_channels(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Channels `first` and `second` that are added before the product with the matrix, and the `ratio` of their
-    columns. The pairs are reciprocal channels with proportional columns; every other channel stands alone, with ratio
+    columns. The pairs are reciprocal channels with proportional columns; every other channel is used alone, with ratio
     0."""
     column_norms = np.linalg.norm(matrix, axis=0)
     is_single = column_norms > 0
@@ -275,7 +275,7 @@ def one_step(
     result_fields = choice.hyperparameter, choice.rule, method, choice
     if isinstance(linear.spectrum, Spectrum) and has_values(choice.hyperparameter):
         factors = linear.factors(choice.hyperparameter)
-        del linear  # frees memory, which cannot hold both for a large body
+        del linear  # frees memory, because the problem and the factors of a large body do not fit in memory together
         return LinearReconstruction.of_factors(model, factors, *result_fields)
     return LinearReconstruction.create(model, linear.matrix(choice.hyperparameter), *result_fields)
 

@@ -96,9 +96,9 @@ class GaussNewton(AbstractSolver):
     """Gauss-Newton method with a backtracking line search; total variation is treated by lagged diffusivity.
 
     **Arguments:** `max_steps`: maximum number of steps, default 30, for an `Imager` 4; rejected steps and the shorter
-    steps tried in their place both count. `rtol`: the iteration ends when the next step would change the objective by
-    less than rtol times the objective, or by less than rtol times ½, which is the misfit of one voltage with an error
-    of one standard deviation; default 1e-6, with total variation 1e-4, for an `Imager` 1e-3.
+    steps that replace them all count. `rtol`: the iteration ends when the next step would change the objective by less
+    than rtol times the objective or rtol times ½ (½ is the contribution of one voltage with an error of one standard
+    deviation to the objective); default 1e-6, with total variation 1e-4, for an `Imager` 1e-3.
 
     **Example:**
 

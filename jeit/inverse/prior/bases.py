@@ -39,7 +39,8 @@ class AbstractBasis(Module):
         """Product of `rows`, such as a Jacobian (M, m), with S."""
 
     def restrict_blocks(self, blocks: Iterable[tuple[slice, Any]]) -> Any:
-        """Product of rows (M, m), given as blocks of consecutive cells, with S; a new NumPy array (M, n)."""
+        """Product with S, as a new NumPy array (M, n), of rows (M, m) that are passed as blocks of consecutive
+        cells."""
         cell_slices, column_blocks = zip(*blocks, strict=True)
         rows: Any = np.empty((len(column_blocks[0]), cell_slices[-1].stop), column_blocks[0].dtype)
         for block_cells, block in zip(cell_slices, column_blocks, strict=True):
@@ -183,7 +184,7 @@ class NodalBasis(AbstractBasis):
         return functools.reduce(operator.add, corner_sums).T
 
     def restrict_blocks(self, blocks):
-        """As `restrict`, for rows given as blocks of cells."""
+        """Rows times S, for rows that are passed as blocks of cells."""
         total: Any = np.zeros(0)
         nodes_per_cell = self.cells.shape[1]
         for cells, block in blocks:

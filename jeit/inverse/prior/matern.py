@@ -40,9 +40,9 @@ _COLUMNS_AT_ONCE = 50
 class Matern(AbstractPrior):
     """Matérn prior: a smooth random field of unit variance.
 
-    The correlation falls to 0.14 at twice the correlation length, as for `Gaussian(length)`, but it has a peak at
-    distance zero, so images have sharper peaks. κ is 1 / length in a solid body, √2 / length in a sheet. The cells must
-    not be much larger than the length. Memory and time are roughly proportional to the number of nodes.
+    The correlation falls to 0.14 at twice the correlation length, as for `Gaussian(length)`, but is more sharply peaked
+    at distance zero, so images have sharper peaks. κ is 1 / length in a solid body, √2 / length in a sheet. The cells
+    must not be much larger than the length. Memory and time are roughly proportional to the number of nodes.
 
     **Arguments:**
 

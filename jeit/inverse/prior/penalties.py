@@ -114,7 +114,7 @@ class QuadraticForm(AbstractPenalty):
 
     @classmethod
     def create(cls, row, column, value, hyperparameter, size: int) -> "QuadraticForm":
-        """Create with Q = λ² times the matrix with the given entries, for λ = `hyperparameter`."""
+        """Create the penalty with Q = λ² times the matrix with these entries, for λ = `hyperparameter`."""
         is_diagonal = len(row) == size and np.array_equal(row, column)
         return cls(row, column, hyperparameter**2 * value, size, bool(is_diagonal))
 

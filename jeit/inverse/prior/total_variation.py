@@ -251,8 +251,8 @@ class TotalVariation(AbstractPrior):
 
     def penalty(self, mesh, reference, hyperparameter, *, jacobian=None, regions=None, per_cell=False):
         """Basis with one coefficient per cell (or node of a solid), and the total variation penalty weighted with λ. An
-        edge as long as the body is wide has the penalty λ per unit of jump. Raises `ValueError` if `regions` are
-        given."""
+        edge as long as the body is wide has the penalty λ per unit of jump. Raises `ValueError` unless `regions` is
+        None."""
         if regions is not None:
             raise ValueError("regions: total variation finds its own; leave them out, or take another prior.")
         check_cells(mesh)
@@ -330,7 +330,7 @@ class TotalVariationPenalty(AbstractPenalty):
 
     def inverse_hessian(self, coefficients, free, columns):
         """Approximate inverse of the energy's Hessian, times columns. The weights in the Hessian are β² / (d² + β²)
-        times those of the touching quadratic form and vanish across large jumps."""
+        times the weights in the touching quadratic form and tend to zero across large jumps."""
         image, _ = self._split_coefficients(coefficients)
         is_free_cell = free[: self.level.shape[0]]
         curvature = self.weight * self.smoothing**2 / self._smoothed_height(image) ** 3

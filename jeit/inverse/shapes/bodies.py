@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from jeit.arguments import describe, is_number
 from jeit.arguments.checks import Interval
 
-# Fields of `Bodies`, except `start`, that hold one value per body.
+# Fields of `Bodies`, except `start`, that have one value per body.
 _FIELDS_PER_BODY = ("sign", "is_other_kind", "same_material", "fixed_contrast")
 
 
@@ -95,8 +95,9 @@ class Quantities:
     **Fields**: `change`, `change_interval`: change of conductivity relative to the background; `measure`,
     `measure_interval`: area, m², or volume, m³; `strength`, `strength_interval`: `measure` times (ρ - 1) / (ρ + n - 1),
     where ρ is the conductivity relative to the background and n the number of axes along which the body is bounded (2
-    in a sheet and for a column, else 3), negative for resistive bodies; `centroid_radius`: radius, metres, of the
-    circle (in a solid, of the ball) about the centroid that contains the true centroid with a probability of 68 %.
+    in a sheet and for a column, else 3); the strength is negative for resistive bodies; `centroid_radius`: radius,
+    metres, of the circle (in a solid, of the ball) about the centroid that contains the true centroid with a
+    probability of 68 %.
 
     **Example:**
 
@@ -309,8 +310,8 @@ class Bodies(abc.ABC):
         return new_bodies, np.append(coefficients[0], rows)
 
     def image(self, coefficients) -> BodyImage:
-        """Image log σ/σ₀ per cell, the overlaps of the bodies, and the derivatives of both with respect to the
-        coefficients."""
+        """Compute the image log σ/σ₀ per cell, the overlaps of the bodies, and the derivatives of image and overlaps
+        with respect to the coefficients."""
         num_cells, dimension = len(self.weight), self.dimension
         rows = self.rows(coefficients)
         coverages = [self.coverage(k, row) for k, row in enumerate(rows)]

@@ -64,7 +64,8 @@ def _contrasts(problem: ShapeProblem, fitted: Fit) -> tuple[Float[np.ndarray, " 
 
 def alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | None, float]]:
     """For each body, the body of the other kind (ellipsoid or column) that explains the data about as well, and the
-    standard deviation of this body's contrast; None and NaN if there is none. The prior odds of kinds are ignored."""
+    standard deviation of this alternative body's contrast; None and NaN if there is no alternative. The prior odds of
+    kinds are ignored."""
     bodies, num_bodies = fitted.bodies, len(fitted.bodies.sign)
     if not num_bodies or bodies.prior.is_of_one_kind or not isinstance(bodies, Ellipsoids):
         return [(None, np.nan)] * num_bodies
@@ -84,12 +85,12 @@ KINDS = ("either", "ellipsoids", "columns")
 # Barycentric coordinates of the twenty points at which a cell is sampled; all represent equal parts of the cell.
 _SAMPLES = np.array([[2 * n + 1 for n in indices] for indices in np.ndindex(4, 4, 4, 4) if sum(indices) == 3]) / 10
 # Width of the blur of a surface, in units of the cell size: large enough for the coverage to be differentiable, but
-# small, because blurred bodies are estimated too small and too strong.
+# small, because the estimates of blurred bodies are too small and too strong.
 _BLUR = 0.1
 # Exponents of the power mean of the conductivities of body and bath in cells that a surface cuts, for bodies more (1)
 # and less (-1) conductive than the bath. With edges of half the radius, the change of voltages due to balls 0.1 to 12
-# times as conductive as the bath then agrees within 1 to 5 % with that on meshes whose facets follow the surface. A
-# single exponent of 0.15 made the change due to balls of 12 times the conductivity 13 to 19 % too large, an error
+# times as conductive as the bath then agrees within 1 to 5 % with that on meshes whose facets follow the surface. With
+# a single exponent of 0.15, the change due to balls of 12 times the conductivity was 13 to 19 % too large, an error
 # proportional to the edge length.
 _POWERS = {1: -1.0, -1: 0.5}
 # Distance from a surface within which cells are refined, in units of the body's shortest half axis; lower limit of this
@@ -282,8 +283,8 @@ class Ellipsoids(Bodies):
 
     @property
     def num_splits(self) -> int:
-        """Number of axes along which a split is tried: 1, the longest, because two neighbours fitted as one body make
-        this body long, and each trial takes tens of forward solves."""
+        """Number of axes along which a split is tried: 1, the longest, because two adjacent bodies fitted as one body
+        form a long body, and each trial requires tens of forward solves."""
         return 1
 
     def with_other_kind(self, indices, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
@@ -351,8 +352,8 @@ class Ellipsoids(Bodies):
         return max_lengths
 
     def left_refined_cells(self, coefficients, others: Bodies, new_coefficients) -> bool:
-        """Whether, between `coefficients` and the coefficients `new_coefficients` of the bodies `others`, a surface
-        has left the cells that were refined for it, a body was removed, or a body changed kind."""
+        """Whether a surface has left the cells that were refined for it, a body was removed, or a body changed kind,
+        between these bodies with `coefficients` and the bodies `others` with `new_coefficients`."""
         if not np.array_equal(self.is_other_kind, others.is_other_kind):
             return True
         for k, (row, new_row) in enumerate(zip(self.rows(coefficients), others.rows(new_coefficients), strict=True)):

@@ -36,7 +36,7 @@ _MEDIAN_LOG_CONTRAST, _LOG_CONTRAST_DEVIATION, _LOG_CONTRAST_BOUNDS = (
 # and the factor by which each step is longer than the last.
 _STEPS, _FIRST_STEP_LIMITS, _STEP_GROWTH = 8, (0.02, 0.35), 1.6
 # By dimension of the mesh: maximum number of steps of each fit and its tolerance, and the drop of the log posterior at
-# which the exploration ends. A step in a solid takes a second.
+# which the exploration ends. A step of a fit in a solid takes a second.
 _FIT_LIMITS, _LOG_POSTERIOR_DROP = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0}
 # The data do not determine a limit of the contrast if the -log likelihood at that bound of the contrast exceeds its
 # minimum by less than this number.
@@ -74,8 +74,8 @@ class Accuracy(NamedTuple):
 def with_quantities(
     problem: ShapeProblem, fit: Fit, accuracy: Accuracy, unmodelled: Any, order: Any
 ) -> list[Quantities]:
-    """Quantities of the bodies of a `fit`, in the given `order` of indices. `unmodelled` (k,): standard deviations of
-    the contrasts of all k bodies due to errors that the problem does not contain.
+    """Compute the quantities of the bodies of a `fit`, in the `order` of indices. `unmodelled` (k,): standard
+    deviations of the contrasts of all k bodies due to errors that the problem does not contain.
 
     `problem` has the noise of `accuracy` alone; the model error is added for the conductivity of the fit.
     """
@@ -161,8 +161,8 @@ class _FixedContrastFit(NamedTuple):
 
 
 def quantify(problem: ShapeProblem, fit: Fit, k: int, unmodelled: float, accuracy: Accuracy) -> Quantities:
-    """Quantities of body k of a `fit`, from an exploration of the body's contrast in both directions until the contrast
-    is improbable or at a bound.
+    """Compute the quantities of body k of a `fit`. The body's contrast is explored in both directions until it is
+    improbable or at a bound.
 
     `unmodelled`: standard deviation of the contrast due to errors that the problem does not contain; these errors do
     not change the strength.

@@ -35,7 +35,8 @@ from jeit_solvers.module import Module
 if TYPE_CHECKING:
     from jeit.inverse.shapes.finer import FinerModel
 
-# Minimum factor by which the objective must rise when a body is left out and the others are fitted again.
+# A body is a ghost if the objective rises by less than this factor when the body is left out and all other bodies are
+# fitted again.
 LEAST_RISE = 1.4
 _FIRST_STEPS, _STEPS, _REMOVAL_STEPS, _TRIAL_STEPS = 15, 40, 8, 6
 _COARSE_TOLERANCE = 1e-2
@@ -337,7 +338,8 @@ class _SearchResult(NamedTuple):
 
 
 class _SearchState(NamedTuple):
-    """State of the search: the bodies `found` in a `setting`, with the smooth field at its `level`."""
+    """State of the search: result `found` of fitting the bodies in a `setting`, with the smooth field at its
+    `level`."""
 
     setting: _FitSetting
     level: float
@@ -404,7 +406,7 @@ def _remove_unsupported(
     doubtful, costs = list(doubtful), np.zeros(len(fitted.bodies.sign)) if min_costs is None else min_costs.copy()
     while True:
         bodies, coefficients, cost, _ = fitted
-        # After a ghost is removed, leaving out another body raises the cost at least as much as before, so costs
+        # After a ghost is removed, leaving out a further body raises the cost at least as much as before, so costs
         # computed earlier are lower limits.
         certain_cost = max(_CERTAIN_RISE * cost, problem.surprise(fitted) + _MIN_EVIDENCE_GAIN)
         uncertain, fits = np.flatnonzero(costs <= certain_cost).tolist(), {}

@@ -1,9 +1,9 @@
 """Imaging of successive frames in bounded time (`Imager`): linear, or by Gauss-Newton steps from the last image.
 
-Everything that does not depend on the frame is computed once: the independent channels, the prior's basis, the
-hyperparameter, the integrals over electrodes, the matrix of linear images, and the few dozen combinations of the
-prior's shapes that the data can resolve. The sizes of arrays never change, so nothing is compiled again: a masked
-channel remains in the arrays, with a variance so large that the channel has no effect.
+Everything that does not depend on the frame is computed once, in advance: independent channels, the prior's basis, the
+hyperparameter, integrals over electrodes, the matrix of linear images, and the few dozen combinations of the prior's
+shapes that the data can resolve. The sizes of arrays never change, so nothing is compiled again: a masked channel
+remains in the arrays, with a variance so large that the channel has no effect.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class FrameEstimate(Module):
 
     **Fields**: `conductivity` (m,): S/m (2-D: S); `coefficients` (n,): coefficients of the image, from which the next
     frame may start; `misfit`: root mean square of predicted - measured voltages over the channels used, in standard
-    deviations; `iterations`: number of iterations; `converged`: whether another step would have changed the objective
+    deviations; `iterations`: number of iterations; `converged`: whether the next step would have changed the objective
     by less than the tolerance.
     """
 
@@ -83,10 +83,11 @@ class Imager(Module):
 
     **Fields**: `channels`: independent channels; `inversion`: the least squares problem, whose data are replaced for
     every frame; `noise` (M,): standard deviation of the channels, volts; `mask` (M,): True for channels that are used;
-    `expected` (M,): voltages of an undisturbed frame; `offset` (M,): voltages of the undisturbed body predicted by the
-    model minus those measured, added to frames; `touching` (L, M): True for channels that drive or read each electrode;
-    `tied`: pairs (P, 2) of reciprocal channels, and the ratio (P,) of the second voltage to the first; `solver`: solver
-    with its settings; `persistence`: fraction of the last image that is expected in the next one, 0 without a memory.
+    `expected` (M,): voltages of an undisturbed frame; `offset` (M,): predicted minus measured voltages of the
+    undisturbed body, which are added to every frame; `touching` (L, M): True for channels that drive or read each
+    electrode; `tied`: pairs (P, 2) of reciprocal channels, and the ratio (P,) of the second voltage to the first;
+    `solver`: solver with its settings; `persistence`: fraction of the last image that is expected in the next one, 0
+    without a memory.
 
     **Example:**
 
@@ -142,7 +143,7 @@ class Imager(Module):
         - `parametrisation`: link, regions and `informative` shapes of the images.
         - `memory`: number of frames over which images are correlated. The last image then predicts the next one (a
           steady-state Kalman filter for coefficients with covariance exp(-|t - t'| / memory) in time), which reduces
-          noise and delays changes by a part of the memory. With 0, every frame is imaged independently.
+          noise but delays changes by a fraction of the memory. With 0, every frame is imaged independently.
 
         Other arguments are as in `reconstruct`. Raises `ValueError` for invalid or inconsistent arguments.
 

@@ -27,7 +27,7 @@ _SUSPECT_FACTOR, _MAX_REMAINING_SHARE, _MIN_DEAD_CHANGE = 0.15, 0.5, 0.5
 # Minimum number of channels with valid readings, as a fraction of the channels in use.
 _MIN_CHANNELS = 0.5
 # Minimum number of channels with equal readings, above or below all others, that count as saturated; relative
-# difference within which their undisturbed voltages count as equal.
+# difference within which the undisturbed voltages of these channels count as equal.
 _MIN_SATURATED, _EQUAL_EXPECTED = 3, 1e-6
 # A frame differs from an undisturbed one by more than noise if the correlation of the changes of reciprocal channels
 # exceeds that of independent noise. Threshold in standard deviations; minimum number of pairs; relative change of a
@@ -160,8 +160,8 @@ class FrameCheck:
         return values, usable, FrameStatus.IMAGED, ""
 
     def _remove_dead_electrode(self, difference, usable):
-        """Return the usable channels without those of a dead electrode, and a sentence that names the electrode; if no
-        electrode is dead, all usable channels and an empty string."""
+        """Return the usable channels without the channels of a dead electrode, and a sentence that names the electrode.
+        If no electrode is dead, return all usable channels and an empty string."""
         total_change = np.linalg.norm(difference)
         remaining_changes = np.array([np.linalg.norm(difference[usable & ~touching]) for touching in self.touching])
         # An electrode whose removal leaves too few channels, such as a common reference, cannot be left out.
