@@ -117,7 +117,7 @@ class PreparedDifference:
 
     @property
     def relative_noise(self) -> Float[Array, " M"]:
-        """Noise of the channels relative to each other, volts: `jeit.inverse.relative_noise` of the reference. For
+        """Noise of the channels up to a common factor, volts: `jeit.inverse.relative_noise` of the reference. For
         channels that measure on `unlike_electrodes`, the noise is multiplied by the relative misfit of the
         electrode."""
         noise = relative_noise(np.asarray(self.reference.voltages)[0], self.mask)

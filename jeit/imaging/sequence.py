@@ -165,8 +165,8 @@ class ImagedFrequencies:
     **Fields**
 
     - `image`: the image of the weighted difference of the two frequencies.
-    - `weight`: factor α of the voltages at the first frequency, by which the voltages of the body as a whole change; 1
-      for plain differences.
+    - `weight`: factor α that multiplies the voltages at the first frequency: the ratio by which the voltages of the
+      body as a whole change; 1 for plain differences.
 
     **Example:**
 

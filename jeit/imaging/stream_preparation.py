@@ -136,7 +136,8 @@ def prepare_imager(
 def described_reference(
     description: Description, frames: Float[np.ndarray, "N M"], *, name: str = "reference"
 ) -> Measurement:
-    """Measurement of a described sensor that contains the mean of frames (N, M), volts, of the undisturbed sensor.
+    """Create a measurement from a description of a sensor and the mean of `frames` (N, M), volts, of the undisturbed
+    sensor.
 
     Raises `ValueError` for a description without geometry, electrodes or protocol, and in the same cases as
     `jeit.data.screen`.

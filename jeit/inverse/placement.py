@@ -132,8 +132,8 @@ class ModelError(NamedTuple):
     drift: float = Uncertainty().drift
 
     def voltages(self, model: ForwardModel, conductivity: ArrayLike, background: ArrayLike) -> Float[np.ndarray, "M q"]:
-        """Errors (M, q) of the voltage difference v(`conductivity`) - v(`background`), volts, each due to one standard
-        deviation of one of q independent errors.
+        """Errors (M, q) of the voltage difference v(`conductivity`) - v(`background`), volts; each column is due to one
+        standard deviation of one of q independent errors.
 
         `conductivity` and `background` per cell, S/m (2-D: S). The covariance of the difference is the product of this
         matrix with its transpose.

@@ -62,8 +62,8 @@ def compare_rules(
     rules: Mapping[str, Rule] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Choice]:
-    """Choose λ for the same data by several rules, and return the choices by the name of the rule. The problem is
-    decomposed once. `jeit.plot.plot_choice` plots the result.
+    """Choose λ for the same data by several rules, and return the choices by the name of the rule. The
+    eigendecomposition of the problem is computed only once. `jeit.plot.plot_choice` plots the result.
 
     **Arguments:**
 

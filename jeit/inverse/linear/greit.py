@@ -72,8 +72,7 @@ def greit(
     - `noise_figure`: the default 0.5 is the value agreed on by GREIT's authors. The signal of data or image is the mean
       absolute value, over channels in units of their noise or over the body. The noise is the root mean square standard
       deviation.
-    - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
-      other).
+    - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts, or up to a common factor.
     - `mask` (M,): True for the channels to use.
     - `num_targets`: number of targets, approximately.
 

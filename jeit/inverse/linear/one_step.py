@@ -251,8 +251,7 @@ def one_step(
     - `prior`: default `Noser()`.
     - `hyperparameter`: λ, a rule in `jeit.inverse.RULES` that chooses λ, or a `Choice`.
     - `difference` (M,): change of voltages to be imaged, volts, required by rules that use data.
-    - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
-      other).
+    - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts, or up to a common factor.
     - `mask` (M,): True for the channels to use.
 
     Raises `ValueError` for invalid or inconsistent arguments.

@@ -1,7 +1,7 @@
 """The nonlinear least squares problem of `reconstruct`, checks of its arguments, its reduction to informed shapes, and
 derivatives of its minimum.
 
-Informed shapes are the few dozen combinations of a prior's shapes that the data resolve. Informed shapes are right
+Informed shapes are the few dozen combinations of a prior's shapes (columns of its basis) that the data resolve: right
 singular vectors of the whitened Jacobian at the background, stored in single precision, which changes an image by a
 relative 1e-6.
 

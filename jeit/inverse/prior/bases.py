@@ -76,11 +76,11 @@ class DiagonalBasis(AbstractBasis):
         return self.deviation * coefficients
 
     def restrict(self, rows):
-        """Rows times S: the columns multiplied by the deviations."""
+        """Rows times S: each column multiplied by the prior standard deviation of its cell."""
         return rows * self.deviation
 
     def restrict_blocks(self, blocks):
-        """Rows times S: the columns multiplied by the deviations."""
+        """Rows times S: each column multiplied by the prior standard deviation of its cell."""
         products: list[np.ndarray] = []
         for cells, block in blocks:
             if not products:
@@ -89,7 +89,7 @@ class DiagonalBasis(AbstractBasis):
         return products[0]
 
     def variance(self):
-        """Variance of the cells: squared deviations."""
+        """Variance of the cells: squared prior standard deviations."""
         return self.deviation**2
 
     def scaled(self, factor):
@@ -97,7 +97,7 @@ class DiagonalBasis(AbstractBasis):
         return DiagonalBasis(self.deviation * factor)
 
     def pooled(self, regions):
-        """Basis with one coefficient per region. Its variance is the mean over the cells of the region."""
+        """Basis with one coefficient per region, whose variance is the mean variance of the cells of the region."""
         return RegionBasis(regions, namespace(regions).sqrt(regions.mean(self.deviation**2)))
 
 
@@ -199,7 +199,7 @@ class NodalBasis(AbstractBasis):
         return np.ascontiguousarray(total.T)
 
     def variance(self):
-        """Variance of the cells, each the mean of independent nodal values."""
+        """Variance of the cells, where each cell has the mean of independent nodal values of unit variance."""
         return namespace(self).full(len(self.cells), 1 / self.cells.shape[1])
 
     def scaled(self, factor):
@@ -267,8 +267,6 @@ class Regions(Module):
 def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
     """Labels (m,) for `Regions` that group the cells of a mesh into the pixels of a grid; empty pixels are not
     numbered.
-
-    `shape`: numbers of rows and columns of the grid.
 
     **Arguments:**
 

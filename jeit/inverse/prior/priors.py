@@ -76,7 +76,7 @@ class AbstractPrior(Module):
 
     A new quadratic prior is a subclass with `covariance_product`, `precision` and `basis`. A prior whose energy is not
     xᵀQx overrides `penalty` and raises `ValueError` in methods that do not apply to such a prior. Real and imaginary
-    part of a complex image have the same prior; methods take the complex conjugate of a complex Jacobian.
+    part of a complex image have the same prior; methods are called with the complex conjugate of a complex Jacobian.
 
     **Example:**
 

@@ -2,8 +2,9 @@
 
     log σ/σ₀ = drift + Σ_bodies mixture(share, ± contrast),
 
-where `share` is the fraction of a cell that a body covers; for a completely covered cell the mixture equals ± contrast.
-Every coefficient is in units of its prior standard deviation, so the penalty is ½‖coefficients‖².
+where σ₀ is the background, `share` the fraction of a cell that a body covers, and the drift a change of the bath, the
+medium around the bodies. For a completely covered cell the mixture equals ± contrast. Every coefficient is in units of
+its prior standard deviation, so the penalty is ½‖coefficients‖².
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Everything that does not depend on the frame is computed once, in advance: independent channels, the prior's basis, the
 hyperparameter, integrals over electrodes, the matrix of linear images, and the few dozen combinations of the prior's
-shapes that the data can resolve. The sizes of arrays never change, so nothing is compiled again: a masked channel
-remains in the arrays, with a variance so large that the channel has no effect.
+shapes (columns of its basis) that the data can resolve. The sizes of arrays never change, so nothing is compiled again:
+a masked channel remains in the arrays, with a variance so large that the channel has no effect.
 """
 
 from __future__ import annotations

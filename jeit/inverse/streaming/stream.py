@@ -18,7 +18,7 @@ from jeit.inverse.streaming.imager import Imager
 from jeit_solvers import Status
 from jeit_solvers.module import Module
 
-# Relative difference from an undisturbed frame above which a frame is faulty or from another sensor.
+# Relative difference from an undisturbed frame above which a frame is faulty or from a different sensor.
 _LARGEST_DIFFERENCE = 0.5
 # Relative difference from an undisturbed frame above which a frame is checked for dead electrodes and saturation. An
 # electrode is dead if at most `_MAX_REMAINING_SHARE` of the difference is left without the electrode's channels, and if
@@ -29,9 +29,9 @@ _MIN_CHANNELS = 0.5
 # Minimum number of channels with equal readings, above or below all others, that count as saturated; relative
 # difference within which the undisturbed voltages of these channels count as equal.
 _MIN_SATURATED, _EQUAL_EXPECTED = 3, 1e-6
-# A frame differs from an undisturbed one by more than noise if the correlation of the changes of reciprocal channels
-# exceeds that of independent noise. Threshold in standard deviations; minimum number of pairs; relative change of a
-# frame below which it counts as equal to the undisturbed one.
+# A frame differs from an undisturbed frame by more than noise if the correlation of the changes of reciprocal channels
+# exceeds that of independent noise. Threshold in standard deviations; minimum number of pairs; relative change below
+# which a frame counts as equal to an undisturbed frame.
 _CORRELATION_THRESHOLD, _MIN_PAIRS, _EQUAL_TOLERANCE = 3.0, 10, 1e-12
 
 
@@ -62,8 +62,8 @@ class FrameCheck:
 
     `mask` (M,): True for channels that are used. `expected` (M,): voltages of an undisturbed frame. `touching` (L, M):
     True for channels that drive or read each electrode. `tied`: pairs (P, 2) of reciprocal channels, and the ratio (P,)
-    of the second voltage to the first. `noise` (M,): standard deviation of the channels, volts or relative to each
-    other.
+    of the second voltage to the first. `noise` (M,): standard deviation of the channels, in volts, or up to a common
+    factor.
     """
 
     def __init__(
