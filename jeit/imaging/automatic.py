@@ -19,8 +19,9 @@ from jeit.inverse.shapes import ShapeReconstruction
 # and for noisy data, whose images show far less than the true change. Data are noisy if the share of noise in the
 # voltage difference exceeds `_NOISY_SHARE`.
 _STRONG_CHANGE, _STRONG_NOISY_CHANGE, _NOISY_SHARE = 0.3, 0.1, 0.3
-# A linear image has a fault if the voltages computed from it leave a share of the voltage difference unexplained that
-# exceeds `_LARGE_MISFIT` and, times `_MAX_MISFIT_RATIO`, the share that linearised voltages leave unexplained.
+# A linear image has a fault if the voltages computed from it leave too large a share of the voltage difference
+# unexplained: more than `_LARGE_MISFIT`, and more than `_MAX_MISFIT_RATIO` times the share that linearised voltages
+# leave unexplained.
 _MAX_MISFIT_RATIO, _LARGE_MISFIT = 1.1, 0.1
 # Lower bound of the conductivity of a linear image, as a share of the background conductivity.
 _MIN_CONDUCTIVITY = 0.01

@@ -47,7 +47,7 @@ class ImagingSettings:
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`. Total variation and filtered back-projection
       need a number; plain back-projection and "shapes" have no hyperparameter. With "auto" and a hyperparameter,
       one-step imaging is used. Defaults: "noise-figure" for one-step imaging, 5 for Gauss-Newton and
-      Levenberg-Marquardt, 300 for total variation, which gave good images of measured tanks.
+      Levenberg-Marquardt, 300 for total variation; these defaults gave good images of measured tanks.
     - `contact`: calibration of the contact impedance: "each" (one value per electrode), "common" (one value) or
       "fixed". Default: "each" if voltages are measured on driven electrodes. Otherwise the data do not determine the
       contact impedance, and the default is "fixed".
@@ -269,7 +269,8 @@ def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, options: Met
     """Fit bodies that explain a difference, starting from the inclusions of its smooth image.
 
     The result contains a body only if the objective of the fit without it is larger by the factor `least_rise` and the
-    Bayesian evidence favours the body. The factor allows for model errors, which the noise does not include.
+    Bayesian evidence favours the body. In a sheet, the factor allows for model errors and increases with their share in
+    the variance of the noise.
     """
     model, background = prepared.model, prepared.calibration.conductivity
     is_solid = prepared.mesh.dimension == 3

@@ -155,9 +155,9 @@ class PreparedDifference:
 
     @property
     def modelled_noise(self) -> Float[Array, " M"]:
-        """Expected deviation of the voltage difference from that of the model, volts: the root of the sum of squares of
-        the noise of the difference, rounding and the model error. The model error is the root mean square of the
-        difference times the relative misfit of the reference (at least 3 %).
+        """Expected deviation of the measured voltage difference from the modelled one, volts: the root of the sum of
+        squares of the noise of the difference, rounding and the model error. The model error is the root mean square of
+        the difference times the relative misfit of the reference (at least 3 %).
 
         If the noise is not known, 0.1 of the difference is used as noise, at most 1 in units of `relative_noise`.
         """

@@ -204,7 +204,7 @@ def _explained(
     misfit_of: Callable[[Wiring], Wiring], described_wiring: Wiring, best_wiring: Wiring, orders: Iterable[str]
 ) -> Wiring:
     """Return the wiring that explains a frame far better than `best_wiring`, the described wiring with its misfit, or
-    `best_wiring` if there is none."""
+    `best_wiring` if no wiring does."""
     num_electrodes = len(described_wiring.places)
 
     def best_of(wirings: Iterable[Wiring], last_best: Wiring) -> Wiring:

@@ -1,15 +1,15 @@
 """Estimation of electrode positions and contact impedances from a reference frame.
 
-Electrodes are rarely exactly where a description says, and their contact impedances differ. Both are estimated from a
-frame y of the homogeneous body. With shifts t of the electrodes along the directions in which they can move, contact
-impedances z = z₀ e^ζ and a conductivity σ, the estimate minimises
+Electrodes are rarely exactly where a description says, and their contact impedances differ. Positions and contact
+impedances are estimated from a frame y of the homogeneous body. With shifts t of the electrodes along the directions in
+which they can move, contact impedances z = z₀ e^ζ and a conductivity σ, the estimate minimises
 
     ½ ‖(v(σ, t, z) - y) / κn‖² + ½ ‖t / s‖² + ½ ζᵀ Γ⁻¹ ζ,
 
 where v are the predicted voltages, n is the `relative_noise` of the channels, s the prior standard deviation of the
 positions, and Γ the prior covariance of the logarithms ζ. The errors of these logarithms have a common part. The factor
-κ is estimated from the residual. Derivatives need no further solve: at fixed fields only the energy of electrode l
-depends on t_l (`jeit.forward.changes`).
+κ is estimated from the residual. Derivatives require no further solution of the forward problem: at fixed fields only
+the energy of electrode l depends on t_l (`jeit.forward.changes`).
 
 Kolehmainen, Vauhkonen, Karjalainen and Kaipio, Physiological Measurement 18 (1997) 289, on errors of electrode
 positions; Vilhunen, Kaipio, Vauhkonen, Savolainen and Vauhkonen, Measurement Science and Technology 13 (2002) 1848, on
@@ -173,7 +173,7 @@ def place_electrodes(
 
     **Arguments:**
 
-    - `model`: the model with the electrodes as they are described.
+    - `model`: the model with the electrodes at their described positions.
     - `voltages` (M,): measured voltages of the homogeneous body, volts.
     - `deviation`: standard deviation of the described positions, metres, in every direction in which an electrode can
       move; 0 if they are exact.

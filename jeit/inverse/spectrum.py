@@ -1,4 +1,5 @@
-"""Eigendecomposition of the linear problem in data space, with which images for any hyperparameter are cheap.
+"""Eigendecomposition of the linear problem in data space, from which images for any hyperparameter are computed at low
+cost.
 
 With the whitened Jacobian J (M, m), the prior covariance Γ and a basis N of the prior's null space, the reconstruction
 matrix is

@@ -42,7 +42,7 @@ def best_resolution(
 
     **Arguments:**
 
-    - `spectrum`: the problem, decomposed; `choose_hyperparameter` gives it to the rule.
+    - `spectrum`: eigendecomposition of the problem, which `choose_hyperparameter` passes to the rule.
     - `data`: not used.
     - `mesh`: the mesh of the image.
     - `signal_to_noise`: root mean square of a target's data, in standard deviations of the noise.
@@ -128,7 +128,8 @@ def spread_cells(mesh: Mesh, num_cells: int) -> Int[np.ndarray, " T"]:
     ]
     lattice = np.stack(np.meshgrid(*coordinates, indexing="ij"), axis=-1).reshape(-1, mesh.space_dimension)
     distances, nearest = (np.asarray(result) for result in KDTree(centres).query(lattice))
-    # A surface in space passes between lattice points, so lattice points up to half a spacing from the surface count.
+    # A surface in space passes between lattice points, so lattice points up to half a spacing from the surface count as
+    # inside.
     inside = distances <= (spacing / 2 if mesh.is_surface else cell_measures[nearest] ** (1 / mesh.dimension))
     return np.unique(nearest[inside] if inside.any() else nearest)
 
@@ -202,7 +203,7 @@ def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = 
 
     **Arguments:**
 
-    - `spectrum`: the problem, decomposed; `choose_hyperparameter` gives it to the rule.
+    - `spectrum`: eigendecomposition of the problem, which `choose_hyperparameter` passes to the rule.
     - `data`: whitened difference of frames (M,).
     - `mesh`: not used.
     - `noise`: standard deviation of the whitened data (of each part of complex data), 1 if the noise of the channels
@@ -274,7 +275,7 @@ def noise_figure(
 
     **Arguments:**
 
-    - `spectrum`: the problem, decomposed; `choose_hyperparameter` gives it to the rule.
+    - `spectrum`: eigendecomposition of the problem, which `choose_hyperparameter` passes to the rule.
     - `data`, `mesh`: not used.
     - `target`: requested noise figure.
 

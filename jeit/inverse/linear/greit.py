@@ -105,7 +105,7 @@ def greit(
     )
     positions, coverage = _place_targets(mesh, body_centre, target_radius * body_radius, num_targets)
     desired_images = _desired_images(mesh, positions, coverage.T @ cell_measures, radius * body_radius)
-    # Responses are computed for the combinations of channels that a body can change, of which there are fewer than
+    # Responses are computed only for those combinations of channels that a body can change, which are fewer than the
     # channels.
     directions = data_directions(model.protocol, channels, root_weight)
     weighted_directions = directions.T * np.asarray(root_weight)  # (r, K)
@@ -161,7 +161,9 @@ def _place_targets(mesh: Mesh, middle, radius: float, num_targets: int) -> tuple
     for samples, sample_cells, sample_shares in _sample_points(mesh, radius / _SAMPLES_PER_RADIUS[mesh.dimension]):
         if mesh.dimension == 3:
             offsets = (samples - middle) / spacing
-            offsets -= np.rint(offsets)  # offset from the nearest centre; not all points lie within a target
+            offsets -= np.rint(
+                offsets
+            )  # offset from the centre of the nearest target; not all points lie within a target
             near_indices = np.flatnonzero(
                 np.einsum("qi,qi->q", offsets, offsets) < (_SEARCH_RADII * radius / spacing) ** 2
             )

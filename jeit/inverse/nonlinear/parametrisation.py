@@ -205,7 +205,7 @@ def _check_deviation(name: str, deviation, num_values: int) -> Float[Array, " k"
     return jnp.broadcast_to(jnp.asarray(values), (num_values,))
 
 
-# Minimum conductivity relative to the mean background, where the lower bound is zero.
+# Minimum of the lower bound on the conductivity, relative to the mean background, for the linear link.
 _MIN_CONDUCTIVITY_RATIO = 1e-6
 
 

@@ -100,7 +100,8 @@ def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
 
 
 def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[Array, " M"]:
-    """Standard deviation of every channel in volts, 1 in channels left out; raises `ValueError` for invalid noise."""
+    """Standard deviation of every channel in volts, 1 in channels that are not used; raises `ValueError` for invalid
+    noise."""
     standard_deviation = np.zeros(()) if noise is None else _as_float_array(noise)
     if standard_deviation.shape not in ((), measured.shape) or standard_deviation.dtype.kind not in "iuf":
         raise ValueError(

@@ -185,8 +185,8 @@ def _squared_distances(points, other_points):
 
 
 def _pivots(scaled, tolerance: float, max_rank: int):
-    """Indices (max_rank,) of the pivots of the Cholesky factorisation, and the number of pivots that reach the
-    tolerance."""
+    """Indices (max_rank,) of the pivots of the Cholesky factorisation, and the number of pivots with which the
+    tolerance is reached."""
     allowed_residual = tolerance * len(scaled)
 
     def is_incomplete(state):

@@ -5,8 +5,8 @@ In unbounded space, the solution of (κ² - Δ) x = white noise has the Matérn 
     d = 2:  κr K₁(κr),    d = 3:  exp(-κr).
 
 The covariance of the nodal values is A⁻¹ M A⁻¹ with A = κ²M + K, mass matrix M and stiffness matrix K. Products with
-this covariance take sparse solves; the covariance itself would be a dense matrix over all pairs of cells. Lindgren, Rue
-and Lindström, J. R. Stat. Soc. B 73 (2011) 423-498. The domain's wall reflects the field and raises the field's
+this covariance require sparse solves; the covariance itself would be a dense matrix over all pairs of cells. Lindgren,
+Rue and Lindström, J. R. Stat. Soc. B 73 (2011) 423-498. The domain's wall reflects the field and raises the field's
 variance near the wall. The Robin condition ∂x/∂n = -κx / 1.42 removes most of this excess (Roininen, Huttunen and
 Lasanen, Inverse Probl. Imaging 8 (2014) 561-586), and the nodal values are scaled to unit variance to remove the rest.
 """

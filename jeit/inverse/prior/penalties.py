@@ -181,7 +181,7 @@ class StandardNormal(AbstractNormal):
         return basis.variance()
 
     def num_draws(self, num_coefficients):
-        """Numbers per sample: one for each coefficient."""
+        """Number of random numbers per sample: one for each coefficient."""
         return num_coefficients
 
     def drawn(self, numbers):
@@ -213,7 +213,8 @@ class SparseNormal(AbstractNormal):
         return host.where(row == column, 1.0, 2.0) @ block_entries / basis.cells.shape[1] ** 2
 
     def num_draws(self, num_coefficients):
-        """Numbers per sample: one for each pivot of the factor, padding included, and one for each further unknown."""
+        """Number of random numbers per sample: one for each pivot of the factor, padding included, and one for each
+        further unknown."""
         return num_coefficients - self.plan.size + self.plan.num_pivots
 
     def drawn(self, numbers):

@@ -296,7 +296,7 @@ def _estimate_frame(imager: Imager, frame, weighing: Weighing, start) -> FrameEs
     data = weighing.combine(frame + imager.offset)
     inversion = eqx.tree_at(lambda inverse_problem: inverse_problem.data, imager.inversion, data)
     expected = jnp.zeros_like(start)
-    if imager.persistence > 0:  # the prior mean moves, and the coefficients are relative to it
+    if imager.persistence > 0:  # the prior mean follows the last image, and the coefficients are relative to this mean
         expected, start = start, expected
         inversion = eqx.tree_at(
             lambda inverse_problem: inverse_problem.reference, inversion, inversion.estimate(expected)
