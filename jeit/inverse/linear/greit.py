@@ -161,9 +161,7 @@ def _place_targets(mesh: Mesh, middle, radius: float, num_targets: int) -> tuple
     for samples, sample_cells, sample_shares in _sample_points(mesh, radius / _SAMPLES_PER_RADIUS[mesh.dimension]):
         if mesh.dimension == 3:
             offsets = (samples - middle) / spacing
-            offsets -= np.rint(
-                offsets
-            )  # offset from the centre of the nearest target; not all points lie within a target
+            offsets -= np.rint(offsets)  # offset from the nearest centre; not all points lie within a target
             near_indices = np.flatnonzero(
                 np.einsum("qi,qi->q", offsets, offsets) < (_SEARCH_RADII * radius / spacing) ** 2
             )
