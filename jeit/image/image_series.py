@@ -108,7 +108,7 @@ class ImageSeries:
         image.
 
         `region`: mask (m,) of the cells of the region, for example from `ball_region`, `box_region` or `half_region`.
-        Raises `ValueError` for a mask of another shape, and for an empty region.
+        Raises `ValueError` for a mask of the wrong shape, and for an empty region.
         """
         is_in_region = np.asarray(region)
         if is_in_region.dtype != bool or is_in_region.shape != (self.mesh.num_cells,) or not is_in_region.any():
@@ -118,7 +118,8 @@ class ImageSeries:
 
 
 Window = Literal["hann", "none"]
-# Resolution of each window in units of 1 / T; number of frequencies per resolution in the search for the strongest one.
+# Resolution of each window in units of 1 / T; number of trial frequencies per resolution in the search for the
+# strongest frequency.
 _WINDOW_RESOLUTION = {"hann": 2.0, "none": 1.0}
 _FREQUENCIES_PER_RESOLUTION = 8
 # Minimum number of periods in the measured time.
@@ -133,8 +134,8 @@ class Oscillation:
 
     - `frequency`: frequency of the oscillation in hertz.
     - `amplitude`: (…), in the unit of the values: half of the difference between maximum and minimum.
-    - `phase`: (…), radians from -π to π: the values vary as cos(2πf t + phase), with the given times t in seconds. The
-      phase is meaningless where the amplitude is only noise.
+    - `phase`: (…), radians from -π to π: the values vary as cos(2πf t + phase), where t are the `times` passed to
+      `oscillation`. The phase is meaningless where the amplitude is only noise.
     - `noise`: (…), standard deviation of the amplitude, computed from the residual of the fit. The residual includes
       oscillations at other frequencies.
     - `resolution`: hertz, smallest difference of two distinguishable frequencies.
@@ -163,8 +164,8 @@ def oscillation(
 
     - `values` (F, …): values in each of F frames, in any unit.
     - `times` (F,): times of the frames in seconds, which need not be evenly spaced.
-    - `frequency`: hertz, or a band (lowest, highest) in which the frequency with the largest power over all values is
-      sought. Frequencies with less than one period in the measured time are not considered.
+    - `frequency`: hertz, or a band (lowest, highest) in which the frequency with the largest power, summed over all
+      values, is determined. Frequencies with less than one period in the measured time are not considered.
     - `window`: "hann", Hann's window, which separates different frequencies better; or "none", with which a single
       oscillation is resolved twice as finely.
 
@@ -300,7 +301,7 @@ def _strongest_frequency(
 ) -> float:
     """The frequency in a band (lowest, highest, resolution) at which the power summed over all values is largest."""
     min_frequency, max_frequency, resolution = band
-    # The first eight principal components of the values represent all values.
+    # The power is computed from the first eight principal components of the values.
     centred = values - values.mean(axis=0)
     left_vectors, singular_values, _ = np.linalg.svd(
         centred @ centred.T if centred.shape[1] > len(centred) else centred, full_matrices=False

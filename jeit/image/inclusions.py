@@ -66,8 +66,9 @@ class SolidForm(Module):
         )
 
 
-# Minimum area of an inclusion as a fraction of a sheet (a disc of a fourteenth of its width), and minimum volume as a
-# fraction of a solid (a ball of an eighth of its width). Images of solids have a coarser resolution.
+# Minimum area of an inclusion as a fraction of a sheet (a disc with a fourteenth of the sheet's width), and minimum
+# volume as a fraction of a solid (a ball with an eighth of the solid's width). Images of solids have a coarser
+# resolution.
 _LEAST_AREA = {2: 0.004, 3: 0.001}
 
 
@@ -77,12 +78,12 @@ class Inclusion(Module):
     **Fields**: `sign`: +1 for conductive, -1 for resistive; `centroid`: in metres, weighted by the change of
     conductivity; `area`: in m² (in solids: volume in m³); `peak`: the strongest change in the region, in the unit of
     the image, or the posterior median of the change if the inclusion was fitted as a body with intervals; `on_surface`:
-    whether the region lies on a surface in space, so that the region has an area although its centroid has three
-    coordinates; `form`: shape of an inclusion that was fitted to data as a body in a solid, else None. None if not
-    estimated: `contrast_interval`: 68 % interval of the change relative to the background; `area_interval`: 68 %
-    interval of the area, m², or volume, m³; `strength` and `strength_interval`: see `jeit.inverse.shapes.Quantities`;
-    `centroid_radius`: radius, metres, of the circle (in a solid, of the ball) about `centroid` that holds the true
-    centroid with a probability of 68 %.
+    whether the region lies on a surface in space, in which case it has an area although its centroid has three
+    coordinates; `form`: shape of an inclusion that was fitted to data as a body in a solid, else None. The other fields
+    are None if not estimated: `contrast_interval`: 68 % interval of the change relative to the background;
+    `area_interval`: 68 % interval of the area, m², or volume, m³; `strength` and `strength_interval`: see
+    `jeit.inverse.shapes.Quantities`; `centroid_radius`: radius, metres, of the circle (in a solid, of the ball) about
+    `centroid` that contains the true centroid with a probability of 68 %.
 
     **Example:**
 
@@ -139,7 +140,8 @@ def find_inclusions(
     least_significance: float = 5.5,
 ) -> list[Inclusion]:
     """Find inclusions: the peaks of an image, each with the surrounding region where the change exceeds `level` times
-    the peak. The strongest inclusion comes first. Peaks below the minimum values given are taken for artefacts.
+    the peak. The strongest inclusion comes first. Peaks below the minimum values in the arguments are regarded as
+    artefacts and left out.
 
     **Arguments:**
 
@@ -150,11 +152,11 @@ def find_inclusions(
     - `least_prominence`: minimum height of a peak above the saddle towards a higher peak, as a share of the height of
       the lower peak.
     - `least_area`: minimum area (volume) of a region, as a fraction of the mesh; default 0.004 for a sheet and 0.001
-      for a solid (0.004 of a solid would be a ball of a fifth of its width).
+      for a solid (0.004 of a solid would be a ball with a fifth of the solid's width).
     - `noise` (m,): standard deviation of the image in every cell, in the unit of the image.
-    - `least_significance`: minimum height of a peak, as a multiple of the `noise` if `noise` is given.
+    - `least_significance`: minimum height of a peak, as a multiple of the `noise`; not used without `noise`.
 
-    Raises `ValueError` for an image of another size or with NaN.
+    Raises `ValueError` for an image of the wrong size or with NaN.
 
     **Example:**
 
@@ -177,8 +179,8 @@ def find_inclusions(
 
 
 class StrongestRegion:
-    """Computes where an image is strongest: the centroid of the connected region around the peak in which the change
-    exceeds half of the peak, weighted by area (volume) and change.
+    """Computes the position of the strongest change in an image: the centroid, weighted by area (volume) and change, of
+    the connected region around the peak where the change exceeds half of the peak.
 
     The position of the peak itself is biased towards electrodes, where voltages are most sensitive; the centroid is
     less biased. Quantities that depend on the `mesh` alone are computed in advance.
@@ -236,8 +238,8 @@ def inclusion_regions(
     if max_change == 0:
         return []
     cell_measures, cell_centres = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
-    # A tetrahedron shares facets with only some of its higher neighbours, so in solids paths along ridges go over
-    # nodes.
+    # In solids, cells that share a node count as neighbours, because a tetrahedron shares facets with only some of the
+    # adjacent cells of higher value.
     shared = np.asarray(mesh.cells) if mesh.dimension == 3 else shared_facets(mesh)
     if least_area is None:
         least_area = _LEAST_AREA[mesh.dimension]

@@ -1,9 +1,9 @@
 """Sections of solids by planes, and isosurfaces of fields on tetrahedra, by marching simplices.
 
-A field is given by values at the nodes and is linear in every cell. The part of a tetrahedron where the field equals a
-level, or of a triangle where the field exceeds the level, is a triangle or a quadrilateral. Each part is stored as four
-corners, with the last corner repeated for a triangle. Doi and Koide, IEICE Trans. E74 (1991) 214-224, for tetrahedra.
-All cells are processed at once, without a loop.
+A field is specified by values at the nodes and is linear in every cell. The part of a tetrahedron where the field
+equals a level, or of a triangle where the field exceeds the level, is a triangle or a quadrilateral. Each part is
+stored as four corners, with the last corner repeated for a triangle. Doi and Koide, IEICE Trans. E74 (1991) 214-224,
+for tetrahedra. All cells are processed at once.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, describe, is_number
 from jeit.mesh import Mesh, measures
 
-# For tetrahedra with nodes sorted from the highest to the lowest value: the end nodes of the edges that the level
-# crosses, in order around the polygon, by the number of nodes above the level.
+# For a tetrahedron with nodes sorted from the highest to the lowest value: the end nodes of the edges that the level
+# crosses, in order around the polygon. The keys are numbers of nodes above the level.
 _CROSSED_EDGES = {
     1: [[0, 1], [0, 2], [0, 3], [0, 3]],
     2: [[0, 2], [0, 3], [1, 3], [1, 2]],
     3: [[0, 3], [1, 3], [2, 3], [2, 3]],
 }
-# For triangles: the corners of the part above the level; a corner at a node has that node as both ends.
+# For a triangle: the corners of the part above the level, each given by the end nodes of its edge; a corner at a node
+# has this node as both ends.
 _CORNERS_ABOVE = {
     1: [[0, 0], [0, 1], [0, 2], [0, 2]],
     2: [[0, 0], [1, 1], [1, 2], [0, 2]],
@@ -56,7 +57,7 @@ class CutPieces(NamedTuple):
 def crossed_cells(cells: Int[np.ndarray, "m 4"], values: Float[np.ndarray, " n"], level: float = 0.0) -> CutPieces:
     """The surface in tetrahedra on which the field with the `values` (n,) at the nodes equals `level`: polygons with
     four corners, in order around each polygon. A node at the level counts as above the level, so a facet of the mesh
-    that lies in the surface is found from one of its two cells only."""
+    that lies in the surface belongs to the polygons of only one of its two cells."""
     return _cut_cells(cells, values, level, _CROSSED_EDGES)
 
 
@@ -122,7 +123,7 @@ def node_values(mesh: Mesh, image: Float[np.ndarray, "..."]) -> Float[np.ndarray
     - `image`: values per cell (m,), which are averaged over the cells around each node, weighted by area or volume; or
       values per node (n,), which are returned unchanged.
 
-    Raises `ValueError` for an image of another shape, complex values and NaN.
+    Raises `ValueError` for an image of the wrong shape, complex values and NaN.
 
     **Example:**
 
@@ -161,7 +162,7 @@ def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) ->
       linear between nodes.
     - `level`: value of the image on the surface, in the unit of the image.
 
-    Raises `ValueError` for a level that is zero or not a number, and as `node_values` does.
+    Raises `ValueError` for a level that is zero or not a number, and in the same cases as `node_values`.
 
     **Example:**
 
@@ -234,8 +235,8 @@ class Plane:
     @classmethod
     def at(cls, axis: str, value: float) -> "Plane":
         """The plane where the coordinate `axis`, "x", "y" or "z", equals `value` metres. The plane is viewed from the
-        right, the front or above, so that the two other axes point to the right and up. Raises `ValueError` for another
-        axis or a value that is not a number."""
+        right, the front or above, so that the two other axes point to the right and up. Raises `ValueError` for any
+        other axis or a value that is not a number."""
         if axis not in AXES:
             raise ValueError(f"axis must be 'x', 'y' or 'z'; it is {describe(axis)}.")
         if not is_number(value):
@@ -248,7 +249,7 @@ class Plane:
     @classmethod
     def through(cls, point: ArrayLike, normal: ArrayLike) -> "Plane":
         """The plane through `point` (3,), in metres, perpendicular to `normal` (3,), which points towards the viewer.
-        Raises `ValueError` unless both are three finite numbers and the normal is not zero."""
+        Raises `ValueError` unless point and normal are three finite numbers each and the normal is not zero."""
         point_array, normal_array = (np.asarray(values, dtype=object) for values in (point, normal))
         for name, value in (("point", point_array), ("normal", normal_array)):
             if value.shape != (3,) or not all(is_number(coordinate) for coordinate in value):
@@ -305,7 +306,8 @@ class Cut:
 def cut_by_plane(mesh: Mesh, plane: Plane) -> Cut:
     """Exact section of a solid by a plane: the polygon cut out of each cell, and the outline of the section.
 
-    A plane that contains facets of the mesh cuts the cells behind the plane, or the cells in front if none are behind.
+    If the plane contains facets of the mesh, it cuts the cells behind these facets as seen by the viewer, or the cells
+    in front of them if no cells lie behind.
 
     **Arguments:**
 

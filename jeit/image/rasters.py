@@ -23,8 +23,7 @@ from jeit_solvers.module import Module
 
 
 class Raster(Module):
-    """Grid of pixels, with the cell of a mesh that contains each pixel; made once for a mesh and used for every image
-    on this mesh.
+    """Grid of pixels, with the cell of a mesh that contains each pixel; one raster serves all images on a mesh.
 
     **Fields**: `cell`: (rows, columns) index of the cell that contains the centre of each pixel, or -1 outside the
     mesh; row 0 is at the top (largest y), column 0 at the left; `extent`: (x_min, x_max, y_min, y_max) in metres, the
@@ -100,9 +99,9 @@ def _sample(cell, image):
 def find_cells(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """Index of the cell that contains each of the `positions` (q, d), -1 for positions outside all cells.
 
-    For each position the cells with the nearest centroids are tested first, then more cells for the positions that are
-    not yet found. Only cells that reach into the bounding box of the positions are considered; if the positions lie in
-    a slice, these are the cells that the slice cuts.
+    For each position the cells with the nearest centroids are tested first, then more distant cells if none of these
+    contains the position. Only cells whose bounding box overlaps that of the positions are tested; if the positions lie
+    in a slice, these are the cells that the slice cuts.
     """
     corners = points[cells]
     tolerance = 1e-9 * np.ptp(points, axis=0).max()
@@ -131,7 +130,7 @@ def find_cells(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> 
         cell_of_position[remaining[is_found]] = candidates[
             candidate_index[is_found, is_inside[is_found].argmax(axis=1)]
         ]
-        # A cell cannot contain a position that is farther from its centroid than its farthest corner.
+        # A cell cannot contain a position that is farther from the cell's centroid than the cell's farthest corner.
         remaining = remaining[~is_found & (distance[:, -1] <= max_reach)]
         num_tried, num_nearest = num_nearest, 4 * num_nearest
     return cell_of_position
@@ -222,8 +221,8 @@ def figures_of_merit(
     - `extent`: (x_min, x_max, y_min, y_max), edges of the raster in metres.
     - `position` (2,) or (T, 2): centre of each target in metres.
     - `area`: area of each target in m², a number or (T,).
-    - `change`: change of conductivity of each target, negative for a resistive one, in the unit of the raster; a number
-      or (T,).
+    - `change`: change of conductivity of each target, negative for a resistive target, in the unit of the raster; a
+      number or (T,).
 
     Raises `ValueError` for arguments whose shapes do not match or whose values are invalid.
 
@@ -329,10 +328,10 @@ def challenge_score(labels: Int[np.ndarray, "256 256"], truth: Int[np.ndarray, "
     over the conductive and the resistive class; 1 is perfect.
 
     `labels`, `truth`: 256 × 256 pixels with the labels 0 background, 1 resistive and 2 conductive. The means, variances
-    and covariance in the SSIM are taken in Gaussian windows with a standard deviation of 80 pixels, cut off at ±160
+    and covariance in the SSIM are computed in Gaussian windows with a standard deviation of 80 pixels, cut off at ±160
     pixels and normalised at the border. The constants that stabilise the quotients of the SSIM are c1 = 1e-4 and c2 =
-    9e-4. The score of a class is the mean of the SSIM over all pixels, or 1 if the class is absent from both images.
-    Raises `ValueError` for images of another shape or with other labels. Räsänen et al., KTC2023, doi
+    9e-4. The score of a class is the mean of the SSIM over all pixels, or 1 if neither image contains the class. Raises
+    `ValueError` for images of the wrong shape or with other labels. Räsänen et al., KTC2023, doi
     10.5281/zenodo.8252370.
     """
     labels, truth = np.asarray(labels), np.asarray(truth)

@@ -22,7 +22,7 @@ def ball_region(mesh: Mesh, centre: ArrayLike, radius: float) -> Bool[np.ndarray
     - `centre` (d,): centre of the ball in metres.
     - `radius`: radius of the ball in metres.
 
-    Raises `ValueError` for a centre with another number of coordinates, a radius that is not positive, and an empty
+    Raises `ValueError` for a centre with the wrong number of coordinates, a radius that is not positive, and an empty
     region.
 
     **Example:**
@@ -45,7 +45,7 @@ def box_region(mesh: Mesh, lower: ArrayLike, upper: ArrayLike) -> Bool[np.ndarra
     - `mesh`: the mesh.
     - `lower`, `upper` (d,): corners of the box, metres.
 
-    Raises `ValueError` for corners with another number of coordinates, for a corner `upper` that is not larger than
+    Raises `ValueError` for corners with the wrong number of coordinates, for a corner `upper` that is not larger than
     `lower`, and for an empty region.
 
     **Example:**
@@ -89,8 +89,8 @@ def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None
 
 
 def _centroids_from(mesh: Mesh, point: ArrayLike, name: str) -> Float[np.ndarray, "m d"]:
-    """Vectors (m, d) from a `point` to the centroids of the cells. Raises `ValueError` for a point with another number
-    of coordinates."""
+    """Vectors (m, d) from a `point` to the centroids of the cells. Raises `ValueError` for a point with the wrong
+    number of coordinates."""
     coordinates = np.asarray(point, float)
     if coordinates.shape != (mesh.dimension,) or not np.isfinite(coordinates).all():
         raise ValueError(f"{name} must be {mesh.dimension} finite numbers in metres; it has shape {coordinates.shape}.")
@@ -131,7 +131,7 @@ def basins(
 
     `change`: (m,) value of every cell; `shared`: (m, k) indices of the facets (`shared_facets`) or nodes that cells
     share, -1 for none. Where two basins meet, the basin with the lower peak is merged into the other basin, unless the
-    lower peak exceeds the meeting point by at least `least_prominence` times this peak's height.
+    lower peak exceeds the value at the meeting point by at least `least_prominence` times its own value.
     """
     peak = np.full(len(change), -1)
     label_of_place: dict[int, int] = {}
@@ -172,7 +172,8 @@ def segment(
       signs equally.
     - `level`: value at the edge of a labelled region, as a share of the peak of the same sign (one half is the middle
       of a blurred edge).
-    - `least_peak`: minimum height of the peak of either sign, as a share of the higher peak of both signs.
+    - `least_peak`: minimum height of the peak of a sign, as a share of the higher of the positive and the negative
+      peak; a sign with a lower peak gets no label.
     - `least_area`: minimum area of a connected region, as a fraction of the body; smaller regions are artefacts.
 
     Raises `ValueError` for an image that is not two-dimensional, or has no pixel inside the body.

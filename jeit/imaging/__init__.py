@@ -1,8 +1,8 @@
-"""Imaging in one call: `image_difference` images the difference of two frames, `compare_on_data` compares the rules for
-the hyperparameter λ on this difference.
+"""Imaging in one call: `image_difference` images the difference of two frames, `compare_on_data` compares the rules
+that choose the hyperparameter λ on such a difference.
 
 `preparation` checks the data and builds the mesh; `calibration` calibrates the model; `wiring` detects wiring that
-differs from its description; `method` holds the settings and the imaging methods; `automatic` chooses a method;
+differs from its description; `method` contains the settings and the imaging methods; `automatic` chooses a method;
 `difference` finds inclusions; `sequence` images many frames at once; `stream_preparation` prepares imaging frame by
 frame. Streams of tactile skins are in `jeit.touch`.
 """

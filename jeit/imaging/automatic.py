@@ -16,11 +16,12 @@ from jeit.inverse.prior.matern import MEASURED
 from jeit.inverse.shapes import ShapeReconstruction
 
 # Changes of conductivity relative to the background above which voltages are not linear in conductivity: in general,
-# and for noisy data, whose images are damped far below the true change. Share of noise in the voltage difference above
-# which data count as noisy.
+# and for noisy data, whose images show far less than the true change. Data are noisy if the share of noise in the
+# voltage difference exceeds `_NOISY_SHARE`.
 _STRONG_CHANGE, _STRONG_NOISY_CHANGE, _NOISY_SHARE = 0.3, 0.1, 0.3
-# Maximum share of the voltage difference that the voltages of a linear image may leave unexplained: relative to the
-# share that the linear approximation of these voltages leaves unexplained, and absolute.
+# A linear image has a fault if the voltages computed from it leave too large a share of the voltage difference
+# unexplained: more than `_LARGE_MISFIT`, and more than `_MAX_MISFIT_RATIO` times the share that linearised voltages
+# leave unexplained.
 _MAX_MISFIT_RATIO, _LARGE_MISFIT = 1.1, 0.1
 # Lower bound of the conductivity of a linear image, as a share of the background conductivity.
 _MIN_CONDUCTIVITY = 0.01
@@ -31,8 +32,9 @@ _DERIVATIVE_STEP = 1e-4
 
 
 class ChosenMethod(NamedTuple):
-    """Automatically chosen imaging method and its image. **Fields**: `method`: name of the method; `reason`: why it was
-    chosen, in a sentence; `imaged`: its result; `shapes`: the fitted bodies, if they explain the voltages."""
+    """Automatically chosen imaging method and its image. **Fields**: `method`: name of the method; `reason`: why the
+    method was chosen, in a sentence; `imaged`: its reconstruction and image; `shapes`: the fitted bodies, if they
+    explain the voltages."""
 
     method: str
     reason: str
@@ -85,8 +87,8 @@ def _image_by(name: str, prepared: PreparedDifference, options: MethodOptions) -
 def _bodies_in_solid(
     prepared: PreparedDifference, options: MethodOptions, change: Float[Array, " m"]
 ) -> ChosenMethod | None:
-    """Fit bodies to the data of a solid; None for sheets, weak changes (see `_MIN_BODY_CHANGE`), noisy data, or if no
-    bodies explain the voltages."""
+    """Fit bodies to the data of a solid. Returns None for sheets, weak changes (see `_MIN_BODY_CHANGE`) and noisy data,
+    and if no bodies explain the voltages."""
     noise = prepared.quality.difference_noise
     max_change = np.abs(np.asarray(change)).max() / float(prepared.calibration.conductivity)
     if (
@@ -124,9 +126,9 @@ def _edges(prepared: PreparedDifference) -> str:
 def _shapes(
     prepared: PreparedDifference, smooth: Reconstruction, options: MethodOptions
 ) -> tuple[ShapeReconstruction | None, str]:
-    """Fit the bodies of a smooth image as shapes. Returns the shapes, with half a sentence for the message. Returns
-    None, with the reason, if no bodies are found, or if the misfit of the shapes exceeds both that of the smooth image
-    and one standard deviation of `PreparedDifference.sharp_noise`."""
+    """Fit the bodies of a smooth image as shapes. Returns the shapes and a clause for the message. Returns None and the
+    reason if no bodies are found, or if the misfit of the shapes exceeds both the misfit of the smooth image and one
+    standard deviation of `PreparedDifference.sharp_noise`."""
     shapes, edges = shapes_in(prepared, smooth, options), _edges(prepared)
     if not shapes.bodies:
         return None, f"; no body's {edges[:-1]} explains the voltages better than errors of the model do"
@@ -164,8 +166,8 @@ def linear_image_fault(prepared: PreparedDifference, change: Float[Array, " m"])
 
 
 def _unexplained_share(prepared: PreparedDifference, background: float, relative: np.ndarray, step: float) -> float:
-    """Share of the measured voltage difference that is not explained by the modelled change of voltages for a step
-    along the image, this change divided by the length of the step. The norm is weighted by the inverse of the noise."""
+    """Share of the measured voltage difference that the model leaves unexplained: the modelled change of voltages for a
+    `step` along the image is divided by `step` and subtracted. Channels are divided by their noise."""
     model, used = prepared.model, np.asarray(prepared.mask)
     conductivity = background * np.maximum(1 + step * relative, _MIN_CONDUCTIVITY)
     predicted = (np.asarray(model.voltages(conductivity)) - np.asarray(model.voltages(background))) / step

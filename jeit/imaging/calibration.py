@@ -20,9 +20,9 @@ from jeit.mesh import Mesh
 from jeit_solvers import one_thread_of_blas
 from jeit_solvers.engines import as_array
 
-# Misfit of the model to the reference up to which the described electrode positions are used; and ratios of the misfit
-# with estimated positions to the misfit with described positions below which the estimated positions are used: with
-# each channel relative to its noise, and with equal weights.
+# Misfit of the model to the reference up to which the described electrode positions are used. Above it, estimated
+# positions are used if the ratios of the misfit with estimated to the misfit with described positions are below these
+# limits: with each channel relative to its noise, and with equal weights.
 _MAX_EXACT_MISFIT, _MAX_RELATIVE_RATIO, _MAX_MISFIT_RATIO = 0.01, 0.7, 2.0
 
 
@@ -85,8 +85,8 @@ def calibrated_model(
 
 
 def threads_for(mesh: Mesh) -> AbstractContextManager:
-    """Context in which the BLAS has one thread for a sheet: the matrices of a sheet are small, and on a busy machine
-    threads that wait for each other take ten times as long."""
+    """Context in which the BLAS has one thread for a sheet. The matrices of a sheet are small, and several threads that
+    wait for each other on a busy machine take ten times as long."""
     return one_thread_of_blas() if mesh.dimension == 2 else nullcontext()
 
 
@@ -95,11 +95,11 @@ def _with_estimated_positions(
 ) -> Calibration:
     """The calibration with estimated electrode positions, if these positions explain the reference frame far better.
 
-    The described positions are kept if they explain the reference, and if the misfit has other causes: for example,
+    The described positions are used if they explain the reference, or if the misfit has other causes: for example,
     estimated positions explain little of the misfit of a two-dimensional model of a deep tank. The background is
     estimated together with the positions, from channels weighted by their relative noise. If the background were fitted
-    mainly to the largest voltages, those at the driven electrodes, it would follow the errors of a two-dimensional
-    model there.
+    mainly to the largest voltages, those at the driven electrodes, the background would follow the errors of a
+    two-dimensional model at these electrodes.
     """
     described_misfit = relative_misfit(calibration.voltages, voltages, mask)
     if (
@@ -133,7 +133,7 @@ def relative_misfit(predicted, measured, mask) -> float:
 
 
 def estimated_positions(model: ForwardModel, voltages, mask, deviation: float) -> Placement | None:
-    """Electrode positions estimated from a reference frame; None if the positions cannot be estimated. `deviation`:
+    """Estimate electrode positions from a reference frame; None if the positions cannot be estimated. `deviation`:
     standard deviation of the described positions, metres."""
     if not isinstance(model.electrodes, AbstractMovableElectrodes) or np.iscomplexobj(voltages):
         return None

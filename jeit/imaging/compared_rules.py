@@ -32,8 +32,8 @@ class RuleOutcome:
     **Fields**
 
     - `choice`: the chosen λ, and the curve from which it was chosen.
-    - `residual`: ‖w (v - Jx)‖ / ‖w v‖, the share of the voltage difference v that the image x does not explain, with
-      the Jacobian J and the weights w of the channels.
+    - `residual`: ‖w (v - Jx)‖ / ‖w v‖, the share of the voltage difference v that the image x does not explain. J is
+      the Jacobian, w are the weights of the channels.
     - `noise_figure`: signal-to-noise ratio of the data divided by that of the image (see `jeit.inverse.RULES`).
     - `change`: the image, change of conductivity per cell (m,), S/m (2-D: S).
     - `inclusions`: inclusions found in the image, strongest first.
@@ -91,7 +91,7 @@ def compare_on_data(
     chooses.
 
     The images are computed by one-step imaging. A rule that cannot be applied to the data is listed in `refused`, or
-    raises `ValueError` if it is the only one requested.
+    raises `ValueError` if it is the only rule requested.
 
     **Arguments:**
 

@@ -1,7 +1,7 @@
 """Search for the protocol of a file of voltages that has no description, with the evidence for each protocol.
 
 Protocols of common kinds whose number of channels fits the file are compared: by reciprocity, which needs no model, and
-by the misfit of a uniform body of the given shape (`jeit.imaging.wiring`), in a frame of the empty body.
+by the misfit of a uniform body of the described shape to a frame of the empty body (`jeit.imaging.wiring`).
 """
 
 from __future__ import annotations
@@ -36,14 +36,15 @@ from jeit.protocol import Protocol
 # protocols are compared, for a sheet and for a solid.
 _FEWEST, _MOST, _NODES = 4, 64, {2: 700, 3: 4000}
 # Unexplained share of the empty body's voltages above which the best protocol is refused: in general; and if its kind
-# is known, or if the channels in another order would leave `_ORDERED` times that share unexplained.
+# is known, or if the channels in a different order would leave `_ORDERED` times as much unexplained.
 _HOPELESS, _HOPELESS_EVEN_SO, _ORDERED = 0.25, 0.5, 2.0
 # Maximum spread of the frames of an empty body; minimum number of channels for each electrode.
 _MAX_SPREAD, _MIN_CHANNELS = 0.2, 2
-# Maximum number of candidate protocols whose misfit is computed; ratio of a candidate's unexplained share to that of
-# the best candidate, and difference between them, above which the candidate is ruled out.
+# Maximum number of candidate protocols whose misfit is computed. A candidate is ruled out if its unexplained share is
+# at least `_RIVAL_RATIO` times that of the best candidate plus `_RIVAL_MARGIN`.
 _MAX_COMPARED, _RIVAL_RATIO, _RIVAL_MARGIN = 12, 1.3, 0.01
-# Reciprocity error from which gains are estimated; maximum ratio of the error after this correction to that before.
+# Minimum reciprocity error for which gains are estimated; maximum ratio of the error after the correction by these
+# gains to the error before.
 _MIN_GAIN_ERROR, _MAX_GAIN_RATIO = 0.03, 0.4
 # Layout of a table of numbers about which nothing is known.
 _UNKNOWN_LAYOUT = TableLayout()
@@ -53,7 +54,7 @@ _RELATIVE_CONTACT = 0.01
 
 @dataclass(frozen=True)
 class Candidate:
-    """Protocol that may be that of a file. **Fields**: `protocol`: table `[protocol]` of a description, without the
+    """Candidate for the protocol of a file. **Fields**: `protocol`: table `[protocol]` of a description, without the
     current; `frames`: number of frames; `spread`: relative deviation of the empty body's frames from their mean;
     `reciprocity`: reciprocity error of the mean frame, None if no two channels are reciprocal; `measurement`: the mean
     frame, read with this protocol; `wiring`: the wiring with which a uniform body explains this frame; `gains`: gains
@@ -87,8 +88,9 @@ class Candidate:
 
     @property
     def ordered(self) -> bool:
-        """Whether a uniform body would explain the voltages far worse if the channels were in another order: a share
-        √(1 - r²) would be unexplained on average, with r the squared mean of the voltages over their mean square."""
+        """Whether a uniform body would explain the voltages far worse if the channels were in a different order. On
+        average, a share √(1 - r²) would then be unexplained, where r is the squared mean of the voltages divided by
+        their mean square."""
         values = np.asarray(self.measurement.voltages)[np.asarray(self.measurement.mask)]
         mean_ratio = abs(values.mean()) ** 2 / np.mean(np.abs(values) ** 2)
         return bool(_ORDERED * self.unexplained < np.sqrt(1 - mean_ratio**2))
@@ -103,8 +105,9 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Findings:
-    """Result of `find_description`. **Fields**: `candidates`: protocols, the best first; `undecided`: others that fit
-    the file as well; `text`: commented description, TOML, with the best; `known`: whether its kind was known."""
+    """Result of `find_description`. **Fields**: `candidates`: protocols, the best first; `undecided`: other protocols
+    that fit the file about as well as the best; `text`: commented description in TOML with the best protocol; `known`:
+    whether the kind of protocol was known."""
 
     candidates: tuple[Candidate, ...]
     undecided: tuple[Candidate, ...]
@@ -113,7 +116,8 @@ class Findings:
 
     @property
     def fault(self) -> str:
-        """Reason why the best protocol explains the file too poorly to be used; empty if it does not."""
+        """Reason why the best protocol explains the file too poorly to be used; empty if it explains the file well
+        enough."""
         best = self.candidates[0]
         limit = _HOPELESS_EVEN_SO if self.known or best.ordered else _HOPELESS
         if best.unexplained < limit and best.spread < _MAX_SPREAD:
@@ -149,8 +153,8 @@ def find_description(
     **Arguments:**
 
     - `path`: file of the voltages.
-    - `geometry`, `electrodes`: tables of a description, metres; `electrodes` lacks the number of electrodes, and the
-      contact impedance, ohm·m (on a solid ohm·m²), is estimated roughly unless given.
+    - `geometry`, `electrodes`: tables of a description, metres, without the number of electrodes. The contact
+      impedance, ohm·m (on a solid ohm·m²), is estimated roughly unless it is in `electrodes`.
     - `reference`: file of frames of the empty body; by default, the mean of all frames replaces them.
     - `keys`: names of the arrays of frames in the file and in the reference, for files with several arrays.
     - `known`: known entries of the table `[protocol]`, such as the kind or the number of electrodes.
@@ -211,7 +215,7 @@ def _described_body(
     reference: Path,
     known: dict[str, Any],
 ) -> Findings:
-    """Findings for a file that contains its protocol: their description is of the body alone."""
+    """Findings for a file that contains its protocol; the description states only the body and its electrodes."""
     data, base = read(path, format), read(reference, format)
     number = data.protocol.num_electrodes
     if known.get("number", number) != number or "kind" in known or "order" in known:
@@ -240,9 +244,9 @@ def _described_body(
 
 @dataclass(frozen=True)
 class _Numbers:
-    """The numbers in a file. **Fields**: `frames`: function that arranges them in frames, given possible numbers of
-    channels; `shape`: their shape in words; `sizes`: possible numbers of values in a frame; `data`: entries of a
-    description's table `[data]` for this arrangement."""
+    """The numbers in a file. **Fields**: `frames`: function that arranges the numbers in frames, for given possible
+    numbers of channels; `shape`: their shape in words; `sizes`: possible numbers of values in a frame; `data`: entries
+    of a description's table `[data]` for this arrangement."""
 
     path: Path
     frames: Callable[[Sequence[int]], Frames]
@@ -327,7 +331,7 @@ def _protocols(number: int) -> Iterator[dict[str, Any]]:
 def _fitting(
     numbers: _Numbers, base_numbers: _Numbers, geometry: dict, electrodes: dict, known: dict, current: float
 ) -> Iterator[Candidate]:
-    """Yield candidates whose number of channels fits both files; of equal protocols, only the first."""
+    """Yield candidates whose number of channels fits the file and its reference; of equal protocols, only the first."""
     counts, found_protocols = set(numbers.sizes), set()
     for number in [known["number"]] if "number" in known else range(_FEWEST, _MOST + 1):
         if not any(number * (number - 4) / 4 <= count <= number**2 for count in counts):

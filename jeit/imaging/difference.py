@@ -35,8 +35,9 @@ from jeit_solvers import Status
 from jeit_solvers.engines import as_array
 
 _MIDDLE = 0.5
-# Minimum width of electrodes relative to their distance that raises no doubt; misfit of the reference above which it
-# may have been exchanged with the frame, and ratio of the frame's misfit to it below which this is likely.
+# Minimum width of electrodes relative to their distance that raises no doubt. Misfit of the reference above which frame
+# and reference may be exchanged, and ratio of the frame's misfit to the reference's misfit below which an exchange is
+# likely.
 _MIN_RELATIVE_WIDTH, _MIN_SUSPICIOUS_MISFIT, _MAX_EXCHANGED_MISFIT = 0.005, 0.1, 0.5
 # Maximum misfit of an image's voltages, in standard deviations, that raises no doubt.
 _MISFIT = 3.0
@@ -65,10 +66,10 @@ class ImagedDifference:
       complex voltages, the complex change of admittivity σ + iωε.
     - `raster`: `change` on a grid, NaN outside the mesh; `extent`: (x_min, x_max, y_min, y_max) in metres.
     - `inclusions`: regions of changed conductivity, strongest first; the `shapes` if there are any. In iterative
-      images, inclusions are found in the logarithm of conductivity, which weights both signs alike, and must exceed the
-      noise; in complex images, in the real part.
-    - `unlike_electrodes`: electrodes, numbered from 0, that the model fits far worse than the others, with the ratio of
-      the misfits. Channels on these electrodes have less weight.
+      images, inclusions must exceed the noise and are found in the logarithm of conductivity, which weights both signs
+      alike. In complex images they are found in the real part.
+    - `unlike_electrodes`: electrodes, numbered from 0, whose channels the model fits far worse than those of the other
+      electrodes, each with the ratio of the misfits. These channels have less weight.
     - `shapes`: fitted bodies with outlines; None if no bodies were fitted, or if they do not explain the voltages.
     - `labels`: label of every pixel of the raster, if requested: 0 background, 1 resistive, 2 conductive.
     - `timings`: duration of each step in seconds.
@@ -125,8 +126,8 @@ class ImagedDifference:
 
     @property
     def peak_ranges(self) -> tuple[tuple[float, float], ...]:
-        """68 % interval of the change in each inclusion, S/m (2-D: S). Empty without fitted bodies, and if the data
-        leave an end of an interval open."""
+        """68 % interval of the change in each inclusion, S/m (2-D: S). Empty without fitted bodies, and if the data do
+        not determine a limit of an interval."""
         background = float(np.real(self.calibration.conductivity))
         intervals = [inclusion.contrast_interval or (None, None) for inclusion in self.inclusions]
         ranges = [
@@ -201,7 +202,7 @@ class ImagedDifference:
     @property
     def departure(self) -> Float[Array, " m"]:
         """Values per cell in which inclusions are found: the change of conductivity, or, for iterative images, the
-        change of its natural logarithm."""
+        change of the natural logarithm of conductivity."""
         if not self.iterative:
             return self.change
         return as_array(np.log1p(np.asarray(self.change) / float(self.calibration.conductivity)))
@@ -225,7 +226,8 @@ def _doubts_of_data(imaged: ImagedDifference) -> list[str]:
 
 
 def _doubt_of_lengths(imaged: ImagedDifference) -> str:
-    """Sentence if electrodes on the edge of a sheet are so narrow that lengths may not be in metres; else empty."""
+    """Return a sentence if electrodes on the edge of a sheet are so narrow that lengths may not be in metres; otherwise
+    an empty string."""
     electrodes, domain = imaged.measurement.electrodes, imaged.measurement.domain
     if not isinstance(electrodes, BoundaryElectrodes) or not isinstance(domain, Domain):
         return ""
@@ -240,7 +242,8 @@ def _doubt_of_lengths(imaged: ImagedDifference) -> str:
 
 
 def _doubt_of_order(imaged: ImagedDifference) -> str:
-    """Sentence if the frame fits an undisturbed body much better than the reference does; otherwise empty."""
+    """Return a sentence if the frame fits an undisturbed body much better than the reference does; otherwise an empty
+    string."""
     misfit = float(imaged.calibration.misfit)
     usable = np.asarray(imaged.measurement.mask)[0] & np.asarray(imaged.reference.mask)[0]
     if not (misfit > _MIN_SUSPICIOUS_MISFIT and usable.any()):
@@ -258,8 +261,8 @@ def _doubt_of_order(imaged: ImagedDifference) -> str:
 
 
 def _doubt_of_units(imaged: ImagedDifference) -> str:
-    """Sentence if the level of the voltages is implausible, with the unit that is likely; otherwise empty, also if the
-    notes of the measurement say that the scale is not known."""
+    """Return a sentence that suggests a unit if the level of the voltages is implausible. Returns an empty string
+    otherwise, and if notes of the measurement or its reference say that the scale is not known."""
     lower, upper = _CONDUCTIVITIES[imaged.mesh.dimension]
     background = abs(complex(imaged.calibration.conductivity))
     frames = [
@@ -317,7 +320,7 @@ def image_difference(
     - `progress`: function called with the name of each step when the step begins.
 
     Raises `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`) or lack the positions of the
-    electrodes, and for arguments of another type, such as the path of a file.
+    electrodes, and for arguments of the wrong type, such as the path of a file.
 
     **Example:**
 

@@ -38,25 +38,26 @@ class ImagingSettings:
 
     **Arguments:**
 
-    - `method`: "auto" or a name in `METHODS`, which has linear methods, iterative methods that solve for conductivity
-      itself, and "shapes", which fits outlines of bodies. "auto" uses one-step imaging if its image is sound, otherwise
+    - `method`: "auto" or a name in `METHODS`: linear methods, iterative methods that solve for conductivity itself, and
+      "shapes", which fits outlines of bodies. "auto" uses one-step imaging if its image is sound, otherwise
       Gauss-Newton imaging with outlines of the bodies; in solids, ellipsoids are fitted wherever the data support them
       (see `jeit.inverse.shapes`).
     - `prior`: a name in `jeit.inverse.prior.matern.PRIORS`, or a quadratic prior; used by one-step, Gauss-Newton and
       Levenberg-Marquardt imaging. With "auto" in solids, no bodies are fitted if the prior is not the default.
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`. Total variation and filtered back-projection
-      need a number; plain back-projection and "shapes" use none. With "auto" and a hyperparameter, one-step imaging is
-      used. Defaults: "noise-figure" for one-step imaging, 5 for Gauss-Newton and Levenberg-Marquardt, 300 for total
-      variation, which gave good images of measured tanks.
+      need a number; plain back-projection and "shapes" have no hyperparameter. With "auto" and a hyperparameter,
+      one-step imaging is used. Defaults: "noise-figure" for one-step imaging, 5 for Gauss-Newton and
+      Levenberg-Marquardt, 300 for total variation; these defaults gave good images of measured tanks.
     - `contact`: calibration of the contact impedance: "each" (one value per electrode), "common" (one value) or
-      "fixed". Default: "each" if voltages are measured on driven electrodes, otherwise "fixed", since the data then do
-      not determine the contact impedance.
+      "fixed". Default: "each" if voltages are measured on driven electrodes. Otherwise the data do not determine the
+      contact impedance, and the default is "fixed".
     - `num_points`: approximate number of mesh nodes; default: 2,000 for a sheet, 10,000 for a solid.
     - `raster_shape`: (rows, columns) of the raster.
     - `level`, `least_peak`: see `jeit.image.find_inclusions`.
     - `as_is`: whether to image even if the wiring seems to differ from its description, see `jeit.imaging.wiring`.
-    - `segment`: whether to label background, resistive and conductive pixels: by the outlines if there are any,
-      otherwise at half of each inclusion's peak. With "auto", images without outlines are then made by total variation.
+    - `segment`: whether to label background, resistive and conductive pixels: by the outlines of fitted bodies if there
+      are any, otherwise at half of each inclusion's peak. With "auto", images without outlines are then computed by
+      total variation.
     - `bodies`: kind of the bodies in a solid: "either", "ellipsoids", or "columns" through its whole height.
 
     Raises `ValueError`, naming the setting, for unknown or incompatible values.
@@ -104,7 +105,8 @@ class ImagingSettings:
 
 
 def as_settings(requested: ImagingSettings | None) -> ImagingSettings:
-    """Return the given settings, or the defaults for None. Raises `ValueError` for an argument of another type."""
+    """Return the `requested` settings, or the defaults for None. Raises `ValueError` for an argument of any other
+    type."""
     settings = ImagingSettings() if requested is None else requested
     check_kind("settings", settings, ImagingSettings, "ImagingSettings, such as ImagingSettings(method='gauss-newton')")
     return settings
@@ -153,8 +155,8 @@ class MethodOptions(NamedTuple):
     progress: Callable[[str], None] | None = None
 
 
-# Inclusions of a smooth image from which fits of shapes start, artefacts among them: minimum peak and minimum area, see
-# `jeit.image.find_inclusions`, and maximum number.
+# Fits of shapes start from the inclusions of a smooth image, some of which are artefacts: minimum peak and minimum area
+# of these inclusions, see `jeit.image.find_inclusions`, and their maximum number.
 _MIN_PEAK, _MIN_AREA, _MAX_STARTS = 0.15, 0.002, 8
 
 
@@ -188,8 +190,8 @@ def prior_for(prior: NamedPrior, domain: Body) -> AbstractPrior:
 
 
 def rule_for(name: str, prepared: PreparedDifference) -> Rule:
-    """Rule `name` for the hyperparameter, with the noise of the data if the rule needs it. Raises `ValueError` if the
-    rule needs noise that is not known."""
+    """Return the rule `name`, which chooses the hyperparameter, with the noise of the data if the rule needs it. Raises
+    `ValueError` if the rule needs noise that is not known."""
     if name != "discrepancy":
         return RULES[name]
     if prepared.noise is None:
@@ -223,7 +225,8 @@ def _one_step(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
 def _back_projection(prepared: PreparedDifference, options: MethodOptions, *, filtered: bool) -> Imaged:
     weight = options.hyperparameter
     keywords = {"hyperparameter": weight} if isinstance(weight, (int, float)) else {}
-    # The equipotential lines are those of the real background; real and imaginary voltages are projected separately.
+    # Equipotential lines are computed for the real part of the background; real and imaginary voltages are projected
+    # separately.
     conductivity = np.real(prepared.calibration.conductivity)
     reconstruction = back_projection(prepared.model, conductivity, filtered=filtered, mask=prepared.mask, **keywords)
     return reconstruction, reconstruction.image(prepared.difference)
@@ -265,8 +268,9 @@ def _iterative_image(
 def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, options: MethodOptions) -> ShapeReconstruction:
     """Fit bodies that explain a difference, starting from the inclusions of its smooth image.
 
-    A body is kept only if the objective of the fit without it is larger by the factor `least_rise` and the Bayesian
-    evidence favours the body. The factor allows for model errors, which the noise does not include.
+    The result contains a body only if the objective of the fit without it is larger by the factor `least_rise` and the
+    Bayesian evidence favours the body. In a sheet, the factor allows for model errors and increases with their share in
+    the variance of the noise.
     """
     model, background = prepared.model, prepared.calibration.conductivity
     is_solid = prepared.mesh.dimension == 3
@@ -295,7 +299,7 @@ def _shapes(prepared: PreparedDifference, options: MethodOptions) -> Imaged:
 
 
 def of_shapes(prepared: PreparedDifference, shapes: ShapeReconstruction) -> Imaged:
-    """Shapes and their change of conductivity; for a solid, per cell of the refined mesh."""
+    """Return the shapes and their change of conductivity per cell; for a solid, per cell of the refined mesh."""
     image = shapes if shapes.finer is None else shapes.finer
     return shapes, image.conductivity - prepared.calibration.conductivity
 

@@ -29,8 +29,8 @@ from jeit_solvers.engines import as_array
 
 
 def chosen_frame(measurement: Measurement, frame: int | str | None = None) -> int:
-    """Number, from 0, of the frame to image, given by number or name; default: the first frame that is not named
-    "reference". Raises `ValueError` for a frame that does not exist."""
+    """Number, from 0, of the frame to image, which is specified by number or name; default: the first frame that is not
+    named "reference". Raises `ValueError` for a frame that does not exist."""
     if frame is not None:
         return measurement.frame_number(frame)
     return int(measurement.num_frames > 1 and measurement.frame_names[:1] == ("reference",))
@@ -53,13 +53,14 @@ def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
 SOLID_POINTS, SHEET_POINTS = 10_000, 2000
 # Minimum share of a voltage difference that is assumed to remain unexplained by any model.
 _MIN_MISFIT = 0.03
-# Factor by which the unexplained share is larger for images with sharp outlines.
+# Factor by which the share of the voltage difference that the model does not explain is larger for images with sharp
+# outlines.
 _SHARP_FACTOR = 3.0
 # Relative standard deviation, due to the discretisation, of the strengths of fitted bodies in a sheet and in a solid:
 # the cells of a solid are coarse relative to the bodies. Estimated on 23 bodies in simulated boxes and cylinders.
 _DISCRETISATION_DEVIATION = {2: 0.0, 3: 0.03}
-# Misfit of an electrode, relative to that of the other electrodes, above which it counts as unlike them. In sound tanks
-# the ratio was at most 2.6.
+# Misfit of an electrode, relative to that of the other electrodes, above which the electrode counts as unlike the
+# others. In sound tanks the ratio was at most 2.6.
 _MIN_UNLIKE_MISFIT = 3.0
 
 
@@ -116,17 +117,19 @@ class PreparedDifference:
 
     @property
     def relative_noise(self) -> Float[Array, " M"]:
-        """Noise of the channels relative to each other, volts: `jeit.inverse.relative_noise` of the reference,
-        multiplied by the relative misfit of the electrode for channels that measure on `unlike_electrodes`."""
+        """Noise of the channels up to a common factor, volts: `jeit.inverse.relative_noise` of the reference. For
+        channels that measure on `unlike_electrodes`, the noise is multiplied by the relative misfit of the
+        electrode."""
         noise = relative_noise(np.asarray(self.reference.voltages)[0], self.mask)
         is_reading = np.asarray(self.model.protocol.channel_measurement) != 0
         return as_array(noise * np.max(np.where(is_reading, self._electrode_weights, 1), axis=1))
 
     @property
     def unlike_electrodes(self) -> dict[int, float]:
-        """Electrodes, numbered from 0, whose channels in the reference are fitted far worse than those of the other
-        electrodes, each with the ratio of the misfits. Such electrodes may be loose or displaced, or their gain may
-        differ. Channels that measure on these electrodes have less weight."""
+        """Electrodes, numbered from 0, whose channels in the reference the model fits far worse than those of the other
+        electrodes. Each electrode is listed with its misfit, divided by the median misfit of all electrodes. Such
+        electrodes may be loose or displaced, or their gain may differ. Channels that measure on these electrodes have
+        less weight."""
         return {
             int(electrode): float(self._electrode_weights[electrode])
             for electrode in np.flatnonzero(self._electrode_weights > 1)
@@ -134,7 +137,7 @@ class PreparedDifference:
 
     @functools.cached_property
     def _electrode_weights(self) -> Float[np.ndarray, " L"]:
-        """Relative misfit (L,) of unlike electrodes, by which the noise of their channels is multiplied; 1 for the
+        """Relative misfit (L,) of each unlike electrode, by which the noise of its channels is multiplied; 1 for all
         other electrodes."""
         base = np.asarray(self.reference.voltages)[0]
         residual = np.asarray(self.calibration.voltages) - base
@@ -152,11 +155,11 @@ class PreparedDifference:
 
     @property
     def modelled_noise(self) -> Float[Array, " M"]:
-        """Expected deviation of the voltage difference from that of the model, volts: the root of the sum of squares of
-        the noise of the difference, of rounding, and of the model error, which is the difference times the relative
-        misfit of the reference (at least 3 %).
+        """Expected deviation of the measured voltage difference from the modelled one, volts: the root of the sum of
+        squares of the noise of the difference, rounding and the model error. The model error is the root mean square of
+        the difference times the relative misfit of the reference (at least 3 %).
 
-        If the noise is not known, 0.1 of the difference is used instead, at most 1 in units of `relative_noise`.
+        If the noise is not known, 0.1 of the difference is used as noise, at most 1 in units of `relative_noise`.
         """
         return self._noise_with_error_share(max(self._misfit, _MIN_MISFIT))
 
@@ -171,11 +174,11 @@ class PreparedDifference:
         """Errors of the voltage difference, from which the intervals of fitted bodies are computed.
 
         The errors of the voltages are noise, the unknown part of electrode positions and contacts, and a share of the
-        difference that equals the misfit of the reference, at least 2 %. The common errors of the strengths of all
-        bodies are the part of this misfit that noise does not explain and, in a solid, the discretisation error.
+        difference that equals the misfit of the reference, at least 2 %. The error common to the strengths of all
+        bodies combines the part of this misfit that noise does not explain and, in a solid, the discretisation error.
         """
         model_error = self.calibration.model_error
-        if model_error is None:  # a reference that the described places explain still leaves them uncertain
+        if model_error is None:  # the described positions are uncertain even if they explain the reference
             reference = np.asarray(self.reference.voltages)[0]
             deviation = self.uncertainty.position_on(self.mesh)
             placement = estimated_positions(self.model, reference, self.mask, deviation)
@@ -269,8 +272,8 @@ def prepare_difference(
         model = ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, base.protocol)
     with clock("wiring"):
         wiring = find_wiring(model, base)
-        # For data that cannot be imaged, a wiring error is reported only if another wiring explains them: pure noise
-        # fits no wiring.
+        # For data that cannot be imaged, a wiring error is reported only if a different wiring explains the data: pure
+        # noise fits no wiring.
         if wiring.explanation or quality.imageable:
             check_wiring(wiring, base, as_is)
         if not quality.imageable:
@@ -293,8 +296,8 @@ def prepare_difference(
 
 
 def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
-    """Check the wiring found in `reference`. Raises `ValueError` if this wiring differs from its description, unless
-    `as_is`."""
+    """Check the `wiring` estimated from `reference`. Raises `ValueError` if it differs from the description or explains
+    the reference too poorly (see `Wiring.fault`), unless `as_is`."""
     if wiring.fault and not as_is:
         # Voltages of the opposite sign cannot be calibrated, even with `as_is`.
         advice = "" if wiring.reversed_signs else "; or go on as it is (as_is=True, --as-is)"
@@ -309,9 +312,9 @@ def select_frames(
 ) -> tuple[Measurement, Measurement]:
     """Select the frame to image and its reference, one frame each.
 
-    A frame named "reference" in `measurement` is imaged only if requested, and serves as reference if no `reference` is
-    given. A reference measured with other currents is converted to the currents of the measurement if it determines
-    their voltages (see `jeit.data.driven_by`); its notes record the conversion.
+    A frame named "reference" in `measurement` is imaged only if requested, and serves as reference if `reference` is
+    None. A reference measured with other currents is converted to the currents of the measurement if it determines the
+    voltages for these currents (see `jeit.data.driven_by`); its notes record the conversion.
 
     **Arguments:**
 
@@ -368,7 +371,8 @@ def imaging_mesh(
 
 
 def check_real(measurement: Measurement) -> None:
-    """Raise `ValueError` if voltages are complex, for functions other than `image_difference`."""
+    """Raise `ValueError` if voltages are complex, in functions that, unlike `image_difference`, require real
+    voltages."""
     if np.iscomplexobj(measurement.voltages):
         raise ValueError(
             f"'{measurement.name}' is complex; choose the part to image with [data] component in its description: "

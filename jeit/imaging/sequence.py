@@ -1,11 +1,11 @@
 """Imaging of many frames at once, and of frames measured at two frequencies.
 
 Frequency-difference imaging compares a body at two frequencies, without a frame of the empty body. Admittivity σ + iωε
-depends on frequency, in tissue and in phantoms of tissue more than in saline. The plain difference v₂ - v₁ contains the
-changes of the background and of the objects. The weighted difference v₂ - αv₁ with α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ removes the
-part of v₂ that is proportional to v₁, the voltages at the first frequency; the weighted difference is zero for a
-homogeneous body. Seo, Lee, Kim, Zribi and Woo, Physiol. Meas. 29 (2008) 755-769; Jun, Kuen, Lee, Woo, Holder and Seo,
-Physiol. Meas. 30 (2009) 1087-1099.
+depends on frequency, in tissue and in phantoms of tissue more than in saline. The plain difference v₂ - v₁ of the
+voltages at the second and the first frequency contains the changes of the background and of the objects. The weighted
+difference v₂ - αv₁ with α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ removes the part of v₂ that is proportional to v₁; the weighted
+difference is zero for a homogeneous body. Seo, Lee, Kim, Zribi and Woo, Physiol. Meas. 29 (2008) 755-769; Jun, Kuen,
+Lee, Woo, Holder and Seo, Physiol. Meas. 30 (2009) 1087-1099.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ def image_sequence(
       raised early.
     - `progress`: function called with the name of each step when the step begins.
 
-    Spikes in single channels are replaced by what other channels determine (`jeit.data.mask_spikes`).
-    Channels missing in more than half of the frames are not used; frames that lack any other channel are refused. The
+    Spikes in single channels are replaced by values that other channels determine (`jeit.data.mask_spikes`). Channels
+    missing in more than half of the frames are not used; frames that lack any of the used channels are refused. The
     images need four bytes per cell and frame. Raises `ValueError` in the same cases as `image_difference`, for a
     measurement with one frame, for an iterative method, and for images that would not fit in memory.
 
@@ -165,8 +165,8 @@ class ImagedFrequencies:
     **Fields**
 
     - `image`: the image of the weighted difference of the two frequencies.
-    - `weight`: factor α of the voltages at the first frequency, by which the voltages of the body as a whole change; 1
-      for plain differences.
+    - `weight`: factor α that multiplies the voltages at the first frequency: the ratio by which the voltages of the
+      body as a whole change; 1 for plain differences.
 
     **Example:**
 
@@ -220,8 +220,8 @@ def image_frequencies(
 
 
 def frequency_weight(second: Measurement, first: Measurement) -> float | complex:
-    """Weight α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ of the voltages at the first frequency, from the first frame of each measurement
-    and the channels usable in both; complex for complex voltages.
+    """Weight α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ of the voltages at the first frequency, computed from the first frame of each
+    measurement and the channels that are usable in both frames; complex for complex voltages.
 
     **Arguments:**
 

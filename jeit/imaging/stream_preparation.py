@@ -46,7 +46,7 @@ class StreamSettings:
       `jeit.inverse.Imager`.
     - `prior`: a name in `jeit.inverse.prior.matern.PRIORS`, or a quadratic prior.
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; default: "noise-figure".
-    - `memory`: number of frames over which an image changes, see `jeit.inverse.Imager`; 0: frames are imaged
+    - `memory`: number of frames over which images are correlated, see `jeit.inverse.Imager`; 0: frames are imaged
       independently.
     - `contact`, `num_points` (default: 1,200), `as_is`: as in `jeit.imaging.ImagingSettings`.
 
@@ -136,7 +136,8 @@ def prepare_imager(
 def described_reference(
     description: Description, frames: Float[np.ndarray, "N M"], *, name: str = "reference"
 ) -> Measurement:
-    """Measurement of a described sensor that contains the mean of frames (N, M), volts, of the undisturbed sensor.
+    """Create a measurement from a description of a sensor and the mean of `frames` (N, M), volts, of the undisturbed
+    sensor.
 
     Raises `ValueError` for a description without geometry, electrodes or protocol, and in the same cases as
     `jeit.data.screen`.

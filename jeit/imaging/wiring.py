@@ -1,10 +1,10 @@
-"""Detection of wiring errors: exchanged wires, channels in another order, and voltages of opposite sign.
+"""Detection of wiring errors: exchanged wires, channels in the wrong order, and voltages of opposite sign.
 
 `exchanges_message` detects drives or measurements that are exchanged in a frame but not in its reference. If each drive
 has all measurements, frame and reference are matrices (drives, measurements), and an exchange of two drives exchanges
-two rows. The exchanges that make the frame most similar to its reference are found.
+two rows. The exchanges that make the frame most similar to its reference are determined.
 
-`find_wiring` finds the wiring that explains a frame of the empty body. A uniform body is known except for its
+`find_wiring` estimates the wiring that explains a frame of the empty body. A uniform body is known except for its
 conductivity and its contacts. Its transfer impedance Z (L, L) is computed for several contact impedances; if electrode
 k is at the place of electrode p(k), the transfer impedance is Z[p, p]. Wirings are compared by their misfit to the
 frame, up to a scale factor.
@@ -32,9 +32,9 @@ _MAX_EXCHANGE_RATIO, _MAX_TOTAL_RATIO, _MAX_EXCHANGES = 0.9, 0.5, 4
 
 
 def exchanges_message(frame: Measurement, reference: Measurement) -> str:
-    """Sentence that names the drives, or the measurements of every drive, that seem exchanged in a frame, numbered from
-    1; empty if no exchanges halve the frame's difference from the reference, or if not all drives have the same
-    measurements."""
+    """Describe in a sentence which drives, or which measurements of every drive, seem exchanged in a frame, numbered
+    from 1. The sentence is empty if no exchanges halve the frame's difference from the reference, or if not all drives
+    have the same measurements."""
     order = _order(frame)
     if order is None:
         return ""
@@ -91,20 +91,22 @@ def _exchanges(
 
 
 MOST_MISFIT = 0.15
-"""Relative misfit of the empty body above which a wiring error is suspected."""
-# Maximum ratio of the misfit after a change of the wiring to the misfit before: for each exchange, and for the reported
-# wiring.
+"""Relative misfit of a uniform body to a frame of the empty body above which a wiring error is suspected."""
+# Maximum ratio of the misfit with a changed wiring to the misfit before the change: for each exchange, and for the
+# reported wiring relative to the described wiring.
 _MAX_STEP_RATIO, _MAX_WIRING_RATIO = 0.85, 0.6
 _MAX_ELECTRODE_EXCHANGES = 4
 # Relative misfit of the empty body above which imaging is refused even if no other wiring explains the frame.
 _HOPELESS = 0.5
-# Contact impedance times conductivity, divided by the size of the body: from negligible to dominant.
+# Trial contact impedances, multiplied by the conductivity and divided by the size of the body: from negligible to
+# dominant.
 _RELATIVE_CONTACTS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 
 
 @dataclass(frozen=True)
 class Wiring:
-    """Estimated connection of electrodes and channels.
+    """Estimated connection of electrodes and channels, which may differ from the described one, that of the data's
+    description.
 
     - `places`: electrode k is at the place of electrode `places[k]`, numbered from 0.
     - `order`: order of the channels, a name in `channel_orders`; empty for the described order.
@@ -164,14 +166,14 @@ class Wiring:
 
 
 def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
-    """Find the wiring that explains the first frame of `measurement`, of the empty body: the described wiring, unless
-    the misfit of another wiring is far smaller.
+    """Find the wiring that explains the first frame of `measurement`, a frame of the empty body. The result is the
+    described wiring unless a different wiring has a far smaller misfit.
 
     Candidates are other orders of the channels, voltages of opposite sign, other first electrodes, the reverse order of
-    electrodes, and up to four successive exchanges of two electrodes. Voltages all of one sign, or with the signs that
-    the described wiring gives them, may be magnitudes: they are compared without signs if a wiring then explains the
-    frame better. Errors that leave the voltages unchanged, such as a rotation of the electrodes of a symmetric body,
-    cannot be found.
+    electrodes, and up to four successive exchanges of two electrodes. Voltages may be magnitudes if all have one sign,
+    or if their signs are those that the described wiring implies. Such voltages are also compared without signs, and
+    the result is used if it explains the frame better. Errors that leave the voltages unchanged, such as a rotation of
+    the electrodes of a symmetric body, cannot be found.
     """
     num_electrodes, orders = model.protocol.num_electrodes, channel_orders(model.protocol)
     described_wiring = Wiring(tuple(range(num_electrodes)))
@@ -201,13 +203,13 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
 def _explained(
     misfit_of: Callable[[Wiring], Wiring], described_wiring: Wiring, best_wiring: Wiring, orders: Iterable[str]
 ) -> Wiring:
-    """The wiring that explains a frame far better than `best_wiring`, which is the described one; otherwise
-    `best_wiring`."""
+    """Return the wiring that explains a frame far better than `best_wiring`, the described wiring with its misfit, or
+    `best_wiring` if no wiring does."""
     num_electrodes = len(described_wiring.places)
 
     def best_of(wirings: Iterable[Wiring], last_best: Wiring) -> Wiring:
-        # Misfits are rounded so that the first of equivalent wirings is taken, such as orders that are the same by
-        # reciprocity.
+        # Misfits are rounded so that the first of equivalent wirings is chosen, for example of orders that are
+        # equivalent by reciprocity.
         best_wiring = min((misfit_of(wiring) for wiring in wirings), key=lambda wiring: round(wiring.misfit, 9))
         return best_wiring if best_wiring.misfit < _MAX_STEP_RATIO * last_best.misfit else last_best
 
@@ -229,8 +231,8 @@ def _explained(
 
 
 def _has_one_sign(model: ForwardModel, measurement: Measurement) -> bool | None:
-    """True if all voltages have one sign; False if they have the signs (or all opposite signs) of a uniform body with
-    the described wiring, which magnitudes are given when their file is read; None for other signs."""
+    """True if all voltages have one sign; False if all signs equal, or all oppose, the signs of a uniform body with the
+    described wiring (which are assigned to magnitudes when their file is read); None for other signs."""
     used = np.asarray(measurement.mask)[0]
     signs = np.sign(np.real(np.asarray(measurement.filled())[0]))[used]
     expected = np.sign(select_channels(on_host(model.protocol), _impedances(model)[0]))[used]
@@ -270,8 +272,8 @@ def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
 def _comparison(
     model: ForwardModel, measurement: Measurement, orders, *, signs: bool = True
 ) -> Callable[[Wiring], Wiring]:
-    """Function that computes the misfit of a wiring to the first frame of `measurement`, and the sign of the voltages;
-    without `signs`, the misfit of their magnitudes."""
+    """Return a function that computes the misfit of a wiring to the first frame of `measurement`, and the sign of the
+    voltages. Without `signs`, only magnitudes of voltages are compared."""
     protocol = on_host(model.protocol)
     voltages, mask = np.real(np.asarray(measurement.filled())[0]), np.asarray(measurement.mask)[0]
     impedances, voltages = _impedances(model), voltages if signs else np.abs(voltages)
@@ -310,7 +312,8 @@ def _impedances(model: ForwardModel) -> list[Float[np.ndarray, "L L"]]:
 
 
 def _turns(num_electrodes: int) -> Iterator[tuple[int, ...]]:
-    """Places of electrodes for each other first electrode, and for the reverse order."""
+    """Yield the places of electrodes that are counted from any first electrode in either direction, except in the
+    described order."""
     for shift in range(num_electrodes):
         for direction in (1, -1):
             if (shift, direction) != (0, 1):

@@ -45,8 +45,8 @@ class TracedFit(NamedTuple):
 
 @eqx.filter_jit
 def traced_fit(model: ForwardModel, measured: Float[Array, " M"], used, contact: str, max_steps: int) -> TracedFit:
-    """Fit the logarithms of the conductivity σ and of z·σ / (model's contact impedance z) to the channels `used` by
-    least squares, inside a JAX transformation; see `calibrate`."""
+    """Fit the logarithms of the conductivity σ and of z·σ / z₀, with contact impedances z and those of the model z₀, to
+    the channels `used` by least squares, inside a JAX transformation; see `calibrate`."""
     problem = on_device((model, measured, used))
     unit_voltages = jnp.where(used, model.voltages(1.0), 0)
     num_parameters = {"fixed": 1, "common": 2, "each": 1 + model.electrodes.num_electrodes}[contact]
@@ -123,7 +123,7 @@ _LARGE_MISFIT = 0.12
 _MIN_VOLTAGE = 1e-30
 # Relative change of the misfit or the parameters that ends a fit: on small meshes, and on large meshes.
 _TOLERANCE, _TOLERANCE_LARGE_MESH = 1e-8, 1e-4
-# Number of cells above which a mesh counts as large. A step of the fit then takes seconds.
+# Number of cells above which a mesh counts as large. A step of the fit on a large mesh takes seconds.
 _LARGE_MESH_CELLS = 30_000
 
 
@@ -135,7 +135,7 @@ class Calibration(Module):
     measured‖ / ‖measured‖ over the channels used; `contact_deviation` (k,): standard deviations of the logarithms of
     the k fitted contact impedances, estimated from the residuals; `iterations`: number of iterations; `outcome`: number
     of the `Status` with which the fit ended; `reason`: a sentence on why the fit did not converge, empty if it
-    converged; `shift` (L, a): displacements of the electrodes along a directions each, metres, if their positions were
+    converged; `shift` (L, a): displacements of each electrode along its a directions, metres, if their positions were
     estimated (`jeit.inverse.placement`), else None; `model_error`: the `ModelError` of positions and contact
     impedances, if estimated, else None.
 
@@ -217,9 +217,9 @@ def calibrate(
     """Fit background conductivity and contact impedance to a reference frame by least squares.
 
     The parameters are logarithms, so conductivity and impedance stay positive. The fit starts from the model's contact
-    impedance and the conductivity that best scales the prediction for σ = 1 to the data (voltages are proportional to
-    1/σ at fixed z·σ). For complex voltages the background σ + iωε is complex, with the two parts of its logarithm as
-    parameters; contact impedances stay real.
+    impedance and from the conductivity for which the prediction for σ = 1, divided by σ, fits the data best (voltages
+    are proportional to 1/σ at fixed z·σ). For complex voltages the background σ + iωε is complex, with the two parts of
+    its logarithm as parameters; contact impedances stay real.
 
     The function works inside `jax.grad`, `jax.vmap` and `jax.jit`, with respect to the voltages and all fields of the
     model. Derivatives of the minimum follow from the implicit function theorem with the full Hessian.
@@ -233,7 +233,7 @@ def calibrate(
       per electrode; "fixed" keeps the model's contact impedance.
     - `max_steps`: maximum number of steps.
 
-    Raises `ValueError` for a frame of another shape or without signal.
+    Raises `ValueError` for a frame of the wrong shape or without signal.
 
     **Example:**
 
@@ -341,8 +341,8 @@ def _standard_deviations(solution: "scipy.optimize.OptimizeResult") -> Float[np.
 
 
 class _CalibrationProblem:
-    """Voltages as a function of two kinds of parameters: log σ, and log (z·σ / model's z), which is one number or one
-    number per electrode, for the conductivity σ and the contact impedance z.
+    """Voltages as a function of two kinds of parameters: log σ, for the conductivity σ, and log (z·σ / z₀), one number
+    or one number per electrode, for the contact impedance z and that of the model z₀.
 
     Voltages are proportional to 1/σ at fixed z·σ, so these parameters are nearly uncorrelated. For a complex
     admittivity γ, the first two parameters are log |γ| and the phase.

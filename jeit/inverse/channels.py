@@ -4,7 +4,7 @@ The transfer impedance Z (L, L) of a body is symmetric with rows that sum to zer
 values. A protocol often has more channels, which repeat or combine these values: 208 adjacent channels have 104
 independent values, 2356 channels of a tank have 376. The voltages v of all M channels are combinations of the voltages
 of r independent channels, v = T v[index] with T (M, r). For measured voltages y with weights W = 1 / noise², the
-weighted least-squares estimates ŷ of the independent voltages hold the same information as y,
+weighted least-squares estimates ŷ of the independent voltages contain the same information as y,
 
     ‖W^½ (T u - y)‖² = (u - ŷ)ᵀ G (u - ŷ) + c,   G = TᵀWT,   ŷ = G⁻¹TᵀWy,
 
@@ -187,7 +187,7 @@ def repeated_noise(
     - `mask` (F, M) or (M,): True for usable voltages; a channel with fewer than two usable voltages gets 1.
     - `prior_frames`: weight of the median, as a number of frames.
 
-    Raises `ValueError` for arrays of other shapes, for identical frames, and for NaN in usable voltages.
+    Raises `ValueError` for arrays of the wrong shape, for identical frames, and for NaN in usable voltages.
 
     **Example:**
 

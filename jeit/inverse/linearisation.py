@@ -2,7 +2,7 @@
 
 Without derivatives the problem is solved with the eigendecomposition of `jeit.inverse.spectrum`. For traced arguments
 the problem is solved for one hyperparameter without an eigendecomposition (`DirectProblem`), because eigenvectors of
-equal eigenvalues, which occur for symmetric bodies, have no derivatives although the images have. In the notation of
+equal eigenvalues, which occur for symmetric bodies, have no derivatives, unlike the images. In the notation of
 `jeit.inverse.spectrum`,
 
     R_λ = ΓJᵀK⁻¹(I - BGᵀ) + NGᵀ,   G = K⁻¹B(BᵀK⁻¹B)⁻¹,   K = JΓJᵀ + λ²I,   B = JN.
@@ -33,8 +33,8 @@ from jeit_solvers.module import Module
 
 
 class DirectProblem(Module):
-    """Whitened linear problem without an eigendecomposition. The class has those methods of a `Spectrum` that compute
-    images.
+    """Whitened linear problem without an eigendecomposition. The class has the methods of a `Spectrum` that compute
+    images, but not its other methods.
 
     **Fields**: `directions` (M, r): orthonormal combinations of the channels; `jacobian` (r, m): Jacobian J of the
     combinations; `product` (m, r): ΓJᵀ; `null_space` (m, p): basis N of the prior's null space.
@@ -135,8 +135,8 @@ class Linearisation(Module):
         """Change of voltages `difference` (M,) divided by the standard deviations of the channels, for the channels in
         use (K,).
 
-        Raises `ValueError` for another number of channels and, unless traced, for NaN or infinite values in channels in
-        use.
+        Raises `ValueError` for the wrong number of channels and, unless traced, for NaN or infinite values in channels
+        in use.
         """
         if np.shape(difference) != (self.num_channels,):
             raise ValueError(

@@ -1,19 +1,20 @@
 """Estimation of electrode positions and contact impedances from a reference frame.
 
-Electrodes are rarely exactly where a description says, and their contact impedances differ. Both are estimated from a
-frame y of the homogeneous body. With shifts t of the electrodes along the directions in which they can move, contact
-impedances z = z₀ e^ζ and a conductivity σ, the estimate minimises
+Electrodes are rarely exactly where a description says, and their contact impedances differ. Positions and contact
+impedances are estimated from a frame y of the homogeneous body. With shifts t of the electrodes along the directions in
+which they can move, contact impedances z = z₀ e^ζ and a conductivity σ, the estimate minimises
 
     ½ ‖(v(σ, t, z) - y) / κn‖² + ½ ‖t / s‖² + ½ ζᵀ Γ⁻¹ ζ,
 
 where v are the predicted voltages, n is the `relative_noise` of the channels, s the prior standard deviation of the
-positions, and Γ the prior covariance of the logarithms ζ, which have a common part. The factor κ is estimated from the
-residual. Derivatives need no further solve: at fixed fields only the energy of electrode l depends on t_l
-(`jeit.forward.changes`).
+positions, and Γ the prior covariance of the logarithms ζ. The errors of these logarithms have a common part. The factor
+κ is estimated from the residual. Derivatives require no further solution of the forward problem: at fixed fields only
+the energy of electrode l depends on t_l (`jeit.forward.changes`).
 
-Kolehmainen, Vauhkonen, Karjalainen and Kaipio, Physiological Measurement 18 (1997) 289, errors of electrode positions;
-Vilhunen, Kaipio, Vauhkonen, Savolainen and Vauhkonen, Measurement Science and Technology 13 (2002) 1848, contact
-impedances; Darde, Hyvönen, Seppänen and Staboulis, SIAM Journal on Imaging Sciences 6 (2013) 176, both at once.
+Kolehmainen, Vauhkonen, Karjalainen and Kaipio, Physiological Measurement 18 (1997) 289, on errors of electrode
+positions; Vilhunen, Kaipio, Vauhkonen, Savolainen and Vauhkonen, Measurement Science and Technology 13 (2002) 1848, on
+contact impedances; Darde, Hyvönen, Seppänen and Staboulis, SIAM Journal on Imaging Sciences 6 (2013) 176, on estimating
+both together.
 """
 
 from __future__ import annotations
@@ -53,10 +54,11 @@ class Uncertainty:
     """Uncertainty of the description of a sensor, as standard deviations. All but `position` are relative: 0.1 is 10 %.
 
     **Fields**: `position`: standard deviation of electrode positions, metres, in every direction in which electrodes
-    can move; default: 0.0175 of the width of the body, which is 2° on a disk. `drift`: of the logarithm of each contact
-    impedance, between the reference and the frame. `size`: of the lengths of the body. `other`: of all other errors of
-    the model, as a share of the difference of the two frames; if the misfit of the reference is larger, the misfit is
-    used instead. Raises `ValueError` for values that are negative or not finite, and for `size` or `other` above 1.
+    can move; default: 0.0175 of the width of the body, which is 2° on a disk. `drift`: standard deviation of the change
+    of the logarithm of each contact impedance between the reference and the frame. `size`: standard deviation of the
+    lengths of the body. `other`: standard deviation of all other errors of the model, as a share of the difference of
+    the two frames; if the misfit of the reference is larger, the misfit is used instead. Raises `ValueError` for values
+    that are negative or not finite, and for `size` or `other` above 1.
 
     **Example:**
 
@@ -130,8 +132,8 @@ class ModelError(NamedTuple):
     drift: float = Uncertainty().drift
 
     def voltages(self, model: ForwardModel, conductivity: ArrayLike, background: ArrayLike) -> Float[np.ndarray, "M q"]:
-        """Errors (M, q) of the voltage difference v(`conductivity`) - v(`background`), volts, each due to one standard
-        deviation of one of q independent errors.
+        """Errors (M, q) of the voltage difference v(`conductivity`) - v(`background`), volts; each column is due to one
+        standard deviation of one of q independent errors.
 
         `conductivity` and `background` per cell, S/m (2-D: S). The covariance of the difference is the product of this
         matrix with its transpose.
@@ -171,14 +173,14 @@ def place_electrodes(
 
     **Arguments:**
 
-    - `model`: the model with the electrodes as they are described.
+    - `model`: the model with the electrodes at their described positions.
     - `voltages` (M,): measured voltages of the homogeneous body, volts.
     - `deviation`: standard deviation of the described positions, metres, in every direction in which an electrode can
       move; 0 if they are exact.
     - `mask` (M,): True for the channels to use.
 
     Raises `ValueError` for electrodes that cannot move, invalid arguments, voltages that have the opposite sign of the
-    model's, and voltages that no positions are found to explain.
+    model's, and if no positions are found that explain the voltages.
 
     **Example:**
 
@@ -242,8 +244,8 @@ class _PlacementProblem:
         )
 
     def at(self, coefficients: Float[np.ndarray, " p"]) -> _LinearisedModel | None:
-        """The model with the parameters that `coefficients` give; None if electrodes would overlap or leave the
-        body."""
+        """Compute the model with the parameters that follow from the `coefficients`; None if electrodes would overlap
+        or leave the body."""
         num_electrodes, num_directions = self.directions.shape[:2]
         parameters = self.spread @ coefficients
         shifts, log_contact = (

@@ -1,4 +1,5 @@
-"""Eigendecomposition of the linear problem in data space, with which images for any hyperparameter are cheap.
+"""Eigendecomposition of the linear problem in data space, from which images for any hyperparameter are computed at low
+cost.
 
 With the whitened Jacobian J (M, m), the prior covariance Γ and a basis N of the prior's null space, the reconstruction
 matrix is
@@ -11,9 +12,9 @@ and
 
     R_λ = (I - NB⁺J) ΓJᵀQU diag(1/(Λ + λ²)) UᵀQᵀ + NB⁺.
 
-The changes of data that a body can cause often have a far lower dimension r than the number of channels: J = DG with
-orthonormal columns of D (M, r). Only G (r, m) and ΓGᵀ are stored at the size of the image. For complex admittivities J
-and the data are complex and ᵀ denotes the conjugate transpose.
+The space of the changes of data that a body can cause often has a dimension r far below the number of channels: J = DG
+with orthonormal columns of D (M, r). Only G (r, m) and ΓGᵀ are stored at the size of the image. For complex
+admittivities J and the data are complex and ᵀ denotes the conjugate transpose.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from jeit_solvers import symmetric_eigen
 from jeit_solvers.engines import adjoint, either_engine, has_values, host, namespace
 from jeit_solvers.module import Module
 
-# Approximate number of cells over which the mean of an image is taken.
+# Approximate number of cells over which an image is averaged.
 _NUM_MEAN_CELLS = 10_000
 
 
@@ -35,8 +36,8 @@ class Spectrum(Module):
     """Eigendecomposition of the data-space system, in the notation of `jeit.inverse.spectrum`.
 
     **Fields**: `basis` (M, k): QU; `eigenvalues` (k,): Λ; `directions` (M, r): D; `reduced` (r, m): G; `images` (m, r):
-    ΓGᵀ; `null_space` (m, p): N; `seen` (M, p): B = JN; `outer` (M, M): JΓJᵀ; `repeated`: number of data components that
-    hold no information because readings are repeated, see `Protocol.repeated_facts`.
+    ΓGᵀ; `null_space` (m, p): N; `seen` (M, p): B = JN; `outer` (M, M): JΓJᵀ; `repeated`: number of data components
+    without information because readings are repeated, see `Protocol.repeated_facts`.
     """
 
     basis: Float[Array, "M k"]
@@ -59,8 +60,8 @@ class Spectrum(Module):
         repeated: int = 0,
     ):
         """Create a spectrum from the whitened Jacobian of all channels, or of their orthonormal combinations
-        `directions`; the `product` of its transpose with the prior covariance; and a basis of the prior's null
-        space."""
+        `directions`; the `product` of the prior covariance with the transpose of this Jacobian; and a basis of the
+        prior's null space."""
         data_basis = host.asarray(np.eye(len(jacobian))) if directions is None else directions
         basis, eigenvalues, null_space_data, data_covariance = _decompose(jacobian, product, null_space, data_basis)
         return cls(

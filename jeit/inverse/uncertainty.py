@@ -12,9 +12,9 @@ and Somersalo, Statistical and Computational Inverse Problems (Springer 2005), c
 
 For total variation, Q is the quadratic form of lagged diffusivity, which touches the energy at ĉ from above (Vogel and
 Oman, SIAM J. Sci. Comput. 17 (1996) 227-238). A jump of height d between cells has a stiffness proportional to 1 / √(d²
-+ β²). Σ is therefore conditional on the edges found: it is the uncertainty if the positions of the edges, and roughly
-their heights, were known. At an edge the energy has a smaller curvature than Q, and an edge at another position may
-explain the data as well, so the true uncertainty is larger at an edge.
++ β²). Σ is therefore conditional on the estimated edges: Σ is the covariance if the positions of the edges, and roughly
+their heights, were known. The true uncertainty is larger at an edge: there the energy has a smaller curvature than Q,
+and an edge at a different position may explain the data as well.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ class Posterior(Module):
         """Lower and upper limits, S/m (2-D: S), between which the conductivity of a cell lies with this `probability`,
         for each cell separately.
 
-        The interval is computed on the link's scale, so positivity and bounds of the link hold. Raises `ValueError` if
-        the probability is not between 0 and 1.
+        The interval is computed on the link's scale, so its limits are positive and within bounds if the link requires
+        this. Raises `ValueError` if the probability is not between 0 and 1.
         """
         if not 0 < probability < 1:
             raise ValueError(f"probability must lie between 0 and 1; it is {probability}.")
@@ -84,7 +84,7 @@ class Posterior(Module):
         )
 
     def region(self, cells: ArrayLike) -> tuple[float | Float[Array, ""], float | Float[Array, ""]]:
-        """Mean conductivity of the given cells, weighted by area (3-D: volume), and its standard deviation, S/m
+        """Mean conductivity of the selected `cells`, weighted by area (3-D: volume), and its standard deviation, S/m
         (2-D: S).
 
         `cells`: booleans (m,) or indices. Raises `ValueError` for an empty selection, invalid indices and traced cells.
@@ -136,10 +136,10 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
 
     With a smooth prior, the standard deviations are as accurate as the noise, the prior and the forward model: with λ =
     1 and the correct prior variance, credible intervals have their nominal coverage; λ = 2 assumes that the image
-    varies half as much as the prior says. With total variation, the standard deviations are conditional on the edges
-    found: they hold if the positions of the edges, and roughly their heights, are known, and are too small at an edge
-    that may lie elsewhere. Raises `ValueError` for bounded solvers, whose posterior is not nearly Gaussian, for a
-    failed reconstruction, and for any other object.
+    varies half as much as the prior says. With total variation, the standard deviations are conditional on the
+    estimated edges: they are valid if the positions of the edges, and roughly their heights, are known, and are too
+    small at an edge that may lie elsewhere. Raises `ValueError` for bounded solvers, whose posterior is not nearly
+    Gaussian, for a failed reconstruction, and for any other object.
 
     **Arguments:**
 
@@ -159,7 +159,7 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
     runs_uncompiled = inversion.model.mesh.dimension == 3 or not inversion.penalty.is_standard_normal
     if not (has_values(inversion, coefficients) and runs_uncompiled):
         return _compute_posterior(inversion, coefficients)
-    # For a solid body, compiled programs would hold several copies of the Jacobian; with sparse factors, compilation
+    # For a solid body, compiled programs would store several copies of the Jacobian; with sparse factors, compilation
     # takes seconds.
     with np.errstate(all="ignore"):
         host_inversion, host_coefficients = on_host((inversion, coefficients))
@@ -244,10 +244,10 @@ def _draw_samples(posterior: Posterior, prior_draws, noise_draws):
 def image_noise(reconstruction: Reconstruction) -> Float[np.ndarray, " m"]:
     """Standard deviation (m,) of an image in every cell due to the noise of the data alone, on the link's scale.
 
-    The coefficients at the solution satisfy c = K (Jc - r) with K = Jᵀ(JJᵀ + C)⁻¹, with the residual r and its Jacobian
-    J, so noise of covariance C gives the coefficients the covariance K C Kᵀ. If the image's misfit exceeds 1, the
-    standard deviation is multiplied by the misfit. Raises `ValueError` for total variation and bounded solvers, for
-    which this formula does not hold.
+    The coefficients at the solution satisfy c = K (Jc - r), where K = Jᵀ(JJᵀ + C)⁻¹, r is the residual and J its
+    Jacobian. Noise of covariance C therefore causes the covariance K C Kᵀ of the coefficients. If the image's misfit
+    exceeds 1, the standard deviation is multiplied by the misfit. Raises `ValueError` for total variation and bounded
+    solvers, for which this formula is not valid.
 
     **Arguments:**
 

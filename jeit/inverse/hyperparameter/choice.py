@@ -19,24 +19,25 @@ RULE = "noise-figure"
 """Default rule that chooses λ, for linear images and for nonlinear problems linearised at the background."""
 ITERATED = 5.0
 """Default λ of Gauss-Newton images of a tank relative to a reference frame, with a smooth prior; the prior standard
-deviation of log σ is then a fifth."""
+deviation of log σ is then 1/5."""
 EDGE_PRICE = 300.0
-"""Default λ of total variation: penalty of an edge as long as the body is wide, per unit of log σ."""
+"""Default λ of total variation: penalty of an edge as long as the body is wide, per unit of jump of log σ across the
+edge."""
 
 
 class Choice(Module):
-    """A hyperparameter λ that was chosen by a rule from a grid of candidates, or given.
+    """A hyperparameter λ that was chosen by a rule from a grid of candidates, or specified by the user.
 
     **Fields**: `hyperparameter`: λ; `candidates` (K,): values of λ evaluated, ascending; `criterion` (K,): value of the
     rule's criterion for every candidate (see the rules in `jeit.inverse.hyperparameter`); `residual` (K,): norm ‖w (v -
-    Jx)‖ of the residual for the image x with every candidate, in standard deviations, with data v, Jacobian J and
-    weights w; `penalty` (K,): √(xᵀQx) of this image for the prior's precision Q, which together with the residual forms
-    the L-curve; `rule`: name of the rule, or "given"; `target`: value of the criterion that the rule seeks, None if the
-    rule seeks the minimum or maximum; `edge`: "smallest" or "largest" if λ is the first or last candidate, so that the
-    rule's optimum may lie beyond the grid, else empty.
+    Jx)‖ of the residual of the image x for every candidate, in standard deviations, with data v, Jacobian J and weights
+    w; `penalty` (K,): √(xᵀQx) of the same images for the prior's precision Q; penalty and residual form the L-curve;
+    `rule`: name of the rule, or "given"; `target`: value of the criterion that the rule seeks, None if the rule seeks
+    the minimum or maximum; `edge`: "smallest" or "largest" if λ is the first or last candidate, so that the rule's
+    optimum may lie outside the grid, else empty.
 
-    If λ was given, λ is the only candidate and the curves are empty, (0,). Without data, residual and penalty are
-    empty.
+    If λ was specified by the user, it is the only candidate, and the curves are empty, (0,). Without data, residual and
+    penalty are empty.
 
     **Example:**
 
@@ -57,7 +58,7 @@ class Choice(Module):
 
     @classmethod
     def given(cls, hyperparameter: ArrayLike) -> "Choice":
-        """Create a choice from a given value of λ."""
+        """Create a choice from a value of λ that the user specified."""
         value = as_array(hyperparameter, float)
         empty_curve = as_array(np.zeros(0))
         return cls(value, as_array(np.reshape(value, 1)), empty_curve, empty_curve, empty_curve, "given")

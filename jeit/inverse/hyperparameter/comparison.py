@@ -1,4 +1,4 @@
-"""Choice of the hyperparameter λ for given data by one rule, or by several rules for comparison."""
+"""Choice of the hyperparameter λ by one rule, or by several rules that are compared on the same data."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def choose_hyperparameter(
     mask: Bool[Array, " M"] | None = None,
 ) -> Choice:
     """Choose the λ that `one_step` would use with the same arguments, without computing the image. The choice can be
-    given to `one_step` as its hyperparameter.
+    passed to `one_step` as its hyperparameter.
 
     **Arguments:**
 
@@ -62,8 +62,8 @@ def compare_rules(
     rules: Mapping[str, Rule] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Choice]:
-    """Choose λ for the same data by several rules, and return the choices by the name of the rule. The problem is
-    decomposed once. `jeit.plot.plot_choice` plots the result.
+    """Choose λ for the same data by several rules, and return the choices by the name of the rule. The
+    eigendecomposition of the problem is computed only once. `jeit.plot.plot_choice` plots the result.
 
     **Arguments:**
 

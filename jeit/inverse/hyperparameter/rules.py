@@ -42,7 +42,7 @@ def best_resolution(
 
     **Arguments:**
 
-    - `spectrum`: the problem, decomposed; `choose_hyperparameter` gives it to the rule.
+    - `spectrum`: eigendecomposition of the problem, which `choose_hyperparameter` passes to the rule.
     - `data`: not used.
     - `mesh`: the mesh of the image.
     - `signal_to_noise`: root mean square of a target's data, in standard deviations of the noise.
@@ -87,12 +87,12 @@ def blur_radius(
 ) -> Float[np.ndarray, "K T"]:
     """Blur radius of the noisy image of every target cell for every candidate λ, relative to the size of the body.
 
-    The blur radius is √(A/A₀) (3-D: the cube root), where A₀ is the area (volume) of the body and A that of the
-    half-amplitude set: the cells where the image is at least half of the image's value *at the target*. (With half the
-    image's maximum, as in Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179, an image with a narrow peak
-    elsewhere would count as sharp.) A is the expected value for white noise of unit variance in the data: for a target
-    of strength s in cell t with image p = R_λJ_t and noise variance (RRᵀ)_ii, cell i belongs to the set with
-    probability Φ(s (p_i - p_t/2) / √(RRᵀ)_ii).
+    The blur radius is √(A/A₀) (3-D: the cube root), where A₀ is the area (volume) of the body and A the area of the
+    half-amplitude set: the cells where the image is at least half of its value *at the target*. (With half of the
+    image's maximum instead, as in Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179, an image with a narrow
+    peak elsewhere would count as sharp.) A is replaced by its expected value for white noise of unit variance in the
+    data: for a target of strength s in cell t with image p = R_λJ_t and noise variance (RRᵀ)_ii, cell i belongs to the
+    set with probability Φ(s (p_i - p_t/2) / √(RRᵀ)_ii).
     """
     cell_areas = np.asarray(measures(mesh))
     eigenvalues, modes = np.asarray(spectrum.eigenvalues), np.asarray(spectrum.modes())
@@ -100,7 +100,7 @@ def blur_radius(
     signal_norms = np.linalg.norm(signals, axis=0)
     strength = signal_to_noise * np.sqrt(len(signals)) / np.maximum(signal_norms, np.finfo(float).tiny)
     components = adjoint(np.asarray(spectrum.basis)) @ signals
-    # Data in the range of the null space are imaged independently of λ.
+    # Data that images in the prior's null space explain are imaged independently of λ.
     null_space_weights = np.asarray(spectrum.null_space) @ np.linalg.pinv(np.asarray(spectrum.seen))
     null_space_images, null_space_variance = null_space_weights @ signals, np.sum(abs(null_space_weights) ** 2, axis=1)
     damping = 1 / (eigenvalues + np.asarray(candidates)[:, None] ** 2)
@@ -128,7 +128,8 @@ def spread_cells(mesh: Mesh, num_cells: int) -> Int[np.ndarray, " T"]:
     ]
     lattice = np.stack(np.meshgrid(*coordinates, indexing="ij"), axis=-1).reshape(-1, mesh.space_dimension)
     distances, nearest = (np.asarray(result) for result in KDTree(centres).query(lattice))
-    # A surface in space passes between lattice points, so lattice points up to half a spacing from the surface count.
+    # A surface in space passes between lattice points, so lattice points up to half a spacing from the surface count as
+    # inside.
     inside = distances <= (spacing / 2 if mesh.is_surface else cell_measures[nearest] ** (1 / mesh.dimension))
     return np.unique(nearest[inside] if inside.any() else nearest)
 
@@ -187,7 +188,8 @@ def generalised_cross_validation(spectrum: Spectrum, data: ArrayLike | None, mes
     """
     candidates, data = spectrum.candidates(), _check_data(data, "gcv")
     residual, penalty = spectrum.curves(data, candidates)
-    # Repeated readings have filter 1 but leave no residual, so their number is subtracted from both counts.
+    # Repeated readings have filter 1 but no residual, so their number is subtracted from the number of channels and
+    # from the trace.
     num_independent = len(data) - spectrum.repeated
     score = num_independent * residual**2 / (_filters(spectrum, candidates).sum(axis=1) - spectrum.repeated) ** 2
     return Choice.among("gcv", candidates, int(np.argmin(score)), score, (residual, penalty))
@@ -201,7 +203,7 @@ def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = 
 
     **Arguments:**
 
-    - `spectrum`: the problem, decomposed; `choose_hyperparameter` gives it to the rule.
+    - `spectrum`: eigendecomposition of the problem, which `choose_hyperparameter` passes to the rule.
     - `data`: whitened difference of frames (M,).
     - `mesh`: not used.
     - `noise`: standard deviation of the whitened data (of each part of complex data), 1 if the noise of the channels
@@ -273,9 +275,9 @@ def noise_figure(
 
     **Arguments:**
 
-    - `spectrum`: the problem, decomposed; `choose_hyperparameter` gives it to the rule.
+    - `spectrum`: eigendecomposition of the problem, which `choose_hyperparameter` passes to the rule.
     - `data`, `mesh`: not used.
-    - `target`: noise figure that λ shall give.
+    - `target`: requested noise figure.
 
     **Example:**
 
@@ -351,7 +353,7 @@ def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
         squared_components * eigenvalues / (eigenvalues + candidates[:, None] ** 2) ** 2
     )  # the sum is the penalty
     residual_terms = squared_components * filters**2  # its sum is ‖r‖²
-    # The derivatives with respect to t are 4 rest (1 - f) and -4 image f.
+    # The derivatives with respect to t are 4 residual_terms (1 - f) and -4 penalty_terms f.
     residual_derivatives = _second_log_derivative(
         residual_terms, 4 * (1 - filters), 8 * (1 - filters) * (2 - 3 * filters)
     )

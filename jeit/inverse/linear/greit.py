@@ -2,7 +2,7 @@
 size.
 
 Adler et al., "GREIT: a unified approach to 2D linear EIT reconstruction of lung images", Physiol. Meas. 30 (2009)
-S35-S55. The paper treats a disk; here bodies of any outline are allowed, and targets in a solid body are balls.
+S35-S55. The paper considers a disk. Here, bodies may have any outline, and targets in a solid body are balls.
 """
 
 from __future__ import annotations
@@ -72,8 +72,7 @@ def greit(
     - `noise_figure`: the default 0.5 is the value agreed on by GREIT's authors. The signal of data or image is the mean
       absolute value, over channels in units of their noise or over the body. The noise is the root mean square standard
       deviation.
-    - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
-      other).
+    - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts, or up to a common factor.
     - `mask` (M,): True for the channels to use.
     - `num_targets`: number of targets, approximately.
 
@@ -106,7 +105,7 @@ def greit(
     )
     positions, coverage = _place_targets(mesh, body_centre, target_radius * body_radius, num_targets)
     desired_images = _desired_images(mesh, positions, coverage.T @ cell_measures, radius * body_radius)
-    # Responses are computed for the combinations of channels that a body can change, of which there are fewer than
+    # Responses are computed only for those combinations of channels that a body can change, which are fewer than the
     # channels.
     directions = data_directions(model.protocol, channels, root_weight)
     weighted_directions = directions.T * np.asarray(root_weight)  # (r, K)

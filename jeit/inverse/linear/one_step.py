@@ -36,9 +36,9 @@ _NUM_SAMPLED_CELLS = 4000
 class LinearReconstruction:
     """A linear image reconstruction: change of conductivity = matrix · change of voltages.
 
-    Two reciprocal channels (v_b = ratio · v_a) have proportional columns in the matrix. The voltages of both channels
-    are added before the product, which halves the arithmetic. If the rank r of the matrix is lower than the number K of
-    combined channels, the combined channels are first reduced to r combinations.
+    Two reciprocal channels (v_b = ratio · v_a) have proportional columns in the matrix. The voltages of the two
+    channels are added before the product, the second with a weight, which halves the arithmetic. If the rank r of the
+    matrix is lower than the number K of combined channels, the combined channels are first reduced to r combinations.
 
     **Fields**: `mesh`; `first`, `second` (K,): channels added to form each combined channel; `ratio` (K,): weight of
     the second channel; `weights` (K, m): change of conductivity in S/m (2-D: S) per volt of each combined channel, or
@@ -163,7 +163,7 @@ class LinearReconstruction:
         """Change of conductivity in every cell, (m,) or (F, m), for one difference of frames (M,) or several (F, M), in
         volts.
 
-        Raises `ValueError` for another number of channels, and for NaN or infinite voltages.
+        Raises `ValueError` for the wrong number of channels, and for NaN or infinite voltages.
         """
         shape = np.shape(difference)
         if len(shape) not in (1, 2) or shape[-1] != self.num_measurements:
@@ -201,7 +201,7 @@ def _combine_channels(difference, first, second, ratio, mixing) -> Any:
 
 def _proportional_channels(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Channels `first` and `second` that are added before the product with the matrix, and the `ratio` of their
-    columns. The pairs are reciprocal channels with proportional columns; every other channel stands alone, with ratio
+    columns. The pairs are reciprocal channels with proportional columns; every other channel is used alone, with ratio
     0."""
     column_norms = np.linalg.norm(matrix, axis=0)
     is_single = column_norms > 0
@@ -251,8 +251,7 @@ def one_step(
     - `prior`: default `Noser()`.
     - `hyperparameter`: λ, a rule in `jeit.inverse.RULES` that chooses λ, or a `Choice`.
     - `difference` (M,): change of voltages to be imaged, volts, required by rules that use data.
-    - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
-      other).
+    - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts, or up to a common factor.
     - `mask` (M,): True for the channels to use.
 
     Raises `ValueError` for invalid or inconsistent arguments.
@@ -275,7 +274,7 @@ def one_step(
     result_fields = choice.hyperparameter, choice.rule, method, choice
     if isinstance(linear.spectrum, Spectrum) and has_values(choice.hyperparameter):
         factors = linear.factors(choice.hyperparameter)
-        del linear  # frees memory, which cannot hold both for a large body
+        del linear  # frees memory, because the problem and the factors of a large body do not fit in memory together
         return LinearReconstruction.of_factors(model, factors, *result_fields)
     return LinearReconstruction.create(model, linear.matrix(choice.hyperparameter), *result_fields)
 
@@ -292,7 +291,7 @@ def back_projection(
     lines of every drive.
 
     The relative change of a channel is assigned to the cells whose potential, under the channel's drive, lies between
-    the potentials of its two measuring electrodes. The image of a cell is the mean over the channels that reach it
+    the potentials of its two measuring electrodes. The image of a cell is the mean of the changes assigned to it
     (Barber and Brown, J. Phys. E 17 (1984) 723-733), scaled so that a uniform change of conductivity is imaged exactly.
     A filtered image is sharper but noisier. Its matrix is B F, where B is the unfiltered matrix and F minimises ‖JBFv -
     v‖² + λ²‖JB‖²‖Fv‖², so that the Jacobian J maps the image BFv approximately to the data v.

@@ -1,6 +1,6 @@
 """Parametrisations of the nonlinear problem: the scale of the conductivity, and unknowns estimated along with it.
 
-Unknowns are further parameters that are not known exactly. Each unknown has a normal prior of mean zero and a given
+Unknowns are further parameters that are not known exactly. Each unknown has a normal prior of mean zero and a specified
 standard deviation, and changes the forward model or the image. The derivatives of the voltages with respect to unknowns
 are computed by automatic differentiation. Positive quantities are estimated through their logarithm.
 """
@@ -44,7 +44,7 @@ class AbstractUnknown(Module):
         self, model: ForwardModel, estimate: Float[Array, " m"], values: Float[Array, " k"]
     ) -> tuple[ForwardModel, Float[Array, " m"]]:
         """Return the model and the image `estimate`, on the link's scale, as changed by the unknown's `values`. Values
-        of zero leave both unchanged."""
+        of zero change neither the model nor the image."""
 
     def quantity(self, model: ForwardModel, values: Float[Array, " k"]) -> Float[Array, " k"]:
         """Estimated quantities in their unit, computed from the values; by default the values themselves."""
@@ -205,13 +205,12 @@ def _check_deviation(name: str, deviation, num_values: int) -> Float[Array, " k"
     return jnp.broadcast_to(jnp.asarray(values), (num_values,))
 
 
-# Minimum conductivity relative to the mean background, where the lower bound is zero.
+# Minimum of the lower bound on the conductivity, relative to the mean background, for the linear link.
 _MIN_CONDUCTIVITY_RATIO = 1e-6
 
 
 class AbstractLink(Module):
-    """Base of all links: increasing, smooth functions σ(x) that give the conductivity σ for the estimated quantity
-    x."""
+    """Base of all links: increasing, smooth functions σ(x) that map the estimated quantity x to the conductivity σ."""
 
     @abc.abstractmethod
     def conductivity(self, estimate: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -299,7 +298,7 @@ class Bounded(AbstractLink):
 
     - `lower`, `upper`: limits of the conductivity, S/m (2-D: S).
 
-    Raises `ValueError` unless 0 ≤ lower < upper, both finite.
+    Raises `ValueError` unless 0 ≤ lower < upper < ∞.
 
     **Example:**
 
@@ -361,7 +360,7 @@ def _as_tuple(unknowns) -> tuple[AbstractUnknown, ...]:
 
 
 def as_parametrisation(parametrisation: "Parametrisation | None") -> "Parametrisation":
-    """The given parametrisation, or the default for None. Raises `ValueError` for any other object."""
+    """Return the parametrisation, or the default for None. Raises `ValueError` for any other object."""
     if parametrisation is None:
         return Parametrisation()
     check_kind(
@@ -379,11 +378,11 @@ class Parametrisation(Module):
     - `bounds`: minimum and maximum conductivity, S/m (2-D: S), satisfied exactly. Bounds require a solver that keeps
       bounds and a prior that has a precision matrix, or total variation.
     - `regions` (m,): integer label of each cell; cells of the same label share one value, and cells labelled -1 are
-      held at the background. `pixels` creates labels.
+      fixed at the background. `pixels` creates labels.
     - `unknowns`: further parameters to estimate: `ContactImpedance`, `ElectrodePosition`, `Background`, `Scale`.
     - `informative`: minimum signal, in standard deviations of the noise, of a combination of the prior's shapes with an
       amplitude of one prior standard deviation, linearised at the background. Images consist of the combinations with a
-      larger signal; 0 takes all. None means 0 in `reconstruct` and 0.03 in an `Imager`.
+      larger signal; 0 selects all combinations. None means 0 in `reconstruct` and 0.03 in an `Imager`.
 
     Raises `ValueError` for invalid values.
 
@@ -418,7 +417,7 @@ class Parametrisation(Module):
             raise ValueError(f"informative must lie between 0 and 1; it is {self.informative}.")
 
     def check_model(self, model: ForwardModel) -> None:
-        """Raise `ValueError` if an unknown was made for another model."""
+        """Raise `ValueError` if an unknown does not fit the model, for example in its number of electrodes."""
         for unknown in self.unknowns:
             if not unknown.fits(model):
                 name = type(unknown).__name__

@@ -1,7 +1,7 @@
 """The nonlinear least squares problem of `reconstruct`, checks of its arguments, its reduction to informed shapes, and
 derivatives of its minimum.
 
-Informed shapes are the few dozen combinations of a prior's shapes that the data resolve. Informed shapes are right
+Informed shapes are the few dozen combinations of a prior's shapes (columns of its basis) that the data resolve: right
 singular vectors of the whitened Jacobian at the background, stored in single precision, which changes an image by a
 relative 1e-6.
 
@@ -100,7 +100,8 @@ def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
 
 
 def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[Array, " M"]:
-    """Standard deviation of every channel in volts, 1 in channels left out; raises `ValueError` for invalid noise."""
+    """Standard deviation of every channel in volts, 1 in channels that are not used; raises `ValueError` for invalid
+    noise."""
     standard_deviation = np.zeros(()) if noise is None else _as_float_array(noise)
     if standard_deviation.shape not in ((), measured.shape) or standard_deviation.dtype.kind not in "iuf":
         raise ValueError(
@@ -196,7 +197,8 @@ def _singular_values(inversion: Inversion):
 
 def _expected_variance(strength, persistence: float):
     """Variance p of a coefficient before a frame in the steady state of the Kalman filter: p = a² p / (1 + s p) + 1 -
-    a², where a is the persistence and s the `strength` of the data, the squared singular value."""
+    a², where a is the persistence and s the `strength` of the data, which is the squared singular value of the
+    coefficient."""
     innovation_variance = 1 - persistence**2
     half_linear_term = innovation_variance * (1 - strength) / 2
     discriminant_root = np.sqrt(half_linear_term**2 + strength * innovation_variance)
@@ -280,7 +282,8 @@ class Inversion(Module):
             unknown_blocks = jax.jacfwd(lambda values: self._predict(shapes, values))(values)
             columns += [block * unknown.deviation for block, unknown in zip(unknown_blocks, self.unknowns, strict=True)]
         weight, xp = self.data.weight, namespace(voltages, jacobian)
-        # A factorisation may succeed although some conductivities are negative; NaN makes a descent reject the point.
+        # A factorisation may succeed although some conductivities are negative; NaN causes a descent to reject the
+        # point.
         residual = xp.where((conductivity > 0).all(), weight * (voltages - self.data.voltages), xp.nan)
         jacobian = xp.concatenate(columns, axis=1) if self.unknowns else jacobian
         if xp is np:
@@ -321,8 +324,8 @@ class Inversion(Module):
 @eqx.filter_jit
 def as_solution(coefficients: Float[Array, " n"], inversion: Inversion, box: Any = None) -> Float[Array, " n"]:
     """Return `coefficients` (n,), the result of a solver, with unchanged values but with the derivatives of the exact
-    minimum with respect to all fields of the inversion and, if there are bounds, the lower and upper bounds `box`, (n,)
-    each."""
+    minimum. Derivatives are with respect to all fields of the inversion and, if there are bounds, the lower and upper
+    bounds `box`, (n,) each."""
     if box is None:
         return as_minimum(coefficients, (inversion, None, None), _free_gradient, _preconditioner)
     gradient = jax.grad(inversion.cost)(coefficients)
@@ -338,13 +341,14 @@ def as_solution(coefficients: Float[Array, " n"], inversion: Inversion, box: Any
 
 
 def _with_bounds(point, box, active_bounds):
-    """Coefficients of which the free ones are taken from `point` and all others are at their bounds."""
+    """Coefficients that equal `point` where they are free and their bounds elsewhere."""
     return point if box is None else jnp.where(active_bounds < 0, box[0], jnp.where(active_bounds > 0, box[1], point))
 
 
 def _free_gradient(point, problem):
-    """Gradient of the objective with respect to the free coefficients. The entries of the other coefficients equal
-    `point`, so that a zero of this function is zero there; `_with_bounds` inserts their bounds."""
+    """Gradient of the objective with respect to the free coefficients. For the other coefficients the function returns
+    `point`, so at a zero of this function their entries in `point` are zero; `_with_bounds` replaces them by the
+    bounds."""
     inversion, box, active_bounds = problem
     gradient = jax.grad(inversion.cost)(_with_bounds(point, box, active_bounds))
     return gradient if box is None else jnp.where(active_bounds == 0, gradient, point)

@@ -41,8 +41,8 @@ class Reconstruction(Module):
 
     **Fields**: `conductivity` (m,): S/m (2-D: S); `voltages` (M,): predicted voltages; `misfit`: root mean square of
     predicted - measured voltages over the channels used, in standard deviations (about 1 if only noise is left);
-    `costs`: objective at the start and at every accepted iterate (only at start and end if a solver keeps no record);
-    `iterations`: number of iterations; `outcome`: number of the `Status` with which the solver ended; `reason`: a
+    `costs`: objective at the start and at every accepted iterate (only at start and end if a solver does not record
+    it); `iterations`: number of iterations; `outcome`: number of the `Status` with which the solver ended; `reason`: a
     sentence on how the solver ended; `choice`: choice of the hyperparameter λ; `inversion`, `coefficients`: the problem
     solved and its solution, for warm starts and uncertainty; `model`: forward model changed by the estimated unknowns.
 
@@ -151,7 +151,8 @@ def reconstruct(
     - `mask` (M,): True for the channels to use.
     - `solver`: a solver such as `LevenbergMarquardt(max_steps=60)`, its name, or a least-squares solver of optimistix
       (not with total variation). Default `GaussNewton()`; with bounds `LBFGSB()`.
-    - `parametrisation`: the quantities estimated: link, bounds, regions of one value, further unknowns.
+    - `parametrisation`: the quantities that are estimated: link, bounds, regions in which all cells share one value,
+      further unknowns.
     - `start`: an earlier reconstruction of the same kind, from which the iteration starts.
 
     Raises `ValueError` for invalid or inconsistent arguments; a failure of the solver is reported in the result's
@@ -231,8 +232,8 @@ def _check_protocol(model: ForwardModel, used) -> None:
 
 
 def _solver_for(solver, prior: AbstractPrior, parametrisation: Parametrisation) -> AbstractSolver:
-    """The given solver, or the default solver for prior and parametrisation. Raises `ValueError` if the solver cannot
-    solve a problem with these."""
+    """Return the requested `solver`, or the default solver for the prior and the parametrisation. Raises `ValueError`
+    if the solver cannot solve a problem with this prior and parametrisation."""
     has_bounds = parametrisation.bounds is not None
     if solver is None:
         return LBFGSB() if has_bounds else GaussNewton()
@@ -309,7 +310,7 @@ def _whitened_jacobian(model: ForwardModel, data: Data, background, slope):
 
 def _start_coefficients(start, inversion: Inversion, choice: Choice) -> Float[Array, " n"]:
     """Coefficients of the earlier reconstruction `start`, rescaled to the λ of `choice`. Raises `ValueError` if the
-    problem of the earlier reconstruction is of another kind."""
+    problem of the earlier reconstruction is of a different kind."""
     if not isinstance(start, Reconstruction):
         raise ValueError(f"start must be what reconstruct has returned, not {type(start).__name__}.")
     if start.coefficients.shape != (inversion.num_coefficients,) or not _have_same_unknowns(start.inversion, inversion):

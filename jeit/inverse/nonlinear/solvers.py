@@ -1,4 +1,5 @@
-"""Solvers of the nonlinear least squares problem: objects that hold settings and declare which problems they can solve.
+"""Solvers of the nonlinear least squares problem: objects that contain settings and declare which problems they can
+solve.
 
 `SOLVERS` lists the solvers by name, and `as_solver` converts a name to an object.
 """
@@ -95,9 +96,9 @@ class GaussNewton(AbstractSolver):
     """Gauss-Newton method with a backtracking line search; total variation is treated by lagged diffusivity.
 
     **Arguments:** `max_steps`: maximum number of steps, default 30, for an `Imager` 4; rejected steps and the shorter
-    steps tried in their place both count. `rtol`: the iteration ends when the next step would change the objective by
-    less than rtol times the objective, or by less than rtol times ½, which is the misfit of one voltage with an error
-    of one standard deviation; default 1e-6, with total variation 1e-4, for an `Imager` 1e-3.
+    steps that replace them all count. `rtol`: the iteration ends when the next step would change the objective by less
+    than rtol times the objective or rtol times ½ (½ is the contribution of one voltage with an error of one standard
+    deviation to the objective); default 1e-6, with total variation 1e-4, for an `Imager` 1e-3.
 
     **Example:**
 
@@ -352,7 +353,7 @@ def _least_squares(inversion: Inversion, start, solver, max_steps: int, options:
 
 
 def _descent_for(max_steps: int, rtol: float, damping: float = 0.0) -> Descent:
-    """Descent of at most `max_steps` steps, with a history that also holds the start. `atol` ends the iteration when
+    """Descent of at most `max_steps` steps, with a history that also contains the start. `atol` ends the iteration when
     the objective tends to zero, as for an undisturbed frame, where no change is small relative to the objective."""
     return Descent(rtol=rtol, atol=0.5 * rtol, damping=damping, history=max_steps + 1)
 

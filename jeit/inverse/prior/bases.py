@@ -39,7 +39,8 @@ class AbstractBasis(Module):
         """Product of `rows`, such as a Jacobian (M, m), with S."""
 
     def restrict_blocks(self, blocks: Iterable[tuple[slice, Any]]) -> Any:
-        """Product of rows (M, m), given as blocks of consecutive cells, with S; a new NumPy array (M, n)."""
+        """Product with S, as a new NumPy array (M, n), of rows (M, m) that are passed as blocks of consecutive
+        cells."""
         cell_slices, column_blocks = zip(*blocks, strict=True)
         rows: Any = np.empty((len(column_blocks[0]), cell_slices[-1].stop), column_blocks[0].dtype)
         for block_cells, block in zip(cell_slices, column_blocks, strict=True):
@@ -56,8 +57,8 @@ class AbstractBasis(Module):
 
     @abc.abstractmethod
     def pooled(self, regions: "Regions") -> "AbstractBasis":
-        """Basis in which the rows of S are replaced by their mean over each region, and by zero where the image is held
-        fixed."""
+        """Basis in which the rows of S are replaced by their mean over each region, and by zero in cells that are fixed
+        at the background."""
 
 
 class DiagonalBasis(AbstractBasis):
@@ -75,11 +76,11 @@ class DiagonalBasis(AbstractBasis):
         return self.deviation * coefficients
 
     def restrict(self, rows):
-        """Rows times S: the columns multiplied by the deviations."""
+        """Rows times S: each column multiplied by the prior standard deviation of its cell."""
         return rows * self.deviation
 
     def restrict_blocks(self, blocks):
-        """Rows times S: the columns multiplied by the deviations."""
+        """Rows times S: each column multiplied by the prior standard deviation of its cell."""
         products: list[np.ndarray] = []
         for cells, block in blocks:
             if not products:
@@ -88,7 +89,7 @@ class DiagonalBasis(AbstractBasis):
         return products[0]
 
     def variance(self):
-        """Variance of the cells: squared deviations."""
+        """Variance of the cells: squared prior standard deviations."""
         return self.deviation**2
 
     def scaled(self, factor):
@@ -96,7 +97,7 @@ class DiagonalBasis(AbstractBasis):
         return DiagonalBasis(self.deviation * factor)
 
     def pooled(self, regions):
-        """Basis with one coefficient per region. Its variance is the mean over the cells of the region."""
+        """Basis with one coefficient per region, whose variance is the mean variance of the cells of the region."""
         return RegionBasis(regions, namespace(regions).sqrt(regions.mean(self.deviation**2)))
 
 
@@ -183,7 +184,7 @@ class NodalBasis(AbstractBasis):
         return functools.reduce(operator.add, corner_sums).T
 
     def restrict_blocks(self, blocks):
-        """As `restrict`, for rows given as blocks of cells."""
+        """Rows times S, for rows that are passed as blocks of cells."""
         total: Any = np.zeros(0)
         nodes_per_cell = self.cells.shape[1]
         for cells, block in blocks:
@@ -198,7 +199,7 @@ class NodalBasis(AbstractBasis):
         return np.ascontiguousarray(total.T)
 
     def variance(self):
-        """Variance of the cells, each the mean of independent nodal values."""
+        """Variance of the cells, where each cell has the mean of independent nodal values of unit variance."""
         return namespace(self).full(len(self.cells), 1 / self.cells.shape[1])
 
     def scaled(self, factor):
@@ -213,7 +214,7 @@ class NodalBasis(AbstractBasis):
 class Regions(Module):
     """Regions of cells that share one value, such as pixels of a grid or layers of a skin.
 
-    **Fields**: `label` (m,): number of each cell's region, from 0, or -1 if the cell is held at the background;
+    **Fields**: `label` (m,): number of each cell's region, from 0, or -1 if the cell is fixed at the background;
     `measure` (m,): area (3-D: volume) of the cells; `number`: number of regions.
     """
 
@@ -252,12 +253,12 @@ class Regions(Module):
     def mean(self, values: Float[Array, "m *k"]) -> Float[Array, "p *k"]:
         """Mean of the cells' values over each region, weighted by area (3-D: volume)."""
         xp = namespace(self, values)
-        region_measures = self.spread(self.total(self.measure))  # zero where the image is held fixed
+        region_measures = self.spread(self.total(self.measure))  # zero in cells that are fixed at the background
         weight = xp.where(self.label < 0, 0, self.measure / xp.where(self.label < 0, 1, region_measures))
         return self.total(values * xp.expand_dims(weight, tuple(range(1, values.ndim))))
 
     def spread(self, values: Float[Array, "p *k"]) -> Float[Array, "m *k"]:
-        """Give each cell the value of its region; zero where the image is held fixed."""
+        """Give each cell the value of its region; zero in cells that are fixed at the background."""
         xp = namespace(self, values)
         is_fixed = xp.expand_dims(self.label < 0, tuple(range(1, values.ndim)))
         return xp.where(is_fixed, 0, values[xp.maximum(self.label, 0)])
@@ -266,8 +267,6 @@ class Regions(Module):
 def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
     """Labels (m,) for `Regions` that group the cells of a mesh into the pixels of a grid; empty pixels are not
     numbered.
-
-    `shape`: numbers of rows and columns of the grid.
 
     **Arguments:**
 
@@ -296,8 +295,8 @@ def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
 
 
 class RegionBasis(AbstractBasis):
-    """Basis with one coefficient per region; all cells of a region have the value `deviation` (p,) times coefficient of
-    the region."""
+    """Basis with one coefficient per region; all cells of a region have the value `deviation` (p,) times the
+    coefficient of the region."""
 
     regions: Regions
     deviation: Float[Array, " p"]

@@ -1,10 +1,10 @@
-"""Linear algebra of priors on many cells, without matrices over all pairs of cells: sparse matrices over the nodes of a
-mesh, solved directly, and averages of nodal values over cells; and approximations of a covariance, by low-rank factors
-and by way of a regular grid.
+"""Linear algebra of priors on many cells, without matrices over all pairs of cells: direct solution of sparse systems
+over the nodes of a mesh, averages of nodal values over cells, and approximations of a covariance by low-rank factors or
+on a regular grid.
 
 A pivoted Cholesky factorisation gives Γ ≈ S Sᵀ with far fewer columns than cells. Columns are added one by one, each at
-the largest diagonal entry of Γ - S Sᵀ, until the trace of Γ - S Sᵀ is below a given fraction of that of Γ. Harbrecht,
-Peters and Schneider, Appl. Numer. Math. 62 (2012) 428-440.
+the largest diagonal entry of Γ - S Sᵀ, until the trace of Γ - S Sᵀ is below a specified fraction of the trace of Γ.
+Harbrecht, Peters and Schneider, Appl. Numer. Math. 62 (2012) 428-440.
 
 A Gaussian covariance between many points is approximated by Γ = P G Pᵀ without a matrix over all pairs. G is the
 covariance on a grid with a spacing of a third of the correlation length; it is a product of covariances along x, y and
@@ -61,7 +61,7 @@ class NodalSystem(NamedTuple):
 
     @classmethod
     def create(cls, mesh: Mesh) -> "NodalSystem":
-        """Create for a mesh whose arrays are not traced."""
+        """Create the structure for a mesh whose arrays are not traced."""
         mesh = on_host(mesh)
         cells, nodes_per_cell = np.asarray(mesh.cells), mesh.cells.shape[1]
         pattern = SparsityPattern.from_elements([cells], size=mesh.num_points)
@@ -142,8 +142,8 @@ _EQUAL_DIAGONAL = 1 - 1e-4
 def pivoted_cholesky(
     diagonal: np.ndarray, column: Callable[[int], np.ndarray], *, tolerance: float, max_rank: int
 ) -> np.ndarray:
-    """Low-rank factor S (m, n) with Γ ≈ S Sᵀ, for a covariance Γ given by its `diagonal` (m,) and a function that
-    returns a `column` of Γ.
+    """Low-rank factor S (m, n) with Γ ≈ S Sᵀ, for a covariance Γ with the `diagonal` (m,), of which the function
+    `column` returns a column.
 
     `tolerance`: fraction of the trace of Γ that may be left out.
     """
@@ -185,8 +185,8 @@ def _squared_distances(points, other_points):
 
 
 def _pivots(scaled, tolerance: float, max_rank: int):
-    """Indices (max_rank,) of the pivots of the Cholesky factorisation, and the number of pivots that reach the
-    tolerance."""
+    """Indices (max_rank,) of the pivots of the Cholesky factorisation, and the number of pivots with which the
+    tolerance is reached."""
     allowed_residual = tolerance * len(scaled)
 
     def is_incomplete(state):

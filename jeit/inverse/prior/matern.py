@@ -5,8 +5,8 @@ In unbounded space, the solution of (κ² - Δ) x = white noise has the Matérn 
     d = 2:  κr K₁(κr),    d = 3:  exp(-κr).
 
 The covariance of the nodal values is A⁻¹ M A⁻¹ with A = κ²M + K, mass matrix M and stiffness matrix K. Products with
-this covariance take sparse solves; the covariance itself would be a dense matrix over all pairs of cells. Lindgren, Rue
-and Lindström, J. R. Stat. Soc. B 73 (2011) 423-498. The domain's wall reflects the field and raises the field's
+this covariance require sparse solves; the covariance itself would be a dense matrix over all pairs of cells. Lindgren,
+Rue and Lindström, J. R. Stat. Soc. B 73 (2011) 423-498. The domain's wall reflects the field and raises the field's
 variance near the wall. The Robin condition ∂x/∂n = -κx / 1.42 removes most of this excess (Roininen, Huttunen and
 Lasanen, Inverse Probl. Imaging 8 (2014) 561-586), and the nodal values are scaled to unit variance to remove the rest.
 """
@@ -40,9 +40,9 @@ _COLUMNS_AT_ONCE = 50
 class Matern(AbstractPrior):
     """Matérn prior: a smooth random field of unit variance.
 
-    The correlation falls to 0.14 at twice the correlation length, as for `Gaussian(length)`, but it has a peak at
-    distance zero, so images have sharper peaks. κ is 1 / length in a solid body, √2 / length in a sheet. The cells must
-    not be much larger than the length. Memory and time are roughly proportional to the number of nodes.
+    The correlation falls to 0.14 at twice the correlation length, as for `Gaussian(length)`, but is more sharply peaked
+    at distance zero, so images have sharper peaks. κ is 1 / length in a solid body, √2 / length in a sheet. The cells
+    must not be much larger than the length. Memory and time are roughly proportional to the number of nodes.
 
     **Arguments:**
 
@@ -154,7 +154,8 @@ def _covariance_factor(solve: Solve, mass: Float[np.ndarray, " n"]) -> Float[np.
 
 
 PRIOR = Noser()
-"""Default prior of `one_step` and `reconstruct`: it needs no length and suits bodies of which nothing is known."""
+"""Default prior of `one_step` and `reconstruct`: it needs no correlation length, so it can be used for bodies of which
+nothing is known."""
 MEASURED = "gaussian"
 """Name in `PRIORS` of the default prior for measured data and streams."""
 

@@ -114,7 +114,7 @@ class QuadraticForm(AbstractPenalty):
 
     @classmethod
     def create(cls, row, column, value, hyperparameter, size: int) -> "QuadraticForm":
-        """Create with Q = λ² times the matrix with the given entries, for λ = `hyperparameter`."""
+        """Create the penalty with Q = λ² times the matrix with these entries, for λ = `hyperparameter`."""
         is_diagonal = len(row) == size and np.array_equal(row, column)
         return cls(row, column, hyperparameter**2 * value, size, bool(is_diagonal))
 
@@ -157,8 +157,8 @@ class AbstractNormal(Module):
 
     @abc.abstractmethod
     def variance(self, basis: AbstractBasis) -> Float[Array, " m"]:
-        """Variance of the image in every cell: the diagonal of S Q⁻¹ Sᵀ for the `basis` S, plus the variance it leaves
-        out."""
+        """Variance of the image in every cell: the diagonal of S Q⁻¹ Sᵀ for the `basis` S, plus the variance that the
+        basis leaves out."""
 
     @abc.abstractmethod
     def num_draws(self, num_coefficients: int) -> int:
@@ -181,7 +181,7 @@ class StandardNormal(AbstractNormal):
         return basis.variance()
 
     def num_draws(self, num_coefficients):
-        """Numbers per sample: one for each coefficient."""
+        """Number of random numbers per sample: one for each coefficient."""
         return num_coefficients
 
     def drawn(self, numbers):
@@ -213,7 +213,8 @@ class SparseNormal(AbstractNormal):
         return host.where(row == column, 1.0, 2.0) @ block_entries / basis.cells.shape[1] ** 2
 
     def num_draws(self, num_coefficients):
-        """Numbers per sample: one for each pivot of the factor, padding included, and one for each further unknown."""
+        """Number of random numbers per sample: one for each pivot of the factor, padding included, and one for each
+        further unknown."""
         return num_coefficients - self.plan.size + self.plan.num_pivots
 
     def drawn(self, numbers):

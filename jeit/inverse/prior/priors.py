@@ -1,7 +1,7 @@
 """Priors of conductivity: quadratic energies xᵀQx of an image x, with precision matrix Q.
 
 A linear image minimises ‖W^½ (J x - v)‖² + λ² xᵀQx. With M measurements and m ≫ M cells the image is computed in data
-space, which takes only products of the prior covariance Γ = Q⁻¹ with Jᵀ. If Q has a null space (Laplace: constant
+space, which requires only products of the prior covariance Γ = Q⁻¹ with Jᵀ. If Q has a null space (Laplace: constant
 images), Γ is any generalised inverse of Q, and the component in the null space is estimated from the data without
 penalty.
 """
@@ -76,7 +76,7 @@ class AbstractPrior(Module):
 
     A new quadratic prior is a subclass with `covariance_product`, `precision` and `basis`. A prior whose energy is not
     xᵀQx overrides `penalty` and raises `ValueError` in methods that do not apply to such a prior. Real and imaginary
-    part of a complex image have the same prior; methods take the complex conjugate of a complex Jacobian.
+    part of a complex image have the same prior; methods are called with the complex conjugate of a complex Jacobian.
 
     **Example:**
 
@@ -178,7 +178,7 @@ class Noser(AbstractPrior):
 
     **Arguments:**
 
-    - `exponent`: 1 weights every cell with its squared sensitivity, 0 gives `Tikhonov`.
+    - `exponent`: with 1, every cell is weighted with its squared sensitivity; 0 is equivalent to `Tikhonov`.
 
     **Example:**
 

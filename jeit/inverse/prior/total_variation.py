@@ -114,8 +114,8 @@ class NodalTotalVariation(AbstractPenalty):
         )
 
     def inverse_hessian(self, coefficients, free, columns):
-        """Approximate inverse of the energy's Hessian, times columns. The stiffness is the second derivative along the
-        gradient, which vanishes where the gradient is large."""
+        """Approximate inverse of the energy's Hessian, times columns. The stiffness is the second derivative of the
+        energy along the gradient, which tends to zero where the gradient is large."""
         image, _ = self._split_coefficients(coefficients)
         size = self.pull.shape[0]
         is_free_node = free[:size]
@@ -147,7 +147,7 @@ class NodalTotalVariation(AbstractPenalty):
             gradient = self.pull * image + self._divergence(flux)
             factor = factorise_matrix(self.plan, self.fronts, self._matrix(self._elements(stiffness), self.pull))
             columns = xp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1)
-            # Products with Γ are formed from half solves; the step takes one more full solve.
+            # Products of columns by way of Q⁻¹ are formed from half solves; the step requires one more full solve.
             half_solution = factor.half_solve(columns)
             products = half_solution.T @ half_solution
             unknown_columns = jacobian[:, size:]
@@ -251,8 +251,8 @@ class TotalVariation(AbstractPrior):
 
     def penalty(self, mesh, reference, hyperparameter, *, jacobian=None, regions=None, per_cell=False):
         """Basis with one coefficient per cell (or node of a solid), and the total variation penalty weighted with λ. An
-        edge as long as the body is wide has the penalty λ per unit of jump. Raises `ValueError` if `regions` are
-        given."""
+        edge as long as the body is wide has the penalty λ per unit of jump. Raises `ValueError` unless `regions` is
+        None."""
         if regions is not None:
             raise ValueError("regions: total variation finds its own; leave them out, or take another prior.")
         check_cells(mesh)
@@ -330,7 +330,7 @@ class TotalVariationPenalty(AbstractPenalty):
 
     def inverse_hessian(self, coefficients, free, columns):
         """Approximate inverse of the energy's Hessian, times columns. The weights in the Hessian are β² / (d² + β²)
-        times those of the touching quadratic form and vanish across large jumps."""
+        times the weights in the touching quadratic form and tend to zero across large jumps."""
         image, _ = self._split_coefficients(coefficients)
         is_free_cell = free[: self.level.shape[0]]
         curvature = self.weight * self.smoothing**2 / self._smoothed_height(image) ** 3

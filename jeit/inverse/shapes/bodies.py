@@ -1,10 +1,10 @@
-"""Base classes of bodies, the inclusions of a domain, which give the conductivity of the cells as a function of the
-bodies' coefficients.
+"""Base classes of bodies (inclusions in a domain), whose coefficients determine the conductivity of the cells.
 
     log σ/σ₀ = drift + Σ_bodies mixture(share, ± contrast),
 
-where `share` is the fraction of a cell that a body covers; for a completely covered cell the mixture equals ± contrast.
-Every coefficient is in units of its prior standard deviation, so the penalty is ½‖coefficients‖².
+where σ₀ is the background, `share` the fraction of a cell that a body covers, and the drift a change of the bath, the
+medium around the bodies. For a completely covered cell the mixture equals ± contrast. Every coefficient is in units of
+its prior standard deviation, so the penalty is ½‖coefficients‖².
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from jeit.arguments import describe, is_number
 from jeit.arguments.checks import Interval
 
-# Fields of `Bodies`, except `start`, that hold one value per body.
+# Fields of `Bodies`, except `start`, that have one value per body.
 _FIELDS_PER_BODY = ("sign", "is_other_kind", "same_material", "fixed_contrast")
 
 
@@ -96,8 +96,9 @@ class Quantities:
     **Fields**: `change`, `change_interval`: change of conductivity relative to the background; `measure`,
     `measure_interval`: area, m², or volume, m³; `strength`, `strength_interval`: `measure` times (ρ - 1) / (ρ + n - 1),
     where ρ is the conductivity relative to the background and n the number of axes along which the body is bounded (2
-    in a sheet and for a column, else 3), negative for resistive bodies; `centroid_radius`: radius, metres, of the
-    circle (in a solid, of the ball) about the centroid that holds the true centroid with a probability of 68 %.
+    in a sheet and for a column, else 3); the strength is negative for resistive bodies; `centroid_radius`: radius,
+    metres, of the circle (in a solid, of the ball) about the centroid that contains the true centroid with a
+    probability of 68 %.
 
     **Example:**
 
@@ -117,12 +118,13 @@ class Quantities:
 
 
 TINY = 1e-30
-"""Minimum measure, m² or m³; that of a body that has left the domain."""
+"""Minimum area, m², or volume, m³, which replaces that of a body that has left the domain."""
 
 
 def polarisation(contrast, axes: int):
     """Strength of a round body per area or volume, (ρ - 1) / (ρ + n - 1), for the conductivity ratio ρ = e^`contrast`
-    and n bounded `axes`. Ammari and Kang, Polarization and Moment Tensors (2007), chapter 4."""
+    and n = `axes`, the number of axes along which the body is bounded. Ammari and Kang, Polarization and Moment Tensors
+    (2007), chapter 4."""
     return np.expm1(contrast) / (np.exp(contrast) + axes - 1)
 
 
@@ -161,10 +163,9 @@ class Bodies(abc.ABC):
     **Fields**: `prior`: prior of every body; `weight` (m,): measure of each cell as a fraction of the domain; `span`:
     longest side of the domain, metres; `start` (k, d): starting centres, metres; `sign` (k,): +1 for bodies more
     conductive than the bath, -1 for less; `is_other_kind` (k,): whether a body is of the other kind (weak for stars, a
-    column for ellipsoids); `same_material` (k,): whether a body is of the same material as all other bodies of its sign
-    that are marked here. Bodies of the same material share the contrast coefficient of the first of them; the contrast
-    coefficients of the others have no effect; `fixed_contrast` (k,): contrast at which a body is held, whatever its
-    coefficient, NaN where the contrast is estimated.
+    column for ellipsoids); `same_material` (k,): whether a body is of the same material as all other marked bodies of
+    its sign, in which case the contrast coefficient of the first such body applies to all of them; `fixed_contrast`
+    (k,): contrast that replaces the one from the coefficient, NaN where the contrast is estimated.
     """
 
     prior: Any
@@ -190,8 +191,8 @@ class Bodies(abc.ABC):
     def with_other_kind(
         self, indices: Any, coefficients: Float[np.ndarray, " n"]
     ) -> tuple[Self, Float[np.ndarray, " n"]]:
-        """The bodies with those of `indices` changed to the other kind, with nearly the same effect on the voltages;
-        and the coefficients of all bodies."""
+        """Change the bodies of `indices` to the other kind, with nearly the same effect on the voltages. Returns all
+        bodies and their coefficients."""
 
     @abc.abstractmethod
     def mixture(self, share: Float[np.ndarray, " c"], contrast: float) -> tuple[Any, Any, Any]:
@@ -235,8 +236,8 @@ class Bodies(abc.ABC):
         return rows
 
     def by_coefficients(self, row_derivatives: Float[np.ndarray, "r n"]) -> Float[np.ndarray, "r n"]:
-        """Convert derivatives with respect to the drift and the rows of `rows` to derivatives with respect to the
-        coefficients, in which bodies of the same material share a contrast coefficient."""
+        """Convert derivatives with respect to the drift and the coefficients returned by `rows` to derivatives with
+        respect to the coefficients, in which bodies of the same material share a contrast coefficient."""
         row_derivatives, order = row_derivatives.copy(), np.arange(len(self.sign))
         contrast_columns = 1 + order * self.prior.size + self.dimension + 1
         for k in order[self.first != order]:
@@ -301,7 +302,7 @@ class Bodies(abc.ABC):
         return replace(self, start=start, **other_fields), np.concatenate([remaining, half_row, half_row])
 
     def with_modes(self, modes: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
-        """The bodies with another number of modes of their form, and their coefficients; the coefficients of added
+        """The bodies with a different number of modes of their form, and their coefficients; the coefficients of added
         modes are zero."""
         new_bodies = replace(self, prior=replace(self.prior, modes=modes))
         rows = np.zeros((len(self.sign), new_bodies.prior.size))
@@ -310,8 +311,8 @@ class Bodies(abc.ABC):
         return new_bodies, np.append(coefficients[0], rows)
 
     def image(self, coefficients) -> BodyImage:
-        """Image log σ/σ₀ per cell, the overlaps of the bodies, and the derivatives of both with respect to the
-        coefficients."""
+        """Compute the image log σ/σ₀ per cell, the overlaps of the bodies, and the derivatives of image and overlaps
+        with respect to the coefficients."""
         num_cells, dimension = len(self.weight), self.dimension
         rows = self.rows(coefficients)
         coverages = [self.coverage(k, row) for k, row in enumerate(rows)]

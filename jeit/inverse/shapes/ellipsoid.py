@@ -39,7 +39,8 @@ def unmodelled_deviations(problem: ShapeProblem, fitted: Fit, free_fit: Fit | No
     """Standard deviations of the contrasts of bodies, in log σ, due to errors that Laplace's approximation of the
     problem lacks: the error of the mesh, and the choice of materials.
 
-    `free_fit`: fit with a material for each body. If the data do not rule out this fit, its contrasts are included.
+    `free_fit`: fit with a material for each body. If the data do not rule out this fit, the deviations allow for its
+    contrasts.
     """
     variance = np.full(len(fitted.bodies.sign), _MESH_DEVIATION[fitted.bodies.dimension] ** 2)
     if (
@@ -63,7 +64,8 @@ def _contrasts(problem: ShapeProblem, fitted: Fit) -> tuple[Float[np.ndarray, " 
 
 def alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | None, float]]:
     """For each body, the body of the other kind (ellipsoid or column) that explains the data about as well, and the
-    standard deviation of this body's contrast; None and NaN if there is none. The prior odds of kinds are ignored."""
+    standard deviation of this alternative body's contrast; None and NaN if there is no alternative. The prior odds of
+    kinds are ignored."""
     bodies, num_bodies = fitted.bodies, len(fitted.bodies.sign)
     if not num_bodies or bodies.prior.is_of_one_kind or not isinstance(bodies, Ellipsoids):
         return [(None, np.nan)] * num_bodies
@@ -83,12 +85,13 @@ KINDS = ("either", "ellipsoids", "columns")
 # Barycentric coordinates of the twenty points at which a cell is sampled; all represent equal parts of the cell.
 _SAMPLES = np.array([[2 * n + 1 for n in indices] for indices in np.ndindex(4, 4, 4, 4) if sum(indices) == 3]) / 10
 # Width of the blur of a surface, in units of the cell size: large enough for the coverage to be differentiable, but
-# small, because blurred bodies are estimated too small and too strong.
+# small, because the estimates of blurred bodies are too small and too strong.
 _BLUR = 0.1
-# Exponents of the power mean in cells on a surface, for bodies more (1) and less (-1) conductive than the bath. With
-# edges of half the radius, the change of voltages due to balls 0.1 to 12 times as conductive as the bath then agrees
-# within 1 to 5 % with that on meshes whose facets follow the surface. A single exponent of 0.15 made the change due to
-# balls of 12 times the conductivity 13 to 19 % too large, an error proportional to the edge length.
+# Exponents of the power mean of the conductivities of body and bath in cells that a surface cuts, for bodies more (1)
+# and less (-1) conductive than the bath. With edges of half the radius, the change of voltages due to balls 0.1 to 12
+# times as conductive as the bath then agrees within 1 to 5 % with that on meshes whose facets follow the surface. With
+# a single exponent of 0.15, the change due to balls of 12 times the conductivity was 13 to 19 % too large, an error
+# proportional to the edge length.
 _POWERS = {1: -1.0, -1: 0.5}
 # Distance from a surface within which cells are refined, in units of the body's shortest half axis; lower limit of this
 # half axis, in units of the geometric mean of the three.
@@ -120,8 +123,9 @@ class EllipsoidPrior(BodyPrior):
       of solids locate bodies well.
     - `roughness`: standard deviation of the five coefficients of the log stretch S.
     - `contrast`, `contrast_spread`: median of the contrast in log σ, and standard deviation of its logarithm.
-    - `odds_for_columns`: prior odds of a column relative to an ellipsoid; most tanks hold columns.
-    - `odds_for_one_material`: prior odds of one material for all bodies of a sign, relative to one for each body.
+    - `odds_for_columns`: prior odds of a column relative to an ellipsoid; most tanks contain columns.
+    - `odds_for_one_material`: prior odds of one material for all bodies of a sign, relative to a different material for
+      each body.
     - `kinds`: kinds of bodies considered, one of `KINDS`.
 
     Raises `ValueError` if a number is not positive or `kinds` is not in `KINDS`.
@@ -173,14 +177,14 @@ class EllipsoidPrior(BodyPrior):
 
 
 class Ellipsoid(Module):
-    """Ellipsoid or column found in a solid.
+    """Ellipsoid or column in a solid.
 
     **Fields**: `sign`: +1 if more conductive than the bath, -1 if less; `centre` (3,): centre, metres; `axes` (3, 3):
     half axes as rows, metres, the longest first; `volume`, `centroid` (3,): volume in m³ and centroid in metres of the
     part inside the domain; `contrast`: contrast in log σ, without its sign; `column`: whether the body is a column, one
     of whose half axes is half the domain's height; `alike`: whether the body is assumed to be of the same material as
-    others of its sign; `rise`: factor by which the minimum of the objective increases without this body, small for a
-    ghost; `quantities`: posterior medians and intervals of the body, None if not estimated.
+    other bodies of its sign; `rise`: factor by which the minimum of the objective increases without this body, small
+    for a ghost; `quantities`: posterior medians and intervals of the body's properties, None if not estimated.
 
     **Example:**
 
@@ -213,7 +217,8 @@ class Ellipsoid(Module):
 
     @property
     def contrast_is_determined(self) -> bool:
-        """Whether the data determine the contrast: no end of the contrast's interval is open."""
+        """Whether the data determine the contrast: both limits of its interval are determined, or no interval was
+        estimated."""
         return self.quantities is None or None not in self.quantities.change_interval
 
     def with_quantities(self, known: Quantities) -> Ellipsoid:
@@ -278,13 +283,13 @@ class Ellipsoids(Bodies):
 
     @property
     def num_splits(self) -> int:
-        """Number of axes along which a split is tried: 1, the longest, because two neighbours fitted as one body make
-        this body long, and each trial takes tens of forward solves."""
+        """Number of axes along which a split is tried: 1, the longest, because two adjacent bodies fitted as one body
+        form a long body, and each trial requires tens of forward solves."""
         return 1
 
     def with_other_kind(self, indices, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
-        """The bodies, of which those of `indices` are changed from ellipsoid to column or back at the same volume; and
-        the coefficients of all bodies. Stretches that the new kind does not have are set to zero."""
+        """Change the bodies of `indices` from ellipsoid to column or back, at the same volume. Stretches that the new
+        kind does not have are set to zero. Returns all bodies and their coefficients."""
         rows, is_column = self.rows(coefficients), self.is_other_kind.copy()
         for k in indices:
             volume = max(self.body(k, coefficients).volume, 1e-6 * self.total) / np.pi
@@ -295,8 +300,8 @@ class Ellipsoids(Bodies):
         return replace(self, is_other_kind=is_column), np.append(coefficients[0], rows)
 
     def of_one_material(self, sign: int, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
-        """The bodies with all those of the given `sign` made of one material, with the mean contrast coefficient and
-        with radii that keep the strengths; and their coefficients."""
+        """Assign one material to all bodies of a `sign`, with the mean of their contrast coefficients and with radii
+        changed so that the strengths stay the same. Returns all bodies and their coefficients."""
         rows, members, column = self.rows(coefficients), np.flatnonzero(self.sign == sign), self.dimension + 1
         old_coefficients = rows[:, column].copy()
         rows[members, column] = old_coefficients[members].mean()
@@ -318,7 +323,7 @@ class Ellipsoids(Bodies):
 
     def display_image(self, coefficients) -> Float[np.ndarray, " m"]:
         """Image log σ/σ₀ (m,) of the bodies, for display. Partly covered cells have the geometric mean of body and
-        bath, so log σ on a surface is halfway between both; voltages are computed with `mixture` instead."""
+        bath, so log σ on a surface is halfway between the two; voltages are computed with `mixture` instead."""
         image = np.full(len(self.weight), coefficients[0] * self.prior.drift)
         for k, row in enumerate(self.rows(coefficients)):
             cells, share, _ = self.coverage(k, row)
@@ -347,8 +352,8 @@ class Ellipsoids(Bodies):
         return max_lengths
 
     def left_refined_cells(self, coefficients, others: Bodies, new_coefficients) -> bool:
-        """Whether, between `coefficients` and the coefficients `new_coefficients` of the bodies `others`, a surface
-        has left the cells that were refined for it, a body was removed, or a body changed kind."""
+        """Whether a surface has left the cells that were refined for it, a body was removed, or a body changed kind,
+        between these bodies with `coefficients` and the bodies `others` with `new_coefficients`."""
         if not np.array_equal(self.is_other_kind, others.is_other_kind):
             return True
         for k, (row, new_row) in enumerate(zip(self.rows(coefficients), others.rows(new_coefficients), strict=True)):
@@ -409,9 +414,10 @@ class Ellipsoids(Bodies):
             distance = _lengths(offset)
         round_offset = np.tensordot(inverse_stretch, offset, 1)
         scaled_distance = _lengths(round_offset)
-        # On the ray from the centre, the surface is at the distance radius · distance / reach.
+        # On the ray from the centre, the surface is at the distance radius · distance / scaled_distance.
         surface = radius * distance / scaled_distance
-        # The blur of a convex surface adds more volume than it removes. Moving it inwards by `excess` compensates.
+        # The blur of a convex surface adds more volume than it removes. Moving the surface inwards by `excess`
+        # compensates for this.
         excess = (np.pi * width) ** 2 * (axes.sum() - 1) / (6 * surface)
         inside = 0.5 * (1 + np.tanh(0.5 * (surface - excess - distance) / width))
         share_slope = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(surface - excess - distance)

@@ -1,9 +1,9 @@
 """Refinement of the mesh of a shape problem at the surfaces of the bodies.
 
 A mesh that suffices for a smooth image resolves a body of a few cells badly. The error of the voltages is proportional
-to the edge length on the surface, differs between channels, and resembles the effect of another body. Bodies that were
-found are therefore fitted again on a mesh that is bisected at their surfaces. The rest of the problem, including the
-voltages of the background, is unchanged.
+to the edge length on the surface, differs between channels, and resembles the effect of another body. The bodies are
+therefore fitted again on a mesh whose cells are bisected at the bodies' surfaces. The rest of the problem, including
+the voltages of the background, is unchanged.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from jeit.mesh.bisection import bisect_with_parents
 from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
 
-# Ratio of the number of nodes of the refined mesh to that of the given mesh, below which no longer edges are tried.
+# Ratio of the number of nodes of the refined mesh to that of the original mesh, below which longer edges are not tried.
 _MAX_NODES = 2.5
 
 
@@ -35,7 +35,7 @@ class FinerModel(NamedTuple):
     """Shape problem on a refined mesh.
 
     **Fields**: `problem`: the problem on the refined mesh; `bodies`: the bodies on the refined mesh; `cell` (f,): index
-    of the cell of the given mesh that contains each refined cell.
+    of the cell of the original mesh that contains each refined cell.
     """
 
     problem: ShapeProblem
@@ -44,14 +44,14 @@ class FinerModel(NamedTuple):
 
     def change(self, protocol: Protocol, image: Float[np.ndarray, " f"], field: Any) -> Float[np.ndarray, " M"]:
         """Change of the voltages of `protocol`, in volts, due to the `image` (f,) of the bodies on the refined mesh and
-        a smooth `field`, (m,) on the given mesh or 0, both in log σ/σ₀."""
+        a smooth `field`, (m,) on the original mesh or 0, both in log σ/σ₀."""
         model, background = self.problem.model.with_protocol(protocol), self.problem.background
         conductivity = self.conductivity(image, field)
         return solved_fields(model, conductivity).voltages - solved_fields(model, background).voltages
 
     def conductivity(self, image: Float[np.ndarray, " f"], field: Any) -> Float[np.ndarray, " f"]:
         """Conductivity of the refined cells, S/m, for the `image` (f,) of the bodies on the refined mesh and a smooth
-        `field`, (m,) on the given mesh or 0, both in log σ/σ₀."""
+        `field`, (m,) on the original mesh or 0, both in log σ/σ₀."""
         return self.problem.background * np.exp(image + np.broadcast_to(field, self.cell.max() + 1)[self.cell])
 
 
@@ -80,8 +80,8 @@ def refine_at_surfaces(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) 
 
 
 def _tag_electrodes(mesh: Mesh, electrodes: AbstractElectrodes) -> tuple[Mesh, list[str]]:
-    """The mesh with one tag per electrode, which marks the facets that the electrode covers and which bisection
-    preserves; and the tags' names."""
+    """Add to the mesh one tag per electrode, which marks the facets that the electrode covers and is preserved by
+    bisection. Returns the mesh and the names of the tags."""
     parts = electrodes.parts if isinstance(electrodes, CombinedElectrodes) else (electrodes,)
     covered_facets = [
         column for part in parts if isinstance(part, FacetElectrodes) for column in np.asarray(part.covers).T
@@ -91,8 +91,8 @@ def _tag_electrodes(mesh: Mesh, electrodes: AbstractElectrodes) -> tuple[Mesh, l
 
 
 def _electrodes_on(mesh: Mesh, electrodes: AbstractElectrodes, names) -> AbstractElectrodes:
-    """Electrodes on a bisected mesh. Electrodes that cover facets are made from the tags `names`; all other electrodes
-    are unchanged."""
+    """Electrodes on a bisected mesh. Electrodes that cover facets are created from the tags `names`; all other
+    electrodes are unchanged."""
     if isinstance(electrodes, CombinedElectrodes):
         return CombinedElectrodes(*[_electrodes_on(mesh, part, names) for part in electrodes.parts])
     if isinstance(electrodes, FacetElectrodes):

@@ -1,7 +1,7 @@
 """Nonlinear least squares problem of bodies, optionally with a smooth conductivity field in addition to the bodies.
 
 The smooth field represents other changes of conductivity in a solid: salt that has sunk from a ball of agar to the
-floor, a bath of uneven temperature, contacts that have changed. Without the field, bodies would be distorted to explain
+floor, uneven temperature of the bath, or changes of contacts. Without the field, bodies would be distorted to explain
 these changes.
 
     log σ/σ₀ = bodies + level · field,    field ~ N(0, Γ), where Γ is the covariance of a smooth image's prior.
@@ -11,13 +11,14 @@ Jacobian J at the background. The level is chosen by the evidence. Kaipio and So
 Applied Mathematics 198 (2007) 493, treat model errors as noise; MacKay, Neural Computation 4 (1992) 415, chooses
 hyperparameters by evidence.
 
-The coefficients c of the bodies minimise ½ rᵀ G r + ½ ‖c‖² + ½ Σ (apart · overlap)², with r = w (v(σ(c)) - ŷ), the data
-ŷ, their weights w and their precision G = C⁻¹.
+The coefficients c of the bodies minimise ½ rᵀ G r + ½ ‖c‖² + ½ Σ (apart · overlap)², with r = w (v(σ(c)) - ŷ), the
+predicted voltages v, the data ŷ, their weights w and their precision G = C⁻¹; the sum is over pairs of bodies.
 
-The evidence is the probability of the data, integrated over the coefficients. The evidence compares descriptions with
+The evidence is the probability of the data, integrated over the coefficients. It serves to compare descriptions with
 different numbers and kinds of bodies. Laplace's approximation at the minimum gives -log evidence = cost + ½ log det H +
-const, where H = 1 + JᵀC⁻¹J is the Hessian in units of the prior and J the Jacobian with respect to c: a coefficient
-costs more, the more precisely the data determine it. MacKay, Neural Computation 4 (1992) 415, section 2.
+const, where H = 1 + JᵀC⁻¹J is the Hessian in units of the prior and J the Jacobian with respect to c: the more
+precisely the data determine a coefficient, the more it increases -log evidence. MacKay, Neural Computation 4 (1992)
+415, section 2.
 """
 
 from __future__ import annotations
@@ -104,7 +105,7 @@ class SmoothField:
         return self.scale * np.asarray(self.image.inversion.basis.expand(coefficients))
 
     def _residual(self, fit: Fit) -> Float[np.ndarray, " r"]:
-        """Residual of the weighted voltages: those predicted for the bodies of a `fit` minus those measured."""
+        """Residual of the weighted voltages: voltages predicted for the bodies of a `fit` minus measured voltages."""
         return fit.rows[0][: len(self.jacobian)]
 
 
@@ -135,8 +136,8 @@ class ShapeProblem:
     rtol: float = 3e-3
 
     def with_errors(self, rows: Float[np.ndarray, "r q"]) -> ShapeProblem:
-        """Copy of the problem with further errors of the data: `rows` (r, q) hold the errors of the r weighted voltages
-        per unit of q coefficients of unit variance."""
+        """Copy of the problem with further errors of the data: `rows` (r, q) are the errors of the r weighted voltages
+        per unit of each of q coefficients of unit variance."""
         covariance = np.asarray(self.data.covariance) + rows @ rows.T
         new_matrices = (covariance, np.linalg.inv(covariance))
         return replace(self, data=eqx.tree_at(lambda data: (data.covariance, data.precision), self.data, new_matrices))

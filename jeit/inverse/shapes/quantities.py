@@ -3,10 +3,10 @@
 To first order the voltages due to a small body depend on the body's strength alone: its area times (ρ - 1) / (ρ + 1),
 or in a solid its volume times (ρ - 1) / (ρ + 2), where ρ is the body's conductivity relative to the background.
 Contrast and size are determined separately only by the second order, so errors of the model affect them most. Each
-body's contrast is therefore explored: the contrast is held at several values, all other coefficients are fitted again,
-and the evidence gives the posterior of the contrast (Laplace's approximation for the other coefficients). The prior of
-the contrast is log-normal. Tierney and Kadane, Journal of the American Statistical Association 81 (1986) 82; Ammari and
-Kang, Polarization and Moment Tensors (2007), chapter 4, strength.
+body's contrast is therefore explored: the contrast is fixed at several values in turn, all other coefficients are
+fitted again, and the evidence gives the posterior of the contrast (Laplace's approximation for the other coefficients).
+The prior of the contrast is log-normal. Tierney and Kadane, Journal of the American Statistical Association 81 (1986)
+82; Ammari and Kang, Polarization and Moment Tensors (2007), chapter 4, for the strength.
 """
 
 from __future__ import annotations
@@ -36,13 +36,14 @@ _MEDIAN_LOG_CONTRAST, _LOG_CONTRAST_DEVIATION, _LOG_CONTRAST_BOUNDS = (
 # and the factor by which each step is longer than the last.
 _STEPS, _FIRST_STEP_LIMITS, _STEP_GROWTH = 8, (0.02, 0.35), 1.6
 # By dimension of the mesh: maximum number of steps of each fit and its tolerance, and the drop of the log posterior at
-# which the exploration ends. A step in a solid takes a second.
+# which the exploration ends. A step of a fit in a solid takes a second.
 _FIT_LIMITS, _LOG_POSTERIOR_DROP = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0}
-# Rise of the -log likelihood at an end of the grid below which the data leave that end open.
+# The data do not determine a limit of the contrast if the -log likelihood at that bound of the contrast exceeds its
+# minimum by less than this number.
 _OPEN_END_RISE = 1.0
-# Probabilities of the ends of an interval, and numbers of contrasts and of normal deviates of the posterior's sample.
+# Probabilities at the limits of an interval; numbers of contrasts and of normal deviates that sample the posterior.
 _INTERVAL_PROBABILITIES, _NUM_CONTRASTS, _NUM_NORMAL_DEVIATES = (0.16, 0.84), 240, 31
-# Probability that the circle about a centroid holds the true centroid; and the step of the finite differences of a
+# Probability that the circle about a centroid contains the true centroid; and the step of the finite differences of a
 # centroid, in standard deviations of a coefficient.
 _CENTROID_PROBABILITY, _CENTROID_STEP = 0.68, 0.1
 # Standard deviation of a body's place due to an error of the fields, as a share of half the width of the domain times
@@ -73,8 +74,8 @@ class Accuracy(NamedTuple):
 def with_quantities(
     problem: ShapeProblem, fit: Fit, accuracy: Accuracy, unmodelled: Any, order: Any
 ) -> list[Quantities]:
-    """Quantities of the bodies of a `fit`, in the given `order` of indices. `unmodelled` (k,): standard deviations of
-    the contrasts of all k bodies due to errors that the problem does not contain.
+    """Compute the quantities of the bodies of a `fit`, in the `order` of indices. `unmodelled` (k,): standard
+    deviations of the contrasts of all k bodies due to errors that the problem does not contain.
 
     `problem` has the noise of `accuracy` alone; the model error is added for the conductivity of the fit.
     """
@@ -96,11 +97,12 @@ def with_quantities(
 def centroid_radius(
     problem: ShapeProblem, fit: Fit, k: int, shown_centroid: Float[np.ndarray, " d"], accuracy: Accuracy
 ) -> float:
-    """Radius, metres, about the `shown_centroid` of body k that holds the true centroid with a probability of 68 %.
+    """Radius, metres, of the circle or ball about the `shown_centroid` of body k that contains the true centroid with a
+    probability of 68 %.
 
-    The posterior of the centroid is that of the coefficients of a `fit`, linearised. Errors of the described lengths
-    and of the fields are added. The distribution of the squared distance is approximated by a scaled χ² distribution
-    with the same mean and variance (Satterthwaite, Biometrics Bulletin 2 (1946) 110).
+    The posterior of the centroid follows from that of the coefficients of a `fit` by linearisation. Errors of the
+    described lengths and of the fields are added. The distribution of the squared distance is approximated by a scaled
+    χ² distribution with the same mean and variance (Satterthwaite, Biometrics Bulletin 2 (1946) 110).
     """
     bodies, prior_size = fit.bodies, fit.bodies.prior.size
     indices = np.arange(1 + k * prior_size, 1 + (k + 1) * prior_size)
@@ -148,7 +150,7 @@ def _interval_hull(interval: Interval, values: Sequence[float]) -> Interval:
 
 
 class _FixedContrastFit(NamedTuple):
-    """A fit in which the contrast of one body is held. **Fields**: `log_contrast`: logarithm of the held contrast;
+    """A fit in which the contrast of one body is fixed. **Fields**: `log_contrast`: logarithm of the fixed contrast;
     `negative_log_likelihood`: -log likelihood, with all other coefficients integrated out; `log_measure`: logarithm of
     the body's area or volume; `deviation`: standard deviation of `log_measure`."""
 
@@ -159,8 +161,8 @@ class _FixedContrastFit(NamedTuple):
 
 
 def quantify(problem: ShapeProblem, fit: Fit, k: int, unmodelled: float, accuracy: Accuracy) -> Quantities:
-    """Quantities of body k of a `fit`, from an exploration of the body's contrast in both directions until the contrast
-    is improbable or at a bound.
+    """Compute the quantities of body k of a `fit`. The body's contrast is explored in both directions until it is
+    improbable or at a bound.
 
     `unmodelled`: standard deviation of the contrast due to errors that the problem does not contain; these errors do
     not change the strength.
@@ -212,9 +214,9 @@ def _fit_with_fixed_contrast(
     log_contrast: float,
     accuracy: Accuracy,
 ):
-    """Fit with the log contrast of body k, and of all other bodies of its material, held at `log_contrast`; and the
-    coefficients of the fit. The fit starts from `coefficients` of a fit at `last_log_contrast`, with radii that keep
-    the strengths."""
+    """Fit the bodies with the log contrast of body k, and of all other bodies of its material, fixed at `log_contrast`;
+    returns the fit and its coefficients. The fit starts from `coefficients` of a fit at `last_log_contrast`, with radii
+    changed so that the strengths stay the same."""
     start, same_material, sign = coefficients.copy(), bodies.first == bodies.first[k], bodies.sign[k]
     for body_index in np.flatnonzero(same_material).tolist():
         axes = bodies.bounded_axes(body_index)
@@ -234,7 +236,7 @@ def _fit_with_fixed_contrast(
 
 
 def _negative_log_evidence(fixed_fit: _FixedContrastFit) -> float:
-    """Negative log posterior density of the logarithm of a held contrast, up to a constant."""
+    """Negative log posterior density of the logarithm of a fixed contrast, up to a constant."""
     return fixed_fit.negative_log_likelihood + _contrast_prior(fixed_fit.log_contrast)
 
 
@@ -244,7 +246,7 @@ def _contrast_prior(log_contrast):
 
 
 def _summary(sign: int, axes: int, unmodelled: float, fixed_fits: Sequence[_FixedContrastFit]) -> Quantities:
-    """Medians and intervals of the posterior, interpolated between the held contrasts and convolved with a normal
+    """Medians and intervals of the posterior, interpolated between the fixed contrasts and convolved with a normal
     distribution of the standard deviation `unmodelled`; `axes`: number of axes along which the body is bounded."""
     log_contrasts, negative_log_likelihoods, log_measure, deviations = np.array(fixed_fits).T
     grid = np.linspace(log_contrasts[0], log_contrasts[-1], _NUM_CONTRASTS)
@@ -268,7 +270,8 @@ def _summary(sign: int, axes: int, unmodelled: float, fixed_fits: Sequence[_Fixe
         log_contrasts[0] == _LOG_CONTRAST_BOUNDS[0]
         and negative_log_likelihoods[0] < min_negative_log_likelihood + _OPEN_END_RISE
     )
-    # The open end of the contrast decides which end of the area or volume is open: a stronger body is smaller.
+    # If the data do not determine the upper limit of the contrast, they do not determine the lower limit of the area or
+    # volume either, and vice versa: a stronger body is smaller.
     changes = [float(np.expm1(sign * values)) for values in _quantiles(contrast, weight)]
     change_limits: list[float | None] = [None if is_open_below else changes[0], None if is_open_above else changes[2]]
     min_measure, median_measure, max_measure = _quantiles(measures, weight)

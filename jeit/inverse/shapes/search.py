@@ -35,21 +35,22 @@ from jeit_solvers.module import Module
 if TYPE_CHECKING:
     from jeit.inverse.shapes.finer import FinerModel
 
-# Minimum factor by which the objective must rise when a body is left out and the others are fitted again.
+# A body is a ghost if the objective rises by less than this factor when the body is left out and all other bodies are
+# fitted again.
 LEAST_RISE = 1.4
 _FIRST_STEPS, _STEPS, _REMOVAL_STEPS, _TRIAL_STEPS = 15, 40, 8, 6
 _COARSE_TOLERANCE = 1e-2
 # Number of successive starts that the data do not support, after which the remaining, weaker starts are not tried.
 _MAX_UNSUPPORTED = 2
-# Factor of the rise of the objective without a body above which the body is beyond doubt.
+# A body is beyond doubt if the objective without it is larger by more than this factor.
 _CERTAIN_RISE = 10.0
 # Maximum number of changes of the number or kind of bodies in a search.
 _MAX_CHANGES = 10
-# Maximum number of times that the mesh is refined at the bodies, which move as a result. Edge lengths on their
-# surfaces, in units of the shortest half axis, that are tried in turn: in the first refinement, when there may still be
-# ghosts among the bodies, and in later ones.
+# Maximum number of times that the mesh is refined at the bodies, which move as a result. Edge lengths on the bodies'
+# surfaces, in units of the shortest half axis, that are tried in turn: in the first refinement, when some bodies may
+# still be ghosts (false bodies), and in later refinements.
 _MAX_REFINEMENTS, _EDGE_LENGTHS = 3, ((0.7,), (0.25, 0.35, 0.5, 0.7))
-# Minimum gain of log evidence for accepting the description of the bodies with more parameters.
+# Minimum gain of log evidence with which a description of the bodies with more parameters is accepted.
 _MIN_EVIDENCE_GAIN = 2.0
 
 
@@ -75,8 +76,8 @@ class ShapeReconstruction(Module):
     voltages predicted for the bodies; `misfit`: root mean square of predicted - measured voltages over the channels
     used, in standard deviations; `drift`: relative difference of the bath's conductivity from `background`; `doubtful`:
     bodies that were removed because their `rise` is too small; `contrast_deviations`: standard deviation of each body's
-    contrast in log σ, due to noise and the mesh (0.03, in solids 0.1); `alternatives`: for each body of a solid, the
-    body of the other kind (ellipsoid or column) if the data do not determine the kind, else None;
+    contrast in log σ, due to noise and to the mesh (the mesh contributes 0.03, in solids 0.1); `alternatives`: for each
+    body of a solid, the body of the other kind (ellipsoid or column) if the data do not determine the kind, else None;
     `alternative_deviations`: standard deviations of the contrasts of the alternatives, or NaN; `finer`: for a solid
     with bodies, the conductivity on the last refined mesh, for display.
 
@@ -133,10 +134,10 @@ def reconstruct_shapes(
 
     All bodies are first fitted together, as disks or balls of high contrast. Then each body in turn is left out and all
     other bodies are fitted again; the body whose absence raises the objective least is removed, as long as the rise is
-    small. This removes ghosts (false bodies) due to model errors and missing electrodes, because other bodies can take
-    their place. Remaining bodies are split in two, or changed to the other kind (a weak star, or a column from floor to
-    lid), if the evidence (`ShapeProblem.surprise`) favours this change. The search is run twice, once starting with a
-    split and once with a change of kind, and the better result is kept.
+    small. This removal eliminates ghosts (false bodies) due to model errors and missing electrodes, because other
+    bodies can take the place of a ghost. Remaining bodies are split in two, or changed to the other kind (a weak star,
+    or a column from floor to lid), if the evidence (`ShapeProblem.surprise`) favours this change. The search is run
+    twice, once starting with a split and once with a change of kind, and the better result is returned.
 
     **Arguments:**
 
@@ -145,7 +146,7 @@ def reconstruct_shapes(
     - `background`: conductivity of the bath without bodies, one number or (m,), S/m (2-D: S); its drift is estimated.
     - `start`: sign, centre (x, y) or (x, y, z) and radius, in metres, of every possible body, for example of all
       inclusions of an image. Starts without a body do no harm, and two bodies at one start are separated, but no body
-      is added where no start is given.
+      is added without a start.
     - `noise`, `mask`: as in `jeit.inverse.reconstruct`.
     - `prior`: default `StarPrior()` for sheets, `EllipsoidPrior()` for solids.
     - `least_rise`: a body is a ghost if the objective without it rises by less than this factor, or if the evidence
@@ -160,8 +161,8 @@ def reconstruct_shapes(
     Raises `ValueError` for invalid or inconsistent arguments, and if `smooth` is not an image of the same channels with
     a smooth prior.
 
-    Kolehmainen, Arridge, Lionheart, Vauhkonen and Kaipio, Inverse Problems 15 (1999) 1375, boundaries by Fourier
-    coefficients; the choice of bodies by evidence is jeit's own.
+    Kolehmainen, Arridge, Lionheart, Vauhkonen and Kaipio, Inverse Problems 15 (1999) 1375, describe boundaries by
+    Fourier coefficients; the choice of bodies by evidence is jeit's own.
 
     **Example:**
 
@@ -222,7 +223,7 @@ def reconstruct_shapes(
     if accuracy is not None:
         report("bodies, how large and how strong")
         exact_data = independent_data(model, measured, used, accuracy.noise, at_once=True)[1]
-        mesh_correction = setting.bodies_problem.data.voltages - data.voltages  # by the finer mesh
+        mesh_correction = setting.bodies_problem.data.voltages - data.voltages  # due to the finer mesh
         exact_data = eqx.tree_at(lambda data: data.voltages, exact_data, exact_data.voltages + mesh_correction)
         unmodelled = unmodelled_deviations(problem, fitted, free_fit)
         quantities = with_quantities(setting.weighted(exact_data).problem(level), fitted, accuracy, unmodelled, order)
@@ -266,7 +267,8 @@ def _grow_bodies(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int
 
 
 class _FitSetting(NamedTuple):
-    """Setting in which bodies are fitted: the problem of bodies without a smooth field, and the field or None."""
+    """Setting in which bodies are fitted: the problem of bodies without a smooth field, and the smooth field, or None
+    if there is none."""
 
     bodies_problem: ShapeProblem
     smooth_field: SmoothField | None
@@ -292,7 +294,7 @@ class _FitSetting(NamedTuple):
         return _FitSetting(bodies_problem, smooth_field)
 
     def fit_level(self, bodies: Bodies, coefficients, level: float, steps: int) -> tuple[float, Fit, float]:
-        """Alternate between fitting the bodies and lowering the smooth field's level, until the level is the likeliest.
+        """Alternate between fitting the bodies and lowering the smooth field's level, until no lower level is likelier.
 
         Returns the level, the fit of the bodies and -log evidence. The level decreases from `level`, because bodies
         fitted with too low a level would be distorted to explain changes that belong to the field.
@@ -307,10 +309,11 @@ class _FitSetting(NamedTuple):
 
 
 def _add_bodies(setting: _FitSetting, bodies: Bodies, coefficients, num_sure: int = 0) -> tuple[float, Fit, list[int]]:
-    """Add bodies in their order to a smooth field, and keep each body that the data support besides the earlier bodies.
+    """Add bodies one by one to a smooth field, and retain each body that the data support in addition to earlier ones.
 
-    Returns the level of the field, the fit, and the indices of the bodies kept. The first `num_sure` bodies are beyond
-    doubt and are fitted together, because either of two bodies fitted alone would settle between both.
+    Returns the level of the field, the fit, and the indices of the retained bodies. The first `num_sure` bodies are
+    beyond doubt and are fitted together, because one of two bodies, fitted alone, would move to a place between the
+    two.
     """
     rows = bodies.rows(coefficients)
     supported, num_refused = list(range(num_sure)), 0
@@ -335,7 +338,8 @@ class _SearchResult(NamedTuple):
 
 
 class _SearchState(NamedTuple):
-    """State of the search: the bodies `found` in a `setting`, with the smooth field at its `level`."""
+    """State of the search: result `found` of fitting the bodies in a `setting`, with the smooth field at its
+    `level`."""
 
     setting: _FitSetting
     level: float
@@ -347,7 +351,8 @@ def _refine_meshes(
 ) -> tuple[_SearchState, FinerModel | None]:
     """Fit the bodies on meshes refined at their surfaces, until the surfaces stay within the refined cells.
 
-    Ghosts due to the coarse mesh are removed. Returns the state and the last refined problem, or None.
+    Ghosts due to the coarse mesh are removed. Returns the state and the last refined problem, which is None if there
+    are no bodies.
     """
     from jeit.inverse.shapes.finer import refine_at_surfaces
 
@@ -393,15 +398,15 @@ def _remove_unsupported(
     least_rise: float,
     min_costs: Float[np.ndarray, " k"] | None = None,
 ) -> _SearchResult:
-    """Remove bodies without which the others, fitted again, explain the data about as well, one at a time, starting
-    with the body whose absence raises the cost least.
+    """Remove, one at a time, bodies without which the other bodies, fitted again, explain the data about as well. The
+    body whose absence raises the cost least is removed first.
 
     `min_costs`: lower limit of the cost without each body, if known.
     """
     doubtful, costs = list(doubtful), np.zeros(len(fitted.bodies.sign)) if min_costs is None else min_costs.copy()
     while True:
         bodies, coefficients, cost, _ = fitted
-        # After a ghost is removed, leaving out another body raises the cost at least as much as before, so costs
+        # After a ghost is removed, leaving out a further body raises the cost at least as much as before, so costs
         # computed earlier are lower limits.
         certain_cost = max(_CERTAIN_RISE * cost, problem.surprise(fitted) + _MIN_EVIDENCE_GAIN)
         uncertain, fits = np.flatnonzero(costs <= certain_cost).tolist(), {}
@@ -417,7 +422,7 @@ def _remove_unsupported(
 
 
 def _split_bodies(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
-    """Fit of the bodies with one body split in two; None if the data support no split."""
+    """Fit the bodies with one body split in two; None if the data support no split."""
     bodies, coefficients, cost, _ = fitted
     starts = [
         _grow_bodies(problem, *bodies.split(k, coefficients, number), _TRIAL_STEPS)
@@ -429,8 +434,8 @@ def _split_bodies(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit 
 
 
 def _alternative_fits(problem: ShapeProblem, fitted: Fit) -> Fit | None:
-    """Fit of the bodies with one or all of them changed to the other kind (weak star or column); None if the data
-    support no change."""
+    """Fit the bodies with one or all of them changed to the other kind (weak star or column); None if the data support
+    no change."""
     first_kind = np.flatnonzero(~fitted.bodies.is_other_kind & (not fitted.bodies.prior.is_of_one_kind))
     groups = [[k] for k in first_kind] + [first_kind] * (len(first_kind) > 1)
     change = _best_fit(problem, fitted, [fitted.bodies.with_other_kind(group, fitted.coefficients) for group in groups])
@@ -438,7 +443,7 @@ def _alternative_fits(problem: ShapeProblem, fitted: Fit) -> Fit | None:
 
 
 def _with_common_contrast(problem: ShapeProblem, fitted: Fit) -> Fit:
-    """The ellipsoids with one material for all bodies of a sign, where this is likelier than a material for each."""
+    """Fit one material for all ellipsoids of a sign, if this is likelier than a material for each ellipsoid."""
     for sign in (1, -1):
         bodies = fitted.bodies
         if isinstance(bodies, Ellipsoids) and ((bodies.sign == sign) & ~bodies.same_material).sum() > 1:

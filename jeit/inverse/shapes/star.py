@@ -86,7 +86,7 @@ class StarPrior(BodyPrior):
 
 
 class Star(Module):
-    """Body with a star-shaped outline, found in a sheet.
+    """Body with a star-shaped outline in a sheet.
 
     **Fields**: `sign`: +1 if more conductive than the bath, -1 if less; `centre` (2,): centre of the star, metres;
     `outline` (k, 2): points of the outline, metres, counter-clockwise; `contrast`: contrast in log σ, without its sign;
@@ -123,13 +123,13 @@ class Star(Module):
 
     @property
     def contrast_is_determined(self) -> bool:
-        """Whether the data determine the contrast: no end of the contrast's interval is open or, without an interval,
-        the body is weak."""
+        """Whether the data determine the contrast: both limits of the contrast's interval are determined or, without an
+        interval, the body is weak."""
         return self.weak if self.quantities is None else None not in self.quantities.change_interval
 
     def with_quantities(self, known: Quantities) -> Star:
-        """Copy of the body with the quantities `known`. Area and contrast become the medians, but the fitted outline is
-        kept if the data leave open how small a strong body is."""
+        """Copy of the body with the quantities `known`. Area and contrast become the medians, but the fitted outline
+        does not change if the data do not determine how small a strong body is."""
         scale = 1.0 if known.measure_interval[0] is None else np.sqrt(known.measure / max(self.area, TINY))
         outline = self.centroid + (self.outline - self.centroid) * scale
         return replace(self, outline=outline, contrast=float(np.abs(np.log1p(known.change))), quantities=known)
@@ -208,8 +208,8 @@ class Stars(Bodies):
         return 2
 
     def with_other_kind(self, indices, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
-        """The stars, of which those of `indices` are made weak and enlarged to keep their effect on the electric field;
-        and the coefficients of the stars."""
+        """Make the stars of `indices` weak, and enlarge them so that their effect on the electric field stays the same.
+        Returns all stars and their coefficients."""
         rows, is_weak = self.rows(coefficients), self.is_other_kind.copy()
         for k in indices:
             strength = np.tanh(self.contrast(k, rows[k])[0] / 2) / np.tanh(self.prior.weak_contrast / 2)

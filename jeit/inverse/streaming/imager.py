@@ -1,9 +1,9 @@
 """Imaging of successive frames in bounded time (`Imager`): linear, or by Gauss-Newton steps from the last image.
 
-Everything that does not depend on the frame is computed once: the independent channels, the prior's basis, the
-hyperparameter, the integrals over electrodes, the matrix of linear images, and the few dozen combinations of the
-prior's shapes that the data can resolve. Shapes of arrays never change, so nothing is compiled again: a masked channel
-keeps its place but gets a variance so large that the channel has no effect.
+Everything that does not depend on the frame is computed once, in advance: independent channels, the prior's basis, the
+hyperparameter, integrals over electrodes, the matrix of linear images, and the few dozen combinations of the prior's
+shapes (columns of its basis) that the data can resolve. The sizes of arrays never change, so nothing is compiled again:
+a masked channel remains in the arrays, with a variance so large that the channel has no effect.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class FrameEstimate(Module):
 
     **Fields**: `conductivity` (m,): S/m (2-D: S); `coefficients` (n,): coefficients of the image, from which the next
     frame may start; `misfit`: root mean square of predicted - measured voltages over the channels used, in standard
-    deviations; `iterations`: number of iterations; `converged`: whether another step would have changed the objective
+    deviations; `iterations`: number of iterations; `converged`: whether the next step would have changed the objective
     by less than the tolerance.
     """
 
@@ -83,10 +83,11 @@ class Imager(Module):
 
     **Fields**: `channels`: independent channels; `inversion`: the least squares problem, whose data are replaced for
     every frame; `noise` (M,): standard deviation of the channels, volts; `mask` (M,): True for channels that are used;
-    `expected` (M,): voltages of an undisturbed frame; `offset` (M,): voltages of the undisturbed body predicted by the
-    model minus those measured, added to frames; `touching` (L, M): True for channels that drive or read each electrode;
-    `tied`: pairs (P, 2) of reciprocal channels, and the ratio (P,) of the second voltage to the first; `solver`: solver
-    with its settings; `persistence`: fraction of the last image that is expected in the next one, 0 without a memory.
+    `expected` (M,): voltages of an undisturbed frame; `offset` (M,): predicted minus measured voltages of the
+    undisturbed body, which are added to every frame; `touching` (L, M): True for channels that drive or read each
+    electrode; `tied`: pairs (P, 2) of reciprocal channels, and the ratio (P,) of the second voltage to the first;
+    `solver`: solver with its settings; `persistence`: fraction of the last image that is expected in the next one, 0
+    without a memory.
 
     **Example:**
 
@@ -142,7 +143,7 @@ class Imager(Module):
         - `parametrisation`: link, regions and `informative` shapes of the images.
         - `memory`: number of frames over which images are correlated. The last image then predicts the next one (a
           steady-state Kalman filter for coefficients with covariance exp(-|t - t'| / memory) in time), which reduces
-          noise and delays changes by a part of the memory. With 0, every frame is imaged independently.
+          noise but delays changes by a fraction of the memory. With 0, every frame is imaged independently.
 
         Other arguments are as in `reconstruct`. Raises `ValueError` for invalid or inconsistent arguments.
 
@@ -195,12 +196,12 @@ class Imager(Module):
         )
 
     def with_reference(self, reference: Float[Array | np.ndarray, " M"]) -> "Imager":
-        """Copy of the imager with another reference frame (M,) of the undisturbed body, volts, for example after
+        """Copy of the imager with a new reference frame (M,) of the undisturbed body, volts, for example after
         electrodes were wetted.
 
-        Model, noise, hyperparameter and the channels in use stay, so nothing is compiled again. Raises `ValueError` for
-        a reference of another shape, without a reading of a channel in use, or different from the model's voltages by a
-        factor of ten or in sign.
+        Model, noise, hyperparameter and the channels in use do not change, so nothing is compiled again. Raises
+        `ValueError` for a reference that has the wrong shape, lacks a reading of a channel in use, or differs from the
+        model's voltages by a factor of ten or in sign.
         """
         frame, used = np.asarray(reference, float), np.asarray(self.mask)
         if frame.shape != used.shape:
@@ -240,7 +241,7 @@ class Imager(Module):
         """Image of a frame (M,) in volts, computed by at most `steps` iterations from the coefficients `start`.
 
         With a memory, `start` is also the prior mean, `persistence` times the last image's coefficients. Unused
-        channels must hold finite voltages, preferably those of the last frame.
+        channels must have finite voltages, preferably those of the last frame.
         """
         return _estimate_frame(self, frame, weighing, start)
 
@@ -295,7 +296,7 @@ def _estimate_frame(imager: Imager, frame, weighing: Weighing, start) -> FrameEs
     data = weighing.combine(frame + imager.offset)
     inversion = eqx.tree_at(lambda inverse_problem: inverse_problem.data, imager.inversion, data)
     expected = jnp.zeros_like(start)
-    if imager.persistence > 0:  # the prior mean moves, and the coefficients are relative to it
+    if imager.persistence > 0:  # the prior mean follows the last image, and the coefficients are relative to this mean
         expected, start = start, expected
         inversion = eqx.tree_at(
             lambda inverse_problem: inverse_problem.reference, inversion, inversion.estimate(expected)

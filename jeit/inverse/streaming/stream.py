@@ -18,7 +18,7 @@ from jeit.inverse.streaming.imager import Imager
 from jeit_solvers import Status
 from jeit_solvers.module import Module
 
-# Relative difference from an undisturbed frame above which a frame is faulty or from another sensor.
+# Relative difference from an undisturbed frame above which a frame is faulty or from a different sensor.
 _LARGEST_DIFFERENCE = 0.5
 # Relative difference from an undisturbed frame above which a frame is checked for dead electrodes and saturation. An
 # electrode is dead if at most `_MAX_REMAINING_SHARE` of the difference is left without the electrode's channels, and if
@@ -27,11 +27,11 @@ _SUSPECT_FACTOR, _MAX_REMAINING_SHARE, _MIN_DEAD_CHANGE = 0.15, 0.5, 0.5
 # Minimum number of channels with valid readings, as a fraction of the channels in use.
 _MIN_CHANNELS = 0.5
 # Minimum number of channels with equal readings, above or below all others, that count as saturated; relative
-# difference within which their undisturbed voltages count as equal.
+# difference within which the undisturbed voltages of these channels count as equal.
 _MIN_SATURATED, _EQUAL_EXPECTED = 3, 1e-6
-# A frame differs from an undisturbed one by more than noise if the correlation of the changes of reciprocal channels
-# exceeds that of independent noise. Threshold in standard deviations; minimum number of pairs; relative change of a
-# frame below which it counts as equal to the undisturbed one.
+# A frame differs from an undisturbed frame by more than noise if the correlation of the changes of reciprocal channels
+# exceeds that of independent noise. Threshold in standard deviations; minimum number of pairs; relative change below
+# which a frame counts as equal to an undisturbed frame.
 _CORRELATION_THRESHOLD, _MIN_PAIRS, _EQUAL_TOLERANCE = 3.0, 10, 1e-12
 
 
@@ -62,8 +62,8 @@ class FrameCheck:
 
     `mask` (M,): True for channels that are used. `expected` (M,): voltages of an undisturbed frame. `touching` (L, M):
     True for channels that drive or read each electrode. `tied`: pairs (P, 2) of reciprocal channels, and the ratio (P,)
-    of the second voltage to the first. `noise` (M,): standard deviation of the channels, volts or relative to each
-    other.
+    of the second voltage to the first. `noise` (M,): standard deviation of the channels, in volts, or up to a common
+    factor.
     """
 
     def __init__(
@@ -160,8 +160,8 @@ class FrameCheck:
         return values, usable, FrameStatus.IMAGED, ""
 
     def _remove_dead_electrode(self, difference, usable):
-        """Return the usable channels without those of a dead electrode, and a sentence that names the electrode; if no
-        electrode is dead, all usable channels and an empty string."""
+        """Return the usable channels without the channels of a dead electrode, and a sentence that names the electrode.
+        If no electrode is dead, return all usable channels and an empty string."""
         total_change = np.linalg.norm(difference)
         remaining_changes = np.array([np.linalg.norm(difference[usable & ~touching]) for touching in self.touching])
         # An electrode whose removal leaves too few channels, such as a common reference, cannot be left out.
@@ -264,11 +264,11 @@ def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     """Yield the image of each frame as soon as the frame arrives.
 
     Iterative methods start from the last image; an imager with a memory also uses the last image as prior mean.
-    Everything is compiled before the first frame is requested. A frame is refused, and the stream continues, if it has
-    another number of channels, is not real, has fewer than half of the channels usable, reads zero everywhere (the
-    current source has failed), or differs from an undisturbed frame by more than half of the undisturbed voltages.
-    Channels of a dead electrode and saturated channels are left out and named in `reason`. A frame that differs from an
-    undisturbed frame by noise only is imaged with status "unchanged".
+    Everything is compiled before the first frame is requested. A frame is refused, and the stream continues, if the
+    frame has the wrong number of channels, is not real, has fewer than half of the channels usable, reads zero
+    everywhere (the current source has failed), or differs from an undisturbed frame by more than half of the
+    undisturbed voltages. Channels of a dead electrode and saturated channels are left out and named in `reason`. A
+    frame that differs from an undisturbed frame by noise only is imaged with status "unchanged".
 
     **Arguments:**
 
