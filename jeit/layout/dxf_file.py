@@ -16,7 +16,7 @@ from jeit.layout.csv_file import MOST_BYTES
 from jeit.layout.layout import Layout
 from jeit.mesh import Disk, Domain, Polygon
 
-# Texts of the error message if the extra `cad` is missing: the task that needs it, and the formats that do not.
+# Parts of the error message if the extra `cad` is missing: what needs `cad`, and which formats do not need it.
 _EXTRA_TEXTS = ("a DXF drawing", "CSV and SVG files need nothing more.")
 _OUTLINE_LAYER, _ELECTRODE_LAYER, _LABEL_LAYER = "OUTLINE", "ELECTRODES", "LABELS"
 # AutoCAD's colour numbers: laser cutters distinguish lines to cut from lines to engrave by their colour.

@@ -182,10 +182,10 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
     tetrahedra.
 
     With n nodes in the plane mesh, node k · n + i is node i of the plane mesh at the height z = k · thickness /
-    num_layers, or at the k-th of `heights`. Tags: 'bottom' (z = 0), 'top' (z = thickness), 'side', and the tags of the
-    plane mesh for the parts of the side above its edges; tags 'bottom' and 'top' of the plane mesh are renamed to
-    'front' and 'back'. Every side face of a prism is divided along the diagonal that rises from its lower-numbered to
-    its higher-numbered node, so that the tetrahedra of neighbouring prisms match.
+    num_layers, or at the k-th of `heights`. Tags: 'bottom' (z = 0), 'top' (z = thickness) and 'side'.
+    Each tag of an edge of the plane mesh is also the tag of the part of the side above this edge; its tags 'bottom' and
+    'top' are renamed to 'front' and 'back'. Every side face of a prism is divided along the diagonal that rises from
+    its lower-numbered to its higher-numbered node, so that the tetrahedra of neighbouring prisms match.
 
     **Arguments:**
 

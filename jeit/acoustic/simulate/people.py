@@ -29,7 +29,7 @@ from jeit.arguments.checks import check_positive
 from jeit_solvers.module import Module
 
 # Standard deviation of the logarithm of a trait between the clips of one person; and standard deviation of the trait
-# `slope` itself between people. Between the clips of one person, `slope` varies half as much.
+# `slope` itself between people. The standard deviation of `slope` between the clips of one person is half as large.
 WITHIN_PERSON_SPREAD, SLOPE_SPREAD = 0.25, 0.3
 
 
@@ -255,9 +255,9 @@ _ROOM_LEVEL, _ROOM_SPREAD = -6.0, 4.0
 class SoundClip:
     """Simulated recording of one touch by one person.
 
-    **Fields**: `touch`: sound of the touch without noise, with the true source; `noise`: noise (M, S) of the
-    microphones and the room; `modality`: name of the kind of touch; `person`: index of the person. The property
-    `samples` is the recorded sound.
+    **Fields**: `touch`: noiseless sound of the touch, which also holds the true position of the source; `noise`: noise
+    (M, S) of the microphones and the room; `modality`: name of the kind of touch; `person`: index of the person. The
+    property `samples` is the recorded sound.
     """
 
     touch: SimulatedSound

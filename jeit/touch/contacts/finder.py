@@ -1,5 +1,5 @@
-"""Common interface of finders of contacts, and the noise of images, which contacts must exceed: standard deviations and
-covariance of the cells."""
+"""Common interface of finders of contacts, and the noise of images: standard deviations and covariance of the cells.
+A contact must exceed this noise."""
 
 from abc import abstractmethod
 

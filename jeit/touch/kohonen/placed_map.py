@@ -206,7 +206,7 @@ class PlacedMap:
 
 
 class _PlacedNeurons(NamedTuple):
-    """The neurons of a map that have a place, as a map of one row.
+    """Those neurons of a map to which a place on the skin is assigned, as a map of one row.
 
     `places` (neurons, coordinates): the neurons' places for estimates, metres; `grid_neighbours` (neurons, neighbours):
     indices of the neurons around each neuron on the grid.

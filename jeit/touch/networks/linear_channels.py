@@ -188,7 +188,7 @@ def strength(depth):
     The effect of a patch of lower conductivity is more than proportional to the change of its conductivity, since
     current flows around the patch. In two dimensions, patches with e^s and e^−s times the conductivity change voltages
     oppositely, to first order in their size (Keller's duality). The strength 2 sinh(s / 2), with log(1 − δ) = −s,
-    changes its sign with s, as these changes do.
+    changes its sign with s, as the changes of the voltages do.
     """
     clipped_depth = jnp.clip(depth, 0.0, _MAX_DEPTH)
     return clipped_depth / jnp.sqrt(1 - clipped_depth) + (depth - clipped_depth)
