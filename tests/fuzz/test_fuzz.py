@@ -43,7 +43,7 @@ def test_no_further_input_causes_a_fault(name):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_commands_fail_with_one_line(name):
-    assert faults(name, range(20)) == []
+    assert faults(name, range(10)) == []
 
 
 def test_an_input_is_reproduced_by_its_number():
