@@ -16,7 +16,7 @@ import numpy as np
 
 from jeit import protocol as protocols
 from jeit.arguments import listed
-from jeit.data.described_body import located
+from jeit.data.described_body import error_with_location
 from jeit.files import check_electrodes, check_memory, matlab, npz_arrays
 from jeit.protocol import Protocol, from_matrices, measurement_patterns
 
@@ -53,7 +53,7 @@ def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: P
             return _optimal(table, origin)
         return _construct(table, num_electrodes, path, origin)
     except ValueError as error:
-        raise located(error, origin, "protocol") from None
+        raise error_with_location(error, origin, "protocol") from None
 
 
 # Options of protocols that a description may omit, and their possible values; the constructor's default is first.
@@ -61,7 +61,7 @@ _OPTION_VALUES = {"driven_electrodes": (False, True), "order": ("rotating", "fix
          "drives": ("distinct", "all")}  # fmt: skip
 
 
-def variants(table: ProtocolTable) -> list[tuple[ProtocolTable, str]]:
+def protocol_table_variants(table: ProtocolTable) -> list[tuple[ProtocolTable, str]]:
     """Return `table`, then copies of it with different values of the options that `table` does not state. Each table is
     paired with the text that states these options in a description."""
     fields = type(table).model_fields

@@ -71,7 +71,7 @@ def _mean_frame_error(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) ->
     return np.inf if error is None else error
 
 
-def driven_zeros(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> Bool[np.ndarray, " M"]:
+def unmeasured_driven_channels(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> Bool[np.ndarray, " M"]:
     """Mask (channels,) of the channels on driven electrodes that are zero in every frame, i.e. were not measured."""
     shared = shares_electrode(np.asarray(protocol.drive), np.asarray(protocol.measurement))
     driven = shared[np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)]

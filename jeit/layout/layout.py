@@ -38,7 +38,7 @@ def check_labels(labels: Sequence[str] | None, num_electrodes: int) -> tuple[str
 
 # Minimum and maximum size of a skin: outside this range, lengths are probably in millimetres, or have been divided by
 # 1000 twice.
-SMALLEST, LARGEST = 1e-3, 5.0  # m
+MIN_SKIN_SIZE, MAX_SKIN_SIZE = 1e-3, 5.0  # m
 # Tolerance for discs that overlap or extend beyond the outline, since lengths are rounded to decimal millimetres in
 # files.
 _ROUNDING = 1e-9  # m
@@ -177,7 +177,7 @@ def check_discs_fit(
     index = int(clearances.argmin())
     if clearances[index] < -_ROUNDING:
         hint = ""
-        if (np.abs(centres) > LARGEST).any() and bool((outline.signed_distance(centres / 1000) > 0).all()):
+        if (np.abs(centres) > MAX_SKIN_SIZE).any() and bool((outline.signed_distance(centres / 1000) > 0).all()):
             hint = " Are they in millimetres? Divide by 1000."
         elif diameters[index] > size:
             hint = " Is its diameter in metres?"
@@ -191,7 +191,7 @@ def check_discs_fit(
 
 def check_size(size: float) -> None:
     """Raise `ValueError` for an implausible `size` of a skin, metres."""
-    if not SMALLEST - _ROUNDING <= size <= LARGEST + _ROUNDING:
+    if not MIN_SKIN_SIZE - _ROUNDING <= size <= MAX_SKIN_SIZE + _ROUNDING:
         raise ValueError(
             f"centres: the skin would be {_length_text(size)} across; are millimetres taken for metres, or metres for "
             "millimetres? Lengths differ by a factor of 1000."
@@ -199,7 +199,7 @@ def check_size(size: float) -> None:
 
 
 def _length_text(length: float) -> str:
-    return f"{length:.3g} m" if length > LARGEST else f"{1e3 * length:.3g} mm"
+    return f"{length:.3g} m" if length > MAX_SKIN_SIZE else f"{1e3 * length:.3g} mm"
 
 
 def bounds(centres: np.ndarray, diameters: np.ndarray) -> tuple[float, float, float, float]:

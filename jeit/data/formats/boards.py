@@ -77,9 +77,13 @@ class Cn0565:
         """
         _check_no_key(path, key)
         values, notes = cls.numbers(path)
-        lender = _lender(path, description, like)
-        sensor_description = description_of(path, description) if lender is None else description_like(lender)
-        protocol, protocol_notes = cls._protocol(path, sensor_description, values.shape[1], lender)
+        described_measurement = _measurement_with_description(path, description, like)
+        sensor_description = (
+            description_of(path, description)
+            if described_measurement is None
+            else description_like(described_measurement)
+        )
+        protocol, protocol_notes = cls._protocol(path, sensor_description, values.shape[1], described_measurement)
         sensor_description = replace(sensor_description, protocol_section=None)
         measurement = measurement_of(
             path, Recording(values, protocol, notes=(*cls._SCALE_NOTES, *protocol_notes, *notes)), sensor_description
@@ -226,8 +230,12 @@ class OpenEit:
         """
         _check_no_key(path, key)
         values, notes = cls.numbers(path)
-        lender = _lender(path, description, like)
-        sensor_description = description_of(path, description) if lender is None else description_like(lender)
+        described_measurement = _measurement_with_description(path, description, like)
+        sensor_description = (
+            description_of(path, description)
+            if described_measurement is None
+            else description_like(described_measurement)
+        )
         table = {**cls._PROTOCOL_TABLES[values.shape[1]], "current": _ASSUMED_CURRENT}
         protocol = parse_description({"protocol": table}, path.name).protocol(path)
         assert protocol is not None
@@ -322,10 +330,10 @@ class OpenEit:
             cells = [cell for cell in cells if cell]
             while cells and not cells[-1][0][:1].isdigit():
                 cells.pop()
-            yield array("d", (cls._cell_value(cell, is_last=cell is cells[-1]) for cell in cells))
+            yield array("d", (cls._parse_table_cell(cell, is_last=cell is cells[-1]) for cell in cells))
 
     @classmethod
-    def _cell_value(cls, words: list[bytes], *, is_last: bool) -> float:
+    def _parse_table_cell(cls, words: list[bytes], *, is_last: bool) -> float:
         """The number in a cell of `words`, NaN if the cell is not a number; words may follow the last number of a
         frame."""
         is_number = cls._NUMBER.fullmatch(words[0]) and (is_last or len(words) == 1)
@@ -343,7 +351,9 @@ def _check_no_key(path: Path, key: str | None) -> None:
         raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
 
 
-def _lender(path: Path, description: str | Path | None, like: Measurement | None) -> Measurement | None:
+def _measurement_with_description(
+    path: Path, description: str | Path | None, like: Measurement | None
+) -> Measurement | None:
     """The measurement whose description is used for a file: `like` if no description is specified and none lies beside
     the file, otherwise None."""
     return like if description is None and find_description(path) is None else None

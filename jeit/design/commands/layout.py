@@ -75,7 +75,7 @@ _COMPARED_QUANTITIES = (
 
 
 @layout.callback(invoke_without_command=True)
-def _top(context: typer.Context) -> None:
+def _print_help(context: typer.Context) -> None:
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 
@@ -87,12 +87,12 @@ def _read_with_outline(name: str, width: float, height: float) -> "Layout":
     Raises `ValueError` for a layout with fewer than three electrodes.
     """
     from jeit.layout import named_layout, read_layout
-    from jeit.layout.layout import LARGEST, SMALLEST
+    from jeit.layout.layout import MAX_SKIN_SIZE, MIN_SKIN_SIZE
     from jeit.mesh import Rectangle
 
     def outline_from_options() -> Rectangle:
         for option, side in (("--width-mm", width), ("--height-mm", height)):
-            check_within(option, side, 1e3 * SMALLEST, 1e3 * LARGEST, "mm")
+            check_within(option, side, 1e3 * MIN_SKIN_SIZE, 1e3 * MAX_SKIN_SIZE, "mm")
         return Rectangle(1e-3 * width, 1e-3 * height)
 
     with naming_options({"name": "layout", "path": "layout"}):

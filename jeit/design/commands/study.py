@@ -27,7 +27,7 @@ Scheduler = Annotated[
 
 
 @study.callback(invoke_without_command=True)
-def _top(context: typer.Context) -> None:
+def _print_help(context: typer.Context) -> None:
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 

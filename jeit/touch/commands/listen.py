@@ -44,7 +44,7 @@ listen = typer.Typer(
 
 
 @listen.callback(invoke_without_command=True)
-def _top(context: typer.Context) -> None:
+def _print_help(context: typer.Context) -> None:
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 

@@ -180,7 +180,7 @@ learn = typer.Typer(name="learn", help="Train networks on simulated touches of a
 
 
 @learn.callback(invoke_without_command=True)
-def _top(context: typer.Context) -> None:
+def _print_help(context: typer.Context) -> None:
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 
