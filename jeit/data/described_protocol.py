@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jeit import protocol as protocols
-from jeit.arguments import listed
+from jeit.arguments import names_text
 from jeit.data.described_body import error_with_location
 from jeit.files import check_electrodes, check_memory, matlab, npz_arrays
 from jeit.protocol import Protocol, from_matrices, measurement_patterns
@@ -231,7 +231,9 @@ def _read_matrices(path: Path, keys: tuple[str, ...]) -> list[np.ndarray]:
     arrays = npz_arrays(path, *keys)
     missing_keys = [key for key in keys if key not in arrays]
     if missing_keys:
-        raise ValueError(f"{path.name}: there is no array '{missing_keys[0][:60]}'; the file has {listed(arrays[''])}.")
+        raise ValueError(
+            f"{path.name}: there is no array '{missing_keys[0][:60]}'; the file has {names_text(arrays[''])}."
+        )
     return [arrays[key] for key in keys]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
-from jeit.arguments import readings
+from jeit.arguments import measurable_values
 from jeit.data.measurement import Measurement
 from jeit.data.quality import order_note
 from jeit.electrodes import AbstractElectrodes
@@ -81,7 +81,7 @@ def screen(
         if given_mask.dtype != bool:
             raise ValueError(f"mask is {given_mask.dtype}; give booleans, True where a voltage is usable.")
         exclude(~given_mask, "excluded by the mask given.")
-    values = readings(values)
+    values = measurable_values(values)
     exclude(np.isnan(values), "NaN, infinite or beyond any instrument (an electrode missing or not connected).")
     is_dead = ~np.any(np.where(usable, values, 0) != 0, axis=1)
     if is_dead.all():

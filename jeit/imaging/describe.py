@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jeit.arguments import counted, did_you_mean, listed, percent
+from jeit.arguments import counted, did_you_mean, names_text, percent
 from jeit.data import Measurement, read
 from jeit.data.description import Description, TableLayout, parse_description
 from jeit.data.exchange import assignments
@@ -181,7 +181,7 @@ def find_description(
     candidates = list(_fitting(numbers, base_numbers, geometry, electrodes, known or {}, current))
     if not candidates:
         counts = _channel_counts(known or {})
-        count_text = f" (of what is known: {listed(counts)})" if counts else ""
+        count_text = f" (of what is known: {names_text(counts)})" if counts else ""
         raise ValueError(
             f"{path.name}: no protocol of common kinds has as many channels{count_text} as there are numbers: "
             f"{numbers.shape}. Are there columns of other things? Otherwise write a description with your own "
@@ -298,11 +298,15 @@ def _array(path: Path, key: str | None, excluded: str | None) -> tuple[np.ndarra
     if name is None:
         tables = [item for item, shape in sizes.items() if item != excluded and int(np.prod(shape)) > 3]
         if len(tables) != 1:
-            names = listed([f"{item} ({' × '.join(map(str, sizes[item]))})" for item in tables]) if tables else "none"
+            names = (
+                names_text([f"{item} ({' × '.join(map(str, sizes[item]))})" for item in tables]) if tables else "none"
+            )
             raise ValueError(f"{path.name}: arrays of numbers are {names}. Name that of the frames by key=.")
         name = tables[0]
     if name not in sizes:
-        raise ValueError(f"key: {path.name} has no array {name!r}{did_you_mean(name, sizes)}; it has {listed(sizes)}.")
+        raise ValueError(
+            f"key: {path.name} has no array {name!r}{did_you_mean(name, sizes)}; it has {names_text(sizes)}."
+        )
     if path.suffix.lower() == ".npz":
         return np.atleast_2d(npz_arrays(path, name)[name]), axis
     table = matlab.numbers(matlab.load(path, name), name, path)

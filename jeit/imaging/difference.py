@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Array, Float, Inexact, UInt8
 
-from jeit.arguments import brief, page, percent, picture
+from jeit.arguments import object_html, object_text, percent, picture
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
 from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes
@@ -102,7 +102,7 @@ class ImagedDifference:
     num_frames: int = 1
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: (
                 f"ImagedDifference({self.measurement.name!r}, by {self.settings.method}: "
                 f"{len(self.inclusions)} inclusions in {self.mesh.num_cells} cells,\n"
@@ -116,7 +116,7 @@ class ImagedDifference:
         return picture(self)
 
     def _repr_html_(self) -> str | None:
-        return page(self)
+        return object_html(self)
 
     @property
     def lowest(self) -> float:

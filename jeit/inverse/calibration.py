@@ -13,7 +13,7 @@ import optimistix as optx
 import scipy
 from jaxtyping import Array, Bool, Float, Inexact, Int
 
-from jeit.arguments import brief, check_name, percent
+from jeit.arguments import check_name, object_text, percent
 from jeit.forward import ForwardModel
 from jeit.forward.changes import ContactSensitivity
 from jeit.forward.model import check_model, select_channels
@@ -159,7 +159,7 @@ class Calibration(Module):
     model_error: Any = None
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: (
                 f"Calibration({self.status}: conductivity {complex(self.conductivity).real:.3g}, "
                 f"misfit {percent(float(self.misfit))},\n  {type(self.model.electrodes).__name__}, {self.model.mesh!r})"

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, page, picture
+from jeit.arguments import object_html, object_text, picture
 from jeit.electrodes.discs import SheetDiscs
 from jeit.electrodes.electrodes import as_electrode_values, as_positions
 from jeit.mesh import Domain
@@ -73,7 +73,7 @@ class Layout(Module):
     name: str = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: f"Layout({self.name!r}: {len(self.centres)} electrodes)",
             self,
         )
@@ -82,7 +82,7 @@ class Layout(Module):
         return picture(self)
 
     def _repr_html_(self) -> str | None:
-        return page(self)
+        return object_html(self)
 
     def __init__(
         self,

@@ -14,7 +14,7 @@ from jaxtyping import Float, Inexact
 from jeit.arguments import counted, describe
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
-from jeit.files import need, npz_arrays
+from jeit.files import npz_arrays, require_arrays
 from jeit.image import Inclusion, Plane, SolidForm
 from jeit.mesh import Mesh
 from jeit.mesh.checks import size_checked
@@ -145,7 +145,7 @@ def read_image(path: str | Path) -> SavedImage:
                 raise ValueError(f"not an image that jeit wrote{_other_file_hint(path)}; {_REMEDY}.")
         arrays = npz_arrays(path, *_READ_ARRAYS)
         _check_kind(arrays)
-        need(arrays, *_REQUIRED_ARRAYS)
+        require_arrays(arrays, *_REQUIRED_ARRAYS)
         if arrays["points"].dtype.kind not in "fiu":
             raise ValueError(f"'points' is {describe(arrays['points'])}; real numbers are wanted, metres.")
         with size_checked():  # the command that wrote the file checked the size of the mesh
@@ -199,7 +199,7 @@ def _to_saved_image(mesh: Mesh, arrays: dict[str, np.ndarray]) -> SavedImage:
 def _read_electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShapes | None:
     if "electrode_corners" not in arrays:
         return None
-    need(arrays, "electrode_sizes", "electrode_numbers")
+    require_arrays(arrays, "electrode_sizes", "electrode_numbers")
     corners, sizes, numbers = (arrays[f"electrode_{name}"] for name in ("corners", "sizes", "numbers"))
     if corners.ndim != 2 or corners.shape[1] != mesh.points.shape[1] or corners.dtype.kind not in "fiu":
         raise ValueError("'electrode_corners' are no places in the mesh's space; write it again.")
@@ -217,7 +217,7 @@ def _read_electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShap
 def _read_inclusions(mesh: Mesh, arrays: dict[str, np.ndarray]) -> tuple[Inclusion, ...]:
     if "inclusion_centroids" not in arrays:
         return ()
-    need(arrays, "inclusion_sizes", "inclusion_peaks")
+    require_arrays(arrays, "inclusion_sizes", "inclusion_peaks")
     centroids, sizes, peaks = (arrays[f"inclusion_{name}"] for name in ("centroids", "sizes", "peaks"))
     num_inclusions = peaks.size
     if centroids.shape != (num_inclusions, mesh.points.shape[1]) or not sizes.shape == peaks.shape == (num_inclusions,):
@@ -234,7 +234,7 @@ def _read_inclusions(mesh: Mesh, arrays: dict[str, np.ndarray]) -> tuple[Inclusi
 def _read_forms(arrays: dict[str, np.ndarray], num_inclusions: int) -> list[SolidForm | None]:
     if "inclusion_axes" not in arrays:
         return [None] * num_inclusions
-    need(arrays, "inclusion_centres", "inclusion_columns")
+    require_arrays(arrays, "inclusion_centres", "inclusion_columns")
     centres, axes, columns = (arrays[f"inclusion_{name}"] for name in ("centres", "axes", "columns"))
     if not (
         centres.shape == (num_inclusions, 3)
@@ -305,13 +305,13 @@ def write_views(
 def drawn_values(image: SavedImage) -> tuple[np.ndarray, "ColourScale"]:
     """Values per cell to draw, and their colour scale: `departure` for iterative images, the real part of the change
     for complex images, otherwise the change of conductivity."""
-    from jeit.plot.axes import CHANGE, FACTOR, ColourScale
+    from jeit.plot.axes import CHANGE_SCALE, FACTOR_SCALE, ColourScale
 
     if image.departure is not None:
-        return image.departure, FACTOR
+        return image.departure, FACTOR_SCALE
     if np.iscomplexobj(image.change):
         return np.real(image.change), ColourScale(quantity="Change of conductivity σ")
-    return np.asarray(image.change), CHANGE
+    return np.asarray(image.change), CHANGE_SCALE
 
 
 def _draw_figures(image: SavedImage, camera, levels, planes, axis: str, slices: int) -> dict[str, "Figure"]:

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from jeit.arguments import counted, listed
+from jeit.arguments import counted, names_text
 from jeit.data.description import Description, parse_description
 from jeit.data.formats.recording import Recording, content_of, description_of, measurement_of
 from jeit.data.formats.table import description_like, find_description
@@ -114,7 +114,9 @@ class Cn0565:
             )
         num_electrodes = next((count for count in cls._ELECTRODE_COUNTS if count * (count - 3) == num_voltages), None)
         if num_electrodes is None:
-            usual_counts = listed([f"{count * (count - 3)} ({count} electrodes)" for count in cls._ELECTRODE_COUNTS])
+            usual_counts = names_text(
+                [f"{count * (count - 3)} ({count} electrodes)" for count in cls._ELECTRODE_COUNTS]
+            )
             raise ValueError(
                 f"{path.name}: {num_voltages} voltages in a frame; with force and sense distance 1 they are "
                 f"{usual_counts}. Give a description with [protocol]: {cls._DISTANCE_HINT}."
@@ -275,7 +277,7 @@ class OpenEit:
         if not frames:
             raise ValueError(f"{path.name}: no frame begins with 'magnitudes:', as those of an OpenEIT device do.")
         if frame_length not in cls._PROTOCOL_TABLES:
-            known_counts = listed(
+            known_counts = names_text(
                 [f"{channels} ({table['number']} electrodes)" for channels, table in cls._PROTOCOL_TABLES.items()]
             )
             raise ValueError(
@@ -371,4 +373,4 @@ def _cut_off_note(length: int) -> str:
 def _notes_on_damage(is_damaged: Bool[np.ndarray, " F"]) -> list[str]:
     """A note on the frames in which characters were lost; none without such frames."""
     frames = [str(frame_index) for frame_index in np.flatnonzero(is_damaged)]
-    return [f"characters are lost in frame{'s' * (len(frames) > 1)} {listed(frames)}: masked."] if frames else []
+    return [f"characters are lost in frame{'s' * (len(frames) > 1)} {names_text(frames)}: masked."] if frames else []

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Inexact
 
-from jeit.arguments import listed
+from jeit.arguments import names_text
 from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.description import Description, TableLayout, load_description
 from jeit.data.formats.text import (
@@ -290,7 +290,7 @@ def _voltages(arrays: dict[str, np.ndarray], layout: TableLayout, path: Path) ->
     keys = layout.keys if layout.keys and path.suffix.lower() == ".npz" else ("voltages",)
     missing_keys = [key for key in keys if key not in arrays]
     if missing_keys:
-        array_names = listed(sorted(arrays.get("", arrays)))
+        array_names = names_text(sorted(arrays.get("", arrays)))
         raise ValueError(
             f"{path.name}: there is no array '{missing_keys[0]}'; the file has {array_names}. Name the voltages with "
             "[data] keys in the description."

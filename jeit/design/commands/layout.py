@@ -194,7 +194,7 @@ def optimise(
 
 
 def _print_improvement(console, result: "ImprovedLayout") -> None:
-    from jeit.cli.console import pairs
+    from jeit.cli.console import name_value_table
     from jeit.design.reports import report_improved_layout
 
     report = report_improved_layout(result)
@@ -206,7 +206,7 @@ def _print_improvement(console, result: "ImprovedLayout") -> None:
         for name, factor, before, after in quantities
         if before is not None and after is not None
     ]
-    console.print(pairs(result.start.name, rows))
+    console.print(name_value_table(result.start.name, rows))
     console.print(f"  {report['status']}: {report['reason']}", soft_wrap=True)
     console.print(
         "  on a sheet that is touched everywhere, with all two-terminal pairs: 'jeit layout compare' computes figures "

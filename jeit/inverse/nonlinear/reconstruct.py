@@ -11,7 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, check_has_values
+from jeit.arguments import check_has_values, object_text
 from jeit.forward import ForwardModel
 from jeit.forward.model import channel_voltages, evaluate, fields_and_impedance_of, jacobian_blocks, voltages_of
 from jeit.forward.system import check_conductivity
@@ -67,7 +67,7 @@ class Reconstruction(Module):
     reason: str = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        return brief(
+        return object_text(
             lambda: (
                 f"Reconstruction({self.status}: {self.conductivity.shape[-1]} cells, "
                 f"{int(self.iterations)} iterations, "

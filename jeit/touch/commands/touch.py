@@ -166,7 +166,7 @@ def fit(
     Writes skin.skops, report.json and learning.png, a picture of the errors, to the folder SKIN.
     """
     from jeit.arguments.extras import need_extra
-    from jeit.cli.console import Steps, pairs, plain_console, say_written
+    from jeit.cli.console import Steps, name_value_table, plain_console, say_written
     from jeit.data import load_description
     from jeit.mesh import OwnMesh
     from jeit.touch import LearntSkin, read_presses
@@ -203,7 +203,7 @@ def fit(
     for name, standing in skin.standing.items():
         rows += [(f"{name}: method", standing.method), (f"{name}, held out", summary(name, standing))]
     console.print()
-    console.print(pairs(f"Learnt from {recorded_presses.name}", rows))
+    console.print(name_value_table(f"Learnt from {recorded_presses.name}", rows))
     _print_notes(console, skin.notes)
     say_written(console, output / "skin.skops", "report.json", "learning.png")
 
