@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from jeit.plot import Camera, ColourScale
 
-_REMEDY = "give the image.npz that jeit reconstruct writes"
+_VALID_FILE_HINT = "give the image.npz that jeit reconstruct writes"
 # Descriptions of files that are not images, with the suffixes of their names.
 _OTHER_FILES = {
     "a table of data, which is to be imaged first": (".csv", ".txt", ".mat", ".eit", ".get", ".npy"),
@@ -142,7 +142,7 @@ def read_image(path: str | Path) -> SavedImage:
     try:
         with path.open("rb") as file:
             if file.read(2) != b"PK":
-                raise ValueError(f"not an image that jeit wrote{_other_file_hint(path)}; {_REMEDY}.")
+                raise ValueError(f"not an image that jeit wrote{_other_file_hint(path)}; {_VALID_FILE_HINT}.")
         arrays = npz_arrays(path, *_READ_ARRAYS)
         _check_kind(arrays)
         require_arrays(arrays, *_REQUIRED_ARRAYS)
@@ -162,7 +162,7 @@ def _check_kind(arrays: dict[str, np.ndarray]) -> None:
         raise ValueError("it holds many frames; give the image.npz of one, of jeit reconstruct.")
     if not array_names & {*_REQUIRED_ARRAYS}:
         first_names = ", ".join(name[:40] for name in sorted(array_names)[:6])
-        raise ValueError(f"it holds {first_names or 'nothing'}, and no image; {_REMEDY}.")
+        raise ValueError(f"it holds {first_names or 'nothing'}, and no image; {_VALID_FILE_HINT}.")
 
 
 def _other_file_hint(path: Path) -> str:
