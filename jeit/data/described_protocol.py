@@ -50,7 +50,7 @@ def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: P
         if table.kind == "measured":
             return protocol_of_file(table, path)
         if table.kind == "optimal":
-            return _optimal(table, origin)
+            return _optimal_protocol(table, origin)
         return _construct(table, num_electrodes, path, origin)
     except ValueError as error:
         raise error_with_location(error, origin, "protocol") from None
@@ -102,7 +102,7 @@ def _construct(table: ConstructedTable, num_electrodes: int | None, path: Path, 
     return protocol if table.name is None else replace(protocol, name=table.name)
 
 
-def _optimal(table: OptimalTable, origin: str) -> Protocol:
+def _optimal_protocol(table: OptimalTable, origin: str) -> Protocol:
     num_electrodes = len(table.transfer)
     _check_size(num_electrodes, num_electrodes, num_electrodes, num_electrodes**2, origin)
     current = 1e-3 if table.current is None else table.current * _CURRENT_UNITS[table.current_unit]
@@ -216,7 +216,7 @@ def protocol_of_file(table: MeasuredTable, path: Path) -> Protocol:
     )
     check_memory(f"{path.name}: the protocol", 64 * len(drive) * len(measurement))
     # Currents measured by an instrument sum to zero only within measurement errors.
-    drive = _balanced(drive, table.drive_key, path) * _CURRENT_UNITS[table.current_unit]
+    drive = _subtract_mean_currents(drive, table.drive_key, path) * _CURRENT_UNITS[table.current_unit]
     measurement_name = table.measurement_key or table.measurement
     name = table.name or f"{len(drive)} measured currents, {measurement_name}, {drive.shape[1]} electrodes"
     return from_matrices(drive, measurement, name=name)
@@ -246,7 +246,7 @@ def _checked_matrix(values: np.ndarray, key: str, path: Path) -> np.ndarray:
     return values.astype(float)
 
 
-def _balanced(drive: np.ndarray, key: str, path: Path) -> np.ndarray:
+def _subtract_mean_currents(drive: np.ndarray, key: str, path: Path) -> np.ndarray:
     """Currents of each drive minus their mean over the electrodes; raises `ValueError` if a mean is not small."""
     net_currents, largest_currents = np.abs(drive.sum(axis=1)), np.abs(drive).max(axis=1)
     worst_index = int(np.argmax(net_currents - 0.05 * largest_currents))

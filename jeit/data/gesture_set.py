@@ -127,7 +127,7 @@ def read_frame_recording(path: str | Path, description: Description | None = Non
         seconds = next((_times(arrays[key], key, len(frames)) for key in _TIME_KEYS if key in arrays), seconds)
         reference = None
         if "reference" in arrays:
-            reference = _checked("reference", np.atleast_2d(arrays["reference"]) * layout.scale, frames.shape[1])
+            reference = _check_frames("reference", np.atleast_2d(arrays["reference"]) * layout.scale, frames.shape[1])
         elif "reference" in layout.frame_names and len(layout.frame_names) == len(frames):
             is_reference = np.array(layout.frame_names) == "reference"
             frames, reference = frames[~is_reference], frames[is_reference]
@@ -154,12 +154,12 @@ def _frames(values: np.ndarray, layout: TableLayout, name: str, num_channels: in
     frames = table.frames_from(values, layout, name)
     if np.iscomplexobj(frames):
         raise ValueError("frames are complex; choose a part with [data] component: real, imaginary or magnitude.")
-    return _checked(
+    return _check_frames(
         "frames", measurable_values(frames) * layout.scale, frames.shape[-1] if num_channels is None else num_channels
     )
 
 
-def _checked(name: str, values: np.ndarray, num_channels: int) -> Float[np.ndarray, "F M"]:
+def _check_frames(name: str, values: np.ndarray, num_channels: int) -> Float[np.ndarray, "F M"]:
     if values.dtype.kind not in "iuf" or values.ndim != 2 or values.shape[1] != num_channels:
         raise ValueError(f"{name} have shape {values.shape}; give one row for each frame, of {num_channels} channels.")
     if not len(values):

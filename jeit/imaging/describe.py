@@ -34,10 +34,10 @@ from jeit.protocol import Protocol
 
 # Minimum and maximum number of electrodes of the protocols that are tried; number of nodes of the mesh on which the
 # protocols are compared, for a sheet and for a solid.
-_FEWEST, _MOST, _NODES = 4, 64, {2: 700, 3: 4000}
+_MIN_ELECTRODES, _MAX_ELECTRODES, _NODES = 4, 64, {2: 700, 3: 4000}
 # Unexplained share of the empty body's voltages above which the best protocol is refused: in general; and if its kind
-# is known, or if the channels in another order would leave `_ORDERED` times that share unexplained.
-_HOPELESS, _HOPELESS_EVEN_SO, _ORDERED = 0.25, 0.5, 2.0
+# is known, or if the channels in another order would leave `_MIN_ORDER_RATIO` times that share unexplained.
+_MAX_UNEXPLAINED, _MAX_UNEXPLAINED_KNOWN, _MIN_ORDER_RATIO = 0.25, 0.5, 2.0
 # Maximum spread of the frames of an empty body; minimum number of channels for each electrode.
 _MAX_SPREAD, _MIN_CHANNELS = 0.2, 2
 # Maximum number of candidate protocols whose misfit is computed; ratio of a candidate's unexplained share to that of
@@ -91,7 +91,7 @@ class Candidate:
         √(1 - r²) would be unexplained on average, with r the squared mean of the voltages over their mean square."""
         values = np.asarray(self.measurement.voltages)[np.asarray(self.measurement.mask)]
         mean_ratio = abs(values.mean()) ** 2 / np.mean(np.abs(values) ** 2)
-        return bool(_ORDERED * self.unexplained < np.sqrt(1 - mean_ratio**2))
+        return bool(_MIN_ORDER_RATIO * self.unexplained < np.sqrt(1 - mean_ratio**2))
 
     @property
     def name(self) -> str:
@@ -115,7 +115,7 @@ class Findings:
     def fault(self) -> str:
         """Reason why the best protocol explains the file too poorly to be used; empty if it does not."""
         best = self.candidates[0]
-        limit = _HOPELESS_EVEN_SO if self.known or best.ordered else _HOPELESS
+        limit = _MAX_UNEXPLAINED_KNOWN if self.known or best.ordered else _MAX_UNEXPLAINED
         if best.unexplained < limit and best.spread < _MAX_SPREAD:
             return ""
         if best.spread >= _MAX_SPREAD:
@@ -172,8 +172,8 @@ def find_description(
     if not known and OpenEit.recognises(path):
         known = OpenEit.protocol_table(path)
     number = (known or {}).get("number")
-    if number is not None and not _FEWEST <= number <= _MOST:
-        raise ValueError(f"number must be from {_FEWEST} to {_MOST} electrodes; it is {number}.")
+    if number is not None and not _MIN_ELECTRODES <= number <= _MAX_ELECTRODES:
+        raise ValueError(f"number must be from {_MIN_ELECTRODES} to {_MAX_ELECTRODES} electrodes; it is {number}.")
     progress("read")
     numbers = _Numbers.read(path, keys[0], excluded=keys[1] if reference is None else None)
     base_numbers = numbers if reference is None and keys[1] is None else _Numbers.read(reference or path, keys[1])
@@ -333,7 +333,7 @@ def _fitting(
 ) -> Iterator[Candidate]:
     """Yield candidates whose number of channels fits both files; of equal protocols, only the first."""
     counts, found_protocols = set(numbers.sizes), set()
-    for number in [known["number"]] if "number" in known else range(_FEWEST, _MOST + 1):
+    for number in [known["number"]] if "number" in known else range(_MIN_ELECTRODES, _MAX_ELECTRODES + 1):
         if not any(number * (number - 4) / 4 <= count <= number**2 for count in counts):
             continue
         for table in _protocols(number):

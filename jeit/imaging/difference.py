@@ -34,7 +34,7 @@ from jeit.mesh import Domain, Mesh
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array
 
-_MIDDLE = 0.5
+_SEGMENTATION_LEVEL = 0.5
 # Minimum width of electrodes relative to their distance that raises no doubt; misfit of the reference above which it
 # may have been exchanged with the frame, and ratio of the frame's misfit to it below which this is likely.
 _MIN_RELATIVE_WIDTH, _MIN_SUSPICIOUS_MISFIT, _MAX_EXCHANGED_MISFIT = 0.005, 0.1, 0.5
@@ -186,7 +186,7 @@ class ImagedDifference:
     def level(self) -> float:
         """Level at which an inclusion ends, as a share of its peak: 0.5, the middle of its blurred edge, in segmented
         images, otherwise the level of the settings."""
-        return _MIDDLE if self.settings.segment else self.settings.level
+        return _SEGMENTATION_LEVEL if self.settings.segment else self.settings.level
 
     @property
     def is_complex(self) -> bool:
@@ -366,7 +366,7 @@ def image_difference(
             calibration=calibration,
             reconstruction=reconstruction,
             change=change,
-            raster=_sampled(grid, change),
+            raster=_sample_on_raster(grid, change),
             extent=grid.extent,
             inclusions=(),
             wiring=prepared.wiring,
@@ -407,18 +407,18 @@ def _body_inclusion(body: Star | Ellipsoid, background: float) -> Inclusion:
             centroid,
             quantities.measure,
             background * quantities.change,
-            form=_form(body),
+            form=_solid_form(body),
             contrast_interval=quantities.change_interval,
             area_interval=quantities.measure_interval,
             strength=quantities.strength,
             strength_interval=quantities.strength_interval,
             centroid_radius=quantities.centroid_radius,
         )
-    inclusion = Inclusion(body.sign, centroid, body.measure, body.sign * body.contrast, form=_form(body))
+    inclusion = Inclusion(body.sign, centroid, body.measure, body.sign * body.contrast, form=_solid_form(body))
     return _with_change(inclusion, background)
 
 
-def _form(body: Star | Ellipsoid) -> SolidForm | None:
+def _solid_form(body: Star | Ellipsoid) -> SolidForm | None:
     """Form of a body in a solid, for drawing; None for star shapes."""
     if isinstance(body, Star):
         return None
@@ -448,7 +448,7 @@ def _labels(mesh: Mesh, bodies: Sequence[Star | Ellipsoid], grid: Raster) -> UIn
     return labels
 
 
-def _sampled(grid: Raster, change) -> Inexact[Array, "rows columns"]:
+def _sample_on_raster(grid: Raster, change) -> Inexact[Array, "rows columns"]:
     """Sample an image on a raster, real and imaginary part separately for complex images."""
     if not np.iscomplexobj(change):
         return grid.sample(change)

@@ -25,7 +25,7 @@ from jeit_solvers.module import Module
 
 # Logarithm of the ratio of a contact impedance to the model's, beyond which the impedance no longer changes the
 # voltages.
-FARTHEST = 50.0
+MAX_LOG_RATIO = 50.0
 # Tolerance of the parameters and the misfit in a fit inside jax.jit, jax.grad or jax.vmap: as small as double precision
 # allows.
 _TRACED_TOLERANCE = 1e-12
@@ -78,7 +78,7 @@ def _fitted_model(contact: str, parameters, model: ForwardModel) -> tuple[Forwar
     conductivity = jnp.exp(parameters[0])
     if contact == "fixed":
         return model, conductivity
-    factor = jnp.exp(jnp.clip(parameters[1:] - parameters[0], -FARTHEST, FARTHEST))
+    factor = jnp.exp(jnp.clip(parameters[1:] - parameters[0], -MAX_LOG_RATIO, MAX_LOG_RATIO))
     impedance = model.electrodes.contact_impedance * factor
     return model.with_electrodes(model.electrodes.with_contact_impedance(impedance)), conductivity
 
@@ -374,7 +374,7 @@ class _CalibrationProblem:
         if self.contact == "fixed":
             return self.initial_model, conductivity
         electrodes = self.initial_model.electrodes
-        factor = np.exp(np.clip(parameters[self.first_contact :] - parameters[0], -FARTHEST, FARTHEST))
+        factor = np.exp(np.clip(parameters[self.first_contact :] - parameters[0], -MAX_LOG_RATIO, MAX_LOG_RATIO))
         impedance = np.asarray(electrodes.contact_impedance) * factor
         return self.initial_model.with_electrodes(electrodes.with_contact_impedance(impedance)), conductivity
 

@@ -28,7 +28,7 @@ from jeit.inverse.nonlinear.problem import (
     keep_informed_shapes,
 )
 from jeit.inverse.nonlinear.solvers import LBFGSB, SOLVERS, AbstractSolver, GaussNewton, as_solver
-from jeit.inverse.prior.matern import PRIOR
+from jeit.inverse.prior.matern import DEFAULT_PRIOR
 from jeit.inverse.prior.priors import AbstractPrior, check_prior
 from jeit.inverse.spectrum import Spectrum
 from jeit_solvers import Status
@@ -165,7 +165,7 @@ def reconstruct(
     ```
     """
     measured, used = check_frame(model, voltages, mask)
-    prior = PRIOR if prior is None else prior
+    prior = DEFAULT_PRIOR if prior is None else prior
     check_prior(prior)
     parametrisation = as_parametrisation(parametrisation)
     parametrisation.check_model(model)

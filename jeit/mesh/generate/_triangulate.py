@@ -178,7 +178,7 @@ _STEP_DIRECTIONS = np.stack([np.cos(_STEP_ANGLES), np.sin(_STEP_ANGLES)], axis=1
 _TRIAL_STEPS = np.concatenate([length * _STEP_DIRECTIONS for length in (0.02, 0.06, 0.15, 0.3)])
 
 
-def improvable(front: Front, cells: np.ndarray) -> np.ndarray:
+def is_improvable(front: Front, cells: np.ndarray) -> np.ndarray:
     """Whether each cell can be improved; a cell at a sharp corner cannot, since the outline determines its shape."""
     is_sharp = np.zeros(cells.max() + 1, bool)
     is_sharp[: front.num_outline] = front.is_sharp_corner()
@@ -204,7 +204,7 @@ def polish(front: Front, passes: int = 4) -> None:
         points = front.points()
         cells = triangulate(front, points)
         angle = smallest_angles(points[cells])
-        bad_cells = np.flatnonzero((angle < _POLISH_ANGLE) & improvable(front, cells))
+        bad_cells = np.flatnonzero((angle < _POLISH_ANGLE) & is_improvable(front, cells))
         movable = np.unique(cells[bad_cells])
         movable = movable[movable >= num_immovable_nodes]
         if not movable.size:
@@ -255,7 +255,7 @@ def repair(front: Front) -> bool:
             _recover(front, points, missing_indices, remove=round_number < 10)
             continue
         angle = smallest_angles(points[cells])
-        bad_cells = np.flatnonzero((angle < _REPAIR_ANGLE) & improvable(front, cells))
+        bad_cells = np.flatnonzero((angle < _REPAIR_ANGLE) & is_improvable(front, cells))
         if not bad_cells.size:
             return True
         _insert_circumcentres(front, points, cells[bad_cells], angle[bad_cells])
@@ -411,7 +411,7 @@ def generate(
         points = front.points()
         cells = triangulate(front, points)
         angle = smallest_angles(points[cells])
-        if is_repaired and angle[improvable(front, cells)].min(initial=90.0) >= PROMISED_ANGLE:
+        if is_repaired and angle[is_improvable(front, cells)].min(initial=90.0) >= PROMISED_ANGLE:
             return order_nodes(points, cells)
         front = None
     raise ValueError(

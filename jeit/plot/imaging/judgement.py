@@ -45,8 +45,8 @@ _CRITERIA = {
     "best-resolution": ("blur radius / body", "linear", "least"),
 }
 # Colours of measured and modelled voltages.
-MEASURED = "#1f6fb4"
-MODELLED = "#d1495b"
+MEASURED_COLOUR = "#1f6fb4"
+MODELLED_COLOUR = "#d1495b"
 
 
 def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = None, ax: Axes | None = None) -> Axes:
@@ -332,10 +332,10 @@ def plot_voltages(
     difference_axes = ax.inset_axes((0, 0, 1, 0.36), sharex=voltage_axes)
     marker_size = float(np.clip(500 / channel.size, 0.8, 3))
     voltage_axes.plot(
-        channel, factor * measured[is_drawn], "o", color=MEASURED, markersize=2 * marker_size, label="measured"
+        channel, factor * measured[is_drawn], "o", color=MEASURED_COLOUR, markersize=2 * marker_size, label="measured"
     )
     voltage_axes.plot(
-        channel, factor * modelled[is_drawn], "o", color=MODELLED, markersize=marker_size, label="modelled"
+        channel, factor * modelled[is_drawn], "o", color=MODELLED_COLOUR, markersize=marker_size, label="modelled"
     )
     voltage_axes.set_ylabel(f"Voltage ({unit})")
     voltage_axes.legend(

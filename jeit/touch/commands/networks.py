@@ -224,7 +224,7 @@ def image(
     from jeit.arguments.extras import need_extra
     from jeit.cli.console import Steps, name_value_table, plain_console, say_written
     from jeit.design import read_described_skin
-    from jeit.design.commands.study import connected
+    from jeit.design.commands.study import connect_to_scheduler
     from jeit.touch.networks import learn_images
     from jeit.touch.reports.image_network import LEARNT_FILES, write_learnt_images
 
@@ -237,7 +237,7 @@ def image(
         step("read")
         with naming_options({"path": "skin"}):
             described_skin = read_described_skin(skin)
-        client = None if scheduler is None else stack.enter_context(connected(scheduler))
+        client = None if scheduler is None else stack.enter_context(connect_to_scheduler(scheduler))
         step("learn")
         learnt = learn_images(
             described_skin,
